@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 from rich.console import Group, RenderableType
 
 import eap
-from eap.appliance.attach import AttachedStation
 from eap.cli.output import repaint
 from eap.cli.table import Column, Styled, TextTable, duration
 from eap.errors import EapError
+from eap.runtime.attach import AttachedStation
 
 PLANT = Path("config/demo.yaml")
 EAPCTL = Path(sys.executable).with_name("eapctl")

@@ -30,12 +30,12 @@ from typing import NamedTuple
 
 import eap
 from devicebus.mailbox.coe_client import upload
-from eap.appliance.attach import AttachedStation
-from eap.appliance.commands.bus_running import open_running
-from eap.appliance.runtime import VARIABLE
 from eap.errors import EapError
 from eap.ids import ObjectId
 from eap.net.ticker import Ticker
+from eap.ops.bus_running import open_running
+from eap.runtime.attach import AttachedStation
+from eap.runtime.folder import VARIABLE
 
 PLANT = Path(__file__).resolve().parent.parent / "config" / "valve.yaml"
 EAPCTL = Path(sys.executable).with_name("eapctl")

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from eap.aoe.ads_device import AdsDevice
-from eap.aoe.ads_notifications import Client
-from eap.aoe.ads_objects import ObjectSpace
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.way import Way
+from eap.ads.answer import AmsAnswer
+from eap.ads.device import AdsDevice
+from eap.ads.notifications import Client
+from eap.ads.objects import ObjectSpace
+from eap.ams.endpoint import Way
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from devicebus.mailbox.protocol import MailboxSizes, refuse
-from eap.aoe.answer import AmsAnswer, response_to
-from eap.aoe.fragment import Assembler, iter_fragments
+from eap.ads.answer import AmsAnswer, response_to
+from eap.ams.fragment import Assembler, iter_fragments
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.codec.mailbox import MailboxError
 from eap.errors import CodecError

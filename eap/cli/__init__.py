@@ -2,7 +2,7 @@
 
 The front end owns no plant: it reads plant files, starts an appliance in the foreground, or talks
 to running ones through their control sockets.  A command calls an operation of
-``eap.appliance.commands``, which returns a typed result; ``output`` renders that as JSON or by the
+``eap.ops``, which returns a typed result; ``output`` renders that as JSON or by the
 command's view.  ``group`` loads subcommands and is the one place where an error becomes a line on
 stderr and an exit code.
 """

@@ -24,10 +24,10 @@ from eap.cli.params import (
 )
 
 if TYPE_CHECKING:
-    from eap.appliance.commands.bus_foe import FileTransfer
     from eap.codec.datatypes import DataType
     from eap.codec.soe import Idn
     from eap.ids import ObjectId
+    from eap.ops.bus_foe import FileTransfer
 
 STATES = ("INIT", "PREOP", "BOOT", "SAFEOP", "OP")
 _U32 = 0xFFFFFFFF
@@ -64,8 +64,8 @@ def bus() -> None:
 @json_option("Print one object.")
 def scan(bus: Place, output: Renderer) -> None:
     """Show all slaves: identity, state, alias, mailbox protocols."""
-    from eap.appliance.commands.bus_info import scan_slaves
     from eap.cli.bus_view import scan_tables
+    from eap.ops.bus_info import scan_slaves
 
     with open_session(bus) as session:
         found = scan_slaves(session)
@@ -82,8 +82,8 @@ def state(words: tuple[str, ...], bus: Place, output: Renderer) -> None:
     One slave, or all of them.  The master of a running station keeps them there.  Behind an
     interface no master does: a slave with outputs leaves OP when it receives no process data.
     """
-    from eap.appliance.commands.bus_info import slave_states
     from eap.cli.bus_view import state_view
+    from eap.ops.bus_info import slave_states
 
     target = words[-1].upper() if words and words[-1].upper() in STATES else None
     rest = words[:-1] if target else words
@@ -112,8 +112,8 @@ def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Rendere
     """
     from time import time
 
-    from eap.appliance.commands.bus_info import diagnosis, reset_diagnosis
     from eap.cli.bus_view import diagnosis_view, reset_view
+    from eap.ops.bus_info import diagnosis, reset_diagnosis
 
     if reset and slave is not None:
         raise click.UsageError("--reset is for the whole bus: leave SLAVE out")
@@ -137,9 +137,9 @@ def sii() -> None:
 @json_option("Print one object, with all octets in hexadecimal digits.")
 def sii_dump(slave: str, file: Path | None, bus: Place, output: Renderer) -> None:
     """Read the EEPROM; with FILE, store its octets there."""
-    from eap.appliance.commands.bus_info import read_eeprom
-    from eap.appliance.durable import whole_file
     from eap.cli.bus_view import eeprom_lines
+    from eap.ops.bus_info import read_eeprom
+    from eap.runtime.durable import whole_file
 
     with open_session(bus) as session:
         content = read_eeprom(session, slave)
@@ -159,7 +159,7 @@ def sii_write(slave: str, file: Path, bus: Place, output: Renderer) -> None:
 
     The master of a running station reads it when it brings its bus up anew.
     """
-    from eap.appliance.commands.bus_info import WrittenEeprom, write_eeprom
+    from eap.ops.bus_info import WrittenEeprom, write_eeprom
 
     def lines(done: WrittenEeprom) -> Iterator[str]:
         yield f"slave {done.address}: {done.octets} octets written and compared"
@@ -188,7 +188,7 @@ def voe(
     slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, output: Renderer
 ) -> None:
     """Send a message of a vendor's own protocol (VoE) and print the answer."""
-    from eap.appliance.commands.bus_foe import exchange
+    from eap.ops.bus_foe import exchange
 
     with open_session(bus) as session:
         reply = exchange(session, slave, vendor, vendor_type, data)
@@ -232,8 +232,8 @@ def sdo_read(
 
     INDEX and SUB are hexadecimal, with or without 0x: 0x1018:01, 1018:1.
     """
-    from eap.appliance.commands.bus_objects import read_entry
     from eap.cli.bus_view import value_line
+    from eap.ops.bus_objects import read_entry
 
     with open_session(bus) as session:
         found = read_entry(session, slave, *entry, kind=kind, complete=complete)
@@ -261,7 +261,7 @@ def sdo_write(
     INDEX and SUB are hexadecimal, with or without 0x: 0x8000:01, 8000:1.  VALUE is as the type has
     it: 12, 0xC, -1.5e3, true, text; hexadecimal digits for a block and with --complete.
     """
-    from eap.appliance.commands.bus_objects import write_entry
+    from eap.ops.bus_objects import write_entry
 
     with open_session(bus) as session:
         done = write_entry(session, slave, *entry, value, kind=kind, complete=complete)
@@ -274,8 +274,8 @@ def sdo_write(
 @json_option("Print one object a line.")
 def sdo_list(slave: str, bus: Place, output: Renderer) -> None:
     """List the objects that the slave describes."""
-    from eap.appliance.commands import bus_objects
     from eap.cli.bus_view import object_table
+    from eap.ops import bus_objects
 
     with open_session(bus) as session:
         output.show_rows(bus_objects.list_objects(session, slave), object_table)
@@ -287,8 +287,8 @@ def sdo_list(slave: str, bus: Place, output: Renderer) -> None:
 @json_option("Print one object a line.")
 def sdo_dump(slave: str, bus: Place, output: Renderer) -> None:
     """Read every entry of every object that the slave describes."""
-    from eap.appliance.commands.bus_objects import dump_entries
     from eap.cli.bus_view import dump_table
+    from eap.ops.bus_objects import dump_entries
 
     with open_session(bus) as session:
         output.show_rows(dump_entries(session, slave), dump_table)
@@ -330,8 +330,8 @@ def idn() -> None:
 @json_option("Print one object.")
 def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Renderer) -> None:
     """Read an IDN with all elements that it has."""
-    from eap.appliance.commands.bus_objects import read_idn
     from eap.cli.bus_view import idn_lines
+    from eap.ops.bus_objects import read_idn
 
     with open_session(bus) as session:
         found = read_idn(session, slave, number, drive=drive)
@@ -352,7 +352,7 @@ def idn_write(
 
     The numbers of a list have commas between them.
     """
-    from eap.appliance.commands.bus_objects import write_idn
+    from eap.ops.bus_objects import write_idn
 
     with open_session(bus) as session:
         done = write_idn(session, slave, number, value, drive=drive)
@@ -366,8 +366,8 @@ def idn_write(
 @json_option("Print one object a line.")
 def idn_list(slave: str, drive: int, bus: Place, output: Renderer) -> None:
     """List all IDNs of a drive."""
-    from eap.appliance.commands import bus_objects
     from eap.cli.bus_view import idn_table
+    from eap.ops import bus_objects
 
     with open_session(bus) as session:
         output.show_rows(bus_objects.list_idns(session, slave, drive=drive), idn_table)
@@ -407,7 +407,7 @@ def foe_get(
 
     FILE is NAME in this folder if left out, and - for stdout.
     """
-    from eap.appliance.commands.bus_foe import get_file
+    from eap.ops.bus_foe import get_file
 
     target = file or Path(Path(name).name)
     is_stdout = target == _STANDARD
@@ -442,7 +442,7 @@ def foe_put(
 
     FILE is - for stdin, which needs a NAME.
     """
-    from eap.appliance.commands.bus_foe import put_file
+    from eap.ops.bus_foe import put_file
 
     is_stdin = file == _STANDARD
     if is_stdin and not name:

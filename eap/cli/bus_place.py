@@ -11,7 +11,7 @@ from eap.cli.params import CommandT
 from eap.ids import InterfaceUri
 
 if TYPE_CHECKING:
-    from eap.appliance.commands.bus_slave import SlaveBus
+    from eap.ops.bus_slave import SlaveBus
 
 _PLACE, _INTERFACE, _PLANT = "place", "interface", "plant"
 _FORMS = "STATION/PORT", "--interface URI"
@@ -143,14 +143,14 @@ def parse_uri(text: str) -> InterfaceUri:
 def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
     """Open the bus; imported here, so that ``--help`` need not wait for a master."""
     if isinstance(bus, StationBus):
-        from eap.appliance.commands.bus_running import open_running
+        from eap.ops.bus_running import open_running
 
         return open_running(*bus)
     if isinstance(bus, GatewayPlace):
-        from eap.appliance.commands.bus_gateway import open_gateway
+        from eap.ops.bus_gateway import open_gateway
 
         return open_gateway(bus.host, bus.port, tcp=bus.tcp, mailbox=bus.mailbox)
-    from eap.appliance.commands import bus_session
+    from eap.ops import bus_session
 
     return bus_session.open_bus(bus)
 

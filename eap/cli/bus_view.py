@@ -7,8 +7,9 @@ from typing import Any
 
 from msgspec import UNSET
 
-from eap.appliance.bus_status import FindingRow
-from eap.appliance.commands.bus_info import (
+from eap.cli.table import Column, Styled, TextTable, count, duration
+from eap.ids import ObjectId
+from eap.ops.bus_info import (
     BusScan,
     CounterReset,
     DiagnosedSlave,
@@ -18,16 +19,15 @@ from eap.appliance.commands.bus_info import (
     SlaveStates,
     fault_lines,
 )
-from eap.appliance.commands.bus_objects import (
+from eap.ops.bus_objects import (
     IdnElements,
     NamedIdn,
     SdoDumpEntry,
     SdoValue,
     SlaveObject,
 )
-from eap.appliance.commands.od import OdObjectRow
-from eap.cli.table import Column, Styled, TextTable, count, duration
-from eap.ids import ObjectId
+from eap.ops.od import OdObjectRow
+from eap.runtime.bus_status import FindingRow
 
 _SHOWN_OCTETS = 32
 _MANY_SLAVES = 16

@@ -17,8 +17,8 @@ from eap.cli.params import json_option
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from eap.appliance.commands.capture import Packet
-    from eap.appliance.commands.decode import DecodedAms, DecodedDatagram, DecodedFrame
+    from eap.ops.capture import Packet
+    from eap.ops.decode import DecodedAms, DecodedDatagram, DecodedFrame
 
 _NAMES = {
     1: "datagrams",
@@ -67,9 +67,9 @@ def _frames(source: str) -> Iterator[DecodedFrame]:
 
 
 def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
-    from eap.appliance.commands.capture import iter_capture
-    from eap.appliance.commands.decode import decode_frame
     from eap.errors import CodecError
+    from eap.ops.capture import iter_capture
+    from eap.ops.decode import decode_frame
 
     try:
         for captured in iter_capture(Path(name)):
@@ -83,8 +83,8 @@ def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
 
 
 def _frames_of_octets(octets: bytes) -> Iterator[DecodedFrame]:
-    from eap.appliance.commands.capture import cut_frames, unwrap
-    from eap.appliance.commands.decode import decode_frame
+    from eap.ops.capture import cut_frames, unwrap
+    from eap.ops.decode import decode_frame
 
     packet = unwrap(octets)
     if packet is None:

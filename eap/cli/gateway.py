@@ -11,8 +11,8 @@ from eap.cli.output import Renderer
 from eap.cli.params import examples, json_option, plant_option
 
 if TYPE_CHECKING:
-    from eap.appliance.control_gateway import GatewayRow
     from eap.cli.table import Column, TextTable
+    from eap.control.gateway import GatewayRow
 
 _JSON = json_option("Print one object for each gateway; docs/control.md explains its fields.")
 _TARGET = click.argument("target", metavar="STATION[/PORT]")
@@ -69,8 +69,8 @@ def status(target: str, plant: str | None, output: Renderer) -> None:
 def _call(
     action: Literal["start", "stop", "status"], target: str, plant: str | None
 ) -> list[GatewayRow]:
-    from eap.appliance import control_gateway
-    from eap.appliance.commands.client import connect_station
+    from eap.control import gateway as control_gateway
+    from eap.ops.client import connect_station
 
     station, slash, port = target.partition("/")
     if not station or (slash and not port) or "/" in port:
@@ -88,10 +88,10 @@ def _all_rows(plant: str | None) -> list[GatewayRow]:
     """Return the gateways of all stations of the running appliances."""
     from contextlib import ExitStack
 
-    from eap.appliance.commands.client import connect
-    from eap.appliance.control import ErrorCode
-    from eap.appliance.control_gateway import GATEWAY_STATUS
+    from eap.control.gateway import GATEWAY_STATUS
+    from eap.control.protocol import ErrorCode
     from eap.errors import ControlError
+    from eap.ops.client import connect
 
     rows: list[GatewayRow] = []
     with ExitStack() as stack:

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import click
 
 from eap.errors import ConfigError, EapError, EnvironmentalError
-from eap.near import near
+from eap.suggest import suggest
 
 DEBUG_VARIABLE = "EAP_DEBUG"
 
@@ -62,7 +62,7 @@ class LazyGroup(click.Group):
         """Find the subcommand that *args* start with; raise UsageError with one that comes near."""
         if args[0] not in self._commands_at and not ctx.resilient_parsing:
             known = ", ".join(self.list_commands(ctx))
-            hint = near(args[0], self._commands_at) or f": there are {known}"
+            hint = suggest(args[0], self._commands_at) or f": there are {known}"
             raise click.UsageError(f"no command {args[0]!r}{hint}", ctx)
         return super().resolve_command(ctx, args)
 

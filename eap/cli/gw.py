@@ -23,7 +23,7 @@ from eap.cli.params import examples, json_option
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from eap.appliance.commands.bus_objects import SdoDumpEntry
+    from eap.ops.bus_objects import SdoDumpEntry
 
 _PORT = 34980
 _TCP, _MAILBOX = "--tcp", "--mailbox"
@@ -134,7 +134,7 @@ def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) 
 @json_option("Print one object a line.")
 def od(slave: str, bus: Place, output: Renderer) -> None:
     """Show every object with its entries and values; of the master if SLAVE is left out."""
-    from eap.appliance.commands.bus_objects import dump_entries
+    from eap.ops.bus_objects import dump_entries
 
     with open_session(bus) as session:
         entries = dump_entries(session, slave)

@@ -12,7 +12,8 @@ from eap.cli.output import Renderer
 from eap.cli.params import examples, json_option, plant_option
 
 if TYPE_CHECKING:
-    from eap.appliance.control_routes import (
+    from eap.cli.table import Styled, TextTable
+    from eap.control.routes import (
         HopRow,
         PlantScan,
         ScanVia,
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
         TargetAnswer,
         TracedPath,
     )
-    from eap.cli.table import Styled, TextTable
 
 _VIA = click.option(
     "--via", metavar="STATION", help="Station whose router sends the requests; the first without."
@@ -41,8 +41,8 @@ def scan(via: str | None, plant: str | None, output: Renderer) -> None:
     take its name.  A station or bus that does not answer is shown as the plant file has it, with
     the reason on stderr.
     """
-    from eap.appliance.commands import ams
-    from eap.appliance.control_routes import MergedScan
+    from eap.control.routes import MergedScan
+    from eap.ops import ams
 
     answers = ams.scan(plant, via)
     stations = [station for answer in answers for station in answer.stations]
@@ -77,7 +77,7 @@ def trace(
 
     Exits with 1 when a target is not reached; the last line says at which hop, and why.
     """
-    from eap.appliance.commands import ams
+    from eap.ops import ams
 
     is_ok = True
     for target in targets:

@@ -15,12 +15,12 @@ from eap.cli.params import json_option, parse_entry, parse_octets, parse_type, p
 from eap.errors import ControlError
 
 if TYPE_CHECKING:
-    from eap.appliance.commands.od import OdDumpEntry, OdObjectRow
-    from eap.appliance.commands.od_devices import Target
-    from eap.appliance.control_device import StateAnswer
     from eap.cli.table import TextTable
     from eap.codec.datatypes import DataType
+    from eap.control.device import StateAnswer
     from eap.ids import ObjectId
+    from eap.ops.od import OdDumpEntry, OdObjectRow
+    from eap.ops.od_devices import Target
 
 STATES = ("PREOP", "SAFEOP", "OP")
 _OF_SLAVES = ("INIT", *STATES, "BOOT")
@@ -45,7 +45,7 @@ def target_argument(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _target(text: str, plant: str | None) -> Target:
-    from eap.appliance.commands.od_devices import Target
+    from eap.ops.od_devices import Target
 
     try:
         return Target.parse(text)._replace(plant=plant)
@@ -69,8 +69,8 @@ def od() -> None:
 @json_option("Print one object a line.")
 def list_objects(target: Target, output: Renderer) -> None:
     """List all objects with their names."""
-    from eap.appliance.commands.od import object_rows
-    from eap.appliance.commands.od_devices import open_device
+    from eap.ops.od import object_rows
+    from eap.ops.od_devices import open_device
 
     with open_device(target) as device:
         rows = list(object_rows(device.objects()))
@@ -98,9 +98,9 @@ def read(
     entry: ObjectId, kind: DataType | None, complete: bool, target: Target, output: Renderer
 ) -> None:
     """Read an entry, or a whole object."""
-    from eap.appliance.commands.od import read_entry, read_object
-    from eap.appliance.commands.od_devices import open_device
     from eap.cli.od_text import object_lines, value_line
+    from eap.ops.od import read_entry, read_object
+    from eap.ops.od_devices import open_device
 
     with open_device(target) as device:
         if complete:
@@ -153,9 +153,9 @@ def write(
         _load(target, file, output)
         return
     place = _entry_to_write(entry, value, octets, complete=complete)
-    from eap.appliance.commands.od import write_entry, write_octets
-    from eap.appliance.commands.od_devices import open_device
     from eap.cli.od_text import octets_line, value_line
+    from eap.ops.od import write_entry, write_octets
+    from eap.ops.od_devices import open_device
 
     with open_device(target) as device:
         if octets is not None:
@@ -166,9 +166,9 @@ def write(
 
 def _load(target: Target, file: Path, output: Renderer) -> None:
     """Write the entries of *file* to *target*."""
-    from eap.appliance.commands import od as ops
-    from eap.appliance.commands.od_devices import open_device
     from eap.cli.od_text import load_line, read_file
+    from eap.ops import od as ops
+    from eap.ops.od_devices import open_device
 
     entries = read_file(file)
     with open_device(target) as device:
@@ -181,9 +181,9 @@ def _load(target: Target, file: Path, output: Renderer) -> None:
 @json_option("Print one entry a line, as an object.")
 def dump(target: Target, output: Renderer) -> None:
     """Write all entries of all objects to stdout, for people and for 'od write --from'."""
-    from eap.appliance.commands.od import dump_rows
-    from eap.appliance.commands.od_devices import open_device
     from eap.cli.od_text import dump_lines
+    from eap.ops.od import dump_rows
+    from eap.ops.od_devices import open_device
 
     def lines(rows: Iterable[OdDumpEntry]) -> Iterator[str]:
         return dump_lines(str(target), rows)
@@ -225,7 +225,7 @@ def state(ctx: click.Context, wanted: str | None, target: Target, output: Render
 
     Exits with 1 when the state was refused, which leaves the station where it was.
     """
-    from eap.appliance.control_device import TargetState
+    from eap.control.device import TargetState
 
     wanted = wanted and wanted.upper()
     answer = _state_of(target, wanted)
@@ -251,16 +251,16 @@ def _state_of(target: Target, wanted: str | None) -> StateAnswer:
 
 
 def _state_by_ads(target: Target, wanted: str | None) -> StateAnswer:
-    from eap.appliance.commands.ams import open_ams, read_state, request_state
+    from eap.ops.ams import open_ams, read_state, request_state
 
     with open_ams(str(target), target.plant) as device:
         return request_state(device, wanted) if wanted else read_state(device)
 
 
 def _state_of_station(target: Target, wanted: str | None) -> StateAnswer:
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control import ErrorCode
-    from eap.appliance.control_device import REQUEST_STATE, STATE
+    from eap.control.device import REQUEST_STATE, STATE
+    from eap.control.protocol import ErrorCode
+    from eap.ops.client import connect_station
 
     try:
         with connect_station(target.station, target.plant) as client:
@@ -274,9 +274,9 @@ def _state_of_station(target: Target, wanted: str | None) -> StateAnswer:
 
 
 def _state_of_slave(target: Target, wanted: str | None) -> StateAnswer:
-    from eap.appliance.commands.bus_info import slave_states
-    from eap.appliance.commands.bus_running import open_running
-    from eap.appliance.control_device import StateAnswer, StateError
+    from eap.control.device import StateAnswer, StateError
+    from eap.ops.bus_info import slave_states
+    from eap.ops.bus_running import open_running
 
     with open_running(target.station, target.port, target.plant) as bus:
         (row,) = slave_states(bus, target.slave, wanted).slaves

@@ -17,7 +17,12 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from eap.appliance.commands.od import (
+from eap.codec import datatypes
+from eap.codec.datatypes import DataType
+from eap.errors import ConfigError
+from eap.ids import ObjectId
+from eap.od import notation
+from eap.ops.od import (
     Download,
     OdDumpEntry,
     OdLoadResult,
@@ -25,11 +30,6 @@ from eap.appliance.commands.od import (
     OdValue,
     OdWholeObject,
 )
-from eap.codec import datatypes
-from eap.codec.datatypes import DataType
-from eap.errors import ConfigError
-from eap.ids import ObjectId
-from eap.od import notation
 
 Entry: TypeAlias = OdValue | OdDumpEntry
 

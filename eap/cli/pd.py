@@ -36,9 +36,9 @@ def pd() -> None:
 @json_option("One object a line: a PD, or the variables of a station that no PD carries.")
 def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
     """List every PD with what identifies it, and every variable with its type and writer."""
-    from eap.appliance.commands.client import connect
-    from eap.appliance.control import PD_LIST, VARIABLES
     from eap.cli.pd_view import listed_pds, pd_table
+    from eap.control.protocol import PD_LIST, VARIABLES
+    from eap.ops.client import connect
 
     rows: list[ListedPd] = []
     with ExitStack() as stack:
@@ -99,10 +99,10 @@ def set_value(words: tuple[str, ...], plant: str | None, output: Renderer) -> No
     VALUE as the variable's type has it: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
     hexadecimal digits for a raw block.
     """
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control import VARIABLES, WRITE
     from eap.cli.pd_view import WrittenVariable, value_text
     from eap.codec import datatypes
+    from eap.control.protocol import VARIABLES, WRITE
+    from eap.ops.client import connect_station
 
     target, text = parse_assignment(words)
     with connect_station(target.station, plant) as client:

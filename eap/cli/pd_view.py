@@ -16,10 +16,10 @@ from typing import Any, TypeAlias
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from eap.appliance.commands.client import connect_station
-from eap.appliance.control import ValuesEvent, VariableRow
 from eap.cli.table import Column, TextTable, quality
+from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
+from eap.ops.client import connect_station
 from eap.pd.report import PdRow, PdRowVariable
 
 _SHOWN = 48

@@ -16,13 +16,13 @@ from eap.errors import ControlError
 from eap.ids import ObjectId
 
 if TYPE_CHECKING:
-    from eap.appliance.commands.plant_change import (
+    from eap.control.device import ObjectChange
+    from eap.ops.plant_change import (
         ChangeReport,
         PlanReport,
         PlantLink,
         StepOutcome,
     )
-    from eap.appliance.control_device import ObjectChange
     from eap.pd.spec import StationSpec
 
 _SIGNS = {"added": "+", "removed": "-", "changed": "~"}
@@ -57,7 +57,7 @@ def running_plant(
         The connections, and the specifications of the *wanted* stations: of all that run here
         unless some are named.
     """
-    from eap.appliance.commands.plant_change import choose, link_to, load_or_raise
+    from eap.ops.plant_change import choose, link_to, load_or_raise
 
     plant = load_or_raise(file)
     with link_to(plant, file) as link:
@@ -73,7 +73,7 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Ren
 
     Nothing is changed.  Exits with 1 when a station cannot become what the file says while it runs.
     """
-    from eap.appliance.commands.plant_change import PlanReport, plan_all, start_command, steps_to
+    from eap.ops.plant_change import PlanReport, plan_all, start_command, steps_to
 
     with running_plant(plant, stations) as (link, wanted):
         plans = plan_all(link, wanted)
@@ -103,7 +103,7 @@ def apply(
 
     Exits with 1 when a station refused.
     """
-    from eap.appliance.commands.plant_change import apply_steps, plan_all, steps_to
+    from eap.ops.plant_change import apply_steps, plan_all, steps_to
 
     with running_plant(plant, stations) as (link, wanted):
         refusing = {each.station: each.refused for each in plan_all(link, wanted) if each.refused}
@@ -128,7 +128,7 @@ def rollback(
 
     Exits with 1 when a station refused.
     """
-    from eap.appliance.commands.plant_change import roll_back
+    from eap.ops.plant_change import roll_back
 
     with running_plant(plant, stations) as (link, wanted):
         _run_steps(ctx, roll_back(link, tuple(wanted), keep_going=keep_going), link, {}, output)
@@ -142,7 +142,7 @@ def _run_steps(
     output: Renderer,
 ) -> None:
     """Take all steps, print the text of each when it is done, and then the whole result."""
-    from eap.appliance.commands.plant_change import ChangeReport
+    from eap.ops.plant_change import ChangeReport
 
     taken: list[StepOutcome] = []
     error: ControlError | None = None

@@ -27,7 +27,7 @@ def check(ctx: click.Context, plant: Path, output: Renderer) -> None:
 
     Exits with 2 when there is an error.  What works, but not with all commands, is a warning.
     """
-    from eap.appliance.commands.plant_check import check_plant  # yaml; --help must not wait
+    from eap.ops.plant_check import check_plant  # yaml; --help must not wait
 
     found, checked = check_plant(plant)
     for warning in found.warnings:
@@ -131,7 +131,7 @@ def new(
 
 
 def _write(file: Path, text: str, *, force: bool) -> None:
-    from eap.appliance.durable import whole_file
+    from eap.runtime.durable import whole_file
 
     if file.exists() and not force:
         raise click.ClickException(f"{file} exists: write over it with --force")

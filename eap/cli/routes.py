@@ -14,7 +14,7 @@ from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
 from eap.errors import EnvironmentalError
 
 if TYPE_CHECKING:
-    from eap.appliance.control_routes import ImportRow, NeighbourRow, TestResult
+    from eap.control.routes import ImportRow, NeighbourRow, TestResult
 
 _IMPORT_S = 60.0
 """Time for a file with many routes, each of which is written to disk."""
@@ -90,8 +90,8 @@ def _run_view(plant: str | None) -> None:
 @json_option("Print one object: stations, each with routes, connections, requests, warnings.")
 def list_all(station: str | None, match: str, plant: str | None, output: Renderer) -> None:
     """List the routes and connections of STATION, or of all running stations."""
-    from eap.appliance.commands.route_lists import RouterList, list_routes
     from eap.cli.routes_view import routes_view
+    from eap.ops.route_lists import RouterList, list_routes
 
     found = list_routes(plant, station, match, requests=50 if output.is_json else 0)
     output.show(RouterList([row for each in found for row in each.stations]), routes_view)
@@ -152,9 +152,9 @@ def add(
     NETID may be left out when NAME is a station of the plant.  A route of the plant file goes
     before one that was added; 'eapctl routes test STATION NAME' shows whether it works.
     """
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control_routes import ROUTES_ADD
     from eap.cli.routes_view import path_of
+    from eap.control.routes import ROUTES_ADD
+    from eap.ops.client import connect_station
 
     with connect_station(station, plant) as client:
         added = client.call(
@@ -186,8 +186,8 @@ def remove(
 
     Routes of the plant file are removed there; learned ones expire.
     """
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control_routes import ROUTES_REMOVE
+    from eap.control.routes import ROUTES_REMOVE
+    from eap.ops.client import connect_station
 
     with connect_station(station, plant) as client:
         removed = client.call(
@@ -229,8 +229,8 @@ def test(
     Exits with 1 when a target does not answer; without a TARGET a client that does not listen is no
     failure.
     """
-    from eap.appliance.commands.route_lists import TestedTarget, list_routes
     from eap.cli.routes_view import result_table
+    from eap.ops.route_lists import TestedTarget, list_routes
 
     chosen = [(station, target) for target in targets if station]
     clients: set[tuple[str, str]] = set()
@@ -252,8 +252,8 @@ def test(
 
 
 def _test(station: str, target: str, timeout_ms: int, plant: str | None) -> TestResult:
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control_routes import ROUTES_TEST
+    from eap.control.routes import ROUTES_TEST
+    from eap.ops.client import connect_station
 
     within_s = timeout_ms / 1000 + ANSWER_MARGIN_S
     with connect_station(station, plant) as client:
@@ -286,9 +286,9 @@ def import_routes(
 
     Exits with 1 when a route could not be added; the others are.
     """
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control_routes import ROUTES_IMPORT
     from eap.cli.routes_view import import_table
+    from eap.control.routes import ROUTES_IMPORT
+    from eap.ops.client import connect_station
 
     xml = _read(file)
     with connect_station(station, plant) as client:
@@ -309,9 +309,9 @@ def export(station: str, file: Path | None, plant: str | None) -> None:
 
     Routes with other transports have no place in such a file; they are named on stderr.
     """
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control_routes import ROUTES_EXPORT
-    from eap.appliance.durable import whole_file
+    from eap.control.routes import ROUTES_EXPORT
+    from eap.ops.client import connect_station
+    from eap.runtime.durable import whole_file
 
     with connect_station(station, plant) as client:
         found = client.call(ROUTES_EXPORT, station=station)
@@ -327,7 +327,7 @@ def export(station: str, file: Path | None, plant: str | None) -> None:
 
 
 def _read(file: Path) -> str:
-    from eap.appliance.commands.route_lists import text_of_xml
+    from eap.ops.route_lists import text_of_xml
 
     octets = sys.stdin.buffer.read() if str(file) == "-" else file.read_bytes()
     try:
@@ -386,8 +386,8 @@ def introduce(
     Exits with 1 when the other router refuses, or does not answer.
     """
     password = _password(user, password_file)
-    from eap.appliance.commands.client import connect_station
-    from eap.appliance.control_routes import ROUTES_INTRODUCE
+    from eap.control.routes import ROUTES_INTRODUCE
+    from eap.ops.client import connect_station
 
     with connect_station(station, plant) as client:
         answer = client.call(
@@ -445,9 +445,9 @@ def scan(
     """
     from contextlib import ExitStack
 
-    from eap.appliance.commands.client import connect
-    from eap.appliance.control_routes import ROUTES_SCAN
     from eap.cli.routes_view import neighbour_table
+    from eap.control.routes import ROUTES_SCAN
+    from eap.ops.client import connect
 
     found: list[NeighbourRow] = []
     with ExitStack() as stack:

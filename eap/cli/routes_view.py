@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 
-from eap.aoe.way import Way
-from eap.appliance.commands.route_lists import RouterList, TestedTarget
-from eap.appliance.control_routes import (
+from eap.ams.endpoint import Way
+from eap.cli.table import Column, Styled, TextTable, count, duration
+from eap.control.routes import (
     ConnectionRow,
     ImportRow,
     NeighbourRow,
@@ -17,7 +17,7 @@ from eap.appliance.control_routes import (
     WayRow,
     interruption_text,
 )
-from eap.cli.table import Column, Styled, TextTable, count, duration
+from eap.ops.route_lists import RouterList, TestedTarget
 
 _UNITS = ("", "k", "M", "G", "T", "P", "E")
 _STYLES = {"up": "green", "down": "bold red", "unknown": "dim", "client": "dim"}

@@ -96,10 +96,10 @@ def run(
     is not fit.
     """
     _check_form(ctx)
-    from eap.appliance.handover import EngineOptions
+    from eap.runtime.handover import EngineOptions
 
     # Processes and sockets: --help must not wait for them.
-    from eap.appliance.supervisor import process as supervisor
+    from eap.supervisor import process as supervisor
 
     options = EngineOptions(realtime=realtime, priority=priority, cpu=-1 if cpu is None else cpu)
     if plant is not None:

@@ -65,8 +65,8 @@ def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults:
     When they answer, one line {"ready": true, "slaves": n} appears on stdout; Ctrl-C or SIGTERM
     ends them.  docs/simulator.md describes bus files; config/buses has some to start from.
     """
-    from eap.appliance import busfile  # yaml and sockets; --help must not wait
-    from eap.appliance.segment import process as segment_process
+    from eap.runtime import busfile  # yaml and sockets; --help must not wait
+    from eap.segment import process as segment_process
 
     loaded = busfile.load_or_raise(bus)
     if second is not None and not (loaded.spec.ring and second.scheme == "ethernet"):
@@ -190,7 +190,7 @@ def set_value(
 
 
 def _send(bus: StationBus, command: dict[str, Any], plant: str | None) -> None:
-    from eap.appliance.commands.client import connect_station
+    from eap.ops.client import connect_station
 
     with connect_station(bus.station, plant) as client:
         client.request("bus_fault", station=bus.station, port=bus.port, command=command)

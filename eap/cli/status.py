@@ -103,8 +103,8 @@ def _pause(seconds: float) -> None:
 
 def _look(plant: str | None, station: str | None) -> Look:
     """Return the merged answer of the chosen appliances, cut down to *station* if it is given."""
-    from eap.appliance.commands.client import connect, merge_status
     from eap.cli.status_findings import findings
+    from eap.ops.client import connect, merge_status
 
     with ExitStack() as stack:
         clients = [stack.enter_context(client) for client in connect(plant, station)]

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from eap.codec.values import Array, Block, Boolean, DataType, Integer, Plain, Real, String, Value
-from eap.near import near
+from eap.suggest import suggest
 
 __all__ = ["MAX_SIZE", "DataType", "Plain", "Value", "parse"]
 
@@ -116,7 +116,7 @@ def _scalar(text: str, name: str, length: str | None) -> DataType:
         hint = (
             f", did you mean {meant}?"
             if meant
-            else near(name, known) or " (such as UINT, REAL[4] or STRING(16))"
+            else suggest(name, known) or " (such as UINT, REAL[4] or STRING(16))"
         )
         raise ValueError(f"{text!r} is not a data type{hint}")
     if length is None:

@@ -7,7 +7,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import TypeVar
 
-from eap.aoe.spec import IP_DOORS, AccessRule, AccessService, AccessTarget, DoorKind, ObjectRange
+from eap.ams.spec import IP_DOORS, AccessRule, AccessService, AccessTarget, DoorKind, ObjectRange
 from eap.config.brokers import brokers_of, check_file
 from eap.config.check_ports import check_names
 from eap.config.finding import FindingReport, one_of
@@ -15,7 +15,7 @@ from eap.config.index import Index
 from eap.config.routes import WHOLE, MisfitError, net_ids_of, without_prefix
 from eap.config.structs import AccessSection, PortSection, StationSection
 from eap.ids import STATION_OCTETS, MacAddr, ObjectId
-from eap.near import near
+from eap.suggest import suggest
 from eap.pd.spec import PortKind
 
 ALL = "all"
@@ -63,7 +63,7 @@ def parse_services(texts: tuple[str, ...]) -> tuple[AccessService, ...]:
         if text == ALL:
             return ()
         if text not in SERVICES:
-            raise MisfitError("", f"no access is called {text!r}{near(text, SERVICES)}", _SERVICES)
+            raise MisfitError("", f"no access is called {text!r}{suggest(text, SERVICES)}", _SERVICES)
         found += _WRITES if text == AccessService.WRITE else [AccessService(text)]
     return tuple(dict.fromkeys(found))
 
@@ -129,14 +129,14 @@ def _targets(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
     if station is None:
         if "/" not in text and text[:1].isdigit():
             return [AccessTarget(_net_id(text))]
-        hint = near(name, index.stations)
+        hint = suggest(name, index.stations)
         raise MisfitError("", f"no station {name!r} in this plant{hint}", TARGET)
     if not port_name:
         return [AccessTarget(net_id) for net_id in _beginnings(station, loose)]
     port = index.ports.get((name, port_name))
     if port is None:
         names = [each.name for each in station.ports]
-        message = f"station {name} has no port {port_name!r}{near(port_name, names)}"
+        message = f"station {name} has no port {port_name!r}{suggest(port_name, names)}"
         raise MisfitError("", message, one_of(names))
     net_id = str(port.net_id)
     if not slave:
@@ -154,7 +154,7 @@ def _slave(index: Index, station: StationSection, port: PortSection, slave: str)
         return known[slave]
     if slave.isdecimal() and (int(slave) in known.values() or not known) and int(slave) < _TOP_PORT:
         return int(slave)
-    message = f"bus {station.name}/{port.name} has no slave {slave!r}{near(slave, known)}"
+    message = f"bus {station.name}/{port.name} has no slave {slave!r}{suggest(slave, known)}"
     raise MisfitError("", message, one_of([*known, *map(str, known.values())]))
 
 
@@ -239,7 +239,7 @@ def _doors(station: StationSection) -> list[str]:
 def _check_door(text: str, known: list[str]) -> None:
     if text not in known:
         expected = f"{one_of(DoorKind)}, or one door such as udp:PORT or mqtt:NETWORK"
-        raise MisfitError("", f"no door {text!r}{near(text, known)}", expected)
+        raise MisfitError("", f"no door {text!r}{suggest(text, known)}", expected)
 
 
 def _check_order(

@@ -6,13 +6,13 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import NamedTuple
 
-from eap.aoe.mqtt_topics import check_network
-from eap.aoe.spec import DoorKind, MqttSpec, TlsSpec
+from eap.ams.mqtt.topics import check_network
+from eap.ams.spec import DoorKind, MqttSpec, TlsSpec
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
 from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import parse_host
-from eap.near import near
+from eap.suggest import suggest
 
 URL = "mqtt://HOST[:PORT], or mqtts:// with TLS"
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
@@ -246,5 +246,5 @@ def _parse(station: StationSection, text: str) -> str:
     network = text.removeprefix(_MQTT)
     if find_network(station, network) is None:
         known = [route.network for route in brokers_of(station)]
-        raise ValueError(f"the station is in no network {network!r}{near(network, known)}")
+        raise ValueError(f"the station is in no network {network!r}{suggest(network, known)}")
     return text

@@ -16,7 +16,7 @@ from eap.config.destination import EXPECTED, check_address, check_monitoring, re
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import FrameSection, PublishSection, StationSection, SubscribeSection
-from eap.near import near
+from eap.suggest import suggest
 from eap.pd import rules
 from eap.pd.device import FaultCode
 from eap.pd.spec import REQUESTER, PortKind
@@ -45,7 +45,7 @@ def check_port_reference(
     if (station.name, name) in index.ports:
         report.add(f"{at}.port", f"port {name} is a bus port", one_of(known))
     else:
-        message = f"station {station.name} has no port {name!r}{near(name, known)}"
+        message = f"station {station.name} has no port {name!r}{suggest(name, known)}"
         report.add(f"{at}.port", message, one_of(known))
 
 
@@ -87,14 +87,14 @@ def _check_pd(
 ) -> None:
     known = [frame.name for frame in station.frames]
     if pd.frame not in known and pd.frame not in report.broken:
-        message = f"station {station.name} has no frame {pd.frame!r}{near(pd.frame, known)}"
+        message = f"station {station.name} has no frame {pd.frame!r}{suggest(pd.frame, known)}"
         report.add(f"{pd.at}.frame", message, one_of(known))
     if not pd.variables and f"{pd.at}.variables[0]" not in report.lines:
         report.add(f"{pd.at}.variables", f"PD {pd.name!r} has no variables", "at least one")
     for position, name in enumerate(pd.variables):
         if index.type_text(station, name) is None and not is_unread(index, report, station, name):
             names = index.names(station)
-            message = f"station {station.name} has no variable {name!r}{near(name, names)}"
+            message = f"station {station.name} has no variable {name!r}{suggest(name, names)}"
             report.add(f"{pd.at}.variables[{position}]", message, one_of(names))
     _check_triggers(index, report, station, pd)
 
@@ -180,7 +180,7 @@ def _check_answer(
         if pd.poll not in report.broken:
             known = [each.name for each in station.subscribe]
             message = f"station {station.name} has no subscription {pd.poll!r}"
-            report.add(path, message + near(pd.poll, known), one_of(known))
+            report.add(path, message + suggest(pd.poll, known), one_of(known))
         return
     frame = index.frames.get((station.name, pd.frame))
     if frame is not None and frame.port != request.port:
@@ -225,7 +225,7 @@ def _check_question(
     if own is None:
         known = [pd.name for pd in station.publish]
         if name not in report.broken and name not in known:  # else its frame or port was reported
-            message = f"station {station.name} publishes no {name!r}{near(name, known)}"
+            message = f"station {station.name} publishes no {name!r}{suggest(name, known)}"
             report.add(path, message, one_of(known))
         return
     if own.port.name != subscription.port:

@@ -6,17 +6,17 @@ from collections.abc import Iterator, Mapping
 from itertools import count
 from pathlib import Path
 
-from eap.aoe.routes import Origin, RouteTable
-from eap.aoe.routes import Route as AmsRoute
-from eap.aoe.spec import DEFAULT_TARGET, RouteSpec, RoutingSpec
-from eap.aoe.way import Way
+from eap.ams.endpoint import Way
+from eap.ams.routes import Origin, RouteTable
+from eap.ams.routes import Route as AmsRoute
+from eap.ams.spec import DEFAULT_TARGET, RouteSpec, RoutingSpec
 from eap.config.brokers import check_brokers
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
 from eap.config.routes import MQTT, MisfitError, next_hop, reach, target_of, without_prefix
 from eap.config.structs import RouteSection, StationSection
 from eap.ids import NetId, prefix_text
-from eap.near import near
+from eap.suggest import suggest
 
 _OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four numbers"
 
@@ -79,7 +79,7 @@ def _check_net_id(index: Index, route: RouteSection, report: FindingReport) -> N
         what = "a default route" if is_default else f"{route.to} is a station of this plant, it"
         report.add(path, f"{what} needs no net_id", "none")
     elif not known and not route.net_id:
-        hint = near(route.to, index.stations)
+        hint = suggest(route.to, index.stations)
         message = f"no station {route.to!r} in this plant{hint}, and no net_id"
         report.add(f"{route.at}.to", message, "a station, default, or a net_id of who is meant")
     if known and route.octets is not None:

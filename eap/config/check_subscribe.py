@@ -10,7 +10,7 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import ANY_SOURCE, FromSection, StationSection, SubscribeSection
 from eap.ids import NetId
-from eap.near import near
+from eap.suggest import suggest
 from eap.pd import rules
 from eap.pd.address import is_group_source, source_octets
 from eap.pd.spec import REQUESTER
@@ -53,7 +53,7 @@ def _check_source(
     elif not set(source.split("/")) & report.broken:
         known = [f"{s.name}/{pd.name}" for s in index.plant.stations for pd in s.publish]
         if source not in known:  # else its frame or port was reported
-            message = f"nobody in this plant publishes {source!r}{near(source, known)}"
+            message = f"nobody in this plant publishes {source!r}{suggest(source, known)}"
             report.add(path, message, f"STATION/PD: {one_of(known)}")
 
 

@@ -11,7 +11,7 @@ from eap.config.check_ports import check_names
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.structs import StationSection, VariableSection
-from eap.near import near
+from eap.suggest import suggest
 from eap.pd.rules import MADE_SUFFIXES
 from eap.pd.spec import (
     INTERFACE_MEASURES,
@@ -89,7 +89,7 @@ def _check_source(
             if any(name in (each.variables or {}) for each in station.subscribe):
                 message = f"{name!r} is received, so it cannot have a source"
             else:
-                message = f"{name!r} is no variable of {station.name}{near(name, known)}"
+                message = f"{name!r} is no variable of {station.name}{suggest(name, known)}"
             report.add(path, message, one_of(known))
         return
     period = getattr(source, "period_ms", 1)
@@ -154,7 +154,7 @@ def _check_csv(
             columns = rows.fieldnames or []
             if source.column not in columns:
                 message = f"{source.file} has no column {source.column!r}"
-                message += near(source.column, columns)
+                message += suggest(source.column, columns)
                 report.add(f"{path}.column", message, one_of(columns))
                 return
             count = 0

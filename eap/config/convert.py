@@ -17,7 +17,7 @@ from eap.config.document import Node, ScalarNode
 from eap.config.finding import FindingReport, one_of
 from eap.config.structs import NO_NET_ID, PlantFile, Section
 from eap.ids import NetId
-from eap.near import near, nearest
+from eap.suggest import suggest, nearest
 
 T = TypeVar("T")
 
@@ -125,7 +125,7 @@ class _Converter:
         tag = str(getattr(node.value["kind"][1], "text", ""))
         if tag not in tags:
             self._enter(node, path)
-            message = f"unknown kind {tag!r}{near(tag, tags)}"
+            message = f"unknown kind {tag!r}{suggest(tag, tags)}"
             self._report.add(f"{path}.kind", message, one_of(tags))
             raise _BrokenError
         # The key of a source is the variable it fills.
@@ -190,7 +190,7 @@ class _Converter:
                 continue
             where = f"{path}.{name}" if path else name
             missing = [each for each in shown if each not in given]
-            message = f"unknown key {name!r}{near(name, missing)}"
+            message = f"unknown key {name!r}{suggest(name, missing)}"
             self._report.add(where, message, one_of(shown), line=line)
             meant = nearest(name, missing)
             if meant is not None:

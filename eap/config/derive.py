@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from eap.aoe.spec import (
+from eap.ams.spec import (
     AmsUser,
     DirectoryPort,
     DirectoryStation,

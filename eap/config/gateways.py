@@ -10,7 +10,7 @@ from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.routes import MisfitError
 from eap.config.structs import Plain, PortSection, StationSection
-from eap.near import near
+from eap.suggest import suggest
 from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
 
 MASTER_PORT = 0xFFFF
@@ -87,7 +87,7 @@ def resolve(
     there = index.ports.get((names[0], names[1]))
     if other is None or there is None or there.kind is not PortKind.BUS or len(names) > 3:
         buses = [f"{at}/{name}" for (at, name), each in index.ports.items() if _is_bus(each)]
-        hint = near("/".join(names[:2]), buses)
+        hint = suggest("/".join(names[:2]), buses)
         raise MisfitError("", f"there is no bus port for {target!r}{hint}", TARGET)
     number = _slave(index, other, there, names[2]) if len(names) == 3 else MASTER_PORT
     if there is port and number != MASTER_PORT:
@@ -126,7 +126,7 @@ def _slave(index: Index, station: StationSection, port: PortSection, slave: obje
             return number  # nothing describes the bus: any slave may be there
         last = f"; its last one is {slaves[-1].station}" if slaves else ""
         raise MisfitError("", f"{name} has no slave {number}{last}", TARGET)
-    hint = near(text, [each.name for each in slaves])
+    hint = suggest(text, [each.name for each in slaves])
     raise MisfitError("", f"{name} has no slave {text!r}{hint}", TARGET)
 
 

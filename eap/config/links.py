@@ -17,7 +17,7 @@ from eap.config.check_publish import is_unread
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.structs import LinkSection, StationSection
-from eap.near import near
+from eap.suggest import suggest
 
 
 class Span(NamedTuple):
@@ -158,7 +158,7 @@ def _kind(
     if text is None:
         if not is_unread(index, report, station, name):
             names = index.names(station)
-            message = f"station {station.name} has no variable {name!r}{near(name, names)}"
+            message = f"station {station.name} has no variable {name!r}{suggest(name, names)}"
             report.add(path, message, one_of(names))
         return None
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from eap.aoe.spec import DirectoryStation, RoutingSpec
+from eap.ams.spec import DirectoryStation, RoutingSpec
 from eap.config.access import check_access
 from eap.config.brokers import check_learning, warn_of_open_brokers
 from eap.config.bus import DescribeBus, describe_buses

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from ipaddress import IPv4Address
 from typing import NamedTuple
 
-from eap.aoe.spec import DEFAULT_TARGET, DoorKind, HopSpec
-from eap.aoe.via import ip_hop, read_address
+from eap.ams.spec import DEFAULT_TARGET, DoorKind, HopSpec
+from eap.ams.via import ip_hop, read_address
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.brokers import HOST, brokers_of, find_network
@@ -23,7 +23,7 @@ from eap.ids import (
     NetId,
     parse_host,
 )
-from eap.near import near
+from eap.suggest import suggest
 from eap.pd.spec import PortKind
 
 VIA = "STATION/PORT, mqtt:NETWORK, an IPv4 address, tcp:// and one, a MAC address or a NetID"
@@ -95,7 +95,7 @@ def next_hop(index: Index, station: StationSection, route: RouteSection) -> Next
 def _check_own_port(index: Index, station: StationSection, route: RouteSection) -> None:
     if route.port and index.eap_port(station, route.port) is None:
         names = [port.name for port in station.ports if port.kind is PortKind.EAP]
-        message = f"station {station.name} has no EAP port {route.port!r}{near(route.port, names)}"
+        message = f"station {station.name} has no EAP port {route.port!r}{suggest(route.port, names)}"
         raise MisfitError("port", message, one_of(names))
 
 
@@ -117,7 +117,7 @@ def _other_port(
     name, _, port = text.partition("/")
     other = index.stations.get(name)
     if other is None:
-        hint = near(name, index.stations)
+        hint = suggest(name, index.stations)
         raise MisfitError(key, f"no station {name!r} in this plant{hint}", one_of(index.stations))
     if other is station:
         raise MisfitError(key, f"{text} is of station {name} itself", "a port of another station")
@@ -166,7 +166,7 @@ def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> Next
         raise MisfitError("via", message, one_of(known))
     other = index.stations.get(name) if name else target_of(index, route)
     if name and other is None:
-        hint = near(name, index.stations)
+        hint = suggest(name, index.stations)
         raise MisfitError("via", f"no station {name!r} in this plant{hint}", one_of(index.stations))
     if other is not None and find_network(other, network) is None:
         message = f"station {other.name} is in no MQTT network {network!r}"

@@ -39,7 +39,7 @@ from devicebus.mailbox.conversation import (
 )
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_browse import IdnDescription
-from eap.closing import Closing
+from eap.closeable import Closing
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.sdo import EXPEDITED_SIZE
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eap.aoe.answer import AmsAnswer, response_to
+from eap.ads.answer import AmsAnswer, response_to
 from eap.codec.ams import AmsHeader
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.coe import encode_message as encode_coe

@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import NamedTuple
 
-from eap.aoe.way import Way
+from eap.ams.endpoint import Way
 
 _S = 1_000_000_000
 

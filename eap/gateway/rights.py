@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 
-from eap.aoe.ads_operation import AdsRefusedError, Operation, Read, ReadWrite, Write
-from eap.aoe.ads_request import parse_request
+from eap.ads.operation import AdsRefusedError, Operation, Read, ReadWrite, Write
+from eap.ads.request import parse_request
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import StateFlags, decode_packet
 from eap.codec.coe import CoeHeader, CoeService

@@ -105,7 +105,7 @@ class ListenerStats(NamedTuple):
     """Time of the last one that was refused or evicted."""
 
 
-class Admission(NamedTuple):
+class AcceptDecision(NamedTuple):
     """Outcome for a connection that was accepted."""
 
     refusal: str = ""
@@ -173,7 +173,7 @@ class ConnectionTable:
 
     def admit(
         self, listener: Listener, connection: Connection, now_ns: int, *, spare_descriptors: int
-    ) -> Admission:
+    ) -> AcceptDecision:
         """Give *connection* a place at *listener*, or say why it gets none.
 
         Args:
@@ -191,11 +191,11 @@ class ConnectionTable:
             if victim is None:
                 listener.refused += 1
                 listener.crowded_at_ns = now_ns
-                return Admission(reason)
+                return AcceptDecision(reason)
             self._evict(victim, now_ns)
         listener.connections[connection] = None
         listener.by_host[connection.host] += 1
-        return Admission(victim=victim)
+        return AcceptDecision(victim=victim)
 
     def shed(self, now_ns: int) -> Connection | None:
         """Forget and return the connection that rule 2 or 3 names, None if there is none.

@@ -18,7 +18,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from eap.closing import Closing
+from eap.closeable import Closing
 from eap.errors import EnvironmentalError, ImageError, WriterConflictError
 from eap.pd.handover import ImageHandover
 from eap.pd.image import Image, format_image, read_generation, read_header

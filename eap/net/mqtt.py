@@ -14,8 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from eap.aoe.mqtt_network import Publish, Subscribe
-from eap.aoe.spec import MqttSpec
+from eap.ams.mqtt.network import Publish, Subscribe
+from eap.ams.spec import MqttSpec
 from eap.errors import EnvironmentalError
 from eap.net.password import read_password_text
 from eap.net.reconnecting import Pauses, ReconnectingLink

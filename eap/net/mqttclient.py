@@ -17,8 +17,8 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from eap.aoe.mqtt_network import Publish
-from eap.aoe.spec import TlsSpec
+from eap.ams.mqtt.network import Publish
+from eap.ams.spec import TlsSpec
 
 __all__ = ["Client", "MqttError", "describe", "is_too_new", "make_client", "tls_context"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 _PROC = Path("/proc")
 _SHOWN = 80
 """Characters of a command in a message."""
-_OWN_COMMANDS = ("eapctl", "eap.appliance", "-m eap ")
+_OWN_COMMANDS = ("eapctl", "-m eap")
 
 
 @dataclass(frozen=True, slots=True)

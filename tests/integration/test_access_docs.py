@@ -8,13 +8,13 @@ from shutil import copy
 
 import pytest
 
-from eap.aoe.access import AccessList
-from eap.aoe.ads_operation import Operation, Read, ReadWrite, Write
-from eap.aoe.directory import Directory
-from eap.aoe.way import Way
-from eap.appliance.plantfile import load_plant
+from eap.ads.operation import Operation, Read, ReadWrite, Write
+from eap.ams.access import AccessList
+from eap.ams.directory import Directory
+from eap.ams.endpoint import Way
 from eap.codec.ads import IndexGroup
 from eap.ids import NetId
+from eap.runtime.plantfile import load_plant
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "access.md").read_text()

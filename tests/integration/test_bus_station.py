@@ -12,9 +12,9 @@ from unittest import mock
 
 import pytest
 
-from eap.appliance.commands.bus_objects import read_entry
-from eap.appliance.commands.bus_running import open_running
-from eap.appliance.runtime import VARIABLE
+from eap.ops.bus_objects import read_entry
+from eap.ops.bus_running import open_running
+from eap.runtime.folder import VARIABLE
 from tests.support.addresses import own_address
 from tests.support.appliance import EAPCTL, plants, run_eapctl, wait_until
 from tests.support.machine import slowness

@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.appliance.commands.plant_change import load_or_raise
 from eap.config.new_plant import Shape, plant_text
 from eap.device.rollout import without_alternates
+from eap.ops.plant_change import load_or_raise
 from eap.pd.spec import StationSpec
 from tests.support.appliance import EAPCTL, Appliance, Plants, run_eapctl, troubles, wait_until
 

@@ -15,9 +15,9 @@ import pytest
 from msgspec.structs import replace
 
 import eap
-from eap.appliance.runtime import VARIABLE
 from eap.errors import ControlError, EapError
 from eap.pd.spec import StationSpec, TxFrameSpec, TxPdSpec, VariableSpec
+from eap.runtime.folder import VARIABLE
 from tests.support.addresses import own_address
 from tests.support.appliance import Appliance, Plants, troubles, wait_until
 

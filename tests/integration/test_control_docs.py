@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.commands.client import connect
+from eap.ops.client import connect
 from tests.support.appliance import wait_until
 
 pytestmark = pytest.mark.net

@@ -19,8 +19,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from msgspec.structs import replace
 
-from eap.appliance.services.device.station_device import StationDevice
-from eap.appliance.store import effective, settle
 from eap.device.eap_records import read_back
 from eap.errors import EngineGoneError, EngineRefusedError
 from eap.od.abort import SdoAbortError
@@ -37,6 +35,8 @@ from eap.pd.spec import (
     VariableSpec,
     Writer,
 )
+from eap.runtime.store import effective, settle
+from eap.services.device.station_device import StationDevice
 from tests.support.examples import examples
 from tests.support.stationengine import StationEngine, make_device
 

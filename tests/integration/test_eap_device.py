@@ -20,10 +20,10 @@ import pytest
 from scapy.layers.inet import IP, UDP
 from scapy.layers.l2 import Ether
 
-from eap.appliance.store import StationStore
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
 from eap.od.profiles.eap1000 import Tx, Var
+from eap.runtime.store import StationStore
 from tests.support import aoe
 from tests.support.aoe import UdpClient
 from tests.support.appliance import Appliance, Plants, SharedAppliance, wait_until

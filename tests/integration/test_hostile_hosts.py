@@ -24,11 +24,11 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.commands.client import connect_those
-from eap.appliance.runtime import VARIABLE
 from eap.errors import ControlError
 from eap.gateway.client import GatewayClient
 from eap.od.abort import AbortCode, SdoAbortError
+from eap.ops.client import connect_those
+from eap.runtime.folder import VARIABLE
 from tests.support import aoe
 from tests.support.amsclient import AmsClient
 from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until

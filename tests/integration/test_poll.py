@@ -13,7 +13,7 @@ from unittest import mock
 import pytest
 
 import eap
-from eap.appliance.runtime import VARIABLE
+from eap.runtime.folder import VARIABLE
 from tests.support.appliance import Appliance, Plants, wait_until
 from tests.support.machine import slowness
 from tests.support.namespaces import cable

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.commands.client import ControlClient, connect
-from eap.appliance.runtime import VARIABLE
 from eap.codec.ethercat import EAP_PORT, EtherCatHeader
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.errors import ControlError
 from eap.ids import NetId
+from eap.ops.client import ControlClient, connect
+from eap.runtime.folder import VARIABLE
 from tests.support.appliance import Appliance, Plants, SharedAppliance, wait_until
 from tests.support.machine import slowness
 

@@ -6,9 +6,9 @@ import struct
 
 import pytest
 
-from eap.aoe.ads_notifications import Client
-from eap.aoe.answer import response_to
-from eap.aoe.way import Way
+from eap.ads.answer import response_to
+from eap.ads.notifications import Client
+from eap.ams.endpoint import Way
 from eap.codec.ams import AmsCommand, decode_packet
 from eap.ids import NetId
 from tests.support.adsdevice import DictStore, Station, variable_device

@@ -16,12 +16,12 @@ from scapy.sessions import TCPSession
 
 from devicebus.wire.datagram import Command, Datagram, DatagramHeader
 from devicebus.wire.datagram import encode_frame as encode_datagrams
-from eap.appliance.commands.capture import iter_capture
-from eap.appliance.commands.decode import decode_frame
 from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.codec.mailbox import encode_frame as encode_mailbox
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import NetId
+from eap.ops.capture import iter_capture
+from eap.ops.decode import decode_frame
 from tests.support.packets import ethernet, tcp_segment, tcp_stream, udp
 from tests.support.tshark import dissect, write_pcap
 from tests.support.vectors import load, load_datagrams

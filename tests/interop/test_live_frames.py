@@ -17,10 +17,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.appliance.commands.capture import iter_capture
-from eap.appliance.commands.decode import decode_frame
 from eap.codec.pd import PdFrameHeader
 from eap.ids import NetId
+from eap.ops.capture import iter_capture
+from eap.ops.decode import decode_frame
 from tests.support.appliance import Plants, plants, wait_until
 from tests.support.namespaces import cable, namespace
 from tests.support.tshark import dissect

@@ -5,15 +5,15 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Any
 
-from eap.aoe.ads_device import AdsDevice
-from eap.aoe.ads_notifications import Client
-from eap.aoe.ads_objects import ObjectSpace
-from eap.aoe.ads_operation import WriteControl
-from eap.aoe.ads_state import al_state_for, states_of
-from eap.aoe.way import Way
-from eap.appliance.control import ErrorCode
-from eap.appliance.control_routes import TracedPath
+from eap.ads.device import AdsDevice
+from eap.ads.notifications import Client
+from eap.ads.objects import ObjectSpace
+from eap.ads.operation import WriteControl
+from eap.ads.state import al_state_for, states_of
+from eap.ams.endpoint import Way
 from eap.codec.ads import AdsDeviceInfo, AdsStates, device_name
+from eap.control.protocol import ErrorCode
+from eap.control.routes import TracedPath
 from eap.errors import ControlError
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary

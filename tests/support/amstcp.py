@@ -14,9 +14,9 @@ import time
 from collections.abc import Mapping
 from typing import Self
 
-from eap.aoe.ads_device import AdsDevice
-from eap.aoe.ads_notifications import Client
-from eap.aoe.way import Way
+from eap.ads.device import AdsDevice
+from eap.ads.notifications import Client
+from eap.ams.endpoint import Way
 from eap.codec.adsnotification import to_filetime
 from eap.ids import NetId
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from eap.aoe.access import AccessList
-from eap.aoe.action import Action, Deliver, Forward, Outcome, Reply
-from eap.aoe.judge import Limits
-from eap.aoe.prober import Prober
-from eap.aoe.router import AnswerNow, Router
-from eap.aoe.routes import Route, RouteTable
-from eap.aoe.spec import AccessRule
-from eap.aoe.way import Door, Way
+from eap.ams.access import AccessList
+from eap.ams.action import Action, Deliver, Forward, Outcome, Reply
+from eap.ams.admission import Limits
+from eap.ams.endpoint import Door, Way
+from eap.ams.hop_prober import Prober
+from eap.ams.router import AnswerNow, Router
+from eap.ams.routes import Route, RouteTable
+from eap.ams.spec import AccessRule
 from eap.ids import NetId
 from tests.support.ams import Ams, parse
 

@@ -20,10 +20,10 @@ from unittest import mock
 
 from click.testing import CliRunner
 
-from eap.appliance.commands.client import connect_those
-from eap.appliance.runtime import VARIABLE
 from eap.cli import main as eapctl
 from eap.errors import ControlError
+from eap.ops.client import connect_those
+from eap.runtime.folder import VARIABLE
 
 EAPCTL = [sys.executable, "-m", "eap"]
 READY_S = 90.0

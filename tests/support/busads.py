@@ -8,18 +8,18 @@ from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite, Write
-from eap.aoe.ads_query import decode_outcome, encode_query
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.way import Way
-from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.bus_ads.service import BusService
-from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.master.master_values import MasterDictionaryProvider
-from eap.appliance.services.routing.service import LocalRequest
+from eap.ads.answer import AmsAnswer
+from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite, Write
+from eap.ads.query import decode_outcome, encode_query
+from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
+from eap.services.ads.bus_ads import BusService
+from eap.services.device.master_values import MasterDictionaryProvider
+from eap.services.engine_link import EngineLink
+from eap.services.routing.service import LocalRequest
+from eap.services.slaves.bus_client import BusClient
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 

@@ -8,16 +8,16 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
-from eap.appliance.control import (
+from eap.control.protocol import (
     Failure,
     decode_request,
     encode_error,
     encode_failure,
     encode_result,
 )
-from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
 from eap.errors import ControlError
 from eap.od.abort import SdoAbortError
+from eap.runtime.folder import ApplianceFolder, ApplianceInfo
 
 Method = Callable[[dict[str, Any]], Any]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.aoe.ads_operation import Operation, OperationOutcome
-from eap.aoe.ads_request import encode_outcome, parse_request
-from eap.aoe.answer import AmsAnswer
-from eap.appliance.services.slaves.remote_slave import RemoteSlave
+from eap.ads.answer import AmsAnswer
+from eap.ads.operation import Operation, OperationOutcome
+from eap.ads.request import encode_outcome, parse_request
 from eap.codec.ads import AdsError
+from eap.services.slaves.remote_slave import RemoteSlave
 from tests.support import busads
 
 

@@ -10,12 +10,12 @@ import msgspec
 
 from devicebus.sim.spec import FaultSpec
 from devicebus.wire.alstatus import AlState
-from eap.appliance.busfile import load_or_raise
-from eap.appliance.engine.engine_bus import EngineBus
-from eap.appliance.engine.engine_buses import master_settings
-from eap.appliance.plantfile import load_plant
+from eap.engine.engine_bus import EngineBus
+from eap.engine.engine_buses import master_settings
 from eap.errors import EnvironmentalError
 from eap.pd.spec import StationSpec, Writer
+from eap.runtime.busfile import load_or_raise
+from eap.runtime.plantfile import load_plant
 from tests.support.cyclic import MS, image_of
 
 US = 1_000

@@ -13,18 +13,7 @@ from typing import Any
 import msgspec
 
 from devicebus.wire.alstatus import AlState
-from eap.appliance.control import encode_request
-from eap.appliance.handover import PortName
-from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
-from eap.appliance.services.accepting import Listeners
-from eap.appliance.services.bus.bus_client import open_buses
-from eap.appliance.services.bus.bus_methods import Buses
-from eap.appliance.services.bus.segment_link import SegmentLink
-from eap.appliance.services.control_server import ControlServer
-from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.methods import Methods
-from eap.appliance.services.status import ProcessMeter, appliance_status
-from eap.appliance.station_image import StationImage
+from eap.control.protocol import encode_request
 from eap.net.image_file import ImageFile, create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
@@ -38,6 +27,17 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.words import RxWord, StationWord
+from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
+from eap.runtime.handover import PortName
+from eap.runtime.station_image import StationImage
+from eap.services.control.bus_methods import Buses
+from eap.services.control.control_server import ControlServer
+from eap.services.control.methods import Methods
+from eap.services.control.status import ProcessMeter, appliance_status
+from eap.services.engine_link import EngineLink
+from eap.services.slaves.bus_client import open_buses
+from eap.services.slaves.segment_link import SegmentLink
+from eap.services.transports.accepting import Listeners
 from tests.support.fakeengine import FakeBus, FakeEngine, FakeSegment
 from tests.support.loopbus import LoopBus
 

@@ -20,8 +20,10 @@ from devicebus.master.master import Master, why_closed
 from devicebus.master.procedure import Procedure
 from devicebus.sim.command import obey
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_errors import ErrorRecord, to_record
-from eap.appliance.bus_request import (
+from eap.engine.bus_requests import bring_all, bring_one
+from eap.errors import EapError
+from eap.runtime.bus_errors import ErrorRecord, to_record
+from eap.runtime.bus_request import (
     BringSlaves,
     BusChange,
     BusReport,
@@ -38,9 +40,7 @@ from eap.appliance.bus_request import (
     SlaveReport,
     UnsolicitedMessage,
 )
-from eap.appliance.engine.bus_requests import bring_all, bring_one
-from eap.appliance.handover import PortName
-from eap.errors import EapError
+from eap.runtime.handover import PortName
 from tests.support.loopbus import LoopBus
 
 PORT = PortName("left", "bus0")

@@ -6,8 +6,8 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.control import ErrorCode, parameters
-from eap.appliance.control_routes import (
+from eap.control.protocol import ErrorCode, parameters
+from eap.control.routes import (
     ConnectionRow,
     Export,
     ImportRow,

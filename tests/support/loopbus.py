@@ -12,9 +12,9 @@ from pathlib import Path
 import msgspec
 
 from devicebus.sim.spec import FaultSpec
-from eap.appliance.busfile import load_or_raise
-from eap.appliance.commands import bus_session
-from eap.appliance.commands.bus_session import BusSession
+from eap.ops import bus_session
+from eap.ops.bus_session import BusSession
+from eap.runtime.busfile import load_or_raise
 
 BUSES = Path(__file__).parents[2] / "config" / "buses"
 STEP_NS = 20_000

@@ -12,14 +12,14 @@ from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.match import answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
-from eap.aoe.way import Way
-from eap.appliance.bus_request import SlaveDescription
-from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.bus.mailbox_queue import MailboxTurn
-from eap.appliance.services.gateway.client_session import SessionCodec
-from eap.appliance.services.slaves.local_slave import LocalSlave
+from eap.ams.endpoint import Way
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
+from eap.runtime.bus_request import SlaveDescription
+from eap.services.gateway.client_session import SessionCodec
+from eap.services.slaves.bus_client import BusClient
+from eap.services.slaves.local_slave import LocalSlave
+from eap.services.slaves.mailbox_queue import MailboxTurn
 from tests.support.mailbox import Line, open_line
 
 T = TypeVar("T")

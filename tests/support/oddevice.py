@@ -6,10 +6,10 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from eap.appliance.commands.od import Content, EntryInfo, ObjectInfo
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RO, RW, RW_PREOP, WO, Access, Entry, OdObject, OdState, record, variable
+from eap.ops.od import Content, EntryInfo, ObjectInfo
 
 
 def mixer() -> ObjectDictionary:

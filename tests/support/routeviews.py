@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.directory import Directory
-from eap.aoe.spec import (
+from eap.ads.answer import AmsAnswer
+from eap.ams.directory import Directory
+from eap.ams.endpoint import Door, Way
+from eap.ams.spec import (
     DirectoryPort,
     DirectoryStation,
     DoorKind,
@@ -12,14 +13,13 @@ from eap.aoe.spec import (
     RouteSpec,
     RoutingSpec,
 )
-from eap.aoe.way import Door, Way
-from eap.appliance.services.routes.route_rows import RouterView
-from eap.appliance.services.routes.station_routes import StationRoutes
-from eap.appliance.services.routing.service import LocalRequest
-from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.store import StationStore
 from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
+from eap.runtime.store import StationStore
+from eap.services.routing.route_rows import RouterView
+from eap.services.routing.service import LocalRequest
+from eap.services.routing.station_router import StationRouter
+from eap.services.routing.station_routes import StationRoutes
 from tests.support.routing import KeepingCarrier, StubService
 
 DIRECTORY = Directory([

@@ -6,12 +6,12 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.way import Way
-from eap.appliance.services.routing.entrance import Entrance
-from eap.appliance.services.routing.service import LocalRequest
-from eap.appliance.services.routing.station_router import StationRouter
+from eap.ads.answer import AmsAnswer
+from eap.ams.endpoint import Way
 from eap.ids import NetId
+from eap.services.routing.service import LocalRequest
+from eap.services.routing.station_router import StationRouter
+from eap.services.transports.demultiplexer import Entrance
 from tests.support import aoe
 from tests.support.ams import Ams, parse
 

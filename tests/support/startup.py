@@ -6,7 +6,7 @@ import os
 
 import msgspec
 
-from eap.appliance.startup import Report
+from eap.runtime.startup import Report
 
 
 def read_reports(fd: int) -> list[Report]:

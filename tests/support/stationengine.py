@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.appliance.services.device.station_device import StationDevice
-from eap.appliance.services.device.station_keeper import StationKeeper
-from eap.appliance.store import StationStore
 from eap.device.eap_objects import DeviceIdentity, NothingRuns
 from eap.errors import EapError, EngineGoneError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
+from eap.runtime.store import StationStore
+from eap.services.device.station_device import StationDevice
+from eap.services.device.station_keeper import StationKeeper
 
 
 class StationEngine:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from devicebus.master.master import Master
-from eap.appliance.busfile import load_or_raise
+from eap.runtime.busfile import load_or_raise
 from tests.support.busline import Paced
 
 DI8, DO8, DI4 = 0x03F0_3052, 0x07D8_3052, 0x03EC_3052

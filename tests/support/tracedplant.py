@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from eap.aoe.access import AccessList
-from eap.aoe.ads_operation import ReadWrite
-from eap.aoe.ads_request import parse_request
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.hop_report import HopQuestion, encode_report
-from eap.aoe.report import Location
-from eap.aoe.router import Router
-from eap.aoe.routes import Route, RouteTable
-from eap.aoe.spec import AccessRule
-from eap.aoe.way import Door, Way
-from eap.appliance.services.routes.tracing import answer_question
+from eap.ads.answer import AmsAnswer
+from eap.ads.operation import ReadWrite
+from eap.ads.request import parse_request
+from eap.ams.access import AccessList
+from eap.ams.endpoint import Door, Way
+from eap.ams.hop_report import HopQuestion, encode_report
+from eap.ams.report import Location
+from eap.ams.router import Router
+from eap.ams.routes import Route, RouteTable
+from eap.ams.spec import AccessRule
 from eap.codec.ads import AdsError, IndexGroup, encode_result
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId
+from eap.services.routing.tracing import answer_question
 
 Serve = Callable[[int, int, bytes], AmsAnswer]
 """Answers port, command and body in the place of a station's devices."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from eap.appliance.commands.capture import unwrap
 from eap.codec.ethercat import FrameType
 from eap.codec.pd import PD_FRAME_START, PdFrameHeader, iter_pds
+from eap.ops.capture import unwrap
 
 _ALL = 3  # ETH_P_ALL; taps for one EtherType are not shown what leaves
 _OUTGOING = 4

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from eap.appliance.busfile import describe
 from eap.config.load import load
+from eap.runtime.busfile import describe
 from tools.demo import PLANT, SHOWN, WAYS, Look, RateMeter, Way, as_line, as_screen
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.runtime import VARIABLE
-from eap.appliance.store import VARIABLE as STATE_VARIABLE
+from eap.runtime.folder import VARIABLE
+from eap.runtime.store import VARIABLE as STATE_VARIABLE
 from tools.bench.machine import ProcessSample, memory_folder
 from tools.bench.network import ROOT, Cable
 from tools.bench.pacing import wait

@@ -11,8 +11,8 @@ from devicebus.mailbox.coe_client import upload
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.alstatus import AlState
-from eap.appliance.commands.bus_session import open_bus
 from eap.ids import InterfaceUri
+from eap.ops.bus_session import open_bus
 from tools.bench.buses import FILE
 from tools.bench.pacing import answer
 

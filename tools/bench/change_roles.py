@@ -9,11 +9,8 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
-from eap.appliance.engine.build import EnginePlant
-from eap.appliance.engine.process import StopFlag, run_cycles
-from eap.appliance.handover import Handover
-from eap.appliance.station_request import Configure
-from eap.appliance.supervisor.sockets import SharedSockets
+from eap.engine.build import EnginePlant
+from eap.engine.process import StopFlag, run_cycles
 from eap.errors import EapError
 from eap.net import realtime
 from eap.pd import pieces
@@ -28,6 +25,9 @@ from eap.pd.spec import (
     VariableSpec,
     Writer,
 )
+from eap.runtime.handover import Handover
+from eap.runtime.station_request import Configure
+from eap.supervisor.sockets import SharedSockets
 from tools.bench.engine_roles import Recorder, own_sockets
 from tools.bench.pacing import answer
 

@@ -12,10 +12,8 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.engine.build import EnginePlant
-from eap.appliance.engine.process import StopFlag, run_cycles
-from eap.appliance.handover import NO_DESCRIPTOR, Handover, SharedSocket
-from eap.appliance.supervisor.sockets import SharedSockets
+from eap.engine.build import EnginePlant
+from eap.engine.process import StopFlag, run_cycles
 from eap.net import realtime
 from eap.pd.engine import Engine
 from eap.pd.spec import (
@@ -29,6 +27,8 @@ from eap.pd.spec import (
     VariableSpec,
     Writer,
 )
+from eap.runtime.handover import NO_DESCRIPTOR, Handover, SharedSocket
+from eap.supervisor.sockets import SharedSockets
 from tools.bench.pacing import answer
 from tools.bench.timing import Latencies
 

@@ -8,8 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic_ns, perf_counter_ns
 
-from eap.appliance.services.device.image_values import ImageValues
-from eap.appliance.station_image import StationImage
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
 from eap.device.eap_records import read_back
@@ -22,6 +20,8 @@ from eap.od.profiles.eap1000 import TX_VARIABLE, Var
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec, VariableSpec
 from eap.pd.station import Station
+from eap.runtime.station_image import StationImage
+from eap.services.device.image_values import ImageValues
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.machine import memory_folder
 from tools.bench.settings import Settings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Any
 
-from eap.appliance.runtime import VARIABLE
+from eap.runtime.folder import VARIABLE
 from tools.bench import buses, machine
 from tools.bench.appliance import running, status
 from tools.bench.buses import PORT, STATION

@@ -15,10 +15,10 @@ from time import monotonic_ns
 from typing import Any, NamedTuple
 
 import eap
-from eap.appliance.attach import AttachedStation
-from eap.appliance.commands.client import ControlClient, connect_station
-from eap.appliance.runtime import VARIABLE
 from eap.net.ticker import Ticker
+from eap.ops.client import ControlClient, connect_station
+from eap.runtime.attach import AttachedStation
+from eap.runtime.folder import VARIABLE
 from tools.bench import buses, machine
 from tools.bench.appliance import running
 from tools.bench.buses import PORT, STATION

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from time import perf_counter_ns
 
-from eap.aoe.action import Forward
-from eap.aoe.router import Router
-from eap.aoe.routes import Route, RouteTable
-from eap.aoe.way import Door, Way
+from eap.ams.action import Forward
+from eap.ams.endpoint import Door, Way
+from eap.ams.router import Router
+from eap.ams.routes import Route, RouteTable
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet, encode_packet
 from eap.ids import NetId
 from tools.bench.figures import Figure, at_most, report

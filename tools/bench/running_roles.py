@@ -13,8 +13,8 @@ from devicebus.mailbox import foe_client
 from devicebus.mailbox.coe_client import upload
 from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.appliance.commands.bus_running import RunningBus, open_running
-from eap.appliance.runtime import VARIABLE
+from eap.ops.bus_running import RunningBus, open_running
+from eap.runtime.folder import VARIABLE
 from tools.bench.buses import FILE
 from tools.bench.network import Page
 from tools.bench.pacing import answer

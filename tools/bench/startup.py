@@ -17,16 +17,16 @@ from tools.bench.settings import Settings
 TITLE = "Start-up, whole processes"
 _EMPTY = "bare interpreter, the reference"
 _IMPORTS = {
-    "import the engine process": "import eap.appliance.engine.process",
+    "import the engine process": "import eap.engine.process",
     "import eap.attach": "import eap; eap.attach",
 }
-_BUS_SIDE = "eap.appliance.services.gateway.opening, eap.appliance.services.bus_ads.service"
+_BUS_SIDE = "eap.services.gateway.opening, eap.services.ads.bus_ads"
 _PROCESSES = {
-    "engine": "eap.appliance.engine.process",
-    "services": "eap.appliance.services.process",
-    "services with buses": f"eap.appliance.services.process, {_BUS_SIDE}",
-    "segment": "eap.appliance.segment.process",
-    "supervisor": "eap.appliance.supervisor.process",
+    "engine": "eap.engine.process",
+    "services": "eap.services.process",
+    "services with buses": f"eap.services.process, {_BUS_SIDE}",
+    "segment": "eap.segment.process",
+    "supervisor": "eap.supervisor.process",
 }
 """Modules that each process has imported when it runs."""
 _COUNT = "print(sum(name.split('.')[0] in ('eap', 'devicebus') for name in sys.modules))"

@@ -12,12 +12,12 @@ from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import DataTable, Footer, Input, Static
 
-from eap.appliance.control_routes import RouteRow
 from eap.cli import routes_view
 from eap.cli.routes_tui.forms import Message, Question, RouteForm, values_of
 from eap.cli.routes_tui.grid import STYLES, Grid
 from eap.cli.routes_tui.link import Picture, PlantRouter, RouteLink
 from eap.cli.routes_tui.table import View, detail, lines
+from eap.control.routes import RouteRow
 from eap.errors import EapError
 
 PERIOD_S = 1.0

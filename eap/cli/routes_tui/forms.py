@@ -12,7 +12,7 @@ from textual.containers import Horizontal, Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Button, Checkbox, Input, Label, Static
 
-from eap.appliance.control_routes import RouteRow
+from eap.control.routes import RouteRow
 from eap.errors import EapError
 
 _FIELDS = {

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from eap.appliance.commands.client import connect_station
-from eap.appliance.commands.route_lists import list_routes
-from eap.appliance.control import AnswerT, Method, ParametersT
-from eap.appliance.control_routes import (
+from eap.control.protocol import AnswerT, Method, ParametersT
+from eap.control.routes import (
     ROUTES_ADD,
     ROUTES_REMOVE,
     ROUTES_TEST,
@@ -15,6 +13,8 @@ from eap.appliance.control_routes import (
     TestResult,
 )
 from eap.errors import EapError
+from eap.ops.client import connect_station
+from eap.ops.route_lists import list_routes
 
 MOST = 500
 """Routes of a station that are shown; a filter finds the others."""

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
-from eap.appliance.control_routes import ConnectionRow, RouteRow
 from eap.cli import routes_view
 from eap.cli.routes_tui.link import PlantRouter
+from eap.control.routes import ConnectionRow, RouteRow
 
 _GAP = 1
 _EXTRA = 6

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eap.appliance.plantfile import load_plant
 from eap.config.load import load
+from eap.runtime.plantfile import load_plant
 from tools.bench import buses
 from tools.bench.ads import (
     HOPS,

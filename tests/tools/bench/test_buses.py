@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.appliance.busfile import load_or_raise
+from eap.runtime.busfile import load_or_raise
 from tools.bench.buses import bus, encode
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eap.appliance.plantfile import load_plant
+from eap.runtime.plantfile import load_plant
 from tools.bench.files import plant, rates
 
 

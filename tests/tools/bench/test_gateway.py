@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eap.appliance.busfile import describe
 from eap.codec.mailbox import MailboxType, decode_frame
 from eap.config.load import load
+from eap.runtime.busfile import describe
 from tools.bench.figures import Verdict
 from tools.bench.gateway import (
     Round,

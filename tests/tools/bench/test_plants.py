@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.appliance.plantfile import load_plant
+from eap.runtime.plantfile import load_plant
 from tools.bench.plants import line
 
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.closing import Closing
+from eap.closeable import Closing
 
 
 class Door(Closing):

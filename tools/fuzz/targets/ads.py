@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from itertools import cycle
 from struct import Struct
 
-from eap.aoe.ads_device import AdsDevice
-from eap.aoe.ads_notifications import Client
-from eap.aoe.ads_request import MAX_ANSWER
-from eap.aoe.ads_symbol_table import SymbolTable, Variable
-from eap.aoe.ads_symbols import SymbolSpace
-from eap.aoe.way import Way
+from eap.ads.device import AdsDevice
+from eap.ads.notifications import Client
+from eap.ads.request import MAX_ANSWER
+from eap.ads.symbol_table import SymbolTable, Variable
+from eap.ads.symbols import SymbolSpace
+from eap.ams.endpoint import Way
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name
 from eap.codec.adsnotification import decode_notification

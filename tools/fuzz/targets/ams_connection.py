@@ -6,11 +6,11 @@ import asyncio
 from collections import deque
 from typing import Any
 
-from eap.aoe.answer import AmsAnswer, response_to
-from eap.appliance.discards import Refusal
-from eap.appliance.services.ams.ams_connection import MAX_REQUESTS, AmsConnection
+from eap.ads.answer import AmsAnswer, response_to
 from eap.codec.ams import AmsHeader
 from eap.codec.amstcp import AmsTcpHeader, encode_with_prefix
+from eap.runtime.discards import Refusal
+from eap.services.transports.ams_connection import MAX_REQUESTS, AmsConnection
 
 
 def fuzz_one(data: bytes) -> None:

@@ -8,16 +8,10 @@ import socket
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from eap.aoe.judged import AuditEntry
-from eap.aoe.routes import Route, RouteTable
-from eap.aoe.spec import AmsUser, RouteSpec, RoutingSpec
-from eap.aoe.way import Way
-from eap.appliance.discards import Refusal
-from eap.appliance.services.ams.ams_discovery import AmsDiscovery, RouterName
-from eap.appliance.services.routes.ams_questions import AmsQuestions
-from eap.appliance.services.routes.route_desk import RouteDesk
-from eap.appliance.services.routes.station_routes import StationRoutes
-from eap.appliance.store import StationFile
+from eap.ams.authorized_request import AuditEntry
+from eap.ams.endpoint import Way
+from eap.ams.routes import Route, RouteTable
+from eap.ams.spec import AmsUser, RouteSpec, RoutingSpec
 from eap.codec.amsdiscovery import (
     decode_discovery,
     decode_text,
@@ -27,6 +21,12 @@ from eap.codec.amsdiscovery import (
 )
 from eap.errors import CodecError
 from eap.ids import NetId
+from eap.runtime.discards import Refusal
+from eap.runtime.store import StationFile
+from eap.services.routing.ams_requests import AmsQuestions
+from eap.services.routing.route_admin import RouteDesk
+from eap.services.routing.station_routes import StationRoutes
+from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
 
 OWN = NetId.parse("10.0.0.1.1.1")
 _MAX_ANSWER = 64

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.aoe.stream import PacketCutter, TooLong
+from eap.ams.stream import PacketCutter, TooLong
 from eap.codec.amstcp import encode_with_prefix
 from eap.errors import MalformedError
 

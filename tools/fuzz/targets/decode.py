@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.appliance.commands.capture import unwrap
-from eap.appliance.commands.decode import decode_frame
+from eap.ops.capture import unwrap
+from eap.ops.decode import decode_frame
 
 
 def fuzz_one(data: bytes) -> None:

@@ -18,19 +18,11 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.voe_server import VoeServer
 from devicebus.master.mailboxes import Unsolicited
-from eap.aoe.access import AccessList
-from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite
-from eap.aoe.ads_request import take_request
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.spec import AccessRule, AccessService
-from eap.appliance.bus_request import SlaveDescription
-from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.bus.mailbox_queue import MailboxTurn
-from eap.appliance.services.gateway.door import GatewayDoor
-from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
-from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.slaves.bus_view import BusDescription
-from eap.appliance.services.slaves.remote_slave import RemoteSlave
+from eap.ads.answer import AmsAnswer
+from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite
+from eap.ads.request import take_request
+from eap.ams.access import AccessList
+from eap.ams.spec import AccessRule, AccessService
 from eap.codec.mailbox import (
     MailboxHeader,
     MailboxType,
@@ -44,6 +36,14 @@ from eap.gateway.request_tracker import ClientLimits
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
+from eap.runtime.bus_request import SlaveDescription
+from eap.services.gateway.gateway import MailboxGateway, Settings
+from eap.services.gateway.gateway_transport import GatewayDoor
+from eap.services.gateway.master_session import MasterSession
+from eap.services.slaves.bus_client import BusClient
+from eap.services.slaves.bus_view import BusDescription
+from eap.services.slaves.mailbox_queue import MailboxTurn
+from eap.services.slaves.remote_slave import RemoteSlave
 from tools.fuzz.messages import cut
 
 T = TypeVar("T")
@@ -211,7 +211,7 @@ async def _serve(data: bytes) -> None:
 def fuzz_one(data: bytes) -> None:
     """Have all frames taken; nothing is raised, every answer is a frame, nothing stays."""
     failures = _Failures()
-    logger = logging.getLogger("eap.appliance.services")
+    logger = logging.getLogger("eap.services")
     logger.addHandler(failures)
     try:
         asyncio.run(_serve(data))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from eap.aoe.mqtt_network import Arrived, MqttNetwork, Publish
-from eap.aoe.routes import RouteTable
-from eap.aoe.spec import MqttSpec
+from eap.ams.mqtt.network import Arrived, MqttNetwork, Publish
+from eap.ams.routes import RouteTable
+from eap.ams.spec import MqttSpec
 from eap.codec.ams import AmsHeader, StateFlags
 from eap.ids import NetId
 from tools.fuzz.messages import cut

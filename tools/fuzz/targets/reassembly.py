@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.aoe.reassembly import Reassembly
-from eap.aoe.way import Way
+from eap.ams.endpoint import Way
+from eap.ams.reassembly import Reassembly
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet
 from eap.errors import CodecError
 from eap.ids import NetId

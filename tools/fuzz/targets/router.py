@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from eap.aoe.access import AccessList
-from eap.aoe.action import Deliver, Forward, Reply
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.router import Router
-from eap.aoe.routes import Route, RouteTable
-from eap.aoe.spec import AccessRule, ObjectRange
-from eap.aoe.way import Door, Way
+from eap.ads.answer import AmsAnswer
+from eap.ams.access import AccessList
+from eap.ams.action import Deliver, Forward, Reply
+from eap.ams.endpoint import Door, Way
+from eap.ams.router import Router
+from eap.ams.routes import Route, RouteTable
+from eap.ams.spec import AccessRule, ObjectRange
 from eap.codec.ams import AmsHeader, decode_packet
 from eap.ids import NetId
 from tools.fuzz.messages import cut

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.aoe.way import Way
+from eap.ams.endpoint import Way
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import refuse

@@ -6,8 +6,8 @@ import pytest
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.fragment import Assembler, iter_fragments
+from eap.ads.answer import AmsAnswer
+from eap.ams.fragment import Assembler, iter_fragments
 from eap.codec.ams import AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxError, decode_frame
 from tests.support.vectors import load_all

@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
 
-from eap.appliance.commands.plant_change import load_or_raise
 from eap.cli import main
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ControlError
+from eap.ops.plant_change import load_or_raise
 from tests.support.plantstub import PlantStub
 
 CHANGE = "~ 0xF800:08 Configured objects: Device cycle time"

@@ -8,15 +8,6 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from eap.appliance.bus_status import FindingRow
-from eap.appliance.commands.bus_info import BusScan, Diagnosis, EepromContent, SlaveStates
-from eap.appliance.commands.bus_objects import (
-    IdnElements,
-    NamedIdn,
-    SdoDumpEntry,
-    SdoValue,
-    SlaveObject,
-)
 from eap.cli.bus_view import (
     diagnosis_view,
     dump_table,
@@ -29,6 +20,15 @@ from eap.cli.bus_view import (
     state_view,
     value_line,
 )
+from eap.ops.bus_info import BusScan, Diagnosis, EepromContent, SlaveStates
+from eap.ops.bus_objects import (
+    IdnElements,
+    NamedIdn,
+    SdoDumpEntry,
+    SdoValue,
+    SlaveObject,
+)
+from eap.runtime.bus_status import FindingRow
 from tests.support.records import record
 
 

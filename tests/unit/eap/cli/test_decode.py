@@ -173,7 +173,7 @@ def test_tree_for_people() -> None:
 def test_help_imports_no_decoder() -> None:
     code = (
         "import sys, eap.cli.decode;"
-        "slow = {'dpkt', 'rich', 'msgspec', 'eap.appliance.commands.decode'};"
+        "slow = {'dpkt', 'rich', 'msgspec', 'eap.ops.decode'};"
         "print(sorted(slow & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 from rich.console import Console
 
-from eap.appliance.commands.decode import decode_frame
 from eap.cli.decode import frame_view
+from eap.ops.decode import decode_frame
 from tests.support.vectors import Vector, load_all
 
 

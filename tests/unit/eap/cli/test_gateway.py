@@ -8,8 +8,8 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
-from eap.appliance.control import ErrorCode
 from eap.cli import main
+from eap.control.protocol import ErrorCode
 from eap.errors import ControlError
 from tests.support.controlstub import ControlStub
 from tests.unit.eap.cli.test_gateway_view import ROW

@@ -3,8 +3,8 @@ from __future__ import annotations
 import msgspec
 from rich.console import Console
 
-from eap.appliance.control_gateway import GatewayRow
 from eap.cli.gateway import gateway_view
+from eap.control.gateway import GatewayRow
 
 ROW = {
     "station": "mixer",

@@ -38,7 +38,7 @@ def test_objects_are_read_and_written(gateway, options) -> None:
 def test_tcp_may_stand_behind_the_host(gateway, words, monkeypatch) -> None:
     opened = []
     monkeypatch.setattr(
-        "eap.appliance.commands.bus_gateway.GatewayClient",
+        "eap.ops.bus_gateway.GatewayClient",
         lambda *place, tcp: opened.append(tcp) or GatewayClient(*place, tcp=tcp),
     )
     assert run(gateway, *words).exit_code == 0

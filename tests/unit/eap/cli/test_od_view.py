@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from eap.appliance.commands.od import OdValue, OdWholeObject
 from eap.cli.od_text import object_lines, value_line
+from eap.ops.od import OdValue, OdWholeObject
 from tests.support.records import record
 
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.control import VariableRow
 from eap.cli.pd_view import UncarriedVariables, ValueChange, change_lines, listed_pds
+from eap.control.protocol import VariableRow
 from eap.pd.report import PdRow, PdRowVariable
 from tests.support.records import record
 

@@ -8,9 +8,9 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
-from eap.appliance.commands.plant_change import load_or_raise
 from eap.cli import main
 from eap.config.new_plant import Shape, plant_text
+from eap.ops.plant_change import load_or_raise
 from tests.support.plantstub import PlantStub
 
 

@@ -3,13 +3,6 @@ from __future__ import annotations
 import msgspec
 from rich.console import Console
 
-from eap.appliance.commands.route_lists import RouterList, TestedTarget
-from eap.appliance.control_routes import (
-    ImportRow,
-    InterruptionRow,
-    NeighbourRow,
-    TestResult,
-)
 from eap.cli import routes_view
 from eap.cli.routes_view import (
     import_table,
@@ -19,6 +12,13 @@ from eap.cli.routes_view import (
 from eap.cli.routes_view import (
     routes_view as view_of,
 )
+from eap.control.routes import (
+    ImportRow,
+    InterruptionRow,
+    NeighbourRow,
+    TestResult,
+)
+from eap.ops.route_lists import RouterList, TestedTarget
 from tests.support.fakeroutes import FakeRoutes
 
 

@@ -5,8 +5,8 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from eap.appliance.control_routes import PlantScan
 from eap.cli.network import client_line, fault_lines, scan_table
+from eap.control.routes import PlantScan
 
 BUS = {
     "name": "bus0",

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from eap.appliance.segment import process as segment_process
 from eap.cli.group import exit_code_of
 from eap.cli.sim import run
+from eap.segment import process as segment_process
 
 COE = Path(__file__).parents[4] / "config" / "buses" / "coe.yaml"
 

@@ -5,8 +5,8 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from eap.appliance.control_routes import TracedPath
 from eap.cli.network import trace_view
+from eap.control.routes import TracedPath
 
 MAY = dict.fromkeys(("read", "write", "control", "files", "raw"), True)
 FIRST = {

@@ -5,9 +5,9 @@ from contextlib import ExitStack
 import msgspec
 import pytest
 
-from eap.appliance.commands.client import connect_station
 from eap.cli.pd_view import SkippedCycles, ValueChange, changes
 from eap.errors import ControlError
+from eap.ops.client import connect_station
 from eap.pd.words import StationWord
 from tests.support.records import record
 from tests.unit.eap.cli.conftest import Appliance

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
+from eap.ams.spec import AccessRule, AccessService, AccessTarget, ObjectRange
 from eap.config.access import (
     access_rules,
     parse_objects,

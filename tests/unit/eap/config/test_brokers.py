@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.aoe.spec import MqttSpec, TlsSpec
+from eap.ams.spec import MqttSpec, TlsSpec
 from eap.config.brokers import (
     Broker,
     broker_spec,

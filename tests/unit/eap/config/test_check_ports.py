@@ -75,7 +75,7 @@ def test_a_station_needs_a_port_and_a_plant_a_station(findings, tmp_path):
     old = '    ports:\n      - {name: eap0, kind: eap, interface: "udp://127.0.9.2", '
     found = findings((old + "net_id: 127.0.9.2.2.1}\n", "    ports: []\n"))
     assert "18: station right has no ports; an EAP port" in found
-    from eap.appliance.plantfile import load_plant
+    from eap.runtime.plantfile import load_plant
 
     path = tmp_path / "empty.yaml"
     path.write_text("plant: empty\nstations: []\n")

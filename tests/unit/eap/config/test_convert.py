@@ -86,7 +86,7 @@ def test_errors_of_shape_and_of_sense_are_found_together_and_without_echo(findin
 
 
 def test_a_document_that_is_no_mapping_is_one_finding(tmp_path):
-    from eap.appliance.plantfile import load_plant
+    from eap.runtime.plantfile import load_plant
 
     path = tmp_path / "list.yaml"
     path.write_text("- plant")

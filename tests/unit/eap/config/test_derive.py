@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.aoe.spec import (
+from eap.ams.spec import (
     AccessRule,
     AmsUser,
     DirectoryPort,

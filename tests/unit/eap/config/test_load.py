@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.appliance.plantfile import load_plant as load_shipped
 from eap.codec import datatypes, pdo
 from eap.codec.amsdiscovery import AMS_UDP_PORT
 from eap.codec.amstcp import AMS_TCP_PORT
@@ -17,6 +16,7 @@ from eap.codec.ethercat import EAP_PORT
 from eap.config.load import INTERFACE_PATH, NET_ID_PATHS, blank
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec, StationSpec
+from eap.runtime.plantfile import load_plant as load_shipped
 
 PLANTS = Path(__file__).parents[4] / "config"
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.aoe.spec import DoorKind, HopSpec
+from eap.ams.spec import DoorKind, HopSpec
 from eap.config.routes import (
     MisfitError,
     find_hop,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.aoe.way import Way
+from eap.ams.endpoint import Way
 from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestTracker, Ticket
 
 A, B, C = (Way("udp", f"10.0.0.{number}:5") for number in (1, 2, 3))

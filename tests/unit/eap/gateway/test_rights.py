@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from eap.aoe.access import objects_of, service_of
-from eap.aoe.spec import AccessService, ObjectRange
+from eap.ams.access import objects_of, service_of
+from eap.ams.spec import AccessService, ObjectRange
 from eap.codec.mailbox import MailboxType
 from eap.gateway.rights import operation_of
 

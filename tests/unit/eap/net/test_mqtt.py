@@ -13,8 +13,8 @@ from contextlib import ExitStack, asynccontextmanager
 import pytest
 from aiomqtt import Message
 
-from eap.aoe.mqtt_network import Publish, Subscribe
-from eap.aoe.spec import MqttSpec, TlsSpec
+from eap.ams.mqtt.network import Publish, Subscribe
+from eap.ams.spec import MqttSpec, TlsSpec
 from eap.errors import EnvironmentalError
 from eap.net import mqtt, mqttclient
 from eap.net.mqtt import Handlers, MqttLink

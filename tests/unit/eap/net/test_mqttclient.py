@@ -13,8 +13,8 @@ from aiomqtt.exceptions import MqttCodeError, MqttConnectError
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
-from eap.aoe.mqtt_network import Publish
-from eap.aoe.spec import TlsSpec
+from eap.ams.mqtt.network import Publish
+from eap.ams.spec import TlsSpec
 from eap.net import mqttclient
 from eap.net.mqttclient import Client, Inbox, MqttError, describe, is_too_new, make_client
 

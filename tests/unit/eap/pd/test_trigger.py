@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from eap.appliance.plantfile import load_plant
 from eap.pd.layout import VAR_CTRL
 from eap.pd.report import station_status
 from eap.pd.spec import OnChangeSpec, StationSpec, TriggerSpec, TxFrameSpec, TxPdSpec
 from eap.pd.station import Station
 from eap.pd.trigger import EVENT_BIT, Schedule, Trigger, plan_schedule
 from eap.pd.words import REASON_INDEX, Reason
+from eap.runtime.plantfile import load_plant
 from tests.support.cyclic import MS, Wire, image_of, station, written
 
 DOCUMENT = Path(__file__).parents[4] / "docs" / "triggers.md"

@@ -1,0 +1,1 @@
+"""ADS services without I/O: requests, sums, dictionaries, symbols, types, states, notifications."""

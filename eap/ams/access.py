@@ -1,0 +1,241 @@
+"""Access: which operations a station does, or passes on, for whom.
+
+Rules come from the plant file; the first one that fits says yes or no.  Where none fits, a program
+on this host may do everything and anybody else only reads.  What an operation is does not depend on
+its command alone: a ReadWrite that looks a name up reads, a file opened for write is written.
+
+A rule about objects grants what lies in its ranges as a whole, and refuses what touches them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from ipaddress import IPv4Address, IPv4Network
+from typing import NamedTuple
+
+from eap.ads.operation import Operation, Read, ReadWrite, Write, WriteControl
+from eap.ads.sum import SUM_COMMANDS
+from eap.ams.endpoint import Way
+from eap.ams.spec import IP_DOORS, AccessRule, AccessService, DoorKind, ObjectRange
+from eap.codec.ads import IndexGroup
+from eap.codec.adsnotification import AddNotification
+from eap.ids import MacAddr, NetId
+
+_MAX_KNOWN = 4096
+"""Pairs of a client and a target whose rules are remembered."""
+
+_RAW = frozenset((IndexGroup.RAW_COMMAND, IndexGroup.VOE, *SUM_COMMANDS))
+"""Sum commands: one inside another, which nobody looks into."""
+_FILES = frozenset((IndexGroup.FOE_OPEN_WRITE, IndexGroup.FOE_WRITE))
+_STATES = frozenset((IndexGroup.MASTER_STATE, IndexGroup.SLAVE_STATES))
+_OWN_HANDLES = frozenset((IndexGroup.RELEASE_HANDLE, IndexGroup.FOE_CLOSE))
+LOOKUPS = frozenset(
+    (
+        IndexGroup.SYMBOL_HANDLE,
+        IndexGroup.VALUE_BY_NAME,
+        IndexGroup.SYMBOL_BY_NAME,
+        IndexGroup.SYMBOL_ENTRY_BY_NAME,
+        IndexGroup.DATA_TYPE_BY_NAME,
+        IndexGroup.FOE_OPEN_READ,
+        IndexGroup.FOE_CLOSE,
+        IndexGroup.FOE_READ,
+        IndexGroup.FOE_PROGRESS,
+        IndexGroup.WHEREABOUTS,
+    )
+)
+"""Groups whose ReadWrite changes nothing but what a client keeps of its own."""
+
+
+_PLACED = (Read, Write, ReadWrite, AddNotification)
+"""Operations that say where.  A tuple: a union would be made anew at each question."""
+
+
+def service_of(operation: Operation) -> AccessService:
+    """Return the kind of access that an operation needs."""
+    if isinstance(operation, WriteControl):
+        return AccessService.CONTROL
+    if not isinstance(operation, (Write, ReadWrite)):
+        return AccessService.READ
+    group = operation.group
+    if group in _RAW:
+        return AccessService.RAW
+    if group in _FILES:
+        return AccessService.FILES
+    if group in (LOOKUPS if isinstance(operation, ReadWrite) else _OWN_HANDLES):
+        return AccessService.READ
+    return AccessService.CONTROL if group in _STATES else AccessService.WRITE
+
+
+def place_of(operation: Operation) -> tuple[int | None, int]:
+    """Return index group and offset, no group for what has none."""
+    if isinstance(operation, _PLACED):
+        return operation.group, operation.offset
+    return None, 0
+
+
+def objects_of(operation: Operation) -> ObjectRange | None:
+    """Return which entries of a dictionary an operation is about, None if it is about none."""
+    group, offset = place_of(operation)
+    if group not in _OF_OBJECTS:
+        return None
+    index, subindex = offset >> 16, offset & 0xFF
+    if group == IndexGroup.OBJECT_DESCRIPTION or (group == IndexGroup.SDO and offset & _WHOLE):
+        return ObjectRange(index, index)
+    return ObjectRange(index, index, subindex, subindex)
+
+
+_WHOLE = 0xFD00
+"""Bits of an offset with which it is not about one entry: complete access, and unknown ones."""
+_OF_OBJECTS = frozenset(
+    (IndexGroup.SDO, IndexGroup.OBJECT_DESCRIPTION, IndexGroup.ENTRY_DESCRIPTION)
+)
+
+
+class Verdict(NamedTuple):
+    """What was decided on one operation."""
+
+    service: AccessService
+    is_allowed: bool
+    why: str
+    """The rule, in words."""
+    is_by_rule: bool = False
+    """Whether the plant file says so, and not only the default."""
+    is_recordable: bool = True
+    """Whether the audit can record it, where that is required."""
+
+
+class Grants:
+    """What one client may do with one target."""
+
+    def __init__(self, rules: Sequence[AccessRule], *, is_this_host: bool) -> None:
+        self._by_service = {
+            service: tuple(rule for rule in rules if not rule.services or service in rule.services)
+            for service in AccessService
+        }
+        self._is_this_host = is_this_host
+        self.may_read = self.may(AccessService.READ) is True
+
+    def judge(self, operation: Operation) -> Verdict:
+        """Decide on one operation."""
+        service = service_of(operation)
+        touched = objects_of(operation)
+        for rule in self._by_service[service]:
+            if not rule.objects or (touched is not None and _is_about(rule, touched)):
+                verb = "allows" if rule.allow else "refuses"
+                return Verdict(service, rule.allow, f"rule {rule.name} {verb} it", is_by_rule=True)
+        if self._is_this_host:
+            return Verdict(service, True, "no rule refuses it to this host")
+        if service is AccessService.READ:
+            return Verdict(service, True, "no rule refuses reading")
+        return Verdict(service, False, "no rule allows it, and other hosts only read")
+
+    def may(self, service: AccessService) -> bool | None:
+        """Say whether *service* is allowed; None if that depends on the object."""
+        rules = self._by_service[service]
+        whole = next((rule for rule in rules if not rule.objects), None)
+        if whole is None:
+            otherwise = self._is_this_host or service is AccessService.READ
+        else:
+            otherwise = whole.allow
+            rules = rules[: rules.index(whole)]
+        return otherwise if all(rule.allow is otherwise for rule in rules) else None
+
+
+class AccessList:
+    """The rules of a station.
+
+    Args:
+        rules: The first that fits counts.
+        own: Addresses of this station: who connects from there is this host.
+    """
+
+    def __init__(
+        self, rules: Sequence[AccessRule] = (), *, own: Collection[IPv4Address] = ()
+    ) -> None:
+        self._rules = [_Matcher(rule) for rule in rules]
+        self._own = frozenset(own)
+        self._known: dict[tuple[Way, NetId, NetId, int], Grants] = {}
+
+    def grants(self, way: Way, source: NetId, target: NetId, port: int) -> Grants:
+        """Return what a client may do that came by *way* and calls itself *source*."""
+        key = way, source, target, port
+        grants = self._known.get(key)
+        if grants is None:
+            if len(self._known) >= _MAX_KNOWN:
+                self._known.clear()
+            grants = self._known[key] = self._find(way, source, target, port)
+        return grants
+
+    def is_this_host(self, way: Way) -> bool:
+        """Say whether only a program of this host can have come by *way*."""
+        kind = way.kind
+        if kind not in IP_DOORS:
+            return kind == DoorKind.LOCAL
+        address = address_of(way)
+        return address is not None and (address.is_loopback or address in self._own)
+
+    def _find(self, way: Way, source: NetId, target: NetId, port: int) -> Grants:
+        address = address_of(way)
+        rules = [
+            each.rule
+            for each in self._rules
+            if each.is_from(way, address, source) and each.is_to(target, port)
+        ]
+        return Grants(rules, is_this_host=self.is_this_host(way))
+
+
+def address_of(way: Way) -> IPv4Address | None:
+    """Return the IPv4 address that somebody came from, None where there is none."""
+    if way.kind not in IP_DOORS:
+        return None
+    try:
+        return IPv4Address(way.connection.partition(":")[0])
+    except ValueError:
+        return None
+
+
+def host_of(way: Way) -> str:
+    """Return who came by *way*, whichever of his connections it is."""
+    kind = way.kind
+    if kind in IP_DOORS:
+        return way.connection.partition(":")[0]
+    return "" if kind == DoorKind.LOCAL else way.connection
+
+
+class _Matcher:
+    """A rule whose addresses need no reading any more."""
+
+    def __init__(self, rule: AccessRule) -> None:
+        self.rule = rule
+        self._networks = tuple(map(IPv4Network, rule.networks))
+        self._macs = frozenset(str(MacAddr.parse(text)) for text in rule.macs)
+        self._net_ids = tuple(map(_prefix, rule.net_ids))
+        self._targets = tuple((_prefix(each.net_id), each.port) for each in rule.targets)
+
+    def is_from(self, way: Way, address: IPv4Address | None, source: NetId) -> bool:
+        doors = self.rule.doors
+        if doors and way.door not in doors and way.kind not in doors:
+            return False
+        if self._net_ids and not source.startswith(self._net_ids):
+            return False
+        if not (self._networks or self._macs):
+            return True
+        if way.kind == DoorKind.ETHERNET:
+            return way.connection in self._macs
+        return address is not None and any(address in each for each in self._networks)
+
+    def is_to(self, target: NetId, port: int) -> bool:
+        return not self._targets or any(
+            target.startswith(prefix) and wanted in {None, port} for prefix, wanted in self._targets
+        )
+
+
+def _prefix(text: str) -> bytes:
+    return bytes(map(int, text.split(".")))
+
+
+def _is_about(rule: AccessRule, touched: ObjectRange) -> bool:
+    """Say whether a rule grants all of *touched*, or refuses any of it."""
+    if rule.allow:
+        return any(each.contains(touched) for each in rule.objects)
+    return any(each.overlaps(touched) for each in rule.objects)

@@ -1,0 +1,178 @@
+"""Whether a request may go on: circles, links that are down, and how much is in flight.
+
+AoE has no count of hops.  What came in by a door does not go back to where it came from; a request
+that this router has passed on already, and whose answer it still waits for, has run in a circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from eap.ams.action import Outcome
+from eap.ams.endpoint import Door, Way
+from eap.ams.error_reply import Refusal
+from eap.ams.hop_prober import Prober
+from eap.ams.inflight import InFlight
+from eap.ams.report import Obstacle, RouteState
+from eap.ams.routes import Route, RouteTable
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
+from eap.ids import STATION_OCTETS, NetId
+
+
+class Limits(NamedTuple):
+    """How much a router takes on."""
+
+    in_flight: int = 4096
+    """Requests that wait, of all connections."""
+    per_connection: int = 512
+    """Requests of one connection that wait."""
+    per_door: int = 2048
+    """Requests of all connections of a door: a flood by one leaves room for the others.
+
+    One connection may have as many as others leave, so however many flood, some room remains.
+    """
+    timeout_ns: int = 4_500_000_000
+    """How long an answer may take: an error comes back before clients lose patience at 5 s."""
+
+
+class Judge:
+    """Decides on requests.
+
+    Args:
+        net_id: Of the router.
+        table: The routes.
+        doors: All doors by name.
+        in_flight: What waits.
+        limits: How much may wait.
+        prober: Knows which hops do not answer.
+    """
+
+    def __init__(
+        self,
+        net_id: NetId,
+        table: RouteTable,
+        doors: Mapping[str, Door],
+        in_flight: InFlight,
+        limits: Limits,
+        prober: Prober | None = None,
+    ) -> None:
+        self._net_id = net_id
+        self._table = table
+        self._doors = doors
+        self._in_flight = in_flight
+        self._limits = limits
+        self._prober = prober
+        self._down: dict[Way, str] = {}
+        self._closed: dict[str, str] = {}
+        self._opened: set[str] = set()
+        """Doors by which some hop was reached; a client behind one listens, or did."""
+
+    def hop_down(self, door: str, address: str | None, text: str) -> None:
+        """Refuse what would go to *address* by *door*, or to any address; *text* says why."""
+        if address is None:
+            self._closed[door] = text
+        else:
+            self._down[Way(door, address)] = text
+
+    def hop_up(self, door: str, address: str | None) -> None:
+        """Take back what :meth:`hop_down` was told with the same arguments."""
+        if door in self._doors:
+            self._opened.add(door)
+        if address is None:
+            self._closed.pop(door, None)
+        else:
+            self._down.pop(Way(door, address), None)
+
+    def door_removed(self, name: str) -> None:
+        """Forget everything about a door."""
+        self._opened.discard(name)
+        self._closed.pop(name, None)
+        for way in [each for each in self._down if each.door == name]:
+            del self._down[way]
+
+    def is_down(self, hop: Way) -> bool:
+        """Say whether nothing can go to *hop* now."""
+        if hop in self._down or hop.door in self._closed:
+            return True
+        return self._prober is not None and self._prober.is_dead(hop)
+
+    def why_down(self, hop: Way) -> str:
+        """Return in words why nothing can go to *hop* now; empty if it can."""
+        if hop.door not in self._doors:
+            return f"this station has no door {hop.door}"
+        if why := self._down.get(hop) or self._closed.get(hop.door):
+            return why
+        is_dead = self._prober is not None and self._prober.is_dead(hop)
+        return "it does not answer" if is_dead else ""
+
+    def find_obstacle(self, route: Route) -> Obstacle | None:
+        """Return why nothing can go by *route* now; None if something can."""
+        why = self.why_down(route.hop)
+        if not why:
+            return None
+        door = route.hop.door
+        if route.is_client and door in self._doors and door not in self._opened:
+            return Obstacle(RouteState.CLIENT, f"not listening: {why}")
+        return Obstacle(RouteState.DOWN, why)
+
+    def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
+        """Return how a request goes on that is for nobody here."""
+        found = self._table.find(header.target)
+        if found is None:
+            return Refusal(AdsError.TARGET_MACHINE, f"no route to {header.target}")
+        route, octets = found
+        if octets < STATION_OCTETS and header.target.station == self._net_id.station:
+            # Whoever has a route for the station's NetIDs would send it back here.
+            text = f"this station has no NetID {header.target}"
+            return Refusal(AdsError.TARGET_MACHINE, text)
+        return self._find_obstacle(header, way, route) or route
+
+    def is_again(self, header: AmsHeader, onward: bytes, way: Way) -> bool:
+        """Say whether it is a doubled packet, or asked again, while the first one waits."""
+        if self._doors[way.door].is_stream:
+            return False
+        return self._in_flight.is_asked(way, onward, header.invoke_id)
+
+    def find_circle(self, header: AmsHeader, onward: bytes, route: Route) -> Refusal | None:
+        """Say whether a request was passed on from here already."""
+        known = self._in_flight.get(header.invoke_id)
+        if known is None or known.route is None:
+            return None
+        if known.onward != onward or known.header.command != header.command:
+            return None
+        text = f"it was passed on from here already: routes to {header.target} run in a circle"
+        return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
+
+    def find_room(self, way: Way) -> Refusal | None:
+        """Say whether too many requests wait for one more."""
+        waiting = self._in_flight.count(way)
+        of_door = self._in_flight.count_of_door(way.door)
+        if waiting >= self._limits.per_connection:
+            text = f"{self._limits.per_connection} requests of the connection wait already"
+            return Refusal(AdsError.MAILBOX_FULL, text)
+        if waiting >= self._limits.per_door - of_door:
+            text = f"{of_door} requests by {way.door} wait already, {waiting} of this connection"
+            return Refusal(AdsError.MAILBOX_FULL, text)
+        if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
+            text = f"{self._limits.in_flight} requests wait already"
+            return Refusal(AdsError.MAILBOX_FULL, text)
+        return None
+
+    def _find_obstacle(self, header: AmsHeader, way: Way, route: Route) -> Refusal | None:
+        back = self._table.find(header.source)
+        if back is not None and back[1] >= STATION_OCTETS and back[0].is_unidirectional:
+            text = f"route {back[0].name} is unidirectional: nothing may be asked from there"
+            return Refusal(AdsError.ACCESS_DENIED, text, back[0])
+        hop = route.hop
+        if hop.door not in self._doors:
+            text = f"route {route.name} is by {hop.door}, which this station does not have"
+            return Refusal(AdsError.HOST_UNREACHABLE, text, route)
+        if hop.door == way.door and (hop == way or not self._doors[hop.door].is_hub):
+            text = f"route {route.name} leads back to where it came from"
+            return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
+        if self.is_down(hop):
+            text = f"{self._table.describe_hop(route)} {self.find_obstacle(route)}"
+            return Refusal(AdsError.HOST_UNREACHABLE, text, route)
+        return None

@@ -1,0 +1,244 @@
+"""Which next hops are alive: asked in the background, so that nobody waits for a dead one.
+
+A hop is asked for the ADS state of its router; whatever it answers, an error too, it is alive, and
+so it is while it answers requests that pass.  What misses two questions in a row is down until it
+answers again.
+
+Where subscriptions come from a hop, its system service is also asked for its restart index: another
+one than before says that the router was started again and has forgotten what it passed on, although
+the hop may never have been silent for long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterator
+from heapq import heapify, heappop, heappush
+from typing import NamedTuple
+
+from eap.ams.endpoint import Way
+from eap.ams.routes import RouteTable
+from eap.codec.ads import AdsRange, AdsSystemState, IndexGroup
+from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
+from eap.ids import NetId
+
+PROBE_PORT = 1
+"""AMS port of this router that answers to probes go to."""
+MISSES = 2
+"""Questions without an answer that make a hop a dead one."""
+GONE_NS = 60_000_000_000
+"""Time after which a dead hop counts as gone: its notifications are ended.  A router that was cut
+off for as long subscribes again when it is back."""
+_BUSY = 5
+"""A hop that answers requests is asked only every so many turns: how long its router takes."""
+_SPACING_NS = 10_000_000
+"""Between two probes at least, on the average: many hops are asked less often."""
+
+
+_STATE = AdsRange(IndexGroup.SYSTEM_STATE, 0, AdsSystemState.SIZE).encode()
+_HEAD = 8
+"""Bytes of result and length before what is read."""
+
+
+class Probe(NamedTuple):
+    """A question that is due."""
+
+    hop: Way
+    packet: bytes
+    is_found_dead: bool
+    """Whether the questions before it make the hop a dead one, which it was not yet."""
+    is_gone: bool = False
+    """True in one report, when the hop has been dead for GONE_NS."""
+
+
+class _Hop:
+    """What is known of one hop."""
+
+    __slots__ = ("asked_at_ns", "gone_at_ns", "has_restart_index", "heard_at_ns", "is_down",
+                 "misses", "number", "restart_index", "round_trip_ns", "target")  # fmt: skip
+
+    def __init__(self, number: int, target: NetId) -> None:
+        self.number = number
+        self.target = target
+        self.asked_at_ns: int | None = None
+        self.heard_at_ns = -1
+        self.misses = 0
+        self.is_down = False
+        self.gone_at_ns: int | None = None
+        self.round_trip_ns: int | None = None
+        self.has_restart_index = True
+        self.restart_index: int | None = None
+
+    def is_due(self, now_ns: int, interval_ns: int) -> bool:
+        """Say whether to ask it, when its turn has come."""
+        if self.is_down or self.heard_at_ns < 0 or self.asked_at_ns is None:
+            return True
+        is_busy = now_ns - self.heard_at_ns < interval_ns
+        return now_ns - self.asked_at_ns >= interval_ns * (_BUSY if is_busy else 1)
+
+
+class Prober:
+    """Asks the hops of a table of routes.
+
+    Attributes:
+        watched: Hops by which subscriptions come.
+
+    Args:
+        net_id: Of the router that asks.
+        table: The routes; those with *is_probed* count.
+        interval_ns: Between two questions to a hop.
+    """
+
+    def __init__(self, net_id: NetId, table: RouteTable, interval_ns: int = 1_000_000_000) -> None:
+        self._net_id = net_id
+        self._table = table
+        self._interval_ns = interval_ns
+        self._hops: dict[Way, _Hop] = {}
+        self._by_number: dict[int, Way] = {}
+        self._paused: set[Way] = set()
+        self._closed: set[str] = set()
+        self._turns: list[tuple[int, int]] = []
+        self._number = 0
+        self._version = -1
+        self.watched: Container[Way] = ()
+
+    def pause(self, door: str, address: str | None) -> None:
+        """Ask no more: the door itself knows that there is no way."""
+        if address is None:
+            self._closed.add(door)
+        else:
+            self._paused.add(Way(door, address))
+
+    def resume(self, door: str, address: str | None) -> None:
+        """Ask again, and take the hop for alive until it misses questions."""
+        if address is None:
+            self._closed.discard(door)
+        else:
+            self._paused.discard(Way(door, address))
+        for way, hop in self._hops.items():
+            if way.door == door and address in {None, way.connection}:
+                hop.asked_at_ns, hop.misses, hop.is_down = None, 0, False
+                hop.restart_index, hop.has_restart_index = None, True
+
+    def hear(self, hop: Way, now_ns: int) -> None:
+        """Note that a hop answered a request."""
+        known = self._hops.get(hop)
+        if known is not None:
+            known.heard_at_ns = now_ns
+            known.misses = 0
+
+    def is_answer(self, header: AmsHeader) -> bool:
+        """Say whether a response is for the prober."""
+        return header.target_port == PROBE_PORT and header.target == self._net_id
+
+    def take_answer(
+        self, header: AmsHeader, body: bytes, way: Way, now_ns: int,
+        is_from: Callable[[Way, Way], bool],
+    ) -> Way | None:  # fmt: skip
+        """Note an answer: its hop is alive.
+
+        Args:
+            header: Of the answer.
+            body: What follows the header.
+            way: That it came by.
+            now_ns: The time on the monotonic clock.
+            is_from: Says of a hop and a way whether it may come from there.
+
+        Returns:
+            The hop, if its router was started again since the answer before.
+        """
+        hop = self._by_number.get(header.invoke_id)
+        if hop is None or not is_from(hop, way):
+            return None
+        self.hear(hop, now_ns)
+        known = self._hops[hop]
+        known.is_down = False
+        if header.command == AmsCommand.READ:
+            return hop if _is_started_again(known, header, body) else None
+        if known.asked_at_ns is not None:
+            known.round_trip_ns = now_ns - known.asked_at_ns
+        return None
+
+    def is_dead(self, hop: Way) -> bool:
+        """Say whether a hop does not answer."""
+        known = self._hops.get(hop)
+        return known is not None and known.is_down
+
+    def is_heard(self, hop: Way) -> bool:
+        """Say whether a hop is asked, and has ever answered anything."""
+        known = self._hops.get(hop)
+        return known is not None and known.heard_at_ns >= 0
+
+    def round_trip_ns(self, hop: Way) -> int | None:
+        """Return how long a hop took to answer last; None if it is not asked or does not."""
+        known = self._hops.get(hop)
+        return None if known is None or known.is_down else known.round_trip_ns
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`probes_due` has something; at once if the routes changed."""
+        if self._version != self._table.version:
+            return 0
+        return self._turns[0][0] if self._turns else None
+
+    def probes_due(self, now_ns: int) -> Iterator[Probe]:
+        """Yield the questions to ask now."""
+        if self._version != self._table.version:
+            self._follow_table(now_ns)
+        interval_ns = max(self._interval_ns, len(self._hops) * _SPACING_NS)
+        while self._turns and self._turns[0][0] <= now_ns:
+            _, number = heappop(self._turns)
+            way = self._by_number[number]
+            heappush(self._turns, (now_ns + interval_ns, number))
+            hop = self._hops[way]
+            if way in self._paused or way.door in self._closed:
+                hop.asked_at_ns = None
+            elif way in self.watched or hop.is_due(now_ns, interval_ns):
+                yield self._ask(way, hop, now_ns)
+                if way in self.watched and hop.has_restart_index and not hop.is_down:
+                    yield Probe(way, self._header(hop, AmsCommand.READ) + _STATE, False)
+
+    def _ask(self, way: Way, hop: _Hop, now_ns: int) -> Probe:
+        if hop.asked_at_ns is not None and hop.heard_at_ns < hop.asked_at_ns:
+            hop.misses += 1
+        hop.asked_at_ns = now_ns
+        is_found_dead = hop.misses >= MISSES and not hop.is_down
+        hop.is_down = hop.is_down or is_found_dead
+        if is_found_dead:
+            # What came from it is restored anyhow, and another router may answer next.
+            hop.restart_index, hop.has_restart_index = None, True
+            hop.gone_at_ns = now_ns + GONE_NS
+        is_gone = hop.is_down and hop.gone_at_ns is not None and now_ns >= hop.gone_at_ns
+        if is_gone:
+            hop.gone_at_ns = None
+        return Probe(way, self._header(hop, AmsCommand.READ_STATE), is_found_dead, is_gone)
+
+    def _header(self, hop: _Hop, command: AmsCommand) -> bytes:
+        return AmsHeader(
+            hop.target, SYSTEM_PORT, self._net_id, PROBE_PORT, command,
+            length=len(_STATE) if command == AmsCommand.READ else 0, invoke_id=hop.number,
+        ).encode()  # fmt: skip
+
+    def _follow_table(self, now_ns: int) -> None:
+        self._version = self._table.version
+        before, self._hops = self._hops, {}
+        for route in self._table:
+            target = route.next_router
+            if route.is_probed and target is not None and route.hop not in self._hops:
+                hop = before.get(route.hop)
+                if hop is None or hop.target != target:
+                    self._number += 1
+                    hop = _Hop(self._number, target)
+                    self._turns.append((now_ns, hop.number))
+                self._hops[route.hop] = hop
+        self._by_number = {hop.number: way for way, hop in self._hops.items()}
+        self._turns = [each for each in self._turns if each[1] in self._by_number]
+        heapify(self._turns)
+
+
+def _is_started_again(hop: _Hop, header: AmsHeader, body: bytes) -> bool:
+    """Note a restart index; say whether it is another one than before."""
+    if header.error_code or any(body[:4]) or len(body) < _HEAD + AdsSystemState.SIZE:
+        hop.has_restart_index = False
+        return False
+    before, now = hop.restart_index, AdsSystemState.decode(body, _HEAD).restart_index
+    hop.restart_index = now
+    return before not in {None, now}

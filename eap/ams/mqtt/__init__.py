@@ -1,0 +1,1 @@
+"""AMS over MQTT without I/O: networks, peers, topics and payloads."""

@@ -1,0 +1,311 @@
+"""A router's place in a network of AMS routers behind an MQTT broker (Beckhoff ADS-over-MQTT).
+
+Each router subscribes to its own topics and to what all tell of themselves, then tells of itself.
+A retained message stays with the broker for who comes later; where brokers keep none, a router
+tells of itself again when it hears of one that it does not know.  The broker says that a router is
+gone by its last will.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from enum import StrEnum, auto
+from typing import NamedTuple, TypeAlias
+
+from eap.ads.answer import AmsAnswer, response_to
+from eap.ams.mqtt.info import Info, decode_info, encode_info
+from eap.ams.mqtt.payload import Payload, decode_payload, encode_payload
+from eap.ams.mqtt.peers import EXPIRY_NS, REFRESH_NS, Change, Peers
+from eap.ams.mqtt.ports import ClientPorts, comes_back, is_request
+from eap.ams.mqtt.topics import TopicKind, Topics
+from eap.ams.routes import RouteTable
+from eap.ams.spec import MqttSpec
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader, StateFlags
+from eap.errors import CodecError
+from eap.ids import NetId
+
+MAX_PACKET = 256 << 10
+"""Octets of the longest AMS packet that is taken."""
+MAX_SENDERS = 4096
+"""Addresses whose form of packets is remembered; the one silent for longest makes room."""
+CONFIRM_NS = 30_000_000_000
+"""How long after a connection routers may take to tell of themselves again."""
+_SILENCE_NS = 3_600_000_000_000
+"""After which a sender that nobody told of is forgotten."""
+_ANNOUNCE_GAP_NS = 1_000_000_000
+_ANSWER_GAP_NS = 30_000_000_000
+"""Since a router told of itself last, in which a known one needs no answer."""
+
+
+class Publish(NamedTuple):
+    """A message for the broker."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    is_retained: bool = False
+
+
+class Subscribe(NamedTuple):
+    """Topics to be subscribed to, with QoS 2; those of before again, for what is retained."""
+
+    filters: Sequence[str]
+
+
+class Arrived(NamedTuple):
+    """A packet for the router."""
+
+    packet: bytes
+    connection: str
+    """NetID whose topics answers go to."""
+
+
+class HopDown(NamedTuple):
+    """A router is gone: whatever waits for it waits in vain."""
+
+    address: str
+    text: str
+
+
+class HopUp(NamedTuple):
+    """A router is there (again), or nothing is known of it any more."""
+
+    address: str
+
+
+class Closed(NamedTuple):
+    """Nobody can be answered there any more."""
+
+    connection: str
+
+
+class Drop(StrEnum):
+    """Why a message came to nothing."""
+
+    TOPIC = auto()
+    """Its topic means nothing here, or it has no business there: a request among answers, a packet
+    that the broker had kept."""
+    BROKEN = auto()
+    """Neither a packet, nor what a router tells of itself."""
+    LENGTH = auto()
+    """Longer than any packet may be; a request was answered so."""
+    FULL = auto()
+    """It tells of one router too many."""
+
+
+class Dropped(NamedTuple):
+    """A message came to nothing."""
+
+    reason: Drop
+
+
+class Warn(NamedTuple):
+    """Something for people, once for each kind of thing."""
+
+    text: str
+
+
+Action: TypeAlias = Publish | Subscribe | Arrived | HopDown | HopUp | Closed | Dropped | Warn
+
+
+class _Sender(NamedTuple):
+    is_prefixed: bool
+    heard_at_ns: int
+
+
+class MqttNetwork:
+    """What becomes of messages, and which messages packets become.
+
+    Args:
+        spec: The network and the broker.
+        net_id: Of this station's router.
+        name: Of the station.
+        door: Name of the door by which the network is reached.
+        table: Routes of the station.
+        learns: Whether routes are added to them.
+    """
+
+    def __init__(
+        self, spec: MqttSpec, net_id: NetId, name: str, *,
+        door: str, table: RouteTable, learns: bool = True,
+    ) -> None:  # fmt: skip
+        self._spec = spec
+        self._net_id = net_id
+        self._info = Info(name, is_online=True, is_unidirectional=spec.is_unidirectional)
+        self._topics = Topics(spec.network, net_id)
+        self._peers = Peers(net_id, door, table, learns=learns)
+        self._ports = ClientPorts(net_id)
+        self._senders: OrderedDict[str, _Sender] = OrderedDict()
+        self._connected_at_ns: int | None = None
+        self._told_at_ns = 0
+        self._tell_at_ns: int | None = None
+        self._refresh_at_ns = 0
+        self._said: set[str] = set()
+
+    def will(self) -> Publish:
+        """Return the message by which the router is gone."""
+        payload = encode_info(self._info._replace(is_online=False))
+        return Publish(self._topics.info, payload, 2, not self._spec.no_retain)
+
+    def connected(self, now_ns: int) -> list[Action]:
+        """Return what to do first on a new connection, in this order."""
+        self._connected_at_ns = now_ns
+        self._refresh_at_ns = now_ns + CONFIRM_NS
+        return [*self._await(), Subscribe(self._topics.filters), self._tell(now_ns)]
+
+    def disconnected(self) -> None:
+        """Wait for the next connection."""
+        self._connected_at_ns = self._tell_at_ns = None
+
+    def receive_message(
+        self, topic: str, payload: bytes, now_ns: int, *, is_retained: bool = False
+    ) -> list[Action]:
+        """Act on a message; nothing that anybody sends raises.
+
+        Args:
+            topic: Where it was published.
+            payload: What it carries.
+            now_ns: The time on the monotonic clock.
+            is_retained: Whether the broker had kept it.
+        """
+        parsed = self._topics.parse(topic)
+        if parsed is None:
+            return self._drop(Drop.TOPIC, "topic nobody knows", topic[:80])
+        net_id, kind = parsed
+        try:
+            if kind is TopicKind.INFO:
+                return self._hear_of(net_id, payload, now_ns, is_retained=is_retained)
+            if net_id != self._net_id:
+                return self._drop(Drop.TOPIC, "topic nobody knows", topic[:80])
+            if is_retained:  # it would be done again at each connection
+                return self._drop(Drop.TOPIC, "retained packet", topic)
+            return self._take(kind, decode_payload(payload), now_ns)
+        except CodecError as exc:
+            what = "info" if kind is TopicKind.INFO else "packet"
+            return self._drop(Drop.BROKEN, f"broken {what}", f"{topic}: {exc}")
+
+    def message_for(self, connection: str, packet: bytes) -> Publish:
+        """Return the message that brings *packet* to the router with the NetID *connection*."""
+        sender = self._senders.get(connection)
+        is_prefixed = self._spec.is_prefixed if sender is None else sender.is_prefixed
+        kind = TopicKind.REQUESTS if is_request(packet) else TopicKind.ANSWERS
+        payload = encode_payload(Payload(self._ports.outward(packet), is_prefixed))
+        return Publish(self._topics.of(connection, kind), payload, self._spec.qos)
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has something to do."""
+        if self._connected_at_ns is None:
+            return None
+        if self._tell_at_ns is None:
+            return self._refresh_at_ns
+        return min(self._tell_at_ns, self._refresh_at_ns)
+
+    def handle_timeout(self, now_ns: int) -> list[Action]:
+        """Tell of this router, ask for the others, forget who is gone without a word."""
+        actions: list[Action] = []
+        if self._connected_at_ns is None:
+            return actions
+        if now_ns >= self._refresh_at_ns:
+            self._refresh_at_ns = now_ns + REFRESH_NS
+            actions += self._forget(max(self._connected_at_ns, now_ns - EXPIRY_NS), now_ns)
+            actions.append(Subscribe((self._topics.all_info,)))
+            if self._spec.no_retain:
+                self._tell_at_ns = now_ns
+        if self._tell_at_ns is not None and now_ns >= self._tell_at_ns:
+            actions.append(self._tell(now_ns))
+        return actions
+
+    def _hear_of(
+        self, net_id: NetId, payload: bytes, now_ns: int, *, is_retained: bool
+    ) -> list[Action]:
+        info = decode_info(payload)
+        if net_id == self._net_id:
+            return self._hear_of_itself(info, now_ns, is_retained=is_retained)
+        address = str(net_id)
+        change = self._peers.tell(net_id, info, now_ns)
+        if change is Change.IGNORED:
+            return self._drop(Drop.FULL, "one router too many", address)
+        if change is Change.DOWN:
+            return [HopDown(address, "it told that it is gone"), Closed(address)]
+        actions: list[Action] = [HopUp(address)] if change is Change.UP else []
+        is_due = change is Change.UP or now_ns - self._told_at_ns >= _ANSWER_GAP_NS
+        if self._spec.no_retain and info.is_online and is_due:
+            actions += self._tell_soon(now_ns)
+        return actions
+
+    def _hear_of_itself(self, info: Info, now_ns: int, *, is_retained: bool) -> list[Action]:
+        if not info.is_online:
+            return self._tell_soon(now_ns)  # the last will of a connection before this one
+        if info == self._info or is_retained:
+            return []
+        text = f"{info.name!r} tells that it has the NetID {self._net_id}, which is this station's"
+        return self._warn("double", f"{text}; each router of a network needs one of its own")
+
+    def _take(self, kind: TopicKind, payload: Payload, now_ns: int) -> list[Action]:
+        packet = payload.packet
+        header = AmsHeader.decode(packet)
+        if kind is TopicKind.ANSWERS and not comes_back(packet):
+            # Brokers let some write there who may not ask anything.
+            return self._drop(Drop.TOPIC, "request on the topic for answers", str(header.source))
+        address = self._peers.address_of(header.source)
+        actions = self._hear(address, payload, now_ns)
+        if len(packet) > MAX_PACKET:
+            text = f"{header.source}: {len(packet)} octets"
+            actions += self._drop(Drop.LENGTH, "too long a packet", text)
+            return actions + self._refuse(header, address, AdsError.AMS_LENGTH)
+        return [*actions, Arrived(self._ports.inward(packet), address)]
+
+    def _hear(self, address: str, payload: Payload, now_ns: int) -> list[Action]:
+        """Remember the form that *address* uses."""
+        self._senders[address] = _Sender(payload.is_prefixed, now_ns)
+        self._senders.move_to_end(address)
+        if len(self._senders) <= MAX_SENDERS:
+            return []
+        oldest, _ = self._senders.popitem(last=False)
+        return [Closed(oldest)]
+
+    def _refuse(self, header: AmsHeader, address: str, error: AdsError) -> list[Action]:
+        if header.state_flags & (StateFlags.RESPONSE | StateFlags.NO_RETURN):
+            return []
+        packet = response_to(header, AmsAnswer(error_code=error))
+        return [self.message_for(address, packet)]
+
+    def _forget(self, since_ns: int, now_ns: int) -> list[Action]:
+        were_there, were_not = self._peers.forget(since_ns, now_ns)
+        actions: list[Action] = []
+        for net_id in were_there:
+            actions.append(HopDown(str(net_id), "it is gone without a word"))
+            actions.append(Closed(str(net_id)))
+        actions += [HopUp(str(net_id)) for net_id in (*were_there, *were_not)]
+        actions += self._await()
+        while self._senders:
+            address, sender = next(iter(self._senders.items()))
+            if now_ns - sender.heard_at_ns < _SILENCE_NS:
+                break
+            del self._senders[address]
+            actions.append(Closed(address))
+        return actions
+
+    def _await(self) -> list[Action]:
+        return [HopDown(each, "it has not told of itself yet") for each in self._peers.awaited()]
+
+    def _tell(self, now_ns: int) -> Publish:
+        self._told_at_ns = now_ns
+        self._tell_at_ns = None
+        return self.will()._replace(payload=encode_info(self._info))
+
+    def _tell_soon(self, now_ns: int) -> list[Action]:
+        self._tell_at_ns = max(now_ns, self._told_at_ns + _ANNOUNCE_GAP_NS)
+        return [self._tell(now_ns)] if now_ns >= self._tell_at_ns else []
+
+    def _drop(self, reason: Drop, kind: str, text: str) -> list[Action]:
+        said = self._warn(kind, f"{kind}: {text}; from now on these are only counted")
+        return [Dropped(reason), *said]
+
+    def _warn(self, kind: str, text: str) -> list[Action]:
+        if kind in self._said:
+            return []
+        self._said.add(kind)
+        return [Warn(text)]

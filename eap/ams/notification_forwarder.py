@@ -1,0 +1,286 @@
+"""Subscriptions that pass a router: requests and answers are followed, samples go to their clients.
+
+The first router on the way keeps what it needs to restore a subscription (restorer.py): it is the
+one whose client has a connection to it and whose request bears no mark of a router before it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+from eap.ams.action import Reply
+from eap.ams.endpoint import Way
+from eap.ams.inflight import Pending
+from eap.ams.invoke import is_marked
+from eap.ams.subscriptions import MAX_PER_CLIENT, Grant, Subscription, Subscriptions, divide
+from eap.ams.transport_table import Outlet
+from eap.codec.ads import AdsError, AdsReadWrite, IndexGroup
+from eap.codec.adsnotification import AddNotification, decode_notification
+from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
+
+_GRANTED = struct.Struct("<II")  # result, handle
+_HANDLE = 4
+_ADD = AmsCommand.ADD_NOTIFICATION.value  # plain numbers: members of enums are slow
+_DELETE = AmsCommand.DELETE_NOTIFICATION.value
+_READ_WRITE = AmsCommand.READ_WRITE.value
+FOLLOWED = frozenset((_ADD, _DELETE, _READ_WRITE))
+"""Commands that may be about notifications."""
+_LOOKUPS = frozenset(
+    (
+        IndexGroup.SYMBOL_HANDLE.value,
+        IndexGroup.SYMBOL_BY_NAME.value,
+        IndexGroup.SYMBOL_ENTRY_BY_NAME.value,
+    )
+)
+"""Groups whose ReadWrite tells by which group and offset a symbol is reached."""
+_SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value
+_SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value
+_SUM_HEAD = 8
+"""Bytes of result and length before the answers to the items of a sum command."""
+_MAX_SYMBOLS = 1024
+"""Symbol handles that are remembered of one connection; the oldest makes room."""
+_LONGEST_LOOKUP = 272
+_PLACE = struct.Struct("<II")  # group, offset
+BY_HANDLE = frozenset((IndexGroup.VALUE_BY_HANDLE, IndexGroup.SYMBOL_NOTIFICATION))
+"""Groups whose offset is the handle of a symbol."""
+_LENGTH = slice(20, 24)
+
+
+class Granted(NamedTuple):
+    """Consequences of the answer to a request for notifications."""
+
+    body: bytes
+    """As the client gets it: with the handles that it knows."""
+    surplus: list[Grant]
+    """Notifications that no client waits for any more."""
+    new: list[Subscription]
+    displaced: list[Subscription]
+    """Subscriptions whose handle the server gave again, so that it does not know them any more."""
+
+
+class Samples(NamedTuple):
+    """Consequences of a notification."""
+
+    replies: list[Reply]
+    ended: list[Subscription]
+    """Subscriptions that their server has ended."""
+    unknown: list[int]
+    """Handles that no client here has."""
+    hop: Way | None
+    """That samples of known subscriptions came from; None if there are none."""
+
+
+class Notifier:
+    """Follows requests for notifications and their answers, and hands notifications on.
+
+    Attributes:
+        subscriptions: What is known.
+    """
+
+    def __init__(self, outlet: Outlet) -> None:
+        self.subscriptions = Subscriptions()
+        self._outlet = outlet
+        self._symbols: dict[Way, OrderedDict[tuple[bytes, int, int], bytes]] = {}
+
+    def find_own(self, header: AmsHeader, data: bytes, way: Way) -> list[Subscription] | None:
+        """Return the subscriptions of this client that a request deletes.
+
+        None says that it deletes nothing that is known here.
+        """
+        handles = deleted_handles(header, data)
+        if not handles:
+            return None
+        asked = data[: ADDRESSES.size]
+        find = self.subscriptions.find_of_client
+        found = [find(way, asked, handle) for handle in handles]
+        return [each for each in found if each is not None] or None
+
+    def has_room(self, header: AmsHeader, data: bytes, way: Way) -> bool:
+        """Say whether a client may have the notifications that it asks for."""
+        count = _count_of(header, data[AmsHeader.SIZE :])
+        return not count or self.subscriptions.has_room(way, data[: ADDRESSES.size], count)
+
+    def follow_request(self, pending: Pending, body: bytes, way: Way) -> None:
+        """Note which notifications a client asks for, and which symbol it looks up."""
+        header = pending.header
+        pending.handles = _count_of(header, body)
+        if pending.handles or _group_of(header, body) in _LOOKUPS:
+            door = self._outlet.doors[way.door]
+            # Where clients have no connection it is never known that they are gone.
+            is_first = (door.is_stream or door.is_shared) and not is_marked(header.invoke_id)
+            pending.asked_for = body if is_first else b""
+
+    def follow_answer(
+        self, pending: Pending, header: AmsHeader, body: bytes, now_ns: int
+    ) -> Granted | None:
+        """Note the notifications that were granted, if any were asked for."""
+        way, route = pending.came_by, pending.route
+        if header.error_code or route is None:
+            return None
+        if not pending.handles:
+            if pending.asked_for and way is not None:
+                self._note_symbol(pending, body, way)
+            return None
+        start = 0 if header.command == AmsCommand.ADD_NOTIFICATION else _SUM_HEAD
+        granted = Granted(body, [], [], [])
+        asked = _addresses(pending.header)
+        requests = _requests_of(pending)
+        for number in range(pending.handles):
+            at = start + number * _GRANTED.size
+            if at + _GRANTED.size > len(body):
+                break
+            result, handle = _GRANTED.unpack_from(body, at)
+            if result:
+                continue
+            grant = Grant(pending.onward, handle, route)
+            if way is None:
+                granted.surplus.append(grant)
+                continue
+            request = requests[number] if requests else None
+            symbol = self._symbol_of(way, asked, request)
+            subscription = Subscription(way, asked, grant, now_ns, request, symbol)
+            displaced = self.subscriptions.add(subscription)
+            granted.new.append(subscription)
+            if displaced is not None:
+                granted.displaced.append(displaced)
+            if subscription.handle != handle:
+                new = subscription.handle.to_bytes(_HANDLE, "little")
+                body = body[: at + _HANDLE] + new + body[at + _GRANTED.size :]
+        return granted._replace(body=body)
+
+    def forget(self, subscriptions: Iterable[Subscription]) -> list[Grant]:
+        """Forget what clients have deleted; return what servers gave for it."""
+        grants = [self.subscriptions.remove(each) for each in subscriptions if not each.is_closed]
+        return [grant for grant in grants if grant is not None]
+
+    def knows(self, header: AmsHeader, body: bytes) -> bool:
+        """Say whether a client here subscribed to a sample of a notification.
+
+        Raises:
+            CodecError: it is shorter or longer than it says.
+        """
+        onward = _back(header)
+        handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
+        return any(self.subscriptions.find(onward, handle) is not None for handle in handles)
+
+    def hand_on(
+        self, header: AmsHeader, data: bytes, now_ns: int, is_hop: Callable[[Way], bool]
+    ) -> Samples:
+        """Return what the clients get of a notification.
+
+        Raises:
+            CodecError: it is shorter or longer than it says.
+        """
+        body = data[AmsHeader.SIZE :]
+        division = divide(body, _back(header), self.subscriptions, now_ns, is_hop)
+        replies = []
+        for way, asked, part in division.parts:
+            addresses = asked[8:] + asked[:8]
+            length = len(part).to_bytes(4, "little")
+            head = data[ADDRESSES.size : _LENGTH.start] + length
+            packet = addresses + head + data[_LENGTH.stop : AmsHeader.SIZE] + part
+            replies.append(self._outlet.reply(way, packet))
+        return Samples(replies, division.ended, division.unknown, division.hop)
+
+    def close(self, way: Way) -> list[Grant]:
+        """Forget the clients of a connection; return what servers gave them."""
+        self._symbols.pop(way, None)
+        return self.subscriptions.close(way)
+
+    def _note_symbol(self, pending: Pending, body: bytes, way: Way) -> None:
+        place = symbol_place(pending.asked_for, body)
+        if place is None or len(pending.asked_for) > _LONGEST_LOOKUP:
+            return
+        mine = self._symbols.setdefault(way, OrderedDict())
+        key = _addresses(pending.header), *place
+        mine[key] = pending.asked_for
+        mine.move_to_end(key)
+        if len(mine) > _MAX_SYMBOLS:
+            mine.popitem(last=False)
+
+    def _symbol_of(self, way: Way, asked: bytes, request: AddNotification | None) -> bytes:
+        mine = self._symbols.get(way)
+        if request is None or mine is None:
+            return b""
+        group = IndexGroup.VALUE_BY_HANDLE if request.group in BY_HANDLE else request.group
+        return mine.get((asked, group, request.offset), b"")
+
+
+def symbol_place(lookup: bytes, answer: bytes) -> tuple[int, int] | None:
+    """Return group and offset of a symbol from the answer to its *lookup*, None if it has none."""
+    group = int.from_bytes(lookup[:4], "little")
+    if group == IndexGroup.SYMBOL_HANDLE:
+        if len(answer) < _SUM_HEAD + _HANDLE or any(answer[:4]):
+            return None
+        handle = int.from_bytes(answer[_SUM_HEAD : _SUM_HEAD + _HANDLE], "little")
+        return IndexGroup.VALUE_BY_HANDLE, handle
+    # An entry has its length before group and offset.
+    at = _SUM_HEAD + (4 if group == IndexGroup.SYMBOL_ENTRY_BY_NAME else 0)
+    if len(answer) < at + _PLACE.size or any(answer[:4]):
+        return None
+    found: tuple[int, int] = _PLACE.unpack_from(answer, at)
+    return found
+
+
+def deleted_handles(header: AmsHeader, data: bytes) -> Sequence[int]:
+    """Return the handles of the notifications that a request deletes; none if it is another one."""
+    body = data[AmsHeader.SIZE :]
+    if header.command == _DELETE:
+        octets = body[:_HANDLE]
+    elif _group_of(header, body) == _SUM_DELETE:
+        count = AdsReadWrite.decode(body).offset
+        octets = body[AdsReadWrite.SIZE :][: count * _HANDLE]
+    else:
+        return ()
+    return [
+        item for (item,) in struct.iter_unpack("<I", octets[: len(octets) // _HANDLE * _HANDLE])
+    ]
+
+
+def encode_deleted(header: AmsHeader, results: Sequence[AdsError]) -> bytes:
+    """Return the body of the answer to a request that deletes notifications."""
+    octets = b"".join(result.to_bytes(4, "little") for result in results)
+    if header.command == _DELETE:
+        return octets
+    return _GRANTED.pack(0, len(octets)) + octets
+
+
+def _group_of(header: AmsHeader, body: bytes) -> int:
+    """Return the index group of a ReadWrite, 0 for any other command."""
+    if header.command != _READ_WRITE or len(body) < AdsReadWrite.SIZE:
+        return 0
+    return int.from_bytes(body[:4], "little")
+
+
+def _count_of(header: AmsHeader, body: bytes) -> int:
+    """Return how many notifications a request asks for."""
+    if header.command == _ADD:
+        return 1
+    if _group_of(header, body) == _SUM_ADD:
+        return min(AdsReadWrite.decode(body).offset, MAX_PER_CLIENT)
+    return 0
+
+
+def _requests_of(pending: Pending) -> list[AddNotification]:
+    """Return the parameters of the notifications that were asked for, if they are kept here."""
+    octets = pending.asked_for
+    if not octets:
+        return []
+    if pending.header.command != _ADD:
+        octets = octets[AdsReadWrite.SIZE :]
+    size = AddNotification.SIZE
+    if len(octets) < size * pending.handles:
+        return []
+    return [AddNotification.decode(octets, size * number) for number in range(pending.handles)]
+
+
+def _addresses(header: AmsHeader) -> bytes:
+    return ADDRESSES.pack(header.target, header.target_port, header.source, header.source_port)
+
+
+def _back(header: AmsHeader) -> bytes:
+    """Return the addresses that the request for a notification had."""
+    return ADDRESSES.pack(header.source, header.source_port, header.target, header.target_port)

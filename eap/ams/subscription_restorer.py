@@ -1,0 +1,527 @@
+"""Restoration of subscriptions whose way to the server was interrupted.
+
+The first router on the way restores: it keeps what its client asked for.  Others tell the router
+before them that a subscription has ended, by the sample without bytes that TwinCAT sends.
+
+Rule 1: a subscription is interrupted when its hop is lost or was started again, when its server
+ends it, or when no sample comes for too long and the server does not know it any more.
+Rule 2: it is asked for again until the server grants it, whatever is wrong with the way; an error
+that says that there is no such object, or that access is refused, ends it, and its client gets a
+sample without bytes.
+Rule 3: what was granted before is deleted at the server after the new one was granted, and never
+while requests for others with the same addresses are under way: a server that was started again may
+give a handle twice.
+Rule 4: after a failure one subscription for each pair of addresses tries the way, again and again;
+when it comes through, the others follow in groups.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from heapq import heapify, heappop, heappush
+from itertools import count
+from typing import NamedTuple, TypeAlias
+
+import msgspec
+
+from eap.ams.action import Action, Outcome
+from eap.ams.admission import Limits
+from eap.ams.endpoint import Way
+from eap.ams.error_reply import Refusal, Refuser
+from eap.ams.inflight import InFlight, Pending
+from eap.ams.invoke import InvokeIds
+from eap.ams.notification_cleanup import Ending, header_to
+from eap.ams.notification_forwarder import BY_HANDLE, symbol_place
+from eap.ams.routes import Route
+from eap.ams.subscriptions import Grant, Subscription, Subscriptions, key_of
+from eap.ams.transport_table import Outlet
+from eap.codec.ads import AdsError
+from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
+
+RETRY_NS = 500_000_000
+"""Between two attempts for one pair of addresses."""
+SPACING_NS = 10_000_000
+"""Between two requests at all, on the average: many pairs are tried less often."""
+_LOOK_SPACING_NS = 1_000_000
+"""Likewise, between two looks for a way that find none, which cost no packet."""
+GROUP = 32
+"""Subscriptions of one pair of addresses that are asked for at a time."""
+MAX_ASKED = 128
+"""Requests of restorations that wait for answers."""
+TIMEOUT_NS = 2_000_000_000
+"""Limit for an answer; then the request is repeated with twice the limit, up to that of requests of
+clients: a slow server is restored too."""
+PATIENCE_NS = 5_000_000_000
+"""Limit for refusals with an error that may pass, as while a server starts."""
+MAX_ENDS = 3
+"""Ends of a subscription by its server without a sample between them."""
+_SOON_NS = 20_000_000
+_MAX_DOUBLINGS = 8
+_SPARE_CHECKS = 256
+"""Checks of subscriptions that have ended, before they are dropped ahead of their time."""
+_GRANTED = 8
+"""Bytes of the answer of AddNotification: result and handle."""
+_OF_THE_WAY = frozenset(
+    (
+        AdsError.MAILBOX_FULL, AdsError.TARGET_MACHINE, AdsError.PORT_NOT_CONNECTED,
+        AdsError.TCP_SEND, AdsError.HOST_UNREACHABLE, AdsError.NOT_READY, AdsError.BUSY,
+        AdsError.NOT_INITIALIZED, AdsError.TIMEOUT, AdsError.PENDING, AdsError.ABORTED,
+        AdsError.CLIENT_TIMEOUT,
+    )
+)  # fmt: skip
+"""Errors that say nothing about the object."""
+_OF_THE_START = frozenset(
+    (
+        AdsError.TARGET_PORT, AdsError.GENERAL, AdsError.NO_MEMORY, AdsError.STATE,
+        AdsError.NO_MORE_HANDLES,
+    )
+)  # fmt: skip
+"""Errors that may pass when the server has started, or has forgotten others."""
+
+FindWay: TypeAlias = Callable[[AmsHeader, bytes, Way, int], tuple[Route, bytes] | Refusal]
+"""Returns by which route and with which addresses a request goes on now, or why it does not."""
+
+
+class _Session:
+    """Subscriptions with the same addresses of server and client that are to be established."""
+
+    __slots__ = ("asked", "at_ns", "interrupted_at_ns", "is_trying", "outstanding", "restored",
+                 "stale", "timeouts", "waiting", "way")  # fmt: skip
+
+    def __init__(self, way: Way, asked: bytes, at_ns: int) -> None:
+        self.way = way
+        self.asked = asked
+        self.at_ns = at_ns
+        self.interrupted_at_ns: int | None = None
+        self.restored = 0
+        self.is_trying = True
+        self.outstanding = 0
+        self.timeouts = 0
+        self.waiting: deque[Subscription] = deque()
+        self.stale: list[tuple[Grant, bool]] = []
+
+
+class _Step(NamedTuple):
+    """A request of a restoration: for the handle of a symbol, for a notification, or its end."""
+
+    session: _Session
+    subscription: Subscription | None
+    """None for the end of an earlier grant."""
+    stale: Grant | None = None
+    is_check: bool = False
+    """Whether it shows that the server had forgotten what was not known to be interrupted."""
+    symbol_handle: int | None = None
+
+
+class Interruption(NamedTuple):
+    """Subscriptions of one client at one server to which nothing comes."""
+
+    way: Way
+    asked: bytes
+    """Addresses of server and client."""
+    number: int
+    since_ns: int
+    why: str
+
+
+class Restorer:
+    """Establishes subscriptions again.
+
+    Args:
+        subscriptions: All that pass the router.
+        outlet: By which servers are asked.
+        in_flight: What waits for an answer, these requests too.
+        ids: Of requests of this router.
+        ending: Ends what was granted in vain.
+        refuser: Takes note of what is given up.
+        limits: How much may wait.
+        find_way: Finds the route of a client's request, by the access rules too.
+    """
+
+    def __init__(
+        self, subscriptions: Subscriptions, outlet: Outlet, in_flight: InFlight, ids: InvokeIds,
+        ending: Ending, refuser: Refuser, limits: Limits, find_way: FindWay,
+    ) -> None:  # fmt: skip
+        self._subscriptions = subscriptions
+        self._outlet = outlet
+        self._in_flight = in_flight
+        self._ids = ids
+        self._ending = ending
+        self._refuser = refuser
+        self._limits = limits
+        self._find_way = find_way
+        self._sessions: dict[bytes, _Session] = {}
+        self._due: list[tuple[int, int, _Session]] = []
+        self._checks: list[tuple[int, int, Subscription]] = []
+        self._numbers = count()
+        self._deleting: set[tuple[bytes, int]] = set()
+        self._asked = 0
+
+    def watch(self, subscription: Subscription) -> None:
+        """Check from time to time whether samples come."""
+        if subscription.request is not None:
+            if len(self._checks) > 2 * len(self._subscriptions) + _SPARE_CHECKS:
+                self._checks = [each for each in self._checks if not each[2].is_closed]
+                heapify(self._checks)
+            at_ns = subscription.heard_at_ns + subscription.quiet_limit_ns()
+            heappush(self._checks, (at_ns, next(self._numbers), subscription))
+
+    def granted(self, subscription: Subscription, now_ns: int) -> list[Action]:
+        """Take note of a new subscription that a client asked for."""
+        self.watch(subscription)
+        return self._mistrust(subscription, now_ns)
+
+    def interrupt(
+        self, subscriptions: Iterable[Subscription], why: str, now_ns: int
+    ) -> list[Action]:
+        """Have subscriptions restored; those that another router restores are ended."""
+        actions: list[Action] = []
+        for each in subscriptions:
+            if each.request is None:
+                actions += self._end(each, now_ns)
+                continue
+            self._subscriptions.suspend(each)
+            if each.interrupted_at_ns is None:
+                each.interrupted_at_ns, each.why = now_ns, why
+                each.refused_at_ns = None
+            session = self._queue(each, now_ns)
+            if session.interrupted_at_ns is None:
+                session.interrupted_at_ns = now_ns
+                self._note(session, Outcome.INTERRUPTED, f"interrupted: {why}", now_ns)
+        return actions
+
+    def ended(self, subscriptions: Iterable[Subscription], now_ns: int) -> list[Action]:
+        """Act on samples without bytes: the server, or a router on the way, ended these."""
+        actions: list[Action] = []
+        for each in subscriptions:
+            if each.is_closed:
+                continue
+            self._subscriptions.detach(each)
+            each.ends += 1
+            if each.request is None or each.ends >= MAX_ENDS:
+                actions += self._end(each, now_ns)
+            else:
+                actions += self.interrupt(
+                    [each], "its server, or a router on the way, ended it", now_ns
+                )
+        return actions
+
+    def displaced(self, subscriptions: Iterable[Subscription], now_ns: int) -> list[Action]:
+        """Act on handles that a server gave a second time: it forgot what they were before."""
+        actions: list[Action] = []
+        for each in subscriptions:
+            if each.is_closed:
+                actions.append(self._outlet.reply(each.way, each.encode_end(now_ns)))
+            else:
+                actions += self.interrupt([each], "its server was started again", now_ns)
+        return actions
+
+    def receive_answer(
+        self, pending: Pending, header: AmsHeader, body: bytes, now_ns: int
+    ) -> list[Action]:
+        """Act on the answer to a request of a restoration."""
+        step = pending.step
+        assert isinstance(step, _Step)  # noqa: S101  for the type
+        step.session.timeouts = 0
+        return self._end_step(pending, step, header, body, now_ns)
+
+    def request_failed(self, pending: Pending, error: AdsError, now_ns: int) -> list[Action]:
+        """Act on a request of a restoration that nothing came back for."""
+        step = pending.step
+        assert isinstance(step, _Step)  # noqa: S101  for the type
+        step.session.timeouts += error is AdsError.TIMEOUT
+        return self._end_step(pending, step, _failed(pending.header, error), b"", now_ns)
+
+    def _end_step(
+        self, pending: Pending, step: _Step, header: AmsHeader, body: bytes, now_ns: int
+    ) -> list[Action]:
+        self._asked -= 1
+        step.session.outstanding -= 1
+        error = header.error_code or int.from_bytes(body[:4], "little")
+        if len(body) < 4 and not error:
+            error = AdsError.GENERAL
+        actions: list[Action] = []
+        if step.stale is not None:
+            actions += self._deleted(step, step.stale, error, now_ns)
+        elif step.subscription is not None:
+            actions += self._answered(pending, step, error, body, now_ns)
+        return actions + self._go_on(step.session, now_ns)
+
+    def interruptions(self) -> list[Interruption]:
+        """Return what is interrupted now, by client and server."""
+        found: dict[tuple[Way, bytes], Interruption] = {}
+        for each in self._subscriptions if self._sessions else ():
+            since_ns = each.interrupted_at_ns
+            if since_ns is None:
+                continue
+            key = each.way, each.asked
+            known = found.get(key, Interruption(*key, 0, since_ns, each.why))
+            found[key] = known._replace(
+                number=known.number + 1, since_ns=min(since_ns, known.since_ns)
+            )
+        return list(found.values())
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has something to do."""
+        times = [heap[0][0] for heap in (self._due, self._checks) if heap]
+        return min(times, default=None)
+
+    def handle_timeout(self, now_ns: int) -> list[Action]:
+        """Ask for what is due, and check what is quiet."""
+        actions: list[Action] = []
+        while self._checks and self._checks[0][0] <= now_ns:
+            self._check(heappop(self._checks)[2], now_ns)
+        while self._due and self._due[0][0] <= now_ns:
+            at_ns, _, session = heappop(self._due)
+            if self._sessions.get(session.asked) is not session or session.at_ns != at_ns:
+                continue
+            if not session.outstanding:
+                actions += self._begin(session, now_ns)
+        return actions
+
+    def _check(self, subscription: Subscription, now_ns: int) -> None:
+        if subscription.is_closed:
+            return
+        at_ns = subscription.heard_at_ns + subscription.quiet_limit_ns()
+        if subscription.interrupted_at_ns is None and at_ns <= now_ns:
+            subscription.fruitless += 1
+            self._queue(subscription, now_ns)
+        at_ns = max(at_ns, now_ns + subscription.quiet_limit_ns() // 2)
+        heappush(self._checks, (at_ns, next(self._numbers), subscription))
+
+    def _queue(self, subscription: Subscription, now_ns: int) -> _Session:
+        session = self._sessions.get(subscription.asked)
+        if session is None:
+            session = self._sessions[subscription.asked] = _Session(
+                subscription.way, subscription.asked, now_ns
+            )
+            self._schedule(session, now_ns)
+        if not subscription.is_queued:
+            subscription.is_queued = True
+            session.waiting.append(subscription)
+        return session
+
+    def _note(self, session: _Session, outcome: Outcome, text: str, now_ns: int) -> None:
+        """Have it in the log: once for all subscriptions of a session."""
+        header = header_to(session.asked, AmsCommand.ADD_NOTIFICATION, 0)
+        self._refuser.drop(session.way, header, outcome, text, now_ns)
+
+    def _schedule(self, session: _Session, at_ns: int) -> None:
+        session.at_ns = at_ns
+        heappush(self._due, (at_ns, next(self._numbers), session))
+
+    def _begin(self, session: _Session, now_ns: int) -> list[Action]:
+        """Ask for one subscription, or for a group when the way is known to be good."""
+        actions: list[Action] = []
+        room = 1 if session.is_trying else GROUP
+        while session.waiting and session.outstanding < room and self._has_room():
+            subscription = session.waiting.popleft()
+            if subscription.is_closed:
+                continue
+            actions += self._ask_for(session, subscription, now_ns)
+            if session.is_trying and session.at_ns > now_ns:
+                break
+        return actions + self._go_on(session, now_ns)
+
+    def _ask_for(
+        self, session: _Session, subscription: Subscription, now_ns: int,
+        place: tuple[int, int] | None = None,
+    ) -> list[Action]:  # fmt: skip
+        request = subscription.request
+        assert request is not None  # noqa: S101  for the type
+        command, body, symbol_handle = AmsCommand.ADD_NOTIFICATION, request.encode(), None
+        is_by_handle = request.group in BY_HANDLE
+        if place is not None:
+            group, offset = place
+            symbol_handle = offset if is_by_handle else None
+            group = request.group if is_by_handle else group
+            body = group.to_bytes(4, "little") + offset.to_bytes(4, "little") + body[8:]
+        elif subscription.symbol:
+            # Where a symbol is may be another place since its server was started again.
+            command, body = AmsCommand.READ_WRITE, subscription.symbol
+        elif is_by_handle:
+            text = "it is of a symbol whose name is not known"
+            return self._give_up(session, subscription, text, now_ns)
+        step = _Step(session, subscription, symbol_handle=symbol_handle)
+        invoke_id = self._ids.take(self._in_flight)
+        header = header_to(subscription.asked, command, invoke_id)
+        packet = encode_packet(header, body)
+        found = self._find_way(header, packet, subscription.way, now_ns)
+        if isinstance(found, Refusal):
+            return self._failed(
+                session, subscription, found.error, found.text, now_ns, _LOOK_SPACING_NS
+            )
+        route, onward = found
+        packet = onward + packet[ADDRESSES.size :]
+        handles = int(command == AmsCommand.ADD_NOTIFICATION)
+        return self._ask(step, header, packet, onward, route, handles, now_ns)
+
+    def _ask(
+        self, step: _Step, header: AmsHeader, packet: bytes, onward: bytes, route: Route,
+        handles: int, now_ns: int,
+    ) -> list[Action]:  # fmt: skip
+        usual_ns = max(TIMEOUT_NS, route.timeout_ns or self._limits.timeout_ns)
+        allowed_ns = TIMEOUT_NS << min(step.session.timeouts, _MAX_DOUBLINGS)
+        deadline_ns = now_ns + min(allowed_ns, usual_ns)
+        pending = Pending(header.invoke_id, header, None, route, onward, now_ns, deadline_ns)
+        pending.handles = handles
+        pending.step = step
+        self._in_flight.add(pending)
+        self._asked += 1
+        step.session.outstanding += 1
+        return [self._outlet.forward(route.hop, packet, header.invoke_id)]
+
+    def _answered(
+        self, pending: Pending, step: _Step, error: int, body: bytes, now_ns: int
+    ) -> list[Action]:
+        """Act on what a server says to the request for a subscription or a symbol."""
+        session, subscription = step.session, step.subscription
+        assert subscription is not None  # noqa: S101  for the type
+        place = None if pending.handles else symbol_place(subscription.symbol, body)
+        if not error and (len(body) < _GRANTED if pending.handles else place is None):
+            error = AdsError.GENERAL
+        if subscription.is_closed:
+            grant = None if error or not pending.handles else _grant_of(pending, step, body)
+            return [] if grant is None else self._ending.end([grant], now_ns)
+        if error:
+            route = pending.route
+            text = AdsError.words_of(error)
+            if route is not None:
+                text += f" from {route.name} ({route.hop}) or from behind it"
+            failed = self._failed(session, subscription, error, text, now_ns)
+            if step.symbol_handle is not None and error not in _OF_THE_WAY:
+                failed += self._ending.release(_grant_of(pending, step, bytes(_GRANTED)), now_ns)
+            return failed
+        if not pending.handles:
+            return self._ask_for(session, subscription, now_ns, place)
+        return self._establish(session, subscription, _grant_of(pending, step, body), now_ns)
+
+    def _establish(
+        self, session: _Session, subscription: Subscription, grant: Grant, now_ns: int
+    ) -> list[Action]:
+        was_interrupted = subscription.interrupted_at_ns is not None
+        before = self._subscriptions.detach(subscription)
+        displaced = self._subscriptions.attach(subscription, grant)
+        subscription.is_queued = False
+        subscription.interrupted_at_ns = subscription.refused_at_ns = None
+        subscription.why = ""
+        subscription.skips_repeat = not was_interrupted
+        subscription.established_at_ns = subscription.heard_at_ns = now_ns
+        session.is_trying = False
+        session.restored += was_interrupted
+        if before is not None and key_of(before) != key_of(grant):
+            session.stale.append((before, not was_interrupted))
+        actions = [] if displaced is None else self.displaced([displaced], now_ns)
+        return actions + self._mistrust(subscription, now_ns)
+
+    def _mistrust(self, subscription: Subscription, now_ns: int) -> list[Action]:
+        """Ask again for what has the handle of a notification that is being deleted."""
+        if subscription.grant is None or key_of(subscription.grant) not in self._deleting:
+            return []
+        self._subscriptions.detach(subscription)
+        return self.interrupt([subscription], "its server was started again", now_ns)
+
+    def _failed(
+        self, session: _Session, subscription: Subscription, error: int, text: str, now_ns: int,
+        spacing_ns: int = SPACING_NS,
+    ) -> list[Action]:  # fmt: skip
+        """Try again later, or give up."""
+        passes = error in _OF_THE_WAY
+        if passes:
+            subscription.refused_at_ns = None
+        elif error in _OF_THE_START:
+            since_ns = subscription.refused_at_ns
+            subscription.refused_at_ns = since_ns = now_ns if since_ns is None else since_ns
+            passes = now_ns - since_ns < PATIENCE_NS
+        if not passes:
+            return self._give_up(session, subscription, text, now_ns)
+        session.waiting.appendleft(subscription)
+        session.is_trying = True
+        self._schedule(session, now_ns + max(RETRY_NS, len(self._sessions) * spacing_ns))
+        subscription.why = text
+        # What waits for its check has the same server, and nothing comes from it either.
+        quiet = [each for each in session.waiting if each.interrupted_at_ns is None]
+        return self.interrupt(quiet, text, now_ns)
+
+    def _give_up(
+        self, session: _Session, subscription: Subscription, text: str, now_ns: int
+    ) -> list[Action]:
+        """End what cannot be restored."""
+        text = f"the subscription cannot be restored: {text}"
+        self._note(session, Outcome.FAILED, text, now_ns)
+        grant = self._subscriptions.detach(subscription)
+        if grant is not None:
+            session.stale.append((grant, False))
+        return self._end(subscription, now_ns)
+
+    def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
+        """Forget a subscription, and tell its client."""
+        self._subscriptions.remove(subscription)
+        way = subscription.way
+        if way.door not in self._outlet.doors:
+            return []
+        return [self._outlet.reply(way, subscription.encode_end(now_ns))]
+
+    def _go_on(self, session: _Session, now_ns: int) -> list[Action]:
+        """Delete what was granted before, then ask for more, when all requests are answered."""
+        if session.outstanding:
+            return []
+        actions: list[Action] = []
+        stale, session.stale = session.stale, []
+        for grant, is_check in stale:
+            if self._subscriptions.find(*key_of(grant)) is None:  # else it was given again
+                actions += self._delete(session, grant, is_check=is_check, now_ns=now_ns)
+        if session.outstanding:
+            return actions
+        if not session.waiting:
+            self._sessions.pop(session.asked, None)
+            if session.restored and session.interrupted_at_ns is not None:
+                took_s = (now_ns - session.interrupted_at_ns) / 1e9
+                noun = "subscription" if session.restored == 1 else "subscriptions"
+                text = f"{session.restored} {noun} restored after {took_s:.1f} s"
+                self._note(session, Outcome.RESTORED, text, now_ns)
+        elif session.at_ns <= now_ns:
+            self._schedule(session, now_ns + _SOON_NS)
+        return actions
+
+    def _delete(
+        self, session: _Session, grant: Grant, *, is_check: bool, now_ns: int
+    ) -> list[Action]:
+        if grant.route.hop.door not in self._outlet.doors:
+            return []
+        self._deleting.add(key_of(grant))
+        step = _Step(session, None, grant, is_check)
+        invoke_id = self._ids.take(self._in_flight)
+        header = header_to(grant.onward, AmsCommand.DELETE_NOTIFICATION, invoke_id)
+        packet = encode_packet(header, grant.handle.to_bytes(4, "little"))
+        actions = self._ask(step, header, packet, grant.onward, grant.route, 0, now_ns)
+        return actions + self._ending.release(grant, now_ns)
+
+    def _deleted(self, step: _Step, grant: Grant, error: int, now_ns: int) -> list[Action]:
+        self._deleting.discard(key_of(grant))
+        if not step.is_check or error != AdsError.NOTIFICATION_HANDLE:
+            return []
+        # The server had forgotten what was quiet: others that were granted before are, too.
+        server = step.session.asked[:6]
+        for each in self._subscriptions:
+            if each.request is not None and each.asked[:6] == server:
+                quiet_ns = now_ns - max(each.established_at_ns, each.heard_at_ns)
+                if each.interrupted_at_ns is None and quiet_ns > TIMEOUT_NS:
+                    self._queue(each, now_ns)
+        return []
+
+    def _has_room(self) -> bool:
+        if self._asked >= MAX_ASKED:
+            return False
+        return len(self._in_flight) < self._limits.in_flight or self._in_flight.make_room()
+
+
+def _grant_of(pending: Pending, step: _Step, body: bytes) -> Grant:
+    assert pending.route is not None  # noqa: S101  for the type
+    handle = int.from_bytes(body[4:8], "little")
+    return Grant(pending.onward, handle, pending.route, step.symbol_handle)
+
+
+def _failed(asked: AmsHeader, error: AdsError) -> AmsHeader:
+    return msgspec.structs.replace(asked, error_code=error)

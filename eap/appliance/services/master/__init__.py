@@ -1,1 +1,0 @@
-"""The dictionary of a master, live: for its gateway, and for ADS."""

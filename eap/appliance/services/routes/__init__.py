@@ -1,1 +1,0 @@
-"""Routes for those who look at them and change them: tools, scans, the control protocol."""

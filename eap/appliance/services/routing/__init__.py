@@ -1,1 +1,0 @@
-"""The AoE router of each station: doors, services and the loop around ``eap.aoe.router``."""

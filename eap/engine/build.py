@@ -1,0 +1,225 @@
+"""From specifications and descriptors to a running engine: the graph of objects of one process."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic_ns
+from typing import Protocol
+
+from eap.engine.engine_buses import EngineBuses
+from eap.engine.rebuild import Rebuilds
+from eap.engine.successor import EngineStation
+from eap.engine.tcp_ports import has_tcp, open_tcp_port
+from eap.ids import InterfaceUri
+from eap.net.connections import CloseReason
+from eap.net.descriptors import descriptor_reserve, spare_descriptors
+from eap.net.ethernet import EthernetInterface, packet_batch
+from eap.net.image_file import create_image
+from eap.net.loopback import LoopbackLines
+from eap.net.mmsg import ReceiveBatch
+from eap.net.tcp import TcpReceiver
+from eap.net.udp import UdpChannel
+from eap.pd.engine import Engine
+from eap.pd.image import Image
+from eap.pd.layout import plan_layout
+from eap.pd.link import FrameChannel, Taker
+from eap.pd.spec import PortKind, PortSpec, Wake
+from eap.pd.station import Station
+from eap.pd.words import StationWord
+from eap.runtime.discards import DiscardCounters, Refusal, Tally
+from eap.runtime.folder import ApplianceFolder
+from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.runtime.passing import PassedConnection
+from eap.runtime.startup import Step, no_step
+
+_REFUSALS: Mapping[str, Refusal] = {
+    CloseReason.OVERDUE: Refusal.TCP_SLOW,
+    CloseReason.EVICTED: Refusal.TCP_EVICTED,
+}
+
+
+class SocketChannel(FrameChannel, Protocol):
+    """A channel over a descriptor."""
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when a frame waits."""
+
+
+class EnginePlant:
+    """All stations of one engine process, with their images and channels.
+
+    Args:
+        handover: What to build.
+        step: Called with the name of each step before it.
+
+    Attributes:
+        engine: Runs them.
+        rebuilds: Changes them while they run.
+        buses: The slaves below them.
+        arrivals: Descriptors to wake up for besides the cycle, and what to call then.
+    """
+
+    def __init__(self, handover: Handover, *, step: Step = no_step) -> None:
+        self.arrivals: dict[int, Callable[[int], object]] = {}
+        self._resources = ExitStack()
+        self._handover = handover
+        folder = ApplianceFolder(Path(handover.folder))
+        self._stations: dict[str, EngineStation] = {}
+        self._batch = ReceiveBatch()
+        self._tallies: list[Tally] = []
+        self._counters = self._resources.enter_context(
+            DiscardCounters(folder.discards("engine"), [s.name for s in handover.stations])
+        )
+        for spec in handover.stations:
+            step(f"building station {spec.name}")
+            file = create_image(folder.image(spec.name), plan_layout(spec))
+            station = Station(spec, file.image, file.wake_waiters)
+            self._stations[spec.name] = EngineStation(station, file)
+        step("opening ports")
+        self._open_own()
+        for shared in handover.sockets:
+            if shared.kind is SocketKind.PACKET:
+                self._open_interface(shared)
+            elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
+                self._open_datagrams(shared)
+        self.engine = Engine([place.station for place in self._stations.values()])
+        self.rebuilds = Rebuilds(self.engine, self._stations)
+        self._resources.callback(self.rebuilds.close)
+        self.arrivals[self.rebuilds.fileno()] = self.rebuilds.collect
+        step("building buses")
+        self.buses = EngineBuses(handover, self._stations, self.rebuilds.serve)
+        self._resources.callback(self.buses.close)
+        self.arrivals.update(self.buses.arrivals)
+
+    def start(self, now_ns: int) -> None:
+        """Bring all stations to their states, and let programs that attach see who runs them."""
+        for place in self._stations.values():
+            place.file.image.words[StationWord.ENGINE_PID] = os.getpid()
+        self.engine.start(now_ns, self._handover.states)
+        self.buses.start(now_ns)
+
+    def add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
+        """Take frames from a connection that services accepted, for all ports behind it."""
+        first = passed.owners[0]
+        port = self._stations[first.station].tcp_ports[first.port]
+        takers = [self._taker(owner) for owner in passed.owners]
+        spare = spare_descriptors(connection.fileno(), descriptor_reserve())
+        try:
+            receiver = TcpReceiver(connection, takers, host=passed.host)
+        except OSError:
+            connection.close()  # the peer has left again
+            return
+        if not port.accept(receiver, monotonic_ns(), spare_descriptors=spare):
+            receiver.close()
+            for station in {owner.station for owner in passed.owners}:
+                self._counters.count(station, Refusal.TCP_FULL)
+
+    def image(self, station: str) -> Image:
+        """Return the process image of a station as it is now."""
+        return self._stations[station].file.image
+
+    def publish_discards(self) -> None:
+        """Show what the interfaces dropped since the last time."""
+        for tally in self._tallies:
+            tally.publish()
+
+    def stop(self) -> None:
+        """Bring all stations out of Op and wake who waits for a cycle that will not come.
+
+        Slaves come to rest, for at most REST_NS.
+        """
+        self.engine.stop()
+        self.buses.rest()
+        for place in self._stations.values():
+            place.file.image.words[StationWord.ENGINE_PID] = 0
+            place.file.wake_waiters()
+
+    def close(self) -> None:
+        """Let go of all sockets and images."""
+        self._resources.close()
+        for place in self._stations.values():
+            place.close()
+
+    def _open_own(self) -> None:
+        """Connect the ports that need no shared socket."""
+        lines = LoopbackLines()
+        for name, port in self._ports():
+            uri = InterfaceUri.parse(port.interface)
+            if port.kind is not PortKind.EAP:
+                continue
+            if uri.scheme == "tcp":
+                self._connect(name, None)
+            elif uri.scheme == "loop":
+                channel = lines.open(uri)
+                channel.takers.append(self._taker(name))
+                self._station(name).connect(port.name, channel)
+
+    def _open_datagrams(self, shared: SharedSocket) -> None:
+        channel = UdpChannel(
+            socket.socket(fileno=shared.engine_fd),
+            self._batch,
+            [self._taker(owner) for owner in shared.owners],
+        )
+        self._resources.callback(channel.close)
+        for owner in shared.owners:
+            if shared.kind is SocketKind.UDP:
+                self._connect(owner, channel)
+            else:
+                self._station(owner).drain_also(channel)
+        self._wake_on_arrival(shared.owners, channel)
+
+    def _connect(self, name: PortName, datagrams: FrameChannel | None) -> None:
+        """Connect a port to its datagrams, to TCP, or to both."""
+        spec = self._handover.port(name)
+        station = self._station(name)
+        if datagrams is not None and not has_tcp(station.spec, spec):
+            station.connect(name.port, datagrams)
+            return
+        port = open_tcp_port(spec, datagrams)
+        place = self._stations[name.station]
+        place.tcp_ports[name.port] = port
+        self._tallies.append(Tally(self._counters, [name.station], port.closed, _tcp_reason))
+        station.connect(name.port, port)
+        place.settle_tcp()
+
+    def _open_interface(self, shared: SharedSocket) -> None:
+        interface = EthernetInterface(socket.socket(fileno=shared.engine_fd), packet_batch())
+        self._resources.callback(interface.close)
+        stations = sorted({owner.station for owner in shared.owners})
+        self._tallies.append(Tally(self._counters, stations, interface.discarded, Refusal))
+        for owner in shared.owners:
+            spec = self._handover.port(owner)
+            port = interface.port(
+                self._taker(owner),
+                vlan_id=spec.vlan_id,
+                priority=spec.vlan_priority,
+                join=spec.join,
+            )
+            self._station(owner).connect(owner.port, port)
+        self._wake_on_arrival(shared.owners, port)
+
+    def _wake_on_arrival(self, owners: Iterable[PortName], channel: SocketChannel) -> None:
+        if any(self._handover.port(owner).wake is Wake.ARRIVAL for owner in owners):
+            self.arrivals[channel.fileno()] = channel.drain
+
+    def _taker(self, name: PortName) -> Taker:
+        return self._station(name).takers[name.port]
+
+    def _station(self, name: PortName) -> Station:
+        return self._stations[name.station].station
+
+    def _ports(self) -> Iterable[tuple[PortName, PortSpec]]:
+        for station in self._handover.stations:
+            for port in station.ports:
+                yield PortName(station.name, port.name), port
+
+
+def _tcp_reason(closed: str) -> Refusal | None:
+    """Return what to count for a connection that ended; one that was just closed is no refusal."""
+    if closed.startswith("frame of type"):
+        return Refusal.TCP_TYPE
+    return _REFUSALS.get(closed)

@@ -1,0 +1,197 @@
+"""Description of a bus for services: the whole as one record, and its changes as messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+
+from msgspec.structs import asdict
+
+from devicebus.master.bus import Unit
+from devicebus.master.findings import NO_ANSWER
+from devicebus.master.master import why_closed
+from eap.engine.engine_bus import WHOLE_BUS, EngineBus
+from eap.runtime.bus_errors import to_record
+from eap.runtime.bus_request import (
+    BusChange,
+    BusReport,
+    PortErrorReport,
+    SlaveDescription,
+    SlaveReport,
+)
+
+
+def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
+    """Return what *bus* knows now; before its slaves are known, those that are expected."""
+    stats = bus.master.stats()
+    units = bus.master.units.values()
+    presets = link_presets(units)
+    slaves = (
+        [_report(bus, unit, presets, now_ns) for unit in units]
+        if units
+        else [SlaveReport(**asdict(each)) for each in expected_slaves(bus)]
+    )
+    cycle = stats.cycle
+    silence = bus.faults.last(WHOLE_BUS)
+    return BusReport(
+        is_up=bus.is_up,
+        fault=bus.fault,
+        slaves=tuple(slaves),
+        silent_since_ns=now_ns - silence.since_ns if silence.text else None,
+        silent_until_ns=None if silence.until_ns is None else now_ns - silence.until_ns,
+        frames_sent=stats.link.sent,
+        frames_received=stats.link.received,
+        frames_late=stats.link.late,
+        frames_lost=stats.link.lost,
+        frames_retried=stats.link.retried,
+        timeout_ns=stats.link.timeout_ns,
+        round_trip_ns=stats.link.round_trip_ns,
+        cycles=cycle.cycles if cycle else 0,
+        cycles_good=cycle.good if cycle else 0,
+        wkc_errors=cycle.wkc_errors if cycle else 0,
+        cycles_late=cycle.late if cycle else 0,
+        cycles_lost=cycle.lost if cycle else 0,
+        cycles_skipped=cycle.skipped if cycle else 0,
+        expected_wkc=cycle.expected_wkc if cycle else 0,
+        received_wkc=cycle.received_wkc if cycle else 0,
+        trip_ns=cycle.trip_ns if cycle else 0,
+        max_trip_ns=cycle.max_trip_ns if cycle else 0,
+    )
+
+
+def link_presets(units: Collection[Unit]) -> dict[int, int]:
+    """Return by position which ports led to other slaves when these were found (ETG.1510)."""
+    presets: dict[int, int] = {}
+    for unit in units:
+        joint = unit.found.joint
+        ends = [(unit.found.position, joint.entry_port)]
+        if joint.parent is not None:
+            ends.append((joint.parent, joint.parent_port))
+        for position, port in ends:
+            if port:  # the standard has no bits for port 0
+                presets[position] = presets.get(position, 0) | 0x11 << port - 1
+    return presets
+
+
+def describe_slave(bus: EngineBus, unit: Unit, presets: Mapping[int, int]) -> SlaveDescription:
+    """Return the description of a slave that was found; *presets* as link_presets returns them."""
+    identity, sii = unit.found.identity, unit.found.sii
+    counts = bus.faults.counts(unit.station)
+    sizes = unit.mailbox.sizes if unit.mailbox is not None else None
+    return SlaveDescription(
+        station=unit.station,
+        name=unit.name,
+        vendor=identity.vendor,
+        product=identity.product,
+        revision=identity.revision,
+        serial=identity.serial,
+        alias=unit.found.alias,
+        state=unit.al_state,
+        target=int(unit.target),
+        to_slave=sizes.to_slave if sizes else 0,
+        to_master=sizes.to_master if sizes else 0,
+        mailbox_fault=None if sizes else to_record(why_closed(unit)),
+        protocols=int(sii.fixed.protocols),
+        order=sii.string(sii.general.order) if sii.general else "",
+        usual_to_slave=sii.fixed.receive_size,
+        usual_to_master=sii.fixed.send_size,
+        port_physics=sii.general.port_physics if sii.general else 0,
+        link_preset=presets.get(unit.found.position, 0),
+        losses=counts.losses,
+        departures=counts.departures,
+        al_code=counts.al_code,
+        fault=_fault(bus, unit),
+    )
+
+
+def _report(bus: EngineBus, unit: Unit, presets: Mapping[int, int], now_ns: int) -> SlaveReport:
+    last = bus.faults.last(unit.station)
+    return SlaveReport(
+        **asdict(describe_slave(bus, unit, presets)),
+        past_fault=last.text if last.until_ns is not None else "",
+        since_ns=now_ns - last.since_ns if last.text else None,
+        until_ns=None if last.until_ns is None else now_ns - last.until_ns,
+        port_errors=tuple(
+            PortErrorReport(port, now_ns - seen.since_ns, now_ns - seen.until_ns)
+            for port, seen in bus.master.port_errors.of(unit.station).items()
+        ),
+    )
+
+
+def _fault(bus: EngineBus, unit: Unit) -> str:
+    """Return the reason why a slave is not in its target state at this moment."""
+    fault = bus.faults.of(unit.station)
+    if fault == NO_ANSWER and unit.is_busy and unit.state is not None:
+        return f"it answers again and is on its way to {unit.target.name}"
+    return fault
+
+
+def expected_slaves(bus: EngineBus) -> list[SlaveDescription]:
+    """Return the slaves of the plant file, for a bus whose slaves have not been found yet."""
+    return [
+        SlaveDescription(
+            station=slave.station,
+            name=slave.name,
+            vendor=slave.vendor,
+            product=slave.product,
+            revision=slave.revision or 0,
+            serial=slave.serial or 0,
+            alias=slave.alias or 0,
+            state=0,
+            target=0,
+            fault="it has not been found yet",
+        )
+        for slave in bus.spec.slaves
+    ]
+
+
+class BusPublisher:
+    """Sends the slaves that have changed since the message that was sent last.
+
+    A message that cannot be sent is not lost: its changes are part of the next one.
+
+    Args:
+        number: Of the bus in messages.
+        bus: The bus.
+        send: Sends a message; returns False if there is no room for it.
+    """
+
+    def __init__(self, number: int, bus: EngineBus, send: Callable[[BusChange], bool]) -> None:
+        self._number = number
+        self._bus = bus
+        self._send = send
+        self._sent: tuple[object, ...] = ()
+        self._units: Mapping[int, Unit] | None = None
+        self._presets: Mapping[int, int] = {}
+        self._changes = 0
+
+    def reset(self) -> None:
+        """Send all slaves next: the receiver is another one."""
+        self._sent, self._units = (), None
+
+    def flush(self) -> None:
+        """Send what has changed, if anything has."""
+        bus, master = self._bus, self._bus.master
+        revision = bus.revision
+        if revision == self._sent:
+            return
+        bus.faults.take_events(master)  # a change that they bring is counted already
+        units = master.units
+        if units is self._units:
+            presets = self._presets
+            changed = [unit for unit in units.values() if unit.revision > self._changes]
+        else:
+            presets = link_presets(units.values())
+            changed = list(units.values())
+        slaves = [describe_slave(bus, unit, presets) for unit in changed]
+        if not units:
+            slaves = expected_slaves(bus)
+        message = BusChange(
+            bus=self._number,
+            is_up=bus.is_up,
+            fault=bus.fault,
+            stations=tuple(units) or tuple(slave.station for slave in slaves),
+            slaves=tuple(slaves),
+        )
+        if self._send(message):
+            self._sent, self._units = revision, units
+            self._presets, self._changes = presets, master.changes

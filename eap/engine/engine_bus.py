@@ -1,0 +1,352 @@
+"""One bus port in the engine: a master, its wire, and the station's variables.
+
+Nothing that a bus does may stop the cycles of the stations: a failure is kept as a text for the
+report of the bus, and tried again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from devicebus.errors import BusError, FrameLostError
+from devicebus.master.bus import MasterSettings
+from devicebus.master.event import (
+    BusBack,
+    BusLost,
+    Event,
+    SlaveBack,
+    SlaveFailed,
+    SlaveLeft,
+    SlaveLost,
+)
+from devicebus.master.findings import NO_ANSWER
+from devicebus.master.mailboxes import Unsolicited
+from devicebus.master.master import Master
+from devicebus.master.task import Task
+from devicebus.wire.alstatus import AlState, name_of, state_name
+from eap.engine.bus_mapping import BusMapping
+from eap.errors import EnvironmentalError
+from eap.net.busport import BusPort
+from eap.pd.image import Image
+from eap.pd.spec import BusPortSpec, PortSpec, Writer
+
+WHOLE_BUS = 0
+"""In place of a station address: no frame comes back."""
+RETRY_NS = 2_000_000_000
+"""Between two attempts to bring a bus up."""
+SILENT_RETRY_NS = 100_000_000
+"""The same while nothing comes back at all: no slave is disturbed then."""
+BATCH = 16
+"""Frames taken in one go; the rest waits until the cycles have had their turn."""
+_LONG_CYCLE_NS = 20_000_000
+_MOST_STALE = 4096
+
+
+class FaultCounts(NamedTuple):
+    """Faults of a slave since the engine started."""
+
+    losses: int = 0
+    """Times that it stopped answering."""
+    departures: int = 0
+    """Times that it left its state by itself."""
+    al_code: int = 0
+    """AL status code when it last did."""
+
+
+class SlaveFault(NamedTuple):
+    """Reason why a slave is, or was, not in its target state; *until_ns* is None if it is."""
+
+    text: str = ""
+    since_ns: int = 0
+    until_ns: int | None = None
+
+
+class SlaveFaults:
+    """Faults by station address: those that last, the last one that is over, and their numbers.
+
+    Attributes:
+        on_unsolicited: Called with each message that a slave sent unasked.
+    """
+
+    def __init__(self) -> None:
+        self.on_unsolicited: list[Callable[[Unsolicited], None]] = []
+        self._faults: dict[int, SlaveFault] = {}
+        self._counts: dict[int, FaultCounts] = {}
+
+    def of(self, station: int) -> str:
+        """Return the reason why a slave is not in its target state, empty if it is."""
+        trouble = self.last(station)
+        return trouble.text if trouble.until_ns is None else ""
+
+    def last(self, station: int) -> SlaveFault:
+        """Return the last fault of a slave, which may be over."""
+        return self._faults.get(station, SlaveFault())
+
+    def counts(self, station: int) -> FaultCounts:
+        """Return the numbers of faults of a slave."""
+        return self._counts.get(station, FaultCounts())
+
+    def forget_past(self) -> None:
+        """Forget the faults that are over; their numbers stay."""
+        self._faults = {at: each for at, each in self._faults.items() if each.until_ns is None}
+
+    def end_all(self, now_ns: int) -> None:
+        """End the faults that last: a master that is replaced reports no end of them."""
+        for station, each in self._faults.items():
+            if each.until_ns is None:
+                self._end(station, now_ns)
+
+    def take_events(self, master: Master) -> None:
+        """Take the events of the master."""
+        while (event := master.next_event()) is not None:
+            self._remember(event)
+            if isinstance(event, BusLost):
+                self._begin(WHOLE_BUS, "no frame comes back", event.at_ns)
+            elif isinstance(event, BusBack):
+                self._end(WHOLE_BUS, event.at_ns)
+            elif isinstance(event, SlaveLost):
+                self._begin(event.station, NO_ANSWER, event.at_ns)
+            elif isinstance(event, SlaveFailed):
+                self._begin(event.station, event.reason, event.at_ns)
+            elif isinstance(event, SlaveLeft):
+                code = f": AL status code 0x{event.code:04X}, {name_of(event.code)}"
+                text = (
+                    f"it went to {state_name(event.status)} by itself{code if event.code else ''}"
+                )
+                self._begin(event.station, text, event.at_ns)
+            elif isinstance(event, SlaveBack):
+                self._end(event.station, event.at_ns)
+            elif isinstance(event, Unsolicited):
+                for call in self.on_unsolicited:
+                    call(event)
+
+    def _begin(self, station: int, text: str, at_ns: int) -> None:
+        """Note a fault; one that follows another began with it."""
+        before = self.last(station)
+        lasts = bool(before.text) and before.until_ns is None
+        self._faults[station] = SlaveFault(text, before.since_ns if lasts else at_ns)
+
+    def _end(self, station: int, at_ns: int) -> None:
+        trouble = self._faults.get(station)
+        if trouble is not None:
+            self._faults[station] = trouble._replace(until_ns=at_ns)
+
+    def _remember(self, event: Event) -> None:
+        if isinstance(event, SlaveLost):
+            past = self.counts(event.station)
+            self._counts[event.station] = past._replace(losses=past.losses + 1)
+        elif isinstance(event, SlaveLeft):
+            past = self.counts(event.station)
+            self._counts[event.station] = past._replace(
+                departures=past.departures + 1, al_code=event.code or past.al_code
+            )
+
+
+class EngineBus:
+    """Runs one bus; fits :class:`eap.pd.link.CyclicBus`.
+
+    Args:
+        spec: The port.
+        settings: Of its master.
+        cycle_ns: Between two exchanges.
+        image: Of the station.
+        memory_of: Returns where a station reads what a writer writes.
+        port: The wire.
+
+    Attributes:
+        is_up: Whether the bus has been brought up, wherever its slaves are now.
+        tasks: Requests that are under way.
+    """
+
+    def __init__(
+        self,
+        spec: PortSpec,
+        settings: MasterSettings,
+        cycle_ns: int,
+        image: Image,
+        memory_of: Callable[[Writer], memoryview],
+        port: BusPort,
+    ) -> None:
+        self.spec = spec.bus or BusPortSpec()
+        self.master = Master(settings)
+        self.faults = SlaveFaults()
+        self.is_up = False
+        self.tasks: set[Task[Any]] = set()
+        self._settings = settings
+        self._is_slow = cycle_ns > _LONG_CYCLE_NS
+        self._mapping = BusMapping(spec, image, memory_of)
+        self._port = port
+        self._starting: Task[None] | None = None
+        self._start_fault = "it is being brought up"
+        self._wire_fault = ""
+        self._retry_ns: int | None = None
+        self._due_ns: int | None = None
+
+    @property
+    def fault(self) -> str:
+        """Faults of the bus as a whole, one line each; empty if there is none."""
+        faults = (self._wire_fault, self._start_fault, *self._mapping.missing)
+        return "\n".join(filter(None, faults))
+
+    @property
+    def revision(self) -> tuple[object, ...]:
+        """Value that changes with anything that a description of the bus shows."""
+        return self.master, self.master.changes, self.is_up, self.fault
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when a frame waits."""
+        return self._port.fileno()
+
+    def close(self) -> None:
+        """Let go of the wire."""
+        self._port.close()
+
+    def start(self, now_ns: int) -> None:
+        """Begin to bring the bus up."""
+        for _ in range(_MOST_STALE):
+            if self._take_frame() is None:
+                break  # the rest was for an engine that has died
+        self._guarded(self._start, now_ns)
+
+    def shut_down(self, now_ns: int) -> Task[None]:
+        """Begin to bring all slaves to INIT."""
+        self._starting = self._retry_ns = None
+        task = self.master.shut_down(now_ns)
+        self.keep(task, now_ns)
+        return task
+
+    def keep(self, task: Task[Any], now_ns: int) -> None:
+        """Send what *task* wants, and hurry until it is done."""
+        if not task.is_done:
+            self.tasks.add(task)
+            task.watch(self.tasks.discard)
+        self._guarded(self._send, now_ns)
+
+    def forget_past(self) -> None:
+        """Forget faults that are over, and when errors of ports were counted."""
+        self.faults.forget_past()
+        self.master.port_errors.clear()
+
+    def prepare_mapping(
+        self, port: PortSpec, image: Image, memory_of: Callable[[Writer], memoryview]
+    ) -> BusMapping:
+        """Return the mapping to another *image* of its station, for :meth:`swap_mapping`."""
+        mapping = BusMapping(port, image, memory_of)
+        mapping.lay_out(self.master.image)
+        return mapping
+
+    def swap_mapping(self, mapping: BusMapping) -> None:
+        """Use another image from now on; it holds what the one before held."""
+        self._mapping = mapping
+
+    def take_inputs(self) -> None:
+        """Copy what the last exchange brought into the image, and where the slaves are."""
+        self._mapping.take_inputs(self.master)
+
+    def exchange(self, now_ns: int) -> None:
+        """Copy the outputs out of the image and send them; do what is due."""
+        self._guarded(self._exchange, now_ns)
+
+    def next_timeout(self) -> int | None:
+        """Return the time for :meth:`handle_timeout`; None if the next cycle is soon enough."""
+        return self._due_ns
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Time passed."""
+        self._guarded(self._handle_timeout, now_ns)
+
+    def receive(self, now_ns: int) -> None:
+        """Take frames that came back, at most a batch, if any are under way."""
+        if self.master.is_waiting:
+            self._guarded(self._receive, now_ns)
+
+    def drain(self, now_ns: int) -> None:
+        """Take frames that are there, at most a batch, also unexpected ones."""
+        self._guarded(self._receive, now_ns)
+
+    def _guarded(self, action: Callable[[int], None], now_ns: int) -> None:
+        try:
+            action(now_ns)
+            if self._starting is not None and self._starting.is_done:
+                self._end_start(self._starting, now_ns)
+        except Exception as exc:  # noqa: BLE001  a bus must not stop the stations
+            self._begin_anew(exc, now_ns)
+        self._due_ns = self.master.next_timeout() if self._is_busy() else None
+
+    def _start(self, now_ns: int) -> None:
+        self._retry_ns = None
+        self._starting = self.master.bring_up(now_ns, AlState[self.spec.target])
+        self._send(now_ns)
+
+    def _end_start(self, task: Task[None], now_ns: int) -> None:
+        """The bus is up, maybe without some slaves that are seen to; or it is not."""
+        self._starting = None
+        self.is_up = task.error is None or self.master.cycle is not None
+        self._start_fault = "" if self.is_up else str(task.error)
+        if not self.is_up:
+            is_silent = isinstance(task.error, FrameLostError)
+            self._retry_ns = now_ns + (SILENT_RETRY_NS if is_silent else RETRY_NS)
+
+    def _begin_anew(self, exc: Exception, now_ns: int) -> None:
+        """The master cannot go on: replace it."""
+        self.faults.take_events(self.master)
+        self.faults.end_all(now_ns)
+        self.master = Master(self._settings)
+        self._mapping.lay_out(None)
+        self._starting = None
+        self.is_up = False
+        self._start_fault = f"the master has failed: {type(exc).__name__}: {exc}"
+        self._retry_ns = now_ns + RETRY_NS
+        for task in list(self.tasks):
+            task.fail(BusError(f"{task.name}: {self._start_fault}"))
+
+    def _exchange(self, now_ns: int) -> None:
+        self.master.handle_timeout(now_ns)
+        if self._retry_ns is not None and now_ns >= self._retry_ns:
+            self._start(now_ns)
+        if self.master.image is not self._mapping.bus_image:
+            self._mapping.lay_out(self.master.image)
+            self._mapping.keep_inputs()
+        self._mapping.put_outputs()
+        self.master.start_cycle(now_ns)
+        self._send(now_ns)
+        self.faults.take_events(self.master)
+
+    def _handle_timeout(self, now_ns: int) -> None:
+        self._take_frames(now_ns)
+        self.master.handle_timeout(now_ns)
+        self._send(now_ns)
+
+    def _receive(self, now_ns: int) -> None:
+        self._take_frames(now_ns)
+        self._send(now_ns)
+
+    def _take_frames(self, now_ns: int) -> None:
+        """Take a batch of what is there: a frame that waits to be taken is not overdue."""
+        for _ in range(BATCH):
+            frame = self._take_frame()
+            if frame is None:
+                break
+            self.master.receive_frame(frame, now_ns)
+
+    def _take_frame(self) -> bytes | None:
+        try:
+            return self._port.receive()
+        except EnvironmentalError as exc:
+            self._wire_fault = str(exc)
+            return None
+
+    def _send(self, now_ns: int) -> None:
+        for frame in self.master.frames_to_send(now_ns):
+            try:
+                self._port.send(frame)
+                self._wire_fault = ""
+            except EnvironmentalError as exc:
+                self._wire_fault = str(exc)
+
+    def _is_busy(self) -> bool:
+        """Return whether something is under way that should not wait for the next cycle."""
+        if self._is_slow or self._starting is not None or self.tasks:
+            return True
+        return any(unit.is_busy for unit in self.master.units.values())

@@ -1,0 +1,214 @@
+"""ADS requests through the routers of running appliances: trace, scan, devices reached by ADS."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from threading import Event
+from typing import TypeVar
+
+from devicebus.wire.alstatus import state_name
+from eap.ads.operation import Operation, OperationOutcome, ReadState, WriteControl
+from eap.ads.query import decode_outcome, encode_query
+from eap.ads.state import BOOT, INIT, OP, PREOP, SAFEOP, states_of
+from eap.codec.ads import AdsError, AdsStates
+from eap.control.device import StateAnswer, StateError
+from eap.control.protocol import ErrorCode
+from eap.control.routes import AMS_ASK, SCAN, TRACE, PlantScan, TracedPath
+from eap.errors import CodecError, ControlError
+from eap.gateway.error_table import cause_of_result
+from eap.ops.client import ControlClient, connect
+
+T = TypeVar("T")
+
+TRACE_S = 60.0
+SCAN_S = 120.0
+"""Time for a scan: each station that does not answer takes its time-out."""
+_ON_THE_WAY = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsError.TIMEOUT))
+"""Errors of routers between here and the device."""
+_NUMBERS = {"INIT": INIT, "PREOP": PREOP, "BOOT": BOOT, "SAFEOP": SAFEOP, "OP": OP}
+STATE_S = 10.0
+_PAUSE_S = 0.1
+
+
+def trace(target: str, plant: str | None = None, via: str | None = None) -> TracedPath:
+    """Return the way to *target*, hop by hop.
+
+    Args:
+        target: ``STATION[/PORT[/SLAVE]]`` or ``NETID[:PORT]``.
+        plant: Of the appliance that asks; None for the first that knows the target.
+        via: Station whose router sends the requests; None for the first of the appliance.
+
+    Raises:
+        ControlError: there is no such target or station, or no appliance answers.
+    """
+
+    def ask(client: ControlClient) -> TracedPath:
+        return client.call(TRACE, within_s=TRACE_S, via=via or "", target=target)
+
+    with first_that_knows(ask, plant, via) as (_, answer):
+        return answer
+
+
+def scan(plant: str | None = None, via: str | None = None) -> list[PlantScan]:
+    """Return one answer for each plant that runs here.
+
+    Raises:
+        ControlError: nothing runs, or it does not answer.
+    """
+    answers: dict[str, PlantScan] = {}
+    with ExitStack() as stack:
+        for client in [stack.enter_context(each) for each in connect(plant, via)]:
+            if client.info.plant not in answers:
+                answers[client.info.plant] = client.call(SCAN, within_s=SCAN_S, via=via or "")
+    return list(answers.values())
+
+
+@contextmanager
+def first_that_knows(
+    ask: Callable[[ControlClient], T], plant: str | None, via: str | None = None
+) -> Iterator[tuple[ControlClient, T]]:
+    """Ask one appliance after the other; give the first that knows the names, and its answer.
+
+    Args:
+        ask: Raises ControlError where a name is not known.
+        plant: Of the appliance; None for any.
+        via: Station that has to run there; None for any.
+
+    Raises:
+        ControlError: nothing runs, the names are not known, or *ask* failed in another way.
+    """
+    unknown: ControlError | None = None
+    with ExitStack() as stack:
+        for client in [stack.enter_context(each) for each in connect(plant, via)]:
+            try:
+                answer = ask(client)
+            except ControlError as exc:
+                if exc.code != ErrorCode.UNKNOWN_NAME:
+                    raise
+                unknown = unknown or exc
+            else:
+                yield client, answer
+                return
+    assert unknown is not None  # noqa: S101  connect() found at least one
+    raise unknown
+
+
+class AmsRefusedError(ControlError):
+    """The device refuses, or cannot be reached; *result* is that of ADS."""
+
+    def __init__(self, message: str, result: int) -> None:
+        super().__init__(message, code=ErrorCode.REFUSED)
+        self.result = result
+
+
+class AmsDevice:
+    """One device; *target* is ``STATION[/PORT[/SLAVE]]`` or ``NETID[:PORT]``."""
+
+    def __init__(self, client: ControlClient, target: str) -> None:
+        self.target = target
+        self._client = client
+
+    def ask(self, operation: Operation) -> OperationOutcome:
+        """Return how one operation came out; raise ControlError if there is no such target."""
+        command, body = encode_query(operation)
+        answer = self._client.call(
+            AMS_ASK, target=self.target, command=command, data=body.hex(), device=True
+        )
+        return decode_outcome(command, answer.error, bytes.fromhex(answer.data))
+
+    def demand(self, operation: Operation, what: str) -> bytes:
+        """Return the data of an answer.
+
+        Args:
+            operation: The request.
+            what: That, in words.
+
+        Raises:
+            AmsRefusedError: the device refuses, or cannot be reached.
+        """
+        outcome = self.ask(operation)
+        if outcome.result:
+            raise self.refusal(outcome.result, what)
+        return outcome.data
+
+    def refusal(self, result: int, what: str) -> AmsRefusedError:
+        """Return the exception for a result of ADS."""
+        if result in _ON_THE_WAY and (why := self._find_fault()):
+            return AmsRefusedError(f"{self.target}: {what}: {why}", result)
+        cause = cause_of_result(result)
+        if cause.is_from_slave and cause.ads == result:
+            text = f"{cause.text} (error 0x{result:x})"
+        else:
+            text = f"{AdsError.words_of(result)}; 'eapctl trace {self.target}' shows where"
+        return AmsRefusedError(f"{self.target}: {what}: {text}", result)
+
+    def _find_fault(self) -> str:
+        """Return at which router the way to the device ends, and why; empty if that is unknown."""
+        try:
+            return self._client.call(TRACE, target=self.target).why
+        except ControlError:
+            return ""
+
+
+@contextmanager
+def open_ams(target: str, plant: str | None) -> Iterator[AmsDevice]:
+    """Reach *target* through the first appliance that knows it.
+
+    Raises:
+        ControlError: nothing runs, or the target is not known.
+    """
+    with first_that_knows(lambda each: AmsDevice(each, target).ask(ReadState()), plant) as found:
+        client, _ = found
+        yield AmsDevice(client, target)
+
+
+def read_state(device: AmsDevice) -> StateAnswer:
+    """Return the state of a device; raises as AmsDevice.demand."""
+    return StateAnswer(_now(device), None)
+
+
+def request_state(
+    device: AmsDevice,
+    wanted: str,
+    *,
+    clock: Callable[[], float] = time.monotonic,
+    pause: Callable[[float], object] | None = None,
+) -> StateAnswer:
+    """Bring a device to another state, and wait for it.
+
+    Args:
+        device: Which.
+        wanted: ``INIT``, ``PREOP``, ``BOOT``, ``SAFEOP`` or ``OP``.
+        clock: In seconds.
+        pause: Lets seconds pass; None really does.
+
+    Raises:
+        AmsRefusedError: the device cannot be reached.
+    """
+    number = _NUMBERS[wanted]
+    pause = pause or Event().wait
+    outcome = device.ask(WriteControl(states_of(number).ads_state, number, b""))
+    if outcome.result == AdsError.ACCESS_DENIED:
+        raise device.refusal(outcome.result, wanted)
+    now = _now(device)
+    deadline = clock() + (0 if outcome.result else STATE_S)
+    while now != wanted and clock() < deadline:
+        pause(_PAUSE_S)
+        now = _now(device)
+    if now == wanted:
+        return StateAnswer(now, None)
+    if outcome.result:
+        error = StateError(outcome.result, AdsError.words_of(outcome.result))
+    else:
+        error = StateError(0, f"not there within {STATE_S:g} s")
+    return StateAnswer(now, error)
+
+
+def _now(device: AmsDevice) -> str:
+    data = device.demand(ReadState(), "state")
+    try:
+        return state_name(AdsStates.decode(data).device_state)
+    except CodecError as exc:
+        raise ControlError(f"{device.target}: state: {exc}") from None

@@ -1,0 +1,243 @@
+"""A bus behind a mailbox gateway, ours or anybody's, as a command uses it (ETG.8200).
+
+A gateway passes mailbox messages, and no registers.  Slaves are known by the master's dictionary.
+Not every gateway has one (KickCAT's is silent at address 0), so that it is read only for names, for
+the sizes of mailboxes that files need, and for hints about what was refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import NoReturn, TypeVar
+
+from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError, SoeError
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.procedure import Procedure
+from devicebus.wire.alstatus import AlState, state_name
+from devicebus.wire.register import AlStatus
+from eap.codec.mailbox import MailboxError
+from eap.codec.soeerror import SoeErrorCode
+from eap.errors import ConfigError, EapError
+from eap.gateway.address import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
+from eap.gateway.client import GatewayClient
+from eap.gateway.slaves import NOT_TOLD, MasterSlave
+from eap.od.abort import AbortCode, SdoAbortError
+from eap.ops.bus_slave import Begin, Slave, choose, no_mailbox
+from eap.runtime.bus_status import FrameCounts
+
+T = TypeVar("T")
+
+_MASTER_SIZE = 1480
+_HINT_S = 0.3
+"""How long the master may take for each answer that only explains an error."""
+
+
+class GatewayBus:
+    """A bus behind a gateway; fits :class:`eap.ops.bus_slave.SlaveBus`.
+
+    Slave 0 is the master itself, with its dictionary.
+
+    Args:
+        client: Of the gateway.
+        mailbox: Octets of the slave's mailboxes, in place of what the master tells.
+    """
+
+    def __init__(self, client: GatewayClient, mailbox: int | None = None) -> None:
+        self._client = client
+        self._mailbox = None if mailbox is None else MailboxSizes(mailbox, mailbox)
+        self._slaves: list[MasterSlave] | None = None
+        self._reached: set[int] = {MASTER_ADDRESS}
+        """Slaves that have answered; a refusal needs no hint then."""
+
+    def scan(self) -> Sequence[Slave]:
+        """Return the slaves that the master tells of.
+
+        Raises:
+            BusError: it does not answer, or has no dictionary.
+        """
+        try:
+            self._slaves = self._client.slaves()
+        except NOT_TOLD as exc:
+            raise BusError(
+                f"the gateway cannot be asked for its slaves and their names: {exc}; name a slave"
+                " by its station address, such as 1001"
+            ) from exc
+        return [_slave(each) for each in self._slaves]
+
+    def find(self, name: str) -> Slave:
+        """Return the slave with a station address or a name, the master for 0.
+
+        The master is asked for names only: addresses are for the gateway to know, which may have
+        virtual ones and no dictionary.
+        """
+        if name in {"0", "master"}:
+            return _slave(_unknown(MASTER_ADDRESS, "master"))
+        number = _number(name)
+        if number == ALL_SLAVES:
+            raise ConfigError(f"{name} is all slaves, each of which answers for itself: name one")
+        if number < 0:
+            return choose(self.scan(), name)
+        return _slave(_unknown(number, name))
+
+    def require_mailbox(self, slave: Slave) -> None:
+        """Learn how long the mailbox of *slave* is.
+
+        Raises:
+            BusError: the master does not tell.
+        """
+        if slave.station == MASTER_ADDRESS or self._mailbox is not None:
+            return
+        reason = "the master does not tell how long its mailbox is"
+        try:
+            if self._slaves is None:
+                self.scan()
+        except BusError as exc:
+            reason += f" ({exc.__cause__})"
+        if self._told_of(slave) is None:
+            raise BusError(
+                f"slave {slave.name}: {reason}, and in packets of another length a file would be"
+                " cut off; say it (--mailbox OCTETS)"
+            )
+
+    def converse(
+        self,
+        slave: Slave,
+        begin: Begin[T],
+        name: str,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> T:
+        """Talk to a slave's mailbox, or to the master; return the result or raise."""
+        conversation = begin(self._sizes(slave))
+        try:
+            result = self._client.converse(slave.station, conversation, meanwhile)
+        except MailboxTimeoutError:
+            raise
+        except EapError as exc:
+            # Its mailbox is smaller than was assumed, and nothing was done: say it in more pieces.
+            if _is_too_long(exc) and self._can_learn_size(slave):
+                return self.converse(slave, begin, name, meanwhile)
+            # A gateway may refuse for a slave that is not there as slaves do for their objects.
+            if slave.station not in self._reached and (hint := self._hint(slave)):
+                exc.add_note(hint)
+            raise
+        self._reached.add(slave.station)
+        return result
+
+    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
+        """Refuse: states are asked for by the master's dictionary, 0xAnnn:02."""
+        del slaves
+        _refuse(f"state {target.name}")
+
+    def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
+        """Refuse: a gateway passes mailbox messages, and no datagrams."""
+        procedure.close()
+        _refuse(name)
+
+    def known(self) -> Sequence[Slave]:
+        """Return the slaves that the gateway tells of."""
+        return self.scan()
+
+    def history(self) -> None:
+        """Return nothing: a gateway tells no times."""
+        return
+
+    def forget(self) -> None:
+        """Do nothing: a gateway has no such service."""
+
+    def frame_counts(self) -> FrameCounts:
+        """Refuse likewise."""
+        _refuse("counters of frames")
+
+    def _sizes(self, slave: Slave) -> MailboxSizes:
+        if slave.station == MASTER_ADDRESS:
+            return MailboxSizes(_MASTER_SIZE, _MASTER_SIZE)
+        if self._mailbox is not None:
+            return self._mailbox
+        told = self._told_of(slave)
+        if told is None:
+            return MailboxSizes()
+        if not told.to_slave:
+            raise no_mailbox(_slave(told), state_name(_slave(told).status.state))
+        return MailboxSizes(told.to_slave, told.to_master)
+
+    def _can_learn_size(self, slave: Slave) -> bool:
+        """Ask the master how long the mailbox of *slave* is, if that was only assumed."""
+        if self._mailbox is not None or self._slaves is not None:
+            return False
+        with suppress(BusError), self._client.waiting_once(_HINT_S):
+            self.scan()
+        return self._told_of(slave) is not None
+
+    def _hint(self, slave: Slave) -> str:
+        """Return what the master knows that explains why a slave's mailbox is not reached."""
+        self._reached.add(slave.station)  # once is enough
+        if self._slaves is None:
+            with suppress(BusError), self._client.waiting_once(_HINT_S):
+                self.scan()
+        if self._slaves is None:
+            return ""
+        told = self._told_of(slave)
+        if told is None:
+            known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
+            return f"the master knows no slave {slave.station}; it knows {known or 'none'}"
+        if not told.to_slave:
+            return str(no_mailbox(_slave(told), state_name(_slave(told).status.state)))
+        return ""
+
+    def _told_of(self, slave: Slave) -> MasterSlave | None:
+        """Return what the master tells of a slave, None if it has not told anything."""
+        station = slave.station & ~VIRTUAL_BIT
+        return next((each for each in self._slaves or () if each.station == station), None)
+
+
+def _unknown(station: int, name: str) -> MasterSlave:
+    return MasterSlave(station, name, 0, 0, 0, 0, 0, 0, 0)
+
+
+def _is_too_long(error: EapError) -> bool:
+    return (
+        (isinstance(error, SdoAbortError) and error.code == AbortCode.LONGER_THAN_MAILBOX)
+        or (isinstance(error, MailboxRefusedError) and error.detail == MailboxError.INVALID_SIZE)
+        or (isinstance(error, SoeError) and error.code == SoeErrorCode.VALUE_TOO_LONG)
+    )
+
+
+def _number(text: str) -> int:
+    try:
+        return int(text, 0)
+    except ValueError:
+        return -1
+
+
+def _slave(slave: MasterSlave) -> Slave:
+    return Slave(
+        station=slave.station,
+        name=slave.name,
+        vendor=slave.vendor,
+        product=slave.product,
+        revision=slave.revision,
+        serial=slave.serial,
+        alias=0,
+        status=AlStatus.decode(slave.al_status.to_bytes(AlStatus.SIZE, "little")),
+        protocols=slave.protocols if slave.to_slave else 0,
+        parent=None,
+        ports=(),
+    )
+
+
+def _refuse(what: str) -> NoReturn:
+    raise BusError(f"{what}: a mailbox gateway passes mailbox messages only")
+
+
+@contextmanager
+def open_gateway(
+    host: str, port: int, *, tcp: bool, mailbox: int | None = None
+) -> Iterator[GatewayBus]:
+    """Talk to a gateway for the length of a block; *mailbox* as GatewayBus has it.
+
+    Raises:
+        EnvironmentalError: it has no address, or takes no connection.
+    """
+    with GatewayClient(host, port, tcp=tcp) as client:
+        yield GatewayBus(client, mailbox)

@@ -1,0 +1,246 @@
+"""Bus of a running station, as commands use it over the control socket.
+
+Conversations and procedures run here, their single steps at the running master.  Whatever a command
+has begun there ends with its connection.
+"""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from time import monotonic, monotonic_ns
+from typing import Any, TypeVar
+
+import msgspec
+
+from devicebus.drive import drive
+from devicebus.errors import FrameLostError
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.access import DatagramReply, fprd
+from devicebus.master.findings import History
+from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
+from devicebus.master.topology import find_joints
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.register import AlStatus, DlStatus, Register
+from eap.control import bus as words
+from eap.control.protocol import AnswerT, Method, ParametersT
+from eap.errors import ControlError
+from eap.ops.bus_slave import Begin, Slave, choose
+from eap.ops.client import ControlClient, connect_station
+from eap.runtime.bus_request import BusReport, SlaveReport, no_mailbox
+from eap.runtime.bus_status import (
+    FrameCounts,
+    count_frames,
+    history_of,
+    is_silent,
+    report_findings,
+)
+
+T = TypeVar("T")
+
+LOOK_S = 0.1
+"""Interval of calls of *meanwhile*."""
+
+_MARGIN_S = 10.0
+"""For services on its way back from a restart, beyond what it waits for itself."""
+_S = 1_000_000_000
+_PER_STEP = 60
+
+
+class RunningBus:
+    """One bus port of a running station; fits :class:`eap.ops.bus_slave.SlaveBus`.
+
+    Args:
+        client: Connected to the appliance, for this bus alone.
+        station: Name of the station.
+        port: Name of its bus port.
+    """
+
+    def __init__(self, client: ControlClient, station: str, port: str) -> None:
+        self._client = client
+        self._where = {"station": station, "port": port}
+        self._report = BusReport(is_up=False)
+        self._reports: dict[int, SlaveReport] = {}
+
+    def scan(self) -> Sequence[Slave]:
+        """Return the slaves that the running master knows, and where they are now."""
+        slaves = self.known()
+        if is_silent(self._report):
+            finding, *_ = report_findings(self._report)
+            raise FrameLostError(f"{finding.what}; {finding.advice}")
+        registers = self.run(_look([slave.station for slave in slaves]))
+        joints = find_joints([dl_status for _, dl_status in registers])
+        return [
+            msgspec.structs.replace(slave, status=al_status, parent=joint.parent, ports=joint.ports)
+            for slave, (al_status, _), joint in zip(slaves, registers, joints, strict=True)
+        ]
+
+    def known(self) -> Sequence[Slave]:
+        """Return the slaves as the running master has them, without asking them."""
+        self._report = self._describe()
+        reports = self._report.slaves
+        self._reports = {report.station: report for report in reports}
+        return [
+            Slave(
+                station=report.station,
+                name=report.name,
+                vendor=report.vendor,
+                product=report.product,
+                revision=report.revision,
+                serial=report.serial,
+                alias=report.alias,
+                status=AlStatus(report.state),
+                protocols=report.protocols,
+                parent=None,
+                ports=(),
+                fault=report.fault,
+                target=report.target,
+                since_ns=report.since_ns if report.fault else None,
+            )
+            for report in reports
+        ]
+
+    def history(self) -> History:
+        """Return when the running master has seen faults, as of the last call of :meth:`known`."""
+        return history_of(self._report)
+
+    def forget(self) -> None:
+        """Have the running master forget faults that are over."""
+        self._call(words.BUS_FORGET, words.PATIENCE_S)
+
+    def find(self, name: str) -> Slave:
+        """Return the slave with a station address or a name; raise BusError if that is not one."""
+        return choose(self.scan(), name)
+
+    def require_mailbox(self, slave: Slave) -> None:
+        """Do nothing: this master knows the mailboxes of its slaves."""
+
+    def converse(
+        self,
+        slave: Slave,
+        begin: Begin[T],
+        name: str,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> T:
+        """Talk to a slave's mailbox until the conversation ends; return its result.
+
+        Raises:
+            BusError: the slave has no mailbox, or does not answer.
+            SdoAbortError, SoeError, FoeError: it refuses.
+            ControlError: the appliance has gone, or others use the mailbox all the while.
+        """
+        del name  # the master has its own
+        report = self._reports[slave.station]
+        if not report.to_slave:
+            raise no_mailbox(report)
+        conversation = begin(MailboxSizes(report.to_slave, report.to_master))
+        return self._drive(slave, conversation, meanwhile)
+
+    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
+        """Bring slaves to a state, where the master keeps them then.
+
+        Raises:
+            AlStatusError, StateTimeoutError: one refuses, or takes too long.
+            BusError: several do.
+        """
+        everyone = {slave.station for slave in slaves} == set(self._reports)
+        for station in [0] if everyone else [slave.station for slave in slaves]:
+            self._call(words.BUS_BRING, words.BRING_S, slave=station, state=target.name)
+
+    def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
+        """Run a procedure to its end and return its result, or raise what went wrong."""
+        del name
+        return drive(procedure, self._step)
+
+    def frame_counts(self) -> FrameCounts:
+        """Return the frames of the master since the engine started."""
+        return count_frames(self._describe())
+
+    def _describe(self) -> BusReport:
+        return self._call(words.BUS_DESCRIBE, words.PATIENCE_S, wait=True)
+
+    def _step(self, step: Step) -> StepReplies:
+        if isinstance(step, Sleep):
+            select.select([], [], [], max(0, step.duration_ns) / _S)
+            return StepReplies((), monotonic_ns())
+        rows = [words.datagram_row(each) for each in step]
+        answer = self._call(words.BUS_TRANSFER, words.TRANSFER_S, datagrams=rows)
+        return StepReplies(words.to_replies(answer.replies), monotonic_ns())
+
+    def _drive(
+        self, slave: Slave, conversation: Conversation[T], meanwhile: Callable[[], None] | None
+    ) -> T:
+        look_s = 0.0
+        number: int | None = None
+
+        def exchange(request: MailboxRequest) -> MailboxMessage:
+            nonlocal look_s, number
+            if number is None:
+                number = self._open(slave, request)
+            elif meanwhile is not None and monotonic() >= look_s:
+                meanwhile()
+                look_s = monotonic() + LOOK_S
+            return MailboxMessage(request.type, self._ask(number, request), monotonic_ns())
+
+        try:
+            return drive(conversation, exchange)
+        except KeyboardInterrupt:
+            number = None  # an answer may be under way: the end of the connection ends it all
+            raise
+        finally:
+            if number is not None:
+                with suppress(ControlError):
+                    self._client.call(words.BUS_CLOSE, conversation=number)
+
+    def _open(self, slave: Slave, request: MailboxRequest) -> int:
+        protocol = words.protocol_of(request.type)
+        opened = self._call(words.BUS_OPEN, words.TURN_S, slave=slave.station, protocol=protocol)
+        return opened.conversation
+
+    def _ask(self, number: int, request: MailboxRequest) -> bytes:
+        limit_s = (request.timeout_ns + request.delay_ns) / _S + words.MARGIN_S + _MARGIN_S
+        answer = self._client.call(
+            words.BUS_ASK,
+            within_s=limit_s,
+            conversation=number,
+            **words.request_parameters(request),
+        )
+        return bytes.fromhex(answer.data)
+
+    def _call(self, method: Method[ParametersT, AnswerT], limit_s: float, **params: Any) -> AnswerT:
+        return self._client.call(method, within_s=limit_s + _MARGIN_S, **self._where, **params)
+
+
+@contextmanager
+def open_running(station: str, port: str, plant: str | None = None) -> Iterator[RunningBus]:
+    """Connect to the appliance that runs a station, for the length of a block.
+
+    Raises:
+        ControlError: none runs it, or several do and *plant* does not choose among them.
+    """
+    with connect_station(station, plant) as client:
+        yield RunningBus(client, station, port)
+
+
+def _look(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:
+    """Read where slaves stand and what is wired to them; zeros for one that does not answer."""
+    replies: list[DatagramReply] = []
+    for start in range(0, len(stations), _PER_STEP):
+        answers, _ = yield [
+            access
+            for station in stations[start : start + _PER_STEP]
+            for access in (
+                fprd(station, Register.AL_STATUS, AlStatus.SIZE),
+                fprd(station, Register.DL_STATUS, DlStatus.SIZE),
+            )
+        ]
+        replies += answers
+    return [
+        (
+            AlStatus.decode(al.data) if al.wkc else AlStatus(0),
+            DlStatus.decode(dl.data) if dl.wkc else DlStatus(),
+        )
+        for al, dl in zip(replies[::2], replies[1::2], strict=True)
+    ]

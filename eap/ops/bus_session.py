@@ -1,0 +1,232 @@
+"""A master on a bus for as long as one command takes: procedures run to their end, one by one.
+
+    with open_bus(InterfaceUri.parse("udp://127.0.1.1")) as bus:
+        for unit in bus.scan(): ...
+        bus.converse(unit, lambda sizes: coe_client.upload(0x1018, 1))
+
+Slaves stay as they are found: a mailbox that works is used as it is set up.  Only a slave in INIT,
+which has none, is brought to PREOP to be talked to.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TypeVar
+
+from devicebus.master.attach import attach
+from devicebus.master.bring import bring, read_process_data
+from devicebus.master.bus import Bus, MasterSettings, Unit
+from devicebus.master.findings import join_errors
+from devicebus.master.procedure import Procedure, together
+from devicebus.master.scan import FoundSlave, scan
+from devicebus.master.startup import set_up_cycle
+from devicebus.master.task import Task
+from devicebus.wire.alstatus import AlState
+from eap.errors import EapError
+from eap.ids import InterfaceUri
+from eap.net.busport import BusPort, open_bus_port
+from eap.ops.bus_slave import Begin, Slave, choose
+from eap.runtime.bus_status import FrameCounts, count_frames
+
+T = TypeVar("T")
+
+CYCLE_NS = 2_000_000
+SPIN_NS = 200_000
+"""How long the answer to a frame is looked for before sleeping."""
+LOOK_NS = 100_000_000
+"""How often *meanwhile* is called while something runs."""
+
+_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
+_WITH_MAILBOX = _WITH_PROCESS_DATA | {AlState.PREOP}
+
+
+class BusSession:
+    """One master on one bus.
+
+    Args:
+        port: Where the bus is.
+        clock: The time in nanoseconds.
+    """
+
+    def __init__(self, port: BusPort, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._port = port
+        self._clock = clock
+        self._bus = Bus(MasterSettings())
+        self._cycle_ns = 0
+        self._slaves: Sequence[Slave] = ()
+
+    def scan(self) -> Sequence[Slave]:
+        """Find all slaves and give them their station addresses; raises as the scan does."""
+        found = self.run(scan(), "scanning the bus")
+        self._bus.units = {each.station: Unit(each, each.name) for each in found}
+        for unit in self._bus.units.values():
+            status = unit.found.al_status
+            unit.state = AlState(status.state) if status.state in set(AlState) else AlState.INIT
+        self._slaves = [_slave(each) for each in found]
+        return self._slaves
+
+    def find(self, name: str) -> Slave:
+        """Return the slave with a station address or a name, after a scan if there was none.
+
+        Raises:
+            BusError: there is none, or several have that name.
+        """
+        return choose(self._slaves or self.scan(), name)
+
+    def require_mailbox(self, slave: Slave) -> None:
+        """Do nothing: this master knows the mailboxes of its slaves."""
+
+    def converse(
+        self,
+        slave: Slave,
+        begin: Begin[T],
+        name: str,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> T:
+        """Talk to a slave's mailbox until the conversation ends; return its result.
+
+        Raises:
+            BusError: the slave has no mailbox, or does not answer.
+            SdoAbortError, SoeError, FoeError: it refuses.
+        """
+        unit = self._bus.units[slave.station]
+        mailbox = unit.mailbox or self.run(attach(self._bus, unit), f"slave {unit.station}")
+        task = mailbox.converse(begin(mailbox.sizes), self._clock(), name=name)
+        return self._finish(task, meanwhile)
+
+    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
+        """Bring slaves to a state together; cycles run until they are there.
+
+        Process data of those that are to get some is laid out anew, so that they begin in PREOP.
+
+        Raises:
+            AlStatusError, StateTimeoutError: one refuses, or takes too long.
+            BusError: several do; the message has a line for each.
+        """
+        units = [self._bus.units[slave.station] for slave in slaves]
+        if target in _WITH_PROCESS_DATA:
+            for unit in units:
+                if unit.state in _WITH_MAILBOX and unit.found.sii.fixed.protocols:
+                    self.run(attach(self._bus, unit))
+            self._bring_all(units, AlState.PREOP)
+            self._run_all(units, [read_process_data(self._bus, unit) for unit in units])
+            set_up_cycle(self._bus)
+        try:
+            self._bring_all(units, target)
+        finally:
+            self._bus.cycle = None
+            self._bus.link.stop_cycles()
+
+    def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
+        """Run a procedure to its end and return its result, or raise what went wrong."""
+        return self._finish(self._bus.runner.start(procedure, self._clock(), name))
+
+    def frame_counts(self) -> FrameCounts:
+        """Return the counters of the frames of this session."""
+        return count_frames(self._bus.link.stats())
+
+    def known(self) -> Sequence[Slave]:
+        """Return the slaves that a scan has found, which is made if there was none."""
+        return self._slaves or self.scan()
+
+    def history(self) -> None:
+        """Return nothing: this master has not been there before."""
+        return
+
+    def forget(self) -> None:
+        """Do nothing: this master remembers nothing."""
+
+    def _bring_all(self, units: Sequence[Unit], target: AlState) -> None:
+        self._run_all(units, [bring(self._bus, unit, target) for unit in units])
+
+    def _run_all(self, units: Sequence[Unit], procedures: Sequence[Procedure[None]]) -> None:
+        results = self.run(together(procedures))
+        errors = [
+            (f"{unit.name} ({unit.station})", result)
+            for unit, result in zip(units, results, strict=True)
+            if isinstance(result, EapError)
+        ]
+        if errors:
+            raise join_errors(errors)
+
+    def _finish(self, task: Task[T], meanwhile: Callable[[], None] | None = None) -> T:
+        look_ns = 0
+        try:
+            while not task.is_done:
+                now_ns = self._step()
+                if meanwhile is not None and now_ns >= look_ns:
+                    meanwhile()
+                    look_ns = now_ns + LOOK_NS
+        finally:
+            task.cancel()
+        for frame in self._bus.link.frames_to_send(self._clock()):
+            self._port.send(frame)
+        return task.result()
+
+    def _step(self) -> int:
+        """Send what is due, wait for what comes next, take it; return the time."""
+        bus, port = self._bus, self._port
+        now_ns = self._clock()
+        if bus.cycle is not None and now_ns >= self._cycle_ns:
+            self._cycle_ns = now_ns + CYCLE_NS
+            bus.cycle.start(now_ns)
+        frames = bus.link.frames_to_send(now_ns)
+        for frame in frames:
+            port.send(frame)
+        times = [bus.link.next_timeout(), bus.runner.next_timeout(), now_ns + LOOK_NS]
+        if bus.cycle is not None:
+            times.append(self._cycle_ns)
+        due_ns = min(at_ns for at_ns in times if at_ns is not None)
+        data = self._spin(now_ns) if frames else None
+        if data is None:
+            select.select([port], [], [], max(0, due_ns - now_ns) / 1e9)
+            data = port.receive()
+        now_ns = self._clock()
+        while data is not None:
+            bus.link.receive_frame(data, now_ns)
+            data = port.receive()
+        bus.link.handle_timeout(now_ns)
+        bus.runner.handle_timeout(now_ns)
+        return now_ns
+
+    def _spin(self, now_ns: int) -> bytes | None:
+        """Return a frame if one comes soon: waking up would take longer than its whole way."""
+        end_ns = now_ns + SPIN_NS
+        while (data := self._port.receive()) is None and self._clock() < end_ns:
+            pass
+        return data
+
+
+def _slave(found: FoundSlave) -> Slave:
+    identity = found.identity
+    return Slave(
+        station=found.station,
+        name=found.name,
+        vendor=identity.vendor,
+        product=identity.product,
+        revision=identity.revision,
+        serial=identity.serial,
+        alias=found.alias,
+        status=found.al_status,
+        protocols=found.sii.fixed.protocols,
+        parent=found.joint.parent,
+        ports=found.joint.ports,
+        fault=found.fault,
+    )
+
+
+@contextmanager
+def open_bus(interface: InterfaceUri) -> Iterator[BusSession]:
+    """Open a bus for the length of a block.
+
+    Raises:
+        EnvironmentalError: *interface* cannot be opened.
+    """
+    port = open_bus_port(interface)
+    try:
+        yield BusSession(port)
+    finally:
+        port.close()

@@ -1,0 +1,282 @@
+"""Blocking client of the control protocol, as commands use it."""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from time import monotonic
+from typing import Any
+
+import msgspec
+
+from eap.closeable import Closing
+from eap.control.protocol import (
+    MAX_LINE,
+    SUBSCRIBE,
+    AnswerT,
+    ControlReply,
+    ErrorCode,
+    Method,
+    ParametersT,
+    ValuesEvent,
+    decode_reply,
+    encode_request,
+)
+from eap.errors import ControlError
+from eap.suggest import suggest
+from eap.runtime.bus_errors import ErrorRecord, to_error
+from eap.runtime.folder import ApplianceFolder, ApplianceInfo, describe_roots, find_running
+
+TIMEOUT_S = 10.0
+"""Time for one answer: services may be on their way back from a restart."""
+_CONNECT_PAUSE_S = 0.02
+_EVENT = partial(msgspec.convert, type=ValuesEvent)
+
+
+class ControlClient(Closing):
+    """One connection to one running appliance."""
+
+    def __init__(
+        self, connection: socket.socket, info: ApplianceInfo, folder: ApplianceFolder | None = None
+    ) -> None:
+        self.info = info
+        self._folder = folder
+        self._socket = connection
+        self._socket.settimeout(TIMEOUT_S)
+        self._reader = connection.makefile("rb")
+        self._last_id = 0
+
+    def call(
+        self,
+        method: Method[ParametersT, AnswerT],
+        /,
+        *,
+        within_s: float = TIMEOUT_S,
+        **params: Any,
+    ) -> AnswerT:
+        """Return the answer to *method*, which may take *within_s*.
+
+        Raises:
+            ControlError: the appliance refused, or does not answer.
+            BusError: a bus or a slave did not do it; as its class says.
+        """
+        return method.decode(self.request_within(within_s, method.name, **params))
+
+    def request(self, method: str, /, **params: Any) -> Any:
+        """Return the result of *method*.
+
+        Raises:
+            ControlError: the appliance refused, or does not answer.
+        """
+        return self.request_within(TIMEOUT_S, method, **params)
+
+    def request_within(self, within_s: float, method: str, /, **params: Any) -> Any:
+        """Return the result of *method*, which may take *within_s*.
+
+        Raises:
+            ControlError: the appliance refused, or does not answer.
+            BusError: a bus or a slave did not do it; as its class says.
+        """
+        self._last_id += 1
+        self._socket.settimeout(within_s)
+        try:
+            self._socket.sendall(encode_request(self._last_id, method, params))
+        except OSError as exc:
+            raise self._gone(exc) from None
+        while True:
+            reply = self._next_reply()
+            if reply.subscription is None:
+                return _checked(reply).result
+
+    def events(self, **params: Any) -> Iterator[ValuesEvent]:
+        """Subscribe with *params* and yield each event until the appliance goes.
+
+        The connection takes no other requests meanwhile.
+
+        Raises:
+            ControlError: the appliance refused, went away, or cannot read the values now.
+        """
+        self.call(SUBSCRIBE, **params)
+        self._socket.settimeout(None)
+        while True:
+            event = _checked(self._next_reply()).event
+            if event is None:
+                continue
+            if failure := event.get("error"):
+                raise ControlError(failure["message"], code=failure["code"])
+            yield _EVENT(event)
+
+    def close(self) -> None:
+        """Hang up, also while another thread waits for an event."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._reader.close()
+        self._socket.close()
+
+    def _next_reply(self) -> ControlReply:
+        try:
+            line = self._reader.readline(MAX_LINE)
+        except OSError as exc:
+            raise self._gone(exc) from None
+        if not line:
+            raise self._gone(None)
+        return decode_reply(line)
+
+    def _gone(self, cause: OSError | None) -> ControlError:
+        why = str(cause) if cause else "it closed the connection"
+        if self._folder is not None:
+            why = "; ".join((why, *_starting(self._folder)))
+        return ControlError(
+            f"appliance {self.info.plant} (process {self.info.supervisor}) does not answer: {why}",
+            code=ErrorCode.UNAVAILABLE,
+        )
+
+
+def _checked(reply: ControlReply) -> ControlReply:
+    """Return *reply*, or raise the error in it."""
+    error = reply.error
+    if error is None:
+        return reply
+    if error.kind:
+        raise to_error(ErrorRecord(error.kind, error.message, error.detail))
+    raise ControlError(error.message, code=error.code)
+
+
+def connect(plant: str | None = None, station: str | None = None) -> list[ControlClient]:
+    """Connect to all running appliances, or to those that run *plant* or *station*.
+
+    Raises:
+        ControlError: there is none; the message says which others run, and where it looked.
+    """
+    clients = connect_those(
+        lambda info: (
+            (not plant or info.plant == plant) and (not station or station in info.stations)
+        )
+    )
+    if not clients:
+        raise _none_runs(plant, station, [info for _, info in find_running()])
+    return clients
+
+
+def connect_those(wanted: Callable[[ApplianceInfo], bool]) -> list[ControlClient]:
+    """Connect to the running appliances that are *wanted*; there may be none.
+
+    Raises:
+        ControlError: one of them cannot be reached.
+    """
+    clients: list[ControlClient] = []
+    try:
+        for folder, info in find_running():
+            if wanted(info):
+                clients.append(_connect_one(folder, info))
+    except ControlError:
+        for client in clients:
+            client.close()
+        raise
+    return clients
+
+
+def connect_station(station: str, plant: str | None) -> ControlClient:
+    """Connect to the one running appliance that has *station*.
+
+    Raises:
+        ControlError: none has it, or several do and *plant* does not choose among them.
+    """
+    first, *others = connect(plant, station)
+    if others:
+        for client in (first, *others):
+            client.close()
+        plants = ", ".join(client.info.plant for client in (first, *others))
+        raise ControlError(f"station {station} runs in {plants}: choose one with --plant")
+    return first
+
+
+def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return one answer for several appliances.
+
+    *processes* are those of the first; *appliances* lists all, each with its plant, its stations'
+    names, its processes, its findings, its audit and its listeners.  Each station has the name of
+    its plant.
+    """
+    appliances = [
+        {
+            "plant": answer["plant"],
+            "stations": [station["name"] for station in answer["stations"]],
+            "processes": answer["processes"],
+            "findings": answer.get("findings", []),
+            "audit": answer.get("audit"),
+            "listeners": answer.get("listeners", []),
+        }
+        for answer in answers
+    ]
+    return {
+        "version": answers[0]["version"],
+        "processes": answers[0]["processes"],
+        "stations": [
+            {"plant": answer["plant"], **station}
+            for answer in answers
+            for station in answer["stations"]
+        ],
+        "appliances": appliances,
+    }
+
+
+def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> ControlClient:
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connection.settimeout(TIMEOUT_S)
+    try:
+        _connect(connection, str(folder.control_socket))
+    except OSError as exc:
+        connection.close()
+        raise ControlError(
+            f"appliance {info.plant} (process {info.supervisor}) cannot be reached at"
+            f" {folder.control_socket}: {exc.strerror}",
+            code=ErrorCode.UNAVAILABLE,
+        ) from None
+    return ControlClient(connection, info, folder)
+
+
+def _connect(connection: socket.socket, path: str) -> None:
+    """Connect to a Unix socket; where too many wait to be accepted, wait for TIMEOUT_S.
+
+    Raises:
+        OSError: the socket has no listener, or did not accept in that time.
+    """
+    end_s = monotonic() + TIMEOUT_S
+    while True:
+        try:
+            connection.connect(path)
+        except BlockingIOError:
+            if monotonic() > end_s:
+                raise
+            select.select([], [], [], _CONNECT_PAUSE_S)
+        else:
+            return
+
+
+def _starting(folder: ApplianceFolder) -> Iterator[str]:
+    """Yield which processes of an appliance do not run yet, or not again, and how far they are."""
+    with suppress(OSError, msgspec.MsgspecError):
+        info = folder.read_info()
+        processes = {"engine": info.engine, "services": info.services, **info.segments}
+        for name, process in processes.items():
+            if process.step:
+                yield f"{name} is starting ({process.step})"
+            elif not process.pid:
+                yield f"{name} ended and will be started again"
+
+
+def _none_runs(
+    plant: str | None, station: str | None, running: Sequence[ApplianceInfo]
+) -> ControlError:
+    wanted = f"station {station}" if station else f"plant {plant}" if plant else "appliance"
+    if running:
+        others = ", ".join(f"{info.plant} ({', '.join(info.stations)})" for info in running)
+        names = [name for info in running for name in info.stations]
+        hint = f"running are {others}{suggest(station, names) if station else ''}"
+    else:
+        hint = f"start one with 'eapctl run PLANT' (looked in {describe_roots()})"
+    return ControlError(f"no {wanted} runs: {hint}", code=ErrorCode.UNAVAILABLE)

@@ -1,0 +1,392 @@
+"""Changes of a running plant: plan, apply and roll back, station by station.
+
+Rule 1: all stations are asked for a plan before the first one is changed.
+Rule 2: the order is that of :mod:`eap.device.rollout`: a receiver takes a new layout beside the old
+one before anything sends it.
+Rule 3: a refusal of a station ends it, unless told to go on with the other stations.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Self, TypeAlias
+
+import msgspec
+
+from eap.ams.spec import RoutingSpec
+from eap.config.load import Plant
+from eap.control import device as protocol
+from eap.control.device import (
+    ApplyAnswer,
+    ChangeResult,
+    ObjectChange,
+    RoutingDifference,
+    RunningRouting,
+    RunningSpec,
+)
+from eap.control.protocol import AnswerT, ErrorCode, Method, ParametersT
+from eap.device.rollout import Step, steps, without_alternates
+from eap.errors import ConfigError, ControlError
+from eap.suggest import suggest
+from eap.ops.client import ControlClient, connect_those
+from eap.pd.spec import StationSpec
+from eap.runtime.plantfile import load_plant
+from eap.runtime.store import new_cause
+
+STATION_S = 60.0
+"""Time for one station: it is checked, stored, and built anew between two cycles."""
+
+Do: TypeAlias = Callable[[StationSpec], ApplyAnswer]
+
+
+class StationPlan(msgspec.Struct, frozen=True):
+    """Difference between a running station and its plant file.
+
+    Attributes:
+        station: Its name.
+        changes: Of the objects of its ports.
+        notes: Differences beside the objects: sources, links, buses, routes, access rules.
+        refused: Why it cannot be as the file says.
+    """
+
+    station: str
+    changes: list[ObjectChange]
+    notes: list[str]
+    refused: list[str]
+
+    @property
+    def differs(self) -> bool:
+        """True if there is anything to do, or to refuse."""
+        return bool(self.changes or self.notes or self.refused)
+
+
+class StepOutcome(msgspec.Struct, frozen=True):
+    """Result of one step."""
+
+    station: str
+    why: str
+    outcome: ApplyAnswer
+
+
+class PlannedStep(msgspec.Struct, frozen=True):
+    """Step that ``apply`` would take."""
+
+    station: str
+    why: str
+
+
+class PlanReport(msgspec.Struct, frozen=True):
+    """``eapctl plan``; *absent* are stations of the plant that do not run here."""
+
+    ok: bool
+    stations: list[StationPlan]
+    steps: list[PlannedStep]
+    absent: tuple[str, ...]
+
+    @classmethod
+    def of(cls, plans: list[StationPlan], order: Iterable[Step], absent: tuple[str, ...]) -> Self:
+        """Return the report of *plans* and the steps in *order*."""
+        steps = [PlannedStep(step.station, step.why) for step in order]
+        return cls(not any(each.refused for each in plans), plans, steps, absent)
+
+
+class TakenStep(msgspec.Struct, frozen=True):
+    """Step of a change that was tried."""
+
+    station: str
+    why: str
+    ok: bool
+    results: list[ChangeResult]
+    refused: list[str]
+
+
+class RefusingStation(msgspec.Struct, frozen=True):
+    """Station that cannot change while it runs, and why."""
+
+    station: str
+    refused: list[str]
+
+
+class ChangeReport(msgspec.Struct, frozen=True):
+    """``eapctl apply`` and ``rollback``; *error* says why it was broken off."""
+
+    ok: bool
+    steps: list[TakenStep]
+    refused: list[RefusingStation]
+    error: str | None
+
+    @classmethod
+    def of(
+        cls,
+        taken: Iterable[StepOutcome],
+        refusing: Mapping[str, list[str]],
+        error: ControlError | None,
+    ) -> Self:
+        """Return the report of all steps *taken*."""
+        steps = [
+            TakenStep(
+                each.station,
+                each.why,
+                each.outcome.ok,
+                each.outcome.results,
+                each.outcome.refused,
+            )
+            for each in taken
+        ]
+        is_ok = not (refusing or error) and all(step.ok for step in steps)
+        refused = [RefusingStation(name, why) for name, why in refusing.items()]
+        return cls(is_ok, steps, refused, None if error is None else str(error))
+
+
+class PlantLink:
+    """Connections to all appliances that run stations of a plant.
+
+    Args:
+        clients: The appliance of each station.
+        file: The plant file.
+        absent: Its stations that do not run here.
+        routing: Configuration of their routers in it.
+        audit_required: Whether it wants changes refused that cannot be recorded.
+
+    Attributes:
+        file: The plant file, as it was named.
+
+    Raises:
+        ControlError: (every method) the appliance refused, or does not answer.
+    """
+
+    def __init__(
+        self,
+        clients: Mapping[str, ControlClient],
+        file: Path,
+        absent: tuple[str, ...] = (),
+        routing: Mapping[str, RoutingSpec] = MappingProxyType({}),
+        *,
+        audit_required: bool = False,
+    ) -> None:
+        self._clients = clients
+        self._routing = routing
+        self._audit_required = audit_required
+        self.file = file
+        self._file = str(file.resolve())
+        self.absent = absent
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """Those that run here."""
+        return tuple(self._clients)
+
+    def export(self, station: str) -> RunningSpec:
+        """Return the specification that a station runs."""
+        return self._call(protocol.EXPORT, station)
+
+    def plan(self, spec: StationSpec) -> StationPlan:
+        """Return the difference between *spec* and the station of its name."""
+        answer = self._call(protocol.PLAN, spec.name, spec=msgspec.to_builtins(spec))
+        router = self.plan_routing(spec.name)
+        notes, refused = answer.station + router.changes, answer.refused + router.refused
+        if self._clients[spec.name].info.audit_required != self._audit_required:
+            duty = "required" if self._audit_required else "optional"
+            refused += [f"access: audit becomes {duty}: this needs a new start of the appliance"]
+        return StationPlan(spec.name, answer.changes, notes, refused)
+
+    def apply(self, spec: StationSpec, cause: str) -> ApplyAnswer:
+        """Let the station of its name be as *spec* says, as a step of the change named *cause*."""
+        where = {"cause": cause, "file": self._file}
+        return self._call(protocol.APPLY, spec.name, spec=msgspec.to_builtins(spec), **where)
+
+    def rollback(self, spec: StationSpec) -> ApplyAnswer:
+        """Let the station of its name be *spec*: what it was before, or is, alternates aside."""
+        return self._call(protocol.ROLLBACK, spec.name, spec=msgspec.to_builtins(spec))
+
+    def export_routing(self, station: str) -> RunningRouting | None:
+        """Return the configuration of a router; None if the plant file has none of it."""
+        if station not in self._routing:
+            return None
+        return self._call(protocol.ROUTING_EXPORT, station)
+
+    def plan_routing(self, station: str) -> RoutingDifference:
+        """Return the changes that the plant file would bring to a router."""
+        if station not in self._routing:
+            return RoutingDifference(changes=[], refused=[])
+        routing = msgspec.to_builtins(self._routing[station])
+        return self._call(protocol.ROUTING_PLAN, station, routing=routing)
+
+    def apply_routing(self, station: str, cause: str) -> RoutingDifference:
+        """Configure a router as the plant file says, as a step of the change named *cause*."""
+        routing = msgspec.to_builtins(self._routing[station])
+        return self._call(protocol.ROUTING_APPLY, station, routing=routing, cause=cause)
+
+    def rollback_routing(self, station: str) -> RoutingDifference:
+        """Take the last change of a router back, or make it again."""
+        return self._call(protocol.ROUTING_ROLLBACK, station)
+
+    def _call(self, method: Method[ParametersT, AnswerT], station: str, **params: Any) -> AnswerT:
+        client = self._clients[station]
+        return client.call(method, within_s=STATION_S, station=station, **params)
+
+
+@contextmanager
+def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
+    """Connect to the appliances that run stations of *plant*, for the length of a block.
+
+    Blank stations belong to every plant that has a station of their name.
+
+    Raises:
+        ControlError: none of its stations runs here.
+    """
+    names = {station.name for station in plant.stations}
+    clients = connect_those(
+        lambda info: (
+            info.plant == plant.name if info.plant_file else not names.isdisjoint(info.stations)
+        )
+    )
+    try:
+        found = {name: each for each in clients for name in each.info.stations if name in names}
+        if not found:
+            command = shlex.join(["eapctl", "run", str(file)])
+            raise ControlError(
+                f"no station of plant {plant.name} runs here: start them with '{command}'",
+                code=ErrorCode.UNAVAILABLE,
+            )
+        order = [station.name for station in plant.stations]
+        here = {name: found[name] for name in order if name in found}
+        absent = tuple(name for name in order if name not in found)
+        yield PlantLink(here, file, absent, plant.routing, audit_required=plant.audit_required)
+    finally:
+        for client in clients:
+            client.close()
+
+
+def load_or_raise(file: Path) -> Plant:
+    """Return the plant of *file*; raise ConfigError with all findings if it is none."""
+    result = load_plant(file)
+    if result.plant is None:
+        raise ConfigError("\n".join(map(str, result.findings)))
+    return result.plant
+
+
+def choose(plant: Plant, link: PlantLink, wanted: Sequence[str]) -> dict[str, StationSpec]:
+    """Return the specifications of *wanted* stations, of all that run here if it is empty.
+
+    Raises:
+        ConfigError: the plant has no such station, or it does not run here; the message has the
+            command that starts it.
+    """
+    known = {station.name: station for station in plant.stations}
+    for name in wanted:
+        if name not in known:
+            raise ConfigError(f"plant {plant.name} has no station {name!r}{suggest(name, known)}")
+        if name not in link.stations:
+            running = ", ".join(link.stations)
+            raise ConfigError(
+                f"station {name} does not run here; of its plant run {running};"
+                f" start it with '{start_command(link.file, [name])}'"
+            )
+    return {name: known[name] for name in wanted or link.stations}
+
+
+def start_command(file: Path, stations: Iterable[str]) -> str:
+    """Return the command that runs *stations* of a plant file."""
+    words = ["eapctl", "run", str(file)]
+    for name in stations:
+        words += ["--station", name]
+    return shlex.join(words)
+
+
+def plan_all(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[StationPlan]:
+    """Return what differs at each of *wanted*; raises as PlantLink does."""
+    return [link.plan(spec) for spec in wanted.values()]
+
+
+def steps_to(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[Step]:
+    """Return in which order the stations become what is *wanted*."""
+    running = {name: link.export(name).spec for name in link.stations}
+    return steps(running, {**running, **wanted})
+
+
+def apply_steps(
+    link: PlantLink,
+    order: Iterable[Step],
+    *,
+    keep_going: bool = False,
+    routed: Iterable[str] = (),
+) -> Iterator[StepOutcome]:
+    """Take *order* step by step, and yield what became of each; last the routers of *routed*.
+
+    A station that refused a step gets no other.  Steps that go on with a change that was broken off
+    belong to it, so that a rollback takes back both.
+    """
+    running = [link.export(name) for name in link.stations]
+    under_way = [each.cause for each in running if _is_under_way(each.spec)]
+    cause = max(under_way, default="") or new_cause()
+    refused = set()
+    for done in _walk(order, partial(link.apply, cause=cause), keep_going=keep_going):
+        yield done
+        if not done.outcome.ok:
+            refused.add(done.station)
+    if keep_going or not refused:
+        names = [name for name in routed if name not in refused]
+        yield from _change_routers(
+            [name for name in names if link.plan_routing(name).changes],
+            partial(link.apply_routing, cause=cause),
+        )
+
+
+def roll_back(
+    link: PlantLink, stations: Iterable[str], *, keep_going: bool = False
+) -> Iterator[StepOutcome]:
+    """Take the last change of *stations* back, and yield what became of each step.
+
+    Those that it did not change are left alone.  If it was taken back everywhere, and nothing is
+    left to do, it is made again.
+    """
+    running = {name: link.export(name) for name in link.stations}
+    now = {name: each.spec for name, each in running.items()}
+    goal = {name: without_alternates(now[name]) for name in stations}
+    known = {name: running[name] for name in goal if running[name].previous is not None}
+    routers = {name: routing for name in goal if (routing := link.export_routing(name)) is not None}
+    routers = {name: each for name, each in routers.items() if each.previous is not None}
+    causes = [each.cause for each in known.values()] + [each.cause for each in routers.values()]
+    last = max(causes, default="")
+    part = {name: each for name, each in known.items() if each.cause == last}
+    left = {n: each for n, each in part.items() if not each.undone and each.previous != goal[n]}
+    routed = [name for name, each in routers.items() if each.cause == last]
+    routed_left = [name for name in routed if not routers[name].undone]
+    if not (left or routed_left or any(_is_under_way(each.spec) for each in part.values())):
+        left, routed_left = part, routed
+    goal |= {name: each.previous for name, each in left.items() if each.previous is not None}
+    back = _walk(steps(now, {**now, **goal}), link.rollback, keep_going=keep_going)
+    return chain(back, _change_routers(routed_left, link.rollback_routing))
+
+
+def _is_under_way(spec: StationSpec) -> bool:
+    return any(pd.alternates for pd in spec.subscriptions)
+
+
+def _change_routers(
+    stations: Iterable[str], change: Callable[[str], RoutingDifference]
+) -> Iterator[StepOutcome]:
+    for name in stations:
+        done = change(name)
+        outcome = ApplyAnswer(not done.refused, [], [], done.refused)
+        yield StepOutcome(name, f"({', '.join(done.changes) or 'routes'})", outcome)
+
+
+def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[StepOutcome]:
+    refused: set[str] = set()
+    for step in order:
+        if step.station in refused:
+            continue
+        outcome = do(step.spec)
+        yield StepOutcome(step.station, step.why, outcome)
+        if not outcome.ok:
+            refused.add(step.station)
+            if not keep_going:
+                return

@@ -1,0 +1,185 @@
+"""A user program's view of a running station: its variables by name, in step with its cycle.
+
+    with eap.attach("island-01") as station:
+        while True:
+            station["setpoint"] = station["left_level"] * 2
+            station.wait_cycle()
+
+Nothing here talks to a process: variables are read and written in the shared process image.  When
+the plant is changed and the image gets a new layout, the program moves there by itself.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from time import monotonic_ns, time_ns
+from typing import Any
+
+from eap.closeable import Closing
+from eap.errors import EngineGoneError, ImageError, WriterConflictError
+from eap.suggest import suggest
+from eap.pd.image import Image
+from eap.pd.layout import VAR_CTRL
+from eap.pd.report import station_status
+from eap.pd.spec import Writer
+from eap.pd.trigger import EVENT_BIT
+from eap.pd.words import StationWord
+from eap.runtime.folder import describe_roots, find_running
+from eap.runtime.station_image import StationImage
+
+_GONE_AFTER_S = 2.0
+"""Without a cycle for this long the engine counts as gone; a restart takes less."""
+_GONE_AFTER_CYCLES = 10
+
+
+class AttachedStation(Closing):
+    """The variables of one running station; made by :func:`attach`."""
+
+    def __init__(self, path: Path) -> None:
+        self._station = StationImage(path)
+        self._file = self._station.file
+        self._opened_ns = monotonic_ns()
+        self._writes = False
+
+    def close(self) -> None:
+        """Detach, and let others write."""
+        self._station.close()
+
+    @property
+    def name(self) -> str:
+        """The station's name."""
+        return self._file.image.layout.station
+
+    @property
+    def cycle_s(self) -> float:
+        """The station's device cycle in seconds."""
+        return self._file.image.layout.cycle_us / 1e6
+
+    @property
+    def cycle(self) -> int:
+        """The station's cycle counter; its low 16 bits are what frames carry."""
+        return int(self._current().words[StationWord.CYCLE])
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the value of the variable *name*."""
+        return self._current().read(self._known(name))
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        """Write one variable; see :meth:`write`."""
+        self.write({name: value})
+
+    def read_all(self) -> dict[str, Any]:
+        """Return all variables; those of one writer belong to the same cycle."""
+        return self._current().read_all()
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Write several variables at once: the engine sees all of them or none.
+
+        Raises:
+            WriterConflictError: one of them is not the application's, or another program writes.
+            ValueError: a value does not fit its type; nothing was written.
+            EngineGoneError: nobody would read it.
+        """
+        image = self._current()
+        for name in values:
+            place = image.slots[self._known(name)]
+            if place.writer is not Writer.APPLICATION:
+                raise WriterConflictError(
+                    f"station {self.name}: {name} is written by the {place.writer}, "
+                    f"not by applications",
+                    holder=place.writer,
+                )
+        if not self._writes:
+            self._station.acquire_writer(Writer.APPLICATION)
+            self._writes = True
+        self._station.write(Writer.APPLICATION, values)
+
+    def fire(self, pd: str) -> None:
+        """Send the TxPD *pd* in the next cycle.
+
+        Raises:
+            ImageError: the station sends no such PD, or its trigger does not say ``event``.
+        """
+        by_event = [place.name for place in self._file.image.layout.tx if place.event]
+        if pd not in by_event:
+            listed = ", ".join(by_event) or "none"
+            raise ImageError(
+                f"station {self.name} sends no PD {pd!r} by event; those with event: true: {listed}"
+            )
+        name = pd + VAR_CTRL
+        control = self[name]
+        if control & EVENT_BIT:  # the engine has to see it low before it can rise
+            self.write({name: control & ~EVENT_BIT})
+            self.wait_cycle()
+        self.write({name: control | EVENT_BIT})
+
+    def wait_cycle(self) -> int:
+        """Sleep until the next cycle has run and return its number.
+
+        Raises:
+            EngineGoneError: no engine runs the station any more.
+        """
+        image = self._current()
+        before = image.words[StationWord.CYCLE]
+        while not self._file.wait_cycle(before, self._patience_s()):
+            image = self._current()  # a new layout, which counts on, or the engine is gone
+        return int(image.words[StationWord.CYCLE])
+
+    def status(self) -> dict[str, Any]:
+        """Return the counters and states of the station, shaped as in ``eapctl status``."""
+        return station_status(self._current().snapshot(), monotonic_ns(), time_ns())
+
+    def _current(self) -> Image:
+        """Return the image, of the newest layout and with an engine behind it."""
+        file = self._station.file
+        if file is not self._file:
+            self._file = file
+            self._opened_ns = monotonic_ns()
+        image = file.image
+        ran_at_ns = image.words[StationWord.CYCLE_AT_NS]
+        silent_s = (monotonic_ns() - (ran_at_ns or self._opened_ns)) / 1e9
+        if silent_s > self._patience_s() and self._station.catch_up():
+            return self._current()
+        if silent_s > self._patience_s():
+            missed = "a cycle" if ran_at_ns else "its first cycle"
+            raise EngineGoneError(
+                f"station {self.name}: its engine has not run {missed} for {silent_s:.1f} s; "
+                f"start the plant again"
+            )
+        return image
+
+    def _patience_s(self) -> float:
+        return max(_GONE_AFTER_S, _GONE_AFTER_CYCLES * self.cycle_s)
+
+    def _known(self, name: str) -> str:
+        places = self._file.image.slots
+        if name in places:
+            return name
+        raise ImageError(f"station {self.name} has no variable {name!r}{suggest(name, places)}")
+
+
+def attach(station: str, *, plant: str = "") -> AttachedStation:
+    """Attach to the running station of that name.
+
+    Args:
+        station: Its name.
+        plant: Name of its plant; needed when several that run have a station of this name.
+
+    Raises:
+        ImageError: no appliance of this user runs such a station, or several do; the message names
+            those that run.
+    """
+    running = [(folder, info) for folder, info in find_running() if plant in {"", info.plant}]
+    found = [(folder, info) for folder, info in running if station in info.stations]
+    if not found:
+        listed = ", ".join(sorted(name for _, info in running for name in info.stations)) or "none"
+        raise ImageError(
+            f"no station {station!r} runs here (running: {listed}; looked in {describe_roots()} as "
+            f"user {os.getuid()}): start its plant with eapctl run"
+        )
+    if len(found) > 1:
+        plants = ", ".join(info.plant for _, info in found)
+        raise ImageError(f"station {station} runs in {plants}: choose one with plant=")
+    return AttachedStation(found[0][0].image(station))

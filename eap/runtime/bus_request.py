@@ -1,0 +1,232 @@
+"""Requests of services to the engine, its replies, and the description of a bus that they carry.
+
+They travel as MessagePack over a SOCK_SEQPACKET pair, one message each.  A request is a small step,
+such as one mailbox message: whole transfers, files and retries are the business of services.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import msgspec
+
+from devicebus.errors import NoMailboxError
+from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
+from devicebus.master.access import DatagramReply, DatagramRequest
+from devicebus.master.mailboxes import Unsolicited
+from devicebus.wire.alstatus import AlState
+from eap.errors import EapError
+from eap.runtime.bus_errors import ErrorRecord, to_error
+from eap.runtime.station_request import StationRequest
+
+
+class BusRequest(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
+    """Base of requests to a bus; *bus* counts the bus ports in the handover's order."""
+
+    id: int
+    """Chosen by the requester and repeated in the reply."""
+    bus: int
+
+
+class DescribeBus(BusRequest, frozen=True, tag="describe"):
+    """Describe the bus: answered by *report*."""
+
+
+class ExchangeMailbox(BusRequest, frozen=True, kw_only=True, tag="mailbox"):
+    """Do one step of a conversation with a slave's mailbox: answered by *message*."""
+
+    station: int
+    request: MailboxRequest
+
+
+class ExchangeDatagrams(BusRequest, frozen=True, kw_only=True, tag="transfer"):
+    """Do one step of a procedure, without logical datagrams: answered by *replies*."""
+
+    datagrams: tuple[DatagramRequest, ...]
+
+
+class BringSlaves(BusRequest, frozen=True, kw_only=True, tag="bring"):
+    """Bring a slave, or with 0 all, to an AL state where it is kept: answered when there."""
+
+    station: int
+    target: AlState
+
+
+class ForgetFaults(BusRequest, frozen=True, tag="forget"):
+    """Forget the faults that are over: answered when done."""
+
+
+class Republish(BusRequest, frozen=True, tag="republish"):
+    """Send a BusChange with all slaves, answered behind it: the sender knows nothing of the bus."""
+
+
+class Ping(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="ping"):
+    """Answered without anything; changes that the engine has noticed come before the answer."""
+
+    id: int
+
+
+class Cancel(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="cancel"):
+    """Drop request *id*, whose requester has gone: not answered."""
+
+    id: int
+
+
+EngineRequest: TypeAlias = (
+    DescribeBus
+    | ExchangeMailbox
+    | ExchangeDatagrams
+    | BringSlaves
+    | ForgetFaults
+    | Republish
+    | Ping
+    | Cancel
+    | StationRequest
+)
+
+
+class PortErrorReport(msgspec.Struct, frozen=True, array_like=True):
+    """Nanoseconds since the error counters of a port grew first and last."""
+
+    port: int
+    since_ns: int
+    until_ns: int
+
+
+class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
+    """A slave without times and counters that run: all of it changes by an event only."""
+
+    station: int
+    name: str
+    vendor: int
+    product: int
+    revision: int
+    serial: int
+    alias: int
+    state: int
+    """AL state where it was brought, 0 if it does not answer."""
+    target: int
+    to_slave: int = 0
+    to_master: int = 0
+    """Octets of the mailboxes, 0 while none is open."""
+    mailbox_fault: ErrorRecord | None = None
+    """Why none is open: a NoMailboxError, or a MailboxClosedError that will pass."""
+    protocols: int = 0
+    """As in its EEPROM."""
+    order: str = ""
+    """Order code in its EEPROM."""
+    usual_to_slave: int = 0
+    usual_to_master: int = 0
+    """Octets of the mailboxes in its EEPROM, whatever its state."""
+    port_physics: int = 0
+    """As in its EEPROM: four bits a port, 0 none, 1 MII, 3 E-bus."""
+    link_preset: int = 0
+    """Bits 0 to 2: ports 1 to 3 led to a slave when it was found; bits 4 to 6: they had a link."""
+    losses: int = 0
+    """Times that it has stopped answering."""
+    departures: int = 0
+    """Times that it has left its state by itself."""
+    al_code: int = 0
+    """AL status code when it last did."""
+    fault: str = ""
+    """Reason why it is not in its target state."""
+
+
+def no_mailbox(slave: SlaveDescription) -> EapError:
+    """Return the error for which no mailbox of a slave is open, as its master gives it."""
+    if slave.mailbox_fault is not None:
+        return to_error(slave.mailbox_fault)
+    return NoMailboxError(f"slave {slave.station} ({slave.name}) has no open mailbox")
+
+
+class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
+    """A slave with the times of its faults."""
+
+    past_fault: str = ""
+    """The same of the last time, if that is over."""
+    since_ns: int | None = None
+    """Nanoseconds since *fault* or *past_fault* began."""
+    until_ns: int | None = None
+    """Nanoseconds since *past_fault* was over."""
+    port_errors: tuple[PortErrorReport, ...] = ()
+    """Ports whose errors were counted while the master looked."""
+
+
+class BusReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Description of a bus; counters since the engine started, times in nanoseconds."""
+
+    is_up: bool
+    """True after it has been brought up, whatever the states of its slaves are now."""
+    fault: str = ""
+    """Why not."""
+    slaves: tuple[SlaveReport, ...] = ()
+    silent_since_ns: int | None = None
+    """Nanoseconds since frames stopped coming back, the last time."""
+    silent_until_ns: int | None = None
+    """Nanoseconds since they came back again."""
+    frames_sent: int = 0
+    frames_received: int = 0
+    frames_late: int = 0
+    """Frames that came back after their time-out: the bus or this machine was slow."""
+    frames_lost: int = 0
+    """Frames that never came back."""
+    frames_retried: int = 0
+    timeout_ns: int = 0
+    """Time-out of the next frame, after which it is sent again."""
+    round_trip_ns: int = 0
+    """Mean of the latest round trips, 0 before the first."""
+    cycles: int = 0
+    cycles_good: int = 0
+    wkc_errors: int = 0
+    cycles_late: int = 0
+    cycles_lost: int = 0
+    cycles_skipped: int = 0
+    """Cycles that were not sent, because the ones before had not come back."""
+    expected_wkc: int = 0
+    received_wkc: int = 0
+    trip_ns: int = 0
+    max_trip_ns: int = 0
+    malformed: int = 0
+    """Malformed messages of services, for all buses of the engine together."""
+    dropped: int = 0
+    """Replies that services did not take, for all buses of the engine together."""
+
+
+class EngineReply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="answer"):
+    """Reply to one request: *error*, or what the request names."""
+
+    id: int
+    error: ErrorRecord | None = None
+    message: MailboxMessage | None = None
+    replies: tuple[DatagramReply, ...] = ()
+    report: BusReport | None = None
+
+
+class EngineStarted(msgspec.Struct, frozen=True, tag="hello"):
+    """First message of an engine: requests to the one before it are not answered."""
+
+    pid: int
+
+
+class UnsolicitedMessage(msgspec.Struct, frozen=True, tag="heard"):
+    """Message that a slave on a bus sent unasked."""
+
+    bus: int
+    message: Unsolicited
+
+
+class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):
+    """Slaves of a bus that have changed, and all that is known of the bus beside its slaves.
+
+    It comes before the answer to any request that was done after the change.
+    """
+
+    bus: int
+    is_up: bool
+    fault: str
+    stations: tuple[int, ...]
+    """All slaves in the order of the bus."""
+    slaves: tuple[SlaveDescription, ...]
+
+
+EngineMessage: TypeAlias = EngineReply | EngineStarted | UnsolicitedMessage | BusChange

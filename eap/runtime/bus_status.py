@@ -1,0 +1,169 @@
+"""Status of a bus from the report of its engine: findings, frames, and the key of ``status``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from devicebus.master.findings import (
+    NO_ANSWER,
+    BusFinding,
+    History,
+    SlaveView,
+    Times,
+    find_causes,
+    find_silence,
+)
+from devicebus.master.link import LinkStats
+from devicebus.wire.alstatus import state_name
+from eap.runtime.bus_request import BusReport, SlaveReport
+
+
+class NamedSlave(msgspec.Struct, frozen=True):
+    """Slave that a finding is about."""
+
+    address: int
+    name: str
+
+
+class FindingRow(msgspec.Struct, frozen=True, kw_only=True):
+    """Finding about a bus as JSON has it; *since* and *until* are Unix times."""
+
+    what: str
+    advice: str
+    slaves: list[NamedSlave]
+    port: int | None
+    is_over: bool
+    since: float | None
+    until: float | None
+
+
+class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
+    """Frames of a master, and the round trip that it measures."""
+
+    sent: int
+    received: int
+    late: int
+    """Came back after their time-out."""
+    lost: int
+    """Never came back."""
+    retried: int
+    """Sent again."""
+    timeout_us: int
+    """Time-out of the next frame."""
+    round_trip_us: int
+    """Mean of the latest, 0 before the first."""
+
+
+def count_frames(source: BusReport | LinkStats) -> FrameCounts:
+    """Return the frames of a running bus, or those of a master of one's own."""
+    prefix = "frames_" if isinstance(source, BusReport) else ""
+    names = ("sent", "received", "late", "lost", "retried")
+    return FrameCounts(
+        **{name: getattr(source, prefix + name) for name in names},
+        timeout_us=source.timeout_ns // 1000,
+        round_trip_us=source.round_trip_ns // 1000,
+    )
+
+
+def report_findings(report: BusReport) -> list[BusFinding]:
+    """Return the causes of what is wrong with a bus now."""
+    views = [_view(slave) for slave in report.slaves]
+    if is_silent(report):
+        return [find_silence(views, report.silent_since_ns)]
+    return find_causes(views)
+
+
+def is_silent(report: BusReport) -> bool:
+    """Return whether no frame comes back, so that nothing is known about any slave."""
+    return report.silent_since_ns is not None and report.silent_until_ns is None
+
+
+def history_of(report: BusReport) -> History:
+    """Return the faults of a report that are over."""
+    over = []
+    ports = {}
+    silence = None
+    if report.silent_since_ns is not None and report.silent_until_ns is not None:
+        silence = Times(report.silent_since_ns, report.silent_until_ns)
+    for slave in report.slaves:
+        if slave.since_ns is not None and slave.until_ns is not None:
+            view = SlaveView(slave.station, slave.name, trouble=slave.past_fault)
+            over.append((view, Times(slave.since_ns, slave.until_ns)))
+        for each in slave.port_errors:
+            ports[slave.station, each.port] = Times(each.since_ns, each.until_ns)
+    since_ns = report.silent_since_ns if is_silent(report) else None
+    return History(tuple(over), silence, since_ns, ports)
+
+
+def finding_row(finding: BusFinding, names: Mapping[int, str], now_s: float) -> FindingRow:
+    """Return a finding as JSON has it.
+
+    Args:
+        finding: The finding.
+        names: Of slaves, by station address.
+        now_s: Unix time at which it was made.
+    """
+    return FindingRow(
+        what=finding.what,
+        advice=finding.advice,
+        slaves=[NamedSlave(at, names[at]) for at in finding.slaves],
+        port=finding.port,
+        is_over=finding.is_over,
+        since=_moment(finding.since_ns, now_s),
+        until=_moment(finding.until_ns, now_s),
+    )
+
+
+def bus_link(report: BusReport | None) -> str:
+    """Return ``up`` when frames come back from slaves, else ``down``; None is no report."""
+    if report is None or not report.is_up:
+        return "down"
+    return "up" if not report.slaves or any(slave.state for slave in report.slaves) else "down"
+
+
+def bus_document(report: BusReport | None, now_s: float) -> dict[str, Any]:
+    """Return the key ``bus`` of a port at *now_s* (Unix time), or nothing without a report."""
+    if report is None:
+        return {}
+    names = {slave.station: slave.name for slave in report.slaves}
+    found = report_findings(report) if report.is_up else []
+    return {
+        "bus": {
+            "is_up": report.is_up,
+            "fault": report.fault,
+            "findings": [finding_row(each, names, now_s) for each in found],
+            "slaves": [
+                {
+                    "address": slave.station,
+                    "name": slave.name,
+                    "state": state_name(slave.state) if slave.state else None,
+                    "target": state_name(slave.target) if slave.target else None,
+                    "fault": slave.fault,
+                }
+                for slave in report.slaves
+            ],
+            "cycles": report.cycles,
+            "wkc_errors": report.wkc_errors,
+            "late": report.cycles_late,
+            "lost": report.cycles_lost,
+            "skipped": report.cycles_skipped,
+            "expected_wkc": report.expected_wkc,
+            "received_wkc": report.received_wkc,
+            "trip_us": report.trip_ns // 1000,
+            "max_trip_us": report.max_trip_ns // 1000,
+            "frames": count_frames(report),
+        }
+    }
+
+
+def _view(slave: SlaveReport) -> SlaveView:
+    answers = bool(slave.state) or slave.fault != NO_ANSWER
+    since_ns = slave.since_ns if slave.fault else None
+    return SlaveView(slave.station, slave.name, answers, slave.fault if answers else "", since_ns)
+
+
+def _moment(ago_ns: int | None, now_s: float) -> float | None:
+    return None if ago_ns is None else round(now_s - ago_ns / 1e9, 3)

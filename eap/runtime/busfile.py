@@ -1,0 +1,201 @@
+"""Bus files: a simulated segment in YAML, checked as a whole like a plant file.
+
+The cores read no files, so what a bus file refers to (values in CSV, device descriptions in XML)
+is read here and handed over as octets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from devicebus.master.pdo import PdoEntry, channels_from_sii
+from devicebus.sim.devices.build import build_segment, build_slave
+from devicebus.sim.fault import FaultySegment
+from devicebus.sim.spec import BusSpec, SlaveSpec
+from devicebus.sim.wiring import Side, find_way
+from devicebus.wire import sii
+from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus
+from eap.config.convert import convert_to
+from eap.config.document import read
+from eap.config.finding import FindingReport, PlantFinding, one_of
+from eap.errors import ConfigError
+from eap.suggest import suggest
+from eap.od.dictionary import ObjectDictionary
+
+MAX_RESOURCE = 16 << 20
+"""Octets of the largest file that a bus file may refer to."""
+
+
+class Bus(msgspec.Struct, frozen=True):
+    """A bus file that can be built, with the files it refers to by the names it uses."""
+
+    spec: BusSpec
+    resources: dict[str, bytes]
+    revised: frozenset[int] = frozenset()
+    """Numbers of the slaves whose revision the file gives."""
+
+    def build(self) -> FaultySegment:
+        """Make the segment with the script of its faults."""
+        return FaultySegment(build_segment(self.spec, self.resources), self.spec.faults)
+
+
+class BusResult(msgspec.Struct, frozen=True):
+    """Either a bus and no findings, or no bus and all findings in the order of the file."""
+
+    bus: Bus | None
+    findings: tuple[PlantFinding, ...]
+
+
+def load(path: Path) -> BusResult:
+    """Read and check the bus file at *path*; never raises for what the file holds."""
+    report = FindingReport(str(path))
+    root = read(path, report)
+    spec = None if root is None else convert_to(BusSpec, root, report, "bus")
+    if spec is None or report.findings():
+        return BusResult(None, report.findings())
+    slaves = range(len(spec.slaves))
+    revised = frozenset(n for n in slaves if f"slaves[{n}].revision" in report.lines)
+    bus = Bus(spec, {}, revised)
+    for number, slave in enumerate(spec.slaves):
+        at = f"slaves[{number}]"
+        for name in _files(slave):
+            _read_resource(bus, path.parent / name, name, report, at)
+        _check_wiring(spec, number, report, at)
+        if not report.findings():
+            _check_slave(slave, bus, report, at)
+    if not spec.slaves:
+        report.add("slaves", "the bus has no slaves", "at least one slave")
+    if not report.findings():
+        _check_faults(bus, report)
+    findings = report.findings()
+    return BusResult(None if findings else bus, findings)
+
+
+def load_or_raise(path: Path) -> Bus:
+    """Read the bus file at *path*; raise ConfigError with every finding if it is none."""
+    result = load(path)
+    if result.bus is None:
+        raise ConfigError("\n".join(str(finding) for finding in result.findings))
+    return result.bus
+
+
+def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
+    """Return what a plant is to know of the bus file at *path*, or all that is wrong with it.
+
+    That is what a master finds on such a bus.  What the file leaves open may be anything on a real
+    one: revisions that it does not give, serial numbers and aliases that are 0.
+    """
+    result = load(path)
+    if result.bus is None:
+        return result.findings
+    bus = result.bus
+    return ExpectedBus(tuple(_describe(bus, number) for number in _line(bus.spec)))
+
+
+def _line(spec: BusSpec) -> tuple[int, ...]:
+    """Return the slaves in the order in which a frame comes to them: branches change it."""
+    links: dict[tuple[int, int], tuple[int, int] | Side] = {(0, 0): Side.PRIMARY}
+    numbers = {slave.name: number for number, slave in enumerate(spec.slaves)}
+    for number, slave in enumerate(spec.slaves[1:], 1):
+        parent = numbers[slave.after] if slave.after else number - 1
+        links[number, 0] = parent, slave.port
+        links[parent, slave.port] = number, 0
+    return find_way(links, (0, 0)).order
+
+
+def _describe(bus: Bus, number: int) -> DescribedSlave:
+    spec = bus.spec.slaves[number]
+    slave = build_slave(spec, bus.resources)
+    image = sii.decode(slave.esc.image)
+    channels = channels_from_sii(image)
+    outputs, inputs = (
+        tuple(
+            _describe_entry(entry, slave.device.dictionary)
+            for channel in channels
+            if channel.is_output is is_output
+            for pdo in channel.pdos
+            for entry in pdo.entries
+        )
+        for is_output in (True, False)
+    )
+    return DescribedSlave(
+        name=spec.name,
+        vendor=image.fixed.vendor,
+        product=image.fixed.product,
+        revision=image.fixed.revision if number in bus.revised else None,
+        serial=image.fixed.serial or None,
+        alias=image.fixed.alias or None,
+        outputs=outputs,
+        inputs=inputs,
+    )
+
+
+def _describe_entry(entry: PdoEntry, dictionary: ObjectDictionary) -> DescribedEntry:
+    place = entry.index, entry.subindex, entry.bit_length
+    if not entry.index:
+        return DescribedEntry("", "", *place)
+    known = dictionary.entry(entry.index, entry.subindex)
+    return DescribedEntry(known.name, known.kind.text, *place)
+
+
+def _files(slave: SlaveSpec) -> Iterator[str]:
+    if slave.esi:
+        yield slave.esi
+    for channel in slave.inputs:
+        if channel.csv:
+            yield channel.csv
+
+
+def _read_resource(bus: Bus, path: Path, name: str, report: FindingReport, at: str) -> None:
+    try:
+        with path.open("rb") as file:
+            octets = file.read(MAX_RESOURCE + 1)
+    except (OSError, ValueError) as exc:
+        reason = getattr(exc, "strerror", None) or exc
+        report.add(at, f"{name} cannot be read: {reason}", "a file beside the bus file")
+        return
+    if len(octets) > MAX_RESOURCE:
+        report.add(at, f"{name} is too large", f"at most {MAX_RESOURCE >> 20} MiB")
+    bus.resources[name] = octets
+
+
+def _check_wiring(spec: BusSpec, number: int, report: FindingReport, at: str) -> None:
+    slave = spec.slaves[number]
+    before = {each.name: position for position, each in enumerate(spec.slaves[:number])}
+    if slave.name in before:
+        report.add(f"{at}.name", f"{slave.name!r} is there twice", "a name of its own")
+    if not number:
+        if slave.after:
+            report.add(f"{at}.after", "the first slave is wired to the master", "no key after")
+        return
+    if slave.after and slave.after not in before:
+        hint = suggest(slave.after, before)
+        report.add(f"{at}.after", f"no slave {slave.after!r} before{hint}", one_of(before))
+        return
+    place = slave.after or spec.slaves[number - 1].name, slave.port
+    for position, other in enumerate(spec.slaves[1:number], 1):
+        taken = other.after or spec.slaves[position - 1].name, other.port
+        if taken == place:
+            message = f"port {slave.port} of {place[0]} has a cable to {other.name} already"
+            report.add(at, message, "another port (key port, 1 to 3)")
+
+
+def _check_slave(slave: SlaveSpec, bus: Bus, report: FindingReport, at: str) -> None:
+    try:
+        build_slave(slave, bus.resources)
+    except ValueError as exc:
+        report.add(at, f"{slave.name}: {exc}", "a device that can be built")
+
+
+def _check_faults(bus: Bus, report: FindingReport) -> None:
+    if not bus.spec.faults:
+        return
+    segment = FaultySegment(build_segment(bus.spec, bus.resources))
+    for number, fault in enumerate(bus.spec.faults):
+        try:
+            segment.check(fault)
+        except ValueError as exc:
+            report.add(f"faults[{number}]", str(exc), "a fault that can happen")

@@ -1,0 +1,182 @@
+"""Another configuration for a running station: what it would change, tried before it is asked for.
+
+Nothing here runs anything: a plan holds dictionaries as they would be, for which nothing runs yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from eap.device import stored
+from eap.device.difference import EntryChange, compare
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_fill import fill
+from eap.device.eap_records import read_back
+from eap.device.pdlayout import bus_variables, kept_versions
+from eap.device.rollout import without_alternates
+from eap.device.stored import StoredError
+from eap.pd.device import DeviceFault
+from eap.pd.handover import needs_new_start
+from eap.pd.spec import LinkSpec, PortKind, Source, StationSpec, VariableSpec
+from eap.runtime.store import Configuration
+
+
+class Plan(NamedTuple):
+    """Changes that another configuration would make."""
+
+    spec: StationSpec
+    changes: list[tuple[str, EntryChange]]
+    """Each with its port, in an order in which they could be written."""
+    station: list[str]
+    """What changes beside the dictionaries."""
+    refused: list[str]
+    """Why it cannot be."""
+    dictionaries: Mapping[str, EapDictionary]
+    """As they would be."""
+
+    @property
+    def is_empty(self) -> bool:
+        """True if nothing would change."""
+        return not (self.changes or self.station)
+
+    def objects(self) -> dict[str, Any]:
+        """Return what the dictionaries would hold, for the store."""
+        return dump_all(self.dictionaries)
+
+
+def eap_ports(spec: StationSpec) -> list[str]:
+    """Return the names of the ports that have a dictionary."""
+    return [port.name for port in spec.ports if port.kind is PortKind.EAP]
+
+
+def dump_all(dictionaries: Mapping[str, EapDictionary]) -> dict[str, Any]:
+    """Return what *dictionaries* hold, for the store."""
+    return {name: stored.dump(each) for name, each in dictionaries.items()}
+
+
+def fill_all(
+    dictionaries: Mapping[str, EapDictionary],
+    objects: Mapping[str, Any],
+    like: Mapping[str, EapDictionary] | None = None,
+) -> None:
+    """Give *dictionaries* what was stored of them, else what their station says.
+
+    Args:
+        dictionaries: Empty ones, by port.
+        objects: What was stored, by port.
+        like: Others; what has the same name there gets the same index.
+
+    Raises:
+        DeviceFault: there is no room for all of it.
+    """
+    for name, dictionary in dictionaries.items():
+        if name in objects:
+            try:
+                stored.load(dictionary, objects[name])
+            except StoredError:
+                pass
+            else:
+                continue
+        fill(dictionary, None if like is None else like[name])
+
+
+def make_plan(
+    now: StationSpec, dictionaries: Mapping[str, EapDictionary], wanted: StationSpec,
+    objects: Mapping[str, Any],
+) -> Plan:  # fmt: skip
+    """Return what it takes to run *wanted*, with *objects* where they are given."""
+    refused = find_refusals(now, wanted)
+    if refused:
+        return Plan(wanted, [], [], refused, {})
+    fresh = {
+        name: EapDictionary(wanted, name, identity=each.identity)
+        for name, each in dictionaries.items()
+    }
+    try:
+        fill_all(fresh, objects, dictionaries)
+        read_back(wanted, fresh)
+    except DeviceFault as exc:
+        return Plan(wanted, [], [], [str(exc)], {})
+    changes = [
+        (name, change) for name, old in dictionaries.items() for change in compare(old, fresh[name])
+    ]
+    return Plan(wanted, changes, describe_rest(now, wanted), [], fresh)
+
+
+def plan_rollback(
+    now: StationSpec, dictionaries: Mapping[str, EapDictionary], previous: Configuration | None,
+    wanted: StationSpec | None = None,
+) -> Plan:  # fmt: skip
+    """Return what it takes to run again what ran before.
+
+    That is *wanted* if there are alternates to it, or else *wanted* is what runs now, with others.
+    """
+    if wanted is not None and without_alternates(wanted) == without_alternates(now):
+        return make_plan(now, dictionaries, wanted, dump_all(dictionaries))
+    if previous is None:
+        reason = "there is nothing to go back to: it has run nothing else"
+        return Plan(now, [], [], [reason], {})
+    if wanted is not None and without_alternates(wanted) != without_alternates(previous.spec):
+        return Plan(now, [], [], ["meanwhile it would go back to something else"], {})
+    return make_plan(now, dictionaries, wanted or previous.spec, previous.objects)
+
+
+def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
+    """Return what cannot change while the station runs; nothing else may be done then."""
+    before = {port.name: port.net_id for port in old.ports}
+    net_ids = [("the station's router", old.net_id, new.net_id)]
+    net_ids += [
+        (f"port {port.name}", before[port.name], port.net_id)
+        for port in new.ports
+        if port.name in before
+    ]
+    return needs_new_start(old, new) + [
+        f"{what}: net_id {was} -> {becomes}: this needs a new start of the appliance"
+        for what, was, becomes in net_ids
+        if was != becomes
+    ]
+
+
+def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
+    """Return what changes beside the objects of the dictionaries, a line for each thing."""
+    on_bus = bus_variables(old) | bus_variables(new)
+    return [
+        *kept_versions(old, new),
+        *_differences("source of", _source_name, old.sources, new.sources),
+        *_differences("link", _link_name, old.links, new.links),
+        *_differences("variable", _variable_name, _chosen(old, on_bus), _chosen(new, on_bus)),
+    ]
+
+
+def _chosen(spec: StationSpec, names: set[str]) -> tuple[VariableSpec, ...]:
+    return tuple(each for each in spec.variables if each.name in names)
+
+
+def _source_name(source: Source) -> str:
+    return source.variable
+
+
+def _link_name(link: LinkSpec) -> str:
+    bits = f" bit {link.source_bit}" if link.source_bit else ""
+    target_bits = f" bit {link.target_bit}" if link.target_bit else ""
+    return f"{link.source}{bits} to {link.target}{target_bits}"
+
+
+def _variable_name(variable: VariableSpec) -> str:
+    return variable.name
+
+
+def _differences(
+    what: str, name_of: Callable[[Any], str], old: tuple[Any, ...], new: tuple[Any, ...]
+) -> Iterator[str]:
+    before = {name_of(each): each for each in old}
+    after = {name_of(each): each for each in new}
+    for name in before:
+        if name not in after:
+            yield f"{what} {name}: removed"
+    for name, each in after.items():
+        if name not in before:
+            yield f"{what} {name}: added"
+        elif before[name] != each:
+            yield f"{what} {name}: changed"

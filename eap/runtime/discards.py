@@ -1,0 +1,139 @@
+"""What a process turned away before any subscription saw it, in a file that survives it."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum, auto
+from pathlib import Path
+
+from eap.closeable import Closing
+from eap.errors import EnvironmentalError
+
+
+class Refusal(StrEnum):
+    """Why a frame or a connection went no further."""
+
+    MAILBOX = auto()
+    """Type 5 that is no AoE request, to a station without a bus or to many."""
+    STALE = auto()
+    """It had waited in its socket since before services started."""
+    WRONG_TYPE = auto()
+    """Neither type 4 nor type 5."""
+    TRUNCATED = auto()
+    """Shorter than its headers say."""
+    TCP_OFF = auto()
+    """A type-4 connection to a station none of whose ports says ``tcp: true``."""
+    TCP_SLOW = auto()
+    """A connection left a frame unfinished, or took no answers, and was closed."""
+    TCP_EVICTED = auto()
+    """A connection with process data made room for another one."""
+    TCP_FULL = auto()
+    """More connections than there is room for."""
+    TCP_TYPE = auto()
+    """A connection that went on with a frame of another type, and was closed."""
+    ENGINE_BUSY = auto()
+    """The engine did not take a connection that was meant for it."""
+    OTHER_VLAN = auto()
+    """An Ethernet frame of a VLAN that no port names."""
+    LOCAL_OVERFLOW = auto()
+    """Stations on one Ethernet interface sent each other more than they took."""
+    AMS_FULL = auto()
+    """More AMS/TCP connections than there is room for."""
+    AMS_TYPE = auto()
+    """An AMS/TCP connection went on with what is no AMS packet, and was closed."""
+    AMS_LENGTH = auto()
+    """An AMS packet too long, or of another length than its header says; it was answered so."""
+    AMS_SLOW = auto()
+    """An AMS/TCP connection left a packet unfinished, or took no answers, and was closed."""
+    AMS_UNASKED = auto()
+    """An answer came by AMS/TCP, and nobody had asked."""
+    AMS_DISCOVERY = auto()
+    """A datagram came to UDP 48899 that asks for nothing that there is."""
+    GATEWAY_OFF = auto()
+    """A mailbox message, while the gateway that it was for is stopped."""
+    MQTT_TOPIC = auto()
+    """A message by MQTT on a topic that means nothing here, or that it has no business on."""
+    MQTT_BROKEN = auto()
+    """A message by MQTT that is neither a packet nor what a router tells of itself."""
+    MQTT_FULL = auto()
+    """One router or one message by MQTT more than there is room for."""
+
+
+_REFUSALS = tuple(Refusal)
+_COLUMN = {reason: index for index, reason in enumerate(_REFUSALS)}
+
+
+class DiscardCounters(Closing):
+    """One 64-bit word for each station and reason; each process has its own file.
+
+    Raises:
+        EnvironmentalError: the file cannot be made.
+    """
+
+    def __init__(self, path: Path, stations: Sequence[str]) -> None:
+        size = 8 * len(_REFUSALS) * max(1, len(stations))
+        try:
+            with path.open("ab") as file:
+                os.posix_fallocate(file.fileno(), 0, size)  # no SIGBUS on a full disk
+                os.ftruncate(file.fileno(), size)
+            with path.open("r+b") as file:
+                self._map = mmap.mmap(file.fileno(), size)
+        except OSError as exc:
+            raise EnvironmentalError(
+                f"{path}: the counters cannot be made: {exc.strerror}"
+            ) from None
+        self._words = memoryview(self._map).cast("Q")
+        self._row = {name: row * len(_REFUSALS) for row, name in enumerate(stations)}
+
+    def count(self, station: str, reason: Refusal, number: int = 1) -> None:
+        """Add *number* to one counter."""
+        self._words[self._row[station] + _COLUMN[reason]] += number
+
+    def stats(self) -> dict[str, dict[str, int]]:
+        """Return all counters that are not zero, by station."""
+        return {
+            name: {
+                str(reason): self._words[row + column]
+                for reason, column in _COLUMN.items()
+                if self._words[row + column]
+            }
+            for name, row in self._row.items()
+        }
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._words.release()
+        self._map.close()
+
+
+class Tally:
+    """Carries what a driver counts by name in a dict over to *counters* of all *stations*.
+
+    *reason_of* says which counter a name belongs to, None for none.
+    """
+
+    def __init__(
+        self,
+        counters: DiscardCounters,
+        stations: Sequence[str],
+        source: Mapping[str, int],
+        reason_of: Callable[[str], Refusal | None],
+    ) -> None:
+        self._counters = counters
+        self._stations = stations
+        self._source = source
+        self._reason_of = reason_of
+        self._seen: dict[str, int] = {}
+
+    def publish(self) -> None:
+        """Add what has come since the last call."""
+        for name, total in self._source.items():
+            grown = total - self._seen.get(name, 0)
+            if not grown:
+                continue
+            self._seen[name] = total
+            if reason := self._reason_of(name):
+                for station in self._stations:
+                    self._counters.count(station, reason, grown)

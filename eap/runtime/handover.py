@@ -1,0 +1,172 @@
+"""What the supervisor hands down to a process it starts: specifications, descriptors, options.
+
+It travels as JSON in an anonymous file whose descriptor the child inherits, so that its size has no
+limit, nobody else can read it, and nothing is left behind.
+"""
+
+from __future__ import annotations
+
+import os
+from enum import StrEnum
+from typing import Self
+
+import msgspec
+
+from eap.ams.spec import DirectoryStation, RoutingSpec
+from eap.ids import decode_value, encode_value
+from eap.pd.device import DeviceState
+from eap.pd.spec import PortSpec, SpecRecord, StationSpec
+
+NO_DESCRIPTOR = -1
+
+
+class SocketKind(StrEnum):
+    """How a shared socket is opened."""
+
+    UDP = "udp"
+    """A pair bound to one unicast address, sorted by frame type."""
+    GROUP = "group"
+    """A pair bound to one multicast group, or to the broadcast address, at one interface."""
+    PACKET = "packet"
+    """A pair of AF_PACKET sockets on one Ethernet interface."""
+    TCP = "tcp"
+    """One listener, for services."""
+    ARP = "arp"
+    """One AF_PACKET socket for services, that asks for subscribers in one VLAN of an interface."""
+    AMS_TCP = "ams_tcp"
+    """One listener, for services; the ports of an address share it."""
+    AMS_UDP = "ams_udp"
+    """One socket for services, on which tools ask for the routers at an address."""
+    AMS_BROADCAST = "ams_broadcast"
+    """One socket for services, on which they ask all hosts of the address's network; none where
+    that does not work.  Without a group it is the broadcast address of the network."""
+    GATEWAY_UDP = "gateway_udp"
+    """One socket for services, for the mailbox gateway of one bus port."""
+    GATEWAY_TCP = "gateway_tcp"
+    """One listener for services, likewise."""
+
+
+class PortName(SpecRecord, frozen=True, order=True):
+    """A port and its station."""
+
+    station: str
+    port: str
+
+
+class SharedSocket(SpecRecord, frozen=True):
+    """One socket, or one pair, that the supervisor opens once and keeps open.
+
+    *address* is an IPv4 address or the name of an Ethernet interface.
+    """
+
+    kind: SocketKind
+    address: str
+    port: int = 0
+    group: str = ""
+    vlan_id: int = 0
+    """ARP only; 0 is untagged."""
+    owners: tuple[PortName, ...] = ()
+    """Whose frames arrive here; several share a group, a broadcast or an Ethernet interface."""
+    engine_fd: int = NO_DESCRIPTOR
+    services_fd: int = NO_DESCRIPTOR
+
+
+class BusSocket(SpecRecord, frozen=True):
+    """What belongs to one bus port, opened once like the shared sockets.
+
+    The number of a bus in requests is its place in the handover.
+    """
+
+    owner: PortName
+    engine_fd: int = NO_DESCRIPTOR
+    """Where the engine's frames go: a packet or UDP socket, or a pair with the segment process."""
+    segment_fd: int = NO_DESCRIPTOR
+    """The other side of that pair, for the process of a simulated segment."""
+    segment_command_fd: int = NO_DESCRIPTOR
+    """Where that process gets commands, one JSON object a message, and answers them."""
+    command_fd: int = NO_DESCRIPTOR
+    """The other side of that pair, for services."""
+
+
+class Handed(SpecRecord, frozen=True):
+    """What crosses to a child in a descriptor."""
+
+    def to_descriptor(self) -> int:
+        """Return the descriptor of a file that holds this; the caller closes it."""
+        fd = os.memfd_create("eap-handover", os.MFD_CLOEXEC)
+        with os.fdopen(os.dup(fd), "wb") as file:
+            file.write(msgspec.json.encode(self, enc_hook=encode_value))
+        return fd
+
+    @classmethod
+    def from_descriptor(cls, fd: int) -> Self:
+        """Read what ``to_descriptor`` wrote, and close *fd*."""
+        with os.fdopen(fd, "rb") as file:
+            file.seek(0)
+            return msgspec.json.decode(file.read(), type=cls, dec_hook=decode_value)
+
+
+class SegmentHandover(Handed, frozen=True):
+    """All that the process of a simulated segment gets."""
+
+    supervisor: int
+    """Process id, as in Handover."""
+    file: str
+    """The bus file."""
+    frames_fd: int
+    """This side of the pair with the engine."""
+    command_fd: int
+    """This side of the pair with services."""
+    realtime: bool = False
+    """As in EngineOptions."""
+
+
+class EngineOptions(SpecRecord, frozen=True):
+    """How hard the engine tries to be on time."""
+
+    realtime: bool = True
+    """Ask for SCHED_FIFO, locked memory and PM QoS; what is not permitted is reported."""
+    cpu: int = -1
+    """Run on this processor only; -1 on any."""
+    priority: int = 50
+    """Of SCHED_FIFO, 1 to 99."""
+
+
+class Handover(Handed, frozen=True):
+    """All that engine and services get; a descriptor that it does not need is NO_DESCRIPTOR."""
+
+    supervisor: int
+    """Process id: a child whose parent is another one has been orphaned."""
+    folder: str
+    """The appliance's runtime folder."""
+    plant: str
+    plant_file: str
+    stations: tuple[StationSpec, ...]
+    sockets: tuple[SharedSocket, ...]
+    link_fd: int = NO_DESCRIPTOR
+    """This side of the SOCK_SEQPACKET pair between engine and services."""
+    control_fd: int = NO_DESCRIPTOR
+    buses: tuple[BusSocket, ...] = ()
+    bus_fd: int = NO_DESCRIPTOR
+    """This side of the pair on which services asks the engine for something on a bus."""
+    options: EngineOptions = EngineOptions()
+    states: dict[str, DeviceState] = msgspec.field(default_factory=dict)
+    """To which each station is brought, Op if it is not here."""
+    first_state: DeviceState = DeviceState.OP
+    """Of stations that were never asked for another one."""
+    routing: dict[str, RoutingSpec] = msgspec.field(default_factory=dict)
+    """What the router of each station is told; nothing for one that is not here."""
+    directory: tuple[DirectoryStation, ...] = ()
+    """The names of everything in the plant, of the stations that run elsewhere too."""
+    audit_required: bool = False
+    """Whether changes that cannot be recorded are refused."""
+
+    def port(self, name: PortName) -> PortSpec:
+        """Return the specification of one port."""
+        return next(
+            port
+            for station in self.stations
+            if station.name == name.station
+            for port in station.ports
+            if port.name == name.port
+        )

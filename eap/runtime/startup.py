@@ -1,0 +1,151 @@
+"""Start-up of a child process: its entry point, and the steps that it reports to the supervisor.
+
+The supervisor runs ``python -m eap.runtime.startup MODULE HANDOVER_FD REPORT_FD BYTECODE``.  This
+module imports next to nothing, so that the first report comes before the imports of the process.
+
+Where Python may write no bytecode (PYTHONDONTWRITEBYTECODE, or a folder of another user), half of a
+start is compilation.  BYTECODE is a folder where it is kept for the next start, else empty.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from time import monotonic
+from types import CodeType, FrameType, ModuleType
+from typing import Any, TypeAlias
+
+import msgspec
+
+Step: TypeAlias = Callable[[str], None]
+"""Reports the beginning of a step."""
+
+_IMPORT_PERIOD_S = 0.5
+"""Period in which a process that imports reports that it goes on."""
+
+
+class Report(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One line of a process to its supervisor: a step that begins, or that it runs."""
+
+    step: str = ""
+    waits_for: str = ""
+    """Process without which this step cannot end."""
+    ready: dict[str, Any] | None = None
+    """Report of the process for ``status``, when it runs."""
+
+
+class Startup:
+    """Start-up of this process, as the supervisor follows it.
+
+    Args:
+        fd: Where reports go, one JSON object a line; closed when the process runs.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._last = Report()
+
+    def step(self, text: str, *, waits_for: str = "") -> None:
+        """Report the beginning of a step; *waits_for* names the process that has to come first."""
+        report = Report(step=text, waits_for=waits_for)
+        if report == self._last:
+            return
+        self._last = report
+        with suppress(OSError):  # a supervisor that does not read, or has gone, stops no start
+            self._write(report)
+
+    def finish(self, report: dict[str, Any]) -> None:
+        """Report that this process runs, with a *report* for ``status``."""
+        self._write(Report(ready=report))
+        os.close(self._fd)
+
+    def _write(self, report: Report) -> None:
+        os.write(self._fd, msgspec.json.encode(report) + b"\n")
+
+
+def no_step(text: str) -> None:
+    """Report nothing: for those who build the objects of a process outside one."""
+
+
+class _Finder:
+    """Finder of modules that reports that imports go on, and keeps bytecode where nobody else does.
+
+    Args:
+        startup: Takes the reports.
+        folder: Where bytecode is kept; empty if Python keeps it beside the modules.
+    """
+
+    def __init__(self, startup: Startup, folder: str) -> None:
+        self._startup = startup
+        self._folder = folder
+        self._count = 0
+        self._report_at_s = monotonic() + _IMPORT_PERIOD_S
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return how to import a module, None where that is nothing special."""
+        self._count += 1
+        if monotonic() >= self._report_at_s:
+            self._report_at_s = monotonic() + _IMPORT_PERIOD_S
+            self._startup.step(f"importing modules, {self._count} so far")
+        if not self._folder:
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is None or spec.cached is None or os.path.exists(spec.cached):  # noqa: PTH110
+            return spec
+        if type(spec.loader) is SourceFileLoader:
+            spec.loader = _Loader(name, spec.loader.path, self._folder)
+        return spec
+
+
+class _Loader(SourceFileLoader):
+    """Loader of a module whose bytecode is kept in *folder*."""
+
+    def __init__(self, name: str, path: str, folder: str) -> None:
+        super().__init__(name, path)
+        self._folder = folder
+
+    def get_code(self, fullname: str) -> CodeType | None:
+        """Return the code, from bytecode or to be kept as such."""
+        before = sys.dont_write_bytecode, sys.pycache_prefix
+        sys.dont_write_bytecode, sys.pycache_prefix = False, self._folder
+        try:
+            return super().get_code(fullname)
+        finally:
+            sys.dont_write_bytecode, sys.pycache_prefix = before
+
+
+def _interrupted(number: int, frame: FrameType | None) -> None:
+    """Take SIGINT for SIGTERM: the process ends as it does when it is asked to."""
+    signal.raise_signal(signal.SIGTERM)
+
+
+def main(arguments: list[str]) -> int:
+    """Run ``main`` of a module, with its handover and its start-up; return its exit code."""
+    module, handover, report, folder = arguments
+    signal.signal(signal.SIGINT, _interrupted)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    startup = Startup(int(report))
+    startup.step("importing modules")
+    finder = _Finder(startup, folder)
+    sys.meta_path.insert(0, finder)
+    gc.disable()  # what modules make stays, and looking through it takes a tenth of the time
+    try:
+        run = importlib.import_module(module).main
+    finally:
+        sys.meta_path.remove(finder)
+        gc.freeze()
+        gc.enable()
+    code: int = run(int(handover), startup)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

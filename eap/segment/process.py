@@ -1,0 +1,240 @@
+"""A simulated segment as a process: it answers a master until it is asked to end.
+
+``eapctl sim run`` runs one in its own process; the supervisor starts one for each simulated bus
+with one argument, the descriptor of its handover.  Commands come as JSON (:mod:`command`), as lines
+or as messages; each is answered, with its *id* if it has one.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from devicebus.sim.command import obey
+from devicebus.sim.fault import FaultySegment
+from devicebus.sim.wiring import Side
+from eap.errors import ConfigError
+from eap.ids import InterfaceUri
+from eap.net import realtime
+from eap.net.segmentsocket import SegmentSocket, open_segment
+from eap.runtime.busfile import Bus, load_or_raise
+from eap.runtime.handover import SegmentHandover
+from eap.runtime.signals import catch_end_signals
+from eap.runtime.startup import Startup
+
+_BATCH = 64
+_MS = 1_000_000
+_STALL_NS = 2_000_000
+"""Lateness from which frames that wait are taken before the watchdogs of slaves are looked at."""
+_NEVER_NS = 1 << 63
+_MAX_COMMAND = 65536
+
+
+class Commands(Protocol):
+    """Where commands come from and answers go."""
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when there is a command."""
+
+    def take(self) -> Iterable[bytes] | None:
+        """Return the commands that wait, None when no more will come."""
+
+    def answer(self, outcome: dict[str, Any]) -> None:
+        """Answer one command; neither waits nor fails."""
+
+
+class CommandLines:
+    """Commands as lines from *fd*, answered by *say*."""
+
+    def __init__(self, fd: int, say: Callable[[dict[str, Any]], None]) -> None:
+        self.answer = say
+        self._fd = fd
+        self._partial = b""
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._fd
+
+    def take(self) -> Iterable[bytes] | None:
+        """Return all whole lines that are there."""
+        data = os.read(self._fd, _MAX_COMMAND)
+        *lines, rest = (self._partial + data).split(b"\n")
+        self._partial = rest[-_MAX_COMMAND:]
+        return [line for line in map(bytes.strip, lines) if line] if data else None
+
+
+class CommandMessages:
+    """Commands as messages of *sock*; one that asks without reading gets no answers."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        sock.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._sock.fileno()
+
+    def take(self) -> Iterable[bytes] | None:
+        """Return the next message."""
+        try:
+            data = self._sock.recv(_MAX_COMMAND)
+        except OSError:
+            return ()
+        return [data] if data else None
+
+    def answer(self, outcome: dict[str, Any]) -> None:
+        """Send one message."""
+        try:
+            self._sock.send(msgspec.json.encode(outcome))
+        except OSError:
+            return
+
+
+def run(
+    bus: Bus,
+    interface: InterfaceUri,
+    say: Callable[[dict[str, Any]], None],
+    *,
+    second: InterfaceUri | None = None,
+    command_fd: int | None = None,
+) -> None:
+    """Answer on *interface* until SIGINT or SIGTERM.
+
+    Args:
+        bus: What answers.
+        interface: Where.
+        say: Called with ``{"ready": true, "slaves": n}`` when the segment answers, and with the
+            outcome of each command.
+        second: The other line of a ring.
+        command_fd: Where commands come from.
+
+    Raises:
+        EnvironmentalError: *interface* cannot be opened.
+    """
+    segment = bus.build()
+    with catch_end_signals() as end_fd, ExitStack() as stack:
+        sockets: dict[Side, SegmentSocket] = {}
+        for side, uri in zip(Side, (interface, second), strict=True):
+            if uri is not None:
+                sockets[side] = open_segment(uri)
+                stack.callback(sockets[side].close)
+        say({"ready": True, "slaves": len(bus.spec.slaves)})
+        commands = None if command_fd is None else CommandLines(command_fd, say)
+        _Loop(segment, sockets, commands).run(end_fd)
+
+
+def run_for_appliance(handover: SegmentHandover, startup: Startup) -> None:
+    """Answer the engine at the other end of a pair until SIGTERM.
+
+    Raises:
+        ConfigError: the bus file is none; one line a finding.
+    """
+    startup.step("reading the bus file")
+    bus = load_or_raise(Path(handover.file))
+    startup.step("building the slaves")
+    segment = bus.build()
+    with catch_end_signals() as end_fd, ExitStack() as stack:
+        frames = SegmentSocket(socket.socket(fileno=handover.frames_fd))
+        stack.callback(frames.close)
+        commands = stack.enter_context(socket.socket(fileno=handover.command_fd))
+        while frames.receive() is not None:
+            continue  # sent while nobody was here, and awaited no longer
+        gc.collect()
+        gc.freeze()
+        startup.finish({"slaves": len(bus.spec.slaves)})
+        _Loop(segment, {Side.PRIMARY: frames}, CommandMessages(commands)).run(end_fd)
+
+
+class _Loop:
+    def __init__(
+        self,
+        segment: FaultySegment,
+        sockets: Mapping[Side, SegmentSocket],
+        commands: Commands | None,
+    ) -> None:
+        self._segment = segment
+        self._sockets = sockets
+        self._commands = commands
+        self._late_ns = 0
+        """Time after which this process has not run for a while, though there was work."""
+
+    def run(self, end_fd: int) -> None:
+        poll = select.poll()
+        command_fd = self._commands.fileno() if self._commands is not None else None
+        for fd in (end_fd, command_fd, *(each.fileno() for each in self._sockets.values())):
+            if fd is not None:
+                poll.register(fd, select.POLLIN)
+        while True:
+            for fd, _ in poll.poll(self._patience_ms()):
+                if fd == end_fd:
+                    return
+                if fd == command_fd and not self._take_commands():
+                    poll.unregister(fd)
+            for side, sock in self._sockets.items():
+                self._pass_frames(side, sock)
+
+    def _patience_ms(self) -> float | None:
+        due, now_ns = self._segment.next_timeout(), time.monotonic_ns()
+        self._late_ns = _NEVER_NS if due is None else max(due, now_ns) + _STALL_NS
+        return None if due is None else max(0.0, (due - now_ns) / _MS)
+
+    def _pass_frames(self, side: Side, sock: SegmentSocket) -> None:
+        segment = self._segment
+        for _ in range(_BATCH):
+            arrival = sock.receive()
+            now_ns = time.monotonic_ns()
+            if arrival is not None and now_ns > self._late_ns:
+                segment.segment.postpone_timeouts(now_ns)
+            self._late_ns = now_ns + _STALL_NS
+            if arrival is None:
+                segment.handle_timeout(now_ns)
+            else:
+                segment.receive_frame(arrival.frame, now_ns, side=side, origin=arrival.origin)
+            for out in segment.frames_to_send(now_ns):
+                if out.side in self._sockets:
+                    self._sockets[out.side].send(out.frame, out.origin)
+            if arrival is None:
+                return
+
+    def _take_commands(self) -> bool:
+        assert self._commands is not None  # noqa: S101  only called when it is readable
+        taken = self._commands.take()
+        for text in taken or ():
+            self._commands.answer(self._obey(text))
+        return taken is not None
+
+    def _obey(self, text: bytes) -> dict[str, Any]:
+        outcome: dict[str, Any] = {"ok": True}
+        try:
+            command = msgspec.json.decode(text)
+            if isinstance(command, dict) and "id" in command:
+                outcome["id"] = command.pop("id")
+            obey(self._segment, command, time.monotonic_ns())
+        except (msgspec.MsgspecError, ValueError) as exc:
+            outcome |= {"ok": False, "error": str(exc)}
+        return outcome
+
+
+def main(handover_fd: int, startup: Startup) -> int:
+    """Return the exit code: 2 for a bus file that is none."""
+    handover = SegmentHandover.from_descriptor(handover_fd)
+    realtime.die_with_parent(handover.supervisor)
+    if handover.realtime:
+        # Hardware does not wait for a processor: simulated slaves answer as late as this does.
+        realtime.take_precedence()
+    try:
+        run_for_appliance(handover, startup)
+    except ConfigError as exc:
+        sys.stderr.write(f"segment: {exc}\n")
+        return 2
+    return 0

@@ -1,0 +1,158 @@
+"""ADS notifications of one station: sampled by the engine, told by services.
+
+Rule 1: the values of variables that one notification tells are those of one cycle, and so is its
+time stamp, however late it is told: both come from the samples that the engine keeps.
+Rule 2: services looks when the next notification is due, and says again and again that samples are
+wanted, as long as there is any notification; the engine waits for nobody.
+Rule 3: services that is kept from looking for longer than samples are kept has missed cycles.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from time import monotonic_ns, time_ns
+from typing import NamedTuple, TypeAlias
+
+from eap.ads.notifications import NotificationTable
+from eap.ads.operation import AdsRefusedError
+from eap.ams.endpoint import Way
+from eap.codec.adsnotification import to_filetime
+from eap.ids import NetId
+from eap.pd.samples import ImageSamples
+from eap.pd.words import StationWord
+from eap.services.ads.image_variables import StationSymbols
+
+Send: TypeAlias = Callable[[Way, bytes], object]
+"""Sends a packet to a client, and does not wait for that."""
+
+_LOOK_NS = 200_000_000
+"""How often at least services says that it wants samples."""
+_WANTED_NS = 1_000_000_000
+"""How long the engine goes on for services that are gone."""
+_CYCLE_TAKES_NS = 200_000
+"""How long after its time a cycle has mostly ended."""
+_SOON_NS = 1_000_000
+_AT_ONCE = 500
+"""Values after which others of this process have a turn."""
+_IDLE_NS = 10_000_000
+"""How soon to look again while the engine does not run."""
+
+logger = logging.getLogger(__name__)
+
+
+class _Device(NamedTuple):
+    table: NotificationTable
+    net_id: NetId
+    port: int
+
+
+class NotificationPump:
+    """Drives the notifications of all devices of one station.
+
+    Args:
+        symbols: The station's variables.
+        send: Sends a packet to a client.
+    """
+
+    def __init__(self, symbols: StationSymbols, send: Send) -> None:
+        self._symbols = symbols
+        self._send = send
+        self._devices: list[_Device] = []
+        self._wake = asyncio.Event()
+        self._samples: ImageSamples | None = None
+        self._told = 0
+        """The last cycle that was looked at."""
+
+    def add(self, table: NotificationTable, net_id: NetId, port: int) -> None:
+        """Drive *table* too, which is that of the device behind *net_id* and *port*."""
+        self._devices.append(_Device(table, net_id, port))
+        table.on_add = self._wake.set
+
+    async def serve(self) -> None:
+        """Tell whoever is to be told, until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                delay_ns = self.look(monotonic_ns(), time_ns())
+            except Exception:
+                logger.exception("notifications of station %s", self._symbols.image.layout.station)
+                delay_ns = _LOOK_NS
+            timer = None
+            if delay_ns is not None:
+                timer = loop.call_later(delay_ns / 1e9, self._wake.set)
+            await self._wake.wait()
+            self._wake.clear()
+            if timer is not None:
+                timer.cancel()
+
+    def look(self, now_ns: int, unix_ns: int) -> int | None:
+        """Tell what is due; return in how many nanoseconds to look again, None if not at all.
+
+        Args:
+            now_ns: The time on the monotonic clock.
+            unix_ns: The same moment since 1970.
+        """
+        if self._due_ns() is None:
+            self._samples = None
+            return None
+        try:
+            self._symbols.look()
+        except AdsRefusedError as exc:
+            logger.debug("notifications wait: %s", exc)
+            return _LOOK_NS
+        image = self._symbols.image
+        if self._samples is None:
+            self._told = image.words[StationWord.CYCLE]
+        if self._samples is None or self._samples.image is not image:
+            self._samples = ImageSamples(image)
+        is_done = self._tell(self._samples, unix_ns - now_ns)
+        self._samples.want(2 + _WANTED_NS // (1000 * image.layout.cycle_us))
+        return self._delay_ns(now_ns) if is_done else _SOON_NS
+
+    def _tell(self, samples: ImageSamples, unix_at_0_ns: int) -> bool:
+        """Go through the cycles since the last look; return whether that was all of them."""
+        room = _AT_ONCE
+        for cycle in samples.since(self._told):
+            if room <= 0:
+                return False
+            self._told = cycle
+            at_ns, due_ns = samples.ran_at_ns(cycle), self._due_ns()
+            if due_ns is None:
+                return True
+            if at_ns is None or at_ns < due_ns:
+                continue
+            sample = samples.read(cycle)
+            if sample is not None:
+                with self._symbols.store.shown(sample):
+                    room -= self._tell_of_cycle(at_ns, to_filetime(at_ns + unix_at_0_ns))
+        return True
+
+    def _tell_of_cycle(self, at_ns: int, time: int) -> int:
+        """Tell of one cycle; return how many values were looked at, at most."""
+        looked_at = 0
+        for table, net_id, port in self._devices:
+            due_ns = table.next_timeout()
+            if due_ns is not None and due_ns <= at_ns:
+                looked_at += len(table)
+                for notice in table.handle_cycle(at_ns, time):
+                    self._send(notice.client.way, notice.encode(net_id, port))
+        return looked_at
+
+    def _due_ns(self) -> int | None:
+        times = (device.table.next_timeout() for device in self._devices)
+        return min((each for each in times if each is not None), default=None)
+
+    def _delay_ns(self, now_ns: int) -> int | None:
+        """Return how long it is until the cycle has ended that has to tell something."""
+        due_ns = self._due_ns()
+        if due_ns is None:
+            return 0  # the last one ended just now: look once more, to rest then
+        image = self._symbols.image
+        cycle_ns = 1000 * image.layout.cycle_us
+        ran_ns = image.words[StationWord.CYCLE_AT_NS]
+        cycles = max(1, -(-(due_ns - ran_ns) // cycle_ns))
+        delay_ns = ran_ns + cycles * cycle_ns + _CYCLE_TAKES_NS - now_ns
+        soon_ns = _SOON_NS if delay_ns > -cycle_ns - _IDLE_NS else _IDLE_NS
+        return min(max(delay_ns, soon_ns), _LOOK_NS)

@@ -1,0 +1,320 @@
+"""The audit: who had what changed, and what was refused, one JSON object a line.
+
+Rule 1: a line is in the file before its client has its answer, so a kill loses the request in hand.
+Rule 2: who floods is told of by numbers, and others' lines are written all the same.
+Rule 3: lines that cannot be written are counted: `status` and the log say so, and the file itself
+as soon as it can be written again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from time import monotonic, time
+from typing import Any, NamedTuple, TypeAlias
+
+import msgspec
+
+from eap.ads.operation import Operation, WriteControl
+from eap.ams.access import host_of, place_of
+from eap.ams.authorized_request import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.directory import Directory
+from eap.codec.ads import AdsError, IndexGroup
+from eap.ids import ObjectId
+from eap.services.control.audit_file import AuditFile
+from eap.services.rate_limiter import Rate, SourceRateLimiter, SourceRates
+
+BURST, PER_S = 500, 50
+"""Lines that a client may cause at once, and in each second for long."""
+DOOR_RATE = Rate(5000, 500)
+"""Likewise, of all clients of a transport."""
+NEW_RATE = Rate(500, 50)
+"""Likewise, of all its clients that were never seen: their addresses can be invented."""
+CONTROL = "control"
+"""Stands for a door in lines about clients of the control socket."""
+TOO_MANY = f"the audit is required, and records {PER_S} changes a second of a client for long"
+_MAX_CLIENTS = 1024
+"""More than can be new at once: invented addresses do not make known clients forgotten."""
+_PLAIN = 8
+"""Octets of a value that is written as it is; of longer ones there is a digest."""
+_TELL_AFTER_S = 1.0
+_COMPLETE = 0x100
+
+_CONTROL_RATES = SourceRates(Rate(BURST, PER_S), known=DOOR_RATE, new=DOOR_RATE, local=DOOR_RATE)
+_RATES = SourceRates(Rate(BURST, PER_S), known=DOOR_RATE, new=NEW_RATE, local=DOOR_RATE)
+_Client: TypeAlias = tuple[str, str, str]
+"""Station, door, and address without its TCP port."""
+
+logger = logging.getLogger(__name__)
+
+
+class Lost(NamedTuple):
+    """Lines that could not be written."""
+
+    lines: int
+    since: float | None
+    """Unix time at which the first one was lost."""
+    until: float | None
+    """Unix time at which the last one was lost."""
+    error: str
+    """Why nothing can be written now; empty if it can."""
+
+
+class Audit:
+    """The audit of a plant's stations on this host.
+
+    Args:
+        file: Where lines go.
+        directory: Names of targets.
+        is_required: Whether changes that cannot be recorded are refused: each has a line before it
+            is done, too.
+        clock: In seconds, for rates.
+        now: Unix time in seconds.
+
+    Attributes:
+        lost: What could not be written since this process began.
+    """
+
+    def __init__(
+        self,
+        file: AuditFile,
+        directory: Directory,
+        *,
+        is_required: bool = False,
+        clock: Callable[[], float] = monotonic,
+        now: Callable[[], float] = time,
+    ) -> None:
+        self.lost = Lost(0, None, None, "")
+        self.is_required = is_required
+        self._file = file
+        self._directory = directory
+        self._clock = clock
+        self._now = now
+        self._limiters: dict[tuple[str, str], SourceRateLimiter] = {}
+        self._skipped: dict[_Client, int] = {}
+        self._untold = 0
+        self._untold_since = 0.0
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self._file.path
+
+    async def serve(self) -> None:
+        """Write what was left out and what was lost, until cancelled."""
+        try:
+            while True:
+                await asyncio.sleep(_TELL_AFTER_S)
+                self.tell_skipped()
+                self.tell_lost()
+        finally:
+            self.tell_skipped()
+            self.tell_lost()
+
+    def report(self) -> dict[str, Any]:
+        """Return what ``status`` says."""
+        return {"file": str(self.path), "required": self.is_required, **self.lost._asdict()}
+
+    def begin(self, station: str, entry: AuditEntry) -> str:
+        """Write down what a station is going to change; return why that cannot be done."""
+        client = station, entry.way.door, host_of(entry.way)
+        if not all(self._take(client) for _ in entry.operations):
+            return TOO_MANY
+        head = self._head(station, entry)
+        lines = [head | _begins(each) for each in entry.operations]
+        return "" if self._append(lines, are_counted=False) else self._why_required()
+
+    def begin_request(self, who: str, station: str, words: dict[str, Any]) -> str:
+        """Write down what a client of the control socket changes, or is refused, if required.
+
+        Returns:
+            Why it cannot be recorded, and hence not be done; empty if it can.
+        """
+        if not self.is_required:
+            return ""
+        why = TOO_MANY
+        if self._take((station, CONTROL, who)):
+            line = self._request_head(who, station) | words | {"begins": True}
+            if self._append([line], are_counted=False):
+                return ""
+            why = self._why_required()
+        self._write_limited(who, station, words | {"error": why})
+        return why
+
+    def _why_required(self) -> str:
+        return f"the audit is required and cannot be written: {self.lost.error}"
+
+    def write(self, station: str, entry: AuditEntry) -> None:
+        """Write down what a station did, or refused."""
+        client = station, entry.way.door, host_of(entry.way)
+        head = self._head(station, entry)
+        lines = []
+        for each in entry.operations:
+            has_begun = self.is_required and each.verdict.is_allowed
+            if has_begun or self._take(client):
+                lines.append(head | _words(each))
+            else:
+                self._skip(client)
+        if lines:
+            self._append(lines)
+
+    def write_request(self, who: str, station: str, words: dict[str, Any]) -> None:
+        """Write down what a client of the control socket did, or was refused.
+
+        If that is required, :meth:`begin_request` has limited it already.
+        """
+        if self.is_required:
+            self._append([self._request_head(who, station) | words])
+        else:
+            self._write_limited(who, station, words)
+
+    def _write_limited(self, who: str, station: str, words: dict[str, Any]) -> None:
+        client = station, CONTROL, who
+        if self._take(client):
+            self._append([self._request_head(who, station) | words])
+        else:
+            self._skip(client)
+
+    def _request_head(self, who: str, station: str) -> dict[str, Any]:
+        return {"time": self._time(), "station": station, "door": CONTROL, "from": who}
+
+    def tell_skipped(self) -> None:
+        """Write how many lines were left out, for each client that had some."""
+        skipped, self._skipped = self._skipped, {}
+        lines = [
+            {"time": self._time(), "station": station, "door": door, "from": who, "skipped": count}
+            for (station, door, who), count in skipped.items()
+        ]
+        if lines:
+            self._append(lines)
+
+    def _take(self, client: _Client) -> bool:
+        """Take one line for a client; return whether its rate and that of its door allow it."""
+        station, door, who = client
+        now = self._clock()
+        limiter = self._limiters.get((station, door))
+        if limiter is None:
+            # Each command is a process of its own, and a new client of the control socket.
+            rates = _CONTROL_RATES if door == CONTROL else _RATES
+            limiter = self._limiters[station, door] = SourceRateLimiter(rates, _MAX_CLIENTS, now)
+        return limiter.take(who, now)
+
+    def _skip(self, client: _Client) -> None:
+        """Count a line that is left out."""
+        if client not in self._skipped and len(self._skipped) >= _MAX_CLIENTS:
+            self.tell_skipped()
+        self._skipped[client] = self._skipped.get(client, 0) + 1
+
+    def _head(self, station: str, entry: AuditEntry) -> dict[str, Any]:
+        header = entry.header
+        return {
+            "time": self._time(),
+            "station": station,
+            "door": entry.way.door,
+            "from": entry.way.connection,
+            "source": f"{header.source}:{header.source_port}",
+            "target": f"{header.target}:{header.target_port}",
+            "name": self._directory.name_of(header.target, header.target_port),
+            "route": entry.route,
+        }
+
+    def _time(self) -> str:
+        return _text_of(self._now())
+
+    def tell_lost(self) -> None:
+        """Write how many lines were lost, if there are such, and the file can be written again."""
+        if self._untold:
+            self._append([])
+
+    def _append(self, lines: list[dict[str, Any]], *, are_counted: bool = True) -> bool:
+        """Write all of *lines*, or none; say which.
+
+        Args:
+            lines: One object each.
+            are_counted: Whether they are lost when they cannot be written: a change has been made,
+                or refused, that is not recorded.
+        """
+        head = [self._lost_line()] if self._untold else []
+        data = b"".join(msgspec.json.encode(line) + b"\n" for line in (*head, *lines))
+        try:
+            self._file.append(data)
+        except OSError as exc:
+            self._lose(len(lines) if are_counted else 0, exc.strerror or str(exc))
+            return False
+        if self._untold:
+            logger.warning("audit %s: written again; %d lines are lost", self.path, self._untold)
+        self._untold = 0
+        self.lost = self.lost._replace(error="")
+        return True
+
+    def _lose(self, count: int, error: str) -> None:
+        if not self.lost.error:
+            effect = "refused" if self.is_required else "not recorded"
+            logger.error("audit %s: changes are %s: %s", self.path, effect, error)
+        self.lost = self.lost._replace(error=error)
+        if count:
+            now = self._now()
+            self._untold_since = self._untold_since if self._untold else now
+            self._untold += count
+            self.lost = Lost(self.lost.lines + count, self.lost.since or now, now, error)
+
+    def _lost_line(self) -> dict[str, Any]:
+        return {
+            "time": self._time(),
+            "lost": self._untold,
+            "since": _text_of(self._untold_since),
+            "until": _text_of(self.lost.until or 0.0),
+            "error": self.lost.error,
+        }
+
+
+def _text_of(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds")
+
+
+def _begins(each: AuditedOperation) -> dict[str, Any]:
+    verdict = each.verdict
+    said = {"service": verdict.service, "allowed": True, "why": verdict.why, "begins": True}
+    return dict(operation_words(each.operation)) | said
+
+
+def _words(each: AuditedOperation) -> dict[str, Any]:
+    verdict, result = each.verdict, each.result
+    return dict(operation_words(each.operation)) | {
+        "service": verdict.service,
+        "allowed": verdict.is_allowed,
+        "why": verdict.why,
+        "result": result,
+        "error": "" if not result else AdsError.words_of(result),
+    }
+
+
+def operation_words(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]]:
+    """Yield what was to be done."""
+    yield "operation", type(operation).__name__
+    if isinstance(operation, AddRoute):
+        yield "adds", operation._asdict()
+        return
+    group, offset = place_of(operation)
+    if group is not None:
+        yield "group", f"0x{group:X}"
+        yield "offset", f"0x{offset:X}"
+    if group == IndexGroup.SDO:
+        whole = " (complete access)" if offset & _COMPLETE else ""
+        yield "object", str(ObjectId(offset >> 16, offset & 0xFF)) + whole
+    if isinstance(operation, WriteControl):
+        yield "states", [operation.ads_state, operation.device_state]
+    data = getattr(operation, "data", None)
+    if data is None:
+        return
+    yield "length", len(data)
+    if group == IndexGroup.FOE_OPEN_WRITE:
+        yield "file", data.rstrip(b"\0").decode("latin-1")[:256]
+    elif len(data) <= _PLAIN:
+        yield "value", data.hex()
+    else:
+        yield "sha256", sha256(data).hexdigest()[:16]

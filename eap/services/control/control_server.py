@@ -1,0 +1,341 @@
+"""The control socket: many clients, each with its requests in order and its subscriptions beside.
+
+Rule: a client can only delay itself.  Nothing is queued for it: a subscription takes its next look
+at the values when the last line has left, and who takes nothing for SLOW_READER_S is disconnected.
+What a client waits for on a bus is cancelled when it leaves, and what it has open there is ended.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import select
+import socket
+from collections.abc import AsyncIterator, Callable, Iterable, Sized
+from contextlib import asynccontextmanager, suppress
+from functools import partial
+from typing import Any, SupportsIndex
+
+from devicebus.errors import BusError
+from eap.control.bus import BUS_METHODS
+from eap.control.protocol import (
+    MAX_CLIENTS,
+    MAX_LINE,
+    MAX_SUBSCRIPTIONS,
+    SLOW_READER_S,
+    ErrorCode,
+    Failure,
+    Request,
+    Subscribed,
+    Unsubscribed,
+    UnsubscribeParameters,
+    ValuesEvent,
+    decode_request,
+    encode_error,
+    encode_event,
+    encode_failure,
+    encode_result,
+    parameters,
+    request_id,
+)
+from eap.errors import ControlError, EapError, ImageError
+from eap.net.connections import Activity, Limits
+from eap.od.abort import SdoAbortError
+from eap.runtime.bus_errors import to_record
+from eap.services.control.bus_methods import BusConnection, Buses
+from eap.services.control.control_audit import (
+    BeginChange,
+    TellChange,
+    change_of,
+    peer_of,
+    refusal_in,
+)
+from eap.services.control.methods import Methods, Watch
+from eap.services.transports.accepting import Listeners, ListeningSocket, TaskConnection
+
+LIMITS = Limits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
+
+logger = logging.getLogger(__name__)
+
+
+class ControlServer:
+    """Serve *methods*, and those on *buses*, on a listening Unix socket."""
+
+    def __init__(
+        self,
+        methods: Methods,
+        buses: Buses,
+        tell: TellChange | None = None,
+        *,
+        begin: BeginChange | None = None,
+        slow_reader_s: float = SLOW_READER_S,
+    ) -> None:
+        self._methods = methods
+        self._buses = buses
+        self._tell = tell
+        self._begin = begin
+        self._slow_reader_s = slow_reader_s
+        self._listening: ListeningSocket[ControlConnection] | None = None
+
+    async def serve(self, listener: socket.socket, listeners: Listeners) -> None:
+        """Accept clients until cancelled; *listener* stays open.
+
+        Shares are counted by process: there is one host, and one user mostly.
+        """
+        if self._listening is None:
+            self._listening = ListeningSocket(listener, "control", self, listeners, LIMITS)
+        await self._listening.serve()
+
+    def connection_from(self, sock: socket.socket, host: str) -> ControlConnection:
+        """Return the connection on a socket that was accepted (ConnectionServer)."""
+        del sock
+        return ControlConnection(host)
+
+    def refuse_connection(self, sock: socket.socket, why: str) -> None:
+        """Tell a client that there is no room for it (ConnectionServer)."""
+        with suppress(OSError):
+            sock.send(encode_error(None, ControlError(why, code=ErrorCode.BUSY)))
+
+    async def serve_connection(self, connection: ControlConnection, sock: socket.socket) -> None:
+        """Answer one client until it leaves (ConnectionServer)."""
+        connection.begin()
+        loop = asyncio.get_running_loop()
+        reader = _Reader(connection, sock, loop)
+        transport, protocol = await loop.connect_accepted_socket(
+            lambda: asyncio.StreamReaderProtocol(reader, loop=loop), sock
+        )
+        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
+        bus = BusConnection(self._buses)
+        try:
+            peer = peer_of(sock)
+            tell = self._tell and partial(self._tell, peer)
+            begin = self._begin and partial(self._begin, peer)
+            client = _Client(self._methods, bus, writer, self._slow_reader_s, tell, begin)
+            connection.subscriptions = client.subscriptions
+            await client.run(reader)
+        except* (OSError, TimeoutError) as group:
+            logger.debug("control client left: %s", group.exceptions[0])
+        finally:
+            bus.close()
+            transport.abort()
+
+
+class ControlConnection(TaskConnection):
+    """A client of the control socket.
+
+    Attributes:
+        is_answered: Whether a request of it is being answered.
+        subscriptions: Those that it has.
+    """
+
+    def __init__(self, host: str) -> None:
+        super().__init__(host)
+        self.is_answered = False
+        self.subscriptions: Sized = ()
+
+    @property
+    def activity(self) -> Activity:
+        """Current use."""
+        if self.subscriptions:
+            return Activity.SUBSCRIBED
+        return Activity.BUSY if self.is_answered else super().activity
+
+
+class _Reader(asyncio.StreamReader):
+    """Reads lines, and notices at once when the client has gone while it waits for an answer."""
+
+    def __init__(
+        self,
+        connection: ControlConnection,
+        sock: socket.socket,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        super().__init__(limit=MAX_LINE, loop=loop)
+        self._connection = connection
+        self._socket = sock
+        self._clock = loop.time
+        self._has_gone = False
+        self._wait: asyncio.Timeout | None = None
+
+    @asynccontextmanager
+    async def while_there(self) -> AsyncIterator[None]:
+        """Raise TimeoutError in a block that waits when the client has gone."""
+        self._wait = asyncio.timeout_at(self._clock() if self._has_gone else None)
+        self._connection.is_answered = True
+        self._connection.late_since_ns = None
+        try:
+            async with self._wait:
+                yield
+        finally:
+            self._connection.is_answered = False
+            self._wait = None
+
+    def feed_data(self, data: Iterable[SupportsIndex]) -> None:
+        """Take data, some of a line or more."""
+        super().feed_data(data)
+        if bytes(data).endswith(b"\n"):
+            self._connection.note_frame()
+        elif not self._connection.is_answered:
+            self._connection.note_partial()
+
+    def feed_eof(self) -> None:
+        """Take the end of what the client sends; it may still wait for answers."""
+        super().feed_eof()
+        poll = select.poll()
+        poll.register(self._socket, 0)
+        if poll.poll(0):  # hung up: not only its sending side is closed
+            self._note_end()
+
+    def set_exception(self, exc: Exception) -> None:
+        """Take the end of a connection that broke."""
+        super().set_exception(exc)
+        self._note_end()
+
+    def _note_end(self) -> None:
+        self._has_gone = True
+        if self._wait is not None:
+            self._wait.reschedule(self._clock())
+
+
+class _Client:
+    def __init__(
+        self,
+        methods: Methods,
+        bus: BusConnection,
+        writer: asyncio.StreamWriter,
+        slow_reader_s: float,
+        tell: Callable[[str, dict[str, Any]], None] | None,
+        begin: Callable[[str, dict[str, Any]], str] | None,
+    ) -> None:
+        self._methods = methods
+        self._begin = begin
+        self._tell = tell
+        self._bus = bus
+        self._writer = writer
+        self._slow_reader_s = slow_reader_s
+        self.subscriptions: dict[int, asyncio.Task[None]] = {}
+        self._last_subscription = 0
+
+    async def send(self, line: bytes) -> None:
+        """Put one line out, and wait until most of it has gone."""
+        self._writer.write(line)
+        async with asyncio.timeout(self._slow_reader_s):
+            await self._writer.drain()
+
+    async def run(self, reader: _Reader) -> None:
+        async with asyncio.TaskGroup() as group:
+            while line := await self._next_line(reader):
+                await self._answer(line, reader, group)
+            for task in self.subscriptions.values():
+                task.cancel()
+
+    async def _next_line(self, reader: asyncio.StreamReader) -> bytes:
+        """Return the next line, empty at the end or when the client sends no lines."""
+        try:
+            return await reader.readuntil(b"\n")
+        except asyncio.IncompleteReadError:
+            return b""
+        except asyncio.LimitOverrunError:
+            reason = f"a line has at most {MAX_LINE} octets"
+            error = ControlError(reason, code=ErrorCode.BAD_REQUEST)
+            await self.send(encode_error(None, error))
+            return b""
+
+    async def _answer(self, line: bytes, reader: _Reader, group: asyncio.TaskGroup) -> None:
+        number = None
+        try:
+            request = decode_request(line)
+            number = request.id
+            if request.method == "subscribe":
+                await self._subscribe(number, request.params, group)
+                return
+            async with reader.while_there():
+                result = await self._call_and_tell(request)
+        except TimeoutError:
+            raise
+        except ControlError as exc:
+            await self.send(encode_error(request_id(line) if number is None else number, exc))
+        except ImageError as exc:
+            error = ControlError(str(exc), code=ErrorCode.UNAVAILABLE)
+            await self.send(encode_error(number, error))
+        except BusError as exc:
+            why = to_record(exc)
+            failure = Failure(ErrorCode.BUS, why.message, why.kind, why.detail)
+            await self.send(encode_failure(number, failure))
+        except SdoAbortError as exc:
+            failure = Failure(ErrorCode.ABORT, str(exc), detail=exc.code)
+            await self.send(encode_failure(number, failure))
+        except Exception:
+            logger.exception("control method failed")
+            error = ControlError("this request failed inside", code=ErrorCode.INTERNAL)
+            await self.send(encode_error(number, error))
+        else:
+            await self.send(encode_result(number, result))
+
+    async def _call_and_tell(self, request: Request) -> Any:
+        """Have a change written down when it is known how it came out, before it is answered."""
+        change = None if self._tell is None else change_of(request, self._bus.opened)
+        if change is None or self._tell is None:
+            return await self._call(request)
+        station, words = change
+        talk = None
+        if request.method == "bus_ask":
+            talk = self._bus.opened(request.params["conversation"])
+        if self._begin is not None and (why := self._begin(station, words)):
+            raise ControlError(why, code=ErrorCode.REFUSED)
+        error: str | None = None  # as long as nobody knows
+        try:
+            result = await self._call(request)
+            error = refusal_in(result, talk)
+        except EapError as exc:
+            error = str(exc)
+            raise
+        finally:
+            self._tell(station, words | {"error": error})
+        return result
+
+    async def _call(self, request: Request) -> Any:
+        if request.method == "unsubscribe":
+            return self._unsubscribe(request.params)
+        if request.method in BUS_METHODS:
+            return await self._bus.call(request.method, request.params)
+        return await self._methods.call(request.method, request.params)
+
+    async def _subscribe(
+        self, number: int | None, params: dict[str, Any], group: asyncio.TaskGroup
+    ) -> None:
+        if len(self.subscriptions) >= MAX_SUBSCRIPTIONS:
+            reason = f"this connection has {MAX_SUBSCRIPTIONS} subscriptions, which is the limit"
+            raise ControlError(reason, code=ErrorCode.BUSY)
+        watch = self._methods.watch(params)
+        self._last_subscription += 1
+        subscription = self._last_subscription
+        await self.send(encode_result(number, Subscribed(subscription)))
+        self.subscriptions[subscription] = group.create_task(self._events(subscription, watch))
+
+    def _unsubscribe(self, params: dict[str, Any]) -> Unsubscribed:
+        subscription = parameters(params, UnsubscribeParameters).subscription
+        task = self.subscriptions.pop(subscription, None)
+        if task is None:
+            reason = f"no subscription {subscription} on this connection"
+            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+        task.cancel()
+        return Unsubscribed(subscription)
+
+    async def _events(self, subscription: int, watch: Watch) -> None:
+        clock = asyncio.get_running_loop().time
+        period_s = watch.period_ms / 1000
+        due_s = clock()
+        while True:
+            event: ValuesEvent | dict[str, Any] | None
+            try:
+                event = watch.next_event()
+            except ImageError as exc:
+                event = {"error": {"code": ErrorCode.UNAVAILABLE, "message": str(exc)}}
+            except ControlError as exc:
+                event = {"error": {"code": exc.code, "message": str(exc)}}
+            if event is not None:
+                await self.send(encode_event(subscription, event))
+            # From one due time to the next: a sleep of the period would be late by more each time.
+            due_s = max(due_s + period_s, clock())
+            await asyncio.sleep(due_s - clock())

@@ -1,0 +1,236 @@
+"""General methods of the control protocol, answered from the process images.
+
+Rule: what is about images does not wait.  An image is read by copying, a value is written under the
+lock that also keeps user programs apart, and the engine notices neither.  Only ``status`` waits a
+little, for what the engine says of its buses; what is done on buses is in :mod:`bus_methods`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from inspect import isawaitable
+from typing import Any
+
+from eap.codec import datatypes
+from eap.control import protocol as control
+from eap.control.bus import BUS_METHODS
+from eap.control.protocol import VERSION, ErrorCode, of_station, parameters
+from eap.errors import ControlError, WriterConflictError
+from eap.suggest import suggest
+from eap.pd.image import Image
+from eap.pd.layout import VariableSlot
+from eap.pd.report import PdRow, pd_list, quality, tracker_word
+from eap.pd.spec import Writer
+from eap.pd.words import RxWord, StationWord
+from eap.runtime.station_image import StationImage
+
+MIN_PERIOD_MS = 10
+_OTHERS = (Writer.SERVICES, Writer.APPLICATION)
+"""The writers whose values do not belong to a cycle."""
+
+
+class Methods:
+    """All methods but those that belong to a connection (subscriptions, and what is on buses).
+
+    Args:
+        identity: What ``hello`` says beside the protocol's version.
+        images: The process image of each station.
+        status: Makes the answer to ``status``.
+        stop: Asks the appliance to end.
+        more: Other methods by name.
+    """
+
+    def __init__(
+        self,
+        identity: Mapping[str, Any],
+        images: Mapping[str, StationImage],
+        *,
+        status: Callable[[], Awaitable[dict[str, Any]]],
+        stop: Callable[[], None],
+        more: Mapping[str, Callable[[dict[str, Any]], Any]] | None = None,
+    ) -> None:
+        self._identity = identity
+        self._images = images
+        self._status = status
+        self._stop = stop
+        self._methods: dict[str, Callable[[dict[str, Any]], Any]] = {
+            "status": self._get_status,
+            **dict(
+                (
+                    control.HELLO.served_by(self._hello),
+                    control.PD_LIST.served_by(self._pd_list),
+                    control.VARIABLES.served_by(self._variables),
+                    control.READ.served_by(self._read),
+                    control.WRITE.served_by(self._write),
+                    control.STOP.served_by(self._ask_to_stop),
+                )
+            ),
+            **(more or {}),
+        }
+
+    async def call(self, method: str, params: dict[str, Any]) -> Any:
+        """Return the result of one method; raise EapError if it is not done."""
+        try:
+            function = self._methods[method]
+        except KeyError:
+            known = [*self._methods, "subscribe", "unsubscribe", *BUS_METHODS]
+            raise ControlError(
+                f"no method {method!r}{suggest(method, known)}", code=ErrorCode.UNKNOWN_METHOD
+            ) from None
+        result = function(params)
+        return await result if isawaitable(result) else result
+
+    def watch(self, params: dict[str, Any]) -> Watch:
+        """Check the parameters of ``subscribe`` and return what makes its events."""
+        wanted = parameters(params, control.SubscribeParameters)
+        if wanted.period_ms < MIN_PERIOD_MS:
+            raise ControlError(
+                f"period_ms is {wanted.period_ms}, the shortest is {MIN_PERIOD_MS}: user programs"
+                f" that need each cycle attach to the process image",
+                code=ErrorCode.BAD_REQUEST,
+            )
+        station = self._station(wanted.station)
+        _places(station.image, wanted.names)
+        return Watch(station, wanted.names, wanted.period_ms, only_changes=wanted.on == "change")
+
+    def _hello(self, wanted: control.NoParameters) -> control.Hello:
+        del wanted
+        return control.Hello(version=VERSION, **self._identity, stations=list(self._images))
+
+    async def _get_status(self, params: dict[str, Any]) -> dict[str, Any]:
+        parameters(params, control.NoParameters)
+        return await self._status()
+
+    def _pd_list(self, wanted: control.PdListParameters) -> list[PdRow]:
+        names = [wanted.station] if wanted.station else list(self._images)
+        return [row for name in names for row in pd_list(self._image(name))]
+
+    def _variables(self, wanted: control.VariablesParameters) -> list[control.VariableRow]:
+        return [
+            control.VariableRow(place.name, place.type, place.writer, place.unit, place.comment)
+            for place in self._image(wanted.station).layout.variables
+        ]
+
+    def _read(self, wanted: control.ReadParameters) -> control.Values:
+        image = self._image(wanted.station)
+        return _snapshot(image, _places(image, wanted.names))
+
+    def _write(self, wanted: control.WriteParameters) -> control.Written:
+        station = self._station(wanted.station)
+        places = _places(station.image, wanted.values)
+        values = {place.name: _checked(place, wanted.values[place.name]) for place in places}
+        try:
+            station.write_once(Writer.APPLICATION, values)
+        except WriterConflictError as exc:
+            raise ControlError(str(exc), code=ErrorCode.REFUSED) from None
+        except ValueError as exc:  # another type, since the station was configured anew
+            raise ControlError(str(exc), code=ErrorCode.VALUE) from None
+        return control.Written(len(values))
+
+    def _ask_to_stop(self, wanted: control.NoParameters) -> control.Stopping:
+        del wanted
+        self._stop()
+        return control.Stopping(stopping=True)
+
+    def _image(self, station: str) -> Image:
+        return self._station(station).image
+
+    def _station(self, station: str) -> StationImage:
+        return of_station(station, self._images)
+
+
+class Watch:
+    """The events of one subscription; asked every *period_ms* by whoever sends them."""
+
+    def __init__(
+        self,
+        station: StationImage,
+        names: Iterable[str],
+        period_ms: int,
+        *,
+        only_changes: bool,
+    ) -> None:
+        self.period_ms = period_ms
+        self._station = station
+        self._names = names
+        self._only_changes = only_changes
+        self._last: dict[str, Any] = {}
+        self._looked_in: int | None = None
+        self._skipped = 0
+
+    def next_event(self) -> control.ValuesEvent | None:
+        """Return the event to send now, None if nothing changed.
+
+        Raises:
+            ImageError: the values cannot be read.
+            ControlError: the station was configured anew, and one of the variables is gone.
+        """
+        image = self._station.image
+        now = _snapshot(image, _places(image, self._names))
+        if self._looked_in is not None:
+            self._skipped += max(now.cycle - self._looked_in - 1, 0)
+        self._looked_in = now.cycle
+        values, quality = now.values, now.quality
+        if self._only_changes:
+            last, self._last = self._last, values
+            values = {n: v for n, v in values.items() if n not in last or last[n] != v}
+            if not values:
+                return None
+            quality = {n: q for n, q in quality.items() if n in values}
+        skipped, self._skipped = self._skipped, 0
+        return control.ValuesEvent(now.station, now.cycle, values, quality, skipped)
+
+
+def _snapshot(image: Image, places: list[VariableSlot]) -> control.Values:
+    """Return the values of *places*; those of one writer belong to one moment.
+
+    Values that the engine writes are those of the cycle that is named.
+    """
+    engine = image.snapshot()
+    if len(places) == 1:
+        (place,) = places
+        source = engine if place.writer is Writer.ENGINE else image
+        values = {place.name: source.read(place.name)}
+    else:
+        values = engine.read_all((Writer.ENGINE,)) | image.read_all(_OTHERS)
+    plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in places}
+    cycle = engine.words[StationWord.CYCLE]
+    return control.Values(image.layout.station, cycle, plain, _qualities(engine, plain))
+
+
+def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
+    """Return the quality of those of *names* that are received, None before the first time."""
+    qualities: dict[str, int | None] = {}
+    for rx in image.layout.rx:
+        received = image.words[tracker_word(image, rx) + RxWord.RECEIVED]
+        value = quality(image, rx) if received else None
+        qualities.update((name, value) for name in rx.variables if name in names)
+    return qualities
+
+
+def _places(image: Image, names: Iterable[str]) -> list[VariableSlot]:
+    """Return the places of *names*, of all variables when there are none."""
+    chosen = list(names)
+    if not chosen:
+        return list(image.layout.variables)
+    unknown = [name for name in chosen if name not in image.slots]
+    if unknown:
+        raise ControlError(
+            f"station {image.layout.station} has no variable {unknown[0]!r}"
+            f"{suggest(unknown[0], image.slots)}",
+            code=ErrorCode.UNKNOWN_NAME,
+        )
+    return [image.slots[name] for name in chosen]
+
+
+def _checked(place: VariableSlot, value: Any) -> Any:
+    if place.writer is not Writer.APPLICATION:
+        raise ControlError(
+            f"variable {place.name} is written by the {place.writer}; only variables of the"
+            f" application can be set",
+            code=ErrorCode.REFUSED,
+        )
+    try:
+        return datatypes.parse(place.type).from_plain(value)
+    except ValueError as exc:
+        raise ControlError(f"variable {place.name}: {exc}", code=ErrorCode.VALUE) from None

@@ -1,0 +1,207 @@
+"""Live entries of a station's dictionaries, from its process image.
+
+Nothing is kept here: each value is looked up when somebody reads it, in the image that is the
+newest then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from eap.codec import datatypes
+from eap.codec.values import DataType
+from eap.errors import ImageError
+from eap.od.profiles import eap1000 as profile
+from eap.od.profiles.eap1000 import EapLive
+from eap.pd.frame_status import frame_state, tx_var_state
+from eap.pd.image import Image
+from eap.pd.layout import (
+    FRAME_CTRL,
+    VAR_CTRL,
+    FrameSlot,
+    ImageLayout,
+    RxSlot,
+    TxSlot,
+)
+from eap.pd.report import quality, tracker_word, tx_status, var_state
+from eap.pd.words import (
+    DISCARD_INDEX,
+    REASON_INDEX,
+    Discard,
+    FrameWord,
+    Reason,
+    RxWord,
+    StationWord,
+    TxWord,
+)
+from eap.runtime.station_image import StationImage
+
+_NEVER = 0xFFFF
+"""Quality of what has never been received: as old as can be told."""
+_KINDS: dict[str, DataType] = {
+    row.live: datatypes.parse(row.kind)
+    for each in profile.ALL
+    for row in each.entries
+    if row.live and row.kind
+}
+"""Types of the live entries, without those that hold a variable's value."""
+
+
+class ImageValues:
+    """What the dictionaries of one station show of what runs."""
+
+    def __init__(self, station: StationImage) -> None:
+        self._station = station
+        self._found: _Places | None = None
+        self._moment: Image | None = None
+
+    def octets(self, key: str, name: str) -> bytes | None:
+        """Return what *key* shows of the object called *name*, None if that does not run."""
+        try:
+            image = self._station.image
+            if key == EapLive.VALUE:
+                return _value(image, name)
+            # What programs write has no place in a snapshot: it may be cut in two there.
+            source = image if key in _CONTROLS else self._moment or image
+            number = self._places(source.layout).number(source, key, name)
+        except ImageError:
+            return None
+        return None if number is None else _encode(_KINDS[key], number)
+
+    @contextmanager
+    def at_one_moment(self) -> Iterator[None]:
+        """Show counters of one moment between two cycles for the length of a block."""
+        with suppress(ImageError):
+            self._moment = self._station.image.snapshot()
+        try:
+            yield
+        finally:
+            self._moment = None
+
+    def _places(self, layout: ImageLayout) -> _Places:
+        if self._found is None or self._found.layout is not layout:
+            self._found = _Places(layout)
+        return self._found
+
+
+class _Places:
+    """Places in images of one layout, by name."""
+
+    def __init__(self, layout: ImageLayout) -> None:
+        self.layout = layout
+        self._frames = {place.name: place for place in layout.frames}
+        self._tx = {place.name: place for place in layout.tx}
+        self._rx = {place.name: place for place in layout.rx}
+
+    def number(self, image: Image, key: str, name: str) -> int | None:
+        if key in _OF_STATION:
+            return int(image.words[_OF_STATION[key]])
+        if key in _OF_FRAME:
+            return _applied(_OF_FRAME[key], image, self._frames.get(name))
+        if key in _OF_TX:
+            return _applied(_OF_TX[key], image, self._tx.get(name))
+        if key in _OF_RX:
+            return _applied(_OF_RX[key], image, self._rx.get(name))
+        return None
+
+
+def _applied(function: Callable[[Image, Any], int], image: Image, place: Any) -> int | None:
+    return None if place is None else function(image, place)
+
+
+def _value(image: Image, name: str) -> bytes | None:
+    place = image.slots.get(name)
+    if place is None:
+        return None
+    kind = datatypes.parse(place.type)
+    return kind.encode(image.read(name)).ljust(kind.size, b"\0")
+
+
+def _encode(kind: DataType, number: int) -> bytes:
+    """Return *number* as near as *kind* can hold it."""
+    limits = kind.scalar_range
+    if limits is not None:
+        number = int(min(max(number, limits[0]), limits[1]))
+    return kind.encode(number)
+
+
+def _frame_word(word: FrameWord) -> Callable[[Image, FrameSlot], int]:
+    return lambda image, place: int(image.words[place.words + word])
+
+
+def _tx_word(word: TxWord) -> Callable[[Image, TxSlot], int]:
+    return lambda image, place: int(image.words[place.words + word])
+
+
+def _sent(reason: Reason) -> Callable[[Image, TxSlot], int]:
+    return lambda image, place: int(tx_status(image, place)["reason"].get(reason.value, 0))
+
+
+def _last_reason(image: Image, place: TxSlot) -> int:
+    last = tx_status(image, place)["last_reason"]
+    return 0 if last is None else REASON_INDEX[Reason(last)]
+
+
+def _control(suffix: str) -> Callable[[Image, FrameSlot | TxSlot], int]:
+    return lambda image, place: int(image.read(place.name + suffix))
+
+
+def _tracked(word: RxWord) -> Callable[[Image, RxSlot], int]:
+    return lambda image, place: int(image.words[tracker_word(image, place) + word])
+
+
+def _discarded(reason: Discard) -> Callable[[Image, RxSlot], int]:
+    offset = RxWord.DISCARDED + DISCARD_INDEX[reason]
+    return lambda image, place: int(image.words[place.words + offset])
+
+
+def _quality(image: Image, place: RxSlot) -> int:
+    return quality(image, place) if _tracked(RxWord.RECEIVED)(image, place) else _NEVER
+
+
+def _cycle_index(image: Image, place: RxSlot) -> int:
+    last = _tracked(RxWord.LAST_CYCLE)(image, place)
+    return last & 0xFFFF if _tracked(RxWord.RECEIVED)(image, place) else 0
+
+
+_CONTROLS = frozenset((EapLive.FRAME_CTRL, EapLive.TX_VAR_CTRL))
+_OF_STATION: dict[str, int] = {
+    EapLive.STATION_CYCLE: StationWord.CYCLE,
+    EapLive.STATION_OVERRUNS: StationWord.OVERRUNS,
+    EapLive.STATION_RESTARTS: StationWord.RESTARTS,
+    EapLive.STATION_TORN: StationWord.TORN,
+    EapLive.STATION_LATENESS_MAX: StationWord.LATENESS_MAX_NS,
+    EapLive.STATION_LINKS_HELD: StationWord.LINKS_HELD,
+} | {
+    key: StationWord.DISCARDED + DISCARD_INDEX[reason]
+    for reason in Discard
+    if (key := f"station_discarded_{reason}") in _KINDS
+}
+_OF_FRAME: dict[str, Callable[[Image, FrameSlot], int]] = {
+    EapLive.FRAME_STATE: lambda image, place: frame_state(image, place.words),
+    EapLive.FRAME_CTRL: _control(FRAME_CTRL),
+    EapLive.FRAME_WHOLE: _frame_word(FrameWord.WHOLE),
+    EapLive.FRAME_PARTIAL: _frame_word(FrameWord.PARTIAL),
+    EapLive.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
+}
+_OF_TX: dict[str, Callable[[Image, TxSlot], int]] = {
+    EapLive.TX_VAR_STATE: lambda image, place: tx_var_state(image.words, place),
+    EapLive.TX_VAR_CTRL: _control(VAR_CTRL),
+    EapLive.TX_LAST_REASON: _last_reason,
+    EapLive.TX_SKIPPED: _tx_word(TxWord.SKIPPED),
+} | {key: _sent(reason) for reason in Reason if (key := f"tx_sent_{reason}") in _KINDS}
+_OF_RX: dict[str, Callable[[Image, RxSlot], int]] = {
+    EapLive.RX_QUALITY: _quality,
+    EapLive.RX_CYCLE_INDEX: _cycle_index,
+    EapLive.RX_VAR_STATE: var_state,
+    EapLive.RX_STATE: _tracked(RxWord.STATE),
+    EapLive.RX_RECEIVED: _tracked(RxWord.RECEIVED),
+    EapLive.RX_LOST: _tracked(RxWord.LOST),
+    EapLive.RX_DUPLICATED: _tracked(RxWord.DUPLICATED),
+    EapLive.RX_REORDERED: _tracked(RxWord.REORDERED),
+    EapLive.RX_LATE: _tracked(RxWord.LATE),
+    EapLive.RX_TIMEOUTS: _tracked(RxWord.TIMEOUTS),
+    EapLive.RX_JITTER_MAX: _tracked(RxWord.JITTER_MAX_US),
+} | {key: _discarded(reason) for reason in Discard if (key := f"rx_discarded_{reason}") in _KINDS}

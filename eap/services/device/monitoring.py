@@ -1,0 +1,237 @@
+"""Subscriber monitoring in services: who is asked, what is heard, and the words that tell it.
+
+It follows the images: which frames are monitored, and where they go at the moment, is looked up
+there again and again, so that a station may be configured anew and a frame sent elsewhere.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import select
+from collections.abc import Iterator, Mapping
+from ipaddress import IPv4Address
+from time import monotonic_ns
+from typing import Protocol
+
+from eap.errors import EnvironmentalError, ImageError
+from eap.ids import Destination, DestinationKind, MacAddr
+from eap.net.arpprobe import ArpProber
+from eap.pd.address import from_word
+from eap.pd.image import Image
+from eap.pd.layout import FrameSlot
+from eap.pd.monitor import (
+    Evidence,
+    MonitorTarget,
+    PresenceChanged,
+    SubscriberMonitor,
+    SubscriberPresence,
+)
+from eap.pd.words import FrameWord
+from eap.runtime.handover import PortName
+from eap.services.routing.monitor_addresses import UdpWay, Ways, key_of
+
+logger = logging.getLogger(__name__)
+
+LOOK_NS = 200_000_000
+"""How often at least it is looked whether frames go elsewhere; answers wait as long at most."""
+
+
+class ImageHolder(Protocol):
+    """Whoever has the newest image of a station."""
+
+    @property
+    def image(self) -> Image:
+        """Return it; raise ImageError if there is none."""
+
+
+class _Row:
+    """One monitored frame, and where it went when somebody looked last."""
+
+    def __init__(self, port: PortName, place: FrameSlot, image: Image) -> None:
+        self.name = f"{port.station}/{place.name}"
+        self.port = port
+        self.place = place
+        self.words = image.words
+        self.address = -1
+        self.destination: Destination | None = None
+
+    def word(self, word: FrameWord) -> int:
+        return int(self.words[self.place.words + word])
+
+    def has_moved(self) -> bool:
+        """Look where the frame goes now; return whether that is somewhere else than before."""
+        address = self.word(FrameWord.ADDRESS)
+        if address == self.address:
+            return False
+        self.address = address
+        self.destination = from_word(address)
+        return True
+
+    @property
+    def target(self) -> MonitorTarget:
+        mac = None
+        if self.destination is not None and self.destination.kind is DestinationKind.MAC:
+            mac = MacAddr.parse(self.destination.host)
+        return MonitorTarget(self.name, self.place.monitor_interval_ms * 1_000_000, mac)
+
+
+class SubscriberWatch:
+    """Monitors the subscribers of all frames of the *images*, by station, that say so."""
+
+    def __init__(self, images: Mapping[str, ImageHolder], ways: Ways) -> None:
+        self._holders = images
+        self._ways = ways
+        self._images: dict[str, Image] = {}
+        self._rows: dict[str, _Row] = {}
+        self._monitor = SubscriberMonitor(0)
+        self._asked: dict[tuple[ArpProber, IPv4Address], list[str]] = {}
+
+    async def run(self) -> None:
+        """Go on until cancelled."""
+        loop = asyncio.get_running_loop()
+        owners = {sock.fileno(): way for way in self._ways.udp.values() for sock in way.sockets}
+        with select.epoll() as errors:
+            for fd in owners:
+                # Errors alone, and each once: the frames that arrive there are for others.
+                errors.register(fd, select.EPOLLET)
+
+            def collect() -> None:
+                for fd, _ in errors.poll(0):
+                    owners[fd].collect(monotonic_ns())
+
+            loop.add_reader(errors.fileno(), collect)
+            try:
+                while True:
+                    pause_ns = self.step(monotonic_ns()) - monotonic_ns()
+                    await asyncio.sleep(max(pause_ns, 0) / 1e9)
+            finally:
+                loop.remove_reader(errors.fileno())
+
+    def step(self, now_ns: int) -> int:
+        """Do what there is to do; return when the next step is due."""
+        self._follow(now_ns)
+        self._hear(now_ns)
+        for name in self._monitor.probes_to_send(now_ns):
+            evidence = self._ask(self._rows[name])
+            if evidence is not None:
+                self._monitor.receive_evidence(name, evidence, now_ns)
+        self._tell()
+        due_ns = self._monitor.next_timeout()
+        return now_ns + LOOK_NS if due_ns is None else min(due_ns, now_ns + LOOK_NS)
+
+    def _follow(self, now_ns: int) -> None:
+        """Look which frames are monitored and where they go."""
+        changed = False
+        for station, holder in self._holders.items():
+            try:
+                image = holder.image
+            except ImageError:
+                continue  # between two images: the next look will find one
+            if self._images.get(station) is not image:
+                self._images[station] = image
+                self._replace(station, image)
+                changed = True
+        for row in self._rows.values():
+            if row.has_moved():
+                self._monitor.add(row.target, now_ns)
+                changed = True
+        if changed:
+            self._listen()
+
+    def _replace(self, station: str, image: Image) -> None:
+        """Follow the frames of *image*; what is known of those that stay as they were is kept."""
+        own = [name for name, row in self._rows.items() if row.port.station == station]
+        before = {name: self._rows.pop(name) for name in own}
+        for place in image.layout.frames:
+            if place.monitor_interval_ms:
+                row = _Row(PortName(station, place.port), place, image)
+                was = before.get(row.name)
+                if was is not None and was.place.target == place.target:
+                    row.address, row.destination = was.address, was.destination
+                self._rows[row.name] = row
+        for name in before.keys() - self._rows.keys():
+            self._monitor.remove(name)
+
+    def _listen(self) -> None:
+        """Have each way listen to what is said of its targets."""
+        self._asked = {}
+        targets: dict[UdpWay, list[Destination]] = {}
+        for row in self._rows.values():
+            if prober := self._prober(row):
+                key = prober, IPv4Address(row.place.monitor_ip)
+                self._asked.setdefault(key, []).append(row.name)
+            way = self._ways.udp.get(row.port)
+            if way is not None and (target := _ip_of(row)) is not None:
+                targets.setdefault(way, []).append(target)
+        for way in set(self._ways.udp.values()):
+            way.watch(targets.get(way, ()))
+        for prober in set(self._ways.arp.values()):
+            try:
+                prober.watch(address for each, address in self._asked if each is prober)
+            except EnvironmentalError as exc:
+                logger.warning("%s", exc)
+
+    def _hear(self, now_ns: int) -> None:
+        for prober in set(self._ways.arp.values()):
+            for heard in prober.drain():
+                for name in self._asked.get((prober, heard.address), ()):
+                    if heard.is_claim:
+                        self._monitor.receive_claim(name, heard.mac, now_ns)
+                    else:
+                        self._monitor.receive_reply(name, heard.mac, now_ns)
+        refused = {way: way.hear(now_ns) for way in set(self._ways.udp.values())}
+        for row in self._rows_by_udp():
+            target = _ip_of(row)
+            if target is not None and key_of(target) in refused[self._ways.udp[row.port]]:
+                self._monitor.receive_evidence(row.name, Evidence.ABSENT, now_ns)
+
+    def _rows_by_udp(self) -> Iterator[_Row]:
+        return (row for row in self._rows.values() if row.port in self._ways.udp)
+
+    def _ask(self, row: _Row) -> Evidence | None:
+        """Ask for the subscriber of *row*; return what is known at once, None if it may answer."""
+        if prober := self._prober(row):
+            return None if prober.probe(IPv4Address(row.place.monitor_ip)) else Evidence.BLIND
+        target, way = _ip_of(row), self._ways.udp.get(row.port)
+        if target is None or way is None:
+            return Evidence.BLIND
+        return way.look(target, row.word(FrameWord.SENT_AT_NS))
+
+    def _prober(self, row: _Row) -> ArpProber | None:
+        """Return who asks by ARP for the subscriber of *row*, None where that is no way."""
+        destination = row.destination
+        if destination is None or destination.kind is not DestinationKind.MAC:
+            return None
+        if destination.is_group or not row.place.monitor_ip:
+            return None
+        return self._ways.arp.get(row.port)
+
+    def _tell(self) -> None:
+        while event := self._monitor.next_event():
+            _log(event, self._rows[event.name])
+        for row in self._rows.values():
+            row.words[row.place.words + FrameWord.PRESENCE] = self._monitor.presence(row.name)
+
+
+def _ip_of(row: _Row) -> Destination | None:
+    """Return where a unicast frame on UDP goes, None for all others."""
+    target = row.destination
+    if target is None or target.kind is not DestinationKind.IP or target.is_group:
+        return None
+    return target
+
+
+def _log(event: PresenceChanged, row: _Row) -> None:
+    level = logging.WARNING if event.new is SubscriberPresence.MISSING else logging.INFO
+    other = ""
+    if event.new is SubscriberPresence.MISSING and event.answered_by not in {None, row.target.mac}:
+        other = f"; {row.place.monitor_ip} is answered by {event.answered_by} instead"
+    logger.log(
+        level,
+        "%s: subscriber at %s is %s%s",
+        event.name,
+        row.destination,
+        event.new.name.lower() if event.new is not SubscriberPresence.UNKNOWN else "out of sight",
+        other,
+    )

@@ -1,0 +1,283 @@
+"""The EAP device of a station as services serve it: its dictionaries, states and changes.
+
+Rule 1: what changes anything is a job; jobs are done one after the other and to their ends.
+Rule 2: there is one way into force, whoever asks: a whole specification, through the keeper.
+Rule 3: in any state but PreOp the dictionaries say what runs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, TypeAlias, TypeVar
+
+from eap.device import stored
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_objects import DeviceIdentity, LiveValues
+from eap.device.eap_records import read_back
+from eap.device.eap_state import EapStateMachine, StateResult
+from eap.od.abort import AbortCode, SdoAbortError
+from eap.od.model import OdState
+from eap.pd.device import DeviceFault, DeviceState, FaultCode
+from eap.pd.spec import StationSpec
+from eap.runtime.device_change import (
+    Plan,
+    dump_all,
+    eap_ports,
+    fill_all,
+    find_refusals,
+    make_plan,
+)
+from eap.runtime.device_change import plan_rollback as make_rollback
+from eap.runtime.store import Configuration
+from eap.services.device.station_keeper import StationKeeper
+from eap.services.jobs import Jobs
+
+_CONTROL = 0xF200
+_STATES = frozenset((DeviceState.PREOP, DeviceState.SAFEOP, DeviceState.OP))
+
+ResultT = TypeVar("ResultT")
+Run: TypeAlias = Callable[[StationSpec, dict[str, Any]], Awaitable[None]]
+
+logger = logging.getLogger(__name__)
+
+
+class StationDevice:
+    """One station's device.
+
+    Args:
+        keeper: Of what it runs.
+        values: Where live entries get theirs.
+        identity: What 0x1000 to 0x1018 show.
+
+    Attributes:
+        dictionaries: By name of the EAP port.
+    """
+
+    def __init__(self, keeper: StationKeeper, values: LiveValues, identity: DeviceIdentity) -> None:
+        self.name = keeper.spec.name
+        self._keeper = keeper
+        self._jobs = Jobs(f"station {self.name}")
+        self.dictionaries = {
+            name: EapDictionary(keeper.spec, name, values, identity)
+            for name in eap_ports(keeper.spec)
+        }
+        self._incomplete: DeviceFault | None = None
+        self._is_written = False
+        try:
+            fill_all(self.dictionaries, keeper.objects)
+        except DeviceFault as exc:
+            self._incomplete = exc
+            logger.warning("station %s: not all of it is in its dictionaries: %s", self.name, exc)
+        self._requested: int | None = None
+        self._changed: StationSpec | None = None
+        self._checked: StationSpec | DeviceFault = keeper.spec
+        self._machine = EapStateMachine(self._recall, _Recalled(self._recall))
+        for dictionary in self.dictionaries.values():
+            self._machine.serve(dictionary)
+            dictionary.on_request = self._note_request
+            dictionary.on_change = self._note_change
+        self._machine.start()
+        if keeper.state is not DeviceState.PREOP:
+            self._machine.request(keeper.state)
+
+    @property
+    def spec(self) -> StationSpec:
+        """What runs."""
+        return self._keeper.spec
+
+    @property
+    def last_change(self) -> tuple[Configuration | None, str, bool]:
+        """What ran before the last change, if anything, which change that was, and if undone."""
+        return self._keeper.previous, self._keeper.cause, self._keeper.undone
+
+    def findings(self) -> list[dict[str, Any]]:
+        """Return as findings of ``status`` that what runs is not what a start would bring back."""
+        unkept = self._keeper.unkept
+        if unkept is None:
+            return []
+        reason, _, remedy = unkept.reason.removeprefix(f"station {self.name}: ").rpartition("; ")
+        state = self._keeper.state.name
+        return [
+            {
+                "severity": "error",
+                "where": self.name,
+                "what": f"{reason}; after a start it is as it was before",
+                "advice": f"{remedy}, then 'eapctl state {self.name} {state}'",
+                "since": unkept.since,
+            }
+        ]
+
+    @property
+    def status(self) -> StateResult:
+        """State, and why it is not another one."""
+        return self._machine.status
+
+    def od_state(self) -> OdState:
+        """Return the rights with which clients reach the dictionaries."""
+        return self._machine.od_state or OdState.PREOP
+
+    async def tell_again(self) -> None:
+        """Tell the engine what it is to run, which it may have missed."""
+        await self._jobs.do(self._keeper.tell_again)
+
+    def upload(self, port: str, index: int, subindex: int, *, complete: bool = False) -> bytes:
+        """Return an entry, or a whole object from *subindex* on; raise SdoAbortError."""
+        dictionary = self.dictionaries[port]
+        read = dictionary.upload_complete if complete else dictionary.upload
+        return read(index, subindex, self.od_state())
+
+    async def download(
+        self, port: str, index: int, subindex: int, data: bytes, *, complete: bool = False
+    ) -> None:
+        """Write an entry, or a whole object from *subindex* on; raise SdoAbortError."""
+        dictionary = self.dictionaries[port]
+
+        def write() -> None:
+            if complete:
+                dictionary.download_complete(index, subindex, data, self.od_state())
+            else:
+                dictionary.download(index, subindex, data, self.od_state())
+
+        await self.change(port, write)
+
+    async def change(self, port: str, write: Callable[[], ResultT]) -> ResultT:
+        """Have *write* change the dictionary of *port*, and do what follows; return its result.
+
+        Raises:
+            SdoAbortError: it, or the engine, refuses; nothing has changed.
+            ControlError: too many changes wait already.
+        """
+        return await self._jobs.do(lambda: self._write(self.dictionaries[port], write))
+
+    async def request_state(self, wanted: int) -> StateResult:
+        """Go to the state numbered *wanted* as far as possible."""
+        return await self._jobs.do(lambda: self._go(wanted))
+
+    async def plan(self, spec: StationSpec) -> Plan:
+        """Return what it takes to run *spec*."""
+        return await self._jobs.do(lambda: asyncio.to_thread(self._plan, spec))
+
+    async def apply(
+        self, spec: StationSpec, cause: str = "", *, of_plant_file: bool = False
+    ) -> tuple[Plan, DeviceFault | None]:
+        """Run *spec*, in the state that there is; return what that changes, or why it does not.
+
+        A change of several stations in several steps has one *cause*; *of_plant_file* says that it
+        is to what the plant file of the appliance says now.
+        """
+        run = partial(self._keeper.change, cause=cause, applied=of_plant_file)
+        return await self._jobs.do(lambda: self._change(lambda: self._plan(spec), run))
+
+    async def roll_back(self, spec: StationSpec | None = None) -> tuple[Plan, DeviceFault | None]:
+        """Run again what ran before the last change; returns as :meth:`apply` does.
+
+        *spec* is that, or what runs now, with alternates where layouts change with other stations.
+        """
+
+        def plan() -> Plan:
+            return make_rollback(self.spec, self.dictionaries, self._keeper.previous, spec)
+
+        return await self._jobs.do(lambda: self._change(plan, self._keeper.take_back))
+
+    def _plan(self, spec: StationSpec) -> Plan:
+        return make_plan(self.spec, self.dictionaries, spec, {})
+
+    async def _change(self, make: Callable[[], Plan], run: Run) -> tuple[Plan, DeviceFault | None]:
+        # A thousand PDs take a second, in which others want answers; only jobs write dictionaries.
+        plan = await asyncio.to_thread(make)
+        if plan.refused or (plan.is_empty and plan.spec == self.spec):
+            return plan, None
+        try:
+            await run(plan.spec, await asyncio.to_thread(plan.objects))
+        except DeviceFault as exc:
+            return plan, exc
+        for name, dictionary in self.dictionaries.items():
+            stored.adopt(dictionary, plan.dictionaries[name])
+        self._incomplete = None
+        return plan, None
+
+    async def _write(self, dictionary: EapDictionary, write: Callable[[], ResultT]) -> ResultT:
+        """Write to *dictionary*, and do what follows from it before anybody is answered.
+
+        Raises:
+            SdoAbortError: it is refused, by the dictionary or by the engine; nothing has changed.
+        """
+        self._requested = self._changed = None
+        runs = self._machine.status.state is not DeviceState.PREOP
+        before = stored.configuration(dictionary) if runs else {}
+        result = write()
+        self._is_written = self._is_written or self._requested is None
+        if self._requested is not None:
+            fault = (await self._go(self._requested)).fault
+            if fault is not None:
+                raise SdoAbortError(AbortCode.DEVICE_STATE, _CONTROL, 1, fault.text)
+        elif self._changed is not None:
+            try:
+                await self._keeper.change(self._changed, dump_all(self.dictionaries))
+            except DeviceFault as exc:
+                stored.restore(dictionary, before)
+                raise SdoAbortError(AbortCode.PARAMETER, exc.index, exc.subindex, exc.text) from exc
+        return result
+
+    async def _go(self, wanted: int) -> StateResult:
+        """Have the engine go first; then the state machine does what the engine did."""
+        state = self._machine.status.state
+        try:
+            if wanted in _STATES:
+                await self._lead(state, DeviceState(wanted))
+        except DeviceFault as exc:
+            self._checked = exc
+        return self._machine.request(wanted)
+
+    async def _lead(self, state: DeviceState, wanted: DeviceState) -> None:
+        self._checked = self.spec
+        is_untouched = self._incomplete is not None and not self._is_written
+        if state is DeviceState.PREOP and wanted is not state and not is_untouched:
+            self._checked = spec = self._read_back()
+            await self._keeper.change(spec, dump_all(self.dictionaries))
+        await self._keeper.change_state(wanted)
+
+    def _read_back(self) -> StationSpec:
+        """Return what the dictionaries say; raise DeviceFault if that cannot run."""
+        if self._incomplete is not None:
+            raise self._incomplete
+        spec = read_back(self.spec, self.dictionaries)
+        for reason in find_refusals(self.spec, spec):
+            raise DeviceFault(FaultCode.PORT, reason)
+        return spec
+
+    def _recall(self) -> StationSpec:
+        """Return what the engine took, or raise why it did not."""
+        if isinstance(self._checked, DeviceFault):
+            raise self._checked
+        return self._checked
+
+    def _note_request(self, wanted: int) -> None:
+        self._requested = wanted
+
+    def _note_change(self, index: int, subindex: int) -> None:
+        del index, subindex
+        self._changed = self._read_back()
+
+
+class _Recalled:
+    """The actions of a state machine whose transitions the engine has made already."""
+
+    def __init__(self, recall: Callable[[], StationSpec]) -> None:
+        self._recall = recall
+
+    def start_sending(self, spec: StationSpec) -> None:
+        """Nothing: the engine has it."""
+
+    def start_receiving(self) -> None:
+        """Raise DeviceFault if the engine did not go there."""
+        self._recall()
+
+    def stop_receiving(self) -> None:
+        """Nothing: the engine has stopped."""
+
+    def stop_sending(self) -> None:
+        """Nothing: likewise."""

@@ -1,0 +1,215 @@
+"""What a station runs, and what is kept of it for the next start: both change together.
+
+Rule 1: what is to run is kept first, then the engine is asked; what it refuses is kept no longer.
+So a kill at any moment leaves a whole configuration, the old or the new one.
+Rule 2: an engine that goes away in the middle is not trusted to have taken anything: what ran
+before is kept, and told again to the engine that comes after.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from time import time
+from typing import Any, NamedTuple, Protocol
+
+from msgspec.structs import replace
+
+from eap.device.rollout import without_alternates
+from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
+from eap.pd.device import DeviceFault, DeviceState, FaultCode
+from eap.pd.spec import StationSpec
+from eap.runtime.store import Configuration, StationFile, Stored, digest_of, new_cause
+
+logger = logging.getLogger(__name__)
+
+
+class Unkept(NamedTuple):
+    """Why a configuration is not kept, and since when, as Unix time."""
+
+    reason: str
+    since: float
+
+
+class StationEngine(Protocol):
+    """Who runs stations.
+
+    Both methods raise EngineRefusedError, EngineGoneError or EnvironmentalError.
+    """
+
+    async def configure(self, station: str, spec: StationSpec) -> None:
+        """Have *station* run *spec* from its next cycle on."""
+
+    async def set_state(self, station: str, state: DeviceState) -> None:
+        """Bring *station* to PreOp, SafeOp or Op."""
+
+
+class StationKeeper:
+    """What one station runs.
+
+    Args:
+        spec: What the engine was started with.
+        state: Likewise.
+        store: Where it is kept.
+        engine: Who runs it.
+
+    Attributes:
+        spec: What it runs.
+        state: In which state.
+        objects: The content of its dictionaries, where that was kept.
+        previous: What it ran before the last change, None if nothing else.
+        cause: Which change that was.
+        undone: Whether it was taken back.
+        on_change: Called with a new specification once it runs.
+        unkept: Why what runs is not what a start would bring back; None while both agree.
+    """
+
+    def __init__(
+        self,
+        spec: StationSpec,
+        state: DeviceState,
+        store: StationFile[Stored],
+        engine: StationEngine,
+    ) -> None:
+        self.spec = spec
+        self.state = state
+        self.objects: dict[str, Any] = {}
+        self.previous: Configuration | None = None
+        self.cause = ""
+        self.undone = False
+        self.on_change: Callable[[StationSpec], None] | None = None
+        self.unkept: Unkept | None = None
+        self._store = store
+        self._engine = engine
+        self._base = digest_of(spec)
+        self._applied = ""
+        self._is_unsure = False
+        stored = store.read()
+        if stored is not None:
+            self._base, self._applied = stored.base, stored.applied
+            self.previous, self.cause = stored.previous, stored.cause
+            self.undone = stored.undone
+            if stored.spec == spec:
+                self.objects = stored.objects
+        self._kept = self._record()
+
+    async def change(
+        self, spec: StationSpec, objects: dict[str, Any], *, cause: str = "", applied: bool = False
+    ) -> None:
+        """Run *spec*, with what the dictionaries hold then.
+
+        Args:
+            spec: What is to run.
+            objects: The content of its dictionaries.
+            cause: What brings it; all steps of one change have the same.  Empty is a new one.
+            applied: Whether *spec* is what the appliance's plant file says, or a step towards it.
+
+        Raises:
+            DeviceFault: it does not run, and what ran before goes on.
+        """
+        record = replace(self._record(), spec=spec, objects=objects)
+        # Where nothing was kept of the dictionaries yet they hold what follows from what runs.
+        is_other = spec != self.spec or objects != (self.objects or objects)
+        if is_other and (not cause or cause != self.cause or self.undone):
+            cause = cause or new_cause()
+            record = replace(record, previous=self._before(), cause=cause, undone=False)
+        bare = without_alternates(spec)
+        if applied and (bare == spec or bare != without_alternates(self.spec)):
+            record = replace(record, applied=digest_of(bare))
+        await self._run(record)
+
+    async def take_back(self, spec: StationSpec, objects: dict[str, Any]) -> None:
+        """Run *spec*: what ran before the last change, or a step on the way there or from there.
+
+        What ran until now is what another :meth:`take_back` brings.  Raises as :meth:`change`.
+        """
+        record = replace(self._record(), spec=spec, objects=objects)
+        if without_alternates(spec) != without_alternates(self.spec):
+            record = replace(record, previous=self._before(), undone=not self.undone)
+        await self._run(record)
+
+    def _before(self) -> Configuration:
+        """Return what runs, as something to go back to."""
+        spec = without_alternates(self.spec)
+        return Configuration(base=self._base, spec=spec, objects=self.objects)
+
+    async def _run(self, record: Stored) -> None:
+        spec = record.spec
+        try:
+            await self._save(record)
+            if spec != self.spec or self._is_unsure:
+                await self._engine.configure(self.spec.name, spec)
+        except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
+            self._is_unsure = isinstance(exc, EngineGoneError)
+            await self._save_back()
+            raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
+        self._is_unsure = False
+        self.objects, self.previous, self._applied = record.objects, record.previous, record.applied
+        self.cause, self.undone = record.cause, record.undone
+        if spec != self.spec:
+            self.spec = spec
+            if self.on_change is not None:
+                self.on_change(spec)
+
+    async def change_state(self, state: DeviceState) -> None:
+        """Bring the station to *state*.
+
+        Raises:
+            DeviceFault: the engine does not go up there; what goes down is down in any case.
+        """
+        if state is self.state:
+            if self.unkept is not None:
+                await self._save_back()
+            return
+        try:
+            await self._engine.set_state(self.spec.name, state)
+        except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
+            if state > self.state:
+                raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
+            self._is_unsure = True
+            logger.warning("station %s, on the way to %s: %s", self.spec.name, state.name, exc)
+        self.state = state
+        await self._save_back()
+
+    async def tell_again(self) -> None:
+        """Tell the engine what it is to run, which it may have missed.
+
+        It may have read what was kept just before that changed, and services may have been killed
+        between the two.
+        """
+        try:
+            await self._engine.configure(self.spec.name, self.spec)
+            await self._engine.set_state(self.spec.name, self.state)
+        except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
+            logger.warning("station %s, after a start: %s", self.spec.name, exc)
+        else:
+            self._is_unsure = False
+
+    def _record(self) -> Stored:
+        return Stored(
+            base=self._base,
+            spec=self.spec,
+            objects=self.objects,
+            state=self.state,
+            applied=self._applied,
+            previous=self.previous,
+            cause=self.cause,
+            undone=self.undone,
+        )
+
+    async def _save(self, record: Stored) -> None:
+        # Other clients do not wait for the disk.
+        await asyncio.to_thread(self._store.save, record)
+        self._kept = record
+        self.unkept = None
+
+    async def _save_back(self) -> None:
+        """Keep what runs; if something else stays kept, log it once and show it until it is not."""
+        record = self._record()
+        try:
+            await self._save(record)
+        except EnvironmentalError as exc:
+            if self.unkept is None and record != self._kept:
+                logger.warning("%s; after a start it will be as it was before", exc)
+                self.unkept = Unkept(str(exc), time())

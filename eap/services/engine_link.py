@@ -1,0 +1,172 @@
+"""Services' end of the pair on which the engine takes requests for its stations and buses.
+
+Replies are matched by number.  An engine that dies leaves the pair open and silent, so a reply has
+a time-out, and a request that waits for long pings the engine now and then.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from time import monotonic_ns
+
+import msgspec
+
+from eap.errors import EngineGoneError
+from eap.runtime.bus_errors import to_error
+from eap.runtime.bus_request import (
+    BusChange,
+    Cancel,
+    EngineMessage,
+    EngineReply,
+    EngineRequest,
+    EngineStarted,
+    Ping,
+    UnsolicitedMessage,
+)
+
+LOOK_S = 1.0
+"""An engine that says nothing at all for this long, though it was asked, is gone."""
+
+_MAX_MESSAGE = 1 << 20
+_BATCH = 64
+
+logger = logging.getLogger(__name__)
+
+
+class EngineLink:
+    """Sends requests to the engine; made inside the loop that serves it.
+
+    Args:
+        sock: This end of the pair; closed by :meth:`close`.
+        look_s: As LOOK_S.
+
+    Attributes:
+        on_restart: Called when another engine has taken its end of the pair.
+        on_unsolicited: Called with each message that a slave sent unasked.
+        on_change: Called with each change of a bus.
+        received_s: Time of the loop at which the engine has sent something last.
+    """
+
+    def __init__(self, sock: socket.socket, *, look_s: float = LOOK_S) -> None:
+        self._socket = sock
+        self._socket.setblocking(False)
+        self._look_s = look_s
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(sock, self._receive)
+        self._encoder = msgspec.msgpack.Encoder()
+        self._decoder = msgspec.msgpack.Decoder(EngineMessage)
+        self._waiting: dict[int, asyncio.Future[EngineReply]] = {}
+        # Numbers of a process before this one do not come again: late answers to it match nothing.
+        self._last_id = monotonic_ns()
+        self.received_s = 0.0
+        self.on_restart: list[Callable[[], None]] = []
+        self.on_unsolicited: list[Callable[[UnsolicitedMessage], None]] = []
+        self.on_change: list[Callable[[BusChange], None]] = []
+
+    @property
+    def is_alive(self) -> bool:
+        """True if the engine has sent something in the time after which it counts as gone."""
+        return self._loop.time() < self.received_s + self._look_s
+
+    async def request(self, make: Callable[[int], EngineRequest], timeout_s: float) -> EngineReply:
+        """Send the request that *make* returns for its number, and wait for the reply.
+
+        When this is cancelled, the request is cancelled at the engine.
+
+        Raises:
+            EngineGoneError: no engine answers, or it was started again meanwhile.
+            BusError, EngineRefusedError: it could not do it.
+        """
+        request = make(self._next_id())
+        future: asyncio.Future[EngineReply] = self._loop.create_future()
+        self._waiting[request.id] = future
+        try:
+            self.post(request)
+            answer = await self._wait(future, self._loop.time() + timeout_s)
+        except (asyncio.CancelledError, EngineGoneError):
+            with suppress(EngineGoneError):
+                self.post(Cancel(id=request.id))
+            raise
+        finally:
+            del self._waiting[request.id]
+        if answer.error is not None:
+            raise to_error(answer.error)
+        return answer
+
+    def send(self, make: Callable[[int], EngineRequest]) -> None:
+        """Send a request whose reply is ignored; raises as :meth:`post` does."""
+        self.post(make(self._next_id()))
+
+    def post(self, request: EngineRequest) -> None:
+        """Send one message.
+
+        Raises:
+            EngineGoneError: there is no room, because the engine takes no messages.
+        """
+        try:
+            self._socket.send(self._encoder.encode(request))
+        except OSError as exc:
+            raise EngineGoneError(f"the engine takes no requests: {exc.strerror}") from None
+
+    def close(self) -> None:
+        """Let go of the pair; the loop may have ended."""
+        if not self._loop.is_closed():
+            self._loop.remove_reader(self._socket)
+        self._socket.close()
+
+    async def _wait(self, future: asyncio.Future[EngineReply], end_s: float) -> EngineReply:
+        looked_s: float | None = None
+        while True:
+            rest_s = min(self._look_s, end_s - self._loop.time())
+            await asyncio.wait({future}, timeout=max(0.0, rest_s))
+            now_s = self._loop.time()
+            if future.done():
+                return future.result()
+            if now_s >= end_s or (looked_s is not None and self.received_s < looked_s):
+                raise EngineGoneError("the engine does not answer")
+            looked_s = now_s
+            self.send(lambda number: Ping(id=number))
+
+    def _next_id(self) -> int:
+        self._last_id += 1
+        return self._last_id
+
+    def _receive(self) -> None:
+        for _ in range(_BATCH):
+            try:
+                octets = self._socket.recv(_MAX_MESSAGE)
+            except OSError:
+                return
+            if not octets:  # the supervisor has closed both ends: everything ends
+                self._loop.remove_reader(self._socket)
+                return
+            self._take(octets)
+
+    def _take(self, octets: bytes) -> None:
+        try:
+            message = self._decoder.decode(octets)
+        except msgspec.MsgspecError as exc:
+            logger.warning("an answer of the engine cannot be read: %s", exc)
+            return
+        self.received_s = self._loop.time()
+        if isinstance(message, EngineStarted):
+            self._restarted()
+        elif isinstance(message, UnsolicitedMessage):
+            for call in self.on_unsolicited:
+                call(message)
+        elif isinstance(message, BusChange):
+            for notify in self.on_change:
+                notify(message)
+        elif (future := self._waiting.get(message.id)) is not None and not future.done():
+            future.set_result(message)
+
+    def _restarted(self) -> None:
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(EngineGoneError("the engine was started again"))
+        for call in self.on_restart:
+            call()

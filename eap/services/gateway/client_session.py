@@ -1,0 +1,284 @@
+"""One client's session with one slave in one mailbox protocol.
+
+Rule 1: a request is answered within a time, by the slave or by the gateway.
+Rule 2: a step of a transfer that comes again gets its answer again, and changes nothing.
+Rule 3: a transfer without a next step is given up, and what it holds is freed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator, Sequence
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+
+from devicebus.errors import MailboxRefusedError
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.ams.endpoint import Way
+from eap.codec.foe import FoeOpcode
+from eap.codec.mailbox import MailboxType
+from eap.errors import CodecError, EapError, TruncatedError
+from eap.gateway import error_table
+from eap.gateway.error_table import Cause, cause_of_result
+from eap.gateway.refusal import GatewayError, mailbox_error, refuse
+from eap.services.slaves.access import RemoteAccessError
+
+IDLE_S = 5.0
+"""Limit for the pause between two steps of a transfer."""
+WRITES = 5
+"""Answer times that the last step of a download may take: the slave gets all of it then."""
+MAX_SESSIONS = 512
+_GRACE_S = 0.03
+"""For the bus, which answers at the deadline itself."""
+_BUSY = bytes((FoeOpcode.BUSY,))
+
+
+class GatewayReply(msgspec.Struct, frozen=True):
+    """A message that goes back to the client."""
+
+    type: MailboxType
+    body: bytes
+    reason: Cause | None = None
+    """Of the gateway's own refusal; None for an answer of the slave."""
+    is_again: bool = False
+    """True for the answer to a repeated step of a transfer, the same as to the step itself."""
+
+
+class SessionCodec(Protocol):
+    """Server's side of one mailbox protocol in front of a slave, for one client.
+
+    Attributes:
+        sizes: Of the mailboxes that the client writes to and reads from.
+    """
+
+    sizes: MailboxSizes
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a transfer is under way, so that more requests belong to it."""
+
+    async def answer(self, body: bytes) -> list[bytes]:
+        """Return the answers to a message.
+
+        Raises:
+            MailboxRefusedError: it can only be answered with a mailbox error.
+            CodecError: it is cut, or none of this protocol.
+            EapError: the slave was not reached.
+        """
+
+    def is_step(self, body: bytes) -> bool:
+        """Return whether a request goes on with a transfer, so that its repeat changes nothing."""
+
+    def completes_write(self, body: bytes) -> bool:
+        """Return whether a request is the last of many, for all of which the slave works now."""
+
+    def reset(self) -> None:
+        """Give up what is under way, at the slave too."""
+
+
+class ClientSession:
+    """Requests of one client to one slave in one protocol, one after the other.
+
+    Args:
+        kind: The protocol.
+        codec: Its server's side.
+        answer_s: Limit for an answer.
+        idle_s: As IDLE_S.
+    """
+
+    def __init__(
+        self, kind: MailboxType, codec: SessionCodec, *, answer_s: float, idle_s: float = IDLE_S
+    ) -> None:
+        self.codec = codec
+        self._kind = kind
+        self._answer_s = answer_s
+        self._idle_s = idle_s
+        self._request = b""
+        self._replies: list[GatewayReply] | None = None
+        self._lock = asyncio.Lock()
+        self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a transfer is under way."""
+        return self.codec.is_running
+
+    async def ask(self, body: bytes, *, is_step: bool) -> list[GatewayReply]:
+        """Return the answers to a request, which may be none.
+
+        Args:
+            body: Behind the mailbox header.
+            is_step: Whether it only makes sense within a transfer.
+        """
+        now_s = asyncio.get_running_loop().time()
+        times = WRITES if self.codec.completes_write(body) else 1
+        if self._lock.locked():
+            try:
+                async with asyncio.timeout_at(now_s + self._answer_s):
+                    await self._lock.acquire()
+            except TimeoutError:
+                return self._refuse(body, Cause.TIMEOUT)
+        else:
+            await self._lock.acquire()  # without waiting, and without the price of a time-out
+        try:
+            return await self._ask(body, now_s + times * self._answer_s, is_step=is_step)
+        finally:
+            self._lock.release()
+
+    def close(self) -> None:
+        """Give up what is under way."""
+        self._stop_timer()
+        self.codec.reset()
+        self._replies = None
+
+    async def _ask(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[GatewayReply]:
+        if self._is_repeated(body):
+            return [replace(each, is_again=True) for each in self._replies or ()]
+        if is_step and not self.is_running:
+            return self._refuse(body, Cause.SERVICE, "no transfer is under way")
+        self._stop_timer()
+        self._request, self._replies = body, None
+        replies = await self._answer(body, deadline_s)
+        self._replies = replies
+        if self.is_running:
+            self._timer = asyncio.get_running_loop().call_later(self._idle_s, self.close)
+        return replies
+
+    def _is_repeated(self, body: bytes) -> bool:
+        """Return whether a request is the last step again, whose reply was lost on its way.
+
+        After BUSY it is none: that is how a client asks whether the slave has time now.
+        """
+        if body != self._request or self._replies is None or not self.codec.is_step(body):
+            return False
+        is_busy = (
+            self._kind is MailboxType.FOE
+            and self._replies[-1:]
+            and (self._replies[-1].body[:1] == _BUSY)
+        )
+        return not is_busy
+
+    async def _answer(self, body: bytes, deadline_s: float) -> list[GatewayReply]:
+        try:
+            async with asyncio.timeout_at(deadline_s + _GRACE_S):
+                answers = await self.codec.answer(body)
+        except TimeoutError:
+            self.close()
+            return self._refuse(body, Cause.TIMEOUT)
+        except MailboxRefusedError as exc:
+            self.codec.reset()
+            return [GatewayReply(*mailbox_error(exc.detail))]
+        except CodecError as exc:
+            is_cut = isinstance(exc, TruncatedError)
+            return self._refuse(body, Cause.TOO_SHORT if is_cut else Cause.SERVICE)
+        except EapError as exc:
+            self.close()
+            return self._refuse(body, cause_of(exc), text_of(exc))
+        except BaseException:
+            self.close()
+            raise
+        return [GatewayReply(self._kind, answer) for answer in answers]
+
+    def _refuse(self, body: bytes, reason: Cause, text: str = "") -> list[GatewayReply]:
+        return refusals(self._kind, body, reason, text)
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+
+def refusals(kind: MailboxType, body: bytes, reason: Cause, text: str = "") -> list[GatewayReply]:
+    """Return the error that answers a request."""
+    return [GatewayReply(*refuse(kind, body, reason, text), reason=reason)]
+
+
+def cause_of(error: EapError) -> Cause:
+    """Return the cause of an error in the gateway, on the way to a slave, or at the slave."""
+    match error:
+        case GatewayError():
+            return error.cause
+        case RemoteAccessError() if error.is_of_way:
+            return cause_of_result(error.result)
+        case RemoteAccessError():
+            return Cause.SERVICE
+    return error_table.cause_of(error)
+
+
+def text_of(error: EapError) -> str:
+    """Return what an error says beyond its cause; the text of an ADS error adds nothing."""
+    return "" if isinstance(error, RemoteAccessError) else str(error)
+
+
+class SessionKey(NamedTuple):
+    """The client of a session, its slave, and the protocol."""
+
+    way: Way
+    address: int
+    """Station address, virtual address, or 0 for the master."""
+    kind: MailboxType
+
+
+class KeyedSession(Protocol):
+    """Session with a slave or with the master."""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a transfer is under way."""
+
+    def close(self) -> None:
+        """Give up what is under way."""
+
+
+S = TypeVar("S", bound=KeyedSession)
+
+
+class SessionTable(Generic[S]):
+    """Sessions of one kind, at most MAX_SESSIONS; the least recently used one makes room."""
+
+    def __init__(self) -> None:
+        self._open: dict[SessionKey, S] = {}
+
+    def take(self, key: SessionKey, begin: Callable[[], S]) -> S:
+        """Return the session of *key*, a new one if there is none."""
+        session = self._open.pop(key, None)
+        if session is None:
+            if len(self._open) >= MAX_SESSIONS:
+                self._drop_oldest()
+            session = begin()
+        self._open[key] = session  # at the end: the least recently used one is in front
+        return session
+
+    def of_slave(self, address: int, kind: MailboxType) -> Sequence[tuple[SessionKey, S]]:
+        """Return the sessions of all clients with one slave in one protocol."""
+        return [
+            (key, each)
+            for key, each in self._open.items()
+            if key.address == address and key.kind is kind
+        ]
+
+    def running(self) -> Iterator[SessionKey]:
+        """Yield those that have a transfer under way."""
+        return (key for key, session in self._open.items() if session.is_running)
+
+    def drop(self, key: SessionKey) -> None:
+        """End a session, if there is one."""
+        session = self._open.pop(key, None)
+        if session is not None:
+            session.close()
+
+    def close_of(self, way: Way) -> None:
+        """End the sessions of a client."""
+        for key in [key for key in self._open if key.way == way]:
+            self.drop(key)
+
+    def close(self) -> None:
+        """End all."""
+        while self._open:
+            self._open.popitem()[1].close()
+
+    def _drop_oldest(self) -> None:
+        idle = (key for key, each in self._open.items() if not each.is_running)
+        self.drop(next(idle, next(iter(self._open))))

@@ -1,0 +1,228 @@
+"""Requests of the high-nibble dialect: each names a whole operation on a slave or the master.
+
+What the dialect knows of errors is coarser than any protocol: a slave's own code goes back only in
+an SDO abort.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TypeAlias
+
+from devicebus.errors import FoeError, MailboxRefusedError, SoeError
+from eap.ads.operation import Operation, ReadWrite
+from eap.ams.endpoint import Way
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.coe import CoeHeader
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoHeader
+from eap.errors import EapError, MalformedError
+from eap.gateway.dialect import (
+    DialectFailure,
+    ReadFile,
+    ReadIdn,
+    ReadSdo,
+    TalkVoe,
+    Task,
+    WriteIdn,
+    WriteSdo,
+    decode,
+    encode_done,
+    encode_failure,
+)
+from eap.gateway.error_table import Cause, cause_of_result
+from eap.gateway.refusal import GatewayError
+from eap.gateway.rights import idn, sdo
+from eap.od.abort import SdoAbortError
+from eap.services.gateway.client_session import cause_of, text_of
+from eap.services.gateway.guard import Guard, RuleTarget, reason_of_refusal
+from eap.services.gateway.master_session import MasterSession
+from eap.services.slaves.access import RemoteAccessError, SlaveAccess
+
+DialectTarget: TypeAlias = SlaveAccess | MasterSession
+FindTarget: TypeAlias = Callable[[], Awaitable[DialectTarget | Cause]]
+"""Returns a slave or the master, or why it cannot be reached."""
+
+_LONGEST_HEAD = CoeHeader.SIZE + SdoHeader.SIZE
+"""Octets in front of what was read, in any protocol."""
+
+
+class DialectError(EapError):
+    """A request of the dialect that was not carried out.
+
+    Attributes:
+        failure: Kind of the error, which each protocol has a code for.
+        code: The slave's own code, for protocols that have one.
+        cause: For statistics.
+    """
+
+    def __init__(
+        self,
+        failure: DialectFailure,
+        text: str,
+        code: int | None = None,
+        cause: Cause = Cause.SERVICE,
+    ) -> None:
+        super().__init__(text)
+        self.failure = failure
+        self.code = code
+        self.cause = cause
+
+
+class DialectHandler:
+    """Carries out requests of the dialect.
+
+    Args:
+        guard: Access rules and audit.
+        room: Octets of the longest answer.
+        answer_s: Limit for an answer.
+    """
+
+    def __init__(self, guard: Guard, room: int, answer_s: float) -> None:
+        self._guard = guard
+        self._room = room - _LONGEST_HEAD
+        self._answer_s = answer_s
+
+    async def answer(
+        self,
+        kind: MailboxType,
+        body: bytes,
+        way: Way,
+        target: RuleTarget,
+        find: FindTarget,
+    ) -> tuple[bytes, Cause | None]:
+        """Return the answer to a request, and why it is an error if it is one.
+
+        Args:
+            kind: The protocol.
+            body: Behind the mailbox header.
+            way: Connection, or address, of the client.
+            target: Its name in access rules.
+            find: Returns the slave or the master.
+        """
+        try:
+            task = decode(kind, body)
+            data = await self._perform_allowed(task, way, target, find)
+            return encode_done(body, task, data), None
+        except MalformedError as exc:
+            error = DialectError(DialectFailure.COMMAND, str(exc))
+        except DialectError as exc:
+            error = exc
+        answer = encode_failure(kind, body, error.failure, code=error.code, text=str(error))
+        return answer, error.cause
+
+    async def _perform_allowed(
+        self, task: Task, way: Way, target: RuleTarget, find: FindTarget
+    ) -> bytes:
+        operation = operation_of(task)
+        verdict = self._guard.judge(way, target, operation)
+        result: int | None = AdsError.GENERAL
+        try:
+            if not verdict.is_allowed:
+                raise _refusal(GatewayError(reason_of_refusal(verdict)))
+            subject = await find()
+            if isinstance(subject, Cause):
+                raise _refusal(GatewayError(subject))
+            data = await self._perform(task, subject)
+            result = 0
+        finally:
+            self._guard.tell(way, target, operation, verdict, result)
+        return data
+
+    async def _perform(self, task: Task, subject: DialectTarget) -> bytes:
+        """Carry out a task; return what was read, raise DialectError."""
+        try:
+            async with asyncio.timeout(self._answer_s):
+                if isinstance(subject, MasterSession):
+                    return await _perform_by_master(task, subject)
+                data = await perform(task, subject, self._room)
+        except TimeoutError:
+            raise DialectError(
+                DialectFailure.NO_RESPONSE, Cause.TIMEOUT.text, cause=Cause.TIMEOUT
+            ) from None
+        except DialectError:
+            raise
+        except EapError as exc:
+            raise _refusal(exc) from None
+        if len(data) > self._room:
+            raise _too_long(self._room)
+        return data
+
+
+async def perform(task: Task, access: SlaveAccess, room: int) -> bytes:
+    """Carry out a task at a slave; return what was read, at most a little more than *room* octets.
+
+    Raises:
+        EapError: as SlaveAccess does.
+    """
+    match task:
+        case ReadSdo(index, subindex, complete):
+            return await access.read_object(index, subindex, complete=complete)
+        case WriteSdo(index, subindex, data):
+            await access.write_object(index, subindex, data)
+        case ReadIdn(number, drive, element):
+            return await access.read_elements(number, element, drive=drive)
+        case WriteIdn(number, drive, element, data):
+            await access.write_elements(number, element, data, drive=drive)
+        case ReadFile(name):
+            return await _read_file(name, access, room)
+        case TalkVoe(body):
+            return await access.exchange_vendor(body)
+    return b""
+
+
+async def _read_file(name: str, access: SlaveAccess, room: int) -> bytes:
+    if not name:
+        raise DialectError(DialectFailure.FILE_NAME, "no file name")
+    file = access.open_file(name, 0, is_write=False)
+    try:
+        return await file.read(room + 1)
+    finally:
+        file.close()
+
+
+async def _perform_by_master(task: Task, master: MasterSession) -> bytes:
+    match task:
+        case ReadSdo(index, subindex, complete):
+            return await master.read(index, subindex, complete=complete)
+        case WriteSdo(index, subindex, data):
+            master.write(index, subindex, data)
+            return b""
+    raise DialectError(DialectFailure.NOT_SUPPORTED, "the master has only a CoE dictionary")
+
+
+def _refusal(error: EapError) -> DialectError:
+    text = str(error)
+    match error:
+        case SdoAbortError():
+            return DialectError(DialectFailure.GENERAL, text, error.code)
+        case MailboxRefusedError():  # the dialect has no mailbox errors
+            return DialectError(DialectFailure.NOT_SUPPORTED, text)
+        case RemoteAccessError() if not error.is_of_way:
+            return DialectError(cause_of_result(error.result).dialect, text)
+        case SoeError() | FoeError():
+            return DialectError(cause_of(error).dialect, text)
+    cause = cause_of(error)
+    return DialectError(cause.dialect, text_of(error) or cause.text, cause=cause)
+
+
+def _too_long(room: int) -> DialectError:
+    text = f"more than {room} octets do not fit one packet of this dialect"
+    return DialectError(DialectFailure.GENERAL, text)
+
+
+def operation_of(task: Task) -> Operation:
+    """Return what a task does, in the terms of access rules."""
+    match task:
+        case ReadSdo(index, subindex, complete):
+            return sdo(index, subindex, complete=complete)
+        case WriteSdo(index, subindex, data):
+            return sdo(index, subindex, complete=False, data=data)
+        case ReadIdn(number, drive, _):
+            return idn(number, drive)
+        case WriteIdn(number, drive, _, data):
+            return idn(number, drive, data)
+        case ReadFile(name):
+            return ReadWrite(IndexGroup.FOE_OPEN_READ, 0, 0, name.encode())
+    return ReadWrite(IndexGroup.VOE, 0, 0, b"")

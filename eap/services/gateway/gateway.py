@@ -1,0 +1,460 @@
+"""The mailbox gateway of one bus (ETG.8200): many clients, one master and its slaves.
+
+Every request is answered: by the slave, by the master's dictionary, or with an error in the
+protocol of the request.  Requests of a client to different slaves or protocols do not wait for each
+other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from time import monotonic_ns
+from typing import NamedTuple, TypeAlias
+
+from msgspec.structs import replace
+
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.mailboxes import Unsolicited
+from devicebus.wire.sii import SiiProtocol
+from eap.ads.operation import Operation
+from eap.ams.access import AccessList, host_of
+from eap.ams.endpoint import Way
+from eap.ams.spec import DoorKind
+from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
+from eap.errors import EngineGoneError
+from eap.gateway import dialect
+from eap.gateway.address import (
+    MASTER_ADDRESS,
+    AddressMap,
+    Destination,
+    GroupAddress,
+    MasterAddress,
+    RemoteAddress,
+    SlaveAddress,
+)
+from eap.gateway.error_table import Cause
+from eap.gateway.request_tracker import (
+    ClientLimits,
+    MemoryBudget,
+    MemoryShare,
+    RequestAdmission,
+    RequestTracker,
+    Ticket,
+)
+from eap.gateway.rights import operation_of
+from eap.ids import NetId
+from eap.runtime.bus_request import SlaveDescription, no_mailbox
+from eap.services.gateway.client_session import (
+    ClientSession,
+    GatewayReply,
+    SessionKey,
+    SessionTable,
+    cause_of,
+    refusals,
+)
+from eap.services.gateway.dialect_handler import DialectHandler, DialectTarget
+from eap.services.gateway.file_codec import FileCodec
+from eap.services.gateway.guard import (
+    MASTER_PORT,
+    Guard,
+    RequestDecision,
+    RuleTarget,
+    reason_of_refusal,
+    result_of,
+)
+from eap.services.gateway.master_session import MasterSession
+from eap.services.gateway.message_codecs import EoeListeners, codec_for
+from eap.services.gateway.reply_encoder import GatewayRequest, ReplyEncoder, Send
+from eap.services.slaves.access import SlaveAccess
+from eap.services.slaves.bus_client import BusClient
+from eap.services.slaves.local_slave import LocalSlave
+from eap.services.tasks import TaskSet
+
+ANSWER_S = 0.9
+"""Limit for an answer, below the second after which usual clients give up."""
+STALL_S = 2.0
+"""Wait of a slave for the client of a file after which that gives way to another client's."""
+
+OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
+"""Returns access to a slave, or the master, of another station."""
+
+_NOT_TAKEN = {RequestAdmission.CROWDED: Cause.CROWDED, RequestAdmission.TOO_FAST: Cause.TOO_FAST}
+
+_BY_TCP = f"{DoorKind.TCP}:"
+"""Prefix of the names of TCP transports."""
+
+logger = logging.getLogger(__name__)
+
+
+class Settings(NamedTuple):
+    """Behaviour of a gateway."""
+
+    net_id: NetId
+    """Of the bus port: targets of access rules."""
+    answer_s: float = ANSWER_S
+    is_silent: bool = False
+    """It sends no errors of its own, and answers only as slaves do."""
+    room: int = 1486
+    """Octets of the longest answer behind its headers: one datagram takes it."""
+    limits: ClientLimits = ClientLimits()
+    name: str = ""
+    """Of the bus port, for log lines."""
+
+
+class MailboxGateway:
+    """A gateway.
+
+    Args:
+        bus: With its slaves.
+        open_master: Begins a session with the master's dictionary.
+        access: Returns the access rules in force.
+        settings: Its behaviour.
+        addresses: Beside those of the standard.
+        open_remote: Returns access to a slave of another station.
+
+    Attributes:
+        statistics: Requests and answers by slave and protocol.
+        tracker: Requests by client.
+        memory: Octets of objects and messages that are under way.
+        file_memory: Octets of files that are fetched ahead; without room fewer are.
+        guard: Access rules and audit.
+        settings: As given.
+        is_open: Whether it takes requests.
+        turned_away: Frames that were dropped while it did not.
+    """
+
+    def __init__(
+        self,
+        bus: BusClient,
+        open_master: Callable[[], MasterSession],
+        access: Callable[[], AccessList],
+        settings: Settings,
+        addresses: AddressMap,
+        open_remote: OpenRemote,
+    ) -> None:
+        self.tracker = RequestTracker(settings.limits)
+        self.memory, self.file_memory = MemoryBudget(), MemoryBudget()
+        self._encoder = ReplyEncoder(self.tracker, settings.name, is_silent=settings.is_silent)
+        self.statistics = self._encoder.statistics
+        self.guard = Guard(access)
+        self.settings = settings
+        self.is_open = True
+        self.turned_away = 0
+        self._bus = bus
+        self._master = RuleTarget(settings.net_id, MASTER_PORT)
+        self._open_master = open_master
+        self._addresses = addresses
+        self._open_remote = open_remote
+        self._dialect = DialectHandler(self.guard, settings.room, settings.answer_s)
+        self._masters: SessionTable[MasterSession] = SessionTable()
+        self._slaves: SessionTable[ClientSession] = SessionTable()
+        self._tasks = TaskSet(f"gateway {settings.name}")
+        self._count = 0
+        self._listeners = EoeListeners()
+        bus.listen(self._take_unsolicited)
+
+    def start(self) -> None:
+        """Take requests, again."""
+        self.is_open = True
+
+    async def stop(self) -> None:
+        """Take no requests; what is under way is ended, at the slaves too."""
+        self.is_open = False
+        await self.close()
+
+    def transfers(self) -> list[SessionKey]:
+        """Return the transfers that are under way."""
+        return [*self._slaves.running()]
+
+    def receive(self, frame: bytes, way: Way, send: Send) -> asyncio.Task[None] | None:
+        """Take a request; its answers go back by *send*, until the task that is returned is done.
+
+        Args:
+            frame: From its EtherCAT header on.
+            way: Connection, or address, of the client.
+            send: Takes whole frames.
+
+        Raises:
+            TruncatedError: it is shorter than its headers say.
+            MalformedError: its protocol is unknown.
+        """
+        header, body = decode_frame(frame)
+        key = frame
+        if way.door.startswith(_BY_TCP):  # TCP repeats nothing by itself
+            self._count += 1
+            key += self._count.to_bytes(8)
+        now_ns = monotonic_ns()
+        admission = self.tracker.admit(way, key, now_ns)
+        if admission is RequestAdmission.REPEATED:
+            return None
+        request = GatewayRequest(header, bytes(body), way, send)
+        if admission is not RequestAdmission.TAKEN:
+            self._encoder.refuse(request, _NOT_TAKEN[admission])
+            return None
+        if self._answer_at_once(request, key, now_ns):
+            return None
+        request = replace(request, ticket=Ticket(self.tracker, way, key))
+        task = self._tasks.start(self._serve(request))
+        task.add_done_callback(lambda _: request.give_back())
+        return task
+
+    def connection_closed(self, way: Way) -> None:
+        """Forget a client, and end what it had under way."""
+        self.tracker.forget(way)
+        self._listeners.forget(way)
+        self._slaves.close_of(way)
+        self._masters.close_of(way)
+
+    async def wait_below(self, way: Way, count: int) -> None:
+        """Wait until fewer than *count* requests of a client wait."""
+        while self.tracker.waiting(way) >= count and len(self._tasks):
+            await self._tasks.wait_any()
+
+    async def close(self) -> None:
+        """End everything that is under way."""
+        await self._tasks.close()
+        for way in self.tracker.table():
+            self.tracker.forget(way)
+            self._listeners.forget(way)
+        self._slaves.close()
+        self._masters.close()
+
+    async def _serve(self, request: GatewayRequest) -> None:
+        kind = dialect.kind_of(request.header)
+        if kind is not None:
+            await self._serve_dialect(request, kind)
+            return
+        address = request.header.address
+        if request.header.type is MailboxType.ERR:
+            self._encoder.refuse(request, Cause.SERVICE)
+            return
+        stations = () if address == MASTER_ADDRESS else await self._stations()
+        match self._addresses.resolve(address, stations):
+            case GroupAddress(members):
+                if not members:
+                    self._encoder.refuse(request, Cause.NO_SLAVE)
+                    return
+                found = ((self._addresses.resolve(each, stations), each) for each in members)
+                await asyncio.gather(
+                    *(self._ask(request, one, each, is_group=True) for one, each in found)
+                )
+            case destination:
+                await self._ask(request, destination, address)
+
+    def _answer_at_once(self, request: GatewayRequest, key: bytes, start_ns: int) -> bool:
+        """Answer from the master's dictionary; return whether nothing had to be waited for."""
+        header, body, way = request.header, request.body, request.way
+        if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
+            return False
+        if self.tracker.waiting(way) > 1:
+            return False  # what came first is answered first
+        operation = operation_of(MailboxType.COE, body)
+        key_of_session = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
+        master = self._masters.take(key_of_session, self._open_master)
+        if not master.is_ready(operation):
+            return False
+        self.tracker.answered(way, key)
+        judged = self._judge(way, MASTER_ADDRESS, self._master, operation)
+        replies = (
+            master.ask_now(body)
+            if judged.is_allowed
+            else refusals(MailboxType.COE, body, reason_of_refusal(judged.verdict))
+        )
+        self._finish(request, judged, MASTER_ADDRESS, replies, start_ns)
+        return True
+
+    async def _ask(
+        self,
+        request: GatewayRequest,
+        destination: Destination,
+        address: int,
+        *,
+        is_group: bool = False,
+    ) -> None:
+        """Have the master or a slave answer a request, from *address*."""
+        kind, body, way = request.header.type, request.body, request.way
+        start_ns = monotonic_ns()
+        operation = operation_of(kind, body)
+        station = destination.station if isinstance(destination, SlaveAddress) else address
+        target = self._target(destination)
+        judged = self._judge(way, station, target, operation, by_rule=is_group)
+        if judged.is_allowed:
+            is_step = operation is None
+            replies = await self._ask_allowed(request, destination, station, is_step=is_step)
+        else:
+            replies = refusals(kind, body, reason_of_refusal(judged.verdict))
+        self._finish(request, judged, address, replies, start_ns)
+
+    async def _ask_allowed(
+        self, request: GatewayRequest, destination: Destination, station: int, *, is_step: bool
+    ) -> list[GatewayReply]:
+        kind, body, way = request.header.type, request.body, request.way
+        key = SessionKey(way, station, kind)
+        match destination:
+            case MasterAddress():
+                return await self._masters.take(key, self._open_master).ask(kind, body)
+            case SlaveAddress():
+                return await self._ask_slave(request, key, is_step=is_step)
+            case RemoteAddress():
+                sizes = MailboxSizes.of_data(self.settings.room)
+                begin = partial(self._begin, key, self._open_remote(destination), sizes)
+                return await self._slaves.take(key, begin).ask(body, is_step=is_step)
+            case GroupAddress():  # a group within a group
+                return refusals(kind, body, Cause.NO_SLAVE)
+
+    def _judge(
+        self,
+        way: Way,
+        station: int,
+        target: RuleTarget,
+        operation: Operation | None,
+        *,
+        by_rule: bool = False,
+    ) -> RequestDecision:
+        if operation is None or self.guard.may_read(way, target, operation):
+            return RequestDecision(station, target, None, None)
+        verdict = self.guard.judge(way, target, operation, by_rule=by_rule)
+        return RequestDecision(station, target, operation, verdict)
+
+    def _finish(
+        self,
+        request: GatewayRequest,
+        judged: RequestDecision,
+        address: int,
+        replies: Sequence[GatewayReply],
+        start_ns: int,
+    ) -> None:
+        """Tell the audit, count, and answer from *address*."""
+        operation, verdict = judged.operation, judged.verdict
+        if operation is not None and verdict is not None:
+            self.guard.tell(request.way, judged.target, operation, verdict, result_of(replies))
+        took_ns = monotonic_ns() - start_ns
+        self._encoder.answer(request, judged.station, address, replies, took_ns)
+
+    def _target(self, destination: Destination) -> RuleTarget:
+        """Return the name of a destination in access rules."""
+        match destination:
+            case RemoteAddress(net_id, port):
+                return RuleTarget(net_id, port)
+            case SlaveAddress(station):
+                return RuleTarget(self.settings.net_id, station)
+        return self._master
+
+    async def _ask_slave(
+        self, request: GatewayRequest, key: SessionKey, *, is_step: bool
+    ) -> list[GatewayReply]:
+        kind, body, station = key.kind, request.body, key.address
+        slave = await self._find(station)
+        if isinstance(slave, Cause):
+            return refusals(kind, body, slave)
+        cause = find_refusal(kind, body, slave)
+        if cause is not None:
+            return refusals(kind, body, cause)
+        if kind is MailboxType.EOE:
+            address, now_ns = request.header.address, monotonic_ns()
+            self._listeners.note(station, request.way, address, request.send, now_ns)
+        session = self._slaves.take(key, partial(self._begin_local, key, slave))
+        sizes = session.codec.sizes
+        if (sizes.to_slave, sizes.to_master) != (slave.to_slave, slave.to_master):
+            self._slaves.drop(key)  # the mailbox is another one than before, as in BOOT
+            session = self._slaves.take(key, partial(self._begin_local, key, slave))
+        replies = await session.ask(body, is_step=is_step)
+        if isinstance(session.codec, FileCodec) and session.codec.waits_for_turn:
+            self._end_stalls(key)
+        return replies
+
+    async def _stations(self) -> tuple[int, ...]:
+        """Return the station addresses in the order of the bus, none while it is down."""
+        with suppress(EngineGoneError):
+            bus = await self._bus.view.current()
+            return tuple(bus.slaves) if bus.is_up else ()
+        return ()
+
+    async def _find(self, station: int) -> SlaveDescription | Cause:
+        """Return a slave, or why it cannot be reached."""
+        try:
+            bus = await self._bus.view.current()
+            slave = bus.slaves.get(station)
+            if not bus.is_up or slave is None or not slave.to_slave:
+                # Clients that have just seen a slave come to PREOP send their requests at once.
+                bus = await self._bus.view.confirm()
+        except EngineGoneError:
+            return Cause.BUS_DOWN
+        return bus.slaves.get(station, Cause.NO_SLAVE) if bus.is_up else Cause.BUS_DOWN
+
+    def _begin_local(self, key: SessionKey, slave: SlaveDescription) -> ClientSession:
+        sizes = MailboxSizes(slave.to_slave, slave.to_master)
+        return self._begin(key, self._open_local(slave, key.way), sizes)
+
+    def _open_local(self, slave: SlaveDescription, way: Way) -> LocalSlave:
+        return LocalSlave(self._bus, slave, way, turn_s=self.settings.answer_s)
+
+    def _begin(self, key: SessionKey, access: SlaveAccess, sizes: MailboxSizes) -> ClientSession:
+        answer_s = self.settings.answer_s
+        budget = self.file_memory if key.kind is MailboxType.FOE else self.memory
+        memory = MemoryShare(budget, host_of(key.way))
+        # The rest of the time is for the probe of a station that lets a client wait.
+        codec = codec_for(key.kind, access, sizes, memory, wait_s=answer_s / 3)
+        return ClientSession(key.kind, codec, answer_s=answer_s)
+
+    def _end_stalls(self, key: SessionKey) -> None:
+        """Give up the files of other clients at a slave that waits for them."""
+        limit_s = asyncio.get_running_loop().time() - STALL_S
+        for other, session in self._slaves.of_slave(key.address, key.kind):
+            codec = session.codec
+            if isinstance(codec, FileCodec) and codec.stalled_since_s < limit_s:
+                logger.info(
+                    "gateway %s: file of slave %d given up: %s has paused for %g s, and %s waits",
+                    self.settings.name, key.address, other.way.connection, STALL_S,
+                    key.way.connection,
+                )  # fmt: skip
+                session.close()
+
+    def _take_unsolicited(self, message: Unsolicited) -> None:
+        """Send an Ethernet frame of a slave to the clients that talk EoE to it."""
+        if message.type != MailboxType.EOE:
+            return
+        for listener in self._listeners.of(message.station, monotonic_ns()):
+            self._encoder.send(listener.send, listener.address, MailboxType.EOE, message.data)
+
+    async def _serve_dialect(self, request: GatewayRequest, kind: MailboxType) -> None:
+        address, start_ns = request.header.address, monotonic_ns()
+        destination = self._addresses.resolve(address, ())
+        if isinstance(destination, GroupAddress):
+            destination = SlaveAddress(address)  # the dialect has no groups: no slave is there
+        answer, cause = await self._dialect.answer(
+            kind, request.body, request.way, self._target(destination),
+            partial(self._dialect_target, kind, destination, request.way),
+        )  # fmt: skip
+        took_ns = monotonic_ns() - start_ns
+        self._encoder.answer_dialect(request, kind, answer, cause, took_ns)
+
+    async def _dialect_target(
+        self, kind: MailboxType, destination: Destination, way: Way
+    ) -> DialectTarget | Cause:
+        match destination:
+            case MasterAddress():
+                return self._open_master()
+            case RemoteAddress():
+                return self._open_remote(destination)
+            case SlaveAddress(station):
+                slave = await self._find(station)
+                if isinstance(slave, Cause):
+                    return slave
+                return find_refusal(kind, b"", slave) or self._open_local(slave, way)
+        return Cause.NO_SLAVE
+
+
+def find_refusal(kind: MailboxType, body: bytes, slave: SlaveDescription) -> Cause | None:
+    """Return why a request does not even go to the slave that it is for."""
+    if not slave.to_slave:
+        return cause_of(no_mailbox(slave))
+    if not slave.protocols & SiiProtocol[kind.name]:
+        return Cause.NO_PROTOCOL
+    if len(body) + MailboxHeader.SIZE > slave.to_slave:
+        return Cause.TOO_LONG
+    return None

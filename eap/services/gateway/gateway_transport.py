@@ -1,0 +1,90 @@
+"""Way of frames of type 5 to a gateway, unless they are AoE to a station itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from eap.ams.endpoint import Way
+from eap.codec.mailbox import MailboxError, encode_plain_frame
+from eap.errors import MalformedError, TruncatedError
+from eap.gateway.refusal import mailbox_error
+from eap.runtime.discards import Refusal
+from eap.services.transports.mailbox_frames import refusal_of
+
+if TYPE_CHECKING:
+    from eap.services.gateway.gateway import MailboxGateway
+
+_ADDRESS = slice(4, 6)
+
+
+class GatewayDoor:
+    """One socket or listener, and the gateway behind it.
+
+    Args:
+        behind: Gateways of the stations there, and by what name each knows the door; a frame does
+            not say which one it is for, so the first is asked.
+    """
+
+    def __init__(self, behind: Sequence[tuple[MailboxGateway, str]]) -> None:
+        self._gateway: MailboxGateway | None = None
+        self._name = ""
+        if behind:
+            self._gateway, self._name = behind[0]
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is any gateway behind."""
+        return self._gateway is not None
+
+    def receive(
+        self, frame: bytes, connection: str, send: Callable[[str, bytes], object]
+    ) -> Refusal | None:
+        """Act on a frame; return why not if it is not taken.
+
+        Args:
+            frame: From its EtherCAT header on.
+            connection: That it came by, or its sender's address.
+            send: Sends a frame to *connection*.
+        """
+        if self._gateway is None:
+            return refusal_of(frame)
+        if not self._gateway.is_open:
+            self._gateway.turned_away += 1
+            return Refusal.GATEWAY_OFF
+
+        def answer(frame: bytes) -> None:
+            send(connection, frame)
+
+        try:
+            self._gateway.receive(frame, Way(self._name, connection), answer)
+        except TruncatedError:
+            return Refusal.TRUNCATED
+        except MalformedError:
+            if not self._gateway.settings.is_silent:
+                _refuse_type(frame, answer)
+            return Refusal.MAILBOX
+        return None
+
+    def connection_closed(self, connection: str) -> None:
+        """Forget a client whose connection is closed."""
+        if self._gateway is not None:
+            self._gateway.connection_closed(Way(self._name, connection))
+
+    def waiting(self, connection: str) -> int:
+        """Return how many requests of a connection wait for their answers."""
+        if self._gateway is None:
+            return 0
+        return self._gateway.tracker.waiting(Way(self._name, connection))
+
+    async def wait_below(self, connection: str, count: int) -> None:
+        """Wait until fewer than *count* requests of a connection wait."""
+        if self._gateway is not None:
+            await self._gateway.wait_below(Way(self._name, connection), count)
+
+
+def _refuse_type(frame: bytes, answer: Callable[[bytes], None]) -> None:
+    """Say that nobody speaks the protocol of a frame."""
+    kind, body = mailbox_error(MailboxError.UNSUPPORTED_PROTOCOL)
+    address = int.from_bytes(frame[_ADDRESS], "little")
+    answer(encode_plain_frame(kind, address, 0, body))

@@ -1,0 +1,173 @@
+"""Access rules at a gateway, and the audit of its changes and refusals.
+
+One line of the audit is written for each change, when it is known how it came out and before its
+client has the answer, and one for each refusal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from eap.ads.operation import Operation, Read
+from eap.ams.access import AccessList, Verdict
+from eap.ams.authorized_request import AuditedOperation, AuditEntry
+from eap.ams.endpoint import Way
+from eap.ams.spec import AccessService
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
+from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.foe import FoeOpcode
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoHeader, SdoRequest
+from eap.codec.soe import SoeHeader
+from eap.gateway.error_table import Cause, ads_result
+from eap.ids import NetId
+from eap.od.abort import SdoAbortError
+from eap.services.gateway.client_session import GatewayReply
+
+NOBODY = NetId(bytes(6))
+"""Source NetID of clients, which have none here."""
+MASTER_PORT = 0xFFFF
+"""AMS port by which rules name the master itself."""
+_SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
+"""Services of CoE whose messages may be aborts."""
+_SOE_ERROR = 0x10
+
+
+class RuleTarget(NamedTuple):
+    """Name of a slave in access rules: a NetID and an AMS port, which is 0xFFFF for a master."""
+
+    net_id: NetId
+    port: int
+
+
+class RequestDecision(msgspec.Struct, frozen=True):
+    """Decision on a request.
+
+    Attributes:
+        station: Mailbox address that is counted.
+        target: Its name in access rules.
+        operation: None for what needs no verdict: a step of what was judged when it began, and a
+            read where everything may be read.
+        verdict: Likewise.
+    """
+
+    station: int
+    target: RuleTarget
+    operation: Operation | None
+    verdict: Verdict | None
+
+    @property
+    def is_allowed(self) -> bool:
+        """Whether it may be done."""
+        return self.verdict is None or self.verdict.is_allowed
+
+
+class Guard:
+    """Judges requests.
+
+    Args:
+        access: Returns the rules that are in force.
+
+    Attributes:
+        on_audit: Called with what was changed, and what was refused.
+        before_change: Called with each change before it is done, where changes that cannot be
+            recorded are refused: returns why it cannot be, empty if it was.
+    """
+
+    def __init__(self, access: Callable[[], AccessList]) -> None:
+        self.on_audit: list[Callable[[AuditEntry], None]] = []
+        self.before_change: Callable[[AuditEntry], str] | None = None
+        self._access = access
+
+    def may_read(self, way: Way, target: RuleTarget, operation: Operation) -> bool:
+        """Return whether an operation is a read where the client may read everything."""
+        if not isinstance(operation, Read):
+            return False
+        return self._access().grants(way, NOBODY, *target).may_read
+
+    def judge(
+        self, way: Way, target: RuleTarget, operation: Operation, *, by_rule: bool = False
+    ) -> Verdict:
+        """Decide on an operation; *by_rule*: a change only if a rule says so."""
+        verdict = self._access().grants(way, NOBODY, *target).judge(operation)
+        if by_rule and verdict.service is not AccessService.READ and not verdict.is_by_rule:
+            why = "only a rule allows it for several slaves at once"
+            return verdict._replace(is_allowed=False, why=why)
+        return self._record_first(way, target, operation, verdict)
+
+    def _record_first(
+        self, way: Way, target: RuleTarget, operation: Operation, verdict: Verdict
+    ) -> Verdict:
+        """Return the verdict on a change when it has been recorded, where that is required."""
+        change = AuditedOperation(operation, verdict, None)
+        is_change = verdict.is_allowed and change.is_told
+        if self.before_change is None or not is_change:
+            return verdict
+        why = self.before_change(_entry(way, target, change))
+        if not why:
+            return verdict
+        return verdict._replace(is_allowed=False, is_recordable=False, why=why)
+
+    def tell(
+        self,
+        way: Way,
+        target: RuleTarget,
+        operation: Operation,
+        verdict: Verdict,
+        result: int | None,
+    ) -> None:
+        """Have the audit written of what was decided and how it came out.
+
+        Args:
+            way: Connection, or address, of the client.
+            target: Its name in access rules.
+            operation: What was to be done.
+            verdict: Whether it may be.
+            result: An error of ADS, 0 for none, None if it is unknown.
+        """
+        if not verdict.is_allowed:
+            result = AdsError.ACCESS_DENIED
+        audited = AuditedOperation(operation, verdict, result)
+        if audited.is_told:
+            for write in self.on_audit:
+                write(_entry(way, target, audited))
+
+
+def _entry(way: Way, target: RuleTarget, audited: AuditedOperation) -> AuditEntry:
+    return AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
+
+
+def reason_of_refusal(verdict: Verdict | None) -> Cause:
+    """Return why a request with this verdict is refused."""
+    is_recordable = verdict is None or verdict.is_recordable
+    return Cause.DENIED if is_recordable else Cause.NOT_RECORDED
+
+
+def result_of(replies: Sequence[GatewayReply]) -> int | None:
+    """Return what an audit says of the answers to a request, as an error of ADS."""
+    if not replies:
+        return None
+    reply = replies[-1]
+    return error_in(reply.type, reply.body) if reply.reason is None else reply.reason.value.ads
+
+
+def error_in(kind: MailboxType, body: bytes) -> int:
+    """Return the error that a slave answered with, as one of ADS; 0 for none."""
+    match kind:
+        case MailboxType.ERR:
+            return AdsError.SERVICE
+        case MailboxType.COE if len(body) >= CoeHeader.SIZE + SdoHeader.SIZE:
+            head = SdoHeader.decode(body, CoeHeader.SIZE)
+            if body[1] >> 4 in _SDO and head.specifier == SdoRequest.ABORT:
+                return ads_result(SdoAbortError(head.value, head.index, head.subindex))
+        case MailboxType.SOE if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR:
+            return AdsError.GENERAL
+        case MailboxType.FOE if body[:1] == bytes((FoeOpcode.BUSY,)):
+            return AdsError.BUSY
+        case MailboxType.FOE if body[:1] == bytes((FoeOpcode.ERROR,)):
+            return AdsError.GENERAL
+    return 0

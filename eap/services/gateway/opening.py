@@ -1,0 +1,104 @@
+"""Assembly of the gateways of an appliance from the plant file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+from eap.ams.access import AccessList
+from eap.gateway.address import AddressMap, GroupAddress, RemoteAddress, SlaveAddress
+from eap.gateway.request_tracker import ClientLimits
+from eap.ids import NetId
+from eap.pd.spec import GatewayAddress, GatewaySpec
+from eap.runtime.handover import Handover, PortName
+from eap.services.device.master_values import MasterDictionaryProvider
+from eap.services.gateway.gateway import MailboxGateway, Settings
+from eap.services.gateway.master_session import MasterSession
+from eap.services.routing.station_router import StationRouter
+from eap.services.slaves.bus_client import BusClient
+from eap.services.slaves.remote_slave import RemoteSlave
+
+_MS = 1000
+
+
+def open_dictionaries(
+    handover: Handover, clients: Mapping[PortName, BusClient], release: str
+) -> dict[PortName, MasterDictionaryProvider]:
+    """Return the dictionary of the master behind each bus port.
+
+    Args:
+        handover: The buses.
+        clients: Of the buses.
+        release: Of this software.
+    """
+    providers = {}
+    for bus in handover.buses:
+        spec = _gateway_of(handover, bus.owner)
+        providers[bus.owner] = MasterDictionaryProvider(
+            clients[bus.owner], release, full=spec.full, padded=spec.padded
+        )
+    return providers
+
+
+def open_gateways(
+    handover: Handover,
+    clients: Mapping[PortName, BusClient],
+    providers: Mapping[PortName, MasterDictionaryProvider],
+    routers: Mapping[str, StationRouter],
+) -> dict[PortName, MailboxGateway]:
+    """Return the gateway to each bus, in their order.
+
+    Args:
+        handover: The stations and their buses.
+        clients: Of the buses.
+        providers: Dictionaries of the masters, one for each bus.
+        routers: Of the stations: they know the access rules, and the way to other buses.
+    """
+    gateways = {}
+    for bus in handover.buses:
+        spec, router = _gateway_of(handover, bus.owner), routers[bus.owner.station]
+        provider = providers[bus.owner]
+        settings = Settings(
+            NetId.parse(handover.port(bus.owner).net_id),
+            answer_s=spec.answer_ms / _MS,
+            is_silent=spec.silent,
+            limits=ClientLimits(spec.in_flight, spec.rate, spec.clients),
+            name=clients[bus.owner].name,
+        )
+        gateway = MailboxGateway(
+            clients[bus.owner],
+            partial(
+                MasterSession,
+                provider.dictionary,
+                settings.room,
+                provider.refresh,
+                provider.is_fresh,
+            ),
+            partial(_access_of, router),
+            settings,
+            AddressMap({each.address: _destination(each) for each in spec.addresses}),
+            partial(_open_remote, router, settings),
+        )
+        gateway.is_open = spec.enabled
+        gateways[bus.owner] = gateway
+    return gateways
+
+
+def _gateway_of(handover: Handover, owner: PortName) -> GatewaySpec:
+    return handover.port(owner).gateway or GatewaySpec()
+
+
+def _access_of(router: StationRouter) -> AccessList:
+    return router.access
+
+
+def _open_remote(router: StationRouter, settings: Settings, slave: RemoteAddress) -> RemoteSlave:
+    return RemoteSlave(partial(router.ask, slave.net_id), slave.port, settings.answer_s)
+
+
+def _destination(address: GatewayAddress) -> SlaveAddress | RemoteAddress | GroupAddress:
+    if address.members:
+        return GroupAddress(address.members)
+    if address.net_id:
+        return RemoteAddress(NetId.parse(address.net_id), address.port)
+    return SlaveAddress(address.station)

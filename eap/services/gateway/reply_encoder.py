@@ -1,0 +1,240 @@
+"""Answers of a gateway as frames, with their statistics and the log lines of refusals."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeAlias
+
+import msgspec
+
+from devicebus.mailbox.counter import next_counter
+from eap.ams.access import host_of
+from eap.ams.endpoint import Way
+from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_plain_frame
+from eap.gateway import dialect
+from eap.gateway.error_table import Cause
+from eap.gateway.request_tracker import RequestTracker, Ticket
+from eap.services.gateway.client_session import GatewayReply, refusals
+from eap.services.log_limits import caused_by
+
+Send: TypeAlias = Callable[[bytes], None]
+"""Sends a frame back to the client of a request, now or later."""
+_ADDRESSES = 1 << 16
+_MAX_ROWS = 4096
+"""Slaves that do not exist have no rows of their own above this."""
+_LOGGED = frozenset(
+    (
+        Cause.DENIED,
+        Cause.NOT_RECORDED,
+        Cause.CROWDED,
+        Cause.TOO_FAST,
+        Cause.TIMEOUT,
+        Cause.BUS_DOWN,
+        Cause.UNREACHABLE,
+    )
+)
+"""Reasons that an operator may want to act on; the others are between client and slave."""
+
+logger = logging.getLogger(__name__)
+
+
+class _StatisticsRow:
+    """One slave, or the master, in one protocol.
+
+    Attributes:
+        requests: All of them.
+        answered: By the slave.
+        replies: Messages of the slave.
+        errors: That the gateway answered itself, by reason.
+        last_error: The latest of these.
+        total_ns: Time from request to answer, of all that the slave answered.
+        slowest_ns: The longest of them.
+    """
+
+    __slots__ = (
+        "answered",
+        "errors",
+        "last_error",
+        "replies",
+        "requests",
+        "slowest_ns",
+        "total_ns",
+    )
+
+    def __init__(self) -> None:
+        self.requests = self.answered = self.replies = self.total_ns = self.slowest_ns = 0
+        self.errors: dict[Cause, int] = {}
+        self.last_error: Cause | None = None
+
+    def note(self, reasons: Sequence[Cause | None], took_ns: int) -> None:
+        """Count one request with its answers."""
+        self.requests += 1
+        before = self.replies
+        for reason in reasons:
+            if reason is None:
+                self.replies += 1
+            else:
+                self.errors[reason] = self.errors.get(reason, 0) + 1
+                self.last_error = reason
+        if self.replies > before:
+            self.answered += 1
+            self.total_ns += took_ns
+            if took_ns > self.slowest_ns:  # noqa: PLR1730  max() takes longer
+                self.slowest_ns = took_ns
+
+
+class GatewayStatistics:
+    """All rows of a gateway, by station address (0 is the master) and protocol."""
+
+    def __init__(self) -> None:
+        self._rows: dict[tuple[int, MailboxType], _StatisticsRow] = {}
+
+    def note(
+        self, station: int, kind: MailboxType, reasons: Sequence[Cause | None], took_ns: int
+    ) -> None:
+        """Count one request; *reasons* has None for each message that a slave answered with."""
+        row = self._rows.get((station, kind))
+        if row is None:
+            if len(self._rows) >= _MAX_ROWS:
+                return
+            row = self._rows[station, kind] = _StatisticsRow()
+        row.note(reasons, took_ns)
+
+    def report(self) -> list[dict[str, Any]]:
+        """Return all rows as plain values."""
+        return [
+            {
+                "address": station,
+                "protocol": kind.name,
+                "requests": row.requests,
+                "replies": row.replies,
+                "errors": {reason.name.lower(): count for reason, count in row.errors.items()},
+                "last_error": row.last_error.text if row.last_error else "",
+                "mean_us": row.total_ns / 1000 / row.answered if row.answered else None,
+                "slowest_us": row.slowest_ns / 1000,
+            }
+            for (station, kind), row in sorted(self._rows.items())
+        ]
+
+
+class RefusalLog:
+    """The lines of one gateway; *name* is that of the bus port."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def write(self, way: Way, address: int, kind: MailboxType, reason: Cause) -> None:
+        """Log that a request was refused."""
+        if reason not in _LOGGED:
+            return
+        host = host_of(way)
+        cause = self._name, way.door, host, address, kind, reason
+        logger.warning(
+            "gateway %s: %s of %s (%s) to address %d refused: %s",
+            self._name, kind.name, way.connection, way.door, address, reason.text,
+            extra=caused_by(cause, f"{self._name} {way.door} {host}"),
+        )  # fmt: skip
+
+
+class GatewayRequest(msgspec.Struct, frozen=True):
+    """A message of a client; *send* takes whole frames."""
+
+    header: MailboxHeader
+    body: bytes
+    way: Way
+    send: Send
+    ticket: Ticket | None = None
+    """None if it was not taken."""
+
+    def give_back(self) -> None:
+        """Note that it waits no more."""
+        if self.ticket is not None:
+            self.ticket.give_back()
+
+
+class ReplyEncoder:
+    """Answers the requests of one gateway.
+
+    Args:
+        tracker: Counts errors of clients.
+        name: Of the bus port, for log lines.
+        is_silent: Whether errors of the gateway itself are kept back.
+
+    Attributes:
+        statistics: Requests and answers by slave and protocol.
+    """
+
+    def __init__(self, tracker: RequestTracker, name: str, *, is_silent: bool) -> None:
+        self.statistics = GatewayStatistics()
+        self._tracker = tracker
+        self._log = RefusalLog(name)
+        self._is_silent = is_silent
+        self._counters = bytearray(_ADDRESSES)
+
+    def answer(
+        self,
+        request: GatewayRequest,
+        station: int,
+        address: int,
+        replies: Sequence[GatewayReply],
+        took_ns: int,
+    ) -> None:
+        """Answer a request from *address*; it is counted for *station*."""
+        reasons = [each.reason for each in replies]
+        kind = request.header.type
+        self.statistics.note(station, kind, reasons, took_ns)
+        self._note_refusals(request, kind, reasons)
+        if replies and replies[0].is_again:
+            self._note_repeated(request.way)
+        if address == request.header.address:  # not one of many
+            request.give_back()
+        for reply in replies:
+            if reply.reason is not None and self._is_silent:
+                continue
+            self.send(request.send, address, reply.type, reply.body)
+
+    def answer_dialect(
+        self,
+        request: GatewayRequest,
+        kind: MailboxType,
+        body: bytes,
+        reason: Cause | None,
+        took_ns: int,
+    ) -> None:
+        """Answer a request of the high-nibble dialect; *reason* is why *body* is an error."""
+        address = request.header.address
+        self.statistics.note(address, kind, [reason], took_ns)
+        self._note_refusals(request, kind, [reason])
+        request.give_back()
+        if not (self._is_silent and reason is not None):
+            request.send(encode_frame(dialect.encode_header(kind, address), body))
+
+    def refuse(self, request: GatewayRequest, reason: Cause) -> None:
+        """Answer with an error."""
+        address, kind = request.header.address, request.header.type
+        self.answer(request, address, address, refusals(kind, request.body, reason), 0)
+
+    def send(self, send: Send, address: int, kind: MailboxType, body: bytes) -> None:
+        """Send a message from *address*, counted as those of one slave are."""
+        counter = self._counters[address] = next_counter(self._counters[address])
+        send(encode_plain_frame(kind, address, counter, body))
+
+    def _note_repeated(self, way: Way) -> None:
+        counts = self._tracker.counts_of(way)
+        if counts is not None:
+            counts.repeated += 1
+
+    def _note_refusals(
+        self, request: GatewayRequest, kind: MailboxType, reasons: Iterable[Cause | None]
+    ) -> None:
+        """Count what the gateway answers itself, and log it."""
+        for reason in reasons:
+            if reason is not None:
+                break
+        else:
+            return
+        counts = self._tracker.counts_of(request.way)
+        if counts is not None:
+            counts.errors += 1
+        self._log.write(request.way, request.header.address, kind, reason)

@@ -1,0 +1,341 @@
+"""The services process: everything of an appliance that may take its time.
+
+The supervisor starts it with the descriptor of its handover.  Whatever happens here, the engine
+goes on: the two share images, and pairs of sockets on which it never waits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import os
+import signal
+import socket
+import sys
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from time import time
+from typing import TYPE_CHECKING, Any
+
+from eap.ams.directory import Directory
+from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
+from eap.ids import NetId
+from eap.net import realtime
+from eap.release import RELEASE
+from eap.runtime.discards import DiscardCounters
+from eap.runtime.folder import ApplianceFolder
+from eap.runtime.handover import (
+    NO_DESCRIPTOR,
+    Handover,
+    PortName,
+    SocketKind,
+)
+from eap.runtime.startup import Startup
+from eap.runtime.station_image import StationImage
+from eap.runtime.store import plant_folder
+from eap.services.control.ams_methods import AmsMethods
+from eap.services.control.audit import Audit
+from eap.services.control.audit_file import AuditFile
+from eap.services.control.bus_methods import Buses
+from eap.services.control.control_server import ControlServer
+from eap.services.control.device_methods import DeviceMethods
+from eap.services.control.gateway_methods import GatewayMethods
+from eap.services.control.methods import Methods
+from eap.services.control.route_methods import RouteMethods
+from eap.services.control.routing_methods import RoutingMethods
+from eap.services.control.status import (
+    ProcessMeter,
+    SharedAnswer,
+    appliance_status,
+    take_snapshot,
+)
+from eap.services.device.engine_client import EngineClient
+from eap.services.device.monitoring import SubscriberWatch
+from eap.services.devices import Devices
+from eap.services.engine_link import EngineLink
+from eap.services.log_limits import LimitedLogHandler, caused_by
+from eap.services.routing.monitor_addresses import open_ways
+from eap.services.routing.route_rows import RouterView, interruption_findings
+from eap.services.routing.station_router import StationRouter
+from eap.services.slaves.bus_client import BusClient, open_buses
+from eap.services.slaves.segment_link import SegmentLink
+from eap.services.sockets import open_doors
+from eap.services.transports.accepting import Listeners
+
+if TYPE_CHECKING:
+    from eap.services.device.master_values import MasterDictionaryProvider
+    from eap.services.gateway.gateway import MailboxGateway
+    from eap.services.transports.mqtt_transport import MqttDoor
+
+STATUS_PATIENCE_S = 0.3
+"""How long ``status`` waits for what the engine says of its buses."""
+_IMAGE_PAUSE_S = 0.01
+_AGAIN_S = 1.0
+"""After an error of a socket."""
+
+logger = logging.getLogger(__name__)
+
+
+class Services:
+    """The objects of one services process, from its start to its end."""
+
+    def __init__(
+        self,
+        handover: Handover,
+        startup: Startup,
+        log: LimitedLogHandler,
+        resources: ExitStack,
+    ) -> None:
+        self._handover = handover
+        self._startup = startup
+        self._log = log
+        self._resources = resources
+        self._folder = ApplianceFolder(Path(handover.folder))
+        self._directory = Directory(handover.directory)
+        self._names = [station.name for station in handover.stations]
+        self._counters = resources.enter_context(
+            DiscardCounters(self._folder.discards("services"), self._names)
+        )
+        self._link = resources.enter_context(socket.socket(fileno=handover.link_fd))
+        self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
+        self._listeners = Listeners()
+        self._stopping = asyncio.Event()
+
+    async def run(self) -> None:
+        """Serve until SIGTERM."""
+        images = {name: await self._open_image(name) for name in self._names}
+        # Not before: whoever waits for images of an engine that failed just ends.
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
+        link = EngineLink(socket.socket(fileno=self._handover.bus_fd))
+        self._resources.callback(link.close)
+        devices = self._devices(images, link)
+        self._startup.step("opening gateways and sockets")
+        clients = open_buses(link, [bus.owner for bus in self._handover.buses])
+        providers, gateways = self._gateways(clients, devices.routers)
+        doors = open_doors(
+            self._handover,
+            devices.routers,
+            {name: each.routes for name, each in devices.routing.items()},
+            gateways,
+            self._counters,
+            self._link,
+            self._listeners,
+            self._resources,
+        )
+        brokers = self._brokers(devices.routers)
+        audit = self._audit(devices.routers, gateways)
+        buses = self._buses(clients, devices, providers)
+        methods = self._methods(images, buses, devices, gateways, audit)
+        server = ControlServer(methods, buses, audit.write_request, begin=audit.begin_request)
+        async with asyncio.TaskGroup() as group:
+            control = partial(server.serve, self._listener, self._listeners)
+            tasks = [group.create_task(_keep_serving(control))]
+            tasks.append(group.create_task(_keep_serving(self._listeners.serve)))
+            tasks += [group.create_task(_keep_serving(each.serve)) for each in doors]
+            tasks += [group.create_task(_keep_serving(each.serve)) for each in brokers]
+            tasks.append(group.create_task(devices.serve()))
+            tasks.append(group.create_task(audit.serve()))
+            tasks.append(group.create_task(self._log.serve()))
+            watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
+            tasks.append(group.create_task(_keep_serving(watch.run)))
+            self._startup.finish({})
+            await self._stopping.wait()
+            for task in tasks:
+                task.cancel()
+
+    async def _open_image(self, station: str) -> StationImage:
+        """Open one image; at the first start the engine is just making it.
+
+        How long that may take is the supervisor's decision, by the progress of both.
+        """
+        while True:
+            try:
+                image = StationImage(self._folder.image(station))
+            except ImageError as exc:
+                is_made = self._folder.image(station).exists()
+                why = str(exc) if is_made else f"no image of station {station} yet"
+                self._startup.step(f"waiting for the engine: {why}", waits_for="engine")
+            else:
+                self._resources.callback(image.close)
+                return image
+            await asyncio.sleep(_IMAGE_PAUSE_S)
+
+    def _devices(self, images: dict[str, StationImage], link: EngineLink) -> Devices:
+        handover = self._handover
+        engine = EngineClient(link, Path(handover.folder))
+        devices = Devices(
+            handover.plant,
+            handover.stations,
+            handover.states,
+            images,
+            engine,
+            RELEASE,
+            handover.routing,
+            step=self._startup.step,
+        )
+        link.on_restart.append(devices.engine_has_restarted)
+        gc.freeze()  # what a collection would go through again and again, while clients wait
+        return devices
+
+    def _gateways(
+        self, clients: Mapping[PortName, BusClient], routers: Mapping[str, StationRouter]
+    ) -> tuple[Mapping[PortName, MasterDictionaryProvider], Mapping[PortName, MailboxGateway]]:
+        if not self._handover.buses:
+            return {}, {}
+        from eap.services.gateway.opening import open_dictionaries, open_gateways
+
+        providers = open_dictionaries(self._handover, clients, RELEASE)
+        return providers, open_gateways(self._handover, clients, providers, routers)
+
+    def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttDoor]:
+        routing = self._handover.routing
+        if not any(told.mqtt for told in routing.values()):
+            return ()
+        from eap.services.transports.mqtt_transport import open_mqtt_doors  # few plants have any
+
+        return open_mqtt_doors(routing, routers, self._counters)
+
+    def _methods(
+        self,
+        images: dict[str, StationImage],
+        buses: Buses,
+        devices: Devices,
+        gateways: Mapping[PortName, MailboxGateway],
+        audit: Audit,
+    ) -> Methods:
+        meter = ProcessMeter()
+        engine = self._resources.enter_context(
+            DiscardCounters(self._folder.discards("engine"), self._names)
+        )
+        identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
+
+        async def status() -> dict[str, Any]:
+            reports = await buses.reports(STATUS_PATIENCE_S)
+            return appliance_status(
+                self._folder.read_info(),
+                [await take_snapshot(each.image) for each in images.values()],
+                (engine.stats(), self._counters.stats()),
+                meter,
+                reports,
+                self._listeners.stats(),
+            ) | {
+                "audit": audit.report(),
+                "findings": [
+                    *interruption_findings(devices.routers.values(), time()),
+                    *(row for each in devices.by_station.values() for row in each.findings()),
+                ],
+            }
+
+        return Methods(
+            identity,
+            images,
+            status=SharedAnswer(status).get,
+            stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
+            more=self._more_methods(devices) | GatewayMethods(self._handover, gateways).table(),
+        )
+
+    def _more_methods(self, devices: Devices) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        views = {
+            name: RouterView(router, devices.routing[name].routes)
+            for name, router in devices.routers.items()
+        }
+        routers = {name: ads.dictionary for name, ads in devices.ads.items()}
+        plant_file = self._handover.plant_file
+        return {
+            **DeviceMethods(devices.by_station, routers, plant_file).table(),
+            **RouteMethods(views, self._directory).table(),
+            **RoutingMethods(devices.routing).table(),
+            **AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
+        }
+
+    def _audit(
+        self, routers: Mapping[str, StationRouter], gateways: Mapping[PortName, MailboxGateway]
+    ) -> Audit:
+        file = AuditFile(plant_folder(self._handover.plant) / "audit.jsonl")
+        is_required = self._handover.audit_required
+        audit = Audit(file, self._directory, is_required=is_required)
+        for name, router in routers.items():
+            router.on_audit.append(partial(audit.write, name))
+            if is_required:
+                router.require_record(partial(audit.begin, name))
+        for owner, gateway in gateways.items():
+            gateway.guard.on_audit.append(partial(audit.write, owner.station))
+            if is_required:
+                gateway.guard.before_change = partial(audit.begin, owner.station)
+        return audit
+
+    def _ams_addresses(self) -> dict[str, str]:
+        """Return where stations are reached by AMS/TCP; the first of several addresses."""
+        found: dict[str, str] = {}
+        for shared in self._handover.sockets:
+            if shared.kind is SocketKind.AMS_TCP:
+                for owner in shared.owners:
+                    found.setdefault(owner.station, shared.address)
+        return found
+
+    def _buses(
+        self,
+        clients: Mapping[PortName, BusClient],
+        devices: Devices,
+        providers: Mapping[PortName, MasterDictionaryProvider],
+    ) -> Buses:
+        handover = self._handover
+        segments = {}
+        for bus in handover.buses:
+            if bus.command_fd != NO_DESCRIPTOR:
+                segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
+                self._resources.callback(segments[bus.owner].close)
+        for bus in handover.buses:
+            from eap.services.ads.bus_ads import BusService
+
+            net_id = NetId.parse(handover.port(bus.owner).net_id)
+            router = devices.routers[bus.owner.station]
+            service = BusService(
+                clients[bus.owner],
+                net_id,
+                RELEASE,
+                router.send_notification,
+                providers[bus.owner],
+            )
+            router.add_service(net_id, service)
+        return Buses(handover.stations, clients, segments)
+
+
+def main(handover_fd: int, startup: Startup) -> int:
+    """Return the exit code: 2 for what this machine or the specification lacks."""
+    handover = Handover.from_descriptor(handover_fd)
+    realtime.die_with_parent(handover.supervisor)
+    if handover.options.realtime:
+        realtime.take_precedence()
+    log = LimitedLogHandler()
+    logging.basicConfig(format="services: %(message)s", level=logging.INFO, handlers=[log])
+    try:
+        with ExitStack() as resources:
+            asyncio.run(_serve(handover, startup, log, resources))
+    except EapError as exc:
+        sys.stderr.write(f"services: {exc}\n")
+        return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
+    return 0
+
+
+async def _keep_serving(serve: Callable[[], Awaitable[None]]) -> None:
+    """Call *serve* again after an error of a socket: that ends neither it nor this process."""
+    while True:
+        try:
+            await serve()
+        except* OSError as group:
+            error = group.exceptions[0]
+            cause = caused_by(("socket", str(error)), "sockets")
+            logger.exception("an error of a socket: %s", error, extra=cause)
+        else:
+            return
+        await asyncio.sleep(_AGAIN_S)
+
+
+async def _serve(
+    handover: Handover, startup: Startup, log: LimitedLogHandler, resources: ExitStack
+) -> None:
+    await Services(handover, startup, log, resources).run()

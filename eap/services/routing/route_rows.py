@@ -1,0 +1,198 @@
+"""The router of a station as the control protocol tells it: routes, connections, requests.
+
+Only figures that routers keep anyway are read here; 10,000 routes are told in pages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from time import monotonic_ns, time
+from typing import Any
+
+from eap.ams.action import Outcome, Trace
+from eap.ams.record import reason_of
+from eap.ams.report import ConnectionReport, RouteReport
+from eap.ams.routes import Origin, Route
+from eap.ams.subscription_restorer import Interruption
+from eap.codec.ams import ADDRESSES, AmsCommand
+from eap.control.routes import (
+    ConnectionRow,
+    InterruptionRow,
+    OriginName,
+    RequestRow,
+    RouteRow,
+    RouterRow,
+    RoutesListParameters,
+    interruption_text,
+)
+from eap.ids import NetId
+from eap.services.routing.station_router import StationRouter
+from eap.services.routing.station_routes import StationRoutes
+
+MAX_LOOPS = 5
+"""Circles that are told of; each as it was seen last."""
+MAX_WARNINGS = 100
+_S = 1_000_000_000
+_ORIGINS: dict[Origin, OriginName] = {
+    Origin.STATIC: "static",
+    Origin.ADDED: "added",
+    Origin.LEARNED: "learned",
+}
+
+
+class RouterView:
+    """The router of one station, to be looked at again and again."""
+
+    def __init__(self, router: StationRouter, routes: StationRoutes) -> None:
+        self.router = router
+        self.routes = routes
+        self._warnings: list[str] = []
+        self._version = -1
+
+    def row(self, wanted: RoutesListParameters) -> RouterRow:
+        """Return what is *wanted* of it now."""
+        now_ns = monotonic_ns()
+        found = list(self.router.table)
+        if text := wanted.match.lower():
+            found = [route for route in found if text in self._words(route)]
+        page = found[wanted.first : wanted.first + wanted.count]
+        latest = list(self.router.record.latest)
+        return RouterRow(
+            station=self.router.name,
+            net_id=str(self.router.net_id),
+            routes=[self.route_row(route, now_ns) for route in page],
+            total=len(found),
+            connections=[connection_row(each, now_ns) for each in self.router.connections()],
+            requests=[request_row(each, now_ns) for each in _last(latest, wanted.requests)],
+            interruptions=[interruption_row(each, now_ns) for each in self.router.interruptions()],
+            warnings=[*self.warnings(), *_loops(latest)],
+        )
+
+    def route_row(self, route: Route, now_ns: int) -> RouteRow:
+        """Return one of the routes."""
+        is_derived = self.routes.is_derived(route)
+        return route_row(self.router.report(route), now_ns, is_derived=is_derived)
+
+    def warnings(self) -> list[str]:
+        """Return what there is to say against the routes."""
+        if self._version != self.router.table.version:
+            self._version = self.router.table.version
+            self._warnings = self.router.table.warnings(self.router.net_ids)[:MAX_WARNINGS]
+        return self._warnings
+
+    def _words(self, route: Route) -> str:
+        """Return all that a filter looks at."""
+        report = self.router.report(route)
+        origin = "derived" if self.routes.is_derived(route) else _ORIGINS[route.origin]
+        words = (route.name, str(route.net_id), *route.hop, origin, report.state, report.why)
+        return " ".join(words).lower()
+
+
+def interruption_row(found: Interruption, now_ns: int) -> InterruptionRow:
+    """Return in plain values what is interrupted for one client."""
+    target, port, source, source_port = ADDRESSES.unpack(found.asked)
+    return InterruptionRow(
+        client=str(found.way),
+        source=f"{NetId(source)}:{source_port}",
+        target=f"{NetId(target)}:{port}",
+        count=found.number,
+        since_s=(now_ns - found.since_ns) // _S,
+        why=found.why,
+    )
+
+
+def interruption_findings(routers: Iterable[StationRouter], now_s: float) -> list[dict[str, Any]]:
+    """Return what is interrupted as findings of ``status``."""
+    now_ns = monotonic_ns()
+    found = []
+    for router in routers:
+        for each in router.interruptions():
+            row = interruption_row(each, now_ns)
+            found.append(
+                {
+                    "severity": "warning",
+                    "where": router.name,
+                    "what": interruption_text(row),
+                    "advice": "they are restored when the way is back: see 'eapctl trace'",
+                    "since": now_s - (now_ns - each.since_ns) / _S,
+                }
+            )
+    return found
+
+
+def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow:
+    """Return a route in plain values."""
+    route, traffic = report.route, report.traffic
+    trip_ns, end_ns = report.round_trip_ns, route.expires_at_ns
+    return RouteRow(
+        name=route.name,
+        net_id=str(route.net_id),
+        octets=route.octets,
+        transport=route.hop.door,
+        address=route.hop.connection,
+        origin="derived" if is_derived else _ORIGINS[route.origin],
+        state=report.state.value,
+        why=report.why,
+        next_name=report.next_name,
+        rtt_us=None if trip_ns is None else trip_ns // 1000,
+        expires_s=None if end_ns is None else max(0, (end_ns - now_ns) // _S),
+        real="" if route.real is None else str(route.real),
+        unidirectional=route.is_unidirectional,
+        timeout_ms=route.timeout_ns // 1_000_000,
+        probed=route.is_probed,
+        requests=traffic.requests,
+        answers=traffic.answers,
+        errors=traffic.errors,
+        octets_out=traffic.octets_asked,
+        octets_in=traffic.octets_answered,
+        last_error=traffic.last_error,
+    )
+
+
+def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
+    """Return a connection in plain values."""
+    way, traffic = report
+    return ConnectionRow(
+        transport=way.door,
+        address=way.connection,
+        since_s=(now_ns - traffic.since_ns) // _S,
+        net_ids=[str(each) for each in traffic.sources],
+        took_us=traffic.round_trip_ns // 1000 if traffic.answers else None,
+        requests=traffic.requests,
+        answers=traffic.answers,
+        errors=traffic.errors,
+        octets_out=traffic.octets_answered,
+        octets_in=traffic.octets_asked,
+        last_error=traffic.last_error,
+    )
+
+
+def request_row(trace: Trace, now_ns: int) -> RequestRow:
+    """Return what became of a packet in plain values."""
+    header, hop = trace.header, trace.hop
+    known = {} if header is None else {
+        "service": AmsCommand.name_of(header.command),
+        "target": f"{header.target}:{header.target_port}",
+        "source": f"{header.source}:{header.source_port}",
+    }  # fmt: skip
+    return RequestRow(
+        at=round(time() - (now_ns - trace.at_ns) / _S, 3),
+        outcome=trace.outcome,
+        came_by="" if trace.came_by is None else str(trace.came_by),
+        transport="" if hop is None else hop.door,
+        address="" if hop is None else hop.connection,
+        error=trace.error_code,
+        took_us=trace.took_ns // 1000,
+        text=reason_of(trace),
+        **known,
+    )
+
+
+def _loops(latest: list[Trace]) -> list[str]:
+    """Return circles that were seen lately, the newest first."""
+    texts = (f"loop: {each.text}" for each in reversed(latest) if each.outcome is Outcome.LOOP)
+    return list(dict.fromkeys(texts))[:MAX_LOOPS]
+
+
+def _last(latest: list[Trace], count: int) -> list[Trace]:
+    return latest[-count:] if count else []

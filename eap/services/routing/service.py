@@ -1,0 +1,250 @@
+"""Services of a station: their interface, the table by NetID and port, and the queues before them.
+
+A *service* answers requests for a NetID of the station, at the AMS ports that it has.  A *carrier*
+is the sending half of a door: it takes packets to a connection or an address.  Both are given to
+:class:`~eap.services.routing.station_router.StationRouter`, which calls them from the
+running loop only, so neither needs locks.
+
+Requests of one client to one port are answered in their order, all others side by side.  The
+queues are bounded in number and octets; a request beyond that is refused at once.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Awaitable, Callable, Collection, Container, Iterable
+from time import monotonic_ns
+from typing import NamedTuple, Protocol, TypeAlias
+
+from eap.ads.answer import AmsAnswer
+from eap.ams.endpoint import Way
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+from eap.services.tasks import TaskSet
+
+
+class LocalRequest(NamedTuple):
+    """A request for a service of this station; who asks may have it done.
+
+    Access rules were applied before: what they refuse of a sum command is not in *body* any more.
+    Notifications go to *came_by* by ``StationRouter.send_notification``.
+    """
+
+    header: AmsHeader
+    body: bytes
+    came_by: Way
+
+
+AnswerNow: TypeAlias = Callable[[AmsHeader, bytes], AmsAnswer | None]
+"""Returns the answer to a request, with its header and body, or None for "in the usual way"."""
+
+
+class Service(Protocol):
+    """Whoever answers behind a NetID.
+
+    One that has a method ``answer_now``, an :data:`AnswerNow`, is asked by that first: what it says
+    there goes back without anything being kept for the request.  It has to change nothing.
+    """
+
+    @property
+    def ports(self) -> Container[int]:
+        """AMS ports that it has now; they may change at any time."""
+
+    def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
+        """Answer a request: at once, or later by what is returned to be awaited.
+
+        A method of ``async def`` will do; what is at hand is better returned as it is, without a
+        task.  Of one client and target port only one request is under way at a time, others are
+        at the same time.  An exception is logged and answered with ``AdsError.INTERNAL``; the
+        router answers in its place what takes longer than its limit, and drops what comes then.
+        """
+
+    def client_gone(self, way: Way) -> None:
+        """End what belongs to the clients of a connection that is closed: notifications, handles.
+
+        An address without connections (a datagram's sender) is never closed.
+        """
+
+
+class Carrier(Protocol):
+    """The sending half of a door."""
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send AMS packets, which are one or its fragments, without waiting.
+
+        Args:
+            connection: Name of a connection that came in, the sender's address where there are
+                none, or the address of a hop that a route names.
+            packets: With their headers, none longer than the room of the door.
+
+        Returns:
+            None, or why they cannot be sent; a request is answered with 0x1B then.
+        """
+
+
+class ServiceTable:
+    """The services of one station.
+
+    Args:
+        net_ids: All NetIDs that the station has.
+    """
+
+    def __init__(self, net_ids: Iterable[NetId]) -> None:
+        self._services: dict[NetId, list[Service]] = {each: [] for each in net_ids}
+
+    @property
+    def net_ids(self) -> Collection[NetId]:
+        """All NetIDs of the station."""
+        return self._services.keys()
+
+    def add(self, net_id: NetId, service: Service) -> None:
+        """Let *service* answer for *net_id*; raise KeyError if the station has no such NetID."""
+        self._services[net_id].append(service)
+
+    def ports(self, net_id: NetId) -> Container[int]:
+        """Return the AMS ports behind *net_id*, which may change at any time."""
+        return _Ports(self._services[net_id])
+
+    def find(self, header: AmsHeader) -> Service | None:
+        """Return the first that has the port which a request is for."""
+        for service in self._services[header.target]:
+            if header.target_port in service.ports:
+                return service
+        return None
+
+    def answer_now(self, header: AmsHeader, body: bytes) -> tuple[AmsAnswer, int] | None:
+        """Return what a service has at hand for a request, and how many nanoseconds that took."""
+        answer_now: AnswerNow | None = getattr(self.find(header), "answer_now", None)
+        if answer_now is None:
+            return None
+        began_ns = monotonic_ns()
+        try:
+            answer = answer_now(header, body)
+        except Exception:  # noqa: BLE001  it is logged when it fails again, in its queue
+            return None
+        return None if answer is None else (answer, monotonic_ns() - began_ns)
+
+    def client_gone(self, way: Way) -> None:
+        """Tell all of them that a connection is closed."""
+        for services in self._services.values():
+            for service in services:
+                service.client_gone(way)
+
+
+class _Ports:
+    """The AMS ports that some services have now."""
+
+    def __init__(self, services: Collection[Service]) -> None:
+        self._services = services
+
+    def __contains__(self, port: object) -> bool:
+        for service in self._services:  # noqa: SIM110  any() takes twice as long
+            if port in service.ports:
+                return True
+        return False
+
+
+MAX_WAITING = 64
+"""Requests of one client to one port that wait for their turn."""
+MAX_OCTETS = 16 << 20
+"""Octets of all requests of a station that are under way or wait."""
+_FAILED = AmsAnswer(error_code=AdsError.INTERNAL)
+_FULL = AmsAnswer(error_code=AdsError.MAILBOX_FULL)
+
+Finish: TypeAlias = Callable[[int, AmsAnswer], None]
+"""Takes the answer to the request with a ticket."""
+_Key: TypeAlias = tuple[Way, bytes]
+
+logger = logging.getLogger(__name__)
+
+
+class _Waiting(NamedTuple):
+    ticket: int
+    service: Service
+    request: LocalRequest
+
+
+class SerialQueues:
+    """All requests of one station's services; *finish* gets their answers."""
+
+    def __init__(self, finish: Finish) -> None:
+        self._finish = finish
+        self._queues: dict[_Key, deque[_Waiting]] = {}
+        self._tasks = TaskSet("AoE requests")
+        self._octets = 0
+
+    def has_work(self, way: Way, header: AmsHeader) -> bool:
+        """Say whether something is under way, or waits, of the client and port of a request."""
+        return bool(self._queues) and (way, _addresses(header)) in self._queues
+
+    def put(self, ticket: int, service: Service, request: LocalRequest) -> None:
+        """Have *service* answer a request when its turn comes."""
+        key = request.came_by, _addresses(request.header)
+        waiting = _Waiting(ticket, service, request)
+        queue = self._queues.get(key)
+        if queue is None:
+            answer = _begin(waiting)
+            if isinstance(answer, AmsAnswer):
+                self._finish(ticket, answer)
+                return
+            self._queues[key] = queue = deque()
+            self._octets += len(request.body)
+            self._tasks.start(self._run(key, queue, waiting, answer))
+        elif len(queue) >= MAX_WAITING or self._octets + len(request.body) > MAX_OCTETS:
+            self._finish(ticket, _FULL)
+        else:
+            self._octets += len(request.body)
+            queue.append(waiting)
+
+    def forget(self, way: Way) -> None:
+        """Leave out what waits for its turn and came by *way*; what has begun goes on."""
+        for key, queue in self._queues.items():
+            if key[0] == way:
+                self._octets -= sum(len(each.request.body) for each in queue)
+                queue.clear()
+
+    async def close(self) -> None:
+        """Give up what is under way."""
+        await self._tasks.close()
+
+    async def _run(
+        self, key: _Key, queue: deque[_Waiting], first: _Waiting, answer: Awaitable[AmsAnswer]
+    ) -> None:
+        """Answer what is in *queue* until nothing is."""
+        waiting: _Waiting = first
+        outcome: AmsAnswer | Awaitable[AmsAnswer] = answer
+        try:
+            while True:
+                if not isinstance(outcome, AmsAnswer):
+                    outcome = await _end(waiting, outcome)
+                self._octets -= len(waiting.request.body)
+                self._finish(waiting.ticket, outcome)
+                if not queue:
+                    return
+                waiting = queue.popleft()
+                outcome = _begin(waiting)
+        finally:
+            del self._queues[key]
+
+
+def _begin(waiting: _Waiting) -> AmsAnswer | Awaitable[AmsAnswer]:
+    try:
+        return waiting.service.answer(waiting.request)
+    except Exception:
+        logger.exception("AoE request from %s failed", waiting.request.header.source)
+        return _FAILED
+
+
+async def _end(waiting: _Waiting, answer: Awaitable[AmsAnswer]) -> AmsAnswer:
+    try:
+        return await answer
+    except Exception:
+        logger.exception("AoE request from %s failed", waiting.request.header.source)
+        return _FAILED
+
+
+def _addresses(header: AmsHeader) -> bytes:
+    ports = header.target_port << 16 | header.source_port
+    return header.target + header.source + ports.to_bytes(4, "little")

@@ -1,0 +1,447 @@
+"""The router of one station, with its doors, its services and the running loop around it.
+
+How the parts meet:
+
+- A **door** brings packets: whoever receives one calls :meth:`StationRouter.receive` with the
+  door's name and the connection that it came by, or the sender's address.  Answers and packets for
+  the next hop leave by the :class:`~.service.Carrier` that was given with the door.  Where several
+  stations are behind one socket, an :class:`~.entrance.Entrance` finds out whose a packet is.
+- A **service** answers for one NetID and its AMS ports, see :class:`~.service.Service`.
+- **Routes** are in :attr:`StationRouter.table`; they are added and removed by the methods here, so
+  that hops are asked for life from then on.
+- A **client** of this process asks by :meth:`StationRouter.ask`, and needs no door.
+
+Everything is called from the running loop; nothing that a peer sends raises.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable, Collection, Hashable
+from time import monotonic_ns
+
+from eap.ads.answer import AmsAnswer
+from eap.ams.access import AccessList, host_of
+from eap.ams.action import Action, Forward, Outcome, Reply, Trace
+from eap.ams.admission import Limits
+from eap.ams.authorized_request import AuditEntry
+from eap.ams.endpoint import Door, Way
+from eap.ams.hop_prober import Prober
+from eap.ams.record import Record, Stats, reason_of
+from eap.ams.report import ConnectionReport, Location, RouteReport
+from eap.ams.router import Router
+from eap.ams.routes import Route, RouteTable
+from eap.ams.subscription_restorer import Interruption
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+from eap.services.log_limits import caused_by
+from eap.services.routing.local_client import LOCAL_DOOR, LocalClient
+from eap.services.routing.service import (
+    Carrier,
+    LocalRequest,
+    SerialQueues,
+    Service,
+    ServiceTable,
+)
+
+_SHORTEST_WAIT_S = 0.001
+_MOMENT_S = 0.02
+"""How late a time-out may be noticed."""
+
+
+class RouterTimer:
+    """Has something handled in time, from :meth:`start` to :meth:`stop`.
+
+    Args:
+        next_timeout: Returns when the next thing is due, in nanoseconds of the monotonic clock, or
+            None for never.
+        handle: Called then, or a bit earlier or later; it has the timer set again.
+    """
+
+    def __init__(self, next_timeout: Callable[[], int | None], handle: Callable[[], None]) -> None:
+        self._next_timeout = next_timeout
+        self._handle = handle
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._is_soon = False
+
+    def start(self) -> None:
+        """Begin, in the running loop."""
+        self._loop = asyncio.get_running_loop()
+        self.set()
+
+    def stop(self) -> None:
+        """Call nobody any more."""
+        self._loop = None
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def set(self) -> None:
+        """Call when the next thing is due."""
+        at_ns = self._next_timeout()
+        if at_ns is None or self._loop is None:
+            return
+        if self._timer is not None:
+            if self._is_soon or self._timer.when() <= at_ns / 1e9:
+                return
+            self._timer.cancel()
+        at_s = max(at_ns / 1e9, self._loop.time() + _SHORTEST_WAIT_S)
+        self._timer = self._loop.call_at(at_s, self._ring)
+
+    def set_soon(self) -> None:
+        """Call after a moment, as something may be due earlier than it was.
+
+        That is cheap; when exactly it is due is looked up then, and not for each packet.
+        """
+        if self._is_soon or self._loop is None:
+            return
+        self._is_soon = True
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_later(_MOMENT_S, self._ring)
+
+    def _ring(self) -> None:
+        self._timer = None
+        self._is_soon = False
+        self._handle()
+
+
+_LEVELS = {
+    Outcome.ANSWERED: logging.INFO,
+    Outcome.FAILED: logging.WARNING,
+    Outcome.DENIED: logging.WARNING,
+    Outcome.LOOP: logging.WARNING,
+    Outcome.LATE: logging.DEBUG,
+    Outcome.DROPPED: logging.DEBUG,
+    Outcome.INTERRUPTED: logging.WARNING,
+    Outcome.RESTORED: logging.INFO,
+}
+
+logger = logging.getLogger(__name__)
+
+
+class TraceLog:
+    """The lines of one *station*."""
+
+    def __init__(self, station: str) -> None:
+        self._station = station
+
+    def write(self, trace: Trace) -> None:
+        """Log what became of a packet."""
+        level = _LEVELS[trace.outcome]
+        if not logger.isEnabledFor(level):
+            return
+        host = "" if trace.came_by is None else host_of(trace.came_by)
+        door = "" if trace.came_by is None else trace.came_by.door
+        # Results inside an answer are in the text.
+        code = f" (0x{trace.error_code:x})" if trace.error_code else ""
+        extra = caused_by((self._station, *_cause(trace, host)), f"{self._station} {door} {host}")
+        logger.log(level, "%s: %s%s", self._station, trace.text, code, extra=extra)
+
+
+def _cause(trace: Trace, host: str) -> tuple[Hashable, ...]:
+    """Return what is equal for packets that met the same obstacle.
+
+    A hop that is down is one cause, whatever is asked by it, and by whom.  Elsewhere clients and
+    targets are told apart, and connections and AMS ports of clients are not.
+    """
+    reason = reason_of(trace)
+    if trace.outcome is Outcome.FAILED and trace.hop is not None:
+        return trace.outcome, trace.hop, trace.error_code, reason
+    header = trace.header
+    what = None if header is None else (header.target, header.target_port, header.command)
+    return trace.outcome, what, host, trace.error_code, reason
+
+
+class StationRouter:
+    """What becomes of the AMS packets of one station.
+
+    Args:
+        name: Of the station.
+        net_id: Of the router itself.
+        net_ids: Of the station's ports; a request to a port that none of its services has is
+            answered with error 6, one to another NetID of the station with error 7.
+        access: The access rules; without any others than this host only read.
+        limits: How much it takes on.
+
+    Attributes:
+        name: Of the station.
+        net_id: Of the router itself.
+        table: The routes, to be read; changed by :meth:`add_route` and :meth:`remove_route`.
+        on_trace: Called with each trace of what was not simply answered.
+        on_audit: Called with each entry of the audit: what was changed, and what was refused.
+        on_routes: Called with the hop of each route that was added or removed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        net_id: NetId,
+        net_ids: Collection[NetId] = (),
+        *,
+        access: AccessList | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.name = name
+        self.net_id = net_id
+        self.table = RouteTable()
+        self.on_trace: list[Callable[[Trace], None]] = [TraceLog(name).write]
+        self.on_audit: list[Callable[[AuditEntry], None]] = []
+        self.on_routes: list[Callable[[Way], None]] = []
+        self._router = Router(
+            net_id,
+            self.table,
+            [],
+            first_invoke_id=int.from_bytes(os.urandom(4), "little"),
+            limits=limits,
+            prober=Prober(net_id, self.table),
+            access=access,
+            answer_now=self._answer_now,
+        )
+        self._carriers: dict[str, Carrier] = {}
+        self._services = ServiceTable((net_id, *net_ids))
+        for each in self._services.net_ids:
+            self._router.add_device(each, self._services.ports(each))
+        self._queues = SerialQueues(self._finish)
+        self._client = LocalClient(self)
+        self.add_door(LOCAL_DOOR, self._client)
+        self._settling: dict[Way, tuple[int, asyncio.Event]] = {}
+        self._timer = RouterTimer(self._router.next_timeout, self._handle_timeout)
+
+    @property
+    def net_ids(self) -> Collection[NetId]:
+        """All NetIDs of the station; none of them is routed."""
+        return self._services.net_ids
+
+    @property
+    def record(self) -> Record:
+        """What was done: traffic by connection and hop, and the latest traces."""
+        return self._router.record
+
+    def report(self, route: Route) -> RouteReport:
+        """Return what is known of one of the routes."""
+        return self._router.report(route)
+
+    def connections(self) -> list[ConnectionReport]:
+        """Return who asks, or asked and is still connected."""
+        return self._router.connections()
+
+    def interruptions(self) -> list[Interruption]:
+        """Return the subscriptions to which nothing comes, by client and server."""
+        return self._router.interruptions()
+
+    @property
+    def access(self) -> AccessList:
+        """The access rules that are in force."""
+        return self._router.gate.access
+
+    def set_access(self, access: AccessList) -> None:
+        """Judge requests by other rules from now on."""
+        self._router.gate.access = access
+
+    def require_record(self, record: Callable[[AuditEntry], str]) -> None:
+        """Refuse changes that cannot be recorded: *record* returns why, empty for one that was."""
+        self._router.gate.before_change = record
+
+    def why_not_recorded(self, entry: AuditEntry) -> str:
+        """Record a change before it is done, where that is required; return why it cannot be."""
+        record = self._router.gate.before_change
+        return record(entry) if record is not None else ""
+
+    def stats(self) -> Stats:
+        """Return what is going on, and what was."""
+        return self._router.stats()
+
+    async def serve(self) -> None:
+        """Look after time-outs and hops until cancelled."""
+        self._timer.start()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self._timer.stop()
+            await self._queues.close()
+
+    def add_door(self, door: Door, carrier: Carrier) -> None:
+        """Let packets come and go by *door*; raises ValueError if there is one of its name."""
+        self._router.add_door(door)
+        self._carriers[door.name] = carrier
+
+    def remove_door(self, name: str) -> None:
+        """Forget a door; what waits for those behind it is answered with 0x1B."""
+        self._act(self._router.remove_door(name, monotonic_ns()))
+        del self._carriers[name]
+
+    def add_service(self, net_id: NetId, service: Service) -> None:
+        """Let *service* answer for *net_id*, one of the station; the first that has a port does.
+
+        Raises:
+            KeyError: the station has no such NetID.
+        """
+        self._services.add(net_id, service)
+
+    def add_route(self, route: Route) -> bool:
+        """Take *route* into the table; return whether it was taken."""
+        is_taken = self.table.add(route)
+        for follow in self.on_routes:
+            follow(route.hop)
+        self._timer.set()
+        return is_taken
+
+    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+        """Forget a route; return whether there was one."""
+        was_there = self.table.remove(net_id, hop)
+        for follow in self.on_routes:
+            follow(hop)
+        self._timer.set()
+        return was_there
+
+    def is_down(self, hop: Way) -> bool:
+        """Say whether a hop is known not to answer now."""
+        return self._router.is_down(hop)
+
+    def hop_is_at(self, door: str, address: str, connection: str) -> None:
+        """Take what comes by *connection* for what comes from the hop that is named *address*."""
+        self._router.hop_is_at(door, address, connection)
+
+    def is_wanted(self, hop: Way) -> bool:
+        """Say whether a route leads to a hop."""
+        return any(route.hop == hop for route in self.table)
+
+    def is_awaited(self, hop: Way) -> bool:
+        """Say whether an answer from a hop is waited for, or subscriptions come from it."""
+        return self._router.is_awaited(hop)
+
+    def locate(self, header: AmsHeader, way: Way) -> Location:
+        """Say where a request would go that came by *way*."""
+        return self._router.locate(header, way)
+
+    def is_waiting_for(self, header: AmsHeader, body: bytes, door: str) -> bool:
+        """Say whether a client of this router waits for a packet."""
+        return self._router.is_waiting_for(header, body, door)
+
+    def receive(self, data: bytes, door: str, connection: str, *, for_all: bool = False) -> None:
+        """Act on an AMS packet, or on the fragment of one.
+
+        Args:
+            data: Header and what follows it.
+            door: Name of the door that it came by.
+            connection: That it came by, or its sender's address; where that is of IP, the name
+                begins with ``ADDRESS:``, for the access rules.
+            for_all: Whether others got it too: who is not meant says nothing.
+        """
+        self._act(
+            self._router.receive_packet(data, door, connection, monotonic_ns(), for_all=for_all)
+        )
+
+    def connection_closed(self, door: str, connection: str) -> None:
+        """Forget whom nobody can answer any more, and tell the services."""
+        way = Way(door, connection)
+        self._queues.forget(way)
+        self._services.client_gone(way)
+        self._act(self._router.connection_closed(door, connection, monotonic_ns()))
+
+    def hop_down(self, door: str, address: str | None, text: str) -> None:
+        """Answer what waits for a hop, and what will be for it, with 0x1B.
+
+        Args:
+            door: By which it is reached.
+            address: None for all that are reached by the door.
+            text: Why, for people.
+        """
+        self._act(self._router.hop_down(door, address, text, monotonic_ns()))
+
+    def hop_up(self, door: str, address: str | None) -> None:
+        """Pass requests on again; the arguments are those of :meth:`hop_down`."""
+        self._router.hop_up(door, address)
+        self._timer.set()
+
+    def send_notification(self, way: Way, packet: bytes) -> None:
+        """Send what a service has for a client of it, in fragments where they are needed."""
+        self._act(self._router.notify(way, packet))
+
+    async def ask(
+        self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
+    ) -> AmsAnswer:
+        """Ask whoever has *target*, near or far, as a program of this station.
+
+        Returns:
+            The data of the answer; every failure is an error code of the AMS header: of the router
+            that found it, 0x719 too when *timeout_s* is over.
+        """
+        return await self._client.ask(target, target_port, command, body, timeout_s=timeout_s)
+
+    def waiting(self, way: Way) -> int:
+        """Return how many requests that came by *way* wait for their answers."""
+        return self._router.waiting(way)
+
+    async def wait_below(self, door: str, connection: str, count: int) -> None:
+        """Wait until fewer than *count* requests of a connection wait for their answers.
+
+        Only its reader calls this: by waiting here it takes no more than it can answer.
+        """
+        way = Way(door, connection)
+        if self._router.waiting(way) < count:
+            return
+        event = asyncio.Event()
+        self._settling[way] = count, event
+        try:
+            await event.wait()
+        finally:
+            del self._settling[way]
+
+    def _act(self, actions: list[Action]) -> None:
+        if self._router.has_news:
+            self._tell()  # first: what is audited is written before it is answered
+        for action in actions:  # told apart by class, which is faster than by pattern
+            kind = type(action)
+            if kind is Reply:
+                self._reply(*action)
+            elif kind is Forward:
+                self._forward(*action)
+            else:
+                self._deliver(*action)
+        for way, (count, event) in self._settling.items():
+            if self._router.waiting(way) < count:
+                event.set()
+        self._timer.set_soon()
+
+    def _tell(self) -> None:
+        while (trace := self._router.next_event()) is not None:
+            for tell in self.on_trace:
+                tell(trace)
+        while (entry := self._router.gate.next_entry()) is not None:
+            for write in self.on_audit:
+                write(entry)
+
+    def _reply(self, way: Way, packets: tuple[bytes, ...]) -> None:
+        self._carriers[way.door].send(way.connection, packets)
+
+    def _forward(self, hop: Way, packets: tuple[bytes, ...], ticket: int) -> None:
+        text = self._carriers[hop.door].send(hop.connection, packets)
+        if text is not None:
+            self._act(self._router.send_failed(ticket, text, monotonic_ns()))
+
+    def _answer_now(self, header: AmsHeader, body: bytes, way: Way) -> tuple[AmsAnswer, int] | None:
+        """Return what a service has at hand, unless its client waits there for something else."""
+        if self._queues.has_work(way, header):
+            return None
+        return self._services.answer_now(header, body)
+
+    def _deliver(self, ticket: int, header: AmsHeader, body: bytes, way: Way) -> None:
+        service = self._services.find(header)
+        if service is not None:
+            self._queues.put(ticket, service, LocalRequest(header, body, way))
+
+    def _finish(self, ticket: int, answer: AmsAnswer) -> None:
+        self._act(self._router.receive_answer(ticket, answer, monotonic_ns()))
+
+    def _handle_timeout(self) -> None:
+        actions = self._router.handle_timeout(monotonic_ns())
+        for hop in self._router.take_gone_hops():
+            self.connection_closed(*hop)  # a datagram door has no other end of a connection
+        if actions:
+            self._act(actions)
+        else:
+            self._timer.set()

@@ -1,0 +1,317 @@
+"""The routes of one station: those of the plant file, those that were added, and what is learned.
+
+Rule: what the plant file says goes before everything else; what was added is kept over restarts,
+what was learned is not.
+Rule: what is added or removed is on the disk before it is in force, and whoever asked is told after
+that.  Packets do not wait for the disk, which takes milliseconds, but the next change does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import Protocol
+
+from msgspec.structs import replace
+
+from eap.ams.authorized_request import AuditEntry
+from eap.ams.endpoint import Way
+from eap.ams.routes import Origin, Route, RouteTable
+from eap.ams.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.errors import ControlError
+from eap.ids import STATION_OCTETS, NetId, prefix_text
+from eap.runtime.store import StationFile
+from eap.services.jobs import Jobs
+from eap.services.routing.neighbours import Scanner
+from eap.services.routing.planned import to_route, to_way
+
+MAX_ADDED = 1000
+"""Routes that can be added to one station."""
+MAX_NAME = 80
+LEARNED_NS = 600_000_000_000
+"""After which a learned route is forgotten, unless its router answers again."""
+
+logger = logging.getLogger(__name__)
+
+
+class RoutedStation(Protocol):
+    """What is needed of the router of a station."""
+
+    on_audit: list[Callable[[AuditEntry], None]]
+    """Called with what was changed, or refused."""
+
+    def why_not_recorded(self, entry: AuditEntry) -> str:
+        """Record a change before it is done, where that is required; return why it cannot be."""
+
+    @property
+    def table(self) -> RouteTable:
+        """Its routes, to be read."""
+
+    @property
+    def net_id(self) -> NetId:
+        """Of the router itself."""
+
+    @property
+    def net_ids(self) -> Collection[NetId]:
+        """All NetIDs of the station."""
+
+    def add_route(self, route: Route) -> bool:
+        """Take a route into the table; return whether it was taken."""
+
+    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+        """Forget a route; return whether there was one."""
+
+
+class StationRoutes:
+    """Which routes the router of a station has.
+
+    Args:
+        router: Of the station.
+        spec: What the plant file says.
+        store: Of the added routes.
+        open_hop: Returns door and address of a hop; raises ValueError if there is no such door.
+
+    Attributes:
+        router: Of the station.
+        scanners: Who asks for the routers of other hosts, one for each address of the station.
+    """
+
+    def __init__(
+        self,
+        router: RoutedStation,
+        spec: RoutingSpec,
+        store: StationFile[tuple[RouteSpec, ...]],
+        *,
+        open_hop: Callable[[HopSpec], Way] = to_way,
+    ) -> None:
+        self.router = router
+        self.scanners: list[Scanner] = []
+        self._spec = spec
+        self._store = store
+        self._open_hop = open_hop
+        self._added: dict[RouteSpec, bool] = {}
+        """With whether it is kept over restarts."""
+        self._written: dict[tuple[NetId, Way], RouteSpec] = {}
+        self._jobs = Jobs("routes")
+
+    @property
+    def spec(self) -> RoutingSpec:
+        """What the plant file says."""
+        return self._spec
+
+    @property
+    def added(self) -> tuple[RouteSpec, ...]:
+        """The added routes, the oldest first."""
+        return tuple(self._added)
+
+    def start(self, spec: RoutingSpec | None = None) -> None:
+        """Take the routes of the plant file, or of *spec*, then those that were added before."""
+        self._spec = spec or self._spec
+        self._take_spec()
+        for added in self._store.read() or ():
+            self._take(added)
+            self._added[added] = True  # what cannot be today may be one after the next start
+
+    def replace_spec(self, spec: RoutingSpec) -> None:
+        """Go on with what another plant file says; added and learned routes stay."""
+        self._spec = spec
+        self._take_spec()
+        for each in self._added:  # one of them may have been hidden by a route of the same hop
+            self._take(each)
+
+    def is_derived(self, route: Route) -> bool:
+        """Tell whether a route follows from the ports of the plant."""
+        spec = self._written.get(route.key)
+        return spec is not None and spec.is_derived
+
+    def has(self, prefix: bytes) -> bool:
+        """Say whether a NetID of the station itself begins with *prefix*."""
+        return any(own.startswith(prefix) for own in self.router.net_ids)
+
+    def check(self, spec: RouteSpec) -> None:
+        """Say whether a route could be added; raise ControlError with the reason if not."""
+        self._checked(spec, "")
+
+    async def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> Route:
+        """Add a route, in place of the added one of its name, or to its NetID.
+
+        Args:
+            spec: The route.
+            replaces: Name or NetID of one more that it takes the place of.
+            is_kept: Whether it is there again after a new start.
+
+        Raises:
+            ControlError: there cannot be such a route, a route of the plant file is before it, or
+                too many changes wait already.
+            EnvironmentalError: it cannot be kept.
+        """
+        return await self._jobs.do(partial(self._add, spec, replaces, is_kept=is_kept))
+
+    def learn(self, net_id: NetId, name: str, address: str, now_ns: int) -> bool:
+        """Take a route to a router that answered, by AMS/TCP; tell whether it was taken.
+
+        It is gone after ten minutes, and never before a route that somebody wrote or added.
+        """
+        found = self.router.table.find(net_id)
+        if not self._spec.learns_from(address) or self.has(net_id.station):
+            return False
+        if found is not None:
+            known, octets = found
+            if octets >= STATION_OCTETS and known.origin is not Origin.LEARNED:
+                return False
+        hop = to_way(HopSpec(DoorKind.AMS_TCP, "", f"{address}:{AMS_TCP_PORT}"))
+        route = Route(
+            net_id,
+            _plain(name) or address,
+            hop,
+            Origin.LEARNED,
+            expires_at_ns=now_ns + LEARNED_NS,
+            is_probed=False,
+        )
+        return self.router.add_route(route)
+
+    async def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
+        """Remove an added route by its name or NetID, and return it.
+
+        *door* and *address* choose where there are several.
+
+        Raises:
+            ControlError: there is none that can be removed, or too many changes wait already.
+            EnvironmentalError: that cannot be kept.
+        """
+        return await self._jobs.do(partial(self._remove, text, door, address))
+
+    async def _add(self, spec: RouteSpec, replaces: str, *, is_kept: bool) -> Route:
+        spec, old = self._checked(spec, replaces)
+        route = self._route(spec, Origin.ADDED)
+        if route.key in self._written:
+            raise ControlError(_hidden_by(self._written[route.key].name))
+        left = {each: kept for each, kept in self._added.items() if each not in old}
+        await self._change({**left, spec: is_kept}, gone=old)
+        self.router.add_route(route)
+        return route
+
+    async def _remove(self, text: str, door: str, address: str) -> RouteSpec:
+        found = [
+            spec
+            for spec in self._added
+            if text in _names(spec) and self._is_at(spec, door, address)
+        ]
+        if not found:
+            raise ControlError(self._why_not_removed(text))
+        left = {each: kept for each, kept in self._added.items() if each != found[0]}
+        await self._change(left, gone=found[:1])
+        return found[0]
+
+    def _checked(self, spec: RouteSpec, replaces: str) -> tuple[RouteSpec, list[RouteSpec]]:
+        """Return a route as it is kept, and the added ones that it takes the place of."""
+        spec = replace(spec, name=_plain(spec.name), is_derived=False)
+        known_as = {spec.name, spec.virtual or spec.net_id, replaces} - {""}
+        old = [each for each in self._added if _names(each) & known_as]
+        self._check(spec, len(self._added) - len(old))
+        return spec, old
+
+    async def _change(self, added: dict[RouteSpec, bool], gone: Sequence[RouteSpec]) -> None:
+        kept = tuple(each for each, is_kept in added.items() if is_kept)
+        await asyncio.to_thread(self._store.save, kept)
+        self._added = added
+        for each in gone:
+            self._forget(each)
+
+    def _take_spec(self) -> None:
+        """Have the routes of the plant file; those that are the same as before are not touched.
+
+        A connection to the next hop is closed when its last route goes.
+        """
+        before, self._written = self._written, {}
+        for spec in self._spec.routes:
+            try:
+                route = self._route(spec, Origin.STATIC)
+            except ControlError as exc:
+                logger.warning("route %s of the plant file is left out: %s", spec.name, exc)
+                continue
+            self._written[route.key] = spec
+            if before.get(route.key) != spec:
+                self.router.add_route(route)
+        for key in before.keys() - self._written.keys():
+            self.router.remove_route(*key)
+
+    def _take(self, spec: RouteSpec) -> None:
+        """Have an added route."""
+        try:
+            self.router.add_route(self._route(spec, Origin.ADDED))
+        except ControlError as exc:
+            logger.warning("added route %s is left out: %s", spec.name, exc)
+
+    def _route(self, spec: RouteSpec, origin: Origin) -> Route:
+        try:
+            return to_route(spec, self._open_hop(spec.hop), origin)
+        except ValueError as exc:
+            raise ControlError(f"route {spec.name!r}: {exc}") from None
+
+    def _forget(self, spec: RouteSpec) -> None:
+        """Take an added route out of the table, unless one of the plant file has its place."""
+        for route in list(self.router.table):
+            same = route.origin is Origin.ADDED and route.name == spec.name
+            if same and str(route.net_id) == (spec.virtual or spec.net_id):
+                self.router.remove_route(*route.key)
+
+    def _check(self, spec: RouteSpec, others: int) -> None:
+        if others >= MAX_ADDED:
+            raise ControlError(f"{MAX_ADDED} routes were added already; remove some")
+        if not spec.name:
+            raise ControlError("a route needs a name")
+        try:
+            net_id = NetId.parse(spec.virtual or spec.net_id)
+        except ValueError as exc:
+            raise ControlError(f"route {spec.name!r}: {exc}") from None
+        if not any(net_id) and spec.octets:
+            raise ControlError(f"NetID {net_id} stands for any; a default route matches 0 octets")
+        prefix = net_id[: spec.octets]
+        if spec.octets and self.has(prefix):
+            raise ControlError(f"NetID {prefix_text(prefix)} is one of this station itself")
+        for route in self.router.table:
+            if route.origin is Origin.STATIC and _takes(route, net_id, spec.octets):
+                raise ControlError(_hidden_by(route.name))
+
+    def _is_at(self, spec: RouteSpec, door: str, address: str) -> bool:
+        if not door and not address:
+            return True
+        hop = self._open_hop(spec.hop)
+        return door in {"", hop.door} and address in {"", hop.connection}
+
+    def _why_not_removed(self, text: str) -> str:
+        for route in self.router.table:
+            if text in {route.name, str(route.net_id)}:
+                if route.origin is Origin.STATIC:
+                    where = "follows from the ports" if self.is_derived(route) else "is"
+                    return f"route {route.name!r} {where} of the plant file; change it there"
+                if route.origin is Origin.LEARNED:
+                    return f"route {route.name!r} is learned: it goes by itself, or learn: false"
+        names = ", ".join(spec.name for spec in self._added) or "none"
+        return f"no route {text!r} was added; there are: {names}"
+
+
+def _takes(route: Route, net_id: NetId, octets: int) -> bool:
+    """Tell whether a route of the plant file is for all that another one would be for."""
+    if not octets:
+        return not route.octets
+    return 0 < route.octets <= octets and net_id.startswith(route.net_id[: route.octets])
+
+
+def _hidden_by(name: str) -> str:
+    return (
+        f"route {name!r} of the plant file is for the same NetIDs and goes before one that is"
+        " added; change the plant file"
+    )
+
+
+def _names(spec: RouteSpec) -> set[str]:
+    return {spec.name, spec.virtual or spec.net_id}
+
+
+def _plain(name: str) -> str:
+    return "".join(filter(str.isprintable, name)).strip()[:MAX_NAME]

@@ -1,0 +1,144 @@
+"""What the router of a station is told: by the plant file at its start, by another one later.
+
+What was applied while the station ran is kept, and runs until the plant file is edited that the
+appliance is started with.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from eap.ams.routing_change import describe_routing, routing_needs_new_start
+from eap.ams.spec import RoutingSpec
+from eap.errors import ControlError, EnvironmentalError
+from eap.runtime.store import AppliedRouting, StationFile, digest_of
+from eap.services.jobs import Jobs
+from eap.services.routing.station_routes import StationRoutes
+
+logger = logging.getLogger(__name__)
+
+
+class RoutingPlan(NamedTuple):
+    """What another specification would change, and why it cannot be, a line for each thing."""
+
+    changes: list[str]
+    refused: list[str]
+
+
+class StationRouting:
+    """Routes, access rules and users of one station, which may change while it runs.
+
+    Args:
+        name: Of the station.
+        routes: Of the station, not started yet.
+        store: What was applied.
+        set_access: Puts the access rules in force.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        routes: StationRoutes,
+        store: StationFile[AppliedRouting],
+        set_access: Callable[[RoutingSpec], None],
+    ) -> None:
+        self.routes = routes
+        self._name = name
+        self._store = store
+        self._set_access = set_access
+        self._base = digest_of(routes.spec)
+        self._applied = self._usable(store.read())
+        self._jobs = Jobs(f"routing of station {name}")
+
+    @property
+    def applied(self) -> AppliedRouting | None:
+        """What was applied last, None if nothing was since the plant file was edited."""
+        return self._applied
+
+    def start(self) -> None:
+        """Let the station have what was applied last, or what the plant file says."""
+        if self._applied is None:
+            self.routes.start()
+        else:
+            if self._applied.spec != self.routes.spec:
+                logger.warning(
+                    "station %s: routes and access rules are as applied last; 'eapctl plan' shows"
+                    " what differs from the plant file",
+                    self._name,
+                )
+            self.routes.start(self._applied.spec)
+        self._set_access(self.routes.spec)
+
+    def plan(self, spec: RoutingSpec) -> RoutingPlan:
+        """Return what *spec* would change."""
+        now = self.routes.spec
+        return RoutingPlan(describe_routing(now, spec), routing_needs_new_start(now, spec))
+
+    async def apply(self, spec: RoutingSpec, cause: str) -> list[str]:
+        """Keep *spec*, then go on with it; return what that changed.
+
+        Raises:
+            ControlError: it cannot be while the station runs, or too many changes wait already.
+            EnvironmentalError: it cannot be kept.
+        """
+        return await self._jobs.do(partial(self._apply, spec, cause))
+
+    async def roll_back(self) -> list[str]:
+        """Take the last change back, or make it again; return what that changed.
+
+        Raises:
+            ControlError: there was none, or too many changes wait already.
+            EnvironmentalError: it cannot be kept.
+        """
+        return await self._jobs.do(self._roll_back)
+
+    async def _apply(self, spec: RoutingSpec, cause: str) -> list[str]:
+        plan = self.plan(spec)
+        if plan.refused:
+            raise ControlError("; ".join(plan.refused))
+        if spec != self.routes.spec:
+            before = self.routes.spec
+            if self._applied is not None and self._applied.cause == cause:
+                before = self._applied.previous  # another step of the same change
+            await self._change(
+                AppliedRouting(base=self._base, spec=spec, previous=before, cause=cause)
+            )
+        return plan.changes
+
+    async def _roll_back(self) -> list[str]:
+        now = self._applied
+        if now is None:
+            raise ControlError("routes and access rules were not changed while the station ran")
+        changes = describe_routing(now.spec, now.previous)
+        await self._change(
+            replace(now, spec=now.previous, previous=now.spec, undone=not now.undone)
+        )
+        return changes
+
+    def _usable(self, kept: AppliedRouting | None) -> AppliedRouting | None:
+        """Return what was applied, unless the plant file was edited since."""
+        if kept is None or kept.base == self._base:
+            return kept
+        if kept.spec != self.routes.spec:
+            logger.warning(
+                "station %s: the plant file was edited since routes or access rules were changed;"
+                " the file counts",
+                self._name,
+            )
+        try:
+            self._store.set_aside()
+        except EnvironmentalError as exc:
+            logger.warning("%s", exc)
+        return None
+
+    async def _change(self, applied: AppliedRouting) -> None:
+        await asyncio.to_thread(self._store.save, applied)  # packets do not wait for the disk
+        self._applied = applied
+        self.routes.replace_spec(applied.spec)
+        self._set_access(applied.spec)

@@ -1,0 +1,314 @@
+"""Files of slaves as streams: read ahead of their reader, or written behind their writer.
+
+A file moves by itself as far as there is data, or room for it, so that a block goes to the slave
+while the client brings the next one.  A fault of the bus that interrupts a file of an own bus does
+not end it: FoE cannot go on in the middle of a file (ETG.1000.6), so it begins anew.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Hashable
+from hashlib import sha256
+from time import monotonic
+
+from devicebus.drive import drive_async
+from devicebus.errors import BusError
+from devicebus.mailbox import foe_client
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, Progress
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.codec.foe import DATA_OVERHEAD, FoeOpcode
+from eap.errors import EapError
+from eap.runtime.foe_restart import PAUSE_S, Restarts
+from eap.services.slaves.mailbox_queue import MailboxTurn
+from eap.services.tasks import TaskSet
+
+AHEAD = 64 << 10
+"""Octets that are read before the reader wants them, unless it says otherwise."""
+BEHIND = 64 << 10
+"""Octets that are taken from the writer before they have gone on."""
+KEPT = 16 << 20
+"""Bytes of a file on its way to a slave that are kept, to begin anew if the bus interrupts it."""
+ALL_KEPT = 64 << 20
+"""Bytes of all files together; one that finds no room goes on, but does not begin anew."""
+_CHANGED = "the slave's file has changed while the bus was interrupted"
+_ACK = bytes((FoeOpcode.ACK,))
+
+logger = logging.getLogger(__name__)
+
+
+class FileStream(ABC):
+    """A file that is moved from a slave or to it, from the constructor on.
+
+    The methods that wait raise the error that has ended the transfer; cancelling one takes nothing
+    and gives nothing.
+
+    Args:
+        name: Of the file, at the slave.
+        sizes: Of the slave's mailboxes.
+        is_write: Whether it goes to the slave.
+        ahead: As AHEAD.
+
+    Attributes:
+        is_write: As given.
+        sizes: Of the slave's mailboxes, known when the file is open.
+        progress: Octets that the slave has, or has given.
+        has_turn: Whether it is its turn at the slave; before, other files are moved.
+        is_open: Whether the slave has opened it.
+        is_whole: Whether nothing more will be written to it.
+        is_complete: Whether all of it was moved.
+        stalled_since_s: Time of the loop since which the slave waits for the reader or writer; None
+            while it need not.
+    """
+
+    def __init__(self, name: str, sizes: MailboxSizes, *, is_write: bool, ahead: int) -> None:
+        self.is_write = is_write
+        self.sizes = sizes
+        self.progress = Progress()
+        self.has_turn = self.is_open = self.is_whole = self.is_complete = False
+        self.name = name
+        self.buffer = bytearray()
+        """Octets read that are not fetched yet, or written that have not gone on."""
+        self.stalled_since_s: float | None = None
+        self._ahead = ahead
+        self._wanted = 0
+        self._error: EapError | None = None
+        self._changed = asyncio.Event()
+        self._tasks = TaskSet(f"file {name!r}")
+        self._tasks.start(self.run())
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether nothing more goes to the slave or comes from it."""
+        return self.is_complete or self._error is not None
+
+    async def wait_open(self) -> None:
+        """Wait until the slave has opened the file."""
+        await self._until(lambda: self.is_open)
+
+    async def read(self, size: int) -> bytes:
+        """Return the next *size* octets, fewer only at the end."""
+        self._wanted = size
+        self.notify()
+        await self._until(lambda: len(self.buffer) >= size)
+        return self.cut(size)
+
+    async def write(self, data: bytes) -> None:
+        """Take *data* when most of what came before has gone on."""
+        await self._until(lambda: len(self.buffer) < BEHIND)
+        self.buffer += data
+        self.notify()
+
+    async def finish(self) -> None:
+        """Wait until the slave has all that was written."""
+        self.is_whole = True
+        self.notify()
+        await self._until(lambda: self.is_complete)
+
+    def close(self) -> None:
+        """Give the file up if it is not complete, at the slave too."""
+        if not self.has_ended:
+            self._tasks.cancel()
+
+    @abstractmethod
+    async def move(self) -> None:
+        """Move the whole file; raise EapError.  Cancelling it ends it at the slave too."""
+
+    def notify(self, *, has_turn: bool = False, is_open: bool = False) -> None:
+        """Let everything that waits for a change look again."""
+        self.has_turn |= has_turn
+        self.is_open |= is_open
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def cut(self, size: int) -> bytes:
+        """Take octets out of the buffer."""
+        data = bytes(self.buffer[:size])
+        del self.buffer[:size]
+        self.notify()
+        return data
+
+    async def wait_room(self) -> None:
+        """Wait until more is to be read: once there was no room, until there is for a half."""
+        if len(self.buffer) >= max(self._ahead, self._wanted):
+            await self._stall(lambda: len(self.buffer) < max(self._ahead // 2, self._wanted))
+
+    async def wait_data(self, size: int) -> None:
+        """Wait for octets that go to the slave, fewer than *size* only at the end."""
+        await self._stall(lambda: self.is_whole or len(self.buffer) >= size)
+
+    async def run(self) -> None:
+        """Move the file, and let its reader or writer know the end."""
+        try:
+            await self.move()
+            self.is_complete = True
+        except EapError as exc:
+            self._error = exc
+        finally:
+            if not self.has_ended:
+                self._error = BusError(f"file {self.name!r}: the transfer was given up")
+            self.notify()
+
+    async def _stall(self, is_so: Callable[[], bool]) -> None:
+        """Wait for the reader or writer."""
+        if not is_so():
+            self.stalled_since_s = asyncio.get_running_loop().time()
+            try:
+                await self._wait(is_so)
+            finally:
+                self.stalled_since_s = None
+
+    async def _until(self, is_so: Callable[[], bool]) -> None:
+        """Wait until it is so, or the transfer has ended; raise what has ended it."""
+        await self._wait(lambda: is_so() or self.has_ended)
+        if self._error is not None:
+            raise self._error
+
+    async def _wait(self, is_so: Callable[[], bool]) -> None:
+        while not is_so():
+            await self._changed.wait()
+
+
+class FileHistory:
+    """Beginning of a file that was moved already, for a transfer that begins anew.
+
+    Of a file that is written the data is kept, as far as KEPT, and given to the slave again.  Of
+    one that is read a hash is enough: what the reader has already is read again and compared.
+    """
+
+    all_kept = 0
+    """Bytes that all transfers of the process keep now."""
+
+    def __init__(self, *, is_kept: bool) -> None:
+        self.can_rewind = True
+        self._is_kept = is_kept
+        self._data = bytearray()
+        self._size = self._repeated = 0
+        self._hash, self._hash_again = sha256(), sha256()
+
+    def keep(self, data: bytes) -> None:
+        """Keep what the slave was given."""
+        if self._is_kept and self.can_rewind:
+            self._data += data
+            FileHistory.all_kept += len(data)
+            if len(self._data) > KEPT or FileHistory.all_kept > ALL_KEPT:
+                self.can_rewind = False
+                self.forget()
+
+    def forget(self) -> None:
+        """Free what is kept."""
+        FileHistory.all_kept -= len(self._data)
+        self._data.clear()
+
+    def fresh(self, data: bytes) -> bytes:
+        """Return what is new of *data*; raise BusError if the rest is not as it was."""
+        known = min(len(data), self._size - self._repeated)
+        if known:
+            self._hash_again.update(data[:known])
+            self._repeated += known
+            if self._repeated == self._size and self._hash_again.digest() != self._hash.digest():
+                raise BusError(_CHANGED)
+            data = data[known:]
+        self._hash.update(data)
+        self._size += len(data)
+        self._repeated += len(data)
+        return data
+
+    def end(self) -> None:
+        """Raise BusError if the file ends before what the reader has already."""
+        if self._repeated < self._size:
+            raise BusError(_CHANGED)
+
+    def rewind(self) -> bytes:
+        """Begin anew; return what the slave has to be given again."""
+        self._repeated = 0
+        self._hash_again = sha256()
+        data = bytes(self._data)
+        self.forget()
+        return data
+
+
+class LocalFile(FileStream):
+    """A file of a slave of an own bus, moved by an FoE conversation.
+
+    Args:
+        name: Of the file, at the slave.
+        password: Up to 32 bits.
+        sizes: Of the slave's mailboxes.
+        open_turn: Waits for the file's turn at the slave; the file itself is the requester.
+        is_write: Whether it goes to the slave.
+        ahead: As AHEAD.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        password: int,
+        sizes: MailboxSizes,
+        open_turn: Callable[[Hashable], Awaitable[MailboxTurn]],
+        *,
+        is_write: bool,
+        ahead: int = AHEAD,
+    ) -> None:
+        super().__init__(name, sizes, is_write=is_write, ahead=ahead)
+        self._password = password
+        self._open_turn = open_turn
+        self._history = FileHistory(is_kept=is_write)
+
+    async def move(self) -> None:
+        """Move the file, again from its beginning after a fault of the bus."""
+        restarts = Restarts(self.progress, lambda: self._history.can_rewind, monotonic)
+        try:
+            while True:
+                try:
+                    return await self._move_once()
+                except EapError as exc:
+                    if not restarts.allows(exc):
+                        raise
+                again = self._history.rewind()
+                if self.is_write:
+                    self.buffer[:0] = again
+                logger.info("%s: restart %d after: %s", self.name, restarts.count, restarts.reason)
+                await asyncio.sleep(PAUSE_S)
+        finally:
+            self._history.forget()
+
+    async def _move_once(self) -> None:
+        room = self.sizes.to_slave - DATA_OVERHEAD
+        turn = await self._open_turn(self)
+        self.notify(has_turn=True)
+
+        async def exchange(request: MailboxRequest) -> MailboxMessage:
+            if not self.is_write:
+                await self.wait_room()
+            message = await turn.exchange(request)
+            if self.is_write and message.data[:1] == _ACK:
+                self.notify(is_open=True)
+                await self.wait_data(room)
+            return message
+
+        try:
+            await drive_async(self._begin(), exchange)
+        except asyncio.CancelledError:
+            turn.abandon()
+            raise
+        finally:
+            turn.close()
+        self._history.end()
+
+    def _begin(self) -> Conversation[int]:
+        name, sizes, password, progress = self.name, self.sizes, self._password, self.progress
+        if self.is_write:
+            return foe_client.write(name, self._give, sizes, password=password, progress=progress)
+        return foe_client.read(name, self._take, sizes, password=password, progress=progress)
+
+    def _take(self, data: bytes) -> None:
+        self.buffer += self._history.fresh(data)
+        self.notify(is_open=True)
+
+    def _give(self, size: int) -> bytes:
+        data = self.cut(size)
+        self._history.keep(data)
+        return data

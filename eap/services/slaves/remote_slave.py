@@ -1,0 +1,404 @@
+"""Access to a slave, or the master, of another station: each operation is one request by AoE.
+
+A refusal comes back as an error of ADS; it is raised with the code of the protocol that comes
+nearest, and as RemoteAccessError where no code does or the slave was not reached (ETG.1020).
+
+A file goes in blocks.  The first one is as long as a packet of FoE, so that the client need not
+wait for more than it wants; each is twice as long as the one before, up to BLOCK.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import Protocol
+
+from devicebus.errors import FoeError, SoeError
+from devicebus.mailbox.conversation import MailboxMessage
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.ads.answer import AmsAnswer, response_to
+from eap.ads.operation import Operation, Read, ReadState, ReadWrite, Write
+from eap.ads.query import decode_outcome, encode_query
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
+from eap.codec.foe import DATA_OVERHEAD
+from eap.codec.foe import name_of as name_of_foe
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
+from eap.codec.soeerror import SoeErrorCode, name_of
+from eap.gateway.error_table import cause_of_result
+from eap.od.abort import AbortCode, SdoAbortError
+from eap.services.slaves.access import RemoteAccessError
+from eap.services.slaves.file_stream import AHEAD, FileStream
+from eap.services.slaves.object_stream import ObjectStream
+
+BLOCK = 16 << 10
+"""Octets of the longest block; where there are only datagrams, one that is lost costs all of it."""
+STEP_S = 5.0
+"""How long the answer to a block may take: routers give up after 4.5 s."""
+PAUSE_S = 0.02
+"""Pause before a station that is busy gets the request again."""
+_HANDLE_SIZE = 4
+_GIVE_UP = b"\1"
+LONGEST_ANSWER = 0x20002
+"""Octets of the longest answer: a list of all indexes there can be."""
+SHORT = 1 << 10
+"""Octets of an object that goes to a slave in a few messages."""
+LONG_TIMES = 5
+"""Answer times that writing a longer one may take."""
+_COMPLETE = 0x100
+_ADDRESSES, _SLAVES = 0xF020, 0x8000
+_TO_SLAVE, _TO_MASTER = 33, 34
+_LISTS, _LISTED = 16, 255
+"""Objects from 0xF020 on, and addresses in each."""
+_INFO_GROUPS = {
+    SdoInfoOpcode.LIST_REQUEST: IndexGroup.OBJECT_LIST,
+    SdoInfoOpcode.OBJECT_REQUEST: IndexGroup.OBJECT_DESCRIPTION,
+    SdoInfoOpcode.ENTRY_REQUEST: IndexGroup.ENTRY_DESCRIPTION,
+}
+_FORWARDED = frozenset(
+    (
+        AmsCommand.READ_DEVICE_INFO,
+        AmsCommand.READ,
+        AmsCommand.WRITE,
+        AmsCommand.READ_STATE,
+        AmsCommand.WRITE_CONTROL,
+        AmsCommand.READ_WRITE,
+    )
+)
+"""Notifications are not: nothing would bring them back to the client."""
+
+
+class AmsRequester(Protocol):
+    """Sends requests to ports behind one NetID; every failure is an error of the answer."""
+
+    async def __call__(
+        self, port: int, command: int, body: bytes, *, timeout_s: float
+    ) -> AmsAnswer:
+        """Return the answer."""
+
+
+class RemoteSlave:
+    """A slave of another station; a SlaveAccess.
+
+    Args:
+        request: Sends requests to the NetID of its bus.
+        port: AMS port of the slave; 0xFFFF is the master.
+        answer_s: Limit for the answer to a request.
+    """
+
+    def __init__(self, request: AmsRequester, port: int, answer_s: float) -> None:
+        self._request = request
+        self._port = port
+        self._answer_s = answer_s
+
+    async def sizes(self) -> MailboxSizes:
+        """Return the sizes of the slave's mailboxes, from the dictionary of its master (ETG.1510).
+
+        Raises:
+            RemoteAccessError: the master does not tell them.
+        """
+        if self._port == DEVICE_PORT:
+            raise RemoteAccessError(AdsError.SERVICE)  # a master has no mailbox
+        try:
+            index = _SLAVES + await self._number()
+            return MailboxSizes(
+                await self._word(index, _TO_SLAVE), await self._word(index, _TO_MASTER)
+            )
+        except ValueError:
+            raise RemoteAccessError(AdsError.NOT_READY) from None
+        except RemoteAccessError as exc:
+            if exc.is_of_way:
+                raise
+            # The master's dictionary refused, which says nothing about the slave.
+            raise RemoteAccessError(AdsError.SERVICE) from None
+
+    async def probe(self) -> None:
+        """Raise RemoteAccessError if the other station does not answer."""
+        try:
+            await self.perform(ReadState())
+        except RemoteAccessError as exc:
+            if exc.is_of_way:
+                raise
+
+    async def read_object(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
+        """Read an entry, or with *complete* an object from subindex 0 or 1 on."""
+        offset = _sdo_offset(index, subindex, complete=complete)
+        try:
+            data = await self.perform(Read(IndexGroup.SDO, offset, LONGEST_ANSWER))
+        except RemoteAccessError as exc:
+            raise _sdo_error(exc, index, subindex) from None
+        if complete and subindex:
+            data = data[2:]  # by ADS an object comes from subindex 0 on, which is 16 bits wide
+        return data
+
+    async def open_object(
+        self, index: int, subindex: int, *, complete: bool = False
+    ) -> ObjectStream:
+        """Read as :meth:`read_object` does: by ADS all of an object comes at once."""
+        data = await self.read_object(index, subindex, complete=complete)
+        return ObjectStream(len(data), data)
+
+    async def write_object(
+        self, index: int, subindex: int, data: bytes, *, complete: bool = False
+    ) -> None:
+        """Write an entry, or with *complete* an object from subindex 0 on."""
+        if complete and subindex:
+            detail = "by ADS an object is written from subindex 0 on"
+            raise SdoAbortError(AbortCode.NO_COMPLETE_ACCESS, index, subindex, detail)
+        offset = _sdo_offset(index, subindex, complete=complete)
+        # The other station answers when its slave has all of it.
+        times = LONG_TIMES if len(data) > SHORT else 1
+        try:
+            await self.perform(
+                Write(IndexGroup.SDO, offset, data), timeout_s=times * self._answer_s
+            )
+        except RemoteAccessError as exc:
+            raise _sdo_error(exc, index, subindex) from None
+
+    async def write_unsized(self, index: int, subindex: int, octets: bytes) -> None:
+        """Write an entry from four octets of which as many count as the entry has."""
+        size = len(await self.read_object(index, subindex))
+        await self.write_object(index, subindex, octets[:size])
+
+    async def read_info(self, opcode: SdoInfoOpcode, request: bytes) -> bytes:
+        """Return the body of an SDO information answer."""
+        index = subindex = 0
+        match opcode:
+            case SdoInfoOpcode.LIST_REQUEST:
+                offset = ListRequest.decode(request).list_type << 16
+            case SdoInfoOpcode.OBJECT_REQUEST:
+                index = ObjectRequest.decode(request).index
+                offset = index << 16
+            case SdoInfoOpcode.ENTRY_REQUEST:
+                entry = EntryRequest.decode(request)
+                index, subindex = entry.index, entry.subindex
+                offset = index << 16 | entry.value_info << 8 | subindex
+            case _:
+                raise RemoteAccessError(AdsError.SERVICE)
+        try:
+            return await self.perform(Read(_INFO_GROUPS[opcode], offset, LONGEST_ANSWER))
+        except RemoteAccessError as exc:
+            raise _sdo_error(exc, index, subindex) from None
+
+    async def read_elements(self, idn: int, elements: int, *, drive: int) -> bytes:
+        """Read elements of an IDN, one behind the other; lists and texts with their heads."""
+        offset = _soe_offset(idn, elements, drive)
+        try:
+            return await self.perform(Read(IndexGroup.SOE, offset, LONGEST_ANSWER))
+        except RemoteAccessError as exc:
+            raise _soe_error(exc) from None
+
+    async def write_elements(self, idn: int, elements: int, data: bytes, *, drive: int) -> None:
+        """Write an element of an IDN; a list or text with its head."""
+        try:
+            await self.perform(Write(IndexGroup.SOE, _soe_offset(idn, elements, drive), data))
+        except RemoteAccessError as exc:
+            raise _soe_error(exc) from None
+
+    def open_file(
+        self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
+    ) -> RemoteFile:
+        """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
+        return RemoteFile(self, name, password, is_write=is_write, ahead=ahead)
+
+    async def exchange_vendor(self, message: bytes) -> bytes:
+        """Return the answer to a VoE message, both with their VoE headers."""
+        return await self.perform(ReadWrite(IndexGroup.VOE, 0, LONGEST_ANSWER, message))
+
+    async def send_vendor(self, message: bytes) -> None:
+        """Send a VoE message that is not answered."""
+        await self.perform(Write(IndexGroup.VOE, 0, message))
+
+    async def exchange_ads(self, header: AmsHeader, data: bytes) -> bytes:
+        """Return the AMS packet that answers an AoE request; nothing if it wants no answer.
+
+        The packet's target is not looked at: the slave is the one that this access leads to.
+        """
+        if header.command not in _FORWARDED:
+            raise RemoteAccessError(AdsError.SERVICE)
+        answer = await self._request(self._port, header.command, data, timeout_s=self._answer_s)
+        if header.state_flags & StateFlags.NO_RETURN:
+            return b""
+        return response_to(header, answer)
+
+    async def exchange(
+        self, kind: MailboxType, request: bytes, *, expects_reply: bool = True
+    ) -> MailboxMessage:
+        """Refuse: ADS has no service that passes mailbox messages."""
+        raise RemoteAccessError(AdsError.SERVICE)
+
+    async def perform(
+        self, operation: Operation, *, port: int | None = None, timeout_s: float | None = None
+    ) -> bytes:
+        """Have an operation done; return what was read.
+
+        Args:
+            operation: To be done by the slave.
+            port: Of another device behind the same NetID.
+            timeout_s: Limit for the answer, if it is another one than usual.
+
+        Raises:
+            RemoteAccessError: it was not done.
+        """
+        command, body = encode_query(operation)
+        answer = await self._request(
+            self._port if port is None else port,
+            command,
+            body,
+            timeout_s=timeout_s or self._answer_s,
+        )
+        outcome = decode_outcome(command, answer.error_code, answer.data)
+        if outcome.result:
+            raise RemoteAccessError(outcome.result)
+        return outcome.data
+
+    async def _number(self) -> int:
+        """Return the number of the slave in the lists of its master."""
+        for number in range(_LISTS):
+            offset = _sdo_offset(_ADDRESSES + number, 0, complete=True)
+            listed = await self.perform(
+                Read(IndexGroup.SDO, offset, 2 + 2 * _LISTED), port=DEVICE_PORT
+            )
+            places = range(2, min(len(listed) - 1, 2 + 2 * _LISTED), 2)
+            stations = [int.from_bytes(listed[at : at + 2], "little") for at in places]
+            if self._port in stations:
+                return number * _LISTED + stations.index(self._port)
+            if len(stations) < _LISTED:
+                break
+        raise RemoteAccessError(AdsError.TARGET_PORT)
+
+    async def _word(self, index: int, subindex: int) -> int:
+        read = Read(IndexGroup.SDO, _sdo_offset(index, subindex, complete=False), 2)
+        return int.from_bytes(await self.perform(read, port=DEVICE_PORT), "little")
+
+
+class RemoteFile(FileStream):
+    """A file of a slave of another station, which does not report turns.
+
+    Args:
+        slave: Owner of the file.
+        name: Of the file, at the slave.
+        password: Up to 32 bits.
+        is_write: Whether it goes to the slave.
+        ahead: Octets that are read before the client wants them.
+    """
+
+    def __init__(
+        self, slave: RemoteSlave, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
+    ) -> None:
+        super().__init__(name, MailboxSizes(), is_write=is_write, ahead=ahead)
+        self._slave = slave
+        self._password = password
+        self._handle = 0
+        self._is_closed = False
+
+    def close(self) -> None:
+        """Give the file up if it is not complete, at the slave too."""
+        self._is_closed = True
+        if self.is_open:  # else the handle that closes it there is not known yet
+            super().close()
+
+    async def move(self) -> None:
+        """Move the file in blocks."""
+        try:
+            await self._open()
+            await (self._drain() if self.is_write else self._fill())
+        except RemoteAccessError as exc:
+            raise _foe_error(exc) from None
+
+    async def run(self) -> None:
+        """Move the file, and close it at the other station once its reader or writer knows."""
+        try:
+            await super().run()
+        finally:
+            await self._leave()
+
+    async def _open(self) -> None:
+        sizes = await self._slave.sizes()
+        self.sizes.set(sizes.to_slave, sizes.to_master)
+        self._check_wanted()  # a slave may forget its old file as soon as a new one is begun
+        group = IndexGroup.FOE_OPEN_WRITE if self.is_write else IndexGroup.FOE_OPEN_READ
+        opened = await self._ask(group, self._password, _HANDLE_SIZE, self.name.encode())
+        self._handle = int.from_bytes(opened, "little")
+        self.notify(has_turn=True, is_open=True)
+        self._check_wanted()
+
+    def _check_wanted(self) -> None:
+        if self._is_closed:
+            raise RemoteAccessError(AdsError.ABORTED)
+
+    async def _fill(self) -> None:
+        size = self.sizes.to_master - DATA_OVERHEAD
+        is_last = False
+        while not is_last:
+            await self.wait_room()
+            data = await self._ask(IndexGroup.FOE_READ, self._handle, size)
+            self.buffer += data
+            self.progress.done += len(data)
+            self.notify()
+            is_last = len(data) < size
+            size = min(2 * size, BLOCK)
+
+    async def _drain(self) -> None:
+        while self.buffer or not self.is_whole:
+            await self.wait_data(1)
+            if block := bytes(self.buffer[:BLOCK]):
+                await self._ask(IndexGroup.FOE_WRITE, self._handle, 0, block)
+                self.progress.done += len(block)
+                self.cut(len(block))
+        await self._ask(IndexGroup.FOE_CLOSE, self._handle)
+
+    async def _leave(self) -> None:
+        """Close the file there; what was written of it does not count unless it is complete."""
+        if not self.is_open or (self.is_write and self.is_complete):
+            return
+        last = ReadWrite(IndexGroup.FOE_CLOSE, self._handle, 0, b"")
+        if self.is_write:
+            last = ReadWrite(IndexGroup.FOE_PROGRESS, self._handle, 0, _GIVE_UP)
+        with suppress(RemoteAccessError):
+            await self._slave.perform(last)
+
+    async def _ask(self, group: int, offset: int, length: int = 0, data: bytes = b"") -> bytes:
+        """Send a request, and again as long as the answer is BUSY and the file is wanted."""
+        while True:
+            try:
+                return await self._slave.perform(
+                    ReadWrite(group, offset, length, data), timeout_s=STEP_S
+                )
+            except RemoteAccessError as exc:
+                if exc.result != AdsError.BUSY or self._is_closed:
+                    raise
+            await asyncio.sleep(PAUSE_S)
+
+
+def _sdo_offset(index: int, subindex: int, *, complete: bool) -> int:
+    return index << 16 | (_COMPLETE if complete else subindex)
+
+
+def _soe_offset(idn: int, elements: int, drive: int) -> int:
+    return drive << 24 | elements << 16 | idn
+
+
+def _sdo_error(
+    error: RemoteAccessError, index: int, subindex: int
+) -> RemoteAccessError | SdoAbortError:
+    if error.is_of_way:
+        return error
+    return SdoAbortError(cause_of_result(error.result).sdo, index, subindex)
+
+
+def _soe_error(error: RemoteAccessError) -> RemoteAccessError | SoeError:
+    code = cause_of_result(error.result).soe
+    if error.is_of_way or code is SoeErrorCode.GENERAL:
+        return error
+    return SoeError(name_of(code), code=code)
+
+
+def _foe_error(error: RemoteAccessError) -> RemoteAccessError | FoeError:
+    """Return the refusal with an FoE code; errors of the way to the slave stay as they are."""
+    if error.is_of_way:
+        return error
+    code = cause_of_result(error.result).foe
+    text = f"{name_of_foe(code)}: ADS error 0x{error.result:x} ({AdsError.name_of(error.result)})"
+    return FoeError(text, code=code, text=text)

@@ -1,0 +1,280 @@
+"""Listeners of this process: connections accepted, admitted by the policy, served and closed.
+
+The policy is :mod:`eap.net.connections`; all listeners of the process share one table, because they
+share the descriptors of the process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import struct
+from contextlib import suppress
+from itertools import count
+from time import monotonic_ns
+from typing import Generic, Protocol, TypeVar
+
+from eap.net.connections import (
+    OVERDUE_NS,
+    Activity,
+    CloseReason,
+    Connection,
+    ConnectionTable,
+    Limits,
+    ListenerStats,
+    host_of,
+)
+from eap.net.descriptors import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
+from eap.services.log_limits import caused_by
+
+_TURN_NS, _LOCAL_TURN_NS = 5_000_000, 20_000_000
+"""Time for accepting connections before others have their turn: a crowd that is refused has to go
+quickly, for the clients that get a place wait behind it."""
+_PAUSE_S = 1.0
+"""After an error of the listener; connections that wait keep waiting."""
+_PEER = struct.Struct("3i")
+_numbers = count(1)
+
+logger = logging.getLogger(__name__)
+
+C = TypeVar("C", bound=Connection)
+
+
+class ConnectionServer(Protocol[C]):
+    """User of a listener, which knows the protocol."""
+
+    def connection_from(self, sock: socket.socket, host: str) -> C:
+        """Return the connection on a socket that was accepted.
+
+        Raises:
+            OSError: the peer has gone again.
+        """
+
+    async def serve_connection(self, connection: C, sock: socket.socket) -> None:
+        """Serve *connection* until its end; the caller closes *sock*."""
+
+    def refuse_connection(self, sock: socket.socket, why: str) -> None:
+        """Count a connection that gets no place, and is closed next."""
+
+
+class TaskConnection:
+    """A connection that one task serves; it is closed by cancelling that task.
+
+    Attributes:
+        host: As the policy counts it.
+        used_at_ns: When the last frame was complete.
+        late_since_ns: Since when a frame is unfinished, or answers are not taken.
+        is_used: Whether a frame was complete ever.
+        closed_for: Reason why the policy closed it.
+    """
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        self.used_at_ns = monotonic_ns()
+        self.late_since_ns: int | None = None
+        self.is_used = False
+        self.closed_for: CloseReason | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def activity(self) -> Activity:
+        """Current use."""
+        return Activity.IDLE if self.is_used else Activity.UNUSED
+
+    def begin(self) -> None:
+        """Note the running task as the one that serves this connection."""
+        self._task = asyncio.current_task()
+        if self.closed_for is not None:
+            self.close(self.closed_for)
+
+    def note_partial(self) -> None:
+        """Note that a frame has begun."""
+        if self.late_since_ns is None:
+            self.late_since_ns = monotonic_ns()
+
+    def note_frame(self) -> None:
+        """Note that a frame is complete."""
+        self.used_at_ns = monotonic_ns()
+        self.late_since_ns = None
+        self.is_used = True
+
+    def close(self, why: CloseReason) -> None:
+        """Cancel the task, now or as soon as it begins."""
+        self.closed_for = why
+        if self._task is not None:
+            self._task.cancel()
+
+
+class Listeners:
+    """All listeners of one process, with their common table.
+
+    Args:
+        patience_ns: Time that a peer has to finish a frame, or to take answers.
+    """
+
+    def __init__(self, patience_ns: int = OVERDUE_NS) -> None:
+        self.table = ConnectionTable()
+        self._patience_ns = patience_ns
+        self._reported: dict[str, int] = {}
+
+    def stats(self) -> list[ListenerStats]:
+        """Return the figures of all listeners."""
+        return [each.stats for each in self.table.listeners]
+
+    async def serve(self) -> None:
+        """Close overdue connections, and report on crowded listeners, until cancelled."""
+        while True:
+            await asyncio.sleep(self._patience_ns / 4e9)
+            for connection in self.table.take_overdue(monotonic_ns(), self._patience_ns):
+                connection.close(CloseReason.OVERDUE)
+            for stats in self.stats():
+                self._report(stats)
+
+    def _report(self, stats: ListenerStats) -> None:
+        total = stats.refused + stats.evicted + stats.overdue
+        if total == self._reported.get(stats.name, 0):
+            return
+        self._reported[stats.name] = total
+        logger.warning(
+            "%s: too many or too slow connections: %d of %d places taken; since the start %d"
+            " refused, %d closed to make room, %d closed as too slow",
+            *(stats.name, stats.open, stats.limit, stats.refused, stats.evicted, stats.overdue),
+            extra=caused_by(("connections", stats.name), stats.name),
+        )
+
+
+class ListeningSocket(Generic[C]):
+    """One listening socket.
+
+    Args:
+        sock: It stays open.
+        name: For ``status`` and log lines.
+        server: Serves the connections.
+        listeners: Of the process.
+        limits: Places.
+    """
+
+    def __init__(
+        self,
+        sock: socket.socket,
+        name: str,
+        server: ConnectionServer[C],
+        listeners: Listeners,
+        limits: Limits,
+    ) -> None:
+        self._socket = sock
+        self._server = server
+        self._table = listeners.table
+        self._listener = listeners.table.add_listener(name, limits)
+        self._is_local = sock.family == socket.AF_UNIX
+        reserve = descriptor_reserve()
+        # The operator of this host may use some of what is kept from all others.
+        self._reserve = reserve // 2 if self._is_local else reserve
+
+    async def serve(self) -> None:
+        """Accept and serve until cancelled; then close all connections."""
+        self._socket.setblocking(False)
+        async with asyncio.TaskGroup() as group:
+            try:
+                while True:
+                    await wait_readable(self._socket)
+                    if not self._accept_some(group):
+                        await asyncio.sleep(_PAUSE_S)
+            finally:
+                for connection in list(self._listener.connections):
+                    connection.close(CloseReason.ENDED)
+
+    def _accept_some(self, group: asyncio.TaskGroup) -> bool:
+        """Accept what waits, not too much at a time; return whether to go on at once."""
+        end_ns = monotonic_ns() + (_LOCAL_TURN_NS if self._is_local else _TURN_NS)
+        while monotonic_ns() < end_ns:
+            try:
+                sock, _ = self._socket.accept()
+            except (BlockingIOError, ConnectionAbortedError, InterruptedError):
+                return True
+            except OSError as exc:
+                return self._make_room(exc)
+            sock.setblocking(False)
+            try:
+                connection = self._server.connection_from(sock, self._host_of(sock))
+            except OSError as exc:
+                logger.debug("%s: a peer has left again: %s", self._listener.name, exc)
+                sock.close()
+                continue
+            self._admit(connection, sock, group)
+        return True
+
+    def _host_of(self, sock: socket.socket) -> str:
+        if self._is_local:
+            return f"process {process_of(sock)[0]}"
+        return host_of(sock.getpeername()[0], sock.getsockname()[0])
+
+    def _admit(self, connection: C, sock: socket.socket, group: asyncio.TaskGroup) -> None:
+        spare = spare_descriptors(sock.fileno(), self._reserve)
+        refusal, victim = self._table.admit(
+            self._listener, connection, monotonic_ns(), spare_descriptors=spare
+        )
+        if refusal:
+            logger.debug("%s: connection refused: %s", self._listener.name, refusal)
+            self._server.refuse_connection(sock, refusal)
+            sock.close()
+            return
+        if victim is not None:
+            victim.close(CloseReason.EVICTED)
+        task = group.create_task(self._serve(connection, sock))
+        task.add_done_callback(lambda _: self._forget(connection, sock))
+
+    async def _serve(self, connection: C, sock: socket.socket) -> None:
+        try:
+            await self._server.serve_connection(connection, sock)
+        except* OSError as group:
+            logger.debug("%s: connection ended: %s", self._listener.name, group.exceptions[0])
+        except* Exception:  # one connection is no reason to end all of them
+            logger.exception("%s: a connection failed", self._listener.name)
+
+    def _forget(self, connection: C, sock: socket.socket) -> None:
+        sock.close()
+        self._table.remove(self._listener, connection)
+
+    def _make_room(self, error: OSError) -> bool:
+        """Close an unused connection for want of descriptors; return whether there was one."""
+        logger.debug("%s: %s", self._listener.name, error)
+        if error.errno not in OUT_OF_DESCRIPTORS:
+            return False
+        victim = self._table.shed(monotonic_ns())
+        if victim is not None:
+            victim.close(CloseReason.EVICTED)
+        return victim is not None
+
+
+async def wait_readable(sock: socket.socket) -> None:
+    """Wait until there is something to read, or to accept."""
+    loop = asyncio.get_running_loop()
+    readable = loop.create_future()
+    loop.add_reader(sock, _set_once, readable)
+    try:
+        await readable
+    finally:
+        loop.remove_reader(sock)
+
+
+def _set_once(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
+
+
+def process_of(connection: socket.socket) -> tuple[int, int]:
+    """Return process id and user id of the other end of a Unix socket."""
+    octets = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+    pid, uid, _ = _PEER.unpack(octets)
+    return pid, uid
+
+
+def connection_name(connection: socket.socket) -> str:
+    """Return a name that no other connection of this process ever has: peer, and a number."""
+    host, port = "", 0
+    if connection.family == socket.AF_INET:
+        with suppress(OSError):  # the peer has gone again already
+            host, port = connection.getpeername()
+    return f"{host}:{port}#{next(_numbers)}"

@@ -1,0 +1,472 @@
+"""One AMS/TCP connection, whoever opened it: packets in, and packets out (Beckhoff ADS, AMS/TCP).
+
+Rule 1: requests are handed on as they come, and answered in any order; who sends ahead of too many
+answers, or takes none, is not read from until that has changed.
+Rule 2: after a few packets others have their turn, however much more of them wait here.
+Rule 3: a connection that this side opened is always read from: what comes are answers mostly, and
+two stations that wait for each other to read would wait for ever.
+Rule 4: a connection has a name that no other one ever has: clients of one host share its NetID, and
+often ports and numbers of requests too.
+Rule 5: a client that asks for an AMS address, as local clients of a TwinCAT router do, is given one
+that no station and no other client has; answers come back by the connection, so nothing is kept of
+the address.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import struct
+from collections.abc import Callable, Iterable
+from time import monotonic_ns
+from typing import ClassVar, Protocol
+
+import msgspec
+
+from eap.ads.answer import AmsAnswer, response_to
+from eap.ams.stream import Asked, PacketCutter, Piece, TooLong
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
+from eap.codec.amstcp import (
+    RouterCommand,
+    encode_net_id,
+    encode_opened_port,
+    encode_with_prefix,
+)
+from eap.errors import MalformedError
+from eap.ids import NetId
+from eap.net.connections import Activity, CloseReason
+from eap.runtime.discards import Refusal
+
+MAX_REQUESTS = 64
+"""Requests of one connection that wait for their answers."""
+MAX_OCTETS = 256 << 10
+"""Of these requests and of the answers that they ask for; one request may have more."""
+_COMMAND, _COMMAND_GROUP, _FLAGS = 16, 17, 18
+"""Octets of the AMS header: both of the command, the lower one of the state flags."""
+_ERROR = slice(24, 28)
+_RESULT = slice(AmsHeader.SIZE, AmsHeader.SIZE + 4)
+_LENGTH = struct.Struct("<8xI")
+_WITHOUT_ANSWER = (StateFlags.RESPONSE | StateFlags.NO_RETURN).value
+_RESPONSE = StateFlags.RESPONSE.value
+_NOTIFICATION = AmsCommand.NOTIFICATION.value
+_READS = frozenset((AmsCommand.READ.value, AmsCommand.READ_WRITE.value))
+_ADD, _DELETE = AmsCommand.ADD_NOTIFICATION.value, AmsCommand.DELETE_NOTIFICATION.value
+_ABOUT_NOTIFICATIONS = frozenset((_ADD, _DELETE))
+_READ_WRITE = AmsCommand.READ_WRITE.value
+_GROUP = slice(AmsHeader.SIZE, AmsHeader.SIZE + 4)
+_SUM_ITEMS = AmsHeader.SIZE + 8
+"""Place of the items in the answer to a sum command, behind its result and length."""
+_SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value.to_bytes(4, "little")
+_SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value.to_bytes(4, "little")
+_ITEM_SIZES = {_SUM_ADD: 8, _SUM_DELETE: 4}
+"""Octets of one item: a result, and a handle where a notification was added."""
+_INVOKE_ID = slice(28, 32)
+_MAX_SUMS = 256
+_NO_ERROR = bytes(4)
+
+
+class SubscriptionCounter:
+    """Notifications of one connection: granted by an answer, and not ended by a later one.
+
+    Attributes:
+        count: As above.
+    """
+
+    __slots__ = ("_sums", "count")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._sums: dict[bytes, bytes] = {}
+        """Index groups of the sum commands that wait: their answers do not repeat them."""
+
+    def take_request(self, packet: bytes) -> None:
+        """Note a request that came in."""
+        group = packet[_GROUP]
+        if group in _ITEM_SIZES and packet[_COMMAND] == _READ_WRITE and len(self._sums) < _MAX_SUMS:
+            self._sums[packet[:16] + packet[_INVOKE_ID]] = group
+
+    def take_answer(self, packet: bytes) -> None:
+        """Note an answer that goes out."""
+        command = packet[_COMMAND]
+        if command in _ABOUT_NOTIFICATIONS:
+            count = int(_is_granted(packet))
+            self._add(count if command == _ADD else -count)
+        elif command == _READ_WRITE and self._sums:
+            key = packet[8:16] + packet[:8] + packet[_INVOKE_ID]
+            group = self._sums.pop(key, b"")
+            if group and _is_granted(packet):
+                starts = range(_SUM_ITEMS, len(packet) - 3, _ITEM_SIZES[group])
+                count = sum(packet[at : at + 4] == _NO_ERROR for at in starts)
+                self._add(count if group == _SUM_ADD else -count)
+
+    def _add(self, count: int) -> None:
+        self.count = max(0, self.count + count)
+
+
+class AmsWindow:
+    """Requests and octets under way on one connection.
+
+    Attributes:
+        requests: Number of requests that wait for their answers.
+        subscriptions: Notifications of the connection.
+    """
+
+    __slots__ = ("_octets", "requests", "subscriptions")
+
+    def __init__(self) -> None:
+        self.requests = 0
+        self.subscriptions = SubscriptionCounter()
+        self._octets = 0
+
+    @property
+    def is_full(self) -> bool:
+        """True if the next request has to wait."""
+        return self.requests >= MAX_REQUESTS or self._octets >= MAX_OCTETS
+
+    def take_in(self, packet: bytes) -> bool:
+        """Note a packet that came in; return whether it is an answer."""
+        flags, command = packet[_FLAGS], packet[_COMMAND]
+        # Those with a group of their own are fragments, of which nothing waits for an answer.
+        if flags & _WITHOUT_ANSWER or packet[_COMMAND_GROUP] or command == _NOTIFICATION:
+            return bool(flags & _RESPONSE)
+        size = len(packet)
+        self.requests += 1
+        self._octets += size
+        if command in _READS and size >= AmsHeader.SIZE + _LENGTH.size:
+            (asked,) = _LENGTH.unpack_from(packet, AmsHeader.SIZE)
+            self._octets += min(MAX_OCTETS, asked)
+            if packet[_GROUP] in _ITEM_SIZES:
+                self.subscriptions.take_request(packet)
+        return False
+
+    def take_out(self, packet: bytes) -> bool:
+        """Note a packet that goes out; return whether it is the answer to one that came in."""
+        if not packet[_FLAGS] & _RESPONSE or packet[_COMMAND_GROUP] or not self.requests:
+            return False
+        # Answers come in any order and do not say how long their requests were; the average does,
+        # and nothing is left when all have come.
+        self._octets -= self._octets // self.requests
+        self.requests -= 1
+        self.subscriptions.take_answer(packet)
+        return True
+
+
+def _is_granted(answer: bytes) -> bool:
+    return answer[_ERROR] == answer[_RESULT] == _NO_ERROR
+
+
+LONGEST_PACKET = 256 << 10
+"""Octets of an AMS packet; nothing here has a value a quarter as long."""
+LONGEST_ANSWER = 4 << 20
+"""Octets of a packet by a connection that this side opened: the symbols of a large controller."""
+MAX_UNSENT = 8 << 20
+"""Octets that wait for a peer to take them; a client is kept below by what it may ask for at a
+time, unless it does not keep up with its notifications."""
+_RECEIVED = memoryview(bytearray(64 << 10))
+"""Of all connections.  What asyncio takes by default, 256 KB anew for each packet, is asked of the
+kernel and given back each time, which takes longer than all the rest."""
+_PER_TURN = 8
+"""Packets of one connection before others have their turn, while few have more to do."""
+_FEW = 4
+"""With more connections than these that have more to do, each has one packet a turn."""
+_FIRST_PORT, _LAST_PORT = 32768, 40959
+"""AMS ports for clients that ask for one, as a TwinCAT router numbers them."""
+_FIRST_SUFFIX, _LAST_SUFFIX = 0x8001, 0xFEFE
+"""Last two bytes of the NetIDs for these clients: not .1.1, .2.1 and so on, which stations have."""
+_NO_RETURN = StateFlags.NO_RETURN.value  # a plain number: operators of flags are slow
+
+logger = logging.getLogger(__name__)
+
+
+class PacketTaker(Protocol):
+    """Who acts on what a connection brings."""
+
+    def connection_opened(self, connection: AmsConnection) -> None:
+        """Take *connection*, by which can be sent from now on."""
+
+    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+        """Act on a request whose length is right; its answer goes back by *connection*."""
+
+    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        """Act on a response."""
+
+    def connection_closed(self, connection: AmsConnection, why: str) -> None:
+        """Forget it: nothing comes and nothing can be sent any more; *why* is for people."""
+
+    def refuse(self, reason: Refusal) -> None:
+        """Count what is not taken."""
+
+
+class ClientAddresses:
+    """AMS addresses for clients that ask for one: no two are the same, nor are they a station's.
+
+    The first four bytes are those of the client's IP address, as access rules expect them.
+
+    Args:
+        first: Number of the first address; another one in each process makes it unlikely that two
+            routers give the same address to two clients of one host.
+    """
+
+    def __init__(self, first: int) -> None:
+        self._numbers = itertools.count(first)
+
+    def next(self, host: str, taken: Callable[[NetId], bool]) -> tuple[NetId, int]:
+        """Return the next address for a client on *host* whose NetID is not *taken*."""
+        while True:
+            number = next(self._numbers)
+            suffix = _FIRST_SUFFIX + number % (_LAST_SUFFIX - _FIRST_SUFFIX + 1)
+            high, low = divmod(suffix, 0x100)
+            net_id = NetId.parse(f"{host}.{high}.{low}")
+            if not taken(net_id):
+                return net_id, _FIRST_PORT + number % (_LAST_PORT - _FIRST_PORT + 1)
+
+
+class AmsConnection(asyncio.BufferedProtocol):
+    """One connection.
+
+    Args:
+        name: Of this one and no other.
+        address: Of the peer.
+        taker: Acts on what it brings.
+        is_ours: Whether this side opened it.
+        give_address: Returns NetID and port for a client on a host that asks for an AMS address;
+            without it no peer may ask for one.
+        host: By which the policy counts it (:mod:`eap.net.connections`).
+
+    Attributes:
+        name: As above.
+        host: As above.
+        used_at_ns: When the last packet came.
+        late_since_ns: Since when a packet is unfinished, or answers are not taken.
+        closed: Done, with the reason, when the connection has ended.
+    """
+
+    _crowd: ClassVar[int] = 0
+    """Connections of this process that have more to do."""
+
+    def __init__(
+        self,
+        name: str,
+        address: str,
+        taker: PacketTaker,
+        *,
+        is_ours: bool = False,
+        give_address: Callable[[str], tuple[NetId, int]] | None = None,
+        host: str = "",
+    ) -> None:
+        self.name = name
+        self.host = host
+        self.used_at_ns = monotonic_ns()
+        self.late_since_ns: int | None = None
+        self.closed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._address = address
+        self._is_used = False
+        self._taker = taker
+        self._is_ours = is_ours
+        self._window = AmsWindow()
+        self._cutter = PacketCutter(LONGEST_ANSWER if is_ours else LONGEST_PACKET)
+        self._transport: asyncio.Transport
+        self._is_open = False
+        self._is_held = False
+        self._is_scheduled = False
+        self._is_blocked = False
+        self._has_ended = False
+        self._why = "closed by the peer"
+        self._give_address = give_address
+        self._net_id: NetId | None = None
+        self._is_closed = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin (asyncio)."""
+        assert isinstance(transport, asyncio.Transport)  # noqa: S101  for the type
+        self._transport = transport
+        self._is_open = True
+        self._taker.connection_opened(self)
+        if self._is_closed:
+            transport.abort()
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Return where octets go; they are taken before anybody else has a turn (asyncio)."""
+        del sizehint
+        return _RECEIVED
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Take octets (asyncio)."""
+        if self._is_ours and not self._is_blocked:
+            # Answers of 4 MB take longer than 10 s by a slow link: the latest byte counts.
+            self.late_since_ns = None
+        packet = self._cutter.receive_one(bytes(_RECEIVED[:nbytes]))
+        if packet is None:
+            self._go_on()
+        else:
+            self._take(packet)
+            if not self._is_ours and (self._is_blocked or self._window.is_full):
+                self._hold()
+
+    def eof_received(self) -> bool:
+        """Take the end of what the peer sends; it may still wait for answers (asyncio)."""
+        self._has_ended = True
+        self._close_when_done()
+        return True
+
+    def pause_writing(self) -> None:
+        """Read no more: the peer does not take what waits for it (asyncio)."""
+        self._is_blocked = True
+        self.late_since_ns = monotonic_ns()
+        if not self._is_ours:
+            self._hold()
+
+    def resume_writing(self) -> None:
+        """Read again (asyncio)."""
+        self._is_blocked = False
+        self.late_since_ns = None
+        self._schedule()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End (asyncio)."""
+        if isinstance(exc, OSError) and exc.strerror:
+            self._why = exc.strerror
+        self._taker.connection_closed(self, self._why)
+        if not self.closed.done():
+            self.closed.set_result(self._why)
+
+    def send(self, packets: Iterable[bytes]) -> str | None:
+        """Send packets; return why not if that is not possible any more."""
+        transport = self._transport
+        if transport.is_closing():
+            return "the connection was closed"
+        if self._is_blocked and transport.get_write_buffer_size() > MAX_UNSENT:
+            if not self._is_ours:
+                self.close(CloseReason.OVERDUE)
+            return "the peer takes nothing"
+        for packet in packets:
+            transport.write(encode_with_prefix(packet))
+            if self._window.take_out(packet) and (self._is_held or self._has_ended):
+                self._schedule()
+        return None
+
+    @property
+    def activity(self) -> Activity:
+        """Current use, for the policy for connections."""
+        if self._window.subscriptions.count:
+            return Activity.SUBSCRIBED
+        if self._window.requests:
+            return Activity.BUSY
+        return Activity.IDLE if self._is_used else Activity.UNUSED
+
+    def close(self, why: str) -> None:
+        """Close it at once, even before it is open; the taker is told *why*."""
+        if why is CloseReason.OVERDUE and not self._has_ended:
+            self._taker.refuse(Refusal.AMS_SLOW)
+        self._why = why
+        self._is_closed = True
+        if self._is_open:
+            self._transport.abort()
+
+    def _schedule(self) -> None:
+        if not self._is_scheduled:
+            self._is_scheduled = True
+            AmsConnection._crowd += 1
+            asyncio.get_running_loop().call_soon(self._go_on)
+
+    def _hold(self) -> None:
+        if not self._is_held:
+            self._is_held = True
+            self._transport.pause_reading()
+        if not self._is_blocked:
+            self.late_since_ns = None  # what is unfinished waits here, not at the peer
+
+    def _go_on(self) -> None:
+        """Take some of the packets that are here, and read on when there are no more."""
+        if self._is_scheduled:
+            self._is_scheduled = False
+            AmsConnection._crowd -= 1
+        for _ in range(_PER_TURN if AmsConnection._crowd <= _FEW else 1):
+            if self._transport.is_closing():
+                return
+            if not self._is_ours and (self._is_blocked or self._window.is_full):
+                self._hold()
+                return
+            try:
+                piece = self._cutter.next_piece()
+            except MalformedError as exc:
+                self._break_off(str(exc))
+                return
+            if piece is None:
+                self._read_on()
+                return
+            self._take(piece)
+        self._hold()
+        self._schedule()
+
+    def _read_on(self) -> None:
+        if self._has_ended:
+            self._close_when_done()
+            return
+        if self._is_held:
+            self._is_held = False
+            self._transport.resume_reading()
+        if self._cutter.has_begun and self.late_since_ns is None:
+            self.late_since_ns = monotonic_ns()
+
+    def _break_off(self, why: str) -> None:
+        """Read no more: these are no AMS packets."""
+        logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
+        self._taker.refuse(Refusal.AMS_TYPE)
+        self._why = f"no AMS packets: {why}"
+        self._cutter = PacketCutter(0)
+        self._has_ended = True
+        self._hold()
+        self._close_when_done()
+
+    def _close_when_done(self) -> None:
+        if self._is_ours or not (self._window.requests or self._is_scheduled):
+            self._transport.close()
+            if self.late_since_ns is None:
+                self.late_since_ns = monotonic_ns()  # answers may still wait to be taken
+
+    def _take(self, piece: Piece) -> None:
+        self.used_at_ns = monotonic_ns()
+        self._is_used = True
+        if not self._is_blocked:
+            self.late_since_ns = None
+        if isinstance(piece, TooLong):
+            self._refuse_length(piece.header)
+        elif isinstance(piece, Asked):
+            self._answer_client(piece)
+        elif int.from_bytes(piece[20:24], "little") != len(piece) - AmsHeader.SIZE:
+            self._refuse_length(AmsHeader.decode(piece))
+        elif self._window.take_in(piece):
+            self._taker.take_answer(piece, self)
+        else:
+            self._taker.take_packet(piece, self)
+
+    def _answer_client(self, asked: Asked) -> None:
+        port = int.from_bytes(asked.data, "little")
+        if self._give_address is None:
+            self._break_off("a router that asks for an address")
+            return
+        net_id, own_port = self._give_address(self._address)
+        self._net_id = net_id = self._net_id or net_id
+        if asked.command is RouterCommand.NET_ID:
+            self._transport.write(encode_net_id(net_id))
+        elif asked.command is RouterCommand.CLOSE_PORT:
+            self._why = "the client gave its port back"
+            self._has_ended = True
+            self._close_when_done()
+        elif port:
+            self._break_off(f"programs cannot serve AMS port {port} of a router")
+        else:
+            self._transport.write(encode_opened_port(net_id, own_port))
+
+    def _refuse_length(self, header: AmsHeader) -> None:
+        self._taker.refuse(Refusal.AMS_LENGTH)
+        if header.state_flags & StateFlags.RESPONSE:
+            # Whoever waits for this answer need not wait any longer.
+            answer = msgspec.structs.replace(header, length=0, error_code=AdsError.AMS_LENGTH)
+            self._taker.take_answer(answer.encode(), self)
+        elif not header.state_flags & _NO_RETURN and header.command != AmsCommand.NOTIFICATION:
+            refusal = response_to(header, AmsAnswer(error_code=AdsError.AMS_LENGTH))
+            self._transport.write(encode_with_prefix(refusal))

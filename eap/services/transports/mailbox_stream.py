@@ -1,0 +1,335 @@
+"""Frames of type 5 over TCP: accepted connections, and those to other stations.
+
+A connection to another station is made when there is data to send, and again when it breaks.  Data
+sent before there is one waits for it, in bounded memory.  A hop that is not reached is down, so
+that requests for it are answered at once, and is tried again with growing pauses for as long as a
+route leads to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import Protocol, TypeAlias
+
+from eap.codec.ams import StateFlags
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.mailbox import MailboxHeader
+from eap.net.connections import OWN_HOST, Activity, CloseReason
+from eap.net.reconnecting import Pauses, ReconnectingLink, connect_tcp
+from eap.runtime.discards import Refusal
+from eap.services.tasks import TaskSet
+from eap.services.transports.accepting import TaskConnection, connection_name
+from eap.services.transports.ams_connection import SubscriptionCounter
+from eap.services.transports.demultiplexer import Entrance
+from eap.services.transports.mailbox_frames import FrameTaker, MailboxCounters, aoe_packet
+
+CONNECT_S = 3.0
+"""How long the other side may take to accept."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0
+_LASTING_S = 5.0
+"""A connection that ends sooner counts as one that could not be made."""
+_UNCONFIRMED_S = 10.0
+"""Time for the other side to confirm what was sent, before the connection is lost."""
+_MAX_WAITING = 256 << 10
+"""Octets that wait for one connection."""
+
+Write: TypeAlias = Callable[[bytes], None]
+Serve: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter, str], Awaitable[None]]
+"""Takes what comes by a connection, with the address of its other end, until it ends."""
+
+
+class StreamHops(Protocol):
+    """The routers for which there are connections."""
+
+    def hop_down(self, address: str, text: str) -> None:
+        """Answer what waits for a hop, and what will be for it."""
+
+    def hop_up(self, address: str) -> None:
+        """Pass requests on again."""
+
+    def is_wanted(self, address: str) -> bool:
+        """Say whether a route leads there."""
+
+    def is_awaited(self, address: str) -> bool:
+        """Say whether an answer from there is waited for."""
+
+
+class Uplinks:
+    """The connections of one transport to other stations, by ``ADDRESS:PORT``.
+
+    Args:
+        hops: Hears of those that come and go.
+        serve: Takes what comes by one.
+        source: Own address to connect from; empty for any.
+    """
+
+    def __init__(self, hops: StreamHops, serve: Serve, source: str = "") -> None:
+        self._hops = hops
+        self._serve = serve
+        self._source = source
+        self._uplinks: dict[str, _Uplink] = {}
+        self._tasks = TaskSet("connections to other stations")
+
+    def send(self, address: str, data: bytes) -> str | None:
+        """Send *data*, now or when there is a connection; return why not if that cannot be."""
+        uplink = self._uplinks.get(address)
+        if uplink is None:
+            if not _is_address(address):
+                return "the connection is closed"
+            uplink = _Uplink(address, self._source, self._hops, self._serve)
+            self._uplinks[address] = uplink
+            self._tasks.start(self._run(address, uplink))
+        return uplink.send(data)
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._tasks.close()
+
+    async def _run(self, address: str, uplink: _Uplink) -> None:
+        try:
+            await uplink.run()
+        finally:
+            del self._uplinks[address]
+            self._hops.hop_up(address)
+
+
+class _Uplink(ReconnectingLink):
+    """Link to one other station, and the data that waits for its connection."""
+
+    def __init__(self, address: str, source: str, hops: StreamHops, serve: Serve) -> None:
+        super().__init__(Pauses(FIRST_PAUSE_S, LONGEST_PAUSE_S, _LASTING_S))
+        self._address = address
+        self._source = source or None
+        self._hops = hops
+        self._serve = serve
+        self._writer: asyncio.StreamWriter | None = None
+        self._waiting: deque[bytes] = deque()
+        self._octets = 0
+
+    def send(self, data: bytes) -> str | None:
+        """Send data, or keep it for the next connection; return why not if that cannot be."""
+        if self._writer is not None:
+            if self._writer.is_closing():
+                return "the connection is closed"
+            if self._writer.transport.get_write_buffer_size() > _MAX_WAITING:
+                return "the other side takes nothing"
+            self._writer.write(data)
+            return None
+        if self._octets + len(data) > _MAX_WAITING:
+            return "too much waits for the connection"
+        self._octets += len(data)
+        self._waiting.append(data)
+        return None
+
+    async def _connect(self) -> str:
+        """Connect, and serve until the end (ReconnectingLink)."""
+        host, _, port = self._address.rpartition(":")
+        try:
+            sock = await connect_tcp(
+                host,
+                int(port),
+                self._source,
+                timeout_s=CONNECT_S,
+                unconfirmed_s=_UNCONFIRMED_S,
+            )
+        except TimeoutError:
+            return f"no connection within {CONNECT_S:g} s"
+        except OSError as exc:
+            return f"no connection: {exc.strerror or exc}"
+        reader, writer = await asyncio.open_connection(sock=sock)
+        try:
+            self._hops.hop_up(self._address)
+            self._writer = writer
+            writer.writelines(self._waiting)
+            self._forget()
+            await self._serve(reader, writer, self._address)
+        except (OSError, TimeoutError) as exc:
+            return f"the connection broke: {exc.strerror or 'the other side takes nothing'}"
+        finally:
+            self._writer = None
+            writer.transport.abort()
+        return ""
+
+    def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
+        """Tell the routers, unless nobody waits for an answer (ReconnectingLink)."""
+        del has_lasted
+        self._forget()
+        if not reason and not self._hops.is_awaited(self._address):
+            return False
+        self._hops.hop_down(self._address, reason or "the connection was closed")
+        return True
+
+    def _is_wanted(self) -> bool:
+        """Say whether a route leads there (ReconnectingLink)."""
+        return self._hops.is_wanted(self._address)
+
+    def _forget(self) -> None:
+        self._waiting.clear()
+        self._octets = 0
+
+
+def _is_address(text: str) -> bool:
+    host, _, port = text.rpartition(":")
+    return bool(host) and port.isdecimal()
+
+
+SLOW_READER_S = 10.0
+"""A peer that takes nothing for this long while answers wait for it is disconnected."""
+LARGEST_FRAME = EtherCatHeader.SIZE + 0x7FF
+"""What the 11 bits of Length allow."""
+MAX_UNANSWERED = 64
+"""Requests of one connection that wait; what it sends ahead stays in the connection."""
+MAX_AT_GATEWAY = 16
+"""Likewise, requests for slaves and the master."""
+_FLAGS, _RESPONSE = 18, StateFlags.RESPONSE.value
+"""Place of the AMS state flags, and their bit for answers."""
+_MAX_UNSENT = 1 << 20
+"""Octets that wait for a client that does not take them."""
+
+
+class StreamConnection(TaskConnection):
+    """A connection of a TCP listener, from its acceptance to its end.
+
+    Attributes:
+        subscriptions: Notifications of its client.
+        waiting: Returns how many requests that came by it wait for their answers.
+    """
+
+    def __init__(self, host: str) -> None:
+        super().__init__(host)
+        self.subscriptions = SubscriptionCounter()
+        self.waiting: Callable[[], int] = int
+
+    @property
+    def activity(self) -> Activity:
+        """Current use."""
+        if self.subscriptions.count:
+            return Activity.SUBSCRIBED
+        return Activity.BUSY if self.waiting() else super().activity
+
+
+class MailboxStreams:
+    """All connections of one port, those that came and those to others; the carrier of its door.
+
+    Args:
+        entrance: To the stations behind the port.
+        gateway: For what is no AoE to a station.
+        refuse: Counts a frame that is not taken.
+        source: Own address to connect from; empty for any.
+        is_aoe_here: Whether AoE is for the stations; otherwise that is for the gateway too.
+    """
+
+    def __init__(
+        self,
+        entrance: Entrance,
+        gateway: FrameTaker,
+        refuse: Callable[[Refusal], None],
+        source: str = "",
+        *,
+        is_aoe_here: bool = True,
+    ) -> None:
+        self._entrance = entrance
+        self._gateway = gateway
+        self._refuse = refuse
+        self._is_aoe_here = is_aoe_here
+        self._uplinks = Uplinks(entrance, self._serve_uplink, source)
+        self._counters = MailboxCounters()
+        self._streams: dict[str, tuple[asyncio.StreamWriter, StreamConnection]] = {}
+
+    async def serve(self, connection: StreamConnection, sock: socket.socket) -> None:
+        """Take what comes by *sock* until its end, and close it.
+
+        Its first frame may have been looked at, not taken.
+        """
+        reader, writer = await asyncio.open_connection(sock=sock)
+        name = connection_name(sock)
+        self._streams[name] = writer, connection
+        connection.waiting = lambda: self._entrance.waiting(name) + self._gateway.waiting(name)
+        try:
+            await self._take(reader, writer, name, connection)
+            async with asyncio.timeout(SLOW_READER_S):
+                # Who has only closed its sending side still listens.
+                await self._entrance.wait_below(name, 1)
+                await self._gateway.wait_below(name, 1)
+                writer.close()
+                await writer.wait_closed()
+        except TimeoutError:
+            connection.closed_for = CloseReason.OVERDUE
+        except OSError:
+            pass
+        finally:
+            writer.transport.abort()
+            del self._streams[name]
+            self._entrance.connection_closed(name)
+            self._gateway.connection_closed(name)
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send packets on a connection; return why not if that cannot be done."""
+        frames = b"".join(self._counters.frame(connection, packet) for packet in packets)
+        if connection not in self._streams:
+            return self._uplinks.send(connection, frames)
+        if packets[0][_FLAGS] & _RESPONSE:
+            self._streams[connection][1].subscriptions.take_answer(packets[0])
+        return self.send_frame(connection, frames)
+
+    def send_frame(self, connection: str, frame: bytes) -> str | None:
+        """Send what is packed already on a connection that came; returns as :meth:`send` does."""
+        found = self._streams.get(connection)
+        if found is None or found[0].is_closing():
+            return "the connection is closed"
+        writer, _ = found
+        if writer.transport.get_write_buffer_size() > _MAX_UNSENT:
+            writer.transport.abort()
+            return "the other side takes nothing"
+        writer.write(frame)
+        return None
+
+    async def close(self) -> None:
+        """Close the connections to others."""
+        await self._uplinks.close()
+
+    async def _serve_uplink(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str
+    ) -> None:
+        try:
+            await self._take(reader, writer, name, StreamConnection(OWN_HOST))
+        finally:
+            self._entrance.connection_closed(name)
+
+    async def _take(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        name: str,
+        connection: StreamConnection,
+    ) -> None:
+        """Take frames until the end, or until what comes is none."""
+        while True:
+            try:
+                head = await reader.readexactly(1)
+                connection.note_partial()
+                head += await reader.readexactly(EtherCatHeader.SIZE - 1)
+                header = EtherCatHeader.decode(head)
+                if header.type != FrameType.MAILBOX or header.length < MailboxHeader.SIZE:
+                    self._refuse(Refusal.TCP_TYPE)
+                    return
+                frame = head + await reader.readexactly(header.length)
+            except asyncio.IncompleteReadError:
+                return
+            connection.note_frame()
+            packet = aoe_packet(frame) if self._is_aoe_here else None
+            if packet is not None:
+                connection.subscriptions.take_request(packet)
+                self._entrance.receive(packet, name)
+                await self._entrance.wait_below(name, MAX_UNANSWERED)
+            else:
+                refusal = self._gateway.receive(frame, name, self.send_frame)
+                if refusal is not None:
+                    self._refuse(refusal)
+                await self._gateway.wait_below(name, MAX_AT_GATEWAY)
+            async with asyncio.timeout(SLOW_READER_S):
+                await writer.drain()
+            await asyncio.sleep(0)  # others first: more of this one may be there already

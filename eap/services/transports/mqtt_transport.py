@@ -1,0 +1,167 @@
+"""The door of a station to a network of AMS routers behind an MQTT broker."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from time import monotonic_ns
+
+from eap.ams.endpoint import Door
+from eap.ams.mqtt.network import (
+    Action,
+    Arrived,
+    Closed,
+    Drop,
+    Dropped,
+    HopDown,
+    HopUp,
+    MqttNetwork,
+    Publish,
+    Subscribe,
+)
+from eap.ams.spec import MqttSpec, RoutingSpec
+from eap.net.mqtt import Handlers, MqttLink
+from eap.runtime.discards import DiscardCounters, Refusal
+from eap.services.routing.planned import mqtt_door
+from eap.services.routing.station_router import StationRouter
+
+_REFUSALS = {
+    Drop.TOPIC: Refusal.MQTT_TOPIC,
+    Drop.BROKEN: Refusal.MQTT_BROKEN,
+    Drop.LENGTH: Refusal.AMS_LENGTH,
+    Drop.FULL: Refusal.MQTT_FULL,
+}
+
+logger = logging.getLogger(__name__)
+
+
+def open_mqtt_doors(
+    routing: Mapping[str, RoutingSpec],
+    routers: Mapping[str, StationRouter],
+    counters: DiscardCounters,
+) -> list[MqttDoor]:
+    """Return the doors of all stations to brokers, to be served.
+
+    Args:
+        routing: What the stations are told, by their names.
+        routers: Of the stations.
+        counters: Of what is not taken.
+
+    Raises:
+        EnvironmentalError: there are some, and MQTT is not installed.
+    """
+    return [
+        MqttDoor(
+            spec,
+            routers[station],
+            partial(counters.count, station),
+            learns=told.learns_by_mqtt(spec.network),
+        )
+        for station, told in routing.items()
+        for spec in told.mqtt
+    ]
+
+
+class MqttDoor:
+    """One network of one station; packets for it are handed to the router as they come.
+
+    Nobody who comes by it is this host, whatever NetID he says he has.
+
+    Args:
+        spec: The network and its broker.
+        router: Of the station.
+        refuse: Counts a message that comes to nothing.
+        learns: Whether routers that tell of themselves become routes.
+
+    Raises:
+        EnvironmentalError: MQTT is not installed.
+    """
+
+    def __init__(
+        self, spec: MqttSpec, router: StationRouter, refuse: Callable[[Refusal], None], *,
+        learns: bool = True,
+    ) -> None:  # fmt: skip
+        self.name = mqtt_door(spec)
+        self._router = router
+        self._refuse = refuse
+        self._network = MqttNetwork(
+            spec, router.net_id, router.name, door=self.name, table=router.table, learns=learns
+        )
+        self._link = MqttLink(
+            spec,
+            spec.client_id or f"eap-{router.net_id}-{spec.network}",
+            will=self._network.will(),
+            handlers=Handlers(self._connected, self._lost, self._receive, self._overrun),
+        )
+        self._timer: asyncio.TimerHandle | None = None
+        self._due_ns: int | None = None
+        router.add_door(Door(self.name, is_shared=True, is_hub=True), self)
+        router.hop_down(self.name, None, "there was no connection to its broker yet")
+
+    async def serve(self) -> None:
+        """Keep the connection until cancelled."""
+        try:
+            await self._link.run()
+        finally:
+            if self._timer is not None:
+                self._timer.cancel()
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send packets to the router with the NetID *connection*; return why not, if not."""
+        for packet in packets:
+            if (why := self._link.send(self._network.message_for(connection, packet))) is not None:
+                return why
+        return None
+
+    def _connected(self) -> None:
+        self._router.hop_up(self.name, None)
+        self._act(self._network.connected(monotonic_ns()))
+
+    def _lost(self, why: str) -> None:
+        self._network.disconnected()
+        self._router.hop_down(self.name, None, why)
+        self._act(())
+
+    def _receive(self, topic: str, payload: bytes, is_retained: bool) -> None:
+        now_ns = monotonic_ns()
+        self._act(self._network.receive_message(topic, payload, now_ns, is_retained=is_retained))
+
+    def _overrun(self) -> None:
+        self._refuse(Refusal.MQTT_FULL)
+
+    def _act(self, actions: Iterable[Action]) -> None:
+        for action in actions:
+            self._do(action)
+        due_ns = self._network.next_timeout()
+        if due_ns == self._due_ns:
+            return
+        self._due_ns = due_ns
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if due_ns is not None:
+            wait_s = max(0, due_ns - monotonic_ns()) / 1e9
+            self._timer = asyncio.get_running_loop().call_later(wait_s, self._time_out)
+
+    def _do(self, action: Action) -> None:
+        if isinstance(action, Arrived):
+            self._router.receive(action.packet, self.name, action.connection)
+        elif isinstance(action, (Publish, Subscribe)):
+            if (why := self._link.send(action)) is not None:
+                logger.debug("%s: %s", self.name, why)
+        elif isinstance(action, HopDown):
+            self._router.hop_down(self.name, action.address, action.text)
+        elif isinstance(action, HopUp):
+            self._router.hop_up(self.name, action.address)
+        elif isinstance(action, Closed):
+            self._router.connection_closed(self.name, action.connection)
+        elif isinstance(action, Dropped):
+            self._refuse(_REFUSALS[action.reason])
+        else:
+            logger.warning("%s: %s: %s", self._router.name, self.name, action.text)
+
+    def _time_out(self) -> None:
+        self._due_ns = None
+        self._act(self._network.handle_timeout(monotonic_ns()))

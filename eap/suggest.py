@@ -1,0 +1,19 @@
+"""What somebody may have meant who gave a name that nobody has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the one of *known* that comes nearest to *name*, None if none comes near."""
+    from difflib import get_close_matches  # takes a millisecond, and few runs need it
+
+    found = get_close_matches(name, list(known), n=1)
+    return found[0] if found else None
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return ``, did you mean …?`` with the one of *known* that comes nearest, or nothing."""
+    meant = nearest(name, known)
+    return "" if meant is None else f", did you mean {meant}?"

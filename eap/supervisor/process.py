@@ -1,0 +1,417 @@
+"""The supervisor: starts the processes of one appliance, starts again what dies, ends them all.
+
+It does no protocol work.  What must outlive a process of the appliance is held here: the shared
+sockets, the control listener, the pair between engine and services, and the lock of the folder.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+from collections.abc import Callable, Collection, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from time import monotonic_ns
+
+import msgspec
+from msgspec.structs import replace
+
+from eap.ams.spec import RoutingSpec
+from eap.config.load import Plant
+from eap.errors import ConfigError, EnvironmentalError
+from eap.suggest import suggest
+from eap.net.descriptors import raise_descriptor_limit
+from eap.pd.device import DeviceState
+from eap.pd.spec import StationSpec
+from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
+from eap.runtime.handover import EngineOptions, Handover, SegmentHandover
+from eap.runtime.plantfile import load_plant, require_own_buses
+from eap.runtime.signals import catch_end_signals
+from eap.runtime.store import StationStore, effective, settle
+from eap.supervisor.bus_sockets import segments
+from eap.supervisor.child import Child, describe_end
+from eap.supervisor.output import OutputHandler
+from eap.supervisor.progress import StartEvent
+from eap.supervisor.sockets import SharedSockets
+from eap.supervisor.what_runs import what_runs_now
+
+GRACE_NS = 1_000_000_000
+"""How long a process may take to end when asked; the whole appliance has two seconds."""
+SEGMENT_GRACE_NS = 500_000_000
+"""The same for simulated segments, which end after the others."""
+
+logger = logging.getLogger(__name__)
+
+
+def run(
+    plant_file: Path,
+    stations: Sequence[str] = (),
+    *,
+    options: EngineOptions = EngineOptions(),  # noqa: B008  frozen
+) -> int:
+    """Run the plant in *plant_file*, or only some of its *stations*, until told to stop.
+
+    Returns:
+        The exit code: 0 when it was told to, 1 or 2 when it could not start.
+
+    Raises:
+        ConfigError: the file is no plant; one line a finding.
+        EnvironmentalError: this machine lacks something that the plant needs.
+    """
+    plant = _load(plant_file)
+    chosen = _choose(plant, stations)
+    require_own_buses(chosen)
+    subset = [station.name for station in chosen] if stations else []
+    info = make_info(plant.name, str(plant_file.resolve()), chosen)
+    with _claim(folder_name(plant.name, subset)) as folder:
+        return _run(info, replace(plant, stations=chosen), folder, options)
+
+
+def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> int:
+    """Run *plant*, which no file describes, until told to stop.
+
+    Its stations start in PreOp, as *plant* has them or, with *resume*, as they were configured
+    last, in the state that was asked for then.  Returns and raises as ``run`` does.
+    """
+    info = make_info(plant.name, "", plant.stations)
+    with _claim(folder_name(plant.name)) as folder:
+        for station in plant.stations:
+            store = StationStore(plant.name, station.name)
+            if resume:
+                store.bring_back()
+            elif store.set_aside():
+                logger.warning(
+                    "station %s starts blank; --resume goes on with what it was configured to be",
+                    station.name,
+                )
+        return _run(info, plant, folder, options, DeviceState.PREOP)
+
+
+def _claim(folder: str) -> ApplianceFolder:
+    logging.basicConfig(
+        format="supervisor: %(message)s", level=logging.INFO, handlers=[OutputHandler()]
+    )
+    raise_descriptor_limit()
+    return ApplianceFolder.claim(folder)
+
+
+def _run(
+    info: ApplianceInfo,
+    plant: Plant,
+    folder: ApplianceFolder,
+    options: EngineOptions,
+    first_state: DeviceState = DeviceState.OP,
+) -> int:
+    stations = plant.stations
+    settle(info.plant, stations, first_state)
+    if info.plant_file:
+        _tell_what_is_kept(info.plant, stations)
+    with SharedSockets(stations, folder.control_socket) as sockets:
+        supervisor = Supervisor(
+            info, plant, folder, sockets, options=options, first_state=first_state
+        )
+        return supervisor.run()
+
+
+def _tell_what_is_kept(plant: str, stations: Sequence[StationSpec]) -> None:
+    """Say which stations start otherwise than their plant file alone would have them."""
+    for spec, kept in zip(stations, effective(plant, stations), strict=True):
+        if kept.spec != spec:
+            logger.warning(
+                "station %s runs as it was configured last; 'eapctl plan' shows what differs from"
+                " the plant file",
+                spec.name,
+            )
+        if kept.state is not DeviceState.OP:
+            logger.warning(
+                "station %s starts in %s, which was asked for last; 'eapctl state %s OP' ends that",
+                spec.name,
+                kept.state.name,
+                spec.name,
+            )
+
+
+def _load(plant_file: Path) -> Plant:
+    result = load_plant(plant_file)
+    if result.plant is None:
+        raise ConfigError("\n".join(str(finding) for finding in result.findings))
+    return result.plant
+
+
+def _choose(plant: Plant, wanted: Sequence[str]) -> tuple[StationSpec, ...]:
+    known = [station.name for station in plant.stations]
+    for name in wanted:
+        if name not in known:
+            hint = suggest(name, known) or f": it has {', '.join(known)}"
+            raise ConfigError(f"plant {plant.name} has no station {name!r}{hint}")
+    return tuple(s for s in plant.stations if not wanted or s.name in wanted)
+
+
+class Supervisor:
+    """Runs engine, services and simulated buses of the stations of *plant* until told to stop.
+
+    Other stations are in its directory only.
+    """
+
+    def __init__(
+        self,
+        info: ApplianceInfo,
+        plant: Plant,
+        folder: ApplianceFolder,
+        sockets: SharedSockets,
+        *,
+        options: EngineOptions,
+        first_state: DeviceState = DeviceState.OP,
+        clock: Callable[[], int] = monotonic_ns,
+    ) -> None:
+        self._clock = clock
+        self._info = info
+        info.audit_required = plant.audit_required
+        self._folder = folder
+        bytecode = str(folder.bytecode)
+        self._engine = Child("engine", "eap.engine.process", bytecode)
+        self._services = Child("services", "eap.services.process", bytecode)
+        self._segments: dict[str, Child] = {}
+        self._restart_ns: dict[Child, int] = {}
+        self._announced = False
+        self._is_info_old = False
+        self._exit_code: int | None = None
+        common = Handover(
+            supervisor=os.getpid(),
+            folder=str(folder.path),
+            plant=info.plant,
+            plant_file=info.plant_file,
+            stations=plant.stations,
+            sockets=sockets.descriptions,
+            buses=sockets.buses,
+            options=options,
+            first_state=first_state,
+            routing=_own_routing(plant),
+            directory=plant.directory,
+            audit_required=plant.audit_required,
+        )
+        self._given = _given_to_segments(self._segments, common, bytecode)
+        self._given[self._engine] = (
+            replace(common, link_fd=sockets.engine_link, bus_fd=sockets.engine_bus),
+            sockets.engine_descriptors(),
+        )
+        self._given[self._services] = (
+            replace(
+                common,
+                link_fd=sockets.services_link,
+                bus_fd=sockets.services_bus,
+                control_fd=sockets.control,
+            ),
+            sockets.services_descriptors(),
+        )
+        self._children = tuple(self._given)
+
+    def run(self) -> int:
+        """Return the exit code when everything has ended."""
+        with catch_end_signals() as wake_fd:
+            try:
+                for child in self._children:
+                    self._start(child)
+                while self._exit_code is None:
+                    self._wait(wake_fd, self._timeout_ms())
+                    self._check_time()
+            finally:
+                self._end_children()
+        return self._exit_code
+
+    def _start(self, child: Child) -> None:
+        self._restart_ns.pop(child, None)
+        handover, descriptors = self._given[child]
+        if isinstance(handover, Handover):
+            handover = what_runs_now(handover)
+        try:
+            child.start(handover, descriptors, self._clock())
+        except OSError as exc:
+            child.close()
+            if not child.watch.has_run:
+                raise EnvironmentalError(f"{child.name} cannot be started: {exc}") from None
+            delay_ns = child.policy.delay_ns(0)
+            self._restart_ns[child] = self._clock() + delay_ns
+            logger.warning(
+                "%s cannot be started: %s; trying again in %d ms",
+                *(child.name, exc, delay_ns // 1_000_000),
+            )
+        self._write_info()
+
+    def _timeout_ms(self) -> int:
+        now_ns = self._clock()
+        deadlines = list(self._restart_ns.values())
+        timeouts = (child.watch.next_timeout() for child in self._children)
+        deadlines += [each for each in timeouts if each is not None]
+        return max(0, -(-(min(deadlines) - now_ns) // 1_000_000)) if deadlines else -1
+
+    def _wait(self, wake_fd: int, timeout_ms: int) -> None:
+        poll = select.poll()
+        poll.register(wake_fd, select.POLLIN)
+        for child in self._children:
+            for fd in (child.pid_fd, child.report_fd, child.error_fd):
+                if fd >= 0:
+                    poll.register(fd, select.POLLIN)
+        fired = {fd for fd, _ in poll.poll(timeout_ms)}
+        if wake_fd in fired:
+            os.read(wake_fd, 64)
+            self._exit_code = 0
+            return
+        for child in self._children:
+            if child.error_fd in fired:
+                child.forward_output()
+            if child.report_fd in fired:
+                self._follow_start(child)
+            if child.pid_fd in fired:
+                self._has_died(child)
+
+    def _follow_start(self, child: Child) -> None:
+        running = {each.name for each in self._children if each.is_ready}
+        reports = child.take_reports()
+        for each in reports:
+            waits_for = "" if each.waits_for in running else each.waits_for
+            child.watch.advance(each.step, self._clock(), waits_for=waits_for)
+        if child.is_ready:
+            self._is_ready(child)
+        elif reports:
+            self._write_info()
+
+    def _is_ready(self, child: Child) -> None:
+        child.watch.succeed()
+        for each in self._children:
+            each.watch.release(child.name, self._clock())
+        self._write_info()
+        if child.restarts:
+            took_ms = (self._clock() - child.started_ns) // 1_000_000
+            logger.warning("%s runs again (process %d, %d ms)", child.name, child.pid, took_ms)
+        if not self._announced and all(child.is_ready for child in self._children):
+            self._announced = True
+            line = msgspec.json.encode({"ready": True, "stations": self._info.stations})
+            try:
+                os.write(1, line + b"\n")
+            except OSError as exc:  # the plant runs all the same
+                logger.warning("the ready line cannot be written to stdout: %s", exc.strerror)
+
+    def _has_died(self, child: Child) -> None:
+        lived_ns = self._clock() - child.started_ns
+        code, last_line = child.reap()
+        if not child.watch.has_run and not child.watch.is_stuck:
+            if code < 0:
+                logger.error("%s was %s while starting", child.name, describe_end(code))
+            self._exit_code = 2 if code == 2 else 1
+            return
+        child.restarts += 1
+        delay_ns = child.policy.delay_ns(lived_ns)
+        reason = f": {last_line}" if code > 0 else ""
+        logger.warning(
+            "%s ended (%s)%s; starting it again in %d ms",
+            child.name,
+            describe_end(code),
+            reason,
+            delay_ns // 1_000_000,
+        )
+        if delay_ns:
+            self._restart_ns[child] = self._clock() + delay_ns
+            self._write_info()
+        else:
+            self._start(child)
+
+    def _check_time(self) -> None:
+        now_ns = self._clock()
+        for child, due_ns in list(self._restart_ns.items()):
+            if now_ns >= due_ns and self._exit_code is None:
+                self._start(child)
+        for child in self._children:
+            self._check_start(child, now_ns)
+
+    def _check_start(self, child: Child, now_ns: int) -> None:
+        watch = child.watch
+        step, limit_s = watch.step, watch.limit_ns // 1_000_000_000
+        event = watch.handle_timeout(now_ns)
+        if event is StartEvent.SLOW:
+            took_s = watch.took_ns(now_ns) // 1_000_000_000
+            logger.warning("%s has been starting for %d s: %s", child.name, took_s, step)
+        elif event is StartEvent.STUCK:
+            logger.error(
+                "%s is stuck: %s, no progress for %d s; it is killed and started again, with %d s"
+                " for each step",
+                child.name,
+                step,
+                limit_s,
+                watch.limit_ns // 1_000_000_000,
+            )
+            child.ask_to_end(signal.SIGKILL)
+
+    def _end_children(self) -> None:
+        """End all: segments last, for the engine brings their slaves to rest."""
+        self._end((self._engine, self._services), GRACE_NS)
+        self._end(self._segments.values(), SEGMENT_GRACE_NS)
+
+    def _end(self, children: Collection[Child], grace_ns: int) -> None:
+        for child in children:
+            child.ask_to_end(signal.SIGTERM)
+        deadline_ns = self._clock() + grace_ns
+        while running := [child for child in children if child.pid]:
+            now_ns = self._clock()
+            if now_ns >= deadline_ns:
+                for child in running:
+                    logger.warning("%s does not end when asked; killing it", child.name)
+                    child.ask_to_end(signal.SIGKILL)
+                deadline_ns = now_ns + GRACE_NS
+            poll = select.poll()
+            for child in running:
+                poll.register(child.pid_fd, select.POLLIN)
+            fired = {fd for fd, _ in poll.poll(max(1, (deadline_ns - now_ns) // 1_000_000))}
+            for child in running:
+                if child.pid_fd in fired:
+                    child.reap()
+
+    def _write_info(self) -> None:
+        self._info.engine = _process_info(self._engine)
+        self._info.services = _process_info(self._services)
+        self._info.segments = {name: _process_info(child) for name, child in self._segments.items()}
+        try:
+            self._folder.write_info(self._info)
+        except OSError as exc:  # a full disk: what commands find in it is older than it should be
+            if not self._is_info_old:
+                logger.warning("%s cannot be written: %s", self._folder.path, exc.strerror)
+            self._is_info_old = True
+        else:
+            self._is_info_old = False
+
+
+def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> ApplianceInfo:
+    """Return what clients find in the folder of an appliance that this process runs."""
+    return ApplianceInfo(
+        plant=plant,
+        plant_file=plant_file,
+        stations=[station.name for station in stations],
+        started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        supervisor=os.getpid(),
+    )
+
+
+def _process_info(child: Child) -> ProcessInfo:
+    return ProcessInfo(child.pid, child.restarts, child.report, child.watch.step)
+
+
+def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:
+    names = {station.name for station in plant.stations}
+    return {name: routing for name, routing in plant.routing.items() if name in names}
+
+
+def _given_to_segments(
+    children: dict[str, Child], common: Handover, bytecode: str
+) -> dict[Child, tuple[Handover | SegmentHandover, list[int]]]:
+    """Add a child for each simulated segment; return what they are given."""
+    given: dict[Child, tuple[Handover | SegmentHandover, list[int]]] = {}
+    handovers = segments(
+        common.stations, common.buses, common.supervisor, realtime=common.options.realtime
+    )
+    for owner, handover in handovers:
+        name = f"{owner.station}/{owner.port}"
+        child = children[name] = Child(f"segment {name}", "eap.segment.process", bytecode)
+        given[child] = handover, [handover.frames_fd, handover.command_fd]
+    return given

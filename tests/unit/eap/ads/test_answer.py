@@ -1,0 +1,16 @@
+from __future__ import annotations
+
+from eap.ads.answer import AmsAnswer, response_to
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
+from eap.ids import NetId
+
+ASKED = AmsHeader(NetId(b"target"), 1001, NetId(b"source"), 33000, AmsCommand.READ, invoke_id=7)
+
+
+def test_response_goes_back_with_command_and_invoke_id() -> None:
+    header, body = decode_packet(response_to(ASKED, AmsAnswer(b"data", 6)))
+    assert (header.target, header.target_port) == (ASKED.source, ASKED.source_port)
+    assert (header.source, header.source_port) == (ASKED.target, ASKED.target_port)
+    assert header.state_flags == StateFlags.ADS | StateFlags.RESPONSE
+    assert (header.command, header.invoke_id, header.error_code) == (AmsCommand.READ, 7, 6)
+    assert bytes(body) == b"data"

@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import pytest
+
+from eap.ads.operation import AdsRefusedError
+from eap.ads.symbol_table import SymbolTable, Variable
+from eap.ads.symbols import SymbolSpace
+from eap.codec import datatypes
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.adssymbol import (
+    AdsType,
+    SymbolEntry,
+    SymbolFlag,
+    SymbolPlace,
+    UploadInfo,
+    decode_entry,
+)
+from tests.support.adsdevice import VALUES, DictStore, variables
+
+G = IndexGroup
+BIG = 0xFFFF_FFFF
+
+
+@pytest.fixture
+def store() -> DictStore:
+    return DictStore()
+
+
+@pytest.fixture
+def space(store: DictStore) -> SymbolSpace:
+    return SymbolSpace(SymbolTable(variables(store), 1), store)
+
+
+def handle(space: SymbolSpace, name: str) -> int:
+    return int.from_bytes(space.read_write(G.SYMBOL_HANDLE, 0, 4, name.encode() + b"\0"), "little")
+
+
+def test_a_value_is_the_same_whichever_way_it_is_reached(space, store) -> None:
+    for name, kind in store.types.items():
+        place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, name.encode()))
+        by_name = space.read_write(G.VALUE_BY_NAME, 0, BIG, name.encode())
+        assert space.read(G.VALUE_BY_HANDLE, handle(space, name), BIG) == by_name
+        assert space.read(G.SYMBOL_NOTIFICATION, handle(space, name), BIG) == by_name
+        assert space.read(place.group, place.offset, place.size) == by_name
+        assert (place.group, place.offset % 8, place.size) == (G.DATA, 0, len(by_name))
+        if by_name[: kind.size] == store.octets[name]:
+            assert space.read(place.group, place.offset, 1) == store.octets[name][:1]
+
+
+def test_table_is_uploaded(space) -> None:
+    count, size = (
+        int.from_bytes(space.read(G.SYMBOL_UPLOAD_INFO, 0, 8)[n : n + 4], "little") for n in (0, 4)
+    )
+    octets = space.read(G.SYMBOL_UPLOAD, 0, size)
+    entries, at = [], 0
+    while at < len(octets):
+        entry, at = decode_entry(octets, at)
+        entries.append(entry)
+    assert (count, size) == (len(VALUES), len(octets))
+    assert [entry.name for entry in entries] == list(VALUES)
+    one, end = decode_entry(space.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 798, b"count"))
+    assert one == entries[2]
+    assert one == SymbolEntry(
+        SymbolPlace(G.DATA, 16, 4),
+        AdsType.UINT32,
+        SymbolFlag.READ_ONLY,
+        "count",
+        "UDINT",
+        "comment of count",
+    )
+    assert end == len(space.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 798, b"count"))
+    info = space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 1024)
+    assert info[:8] == space.read(G.SYMBOL_UPLOAD_INFO, 0, 1024)
+    assert len(info) == 64
+    with pytest.raises(AdsRefusedError, match="SIZE"):
+        space.read(G.SYMBOL_UPLOAD, 0, size - 1)
+
+
+def test_types_of_symbols_are_told_and_uploaded(space) -> None:
+    info = UploadInfo.decode(space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 24))
+    octets = space.read(G.DATA_TYPE_UPLOAD, 0, BIG)
+    assert len(octets) == info.type_size
+    entries, at = {}, 0
+    while at < len(octets):
+        size = int.from_bytes(octets[at : at + 4], "little")
+        length = int.from_bytes(octets[at + 32 : at + 34], "little")
+        entries[octets[at + 42 : at + 42 + length].decode()] = octets[at : at + size]
+        at += size
+    assert len(entries) == info.types
+    assert {"INT", "ARRAY [0..3] OF INT", "STRING(15)", "BYTE", "BOOL"} <= set(entries)
+    for name, entry in entries.items():
+        assert space.read_write(G.DATA_TYPE_BY_NAME, 0, BIG, name.lower().encode()) == entry
+    with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
+        space.read_write(G.DATA_TYPE_BY_NAME, 0, BIG, b"ST_PUMP")
+    with pytest.raises(AdsRefusedError, match="SIZE"):
+        space.read_write(G.DATA_TYPE_BY_NAME, 0, 40, b"INT")
+
+
+def test_a_handle_comes_with_its_type_where_there_is_room(space) -> None:
+    octets = space.read_write(G.SYMBOL_HANDLE, 0, BIG, b"count")
+    assert octets == bytes.fromhex("03000001 04000000 00000000 0500") + b"UDINT\0"
+    assert space.read_write(G.SYMBOL_HANDLE, 0, len(octets), b"count") == octets
+    assert space.read_write(G.SYMBOL_HANDLE, 0, len(octets) - 1, b"count") == octets[:4]
+
+
+def test_values_are_written(space, store) -> None:
+    space.write(G.VALUE_BY_HANDLE, handle(space, "depth"), b"\xfe\xff\xff\xff")
+    assert store.get("depth") == -2
+    place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
+    space.write(place.group, place.offset, bytes(range(8)))
+    assert store.octets["curve"] == bytes(range(8))
+    for offset, data, result in (
+        (place.offset + 2, bytes(6), "SIZE"),
+        (place.offset, bytes(6), "SIZE"),
+        (place.offset + 8, bytes(8), "SIZE"),
+    ):
+        with pytest.raises(AdsRefusedError, match=result):
+            space.write(place.group, offset, data)
+    with pytest.raises(AdsRefusedError, match="ACCESS"):
+        space.write(G.VALUE_BY_HANDLE, handle(space, "count"), bytes(4))
+
+
+def test_elements_of_a_list_are_read_by_offset(space) -> None:
+    place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
+    assert space.read(place.group, place.offset + 2, 2) == b"\xfe\xff"
+    assert space.read(place.group, place.offset + 6, BIG) == b"\xfc\xff"
+
+
+def test_handles_of_an_older_table_are_refused_as_such(space, store) -> None:
+    old = handle(space, "count")
+    version = space.watch(G.SYMBOL_VERSION, 0, 1)
+    assert version() == b"\1"
+    space.replace(SymbolTable(variables(store)[:2], 0x102), store)
+    assert (version(), space.read(G.SYMBOL_VERSION, 0, 9)) == (b"\2", b"\2")
+    with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
+        space.read(G.VALUE_BY_HANDLE, old, 4)
+    space.write(G.RELEASE_HANDLE, 0, old.to_bytes(4, "little"))
+    with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
+        handle(space, "count")
+
+
+def test_watching_goes_on_with_what_is_in_the_next_table_too(space, store) -> None:
+    value = space.watch(G.VALUE_BY_HANDLE, handle(space, "count"), 4)
+    space.replace(SymbolTable(reversed(variables(store)), 2), store)
+    store.set("count", 5)
+    assert value() == b"\5\0\0\0"
+    other = [Variable("count", datatypes.parse("UINT"))]
+    for without in (other, []):
+        space.replace(SymbolTable(without, 3), store)
+        with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
+            value()
+
+
+@pytest.mark.parametrize("number", [1 << 24, (1 << 24) + len(VALUES) + 1])
+def test_handles_that_never_were_any(space, number: int) -> None:
+    with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
+        space.read(G.VALUE_BY_HANDLE, number, 4)
+
+
+def test_watching_gives_exactly_what_was_asked_for(space, store) -> None:
+    place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
+    second = space.watch(G.DATA, place.offset + 2, 2)
+    store.set("curve", (1, 2, 3, 4))
+    assert second() == b"\2\0"
+    for group, offset, length in (
+        (G.DATA, place.offset + 2, 7),
+        (G.VALUE_BY_HANDLE, handle(space, "curve"), 9),
+        (G.SYMBOL_VERSION, 0, 2),
+    ):
+        with pytest.raises(AdsRefusedError, match="SIZE"):
+            space.watch(group, offset, length)
+
+
+@pytest.mark.parametrize(
+    ("attempt", "result"),
+    [
+        (lambda s: s.read_write(G.SYMBOL_HANDLE, 0, 4, b"nobody"), "SYMBOL_NOT_FOUND"),
+        (lambda s: s.read_write(G.SYMBOL_HANDLE, 0, 3, b"count"), "SIZE"),
+        (lambda s: s.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 30, b"count"), "SIZE"),
+        (lambda s: s.read_write(G.VALUE_BY_HANDLE, 0, 4, b"count"), "ACCESS"),
+        (lambda s: s.read(G.SYMBOL_HANDLE, 0, 4), "ACCESS"),
+        (lambda s: s.write(G.SYMBOL_UPLOAD, 0, b"abcd"), "ACCESS"),
+        (lambda s: s.write(G.RELEASE_HANDLE, 0, b"abc"), "SIZE"),
+        (lambda s: s.watch(G.SYMBOL_UPLOAD, 0, 4), "ACCESS"),
+        (lambda s: s.read(G.DATA, 4, 4), "INDEX_OFFSET"),
+        (lambda s: s.read(G.DATA, BIG, 4), "INDEX_OFFSET"),
+    ],
+)
+def test_refusals(space, attempt, result: str) -> None:
+    with pytest.raises(AdsRefusedError, match=result):
+        attempt(space)
+
+
+def test_what_the_store_refuses_is_passed_on(space, store) -> None:
+    store.broken["motor.speed"] = AdsError.BUSY
+    number = handle(space, "motor.speed")
+    with pytest.raises(AdsRefusedError, match="BUSY"):
+        space.read(G.VALUE_BY_HANDLE, number, 4)
+    with pytest.raises(AdsRefusedError, match="BUSY"):
+        space.write(G.VALUE_BY_HANDLE, number, bytes(4))

@@ -1,0 +1,370 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from eap.ams.endpoint import Way
+from eap.ams.mqtt import network as mqtt_network
+from eap.ams.mqtt.info import Info, encode_info
+from eap.ams.mqtt.network import (
+    CONFIRM_NS,
+    MAX_PACKET,
+    Action,
+    Arrived,
+    Closed,
+    Drop,
+    Dropped,
+    HopDown,
+    HopUp,
+    MqttNetwork,
+    Publish,
+    Subscribe,
+    Warn,
+)
+from eap.ams.mqtt.peers import EXPIRY_NS, REFRESH_NS
+from eap.ams.mqtt.ports import FIRST_PORT
+from eap.ams.routes import Route, RouteTable
+from eap.ams.spec import MqttSpec
+from eap.ids import NetId
+from tests.support.ams import NOTIFICATION, Ams, parse
+
+OWN, FAR = "5.1.1.1.1.1", "6.1.1.1.1.1"
+DEVICE, TOOL = f"{OWN}:10000", f"{FAR}:33000"
+REQUEST = Ams(DEVICE, TOOL).octets()
+HERE, GONE = Info("far", is_online=True), Info("far", is_online=False)
+SECOND = 1_000_000_000
+
+
+class Place:
+    """A router's place in a network, and what came of what it was told."""
+
+    def __init__(self, **settings: object) -> None:
+        spec = MqttSpec(network="hall", host="broker", **settings)
+        self.table = RouteTable()
+        self.network = MqttNetwork(
+            spec, NetId.parse(OWN), "island-01", door="mqtt:hall", table=self.table
+        )
+        self.now_ns = 100 * SECOND
+        self.first = self.network.connected(self.now_ns)
+
+    def hear(self, topic: str, payload: bytes, **more: bool) -> list[Action]:
+        return self.network.receive_message(f"hall/{topic}", payload, self.now_ns, **more)
+
+    def hear_of(self, net_id: str, info: Info, **more: bool) -> list[Action]:
+        return self.hear(f"{net_id}/info", encode_info(info), **more)
+
+    def asked(self, payload: bytes, topic: str = "ams") -> list[Action]:
+        return self.hear(f"{OWN}/{topic}", payload)
+
+    def wait(self, seconds: float) -> list[Action]:
+        self.now_ns += int(seconds * SECOND)
+        return self.network.handle_timeout(self.now_ns)
+
+
+def own_info(*, is_retained: bool = True) -> Publish:
+    payload = encode_info(Info("island-01", is_online=True))
+    return Publish(f"hall/{OWN}/info", payload, 2, is_retained)
+
+
+def test_subscribes_first_then_tells_of_itself_and_leaves_a_will() -> None:
+    place = Place()
+    assert place.first == [Subscribe((f"hall/{OWN}/ams/#", "hall/+/info")), own_info()]
+    will = place.network.will()
+    assert (will.topic, will.qos, will.is_retained) == (f"hall/{OWN}/info", 2, True)
+    assert b">false<" in will.payload
+    place.network.disconnected()
+    assert place.network.next_timeout() is None
+    assert place.network.handle_timeout(1 << 60) == []
+    assert place.network.connected(1 << 60) == place.first
+
+
+def test_router_that_comes_is_a_hop_and_one_that_goes_is_none() -> None:
+    place = Place()
+    assert place.hear_of(FAR, HERE) == [HopUp(FAR)]
+    assert place.hear_of(FAR, HERE) == []
+    assert [each.name for each in place.table] == ["far"]
+    assert place.hear_of(FAR, GONE) == [HopDown(FAR, "it told that it is gone"), Closed(FAR)]
+
+
+def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
+    place = Place()
+    place.hear_of(FAR, HERE)
+    place.hear_of("7.1.1.1.1.1", GONE)
+    place.hear_of("8.1.1.1.1.1", HERE)
+    place.network.disconnected()
+    place.now_ns += SECOND
+    place.network.connected(place.now_ns)
+    place.hear_of("8.1.1.1.1.1", HERE)
+    assert place.network.next_timeout() == place.now_ns + CONFIRM_NS
+    assert place.wait(29) == []
+    assert place.wait(1) == [
+        HopDown(FAR, "it is gone without a word"), Closed(FAR), HopUp(FAR),
+        HopUp("7.1.1.1.1.1"), Subscribe(("hall/+/info",)),
+    ]  # fmt: skip
+    place.table.expire(place.now_ns)
+    assert [str(each.net_id) for each in place.table] == ["8.1.1.1.1.1"]
+
+
+def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
+    place = Place()
+    far = NetId.parse(FAR)
+    place.table.add(Route(far, "far", Way("mqtt:hall", FAR), is_probed=False))
+    place.network.disconnected()
+    awaited = HopDown(FAR, "it has not told of itself yet")
+    assert place.network.connected(place.now_ns) == [awaited, *place.first]
+    assert place.wait(30)[0] == awaited
+    assert place.hear_of(FAR, HERE) == [HopUp(FAR)]
+    place.wait(REFRESH_NS / SECOND)
+    place.wait(REFRESH_NS / SECOND)
+    gone = place.wait(REFRESH_NS / SECOND)
+    assert gone[:4] == [
+        HopDown(FAR, "it is gone without a word"), Closed(FAR), HopUp(FAR), awaited,
+    ]  # fmt: skip
+
+
+def test_all_are_asked_for_now_and_then() -> None:
+    place = Place()
+    place.wait(30)
+    place.hear_of(FAR, HERE)
+    assert place.network.next_timeout() == place.now_ns + REFRESH_NS
+    assert place.wait(120) == [Subscribe(("hall/+/info",))]
+    place.wait(120)
+    assert place.wait(120)[0] == HopDown(FAR, "it is gone without a word")
+
+
+def test_without_retained_messages_who_is_new_is_told_of_this_router() -> None:
+    place = Place(no_retain=True)
+    assert place.first[1] == own_info(is_retained=False)
+    assert not place.network.will().is_retained
+    assert place.hear_of(FAR, HERE) == [HopUp(FAR)]  # told a moment ago: soon again
+    assert place.network.next_timeout() == place.now_ns + SECOND
+    assert place.wait(1) == [own_info(is_retained=False)]
+    place.now_ns += SECOND
+    assert place.hear_of(FAR, HERE) == []  # that was its answer
+    assert place.hear_of("7.1.1.1.1.1", HERE)[1:] == [own_info(is_retained=False)]
+    place.now_ns += 30 * SECOND
+    assert place.hear_of(FAR, HERE) == [own_info(is_retained=False)]
+    assert own_info(is_retained=False) in place.wait(REFRESH_NS / SECOND)
+
+
+def test_two_routers_without_retained_messages_meet_and_fall_silent() -> None:
+    one, two = Place(no_retain=True), Place(no_retain=True)
+    two.network = MqttNetwork(
+        MqttSpec(network="hall", host="broker", no_retain=True),
+        NetId.parse(FAR), "island-02", door="mqtt:hall", table=two.table,
+    )  # fmt: skip
+    two.now_ns += 60 * SECOND
+    one.now_ns = two.now_ns
+    sent = {two: list(two.network.connected(two.now_ns)), one: []}
+    count = 0
+    for _ in range(20):
+        for place, other in ((one, two), (two, one)):
+            for message in [each for each in sent[other] if isinstance(each, Publish)]:
+                count += 1
+                sent[place] += place.network.receive_message(
+                    message.topic, message.payload, place.now_ns
+                )
+            sent[other] = []
+        for place in (one, two):
+            place.now_ns += SECOND // 2
+            sent[place] += place.network.handle_timeout(place.now_ns)
+    assert [str(each.net_id) for each in one.table] == [FAR]
+    assert [str(each.net_id) for each in two.table] == [OWN]
+    assert count <= 4  # of the one that was there the first time, one is by the clock
+
+
+def test_late_will_of_an_earlier_connection_is_corrected() -> None:
+    place = Place()
+    will = place.network.will()
+    assert place.network.receive_message(will.topic, will.payload, place.now_ns) == []
+    assert place.wait(1) == [own_info()]
+    place.now_ns += SECOND
+    assert place.network.receive_message(will.topic, b"", place.now_ns) == [own_info()]
+
+
+def test_second_router_with_the_net_id_is_named_once() -> None:
+    place = Place()
+    assert place.hear_of(OWN, Info("island-01", is_online=True)) == []
+    assert place.hear_of(OWN, Info("before", is_online=True), is_retained=True) == []
+    (warning,) = place.hear_of(OWN, Info("twin", is_online=True))
+    assert warning == Warn(
+        f"'twin' tells that it has the NetID {OWN}, which is this station's;"
+        " each router of a network needs one of its own"
+    )
+    assert place.hear_of(OWN, Info("twin", is_online=True)) == []
+
+
+@pytest.mark.parametrize("prefix", [b"", bytes.fromhex("0000 25000000")], ids=["bare", "prefixed"])
+def test_packet_arrives_and_its_answer_has_its_form(prefix: bytes) -> None:
+    place = Place()
+    asked = Ams(DEVICE, TOOL, body=b"asked")
+    assert place.asked(prefix + asked.octets()) == [Arrived(asked.octets(), FAR)]
+    answer = asked.answer(b"gives").octets()
+    assert place.network.message_for(FAR, answer) == Publish(
+        f"hall/{FAR}/ams/res", prefix + answer, 0
+    )
+
+
+@pytest.mark.parametrize(("is_prefixed", "length"), [(False, 32), (True, 38)])
+def test_who_was_not_heard_yet_gets_the_form_of_the_settings(
+    is_prefixed: bool, length: int
+) -> None:
+    place = Place(is_prefixed=is_prefixed, qos=1)
+    sent = place.network.message_for(FAR, Ams(TOOL, DEVICE).octets())
+    assert (sent.topic, len(sent.payload), sent.qos) == (f"hall/{FAR}/ams", length, 1)
+    note = Ams(TOOL, DEVICE, command=NOTIFICATION).octets()
+    assert place.network.message_for(FAR, note).topic == f"hall/{FAR}/ams/res"
+
+
+def test_client_behind_the_router_asks_and_is_answered() -> None:
+    place = Place()
+    asked = Ams(f"{FAR}:851", "192.168.0.9.1.1:33000")
+    sent = parse(place.network.message_for(FAR, asked.octets()).payload)
+    assert sent.source == f"{OWN}:{FIRST_PORT}"
+    (arrived,) = place.asked(sent.answer().octets(), "ams/res")
+    assert isinstance(arrived, Arrived)
+    assert parse(arrived.packet) == asked.answer()
+    note = sent.answer()._replace(command=NOTIFICATION, flags=4)
+    for topic in ("ams", "ams/res"):
+        (arrived,) = place.asked(note.octets(), topic)
+        assert isinstance(arrived, Arrived)
+        assert parse(arrived.packet).target == asked.source
+
+
+def test_answers_go_to_the_router_that_the_sender_is_behind() -> None:
+    place = Place()
+    asked = Ams(DEVICE, "6.1.1.1.3.1:1001").octets()
+    assert place.asked(asked) == [Arrived(asked, "6.1.1.1.3.1")]
+    place.hear_of(FAR, HERE)
+    assert place.asked(asked) == [Arrived(asked, FAR)]
+
+
+def test_one_way_station_tells_so() -> None:
+    place = Place(is_unidirectional=True)
+    assert b'unidirectional="true"' in place.first[1].payload
+
+
+def test_too_long_a_request_is_answered_and_too_long_an_answer_is_not() -> None:
+    place = Place()
+    asked = Ams(DEVICE, TOOL, body=bytes(MAX_PACKET))
+    dropped, warning, refusal = place.asked(asked.octets())
+    assert dropped == Dropped(Drop.LENGTH)
+    assert "too long a packet" in warning.text
+    assert parse(refusal.payload) == asked.answer(b"", 0xE)
+    assert place.asked(asked._replace(flags=6).octets()) == [dropped]
+    assert place.asked(asked.answer(bytes(MAX_PACKET)).octets(), "ams/res") == [dropped]
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload", "more", "reason", "text"),
+    [
+        (f"{OWN}/ams", b"short", {}, Drop.BROKEN, "broken packet"),
+        (f"{FAR}/info", b"<info>", {}, Drop.BROKEN, "broken info"),
+        (f"{FAR}/ams", REQUEST, {}, Drop.TOPIC, "topic nobody knows"),
+        ("nonsense", b"", {}, Drop.TOPIC, "topic nobody knows"),
+        (f"{OWN}/ams/res", REQUEST, {}, Drop.TOPIC, "request on the topic for answers"),
+        (f"{OWN}/ams", REQUEST, {"is_retained": True}, Drop.TOPIC, "retained packet"),
+    ],
+)
+def test_what_comes_to_nothing_is_counted_and_said_once(
+    topic: str, payload: bytes, more: dict[str, bool], reason: Drop, text: str
+) -> None:
+    place = Place()
+    dropped, warning = place.hear(topic, payload, **more)
+    assert dropped == Dropped(reason)
+    assert warning.text.startswith(f"{text}: ")
+    assert place.hear(topic, payload, **more) == [dropped]
+
+
+def test_routers_and_senders_have_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_network, "MAX_SENDERS", 2)
+    monkeypatch.setattr("eap.ams.mqtt.peers.MAX_PEERS", 1)
+    place = Place()
+    place.hear_of(FAR, HERE)
+    assert place.hear_of("7.1.1.1.1.1", HERE)[0] == Dropped(Drop.FULL)
+    for number in (7, 8):
+        assert len(place.asked(Ams(DEVICE, f"{number}.1.1.1.1.1:1").octets())) == 1
+    closed, _ = place.asked(Ams(DEVICE, "9.1.1.1.1.1:1").octets())
+    assert closed == Closed("7.1.1.1.1.1")
+
+
+def test_sender_that_nobody_told_of_is_forgotten_when_silent_for_an_hour() -> None:
+    place = Place()
+    place.asked(Ams(DEVICE, "7.1.1.1.1.1:1").octets())
+    place.now_ns += 1800 * SECOND
+    place.asked(Ams(DEVICE, "8.1.1.1.1.1:1").octets())
+    assert Closed("7.1.1.1.1.1") not in place.wait(1799)
+    place.now_ns += REFRESH_NS
+    assert place.wait(1)[0] == Closed("7.1.1.1.1.1")
+    assert Closed("8.1.1.1.1.1") not in place.wait(REFRESH_NS / SECOND)
+
+
+@given(st.sampled_from([f"{OWN}/ams", f"{OWN}/ams/res", f"{FAR}/info", f"{OWN}/info"]),
+       st.binary(max_size=80), st.booleans())  # fmt: skip
+def test_no_message_raises(topic: str, payload: bytes, is_retained: bool) -> None:
+    place = Place()
+    place.hear(topic, payload, is_retained=is_retained)
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """Whatever is told in whatever order, hops and routes are those of who is there."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.place = Place()
+        self.told_at: dict[str, int] = {}
+        self.down: set[str] = set()
+        self.is_connected = True
+
+    def do(self, actions: list[Action]) -> None:
+        for action in actions:
+            if isinstance(action, HopDown):
+                self.down.add(action.address)
+            elif isinstance(action, HopUp):
+                self.down.discard(action.address)
+            elif isinstance(action, Publish):
+                assert self.is_connected
+
+    @rule(number=st.integers(1, 4), is_online=st.booleans(), is_retained=st.booleans())
+    def tell(self, number: int, is_online: bool, is_retained: bool) -> None:
+        if not self.is_connected:
+            return
+        net_id = f"6.1.1.1.{number}.1"
+        self.do(self.place.hear_of(net_id, Info("x", is_online), is_retained=is_retained))
+        self.told_at.pop(net_id, None)
+        if is_online:
+            self.told_at[net_id] = self.place.now_ns
+        assert (net_id in self.down) == (not is_online)
+
+    @rule()
+    def lose(self) -> None:
+        self.place.network.disconnected()
+        self.is_connected = False
+
+    @rule()
+    def connect(self) -> None:
+        self.is_connected = True
+        self.do(self.place.network.connected(self.place.now_ns))
+
+    @rule(seconds=st.sampled_from([1, 31, 121, 301]))
+    def elapse(self, seconds: int) -> None:
+        self.do(self.place.wait(seconds))
+        self.place.table.expire(self.place.now_ns)
+
+    @invariant()
+    def time_goes_on(self) -> None:
+        due_ns = self.place.network.next_timeout()
+        assert (due_ns is not None) == self.is_connected
+
+    @invariant()
+    def routes_are_of_who_was_there(self) -> None:
+        oldest = self.place.now_ns - EXPIRY_NS
+        for route in self.place.table:
+            address = route.hop.connection
+            known = self.told_at.get(address, -1) > oldest
+            assert known or address in self.down
+
+
+TestAnyOrder = AnyOrder.TestCase

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from eap.ams.endpoint import Way
+from eap.ams.inflight import InFlight, Pending
+from eap.ams.routes import Route
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+
+ONE, TWO, LINK = Way("tcp", "1"), Way("tcp", "2"), Way("link", "6")
+ROUTE = Route(NetId(b"target"), "far", LINK)
+
+
+def pending(
+    invoke_id: int, way: Way | None = ONE, at_ns: int = 0, allowed_ns: int = 10,
+    route: Route | None = ROUTE,
+) -> Pending:  # fmt: skip
+    header = AmsHeader(NetId(b"target"), 1, NetId(b"source"), 2, 2, invoke_id=7)
+    return Pending(invoke_id, header, way, route, b"addresses", at_ns, at_ns + allowed_ns)
+
+
+def filled(*items: Pending) -> InFlight:
+    waiting = InFlight()
+    for each in items:
+        waiting.add(each)
+    return waiting
+
+
+def test_request_is_found_until_it_is_taken_out() -> None:
+    first = pending(1)
+    waiting = filled(first, pending(2, TWO))
+    assert waiting.get(1) is first
+    assert 1 in waiting
+    assert (len(waiting), waiting.count(ONE)) == (2, 1)
+    assert [waiting.count_of_door(door) for door in ("tcp", "link")] == [2, 0]
+    assert waiting.is_asked(ONE, b"addresses", 7)
+    assert waiting.pop(1) is first
+    assert waiting.pop(1) is None
+    assert (len(waiting), waiting.count(ONE)) == (1, 0)
+    assert waiting.count_of_door("tcp") == 1
+    assert not waiting.is_asked(ONE, b"addresses", 7)
+    assert waiting.is_asked(TWO, b"addresses", 7)
+
+
+def test_asked_again_is_known_until_the_latest_is_taken_out() -> None:
+    waiting = filled(pending(1), pending(2))
+    waiting.pop(1)
+    assert waiting.is_asked(ONE, b"addresses", 7)
+    waiting.pop(2)
+    assert not waiting.is_asked(ONE, b"addresses", 7)
+
+
+def test_deadlines_come_in_order_whatever_is_allowed() -> None:
+    waiting = filled(pending(1, at_ns=0, allowed_ns=10), pending(2, at_ns=1, allowed_ns=3),
+                     pending(3, at_ns=2, allowed_ns=10))  # fmt: skip
+    assert waiting.next_timeout() == 4
+    assert [each.invoke_id for each in waiting.due(10)] == [2, 1]
+    for each in waiting.due(10):
+        waiting.pop(each.invoke_id)
+    assert waiting.next_timeout() == 12
+    waiting.pop(3)
+    assert waiting.next_timeout() is None
+
+
+def test_abandoned_requests_stay_for_nobody_and_make_room_first() -> None:
+    waiting = filled(pending(1), pending(2), pending(3, TWO))
+    assert not waiting.make_room()
+    assert [each.invoke_id for each in waiting.abandon(ONE)] == [1, 2]
+    assert waiting.abandon(ONE) == []
+    assert len(waiting) == 3
+    assert waiting.get(1).came_by is None
+    assert waiting.make_room()
+    assert [each.invoke_id for each in waiting] == [2, 3]
+    waiting.pop(2)
+    assert not waiting.make_room()
+
+
+def test_request_of_nobody_makes_room_too() -> None:
+    waiting = filled(pending(1, None))
+    assert waiting.make_room()
+    assert len(waiting) == 0
+
+
+def test_requests_of_a_hop_are_found() -> None:
+    other = Route(NetId(b"target"), "other", Way("link", "7"))
+    waiting = filled(pending(1), pending(2, route=other), pending(3, route=None))
+    assert [each.invoke_id for each in waiting.on("link", "6")] == [1]
+    assert [each.invoke_id for each in waiting.on("link", None)] == [1, 2]
+    assert waiting.on("tcp", None) == []

@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import struct
+
+from eap.ams.action import Forward
+from eap.ams.endpoint import Way
+from eap.ams.invoke import InvokeIds
+from eap.ams.routes import Route
+from eap.ams.subscriptions import MAX_PER_CLIENT
+from eap.ids import NetId
+from tests.support.ams import (
+    ADD_NOTIFICATION,
+    DELETE_NOTIFICATION,
+    NOTIFICATION,
+    READ_WRITE,
+    Ams,
+    parse,
+)
+from tests.support.aoerouter import (
+    CLIENT,
+    FAR,
+    FAR_DEVICE,
+    LINK,
+    ROUTER,
+    SECOND_LINK,
+    Station,
+    only_reply,
+    route,
+)
+from tests.unit.eap.ams.test_subscriptions import stream
+
+SECOND = 1_000_000_000
+ONE, TWO = Way("tcp", "1"), Way("tcp", "2")
+LOCAL, ALSO_LOCAL = Way("local", "1"), Way("local", "2")
+ADD = Ams(FAR_DEVICE, CLIENT, ADD_NOTIFICATION, body=bytes(40))
+NOTICE = Ams(CLIENT, FAR_DEVICE, NOTIFICATION)
+
+
+def granted(handle: int, result: int = 0) -> bytes:
+    return result.to_bytes(4, "little") + handle.to_bytes(4, "little")
+
+
+def subscribed(*ways: Way, routes: tuple[Route, ...] = (route(FAR, LINK),)) -> Station:
+    """Return a station by which each way has one notification; the handles count from 1."""
+    station = Station(routes)
+    asked = ADD._replace(target=f"{routes[0].net_id}:851")
+    for handle, way in enumerate(ways, 1):
+        onward = station.forwarded(asked, way)
+        assert station.replied(onward.answer(granted(handle)), LINK)[0] == way
+    return station
+
+
+def test_notification_goes_to_who_asked_for_it_with_one_address_for_both() -> None:
+    station = subscribed(ONE, TWO)
+    for handle, way in ((1, ONE), (2, TWO)):
+        notice = NOTICE._replace(body=stream((5, {handle: b"data"})))
+        assert station.replied(notice, LINK) == (way, notice)
+    both = NOTICE._replace(body=stream((5, {1: b"a", 2: b"b"})))
+    parts = {each.way: parse(*each.packets).body for each in station.give(both, LINK)}
+    assert parts == {ONE: stream((5, {1: b"a"})), TWO: stream((5, {2: b"b"}))}
+
+
+def test_notifications_reach_clients_with_the_net_id_of_the_router() -> None:
+    station = Station([route(FAR, LINK)])
+    own = f"{ROUTER}:30000"
+    for handle, way in ((1, LOCAL), (2, ALSO_LOCAL)):
+        onward = station.forwarded(ADD._replace(source=own), way)
+        assert station.replied(onward.answer(granted(handle)), LINK)[0] == way
+        notice = NOTICE._replace(target=own, body=stream((5, {handle: b"data"})))
+        assert station.replied(notice, LINK) == (way, notice)
+
+
+def test_notification_for_the_router_that_no_client_has_is_ended() -> None:
+    station = Station([route(FAR, LINK)])
+    notice = NOTICE._replace(target=f"{ROUTER}:30000", body=stream((5, {9: b"data"})))
+    way, end = station.replied(notice, LINK)
+    assert (way, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
+
+
+def test_notification_for_a_client_that_does_not_listen_is_ended() -> None:
+    station = Station([route("192.168.0.9.1.1", SECOND_LINK, is_client=True)])
+    notice = NOTICE._replace(body=stream((5, {9: b"data"})))
+    station.forwarded(notice, LINK)  # nothing is known of it yet
+    station.router.hop_down(SECOND_LINK.door, SECOND_LINK.connection, "connection refused", 0)
+    way, end = station.replied(notice, LINK)
+    assert (way, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
+
+
+def test_notification_for_a_router_that_is_down_for_now_is_not_ended() -> None:
+    station = Station([route("192.168.0.9.1.1", SECOND_LINK)])
+    station.router.hop_down(SECOND_LINK.door, SECOND_LINK.connection, "connection refused", 0)
+    assert station.give(NOTICE._replace(body=stream((5, {9: b"data"}))), LINK) == []
+
+
+def test_notification_comes_from_the_address_that_was_asked() -> None:
+    virtual = route("10.0.0.6.1.1", LINK, real=NetId.parse(FAR))
+    station = subscribed(ONE, routes=(virtual,))
+    notice = NOTICE._replace(body=stream((5, {1: b"data"})))
+    assert station.replied(notice, LINK) == (ONE, notice._replace(source="10.0.0.6.1.1:851"))
+
+
+def test_notification_may_go_by_a_route() -> None:
+    station = Station([route("192.168.0.9.1.1", SECOND_LINK)])
+    notice = NOTICE._replace(body=stream((5, {1: b"data"})))
+    onward = station.forwarded(notice, LINK)
+    assert onward == notice._replace(invoke_id=onward.invoke_id)
+
+
+def test_refused_notifications_are_not_remembered() -> None:
+    for body, error in ((granted(1, 0x714), 0), (granted(1), 7), (b"\0\0\0\0", 0)):
+        station = Station([route(FAR, LINK)])
+        station.replied(station.forwarded(ADD, ONE).answer(body, error), LINK)
+        assert station.router.stats().subscriptions == 0
+
+
+def test_subscription_of_a_client_is_deleted_here_by_that_client_only() -> None:
+    station = subscribed(ONE)
+    delete = ADD._replace(command=DELETE_NOTIFICATION, body=b"\1\0\0\0")
+    station.forwarded(delete, TWO)
+    for unknown in (b"\2\0\0\0", b""):
+        station.forwarded(delete._replace(body=unknown), ONE)
+    assert station.router.stats().subscriptions == 1
+    answer, end = station.give(delete, ONE)
+    assert only_reply([answer]) == (ONE, delete.answer(bytes(4)))
+    assert isinstance(end, Forward)
+    assert parse(*end.packets).body == b"\1\0\0\0"
+    assert station.router.stats().subscriptions == 0
+    station.forwarded(delete, ONE)
+
+
+def test_subscription_of_another_router_is_deleted_at_the_server() -> None:
+    station = Station([route(FAR, LINK)])
+    marked = ADD._replace(invoke_id=InvokeIds(7).take(()))
+    station.replied(station.forwarded(marked, ONE).answer(granted(1)), LINK)
+    delete = marked._replace(command=DELETE_NOTIFICATION, body=b"\1\0\0\0")
+    assert station.forwarded(delete, ONE).body == b"\1\0\0\0"
+    assert station.router.stats().subscriptions == 0
+
+
+def test_sum_commands_are_followed() -> None:
+    station = Station([route(FAR, LINK)])
+    sum_add = struct.pack("<IIII", 0xF085, 3, 24, 120) + bytes(120)
+    add = ADD._replace(command=READ_WRITE, body=sum_add)
+    answer = granted(1) + granted(0, 0x702) + granted(3)
+    body = struct.pack("<II", 0, len(answer)) + answer + b"tail"
+    assert station.replied(station.forwarded(add, ONE).answer(body), LINK) == (
+        ONE,
+        add.answer(body),
+    )
+    notice = NOTICE._replace(body=stream((5, {1: b"a", 3: b"b"})))
+    assert station.replied(notice, LINK) == (ONE, notice)
+    delete = add._replace(body=struct.pack("<IIII5I", 0xF086, 4, 16, 16, 1, 9, 3, 3, 7))
+    back, *ends = station.give(delete, ONE)
+    results = struct.pack("<IIIIII", 0, 16, 0, 0x714, 0, 0)
+    assert only_reply([back]) == (ONE, delete.answer(results))
+    assert [parse(*each.packets).body[0] for each in ends] == [1, 3]
+    assert station.router.stats().subscriptions == 0
+    station.forwarded(add._replace(body=b"short"), ONE)
+    station.forwarded(add._replace(body=struct.pack("<IIII", 0xF080, 3, 24, 0)), ONE)
+
+
+def test_client_that_has_too_many_subscriptions_is_refused() -> None:
+    station = Station([route(FAR, LINK)])
+    count = MAX_PER_CLIENT
+    add = ADD._replace(
+        command=READ_WRITE, body=struct.pack("<IIII", 0xF085, count, 8 * count, 40 * count)
+    )
+    answer = b"".join(granted(handle) for handle in range(count))
+    body = struct.pack("<II", 0, len(answer)) + answer
+    station.replied(station.forwarded(add, ONE).answer(body), LINK)
+    more = ADD._replace(invoke_id=2)
+    assert station.replied(more, ONE) == (ONE, more.answer(granted(0, 0x716)))
+    station.forwarded(more, TWO)
+
+
+def test_handle_that_a_client_has_already_is_given_as_another_one() -> None:
+    station = subscribed(ONE)
+    again = ADD._replace(invoke_id=2)
+    interrupted, _ = station.give(station.forwarded(again, ONE).answer(granted(1)), LINK), None
+    _, answer = only_reply(interrupted)
+    assert answer.body[:4] == bytes(4)
+    handle = int.from_bytes(answer.body[4:], "little")
+    assert handle != 1
+    notice = NOTICE._replace(body=stream((5, {1: b"data"})))
+    renamed = NOTICE._replace(body=stream((5, {handle: b"data"})))
+    assert station.replied(notice, LINK) == (ONE, renamed)

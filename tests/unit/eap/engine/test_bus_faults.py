@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.master.event import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
+from devicebus.master.mailboxes import Unsolicited
+from eap.codec.mailbox import MailboxType
+from eap.engine.engine_bus import FaultCounts, SlaveFaults
+
+
+class Master:
+    def __init__(self, *events):
+        self._events = list(events)
+
+    def next_event(self):
+        return self._events.pop(0) if self._events else None
+
+
+@pytest.mark.parametrize(
+    ("event", "text"),
+    [
+        (SlaveLost(1001, 1), "it does not answer"),
+        (SlaveFailed(1001, "it refuses", 1), "it refuses"),
+        (
+            SlaveLeft(1001, 0x14, 0x1B, 1),
+            "it went to SAFEOP+ERROR by itself: AL status code 0x001B, sync manager watchdog",
+        ),
+        (SlaveLeft(1001, 0x01, 0, 1), "it went to INIT by itself"),
+        (BusLost(1), ""),
+    ],
+)
+def test_what_happened_has_words(event, text):
+    faults = SlaveFaults()
+    faults.take_events(Master(event))
+    assert faults.of(1001) == text
+    assert faults.of(1002) == ""
+
+
+def test_the_last_counts_until_the_slave_is_back():
+    faults = SlaveFaults()
+    faults.take_events(Master(SlaveLost(1001, 1), SlaveLost(1002, 1), SlaveFailed(1001, "x", 2)))
+    assert (faults.of(1001), faults.of(1002)) == ("x", "it does not answer")
+    faults.take_events(Master(SlaveBack(1001, 1, 3)))
+    assert (faults.of(1001), faults.of(1002)) == ("", "it does not answer")
+
+
+def test_what_is_over_is_counted():
+    faults = SlaveFaults()
+    faults.take_events(
+        Master(
+            SlaveLost(1001, 1),
+            SlaveBack(1001, 1, 2),
+            SlaveLeft(1001, 0x14, 0x1B, 3),
+            SlaveLeft(1001, 0x01, 0, 4),
+            SlaveLost(1001, 5),
+            BusLost(6),
+        )
+    )
+    assert faults.counts(1001) == FaultCounts(losses=2, departures=2, al_code=0x1B)
+    assert faults.counts(1002) == FaultCounts()
+
+
+def test_what_slaves_send_unasked_is_told_on():
+    faults, heard = SlaveFaults(), []
+    faults.on_unsolicited.append(heard.append)
+    message = Unsolicited(1001, MailboxType.EOE, b"frame")
+    faults.take_events(Master(message, SlaveLost(1001, 1)))
+    assert heard == [message]
+    assert faults.of(1001) == "it does not answer"

@@ -1,0 +1,166 @@
+"""The engine process: its loop in this process, its ends in one of its own."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+import weakref
+from time import monotonic_ns
+
+import msgspec
+import pytest
+
+from eap.engine import process as engine_process
+from eap.engine.build import EnginePlant
+from eap.engine.process import StopFlag, run_cycles
+from eap.net.image_file import open_image
+from eap.pd.words import StationWord
+from eap.runtime.handover import EngineOptions, Handover
+from tests.support.startup import read_reports
+from tests.unit.eap.runtime.conftest import eap_port, left, right
+
+pytestmark = pytest.mark.net
+
+LINE = (left(eap_port(1, "loop://line")), right(eap_port(2, "loop://line")))
+
+
+def handover(folder, **more) -> Handover:
+    options = EngineOptions(realtime=False)
+    return Handover(
+        os.getpid(), str(folder), "demo", "demo.yaml", LINE, (), options=options, **more
+    )
+
+
+def cycles(folder) -> list[int]:
+    """Return how many cycles left and right have run."""
+    counts = []
+    for station in ("left", "right"):
+        with open_image(folder / f"{station}.image") as file:
+            counts.append(file.image.words[StationWord.CYCLE])
+    return counts
+
+
+def test_every_cycle_runs_until_the_signal(tmp_path):
+    told: list[list[int]] = []
+    before = signal.getsignal(signal.SIGTERM)
+    engine, services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    plant = EnginePlant(handover(tmp_path))
+    try:
+        stop = StopFlag()
+        signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+
+        def ready() -> None:
+            told.append(cycles(tmp_path))
+            signal.setitimer(signal.ITIMER_REAL, 0.2)  # not before: to begin takes its time
+
+        plant.start(monotonic_ns())
+        with engine, services:
+            run_cycles(plant, engine, stop, ready)
+        assert stop.is_set
+    finally:
+        plant.close()
+        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    assert min(cycles(tmp_path)) >= 10  # of 20
+    assert len(told) == 1
+    assert min(told[0]) >= 1  # who hears it finds values of a cycle
+
+
+MODULE = "eap.engine.process"
+
+
+class Engine:
+    """The engine as the supervisor starts it."""
+
+    def __init__(self, given: Handover) -> None:
+        self.link, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ready, ready_end = os.pipe()
+        given = msgspec.structs.replace(given, link_fd=theirs.fileno())
+        fd = given.to_descriptor()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "eap.runtime.startup", MODULE, str(fd), str(ready_end), ""],
+            pass_fds=(fd, ready_end, theirs.fileno()),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        os.close(fd)
+        os.close(ready_end)
+        theirs.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.communicate()
+        self.link.close()
+        os.close(self.ready)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_engine_reports_its_start_and_ends_when_asked(tmp_path, number):
+    with Engine(handover(tmp_path)) as engine:
+        *steps, ready = read_reports(engine.ready)
+        assert [each.step for each in steps][-2:] == [
+            "starting the stations", "running the first cycle"
+        ]  # fmt: skip
+        assert ready.ready == {"realtime": {"scheduler": "other: not asked for"}}
+        assert min(cycles(tmp_path)) >= 1
+        engine.process.send_signal(number)
+        assert engine.process.communicate(timeout=20)[1] == ""
+        assert engine.process.returncode == 0
+
+
+def test_what_is_missing_is_one_line_and_exit_code_2(tmp_path):
+    with Engine(handover(tmp_path / "nowhere")) as engine:
+        error = engine.process.communicate(timeout=20)[1]
+        assert engine.process.returncode == 2
+        assert not any(each.ready for each in read_reports(engine.ready))
+    assert error.startswith("engine: ")
+    assert len(error.splitlines()) == 1
+
+
+def test_an_orphan_does_not_start(tmp_path):
+    orphan = msgspec.structs.replace(handover(tmp_path), supervisor=1)
+    with Engine(orphan) as engine:
+        engine.process.communicate(timeout=20)
+        assert engine.process.returncode == -signal.SIGKILL
+    assert list(tmp_path.iterdir()) == []
+
+
+class Circle:
+    """What only the garbage collector finds."""
+
+    def __init__(self):
+        self.me = self
+
+
+def test_garbage_does_not_pile_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(engine_process, "GARBAGE", 50)
+    handler = signal.getsignal(signal.SIGTERM)
+    engine, services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    plant = EnginePlant(handover(tmp_path))
+    stop = StopFlag()
+    circles = []
+    receive = plant.engine.handle_timeout
+
+    def make_circles(now_ns):
+        receive(now_ns)
+        circles.extend(weakref.ref(Circle()) for _ in range(100))
+        stop.is_set = len(circles) > 5 and circles[0]() is None
+
+    monkeypatch.setattr(plant.engine, "handle_timeout", make_circles)
+    gc.disable()
+    try:
+        plant.start(monotonic_ns())
+        with engine, services:
+            run_cycles(plant, engine, stop, lambda: None)
+    finally:
+        gc.enable()
+        plant.close()
+        signal.signal(signal.SIGTERM, handler)
+    assert circles[0]() is None

@@ -1,0 +1,276 @@
+"""Stations of an engine in memory that are configured anew while they run."""
+
+from __future__ import annotations
+
+import select
+
+import pytest
+from msgspec.structs import replace
+
+from eap.engine.build import EnginePlant
+from eap.engine.rebuild import MOST_WAITING
+from eap.errors import EngineRefusedError, EnvironmentalError
+from eap.net.image_file import ImageFile, open_image
+from eap.pd import pieces
+from eap.pd.device import DeviceState
+from eap.pd.handover import ImageHandover
+from eap.pd.report import station_status
+from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, VariableSpec, Writer
+from eap.pd.words import StationWord
+from eap.runtime.folder import ApplianceFolder
+from eap.runtime.handover import Handover
+from eap.runtime.station_request import Configure, SetState
+from tests.unit.eap.runtime.conftest import eap_port, left, right
+
+pytestmark = pytest.mark.net
+
+PATIENCE_MS = 10_000
+
+
+class Running:
+    """An engine's plant of two stations on a line, whose cycles run when the test says so."""
+
+    def __init__(self, folder):
+        self.folder = ApplianceFolder(folder)
+        self.left, self.right = left(eap_port(1, "loop://x")), right(eap_port(2, "loop://x"))
+        specs = (self.left, self.right)
+        self.plant = EnginePlant(Handover(1, str(folder), "demo", "demo.yaml", specs, ()))
+        self.plant.start(1)
+        self.answers = {}
+        self.count = 0
+
+    def cycles(self, count=1):
+        for _ in range(2 * count):
+            self.plant.engine.handle_timeout(self.plant.engine.next_timeout())
+            if self.plant.rebuilds.is_ready:
+                self.plant.rebuilds.swap(self.plant.engine.next_timeout() - 1)
+
+    def post(self, spec, name=None):
+        """Ask for *spec*; return the number of the request."""
+        self.count += 1
+        path = self.folder.path / f"{self.count}.spec"
+        path.write_bytes(pieces.to_lines(spec))
+        request = Configure(id=self.count, station=name or spec.name, path=str(path))
+        return self.serve(request)
+
+    def serve(self, request):
+        now_ns = self.plant.engine.next_timeout() - 1
+        self.plant.rebuilds.serve(
+            request, now_ns, lambda error: self.answers.update({request.id: error})
+        )
+        return request.id
+
+    def finish(self, number):
+        """Wait for what was asked, with cycles in the meantime; return the error, if any."""
+        rebuilds = self.plant.rebuilds
+        while number not in self.answers:
+            if select.select([rebuilds], [], [], 0.001)[0]:
+                rebuilds.collect(self.plant.engine.next_timeout() - 1)
+            self.cycles()
+        return self.answers[number]
+
+    def configure(self, spec, name=None):
+        return self.finish(self.post(spec, name))
+
+    def status(self, name):
+        with open_image(self.folder.image(name)) as file:
+            return station_status(file.image, 1)
+
+    def values(self, name):
+        with open_image(self.folder.image(name)) as file:
+            return file.image.read_all()
+
+    def word(self, name, word):
+        with open_image(self.folder.image(name)) as file:
+            return file.image.words[word]
+
+    def write(self, station, **values):
+        with open_image(self.folder.image(station)) as file, file.image.writing(Writer.APPLICATION):
+            for variable, value in values.items():
+                file.image.write(variable, value)
+
+
+@pytest.fixture
+def running(tmp_path):
+    made = Running(tmp_path)
+    yield made
+    made.plant.close()
+
+
+def wider(spec):
+    """The sender with one more variable in a second PD."""
+    (frame,) = spec.frames
+    more = TxFrameSpec("more", "eap0", "127.9.2.2", (TxPdSpec("extra", 8, ("level",)),))
+    return replace(
+        spec,
+        variables=(VariableSpec("level", "INT", default=-5), *spec.variables),
+        frames=(frame, more),
+    )
+
+
+def listening_more(spec):
+    """The receiver with a subscription that nobody serves."""
+    more = RxPdSpec("nobody", "eap0", 99, ("spare",), "9.9.9.9.1.1", timeout_ms=50)
+    return replace(
+        spec,
+        variables=(VariableSpec("spare", "INT", Writer.ENGINE), *spec.variables),
+        subscriptions=(more, *spec.subscriptions),
+    )
+
+
+def test_a_pd_more_costs_the_others_nothing(running):
+    running.cycles(5)
+    running.write("left", setpoint=[1.5, 2.5], name="xyz")
+    running.cycles(5)
+    before = running.status("right")["pd"]["rx"][0]
+    assert running.configure(wider(running.left)) is None
+    running.cycles(20)
+    left_now, right_now = running.status("left"), running.status("right")
+    assert [pd["name"] for pd in left_now["pd"]["tx"]] == ["state", "extra"]
+    assert left_now["pd"]["tx"][0]["sent"] == left_now["cycle"]
+    assert 0 < left_now["pd"]["tx"][1]["sent"] < left_now["cycle"]
+    rx = right_now["pd"]["rx"][0]
+    assert (rx["lost"], rx["duplicated"], rx["reordered"]) == (0, 0, 0)
+    assert rx["received"] > before["received"]
+    assert running.values("left")["name"] == "xyz"
+    assert running.values("left")["level"] == -5
+    assert running.values("right")["setpoint"] == (1.5, 2.5)
+    assert right_now["discarded"].keys() == {"unknown_id"}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_one_side_is_swapped_a_hundred_times_while_frames_flow(running, side):
+    spec = getattr(running, side)
+    other = wider(spec) if side == "left" else listening_more(spec)
+    running.cycles(3)
+    for number in range(100):
+        assert running.configure(spec if number % 2 else other) is None
+        running.cycles(number % 3)
+    sent = running.status("left")["pd"]["tx"][0]["sent"]
+    right_now = running.status("right")
+    rx = next(rx for rx in right_now["pd"]["rx"] if rx["name"] == "left-state")
+    assert (rx["lost"], rx["duplicated"], rx["reordered"]) == (0, 0, 0)
+    assert sent == running.word("left", StationWord.CYCLE)
+    assert rx["received"] in {sent, sent - 1}  # one may be under way
+    assert running.word("left", StationWord.RESTARTS) == 0
+    with open_image(running.folder.image(side)) as file:
+        assert file.generation == 101
+    assert list(running.folder.path.glob(".*")) == []
+
+
+def test_what_needs_another_start_is_refused_and_the_old_goes_on(running):
+    running.cycles(3)
+    other = replace(running.left, ports=(eap_port(1, "loop://y"),))
+    error = running.configure(other)
+    assert isinstance(error, EngineRefusedError)
+    assert str(error) == (
+        "port eap0: interface loop://x -> loop://y: this needs a new start of the appliance"
+    )
+    cycle = running.word("left", StationWord.CYCLE)
+    running.cycles(3)
+    assert running.word("left", StationWord.CYCLE) == cycle + 3
+
+
+def test_what_cannot_be_built_is_refused_and_leaves_nothing_behind(running):
+    pd = RxPdSpec("a", "eap0", 1, ("nothing",))
+    error = running.configure(replace(running.right, subscriptions=(pd,)))
+    assert isinstance(error, EngineRefusedError)
+    assert str(error) == "station right: KeyError: 'nothing'"
+    number = running.serve(Configure(id=77, station="left", path="/nowhere"))
+    assert "/nowhere: [Errno 2]" in str(running.finish(number))
+    assert str(running.configure(running.left, "right")).startswith("station right cannot become")
+    assert list(running.folder.path.glob(".*")) == []
+    running.cycles(3)
+    assert running.status("right")["pd"]["rx"][0]["received"] > 0
+
+
+def test_an_image_that_cannot_be_put_in_its_place_changes_nothing(running, monkeypatch):
+    running.cycles(3)
+
+    def full(self, path):
+        raise EnvironmentalError(f"{path}: read-only")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ImageFile, "take_name", full)
+        assert "read-only" in str(running.configure(wider(running.left)))
+    assert list(running.folder.path.glob(".*")) == []
+    assert not running.status("left")["pd"]["tx"][1:]
+    assert running.configure(wider(running.left)) is None
+    assert len(running.status("left")["pd"]["tx"]) == 2
+
+
+def test_requests_are_done_one_after_the_other_and_not_without_limit(running):
+    specs = [wider(running.left), listening_more(running.right), running.left]
+    numbers = [running.post(spec) for spec in specs]
+    numbers += [running.post(running.left) for _ in range(MOST_WAITING)]
+    refused = [number for number in numbers if running.answers.get(number) is not None]
+    assert len(refused) == 2
+    assert "changes wait already" in str(running.answers[refused[0]])
+    for number in numbers:
+        running.finish(number)
+    assert [pd["name"] for pd in running.status("left")["pd"]["tx"]] == ["state"]
+    assert len(running.status("right")["pd"]["rx"]) == 2
+
+
+def test_what_runs_already_is_no_change(running):
+    assert running.configure(running.left) is None
+    with open_image(running.folder.image("left")) as file:
+        assert file.generation == 1
+
+
+def test_accounts_that_part_while_something_is_built_are_looked_at_again(running, monkeypatch):
+    running.cycles(3)
+    answers = [False, True]
+    monkeypatch.setattr(ImageHandover, "is_current", property(lambda _: answers.pop(0)))
+    assert running.configure(wider(running.left)) is None
+    assert answers == []
+    assert list(running.folder.path.glob(".*")) == []
+
+
+def test_the_swap_waits_for_the_next_cycle_when_that_is_near(running):
+    number = running.post(wider(running.left))
+    select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
+    due_ns = running.plant.engine.next_timeout()
+    running.plant.rebuilds.collect(due_ns - 100_000)
+    assert number not in running.answers
+    running.cycles()
+    assert running.answers[number] is None
+    while running.plant.rebuilds.is_building:  # it clears up what has been replaced
+        select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
+        running.plant.rebuilds.collect(due_ns)
+    number = running.post(running.left)
+    select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
+    running.plant.rebuilds.collect(running.plant.engine.next_timeout() - 2_000_000)
+    assert running.answers[number] is None
+
+
+def test_states_change_while_cycles_run(running):
+    def go(state):
+        number = running.serve(SetState(id=1000 + state, station="right", state=state))
+        return running.finish(number)
+
+    running.cycles(3)
+    assert go(DeviceState.SAFEOP) is None
+    received = running.status("right")["pd"]["rx"][0]["received"]
+    running.cycles(3)
+    assert running.status("right")["state"] == "SAFEOP"
+    assert running.status("right")["pd"]["rx"][0]["received"] == received
+    assert running.status("right")["discarded"] == {"suppressed": 3}
+    assert running.configure(listening_more(running.right)) is None
+    assert running.status("right")["state"] == "SAFEOP"
+    assert go(DeviceState.OP) is None
+    running.cycles(3)
+    assert running.status("right")["pd"]["rx"][1]["lost"] == 0
+    assert running.status("right")["pd"]["rx"][1]["received"] > received
+    assert str(go(DeviceState.INIT)).startswith("INIT cannot be requested")
+    assert str(go(3)) == "there is no state 3, expected 2, 4 or 8"
+    number = running.serve(SetState(id=1, station="nobody", state=8))
+    assert str(running.answers[number]) == "there is no station nobody"
+
+
+def test_an_engine_that_ends_waits_for_what_it_builds(tmp_path):
+    running = Running(tmp_path)
+    running.post(wider(running.left))
+    running.plant.close()
+    assert list(tmp_path.glob(".*")) == []
+    assert running.answers == {}

@@ -1,0 +1,172 @@
+"""The command line's side of the control protocol, against a scripted appliance."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+
+import pytest
+
+from devicebus.errors import AlStatusError
+from eap.errors import ControlError
+from eap.ops.client import ControlClient, connect, merge_status
+from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
+
+pytestmark = pytest.mark.net
+
+
+def info(plant: str = "demo", stations: tuple[str, ...] = ("a", "b")) -> ApplianceInfo:
+    return ApplianceInfo(plant, "p.yaml", list(stations), "2026-01-01T00:00:00+00:00", os.getpid())
+
+
+class Script:
+    """Answers each request with the next lines, then hangs up."""
+
+    def __init__(self, *answers: list[dict]) -> None:
+        ours, theirs = socket.socketpair()
+        self.client = ControlClient(ours, info())
+        self.requests: list[dict] = []
+        self._thread = threading.Thread(target=self._play, args=(theirs, answers))
+        self._thread.start()
+
+    def _play(self, connection, answers):
+        with connection, connection.makefile("rb") as lines:
+            for answer in answers:
+                self.requests.append(json.loads(lines.readline()))
+                for message in answer:
+                    connection.sendall(json.dumps(message).encode() + b"\n")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.client.close()
+        self._thread.join()
+
+
+def test_a_request_and_its_result():
+    with Script([{"v": 1, "id": 1, "result": {"written": 1}}]) as script:
+        assert script.client.request("write", station="a", values={"x": 1}) == {"written": 1}
+    assert script.requests == [
+        {"v": 1, "id": 1, "method": "write", "params": {"station": "a", "values": {"x": 1}}}
+    ]
+
+
+def test_an_error_of_a_bus_is_what_it_was():
+    error = {"code": "bus", "message": "refuses OP", "kind": "AlStatusError", "detail": 0x4001B}
+    with (
+        Script([{"v": 1, "id": 1, "error": error}]) as script,
+        pytest.raises(AlStatusError, match="refuses OP") as caught,
+    ):
+        script.client.request_within(20, "bus_bring", state="OP")
+    assert (caught.value.code, caught.value.state) == (0x1B, 4)
+
+
+def test_a_refusal_keeps_its_code():
+    error = {"code": "refused", "message": "held by process 7"}
+    with (
+        Script([{"v": 1, "id": 1, "error": error}]) as script,
+        pytest.raises(ControlError, match="process 7") as caught,
+    ):
+        script.client.request("write")
+    assert caught.value.code == "refused"
+
+
+def test_events_follow_until_one_is_an_error():
+    def event(cycle):
+        return {"station": "a", "cycle": cycle, "values": {}, "quality": {}}
+
+    lines = [
+        {"v": 1, "id": 1, "result": {"subscription": 1}},
+        {"v": 1, "subscription": 1, "event": event(1)},
+        {"v": 1, "subscription": 1, "event": event(2)},
+        {"v": 1, "subscription": 1, "event": {"error": {"code": "unavailable", "message": "t"}}},
+    ]
+    with Script(lines) as script:
+        events = script.client.events(station="a")
+        assert [next(events).cycle, next(events).cycle] == [1, 2]
+        with pytest.raises(ControlError) as caught:
+            next(events)
+        assert caught.value.code == "unavailable"
+
+
+def test_an_appliance_that_goes_is_named():
+    with Script() as script, pytest.raises(ControlError, match=r"demo .* does not answer"):
+        script.client.request("hello")
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path))
+
+
+def listen(folder: ApplianceFolder) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(folder.control_socket))
+    listener.listen()
+    return listener
+
+
+@pytest.mark.usefixtures("root")
+def test_running_appliances_are_chosen_by_plant_and_station(tmp_path):
+    with pytest.raises(ControlError, match="eapctl run PLANT") as caught:
+        connect()
+    assert str(tmp_path) in str(caught.value)
+    with (
+        ApplianceFolder.claim("demo") as demo,
+        ApplianceFolder.claim("line") as line,
+        ApplianceFolder.claim("starting"),
+        listen(demo),
+        listen(line),
+    ):
+        demo.write_info(info())
+        line.write_info(info("line", ("c",)))
+
+        def plants(**choice) -> list[str]:
+            clients = connect(**choice)
+            for client in clients:
+                client.close()
+            return [client.info.plant for client in clients]
+
+        assert plants() == ["demo", "line"]
+        assert plants(plant="line") == ["line"]
+        assert plants(station="b") == ["demo"]
+        with pytest.raises(ControlError, match=r"no station x runs.*demo \(a, b\), line \(c\)"):
+            connect(station="x")
+
+
+@pytest.mark.usefixtures("root")
+def test_client_without_an_answer_names_the_processes_that_are_starting():
+    with ApplianceFolder.claim("demo") as demo, listen(demo) as listener:
+        starting = info()
+        starting.engine = ProcessInfo(7, step="building station a")
+        starting.services = ProcessInfo(0, 1)
+        demo.write_info(starting)
+        (client,) = connect()
+        listener.accept()[0].close()
+        with client, pytest.raises(ControlError) as caught:
+            client.request("hello")
+    assert "; engine is starting (building station a); services ended" in str(caught.value)
+
+
+@pytest.mark.usefixtures("root")
+def test_a_socket_that_does_not_listen_is_named():
+    with ApplianceFolder.claim("demo") as demo:
+        demo.write_info(info())
+        with pytest.raises(ControlError, match="cannot be reached"):
+            connect()
+
+
+def test_status_of_several_becomes_one():
+    first = {"version": 1, "plant": "p", "processes": {"engine": {}}, "stations": [{"name": "a"}]}
+    second = {"version": 1, "plant": "q", "processes": {}, "stations": [{"name": "b"}]}
+    merged = merge_status([first, second])
+    assert merged["processes"] == {"engine": {}}
+    assert [station["name"] for station in merged["stations"]] == ["a", "b"]
+    none = {"findings": [], "audit": None, "listeners": []}
+    assert merged["appliances"] == [
+        {"plant": "p", "stations": ["a"], "processes": {"engine": {}}} | none,
+        {"plant": "q", "stations": ["b"], "processes": {}} | none,
+    ]

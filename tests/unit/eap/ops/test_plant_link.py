@@ -1,0 +1,84 @@
+"""Which running stations belong to a plant, and what they are asked."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from eap.config.load import Plant
+from eap.errors import ControlError
+from eap.ops.plant_change import StationPlan, link_to
+from tests.support.fakeappliance import station
+from tests.support.plantstub import PlantStub
+
+pytestmark = pytest.mark.net
+
+FILE = Path("line.yaml")
+PLANT = Plant("line", (station("mixer"), station("oven")))
+
+
+@pytest.fixture
+def stack(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path / "run"))
+    with ExitStack() as stack:
+        yield stack
+
+
+def test_all_appliances_of_the_plant(stack):
+    PlantStub("line", [station("oven")], stack)
+    PlantStub("hall", [station("mixer")], stack)
+    with link_to(PLANT, FILE) as link:
+        assert (link.stations, link.absent) == (("oven",), ("mixer",))
+
+
+def test_a_blank_station_belongs_to_whoever_has_one_of_its_name(stack):
+    PlantStub("mixer", [station("mixer")], stack, plant_file="")
+    PlantStub("saw", [station("saw")], stack, plant_file="")
+    with link_to(PLANT, FILE) as link:
+        assert link.stations == ("mixer",)
+
+
+def test_nothing_runs(stack):
+    PlantStub("hall", [station("mixer")], stack)
+    with pytest.raises(ControlError, match=r"no station of plant line runs here.*run line\.yaml"):
+        link_to(PLANT, FILE).__enter__()
+
+
+def test_plan_refuses_another_duty_of_the_audit(stack):
+    PlantStub("line", PLANT.stations, stack)
+    with link_to(replace(PLANT, audit_required=True), FILE) as link:
+        plan = link.plan(PLANT.stations[0])
+    assert plan.refused == [
+        "access: audit becomes required: this needs a new start of the appliance"
+    ]
+
+
+def test_requests(stack):
+    stub = PlantStub("line", PLANT.stations, stack)
+    faster = replace(PLANT.stations[0], cycle_us=5000)
+    with link_to(PLANT, FILE) as link:
+        assert (link.export("mixer").spec, link.export("mixer").previous) == (
+            station("mixer"),
+            None,
+        )
+        plan = link.plan(faster)
+        assert plan.differs
+        assert [change.new for change in plan.changes] == ["5000"]
+        assert link.apply(faster, "1").ok
+        assert (link.export("mixer").cause, link.export("mixer").undone) == ("1", False)
+        assert link.export("mixer").previous == station("mixer")
+        assert stub.specs["mixer"] == faster
+        assert link.rollback(station("mixer")).ok
+        assert stub.specs["mixer"] == station("mixer")
+        with pytest.raises(ControlError, match="has not that to go back to"):
+            link.rollback(replace(station("oven"), cycle_us=7000))
+
+
+@pytest.mark.parametrize("field", ["changes", "notes", "refused"])
+def test_anything_is_a_difference(field):
+    none = {"changes": [], "notes": [], "refused": []}
+    assert not StationPlan("mixer", **none).differs
+    assert StationPlan("mixer", **none | {field: ["x"]}).differs

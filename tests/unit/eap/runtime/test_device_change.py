@@ -1,0 +1,190 @@
+"""Plans of other configurations, and what fills dictionaries."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.stored import dump
+from eap.pd.spec import (
+    BusPortSpec,
+    CounterSource,
+    LinkSpec,
+    PortKind,
+    PortSpec,
+    RxAlternateSpec,
+    TakenVariableSpec,
+    VariableSpec,
+    Writer,
+)
+from eap.runtime.device_change import (
+    describe_rest,
+    dump_all,
+    eap_ports,
+    fill_all,
+    find_refusals,
+    make_plan,
+    plan_rollback,
+)
+from eap.runtime.store import Configuration
+
+
+@pytest.fixture
+def spec(stations):
+    bus = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.9.1")
+    return replace(stations[0], ports=(*stations[0].ports, bus))
+
+
+@pytest.fixture
+def dictionaries(spec):
+    made = {"eap0": EapDictionary(spec, "eap0")}
+    fill_all(made, {})
+    return made
+
+
+def test_dictionaries_are_those_of_eap_ports(spec):
+    assert eap_ports(spec) == ["eap0"]
+
+
+def test_what_was_stored_goes_before_the_specification(spec, dictionaries):
+    blank = {"eap0": EapDictionary(replace(spec, variables=(), frames=(), sources=()), "eap0")}
+    fill_all(blank, dump_all(dictionaries))
+    assert dump_all(blank) == dump_all(dictionaries)
+
+
+@pytest.mark.parametrize("plain", [None, {}, {"version": 99}])
+def test_what_was_stored_and_cannot_be_used_does_not(spec, dictionaries, plain):
+    made = {"eap0": EapDictionary(spec, "eap0")}
+    fill_all(made, {"eap0": plain})
+    assert dump_all(made) == dump_all(dictionaries)
+
+
+def test_plan_tells_all_kinds_of_changes(spec, dictionaries):
+    wanted = replace(spec, cycle_us=20_000, sources=(CounterSource("ticks", 3),))
+    plan = make_plan(spec, dictionaries, wanted, {})
+    assert [(port, change.name) for port, change in plan.changes] == [
+        ("eap0", "Configured objects: Device cycle time")
+    ]
+    assert plan.station == ["source of ticks: changed"]
+    assert plan.refused == []
+    assert not plan.is_empty
+    assert plan.objects() == {"eap0": dump(plan.dictionaries["eap0"])}
+    assert make_plan(spec, dictionaries, spec, {}).is_empty
+
+
+def test_plan_of_what_cannot_be(spec, dictionaries):
+    assert make_plan(spec, dictionaries, replace(spec, ports=()), {}).refused
+    (frame,) = spec.frames
+    nowhere = replace(spec, frames=(replace(frame, pds=()),))
+    plan = make_plan(spec, dictionaries, nowhere, {})
+    assert "frame carries no enabled PD" in plan.refused[0]
+    assert plan.dictionaries == {}
+
+
+def test_rollback_takes_the_objects_of_then(spec, dictionaries):
+    assert plan_rollback(spec, dictionaries, None).refused
+    before = replace(spec, cycle_us=20_000)
+    objects = dump_all(dictionaries)
+    objects["eap0"]["objects"]["F800"]["8"] = "204e0000"
+    plan = plan_rollback(spec, dictionaries, Configuration(base="", spec=before, objects=objects))
+    assert plan.spec == before
+    assert plan.objects() == objects
+
+
+def test_rollback_with_alternates(stations):
+    right = stations[1]
+    (pd,) = right.subscriptions
+    alternate = RxAlternateSpec(9, (TakenVariableSpec("ticks", "UINT"),))
+    both = replace(right, subscriptions=(replace(pd, alternates=(alternate,)),))
+    dictionaries = {"eap0": EapDictionary(right, "eap0")}
+    fill_all(dictionaries, {})
+    previous = Configuration(base="", spec=right, objects={})
+    assert plan_rollback(right, dictionaries, previous, both).spec == both
+    assert plan_rollback(right, dictionaries, None, both).objects() == dump_all(dictionaries)
+    slower = replace(right, cycle_us=20_000)
+    before = Configuration(base="", spec=replace(both, cycle_us=20_000))
+    for wanted in (slower, before.spec):
+        assert plan_rollback(right, dictionaries, before, wanted).spec == wanted
+    other = replace(right, cycle_us=20_000)
+    assert plan_rollback(right, dictionaries, previous, other).refused == [
+        "meanwhile it would go back to something else"
+    ]
+
+
+BUS = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.9.1", bus=BusPortSpec())
+
+
+@pytest.fixture
+def plain(stations):
+    return stations[0]
+
+
+def with_port(spec, **changes):
+    return replace(spec, ports=(replace(spec.ports[0], **changes),))
+
+
+def test_same_specification(plain):
+    assert find_refusals(plain, plain) == []
+    assert describe_rest(plain, plain) == []
+
+
+def test_what_the_dictionaries_hold_is_not_told_here(plain):
+    variables = (*plain.variables, VariableSpec("more", "UINT"))
+    changed = replace(plain, cycle_us=20_000, variables=variables, frames=())
+    assert find_refusals(plain, changed) == []
+    assert describe_rest(plain, changed) == []
+
+
+def test_layout_that_changes_under_its_version_is_told(plain):
+    frame = plain.frames[0]
+    shorter = replace(frame.pds[0], variables=frame.pds[0].variables[1:])
+    changed = replace(plain, frames=(replace(frame, pds=(shorter,)),))
+    (line,) = describe_rest(plain, changed)
+    assert "PD 'state' (id 7) changes from 19 to 17 octets" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: replace(s, name="middle"), "station left cannot become middle"),
+        (
+            lambda s: replace(s, net_id="9.9.9.9.9.9"),
+            "the station's router: net_id 1.1.1.1.1.1 -> 9.9.9.9.9.9",
+        ),
+        (
+            lambda s: with_port(s, net_id="9.9.9.9.9.9"),
+            "port eap0: net_id 1.2.3.4.5.1 -> 9.9.9.9.9.9",
+        ),
+        (lambda s: replace(s, ports=()), "port eap0 is gone"),
+        (lambda s: replace(s, ports=(*s.ports, BUS)), "port bus0 is new"),
+        (lambda s: with_port(s, tcp=True), "port eap0: tcp False -> True"),
+    ],
+)
+def test_what_needs_a_new_start(plain, change, words):
+    (reason,) = find_refusals(plain, change(plain))
+    assert reason.startswith(words)
+    assert reason.endswith("needs a new start of the appliance")
+
+
+def test_sources_links_and_variables_of_buses_are_told(plain):
+    on_bus = VariableSpec("bus0.valve.valve", "BOOL", Writer.ENGINE)
+    before = replace(
+        plain,
+        ports=(*plain.ports, BUS),
+        links=(LinkSpec("running", "a"), LinkSpec("ticks", "b", source_bit=3, target_bit=1)),
+        variables=(*plain.variables, on_bus),
+    )
+    after = replace(
+        before,
+        sources=(CounterSource("ticks", 2), CounterSource("more")),
+        links=(LinkSpec("running", "a", swap=True),),
+        variables=(*plain.variables, replace(on_bus, writer=Writer.APPLICATION)),
+    )
+    assert describe_rest(before, after) == [
+        "source of ticks: changed",
+        "source of more: added",
+        "link ticks bit 3 to b bit 1: removed",
+        "link running to a: changed",
+        "variable bus0.valve.valve: changed",
+    ]

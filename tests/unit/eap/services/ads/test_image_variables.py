@@ -1,0 +1,111 @@
+"""The variables of a running station as ADS symbols."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from eap.ads.operation import AdsRefusedError
+from eap.codec.ads import IndexGroup as G
+from eap.codec.adssymbol import SymbolFlag, decode_entry
+from eap.net.image_file import create_image, open_image
+from eap.pd.layout import plan_layout
+from eap.pd.spec import VariableSpec, Writer
+from eap.pd.words import StationWord
+from eap.services.ads.image_variables import StationSymbols
+
+BIG = 0xFFFF
+
+
+@pytest.fixture
+def station(images):
+    return images["left"]
+
+
+@pytest.fixture
+def symbols(station):
+    return StationSymbols(station)
+
+
+def entry(symbols, name):
+    return decode_entry(symbols.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, BIG, name.encode()))[0]
+
+
+def handle(symbols, name):
+    return int.from_bytes(symbols.read_write(G.SYMBOL_HANDLE, 0, 4, name.encode()), "little")
+
+
+def test_every_variable_is_a_symbol_of_its_type(symbols, station):
+    octets, at, names = symbols.read(G.SYMBOL_UPLOAD, 0, 1 << 20), 0, []
+    while at < len(octets):
+        found, at = decode_entry(octets, at)
+        names.append(found.name)
+    assert names == [place.name for place in station.image.layout.variables]
+    setpoint = entry(symbols, "setpoint")
+    assert (setpoint.type_name, setpoint.place.size) == ("ARRAY [0..1] OF REAL", 8)
+    assert (setpoint.comment, setpoint.flags) == ("pressure [bar]", 0)
+    assert entry(symbols, "load").flags == SymbolFlag.READ_ONLY
+
+
+def test_values_are_those_of_the_image(symbols, files):
+    with files["left"].image.writing(Writer.APPLICATION):
+        files["left"].image.write("running", True)
+    assert symbols.read_write(G.VALUE_BY_NAME, 0, BIG, b"running") == b"\1"
+    symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "name"), b"pump\0")
+    assert files["left"].image.read("name") == "pump"
+
+
+def test_variables_of_others_are_only_read(symbols):
+    with pytest.raises(AdsRefusedError, match="ACCESS: load is written by the services"):
+        symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "load"), b"\0")
+
+
+def test_text_in_another_encoding_stays_as_its_client_wrote_it(symbols):
+    place = handle(symbols, "name")
+    symbols.write(G.VALUE_BY_HANDLE, place, "größe\0".encode("latin-1"))
+    assert symbols.read(G.VALUE_BY_HANDLE, place, 6) == "größe\0".encode("latin-1")
+    assert entry(symbols, "name").flags == SymbolFlag.ATTRIBUTES
+
+
+def test_variable_that_has_just_gone_is_refused(symbols, stations, files):
+    store = symbols.store
+    spec = replace(stations[0], variables=stations[0].variables[:1], frames=())
+    gone = r"SYMBOL_VERSION: .*no variable 'running'"
+    create_image(files["left"].path, plan_layout(spec)).close()
+    with pytest.raises(AdsRefusedError, match=gone):
+        store.write("running", b"\1")
+
+
+def test_program_that_writes_keeps_others_out_for_now(symbols, files):
+    with open_image(files["left"].path) as other:
+        other.acquire_writer(Writer.APPLICATION)
+        with pytest.raises(AdsRefusedError, match=r"BUSY: station left.* by process \d+"):
+            symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "running"), b"\1")
+
+
+def test_writer_in_the_middle_is_told(symbols, files):
+    files["left"].image.words[StationWord.APPLICATION_SEQUENCE] += 1
+    with pytest.raises(AdsRefusedError, match="BUSY: station left: the application stopped"):
+        symbols.read(G.VALUE_BY_HANDLE, handle(symbols, "running"), 1)
+
+
+def test_new_layout_is_a_new_version(symbols, stations, files):
+    old = handle(symbols, "running")
+    value = symbols.watch(G.VALUE_BY_HANDLE, old, 1)
+    assert symbols.read(G.SYMBOL_VERSION, 0, 1) == b"\1"
+    spec = replace(stations[0], variables=(VariableSpec("more", "UDINT"), *stations[0].variables))
+    with create_image(files["left"].path, plan_layout(spec)) as fresh:
+        assert symbols.read(G.SYMBOL_VERSION, 0, 1) == b"\2"
+        with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
+            symbols.read(G.VALUE_BY_HANDLE, old, 1)
+        symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "running"), b"\1")
+        assert fresh.image.read("running") is True
+        assert value() == b"\1"
+        symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "more"), b"\x08\0\0\0")
+
+
+def test_image_that_cannot_be_opened_is_not_ready(symbols, files):
+    files["left"].path.unlink()
+    files["left"].retire()
+    with pytest.raises(AdsRefusedError, match=r"NOT_READY: .*no process image"):
+        symbols.read(G.SYMBOL_VERSION, 0, 1)

@@ -1,0 +1,268 @@
+from __future__ import annotations
+
+import asyncio
+from inspect import isawaitable
+from ipaddress import IPv4Address
+from typing import Any
+
+import pytest
+
+from eap.ams.endpoint import Way
+from eap.ams.routes import Origin, Route
+from eap.codec.staticroutes import StaticRoute, dump, parse
+from eap.errors import ControlError, EnvironmentalError
+from eap.ids import NetId
+from eap.services.control.route_methods import RouteMethods
+from eap.services.routing.neighbours import Neighbour
+from tests.support.routeviews import DIRECTORY, Left
+from tests.support.routing import while_serving
+
+PLC = {"station": "left", "name": "plc", "net_id": "5.1.2.3.1.1", "via": "ams-tcp:10.0.0.5"}
+
+
+@pytest.fixture
+def left():
+    return Left()
+
+
+@pytest.fixture
+def methods(left):
+    return RouteMethods({"left": left.view}, DIRECTORY).table()
+
+
+@pytest.fixture
+def ask(methods):
+    def ask(method, **params):
+        result = methods[f"routes_{method}"](params)
+        return asyncio.run(result) if isawaitable(result) else result
+
+    return ask
+
+
+def names(left: Left) -> list[str]:
+    return [route.name for route in left.router.table]
+
+
+def refused(ask: Any, method: str, **params: Any) -> tuple[str, str]:
+    with pytest.raises(ControlError) as caught:
+        ask(method, **params)
+    return caught.value.code, str(caught.value)
+
+
+def test_list_of_all_and_of_one(ask):
+    (row,) = ask("list")
+    assert [each.name for each in row.routes] == ["right"]
+    assert ask("list", station="left") == [row]
+    assert refused(ask, "list", station="lefd") == (
+        "unknown_name", "no station 'lefd' here, did you mean left?"
+    )  # fmt: skip
+
+
+def test_add_and_remove(ask, left):
+    answer = ask("add", **PLC, octets=6, timeout_ms=900, unidirectional=True, probed=False)
+    row = answer.route
+    assert (row.name, row.transport, row.address, row.origin) == (
+        "plc", "ams-tcp:10.0.0.5:48898", "10.0.0.5:48898", "added"
+    )  # fmt: skip
+    assert answer.warnings == []
+    (route,) = (each for each in left.router.table if each.name == "plc")
+    assert (route.origin, route.octets, route.timeout_ns) == (Origin.ADDED, 6, 900_000_000)
+    assert (route.is_unidirectional, route.is_probed) == (True, False)
+    assert names(Left()) == ["right", "plc"]  # it is kept
+    removed = ask("remove", station="left", route="plc").route
+    assert (removed.name, removed.net_id, removed.transport) == ("plc", "5.1.2.3.1.1", "ams-tcp")
+    assert names(left) == ["right"]
+
+
+def test_route_of_the_plant_needs_no_net_id(ask, left):
+    ask("add", station="left", name="third", via="udp:127.0.9.9", octets=6)
+    assert str(left.routes.added[0].net_id) == "127.0.9.3.1.1"
+    ask("add", station="left", name="others", via="right/eap0", octets=0)
+    assert left.routes.added[1].router == "127.0.9.2.1.1"
+    code, text = refused(ask, "add", station="left", name="rigth", via="udp:127.0.9.9")
+    assert code == "value"
+    assert text == "a NetID is needed: 'rigth' is no station of the plant, did you mean right?"
+
+
+def test_replaced_route_goes(ask, left):
+    ask("add", **PLC)
+    ask("add", **(PLC | {"name": "press", "net_id": "5.1.2.4.1.1"}), replaces="plc")
+    assert names(left) == ["right", "press"]
+
+
+def test_what_speaks_against_a_route_is_told(ask, left):
+    net_id = NetId.parse(PLC["net_id"])
+    left.router.add_route(Route(net_id, "first", Way("udp:eap0", "127.0.9.9:34980"), octets=6))
+    (warning,) = ask("add", **PLC).warnings
+    assert warning.startswith("route plc (5.1.2.3.1.1, 10.0.0.5:48898 by ams-tcp)")
+    assert "is not taken for 5.1.2.3.1.1: first" in warning
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"net_id": "5.1.2"}, "is not an AMS NetID"),
+        ({"via": "nowhere"}, "neither a station of the plant nor one of"),
+        ({"via": "ethernet:02:00:00:00:00:09"}, "no EAP port here is on ethernet"),
+        ({"net_id": "127.0.9.1.1.1"}, "is one of this station itself"),
+        ({"net_id": "127.0.9.2.1.1"}, "of the plant file is for the same NetIDs"),
+        ({"virtual": "x"}, "is not an AMS NetID"),
+        ({"via": "mqtt:line"}, "has no door mqtt:line"),
+    ],
+)
+def test_routes_that_cannot_be_are_refused(ask, left, change, reason):
+    assert reason in refused(ask, "add", **(PLC | change))[1]
+    assert names(left) == ["right"]
+
+
+def test_remove_of_what_was_not_added(ask):
+    assert refused(ask, "remove", station="left", route="right")[0] == "refused"
+    assert "no route 'x' was added" in refused(ask, "remove", station="left", route="x")[1]
+
+
+def test_what_cannot_be_kept_is_refused(ask, left, monkeypatch):
+    def fail(_):
+        raise EnvironmentalError("disk full")
+
+    monkeypatch.setattr(left.routes._store, "save", fail)
+    assert refused(ask, "add", **PLC) == ("unavailable", "disk full")
+
+
+def test_virtual_routes_are_told_by_their_net_ids_here(ask):
+    ask("add", **PLC, virtual="9.9.9.9.1.1")
+    removed = ask("remove", station="left", route="9.9.9.9.1.1").route
+    assert (removed.net_id, removed.real) == ("9.9.9.9.1.1", "5.1.2.3.1.1")
+
+
+def test_test_asks(methods, left):
+    testing = methods["routes_test"]({"station": "left", "target": "left", "timeout_ms": 200})
+    found = asyncio.run(while_serving(testing, left.router))
+    assert (found.ok, found.state) == (True, "RUN")
+
+
+def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
+    file = [
+        StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
+        StaticRoute("old", "5.1.2.4.1.1", "3", "PROFIBUS"),
+        StaticRoute("bare", "5.1.2.5.1.1", ""),
+        StaticRoute("wrong", "5.1.2", "10.0.0.6"),
+        StaticRoute("self", "127.0.9.1.1.1", "10.0.0.7"),
+    ]
+    xml = dump("x", "1.1.1.1.1.1", file, tcp_port=48898)
+    dry = ask("import", station="left", xml=xml, dry_run=True)
+    assert names(left) == ["right"]
+    rows = ask("import", station="left", xml=xml)
+    assert rows == dry
+    assert [(row.name, bool(row.reason)) for row in rows] == [
+        ("plc", False), ("old", True), ("bare", True), ("wrong", True), ("self", True)
+    ]  # fmt: skip
+    assert rows[0].via == "ams-tcp:10.0.0.5"
+    assert rows[1].reason == "its type is 'PROFIBUS', expected TCP_IP"
+    assert names(left) == ["right", "plc"]
+    with pytest.raises(ControlError) as caught:
+        ask("import", station="left", xml="<a/>")
+    code, text = caught.value.code, str(caught.value)
+    assert (code, text) == ("value", "it begins with 'a', expected TcConfig")
+
+
+def test_export_holds_ams_tcp_and_names_the_rest(ask):
+    ask("add", **PLC)
+    ask("add", **(PLC | {"name": "behind", "net_id": "5.1.2.4.1.1", "via": "ams-tcp:plc:1000"}))
+    ask("add", **(PLC | {"name": "nat", "net_id": "5.1.2.5.1.1", "virtual": "9.9.9.9.1.1"}))
+    found = ask("export", station="left")
+    assert found.left_out == ["right", "nat"]
+    assert parse(found.xml) == [
+        StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
+        StaticRoute("behind", "5.1.2.4.1.1", "plc:1000"),
+    ]
+    assert ask("import", station="left", xml=found.xml)[1].reason == ""
+
+
+class Scanner:
+    """Finds two routers, one of them is known."""
+
+    def __init__(self):
+        self.asked = []
+
+    async def scan(self, address="", *, wait_s):
+        self.asked.append((address, wait_s))
+        return [
+            Neighbour("right", NetId.parse("127.0.9.2.1.1"), "127.0.9.2", "1.2.3"),
+            Neighbour("cx", NetId.parse("5.1.2.3.1.1"), "10.0.0.5", ""),
+        ]
+
+
+def test_scan_tells_who_is_there_and_learns(ask, left):
+    left.routes.scanners.append(scanner := Scanner())
+    known, new = ask("scan", station="left", address="10.0.0.255", wait_ms=20)
+    assert scanner.asked == [("10.0.0.255", 0.02)]
+    assert (known.name, known.route, known.is_learned) == ("right", "right", False)
+    assert (new.station, new.net_id, new.address) == ("left", "5.1.2.3.1.1", "10.0.0.5")
+    assert (new.route, new.is_learned) == ("cx", True)
+    assert ask("scan")[1].is_learned  # again, which makes it younger
+
+
+def test_scan_from_a_default_route_knows_no_route(ask, left):
+    left.routes.scanners.append(Scanner())
+    ask("add", station="left", name="others", via="right/eap0", octets=0)
+    row = ask("scan")[1]
+    assert (row.route, row.is_learned) == ("cx", True)
+
+
+def test_scan_that_cannot_be(ask):
+    assert ask("scan") == []  # nobody here has an address
+    for params, code, text in (
+        ({"station": "left"}, "unavailable", "no IP address at which it serves AMS"),
+        ({"address": "plc"}, "value", "address: Expected 4 octets in 'plc'"),
+    ):
+        with pytest.raises(ControlError, match=text) as caught:
+            ask("scan", **params)
+        assert caught.value.code == code
+
+
+class Introducer:
+    """Stands for another router that is asked for a route."""
+
+    address = IPv4Address("127.0.9.1")
+
+    def __init__(self, result):
+        self.result = result
+        self.asked = []
+
+    async def introduce(self, wanted, address, *, wait_s):
+        self.asked.append((*wanted, address, wait_s))
+        return self.result
+
+
+@pytest.mark.parametrize(
+    ("result", "ok", "text"),
+    [
+        (0, True, "added"),
+        (
+            0x704,
+            False,
+            "error 0x704 (not permitted: read only, protected, or a wrong user or password)",
+        ),
+        (None, False, "no answer by UDP 48899"),
+    ],
+)
+def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
+    left.routes.scanners.append(other := Introducer(result))
+    login = {"user": "Administrator", "password": "1"}
+    row = ask("introduce", station="left", address="10.0.0.5", **login, wait_ms=20)
+    assert (row.ok, row.result, row.text) == (ok, result, text)
+    net_id = NetId.parse("127.0.9.1.1.1")
+    assert other.asked == [("left", net_id, "Administrator", "1", "10.0.0.5", 0.02)]
+
+
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ({"address": "plc"}, "address: Expected 4 octets in 'plc'"),
+        ({"address": "10.0.0.5", "user": "a\0"}, "a NUL in a text"),
+        ({"address": "10.0.0.5"}, "no IP address at which it serves AMS"),
+    ],
+)
+def test_introduction_that_cannot_be(ask, params, text):
+    with pytest.raises(ControlError, match=text):
+        ask("introduce", station="left", **params)

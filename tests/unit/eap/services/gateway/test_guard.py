@@ -1,0 +1,83 @@
+"""Who may do what, and what the audit is told of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from eap.ads.operation import Read, Write
+from eap.ams.access import AccessList
+from eap.ams.authorized_request import AuditEntry
+from eap.ams.endpoint import Way
+from eap.ams.spec import AccessRule, AccessService
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.mailbox import MailboxType
+from eap.gateway.error_table import Cause
+from eap.gateway.refusal import refuse
+from eap.ids import NetId
+from eap.services.gateway.client_session import GatewayReply
+from eap.services.gateway.guard import Guard, RuleTarget, reason_of_refusal, result_of
+
+TARGET = RuleTarget(NetId.parse("5.1.1.1.3.1"), 1001)
+HERE, ELSEWHERE = Way("udp:eap0", "127.0.0.1:1"), Way("udp:eap0", "10.0.0.9:1")
+READ, WRITE = Read(IndexGroup.SDO, 0x1018_0001, 4), Write(IndexGroup.SDO, 0x6040_0000, b"1")
+
+
+def test_rules_that_change_count_at_once() -> None:
+    rules: list[AccessRule] = []
+    guard = Guard(lambda: AccessList(tuple(rules)))
+    assert guard.judge(HERE, TARGET, WRITE).is_allowed
+    assert not guard.judge(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert guard.judge(HERE, TARGET, READ, by_rule=True).is_allowed
+    assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+    rules.append(AccessRule("all", services=(AccessService.WRITE,)))
+    assert guard.judge(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+
+
+def test_the_audit_is_told_of_changes_and_refusals() -> None:
+    guard = Guard(AccessList)
+    told: list[AuditEntry] = []
+    guard.on_audit.append(told.append)
+    for way, operation in ((HERE, READ), (HERE, WRITE), (ELSEWHERE, WRITE)):
+        guard.tell(way, TARGET, operation, guard.judge(way, TARGET, operation), 0)
+    assert [(each.way, each.header.target_port, each.operations[0].result) for each in told] == [
+        (HERE, 1001, 0),
+        (ELSEWHERE, 1001, AdsError.ACCESS_DENIED),
+    ]
+
+
+def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
+    guard = Guard(AccessList)
+    recorded: list[AuditEntry] = []
+    guard.before_change = lambda entry: recorded.append(entry) or "the audit cannot be written"  # type: ignore[func-returns-value]
+    verdict = guard.judge(HERE, TARGET, WRITE)
+    assert (verdict.is_allowed, verdict.why) == (False, "the audit cannot be written")
+    assert reason_of_refusal(verdict) is Cause.NOT_RECORDED
+    assert reason_of_refusal(guard.judge(ELSEWHERE, TARGET, WRITE)) is Cause.DENIED
+    assert guard.judge(HERE, TARGET, READ).is_allowed
+    assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+    assert [each.operations[0].operation for each in recorded] == [WRITE]
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "result"),
+    [
+        (MailboxType.COE, "0030 60 4060 00 00000000", 0),
+        (MailboxType.COE, "0020 80 4060 00 00000206", AdsError.NOT_FOUND),
+        (MailboxType.COE, "0080 81 00 0000 00000000", 0),
+        (MailboxType.SOE, "04 40 2000", 0),
+        (MailboxType.SOE, "14 40 2000 0110", AdsError.GENERAL),
+        (MailboxType.FOE, "04 00 00000000", 0),
+        (MailboxType.FOE, "05 00 01800000", AdsError.GENERAL),
+        (MailboxType.FOE, "06 00 00006400", AdsError.BUSY),
+        (MailboxType.ERR, "0100 0200", AdsError.SERVICE),
+    ],
+)
+def test_how_a_request_came_out(kind: MailboxType, body: str, result: int) -> None:
+    assert result_of([GatewayReply(kind, bytes.fromhex(body))]) == result
+
+
+def test_how_a_request_came_out_that_the_gateway_answers() -> None:
+    refusal = refuse(MailboxType.COE, bytes(10), Cause.TIMEOUT)
+    assert result_of([GatewayReply(*refusal, reason=Cause.TIMEOUT)]) == AdsError.TIMEOUT
+    assert result_of([]) is None

@@ -1,0 +1,111 @@
+"""Frames of type 5 as datagrams and on Ethernet: who is answered, and how."""
+
+from __future__ import annotations
+
+import pytest
+
+from eap.ams.endpoint import Door
+from eap.runtime.discards import Refusal
+from eap.services.gateway.gateway_transport import GatewayDoor
+from eap.services.transports.mailbox_frames import ChannelCarrier, MailboxIntake
+from tests.support import aoe
+from tests.support.routing import entrance, station
+
+TARGET = "1.1.1.1.2.1"
+
+
+class Wire:
+    """A channel that keeps what it is to send, and an origin."""
+
+    def __init__(self, headroom: bytes = b"", minimum_size: int = 0, sender: str = "peer") -> None:
+        self.minimum_size = minimum_size
+        self.sent: list[tuple[str, bytes]] = []
+        self._headroom = headroom
+        self._sender = sender
+        self.is_broken = False
+
+    def link_header(self, destination):
+        return destination.encode() + self._headroom if self._headroom else b""
+
+    def send(self, frames, now_ns):
+        self.sent += [(frame.destination, bytes(frame.buffer)) for frame in frames]
+        return frames if self.is_broken else ()
+
+    def sender_of(self, data):
+        return self._sender
+
+
+def tell(wire: Wire, frame: bytes, *, for_many: bool = False, room: int = 0) -> Refusal | None:
+    there = station(TARGET)
+    carrier = ChannelCarrier(wire)
+    there.add_door(Door("door", room), carrier)
+    intake = MailboxIntake(entrance(there), GatewayDoor([]), carrier, lambda data: for_many)
+    return intake.take(memoryview(frame + bytes(20)), len(frame), 0, wire)
+
+
+def ask(target: str = TARGET, **more) -> bytes:
+    return aoe.frame(aoe.packet(target, 4, b"abc"), **more)
+
+
+def test_answer_goes_to_the_sender():
+    wire = Wire()
+    assert tell(wire, ask()) is None
+    ((destination, frame),) = wire.sent
+    assert destination == "peer"
+    assert aoe.answer(frame).data == b"\4cba"
+
+
+def test_answer_has_the_headers_and_the_size_that_its_wire_wants():
+    wire = Wire(b"!", 90)
+    tell(wire, ask())
+    ((_, frame),) = wire.sent
+    assert frame.startswith(b"peer!")
+    assert len(frame) == 90
+    assert aoe.answer(frame[5:]).data == b"\4cba"
+
+
+def test_who_has_no_address_gets_no_answer():
+    wire = Wire(sender="")
+    assert tell(wire, ask()) is Refusal.MAILBOX
+    assert wire.sent == []
+
+
+def test_answers_fit_the_transport():
+    wire = Wire()
+    tell(wire, aoe.frame(aoe.packet(TARGET, 4, b"x" * 200)), room=100)
+    assert len(wire.sent) > 1
+    assert all(len(aoe.opened(frame)) <= 100 for _, frame in wire.sent)
+
+
+def test_frame_that_the_network_does_not_take():
+    wire = Wire()
+    wire.is_broken = True
+    assert ChannelCarrier(wire).send("peer", (b"x" * 32,)) == "the network took no frame"
+
+
+@pytest.mark.parametrize(("for_many", "answers"), [(False, 1), (True, 0)])
+def test_stranger_is_told_unless_many_were_asked(for_many, answers):
+    wire = Wire()
+    assert tell(wire, ask("9.9.9.9.9.9"), for_many=for_many) is None
+    assert len(wire.sent) == answers
+
+
+def test_what_is_not_taken_has_a_reason():
+    assert tell(Wire(), ask(kind=3)) is Refusal.MAILBOX
+
+
+@pytest.mark.parametrize(
+    ("frame", "behind", "for_many", "reason"),
+    [
+        (ask(), [], False, None),
+        (ask()[:-1], [], False, Refusal.TRUNCATED),
+        (ask(kind=3), [], False, Refusal.MAILBOX),
+        (ask(kind=3), ["a gateway"], False, None),
+        (ask(kind=3), ["a gateway"], True, Refusal.MAILBOX),
+    ],
+)
+def test_frame_that_another_intake_takes_is_only_judged(frame, behind, for_many, reason):
+    gateway = GatewayDoor([(object(), name) for name in behind])
+    carrier = ChannelCarrier(Wire())
+    intake = MailboxIntake(entrance(station(TARGET)), gateway, carrier, lambda data: for_many)
+    assert intake.judge(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason

@@ -1,0 +1,109 @@
+"""Routes and access of a plant file, for a router."""
+
+from __future__ import annotations
+
+import pytest
+
+from eap.ams.endpoint import Way
+from eap.ams.routes import Origin, Route
+from eap.ams.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
+from eap.ids import NetId
+from eap.services.routing import planned
+from eap.services.routing.planned import access_of, make_router, to_route, to_way
+from tests.unit.eap.runtime.conftest import eap_port, left
+
+UDP = HopSpec(DoorKind.UDP, "eap0", "127.0.1.2:34980")
+WAY = Way("udp:eap0", "127.0.1.2:34980")
+THERE = NetId.parse("5.1.2.3.1.1")
+
+
+def test_route_has_all_of_its_specification():
+    spec = RouteSpec(name="plc", net_id=str(THERE), hop=UDP, timeout_ms=700, router="7.7.7.7.1.1")
+    assert to_route(spec, WAY, Origin.ADDED) == Route(
+        THERE,
+        "plc",
+        WAY,
+        Origin.ADDED,
+        timeout_ns=700_000_000,
+        router=NetId.parse("7.7.7.7.1.1"),
+    )
+
+
+def test_virtual_net_id_is_the_one_that_is_known_here():
+    spec = RouteSpec(name="plc", net_id=str(THERE), hop=UDP, virtual="6.6.6.6.1.1")
+    route = to_route(spec, WAY, Origin.STATIC)
+    assert (str(route.net_id), route.real) == ("6.6.6.6.1.1", THERE)
+
+
+@pytest.mark.parametrize(
+    ("hop", "way"),
+    [
+        (UDP, Way("udp:eap0", "127.0.1.2:34980")),
+        (HopSpec(DoorKind.ETHERNET, "eap1", "1.2.3.4.5.6"), Way("ethernet:eap1", "1.2.3.4.5.6")),
+        (HopSpec(DoorKind.AMS_TCP, "", "10.0.0.5:48898"),
+         Way("ams-tcp:10.0.0.5:48898", "10.0.0.5:48898")),
+        (HopSpec(DoorKind.MQTT, "line", "1.2.3.4.5.6"), Way("mqtt:line", "1.2.3.4.5.6")),
+    ],
+)  # fmt: skip
+def test_hops(hop, way):
+    assert to_way(hop) == way
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "address"),
+    [
+        (DoorKind.UDP, "10.0.0.5", "10.0.0.5:34980"),
+        (DoorKind.TCP, "10.0.0.5:7", "10.0.0.5:7"),
+        (DoorKind.ETHERNET, "02-00-00-00-0A-01", "02:00:00:00:0a:01"),
+    ],
+)
+def test_each_address_is_written_in_one_way(kind, text, address):
+    assert to_way(HopSpec(kind, "eap0", text)).connection == address
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (DoorKind.UDP, "mill"),
+        (DoorKind.UDP, "10.0.0.5:0x10"),
+        (DoorKind.TCP, "02:00:00:00:00:01"),
+        (DoorKind.UDP, "239.1.1.1"),
+        (DoorKind.ETHERNET, "10.0.0.5"),
+        (DoorKind.ETHERNET, "01:01:05:04:00:00"),
+    ],
+)
+def test_what_is_no_address_of_a_station_is_refused(kind, text):
+    with pytest.raises(ValueError, match=r"10\.0|0x10|mill|239|01:01|02:00"):
+        to_way(HopSpec(kind, "eap0", text))
+
+
+def test_addresses_of_the_station_are_this_host():
+    station = left(eap_port(1, interface="udp://10.0.0.1"))
+    access = access_of(station, RoutingSpec(access=(AccessRule("no", allow=False),)))
+    assert access.is_this_host(Way("ams-tcp", "10.0.0.1:4711#1"))
+    assert not access.is_this_host(Way("ams-tcp", "10.0.0.2:4711#1"))
+    way = Way("ams-tcp", "10.0.0.2:4711#1")
+    assert not access.grants(way, THERE, THERE, 1).may_read
+
+
+def test_network_that_may_ask_nothing_is_refused_whatever_the_rules_say():
+    brokers = (
+        MqttSpec(network="hall", host="b", is_unidirectional=True),
+        MqttSpec(network="line", host="b"),
+    )
+    access = access_of(left(), RoutingSpec(mqtt=brokers, access=(AccessRule("all"),)))
+    granted = [access.grants(Way(door, "5.1.2.3.1.1"), THERE, THERE, 1).may_read
+               for door in ("mqtt:hall", "mqtt:line")]  # fmt: skip
+    assert granted == [False, True]
+
+
+def test_router_knows_its_net_ids():
+    router = make_router(left(), RoutingSpec())
+    assert {str(each) for each in router.net_ids} == {"1.1.1.1.1.1", "1.2.3.4.5.1"}
+
+
+def test_all_addresses_of_the_machine_are_those_of_a_port_at_any(monkeypatch):
+    monkeypatch.setattr(planned, "own_addresses", lambda: [("eth7", "10.0.0.7")])
+    access = access_of(left(eap_port(1, interface="udp://0.0.0.0")), RoutingSpec())
+    assert access.is_this_host(Way("ams-tcp", "10.0.0.7:4711#1"))
+    assert not access.is_this_host(Way("ams-tcp", "10.0.0.8:4711#1"))

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable
+
+import pytest
+
+from eap.ads.answer import AmsAnswer
+from eap.ads.operation import Operation, Read, ReadState, ReadWrite
+from eap.ads.query import decode_outcome, encode_query
+from eap.ams.endpoint import Way
+from eap.ams.hop_report import HopQuestion, decode_report
+from eap.codec.ads import IndexGroup
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+from eap.services.routing.route_query import Whereabouts
+from eap.services.routing.service import LocalRequest
+from tests.support.tracedplant import Line, to
+
+WAY = Way("link", "island-09")
+TARGET = NetId.parse("5.1.1.2.3.1")
+G = IndexGroup
+
+
+class Rest:
+    """What stands behind: it says that it was asked."""
+
+    ports = frozenset((10_000,))
+
+    def __init__(self) -> None:
+        self.gone: list[Way] = []
+
+    def answer(self, request: LocalRequest) -> AmsAnswer:
+        return AmsAnswer(b"rest" + bytes((request.header.command,)))
+
+    def client_gone(self, way: Way) -> None:
+        self.gone.append(way)
+
+
+def service(rest: Rest) -> Whereabouts:
+    line = Line()
+    station = line.add(1, to(2))
+    line.add(2)
+    return Whereabouts(station, rest)
+
+
+def ask(operation: Operation) -> AmsAnswer:
+    command, body = encode_query(operation)
+    header = AmsHeader(NetId.parse("5.1.1.1.1.1"), 10_000, NetId.parse("9.9.9.9.1.1"), 1, command)
+
+    async def get() -> AmsAnswer:
+        answer = service(Rest()).answer(LocalRequest(header, body, WAY))
+        return await answer if isinstance(answer, Awaitable) else answer
+
+    return asyncio.run(get())
+
+
+@pytest.mark.parametrize(("further", "station"), [(0, "island-01"), (1, "island-02")])
+def test_a_question_is_answered_or_handed_on(further: int, station: str) -> None:
+    question = HopQuestion(TARGET, 1001, further)
+    answer = ask(ReadWrite(G.WHEREABOUTS, 0, 4096, question.encode()))
+    outcome = decode_outcome(9, answer.error_code, answer.data)
+    assert decode_report(outcome.data).station == station
+
+
+@pytest.mark.parametrize(
+    "operation",
+    [
+        ReadWrite(G.WHEREABOUTS, 0, 4096, b"\5\1"),
+        ReadWrite(G.WHEREABOUTS, 0, 10, HopQuestion(TARGET, 1001).encode()),
+    ],
+)
+def test_questions_that_are_too_short_and_answers_that_are_too_long(operation: Operation) -> None:
+    assert ask(operation).data == bytes.fromhex("05070000 00000000")
+
+
+@pytest.mark.parametrize(
+    "operation", [ReadState(), Read(G.WHEREABOUTS, 0, 4), ReadWrite(G.SYMBOL_HANDLE, 0, 4, b"x")]
+)
+def test_everything_else_is_for_who_stands_behind(operation: Operation) -> None:
+    assert ask(operation).data.startswith(b"rest")
+
+
+def test_ports_and_clients_are_those_of_who_stands_behind() -> None:
+    rest = Rest()
+    here = service(rest)
+    assert here.ports is rest.ports
+    here.client_gone(WAY)
+    assert rest.gone == [WAY]

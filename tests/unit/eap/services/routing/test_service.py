@@ -1,0 +1,29 @@
+"""The two sides of a router: whoever stands there fits."""
+
+from __future__ import annotations
+
+from inspect import signature
+
+import pytest
+
+from eap.services.ads.ads_service import AdsService
+from eap.services.routing.local_client import LocalClient
+from eap.services.routing.service import Carrier, Service
+from eap.services.transports.ams_transport import AmsClients
+from eap.services.transports.mailbox_frames import ChannelCarrier
+from eap.services.transports.mailbox_stream import MailboxStreams
+from tests.support.routing import KeepingCarrier, StubService
+
+
+@pytest.mark.parametrize("service", [AdsService, StubService])
+def test_services(service):
+    for method in ("answer", "client_gone"):
+        asked = [*signature(getattr(Service, method)).parameters]
+        assert [*signature(getattr(service, method)).parameters] == asked
+
+
+@pytest.mark.parametrize(
+    "carrier", [AmsClients, ChannelCarrier, KeepingCarrier, LocalClient, MailboxStreams]
+)
+def test_carriers(carrier):
+    assert [*signature(carrier.send).parameters] == [*signature(Carrier.send).parameters]

@@ -1,0 +1,314 @@
+"""A station's router in its loop: doors, services, time-outs, local clients."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from eap.ads.answer import AmsAnswer
+from eap.ams.access import AccessList
+from eap.ams.admission import Limits
+from eap.ams.endpoint import Door, Way
+from eap.ams.routes import Route
+from eap.ams.spec import AccessRule
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+from eap.services.routing import station_router
+from eap.services.routing.station_router import StationRouter
+from tests.support import aoe
+from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
+from tests.support.eventually import eventually, settle
+from tests.support.routing import KeepingCarrier, StubService, while_serving
+
+ROUTER, DEVICE = NetId.parse("1.1.1.1.1.1"), NetId.parse("1.1.1.1.2.1")
+CLIENT = "192.168.9.9.1.1:33000"
+FAR = "7.7.7.7.1.1:851"
+HOP = Way("out", "hop")
+PEER = Way("in", "peer")
+DOORS = (
+    Door("in", is_stream=True, is_hub=True),
+    Door("out"),
+    Door("narrow", room=60),
+    Door("ams-tcp", is_stream=True),
+)
+
+
+class Scene:
+    """A station with doors whose packets are kept."""
+
+    def __init__(self, **more: object) -> None:
+        self.carrier = KeepingCarrier()
+        self.service = StubService()
+        self.station = StationRouter("island", ROUTER, [DEVICE], **more)
+        self.station.add_service(DEVICE, self.service)
+        for door in DOORS:
+            self.station.add_door(door, self.carrier)
+
+    def add_route(self, **more: object) -> None:
+        net_id = NetId.parse(FAR.partition(":")[0])
+        self.station.add_route(Route(net_id, "far", HOP, is_probed=False, **more))
+
+    def ask(self, target: str = f"{DEVICE}:65535", way: Way = PEER, **more) -> None:
+        self.station.receive(Ams(target, CLIENT, **more).octets(), *way)
+
+    @property
+    def sent(self) -> list[Ams]:
+        return [packet for _, packet in self.carrier.sent]
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+def test_service_answers_where_the_request_came_from(scene):
+    scene.ask(body=b"abc", invoke_id=5)
+    ((connection, answer),) = scene.carrier.sent
+    assert connection == "peer"
+    assert (answer.target, answer.source) == (CLIENT, f"{DEVICE}:65535")
+    assert (answer.flags, answer.invoke_id, answer.body) == (5, 5, b"\0\0\0\0\2cba")
+
+
+def test_first_service_that_has_the_port_answers(scene):
+    scene.station.add_service(DEVICE, slave := StubService(lambda _: AmsAnswer(b"1001"), 1001))
+    scene.ask(f"{DEVICE}:1001")
+    scene.ask(f"{DEVICE}:1002")
+    slave.ports.add(1002)
+    scene.ask(f"{DEVICE}:1002")
+    slave.ports.remove(1001)
+    scene.ask(f"{DEVICE}:1001")
+    assert [(each.error, each.body) for each in scene.sent] == [
+        (0, b"1001"),
+        (6, b""),
+        (0, b"1001"),
+        (6, b""),
+    ]
+
+
+class PromptService(StubService):
+    """Has some answers at hand, and fails at a body that says so."""
+
+    def answer_now(self, header: AmsHeader, body: bytes) -> AmsAnswer | None:
+        if body == b"fail":
+            raise RuntimeError("a fault")
+        return AmsAnswer(b"now " + body) if body[:4] == b"fast" else None
+
+
+def test_what_a_service_has_at_hand_is_answered_without_its_lane(scene):
+    scene.service.ports.clear()
+    scene.station.add_service(DEVICE, PromptService())
+    for number, body in enumerate((b"fast", b"slow", b"fail")):
+        scene.ask(body=body, invoke_id=number)
+    found = [(each.invoke_id, each.body) for each in scene.sent]
+    assert found == [(0, b"now fast"), (1, bytes(4) + b"\2wols"), (2, bytes(4) + b"\2liaf")]
+    assert scene.station.stats().in_flight == 0
+    traffic = scene.station.record.connections.snapshot()[PEER]
+    assert (traffic.requests, traffic.answers) == (3, 3)
+
+
+def test_what_is_at_hand_does_not_overtake_what_its_client_asked_before(scene):
+    gate = asyncio.Event()
+
+    async def wait(request):
+        await gate.wait()
+        return AmsAnswer(request.body)
+
+    async def script():
+        scene.station.add_service(DEVICE, PromptService(wait, 1001))
+        other = Way("in", "other")
+        scene.ask(f"{DEVICE}:1001", body=b"slow")
+        scene.ask(f"{DEVICE}:1001", body=b"fast")
+        scene.ask(f"{DEVICE}:1001", other, body=b"fast of another")
+        gate.set()
+        await settle()
+
+    asyncio.run(while_serving(script(), scene.station))
+    assert [each.body for each in scene.sent] == [b"now fast of another", b"slow", b"fast"]
+
+
+def test_long_answer_goes_in_fragments_where_the_door_is_narrow(scene):
+    scene.ask(way=Way("narrow", "peer"), body=b"x" * 100)
+    assert [each.command for each in scene.sent] == [0x0902] * 5
+
+
+def test_access_rules_come_before_services():
+    scene = Scene(access=AccessList([AccessRule("nobody", allow=False)]))
+    entries = []
+    scene.station.on_audit.append(entries.append)
+    scene.ask(body=aoe.read_body(0))
+    (answer,) = scene.sent
+    assert (answer.error, answer.body[:4]) == (0x723, b"")
+    assert [each.header.target for each in entries] == [DEVICE]
+
+
+def test_audit_is_kept_before_the_answer_leaves():
+    scene = Scene(access=AccessList([AccessRule("nobody", allow=False)]))
+    sent = []
+    scene.station.on_audit.append(lambda _: sent.append(len(scene.sent)))
+    scene.ask(body=aoe.read_body(0))
+    assert (sent, len(scene.sent)) == ([0], 1)
+
+
+def test_source_of_this_station_is_believed_to_programs_of_this_host_only(scene):
+    packet = Ams(f"{DEVICE}:65535", f"{ROUTER}:300", command=aoe.READ_STATE).octets()
+    scene.station.receive(packet, "ams-tcp", "10.0.0.9:4711#1")
+    scene.station.receive(packet, "ams-tcp", "127.0.0.1:4711#2")
+    assert [each.error for each in scene.sent] == [7, 0]
+
+
+def test_request_goes_on_and_its_answer_comes_back(scene):
+    scene.add_route()
+    scene.ask(FAR, invoke_id=5)
+    assert scene.carrier.sent[0][0] == "hop"
+    scene.station.receive(scene.sent[0].answer(b"far").octets(), *HOP)
+    connection, answer = scene.carrier.sent[1]
+    assert (connection, answer.invoke_id, answer.body) == ("peer", 5, b"far")
+
+
+def test_what_a_door_cannot_send_is_answered_and_named(scene, caplog):
+    scene.add_route()
+    scene.station.add_door(Door("dead"), carrier := KeepingCarrier())
+    carrier.error = "no cable"
+    net_id = NetId.parse("8.8.8.8.1.1")
+    scene.station.add_route(Route(net_id, "dead end", Way("dead", "hop"), is_probed=False))
+    scene.ask("8.8.8.8.1.1:1")
+    assert [each.error for each in scene.sent] == [0x1B]
+    assert "island: READ of 8.8.8.8.1.1:1" in caplog.text
+    assert "dead end (hop by dead): no cable (0x1b)" in caplog.text
+
+
+def test_hop_that_is_down_is_answered_for_at_once_until_it_is_up(scene):
+    scene.add_route()
+    scene.ask(FAR)
+    scene.station.hop_down("out", None, "no link")
+    assert scene.station.is_down(HOP)
+    scene.ask(FAR, invoke_id=2)
+    scene.station.hop_up("out", None)
+    scene.ask(FAR, invoke_id=3)
+    assert [(each.error, each.target) for each in scene.sent] == [
+        (0, FAR),
+        (0x1B, CLIENT),
+        (0x1B, CLIENT),
+        (0, FAR),
+    ]
+
+
+def test_time_is_up_at_a_hop_and_at_a_service():
+    scene = Scene(limits=Limits(timeout_ns=20_000_000))
+    scene.add_route(timeout_ns=10_000_000)
+
+    async def never(request):
+        await asyncio.Event().wait()
+
+    scene.station.add_service(ROUTER, StubService(never, 1))
+
+    async def script():
+        scene.ask(FAR)
+        scene.ask(f"{ROUTER}:1", invoke_id=2)
+        await eventually(lambda: len(scene.sent) >= 3)
+
+    asyncio.run(while_serving(script(), scene.station))
+    assert [(each.error, each.invoke_id) for each in scene.sent[1:]] == [(0x719, 1), (0x719, 2)]
+
+
+def test_hops_are_asked_for_life_from_the_moment_there_is_a_route(scene):
+    async def script():
+        await asyncio.sleep(0)
+        scene.station.add_route(Route(NetId.parse("7.7.7.7.1.1"), "far", HOP))
+        await eventually(lambda: scene.sent)
+        assert scene.station.remove_route(NetId.parse("7.7.7.7.1.1"), HOP)
+
+    asyncio.run(while_serving(script(), scene.station))
+    (probe,) = scene.sent
+    assert (probe.target, probe.command) == ("7.7.7.7.1.1:10000", 4)
+
+
+def test_services_are_told_of_a_connection_that_is_closed(scene):
+    scene.station.connection_closed("in", "peer")
+    assert scene.service.gone == [Way("in", "peer")]
+
+
+def test_services_are_told_of_a_hop_that_has_been_dead_for_long(scene, monkeypatch):
+    now_ns = 0
+    monkeypatch.setattr(station_router, "monotonic_ns", lambda: now_ns)
+    scene.station.add_route(Route(NetId.parse("7.7.7.7.1.1"), "far", HOP))
+    for second in range(70):
+        assert scene.service.gone == ([HOP] if second > 62 else [])
+        now_ns = second * 1_000_000_000
+        scene.station._handle_timeout()
+
+
+def test_notifications_go_to_their_clients_and_pass(scene):
+    notice = Ams(CLIENT, f"{DEVICE}:65535", NOTIFICATION).octets()
+    scene.station.send_notification(Way("in", "peer"), notice)
+    scene.station.send_notification(Way("gone", "peer"), notice)
+    assert [name for name, _ in scene.carrier.sent] == ["peer"]
+    scene.add_route()
+    scene.ask(FAR, command=ADD_NOTIFICATION, body=bytes(40))
+    scene.station.receive(scene.sent[1].answer(bytes(4) + b"\7\0\0\0").octets(), *HOP)
+    sample = bytes.fromhex("15000000 01000000 0000000000000000 01000000 07000000 01000000 55")
+    scene.station.receive(Ams(CLIENT, FAR, NOTIFICATION, body=sample).octets(), *HOP)
+    connection, passed = scene.carrier.sent[3]
+    assert (connection, passed.command, passed.body) == ("peer", NOTIFICATION, sample)
+    scene.station.connection_closed("in", "peer")
+    assert (scene.sent[4].target, scene.sent[4].command) == (FAR, 7)
+
+
+def test_door_that_is_removed_takes_with_it_who_waits_there(scene):
+    scene.add_route()
+    scene.ask(FAR)
+    scene.station.remove_door("out")
+    scene.ask(FAR, invoke_id=2)
+    assert [each.error for each in scene.sent[1:]] == [0x1B, 0x1B]
+    scene.add_route()
+    scene.station.add_door(Door("out"), scene.carrier)
+    scene.ask(FAR, invoke_id=3)
+    scene.station.remove_door("in")
+    scene.station.receive(scene.sent[3].answer().octets(), *HOP)
+    assert len(scene.sent) == 4
+
+
+def test_reader_waits_while_too_many_of_its_requests_do(scene):
+    gate = asyncio.Event()
+
+    async def slow(request):
+        await gate.wait()
+        return AmsAnswer()
+
+    scene.station.add_service(ROUTER, StubService(slow, 1))
+
+    async def script():
+        scene.ask(f"{ROUTER}:1")
+        scene.ask(f"{ROUTER}:1", invoke_id=2)
+        await scene.station.wait_below("in", "peer", 3)
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(scene.station.wait_below("in", "peer", 2), 0.01)
+        gate.set()
+        await scene.station.wait_below("in", "peer", 1)
+
+    asyncio.run(while_serving(script(), scene.station))
+    assert len(scene.sent) == 2
+
+
+def test_traces_are_told_to_whoever_wants_them(scene):
+    traces = []
+    scene.station.on_trace.append(traces.append)
+    scene.ask("9.9.9.9.1.1:1")
+    assert [each.error_code for each in traces] == [7]
+    assert scene.station.stats().counts["failed"] == 1
+
+
+def test_station_knows_its_net_ids(scene):
+    assert set(scene.station.net_ids) == {ROUTER, DEVICE}
+    with pytest.raises(KeyError):
+        scene.station.add_service(NetId.parse("2.2.2.2.2.2"), scene.service)
+
+
+def test_whoever_follows_the_routes_is_told_of_each() -> None:
+    scene = Scene()
+    told: list[Way] = []
+    scene.station.on_routes.append(told.append)
+    scene.add_route()
+    scene.station.remove_route(NetId.parse("7.7.7.7.1.1"), HOP)
+    assert told == [HOP, HOP]

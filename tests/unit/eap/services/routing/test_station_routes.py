@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+
+import pytest
+from msgspec.structs import replace
+
+from eap.ams.endpoint import Way
+from eap.ams.routes import Origin, Route, RouteTable
+from eap.ams.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.errors import ControlError
+from eap.ids import NetId
+from eap.runtime.store import StationFile, StationStore
+from eap.services.routing.station_routes import LEARNED_NS, MAX_ADDED, StationRoutes
+from tests.support.eventually import settle
+
+OWN = NetId.parse("10.0.0.1.1.1")
+STATIC = RouteSpec(
+    name="mill",
+    net_id="10.0.0.2.1.1",
+    hop=HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980"),
+    router="10.0.0.2.1.1",
+    is_derived=True,
+)
+PLC = RouteSpec(name="plc", net_id="5.1.2.3.1.1", hop=HopSpec(DoorKind.AMS_TCP, "", "plc:48898"))
+
+WITH_STATIC = RoutingSpec(routes=(STATIC,))
+
+
+class Router:
+    def __init__(self):
+        self.table = RouteTable()
+        self.net_ids = (OWN,)
+        self.add_route = self.table.add
+        self.remove_route = self.table.remove
+
+
+class House:
+    """A station with its store, which may start again."""
+
+    def __init__(self, spec=WITH_STATIC):
+        self.router = Router()
+        self.store = StationStore("demo", "left").routes
+        self.routes = StationRoutes(self.router, spec, self.store, open_hop=self.open)
+        self.routes.start()
+
+    def open(self, hop):
+        if hop.port == "gone":
+            raise ValueError("there is no door udp:gone")
+        return Way(f"{hop.kind}:{hop.port}", hop.address)
+
+    def names(self):
+        return {route.name: route.origin for route in self.router.table}
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_STATE_DIR", str(tmp_path))
+
+
+def test_an_added_route_is_there_again_after_a_new_start():
+    house = House()
+    asyncio.run(house.routes.add(PLC))
+    assert house.names() == {"mill": Origin.STATIC, "plc": Origin.ADDED}
+    again = House()
+    assert again.names() == house.names()
+    assert again.routes.added == (PLC,)
+    asyncio.run(again.routes.remove("plc"))
+    assert House().names() == {"mill": Origin.STATIC}
+
+
+@pytest.mark.parametrize(
+    ("change", "replaces"),
+    [
+        ({"net_id": "6.1.2.3.1.1"}, ""),
+        ({"name": "other"}, ""),
+        ({"hop": HopSpec(DoorKind.UDP, "eap0", "10.0.0.9:34980")}, ""),
+        ({"name": "other", "net_id": "6.1.2.3.1.1"}, "plc"),
+        ({"name": "other", "net_id": "6.1.2.3.1.1"}, "5.1.2.3.1.1"),
+    ],
+)
+def test_a_route_takes_the_place_of_the_one_of_its_name_or_net_id(change, replaces):
+    house = House()
+    asyncio.run(house.routes.add(PLC))
+    new = replace(PLC, **change)
+    asyncio.run(house.routes.add(new, replaces=replaces))
+    assert house.routes.added == (new,)
+    assert len(house.router.table) == 2
+    assert House().routes.added == (new,)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"name": " \n"}, "a route needs a name"),
+        ({"net_id": "1.2.3"}, "'1.2.3' is not an AMS NetID"),
+        ({"net_id": "0.0.0.0.0.0"}, "NetID 0.0.0.0.0.0 stands for any; a default route matches 0"),
+        ({"net_id": "10.0.0.1.9.9"}, "NetID 10.0.0.1.x.x is one of this station itself"),
+        ({"net_id": "10.0.0.2.9.9"}, "route 'mill' of the plant file is for the same NetIDs and"),
+        ({"net_id": STATIC.net_id, "octets": 6}, "route 'mill' of the plant file is for the same"),
+        ({"octets": 3}, "3 octets to match, expected 6, 5, 4 or 0"),
+        ({"hop": HopSpec(DoorKind.UDP, "gone", "1.1.1.1:1")}, "there is no door udp:gone"),
+    ],
+)
+def test_a_route_that_cannot_be_changes_nothing(change, reason):
+    house = House()
+    asyncio.run(house.routes.add(PLC))
+    before = list(house.router.table)
+    with pytest.raises(ControlError) as caught:
+        asyncio.run(house.routes.add(replace(PLC, **{"name": "x", **change})))
+    assert reason in str(caught.value)
+    assert list(house.router.table) == before
+    assert House().routes.added == (PLC,)
+
+
+def test_a_default_route_can_be_added():
+    house = House()
+    asyncio.run(house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0)))
+    assert house.router.table.find(NetId.parse("10.0.0.2.1.1"))[0].name == "mill"
+    assert house.router.table.find(NetId.parse("99.0.0.2.1.1"))[0].name == "default"
+
+
+def test_there_are_not_more_than_so_many(monkeypatch):
+    house = House()
+    asyncio.run(house.routes.add(PLC))
+    monkeypatch.setattr("eap.services.routing.station_routes.MAX_ADDED", 1)
+    with pytest.raises(ControlError, match="1 routes were added already; remove some"):
+        asyncio.run(house.routes.add(replace(PLC, name="b", net_id="6.1.2.3.1.1")))
+    asyncio.run(house.routes.add(replace(PLC, name="b")))  # in place of the first
+    assert MAX_ADDED > 1
+
+
+def test_a_name_is_text_that_can_be_shown():
+    house = House()
+    asyncio.run(house.routes.add(replace(PLC, name=f" a\x1b[2J\n{'b' * 200}")))
+    assert house.routes.added[0].name == "a[2J" + "b" * 76
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("mill", "route 'mill' follows from the ports of the plant file; change it there"),
+        ("10.0.0.2.1.1", "route 'mill' follows from the ports of the plant file; change it there"),
+        ("written", "route 'written' is of the plant file; change it there"),
+        ("seen", "route 'seen' is learned: it goes by itself, or learn: false"),
+        ("nothing", "no route 'nothing' was added; there are: plc"),
+    ],
+)
+def test_only_added_routes_are_removed(text, reason):
+    written = replace(STATIC, name="written", net_id="7.1.1.1.1.1", is_derived=False)
+    house = House(RoutingSpec(routes=(STATIC, written)))
+    asyncio.run(house.routes.add(PLC))
+    seen = Route(NetId.parse("8.1.1.1.1.1"), "seen", Way("mqtt:n", "8"), Origin.LEARNED)
+    house.router.table.add(seen)
+    with pytest.raises(ControlError) as caught:
+        asyncio.run(house.routes.remove(text))
+    assert str(caught.value) == reason
+    assert len(house.router.table) == 4
+
+
+def test_a_door_and_an_address_choose_what_is_removed():
+    house = House()
+    asyncio.run(house.routes.add(PLC))
+    with pytest.raises(ControlError, match="no route 'plc' was added"):
+        asyncio.run(house.routes.remove("plc", address="elsewhere:48898"))
+    with pytest.raises(ControlError, match="no route 'plc' was added"):
+        asyncio.run(house.routes.remove("plc", door="udp:eap0"))
+    assert asyncio.run(house.routes.remove("plc", door="ams-tcp:", address="plc:48898")) == PLC
+
+
+def test_another_plant_file_takes_over_and_added_routes_stay():
+    house = House()
+    asyncio.run(house.routes.add(PLC))
+    other = replace(STATIC, name="saw", net_id="10.0.0.3.1.1", is_derived=False)
+    house.routes.replace_spec(RoutingSpec(routes=(other,)))
+    assert house.names() == {"saw": Origin.STATIC, "plc": Origin.ADDED}
+    assert house.routes.spec.routes == (other,)
+    [saw] = [route for route in house.router.table if route.name == "saw"]
+    assert not house.routes.is_derived(saw)
+    house.routes.replace_spec(RoutingSpec(routes=(replace(PLC, name="written"),)))
+    assert house.names() == {"written": Origin.STATIC}
+    house.routes.replace_spec(RoutingSpec())
+    assert house.names() == {"plc": Origin.ADDED}
+
+
+def test_a_route_that_stays_is_not_touched():
+    """Its connection would be closed and opened again."""
+    saw = replace(STATIC, name="saw", net_id="10.0.0.3.1.1")
+    house = House(RoutingSpec(routes=(STATIC, saw)))
+    touched = []
+    house.router.add_route = lambda route: touched.append(route.name)
+    house.router.remove_route = lambda net_id, hop: touched.append(str(net_id))
+    house.routes.replace_spec(RoutingSpec(routes=(STATIC, replace(saw, timeout_ms=5))))
+    assert touched == ["saw"]
+    house.routes.replace_spec(RoutingSpec(routes=(STATIC,)))
+    assert touched == ["saw", "10.0.0.3.1.1"]
+
+
+def test_what_cannot_be_taken_is_told_and_kept_for_later(caplog):
+    House().store.save([replace(PLC, hop=HopSpec(DoorKind.UDP, "gone", "1.1.1.1:1"))])
+    house = House(RoutingSpec(routes=(replace(STATIC, hop=HopSpec(DoorKind.UDP, "gone", "x")),)))
+    assert house.names() == {}
+    assert "route mill of the plant file is left out: route 'mill': there is no door" in caplog.text
+    assert "added route plc is left out" in caplog.text
+    house.routes.replace_spec(RoutingSpec())
+    assert len(house.routes.added) == 1
+
+
+def learned(house, net_id="8.1.1.1.1.1", name="seen", now_ns=0):
+    return house.routes.learn(NetId.parse(net_id), name, "10.0.0.9", now_ns)
+
+
+def test_who_answered_has_a_route_for_ten_minutes():
+    house = House()
+    assert learned(house, name="seen\n")
+    [route] = [each for each in house.router.table if each.origin is Origin.LEARNED]
+    assert (route.name, route.hop) == ("seen", Way("ams-tcp:10.0.0.9:48898", "10.0.0.9:48898"))
+    assert learned(house, now_ns=5)
+    assert house.router.table.expire(LEARNED_NS) == []
+    assert [each.name for each in house.router.table.expire(LEARNED_NS + 5)] == ["seen"]
+    assert House().names() == {"mill": Origin.STATIC}
+
+
+@pytest.mark.parametrize("net_id", ["10.0.0.1.7.7", "10.0.0.2.7.7", "5.1.2.3.9.9"])
+def test_nobody_makes_a_route_in_place_of_another_by_an_answer(net_id):
+    house = House()
+    asyncio.run(house.routes.add(PLC))
+    assert not learned(house, net_id)
+    assert len(house.router.table) == 2
+
+
+def test_nothing_is_learned_where_that_is_switched_off():
+    assert not learned(House(RoutingSpec(learn=False)))
+
+
+def test_learn_sources_decide_which_answers_to_scans_are_learned():
+    assert learned(House(RoutingSpec(learn=("mqtt:n", "10.0.0.0/24"))))
+    assert not learned(House(RoutingSpec(learn=("mqtt:n", "10.0.1.0/24"))))
+    assert not learned(House(RoutingSpec(learn=("mqtt:n",))))
+    assert not learned(House(RoutingSpec(learn=())))
+
+
+def test_a_default_route_is_no_reason_not_to_learn():
+    house = House()
+    asyncio.run(house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0)))
+    assert learned(house, name="")
+    assert house.router.table.find(NetId.parse("8.1.1.1.5.5"))[0].name == "10.0.0.9"
+
+
+class SlowStore(StationFile):
+    """A disk that takes its time; *written* is what came there, in that order."""
+
+    def __init__(self):
+        file = StationStore("demo", "left").routes
+        super().__init__(file.path.parent, "left", tuple[RouteSpec, ...], "added routes")
+        self.go_on = threading.Event()
+        self.written = []
+
+    def save(self, value):
+        assert self.go_on.wait(10)
+        super().save(value)
+        self.written.append([each.name for each in value])
+
+
+def test_packets_do_not_wait_for_the_disk_but_changes_and_who_asked_do():
+    house = House()
+    house.store = house.routes._store = SlowStore()
+
+    async def script():
+        changes = [
+            asyncio.ensure_future(house.routes.add(PLC)),
+            asyncio.ensure_future(house.routes.add(replace(PLC, name="b", net_id="6.1.2.3.1.1"))),
+            asyncio.ensure_future(house.routes.remove("plc")),
+        ]
+        await settle()
+        assert not any(each.done() for each in changes)
+        assert house.names() == {"mill": Origin.STATIC}
+        changes[0].cancel()  # who asked has gone: what was begun is finished
+        house.store.go_on.set()
+        await asyncio.wait(changes)
+
+    asyncio.run(script())
+    assert house.store.written == [["plc"], ["plc", "b"], ["b"]]
+    assert house.names() == House().names() == {"mill": Origin.STATIC, "b": Origin.ADDED}

@@ -1,0 +1,145 @@
+"""All connections that a station opens."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+from contextlib import asynccontextmanager, contextmanager
+
+import pytest
+
+from eap.ams.endpoint import Door, Way
+from eap.ams.routes import Route
+from eap.ids import NetId
+from eap.services.transports.ams_uplink import AmsUplinks
+from tests.support.eventually import eventually
+
+pytestmark = pytest.mark.net
+
+
+class Router:
+    """Has doors and routes; knows which hops are up."""
+
+    name = "left"
+
+    def __init__(self, *routes: Route) -> None:
+        self.table: list[Route] = list(routes)
+        self.doors: dict[str, Door] = {}
+        self.up: set[Way] = set()
+        self.on_routes: list[Callable[[Way], None]] = []
+
+    def add(self, route: Route) -> None:
+        self.table.append(route)
+        self.on_routes[0](route.hop)
+
+    def remove(self, route: Route) -> None:
+        self.table.remove(route)
+        self.on_routes[0](route.hop)
+
+    def add_door(self, door, carrier):
+        assert door.name not in self.doors
+        self.doors[door.name] = door
+
+    def remove_door(self, name):
+        del self.doors[name]
+
+    def receive(self, data, door, connection):
+        raise AssertionError("nobody asks")
+
+    def connection_closed(self, door, connection):
+        assert door in self.doors
+        self.up.discard(Way(door, connection))
+
+    def hop_up(self, door, address):
+        assert door in self.doors
+        self.up.add(Way(door, address))
+
+    def hop_down(self, door, address, text):
+        assert door in self.doors
+
+
+def route(address: str, net_id: str = "1.1.1.1.1.1", door: str = "ams-tcp:") -> Route:
+    return Route(NetId.parse(net_id), "plc", Way(door + address, address))
+
+
+@asynccontextmanager
+async def serving(*several: AmsUplinks):
+    tasks = [asyncio.ensure_future(each.serve()) for each in several]
+    try:
+        await asyncio.sleep(0)
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        await asyncio.sleep(0)
+
+
+@contextmanager
+def listening():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        yield listener, f"127.0.0.1:{listener.getsockname()[1]}"
+
+
+def accept(listener: socket.socket) -> socket.socket:
+    """Take a connection that is there."""
+    listener.setblocking(False)
+    sock, _ = listener.accept()
+    sock.settimeout(5)
+    return sock
+
+
+def test_one_connection_for_all_routes_to_a_peer_until_the_last_is_removed():
+    async def run(listener, address):
+        first, second = route(address), route(address, "1.1.1.2.1.1")
+        router = Router(first)
+        async with serving(AmsUplinks(router, [], [].append)):
+            assert router.doors == {
+                first.hop.door: Door(first.hop.door, is_stream=True, is_hub=True)
+            }
+            router.add(second)
+            await eventually(lambda: router.up == {first.hop})
+            router.remove(first)
+            assert router.up == {first.hop}
+            with accept(listener) as sock:
+                with pytest.raises(BlockingIOError):
+                    listener.accept()
+                router.remove(second)
+                assert router.doors == {}
+                await asyncio.sleep(0)
+                assert sock.recv(1) == b""
+            router.up.clear()
+            router.add(first)
+            await eventually(lambda: router.up)
+            accept(listener).close()
+        assert router.up == set()
+
+    with listening() as there:
+        asyncio.run(run(*there))
+
+
+def test_two_stations_have_a_connection_each():
+    async def run(listener, address):
+        routers = Router(route(address)), Router(route(address))
+        async with serving(*(AmsUplinks(each, [], [].append) for each in routers)):
+            await eventually(lambda: all(each.up for each in routers))
+            for _ in routers:
+                accept(listener).close()
+
+    with listening() as there:
+        asyncio.run(run(*there))
+
+
+def test_routes_by_other_doors_are_for_others():
+    router = Router(route("eap0", door="udp:"))
+    AmsUplinks(router, [], [].append)
+    router.add(route("eap0", door="ams-tcp"))
+    assert router.doors == {}
+
+
+def test_address_that_is_none_is_said(caplog):
+    router = Router(route("plc:nothing"))
+    AmsUplinks(router, [], [].append)
+    assert router.doors == {}
+    assert "'nothing' is not a port" in caplog.messages[0]

@@ -1,0 +1,160 @@
+"""The supervisor's start and its refusals; tests/integration has the rest of its life."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from eap.config.load import Plant
+from eap.errors import ConfigError, EnvironmentalError
+from eap.pd.spec import BusPortSpec, PortKind, PortSpec
+from eap.runtime.folder import ApplianceFolder, find_appliances
+from eap.runtime.handover import EngineOptions
+from eap.supervisor.child import Child
+from eap.supervisor.process import Supervisor, make_info, run
+from eap.supervisor.sockets import SharedSockets
+from tests.support.eventually import wait_until
+
+DEMO = Path(__file__).parents[5] / "config" / "demo.yaml"
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path / "run"))
+    return tmp_path / "run"
+
+
+def test_a_wrong_plant_is_refused_with_all_its_findings(tmp_path, root):
+    plant = tmp_path / "plant.yaml"
+    plant.write_text("plant: x\nstation: []\ncolour: red\n")
+    with pytest.raises(ConfigError) as caught:
+        run(plant)
+    assert len(str(caught.value).splitlines()) > 1
+    assert f"{plant}:2" in str(caught.value)
+    assert not root.exists()
+
+
+def test_an_unknown_station_is_refused_with_the_near_one(root):
+    with pytest.raises(ConfigError, match="did you mean island-01"):
+        run(DEMO, ["island-1"])
+    with pytest.raises(ConfigError, match="it has island-01, island-02, island-03"):
+        run(DEMO, ["x"])
+    assert not root.exists()
+
+
+def test_info_names_this_process(stations):
+    info = make_info("demo", "/demo.yaml", stations)
+    assert (info.supervisor, info.stations) == (os.getpid(), ["left", "right"])
+    assert info.started_at.endswith("+00:00")
+
+
+@pytest.mark.net
+def test_a_child_that_cannot_start_ends_all_with_its_exit_code(stations, capfd):
+    options = EngineOptions(realtime=False)
+    with ApplianceFolder.claim("demo") as folder:
+        with SharedSockets(stations, folder.control_socket) as sockets:
+            folder.image("left").mkdir()  # no image can be made here
+            info = make_info("demo", "demo.yaml", stations)
+            assert (
+                Supervisor(info, Plant("x", stations), folder, sockets, options=options).run() == 2
+            )
+        engine, services = folder.read_info().engine.pid, folder.read_info().services.pid
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith("engine: ")
+    assert len(err.splitlines()) == 1
+    assert not Path(f"/proc/{engine}").exists()
+    assert not Path(f"/proc/{services}").exists()
+    assert find_appliances() == []
+
+
+@pytest.mark.net
+def test_a_segment_that_cannot_start_ends_all_with_its_exit_code(tmp_path, stations, capfd):
+    bus_file = tmp_path / "bus.yaml"
+    bus_file.write_text("bus: b\nslaves: []\n")
+    bus = PortSpec(
+        "bus0", PortKind.BUS, f"sim://{bus_file}", "1.1.1.1.1.9", bus=BusPortSpec(str(bus_file))
+    )
+    station = replace(stations[0], ports=(*stations[0].ports, bus))
+    options = EngineOptions(realtime=False)
+    with ApplianceFolder.claim("demo") as folder:
+        with SharedSockets([station], folder.control_socket) as sockets:
+            info = make_info("demo", "demo.yaml", [station])
+            assert (
+                Supervisor(info, Plant("x", (station,)), folder, sockets, options=options).run()
+                == 2
+            )
+        assert list(folder.read_info().segments) == ["left/bus0"]
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "segment: " in err
+    assert "the bus has no slaves" in err
+
+
+def end_when_all_run(folder: ApplianceFolder) -> None:
+    """Ask this process to end as soon as engine and services run."""
+
+    def do_all_run() -> bool:
+        processes = (folder.read_info().engine, folder.read_info().services)
+        return all(each.pid and not each.step for each in processes)
+
+    try:
+        wait_until(do_all_run, timeout_s=60)
+    finally:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.net
+def test_supervisor_gives_children_that_got_stuck_more_time_and_never_gives_up(
+    stations, caplog, capfd
+):
+    options = EngineOptions(realtime=False)
+    info = make_info("demo", "demo.yaml", stations)
+    with (
+        ApplianceFolder.claim("demo") as folder,
+        SharedSockets(stations, folder.control_socket) as sockets,
+        ThreadPoolExecutor(1) as other,
+    ):
+        supervisor = Supervisor(
+            info, Plant("x", stations), folder, sockets, options=options,
+            clock=lambda: time.monotonic_ns() * 400,  # no Python starts in 50 ms, which are 20 s
+        )  # fmt: skip
+        folder.write_info(info)
+        other.submit(end_when_all_run, folder)
+        assert supervisor.run() == 0
+    assert '"ready":true' in capfd.readouterr().out
+    stuck = [line for line in caplog.messages if " is stuck: " in line]
+    wanted = "no progress for 20 s; it is killed and started again, with 40 s for each step"
+    assert stuck[0].endswith(wanted)
+
+
+def test_supervisor_tries_again_when_a_process_that_ran_cannot_be_started(
+    stations, caplog, monkeypatch
+):
+    def fail(self, *_):
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    with (
+        ApplianceFolder.claim("demo") as folder,
+        SharedSockets(stations, folder.control_socket) as sockets,
+    ):
+        options = EngineOptions(realtime=False)
+        info = make_info("demo", "demo.yaml", stations)
+        supervisor = Supervisor(info, Plant("x", stations), folder, sockets, options=options)
+        monkeypatch.setattr(Child, "start", fail)
+        engine = supervisor._engine
+        with pytest.raises(EnvironmentalError, match="engine cannot be started"):
+            supervisor._start(engine)
+        engine.watch.begin(0)
+        engine.watch.succeed()
+        for _ in range(2):
+            supervisor._start(engine)
+        assert engine in supervisor._restart_ns
+    assert "trying again in 100 ms" in caplog.messages[-1]

@@ -1,0 +1,170 @@
+"""The plan of shared sockets, and that all of them open or none."""
+
+from __future__ import annotations
+
+import gc
+import os
+import socket
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from eap.errors import EnvironmentalError
+from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec
+from eap.runtime.handover import NO_DESCRIPTOR, PortName, SocketKind
+from eap.supervisor.sockets import SharedSockets, plan_sockets
+from tests.unit.eap.runtime.conftest import eap_port, left, right
+
+LEFT, RIGHT = PortName("left", "eap0"), PortName("right", "eap0")
+
+
+def test_a_udp_port_needs_a_pair_and_a_listener():
+    planned = plan_sockets([left(), right()])
+    assert [(s.kind, s.address, s.port, s.owners) for s in planned] == [
+        (SocketKind.UDP, "127.9.2.1", 34980, (LEFT,)),
+        (SocketKind.UDP, "127.9.2.2", 34980, (RIGHT,)),
+        (SocketKind.TCP, "127.9.2.1", 34980, (LEFT,)),
+        (SocketKind.TCP, "127.9.2.2", 34980, (RIGHT,)),
+        (SocketKind.AMS_TCP, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_TCP, "127.9.2.2", 0, (RIGHT,)),
+        (SocketKind.AMS_UDP, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_UDP, "127.9.2.2", 0, (RIGHT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.2", 0, (RIGHT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.2", 0, (RIGHT,)),
+    ]
+
+
+def ams_of(*stations: StationSpec) -> list[tuple[str, str, tuple[PortName, ...]]]:
+    kinds = (SocketKind.AMS_TCP, SocketKind.AMS_UDP)
+    return [(s.kind, s.address, s.owners) for s in plan_sockets(stations) if s.kind in kinds]
+
+
+def test_stations_of_one_address_share_what_ams_needs():
+    lodger = right(eap_port(2, "tcp://127.9.2.1:5000"))
+    assert ams_of(left(), lodger) == [
+        (SocketKind.AMS_TCP, "127.9.2.1", (LEFT, RIGHT)),
+        (SocketKind.AMS_UDP, "127.9.2.1", (LEFT, RIGHT)),
+    ]
+    assert ams_of(left(eap_port(1, ams=False)), lodger) == [
+        (SocketKind.AMS_TCP, "127.9.2.1", (RIGHT,)),
+        (SocketKind.AMS_UDP, "127.9.2.1", (RIGHT,)),
+    ]
+
+
+def test_who_listens_at_every_address_shares_it_with_all():
+    everywhere = right(eap_port(2, "udp://0.0.0.0:5000"))
+    assert ams_of(left(), everywhere) == [
+        (SocketKind.AMS_TCP, "0.0.0.0", (LEFT, RIGHT)),
+        (SocketKind.AMS_UDP, "0.0.0.0", (LEFT, RIGHT)),
+    ]
+
+
+def test_no_ams_without_an_ip_address():
+    without = (eap_port(1, ams=False), eap_port(1, "loop://line"), eap_port(1, "ethernet://eth0"))
+    assert [ams_of(left(port)) for port in without] == [[], [], []]
+
+
+def test_gateways_have_their_own_at_each_address():
+    def bus(number: int, own: int) -> PortSpec:
+        return PortSpec(
+            f"bus{number}", PortKind.BUS, "sim://bus.yaml", f"5.1.1.1.{number}.1",
+            bus=BusPortSpec(), gateway=GatewaySpec(port=own),
+        )  # fmt: skip
+
+    station = msgspec.structs.replace(left(), ports=(eap_port(1), bus(0, 0), bus(1, 34981)))
+    kinds = (SocketKind.GATEWAY_UDP, SocketKind.GATEWAY_TCP)
+    owners = (PortName("left", "bus1"),)
+    assert [
+        (s.kind, s.address, s.port, s.owners) for s in plan_sockets([station]) if s.kind in kinds
+    ] == [(kind, "127.9.2.1", 34981, owners) for kind in kinds]
+
+
+def test_groups_and_broadcasts_have_their_own():
+    port = eap_port(1, "udp://127.9.2.1:5000", join=("239.1.1.1", "239.1.1.2"), broadcast=True)
+    planned = plan_sockets([left(port)])
+    assert [(s.kind, s.group, s.port) for s in planned] == [
+        (SocketKind.UDP, "", 5000),
+        (SocketKind.GROUP, "239.1.1.1", 5000),
+        (SocketKind.GROUP, "239.1.1.2", 5000),
+        (SocketKind.GROUP, "255.255.255.255", 5000),
+        (SocketKind.TCP, "", 5000),
+        (SocketKind.AMS_TCP, "", 0),
+        (SocketKind.AMS_UDP, "", 0),
+        (SocketKind.AMS_BROADCAST, "", 0),
+        (SocketKind.AMS_BROADCAST, "255.255.255.255", 0),
+    ]
+
+
+def test_stations_share_an_ethernet_interface():
+    planned = plan_sockets(
+        [left(eap_port(1, "ethernet://eth0", vlan_id=5)), right(eap_port(2, "ethernet://eth0"))]
+    )
+    assert [(s.kind, s.address, s.owners) for s in planned] == [
+        (SocketKind.PACKET, "eth0", (LEFT, RIGHT)),
+        (SocketKind.ARP, "eth0", (LEFT,)),
+        (SocketKind.ARP, "eth0", (RIGHT,)),
+    ]
+    assert [s.vlan_id for s in planned] == [0, 5, 0]
+
+
+def test_what_stays_in_the_engine_needs_none():
+    assert plan_sockets([left(eap_port(1, "loop://line"))]) == ()
+    tcp_only = plan_sockets([left(eap_port(1, "tcp://127.9.2.1", ams=False))])
+    assert [s.kind for s in tcp_only] == [SocketKind.TCP]
+
+
+def open_descriptors() -> int:
+    gc.collect()  # what an earlier test left to the collector must not go while we count
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+@pytest.mark.net
+def test_all_are_opened_and_described(tmp_path):
+    before = open_descriptors()
+    port = eap_port(1, join=("239.1.1.1",), broadcast=True)
+    with SharedSockets([left(port)], tmp_path / "control") as shared:
+        for described in shared.descriptions:
+            of_both = described.kind in {SocketKind.UDP, SocketKind.GROUP}
+            assert (described.engine_fd != NO_DESCRIPTOR) == of_both
+            assert described.services_fd != NO_DESCRIPTOR
+        inherited = {*shared.engine_descriptors(), *shared.services_descriptors()}
+        assert len(inherited) == open_descriptors() - before
+        assert not any(os.get_inheritable(fd) for fd in inherited)
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(tmp_path / "control"))
+    assert open_descriptors() == before
+
+
+@pytest.mark.net
+def test_buses_add_theirs(tmp_path):
+    before = open_descriptors()
+    bus = PortSpec("bus0", PortKind.BUS, "sim:///x.yaml", "1.1.1.1.1.9", bus=BusPortSpec("/x.yaml"))
+    station = left()
+    station = msgspec.structs.replace(station, ports=(*station.ports, bus))
+    with SharedSockets([station], tmp_path / "control") as shared:
+        (described,) = shared.buses
+        engine, services = shared.engine_descriptors(), shared.services_descriptors()
+        assert {described.engine_fd, shared.engine_bus} < set(engine)
+        assert {described.command_fd, shared.services_bus} < set(services)
+        own_datagrams = {each.engine_fd for each in shared.descriptions} - {NO_DESCRIPTOR}
+        assert set(engine) & set(services) == own_datagrams
+        segment = {described.segment_fd, described.segment_command_fd}
+        assert len({*engine, *services, *segment}) == open_descriptors() - before
+    assert open_descriptors() == before
+
+
+@pytest.mark.net
+def test_nothing_stays_open_when_one_fails(tmp_path):
+    before = open_descriptors()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
+        squatter.bind(("127.9.2.2", 34980))
+        with pytest.raises(EnvironmentalError, match=r"127\.9\.2\.2:34980"):
+            SharedSockets([left(), right()], tmp_path / "control")
+    assert open_descriptors() == before
+    (tmp_path / "control").touch()
+    with pytest.raises(EnvironmentalError, match="control socket"):
+        SharedSockets([left()], tmp_path / "control")
+    assert open_descriptors() == before
