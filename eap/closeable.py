@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Self
 
 
-class Closing(ABC):
+class Closeable(ABC):
     """Something that holds files, sockets or memory until it is closed."""
 
     @abstractmethod

@@ -53,7 +53,7 @@ class Shown(NamedTuple):
         return self.title or self.name
 
 
-class Way(NamedTuple):
+class Endpoint(NamedTuple):
     """One PD on its way from the station that sends it to one that receives it."""
 
     sender: str
@@ -104,11 +104,11 @@ SHOWN = {
 """The variables that the screen shows of each station of the demo; in brackets, their origin."""
 
 WAYS = (
-    Way("island-01", "island-02", "state", "left-state"),
-    Way("island-02", "island-03", "state", "left-state"),
-    Way("island-03", "island-01", "state", "left-state"),
-    Way("island-03", "island-01", "alarm", "line-alarm"),
-    Way("island-03", "island-02", "alarm", "line-alarm"),
+    Endpoint("island-01", "island-02", "state", "left-state"),
+    Endpoint("island-02", "island-03", "state", "left-state"),
+    Endpoint("island-03", "island-01", "state", "left-state"),
+    Endpoint("island-03", "island-01", "alarm", "line-alarm"),
+    Endpoint("island-03", "island-02", "alarm", "line-alarm"),
 )
 
 
@@ -208,7 +208,7 @@ class RateMeter:
     def __init__(self) -> None:
         self._looks: deque[Look] = deque()
 
-    def rates(self, look: Look) -> dict[Way, float]:
+    def rates(self, look: Look) -> dict[Endpoint, float]:
         """Return how many PDs a second came by each way; nothing at the first look."""
         self._looks.append(look)
         while len(self._looks) > 2 and look.at_s - self._looks[1].at_s >= RATE_OVER_S:
@@ -224,7 +224,7 @@ class RateMeter:
         }
 
 
-def as_screen(look: Look, rates: Mapping[Way, float]) -> RenderableType:
+def as_screen(look: Look, rates: Mapping[Endpoint, float]) -> RenderableType:
     """Return stations, their values, and the arrows between them; at most 80 columns, 23 lines."""
     stations = TextTable(*(Column(name, rank=number) for number, name in enumerate(SHOWN)))
     for row in zip_longest(*(cells(look.values[name], SHOWN[name]) for name in SHOWN)):
@@ -247,7 +247,7 @@ def cells(values: Mapping[str, Any], shown: Sequence[Shown]) -> Iterator[str]:
         yield f"{each.label[:room]:<{room}} {value}"
 
 
-def arrows(look: Look, rates: Mapping[Way, float]) -> TextTable:
+def arrows(look: Look, rates: Mapping[Endpoint, float]) -> TextTable:
     """Return a line for each way that PDs take, with its rate and what it lost."""
     table = TextTable(
         "From",
@@ -276,7 +276,7 @@ def arrows(look: Look, rates: Mapping[Way, float]) -> TextTable:
     return table
 
 
-def as_line(look: Look, rates: Mapping[Way, float]) -> str:
+def as_line(look: Look, rates: Mapping[Endpoint, float]) -> str:
     """Return one line of less than 80 columns: rate, losses, and a value on its way."""
     rows = [look.received[way.key] for way in WAYS]
     lost = sum(row["lost"] or 0 for row in rows)

@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 from eap.ads.answer import AmsAnswer
 from eap.ads.device import AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
 from eap.ads.objects import ObjectSpace
-from eap.ams.endpoint import Way
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,
@@ -32,7 +32,7 @@ _NET_ID_OFFSET = 3
 _NET_ID_SIZE = 6
 _SERVICES = frozenset((AmsCommand.READ_DEVICE_INFO, AmsCommand.READ_STATE, AmsCommand.READ,
                        AmsCommand.WRITE, AmsCommand.READ_WRITE))  # fmt: skip
-_MASTER = Client(Way("", ""), NetId(bytes(_NET_ID_SIZE)), 0)
+_MASTER = Client(Endpoint("", ""), NetId(bytes(_NET_ID_SIZE)), 0)
 """Without notifications nothing belongs to a client."""
 
 

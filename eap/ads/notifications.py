@@ -15,9 +15,9 @@ from collections.abc import Callable
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import AdsRefusedError
 from eap.ads.space import Source
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
     UNIT_NS,
@@ -47,7 +47,7 @@ _FOR_NOW = frozenset((AdsError.BUSY, AdsError.NOT_READY))
 class Client(NamedTuple):
     """Whoever asked: an AMS address, which programs of one computer share, and its connection."""
 
-    way: Way
+    endpoint: Endpoint
     net_id: NetId
     port: int
 
@@ -197,9 +197,9 @@ class NotificationTable:
             raise AdsRefusedError(AdsError.NOTIFICATION_HANDLE)
         self._remove(notification)
 
-    def forget(self, way: Way) -> None:
+    def forget(self, endpoint: Endpoint) -> None:
         """End all notifications that were asked for by a connection that is gone."""
-        for client in [client for client in self._clients if client.way == way]:
+        for client in [client for client in self._clients if client.endpoint == endpoint]:
             for handle in self._clients.pop(client).handles:
                 del self._notifications[handle]
         self._clear_due()

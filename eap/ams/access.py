@@ -13,10 +13,10 @@ from collections.abc import Collection, Sequence
 from ipaddress import IPv4Address, IPv4Network
 from typing import NamedTuple
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write, WriteControl
 from eap.ads.sum import SUM_COMMANDS
-from eap.ams.endpoint import Way
-from eap.ams.spec import IP_DOORS, AccessRule, AccessService, DoorKind, ObjectRange
+from eap.ams.spec import IP_DOORS, AccessRule, AccessService, ObjectRange, TransportKind
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.ids import MacAddr, NetId
@@ -91,7 +91,7 @@ _OF_OBJECTS = frozenset(
 )
 
 
-class Verdict(NamedTuple):
+class Decision(NamedTuple):
     """What was decided on one operation."""
 
     service: AccessService
@@ -115,19 +115,19 @@ class Grants:
         self._is_this_host = is_this_host
         self.may_read = self.may(AccessService.READ) is True
 
-    def judge(self, operation: Operation) -> Verdict:
+    def admission(self, operation: Operation) -> Decision:
         """Decide on one operation."""
         service = service_of(operation)
         touched = objects_of(operation)
         for rule in self._by_service[service]:
             if not rule.objects or (touched is not None and _is_about(rule, touched)):
                 verb = "allows" if rule.allow else "refuses"
-                return Verdict(service, rule.allow, f"rule {rule.name} {verb} it", is_by_rule=True)
+                return Decision(service, rule.allow, f"rule {rule.name} {verb} it", is_by_rule=True)
         if self._is_this_host:
-            return Verdict(service, True, "no rule refuses it to this host")
+            return Decision(service, True, "no rule refuses it to this host")
         if service is AccessService.READ:
-            return Verdict(service, True, "no rule refuses reading")
-        return Verdict(service, False, "no rule allows it, and other hosts only read")
+            return Decision(service, True, "no rule refuses reading")
+        return Decision(service, False, "no rule allows it, and other hosts only read")
 
     def may(self, service: AccessService) -> bool | None:
         """Say whether *service* is allowed; None if that depends on the object."""
@@ -154,52 +154,52 @@ class AccessList:
     ) -> None:
         self._rules = [_Matcher(rule) for rule in rules]
         self._own = frozenset(own)
-        self._known: dict[tuple[Way, NetId, NetId, int], Grants] = {}
+        self._known: dict[tuple[Endpoint, NetId, NetId, int], Grants] = {}
 
-    def grants(self, way: Way, source: NetId, target: NetId, port: int) -> Grants:
-        """Return what a client may do that came by *way* and calls itself *source*."""
-        key = way, source, target, port
+    def grants(self, endpoint: Endpoint, source: NetId, target: NetId, port: int) -> Grants:
+        """Return what a client may do that came by *endpoint* and calls itself *source*."""
+        key = endpoint, source, target, port
         grants = self._known.get(key)
         if grants is None:
             if len(self._known) >= _MAX_KNOWN:
                 self._known.clear()
-            grants = self._known[key] = self._find(way, source, target, port)
+            grants = self._known[key] = self._find(endpoint, source, target, port)
         return grants
 
-    def is_this_host(self, way: Way) -> bool:
-        """Say whether only a program of this host can have come by *way*."""
-        kind = way.kind
+    def is_this_host(self, endpoint: Endpoint) -> bool:
+        """Say whether only a program of this host can have come by *endpoint*."""
+        kind = endpoint.kind
         if kind not in IP_DOORS:
-            return kind == DoorKind.LOCAL
-        address = address_of(way)
+            return kind == TransportKind.LOCAL
+        address = address_of(endpoint)
         return address is not None and (address.is_loopback or address in self._own)
 
-    def _find(self, way: Way, source: NetId, target: NetId, port: int) -> Grants:
-        address = address_of(way)
+    def _find(self, endpoint: Endpoint, source: NetId, target: NetId, port: int) -> Grants:
+        address = address_of(endpoint)
         rules = [
             each.rule
             for each in self._rules
-            if each.is_from(way, address, source) and each.is_to(target, port)
+            if each.is_from(endpoint, address, source) and each.is_to(target, port)
         ]
-        return Grants(rules, is_this_host=self.is_this_host(way))
+        return Grants(rules, is_this_host=self.is_this_host(endpoint))
 
 
-def address_of(way: Way) -> IPv4Address | None:
+def address_of(endpoint: Endpoint) -> IPv4Address | None:
     """Return the IPv4 address that somebody came from, None where there is none."""
-    if way.kind not in IP_DOORS:
+    if endpoint.kind not in IP_DOORS:
         return None
     try:
-        return IPv4Address(way.connection.partition(":")[0])
+        return IPv4Address(endpoint.connection.partition(":")[0])
     except ValueError:
         return None
 
 
-def host_of(way: Way) -> str:
-    """Return who came by *way*, whichever of his connections it is."""
-    kind = way.kind
+def host_of(endpoint: Endpoint) -> str:
+    """Return who came by *endpoint*, whichever of his connections it is."""
+    kind = endpoint.kind
     if kind in IP_DOORS:
-        return way.connection.partition(":")[0]
-    return "" if kind == DoorKind.LOCAL else way.connection
+        return endpoint.connection.partition(":")[0]
+    return "" if kind == TransportKind.LOCAL else endpoint.connection
 
 
 class _Matcher:
@@ -212,16 +212,16 @@ class _Matcher:
         self._net_ids = tuple(map(_prefix, rule.net_ids))
         self._targets = tuple((_prefix(each.net_id), each.port) for each in rule.targets)
 
-    def is_from(self, way: Way, address: IPv4Address | None, source: NetId) -> bool:
-        doors = self.rule.doors
-        if doors and way.door not in doors and way.kind not in doors:
+    def is_from(self, endpoint: Endpoint, address: IPv4Address | None, source: NetId) -> bool:
+        transports = self.rule.transports
+        if transports and endpoint.transport not in transports and endpoint.kind not in transports:
             return False
         if self._net_ids and not source.startswith(self._net_ids):
             return False
         if not (self._networks or self._macs):
             return True
-        if way.kind == DoorKind.ETHERNET:
-            return way.connection in self._macs
+        if endpoint.kind == TransportKind.ETHERNET:
+            return endpoint.connection in self._macs
         return address is not None and any(address in each for each in self._networks)
 
     def is_to(self, target: NetId, port: int) -> bool:

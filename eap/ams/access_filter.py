@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import AdsRefusedError, OperationOutcome
 from eap.ads.part import has_results
 from eap.ads.request import encode_refusal, parse_request
 from eap.ams.access import LOOKUPS, AccessList
 from eap.ams.action import Outcome, Trace
-from eap.ams.authorized_request import AuditEntry, Judged
-from eap.ams.endpoint import Way
+from eap.ams.authorized_request import AuditEntry, AuthorizedRequest
 from eap.ams.error_reply import Refusal
 from eap.ams.record import Record, describe
 from eap.ams.spec import AccessService
@@ -51,7 +51,7 @@ _LENGTH = 20
 """Where the header says how long the body is."""
 
 
-class Gate:
+class AccessFilter:
     """Judges requests.
 
     Args:
@@ -79,30 +79,30 @@ class Gate:
         """Take the oldest entry of the audit."""
         return self._entries.popleft() if self._entries else None
 
-    def may(self, header: AmsHeader, way: Way) -> dict[AccessService, bool | None]:
+    def may(self, header: AmsHeader, endpoint: Endpoint) -> dict[AccessService, bool | None]:
         """Return what a client may do with its target; None if that depends on the object."""
-        grants = self.access.grants(way, header.source, header.target, header.target_port)
+        grants = self.access.grants(endpoint, header.source, header.target, header.target_port)
         return {service: grants.may(service) for service in AccessService}
 
-    def is_this_host(self, way: Way) -> bool:
-        """Say whether only a program of this host can have come by *way*."""
-        return self.access.is_this_host(way)
+    def is_this_host(self, endpoint: Endpoint) -> bool:
+        """Say whether only a program of this host can have come by *endpoint*."""
+        return self.access.is_this_host(endpoint)
 
     def let_through(
-        self, header: AmsHeader, data: bytes, way: Way, now_ns: int, route: str = ""
-    ) -> tuple[bytes, Judged | None] | Refusal:
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, route: str = ""
+    ) -> tuple[bytes, AuthorizedRequest | None] | Refusal:
         """Return a request as it goes in or on, and what to do with its answer, or refuse it.
 
         Args:
             header: As it came.
             data: All of the packet.
-            way: That it came by.
+            endpoint: That it came by.
             now_ns: The time on the monotonic clock.
             route: Name of the route that it would go on by.
         """
         if header.command == _NOTIFICATION:
             return data, None  # nobody gets one who has not asked for it
-        grants = self.access.grants(way, header.source, header.target, header.target_port)
+        grants = self.access.grants(endpoint, header.source, header.target, header.target_port)
         if grants.may_read and (
             header.command in _READS
             or (header.command == _READ_WRITE and data[_GROUP] in _READ_GROUPS)
@@ -114,45 +114,45 @@ class Gate:
             is_recorded = self.before_change is not None
             may_pass = grants.may(AccessService.RAW) and not is_recorded
             return (data, None) if may_pass else _refuse_unreadable(header, exc)
-        verdicts = tuple(map(grants.judge, request.operations))
-        judged = Judged(way, header, route, request, verdicts)
-        if why := self._record_first(judged):
-            judged = judged.refuse_changes(why)
-        if judged.refused:
-            return self._refuse(judged, now_ns) or (
-                exchange_body(data, judged.encode_part()),
-                judged,
+        decisions = tuple(map(grants.admission, request.operations))
+        authorized = AuthorizedRequest(endpoint, header, route, request, decisions)
+        if why := self._record_first(authorized):
+            authorized = authorized.refuse_changes(why)
+        if authorized.refused:
+            return self._refuse(authorized, now_ns) or (
+                exchange_body(data, authorized.encode_part()),
+                authorized,
             )
-        is_read = all(each.service is AccessService.READ for each in verdicts)
-        return data, None if is_read else judged
+        is_read = all(each.service is AccessService.READ for each in decisions)
+        return data, None if is_read else authorized
 
-    def take_answer(self, judged: Judged, error_code: int, body: bytes) -> bytes:
+    def take_answer(self, authorized: AuthorizedRequest, error_code: int, body: bytes) -> bytes:
         """Return the body of the answer that the client gets to all it asked for."""
-        body, entry = judged.take_answer(error_code, body)
+        body, entry = authorized.take_answer(error_code, body)
         self._enter(entry)
         return body
 
-    def give_up(self, judged: Judged, error_code: int | None = None) -> None:
+    def give_up(self, authorized: AuthorizedRequest, error_code: int | None = None) -> None:
         """Take note that nothing came back; *error_code* is what the client got, if anything."""
-        self._enter(judged.give_up(error_code))
+        self._enter(authorized.give_up(error_code))
 
-    def _record_first(self, judged: Judged) -> str:
+    def _record_first(self, authorized: AuthorizedRequest) -> str:
         """Record what a request is going to change, where that is required; return why not."""
         if self.before_change is None:
             return ""
-        changes = judged.changes
+        changes = authorized.changes
         return self.before_change(changes) if changes.operations else ""
 
-    def _refuse(self, judged: Judged, now_ns: int) -> Refusal | None:
+    def _refuse(self, authorized: AuthorizedRequest, now_ns: int) -> Refusal | None:
         """Refuse a request as a whole, unless some of its items may be done."""
-        request, text = judged.request, _describe(judged)
-        count = len(judged.verdicts)
-        if has_results(request) and len(judged.refused) < count:
-            header, way, code = judged.header, judged.way, AdsError.ACCESS_DENIED
-            text = f"{describe(header, way)}: {text}"
-            self._record.enter(Trace(now_ns, Outcome.DENIED, way, None, header, code, 0, text))
+        request, text = authorized.request, _describe(authorized)
+        count = len(authorized.decisions)
+        if has_results(request) and len(authorized.refused) < count:
+            header, endpoint, code = authorized.header, authorized.endpoint, AdsError.ACCESS_DENIED
+            text = f"{describe(header, endpoint)}: {text}"
+            self._record.enter(Trace(now_ns, Outcome.DENIED, endpoint, None, header, code, 0, text))
             return None
-        self.give_up(judged, AdsError.ACCESS_DENIED)
+        self.give_up(authorized, AdsError.ACCESS_DENIED)
         body = b""
         if has_results(request):
             body = request.encode_answer([OperationOutcome(AdsError.ACCESS_DENIED)] * count)
@@ -180,9 +180,11 @@ def _refuse_unreadable(header: AmsHeader, why: AdsRefusedError) -> Refusal:
     return Refusal(why.result, text, body=encode_refusal(header.command, why.result))
 
 
-def _describe(judged: Judged) -> str:
-    first = judged.refused[0]
+def _describe(authorized: AuthorizedRequest) -> str:
+    first = authorized.refused[0]
     text = f"{first.service} refused: {first.why}"
-    if len(judged.verdicts) == 1:
+    if len(authorized.decisions) == 1:
         return text
-    return f"{len(judged.refused)} of {len(judged.verdicts)} items refused, the first: {text}"
+    return (
+        f"{len(authorized.refused)} of {len(authorized.decisions)} items refused, the first: {text}"
+    )

@@ -5,14 +5,14 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple, TypeAlias
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.ams import AmsHeader
 
 
 class Forward(NamedTuple):
     """A request for the next hop."""
 
-    hop: Way
+    hop: Endpoint
     packets: tuple[bytes, ...]
     """One, or its fragments in their order."""
     ticket: int
@@ -22,7 +22,7 @@ class Forward(NamedTuple):
 class Reply(NamedTuple):
     """An answer or a notification, for the connection that it belongs to."""
 
-    way: Way
+    endpoint: Endpoint
     packets: tuple[bytes, ...]
     """One, or its fragments in their order."""
 
@@ -34,7 +34,7 @@ class Deliver(NamedTuple):
     """Names the request, for its answer."""
     header: AmsHeader
     body: bytes
-    came_by: Way
+    came_by: Endpoint
     """Where notifications go, if it is about any."""
 
 
@@ -66,9 +66,9 @@ class Trace(NamedTuple):
 
     at_ns: int
     outcome: Outcome
-    came_by: Way | None
+    came_by: Endpoint | None
     """None if its connection is gone."""
-    hop: Way | None
+    hop: Endpoint | None
     """None if it went no further."""
     header: AmsHeader | None
     """Of the request, as it came; None if it could not be read."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Outcome
-from eap.ams.endpoint import Door, Way
 from eap.ams.error_reply import Refusal
-from eap.ams.hop_prober import Prober
+from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import InFlight
 from eap.ams.report import Obstacle, RouteState
 from eap.ams.routes import Route, RouteTable
+from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.ids import STATION_OCTETS, NetId
@@ -28,7 +29,7 @@ class Limits(NamedTuple):
     """Requests that wait, of all connections."""
     per_connection: int = 512
     """Requests of one connection that wait."""
-    per_door: int = 2048
+    per_transport: int = 2048
     """Requests of all connections of a door: a flood by one leaves room for the others.
 
     One connection may have as many as others leave, so however many flood, some room remains.
@@ -37,74 +38,74 @@ class Limits(NamedTuple):
     """How long an answer may take: an error comes back before clients lose patience at 5 s."""
 
 
-class Judge:
+class Admission:
     """Decides on requests.
 
     Args:
         net_id: Of the router.
         table: The routes.
-        doors: All doors by name.
+        transports: All doors by name.
         in_flight: What waits.
         limits: How much may wait.
-        prober: Knows which hops do not answer.
+        hop_prober: Knows which hops do not answer.
     """
 
     def __init__(
         self,
         net_id: NetId,
         table: RouteTable,
-        doors: Mapping[str, Door],
+        transports: Mapping[str, Transport],
         in_flight: InFlight,
         limits: Limits,
-        prober: Prober | None = None,
+        hop_prober: HopProber | None = None,
     ) -> None:
         self._net_id = net_id
         self._table = table
-        self._doors = doors
+        self._transports = transports
         self._in_flight = in_flight
         self._limits = limits
-        self._prober = prober
-        self._down: dict[Way, str] = {}
+        self._hop_prober = hop_prober
+        self._down: dict[Endpoint, str] = {}
         self._closed: dict[str, str] = {}
         self._opened: set[str] = set()
         """Doors by which some hop was reached; a client behind one listens, or did."""
 
-    def hop_down(self, door: str, address: str | None, text: str) -> None:
-        """Refuse what would go to *address* by *door*, or to any address; *text* says why."""
+    def hop_down(self, transport: str, address: str | None, text: str) -> None:
+        """Refuse what would go to *address* by *transport*, or to any address; *text* says why."""
         if address is None:
-            self._closed[door] = text
+            self._closed[transport] = text
         else:
-            self._down[Way(door, address)] = text
+            self._down[Endpoint(transport, address)] = text
 
-    def hop_up(self, door: str, address: str | None) -> None:
+    def hop_up(self, transport: str, address: str | None) -> None:
         """Take back what :meth:`hop_down` was told with the same arguments."""
-        if door in self._doors:
-            self._opened.add(door)
+        if transport in self._transports:
+            self._opened.add(transport)
         if address is None:
-            self._closed.pop(door, None)
+            self._closed.pop(transport, None)
         else:
-            self._down.pop(Way(door, address), None)
+            self._down.pop(Endpoint(transport, address), None)
 
     def door_removed(self, name: str) -> None:
         """Forget everything about a door."""
         self._opened.discard(name)
         self._closed.pop(name, None)
-        for way in [each for each in self._down if each.door == name]:
-            del self._down[way]
+        for endpoint in [each for each in self._down if each.transport == name]:
+            del self._down[endpoint]
 
-    def is_down(self, hop: Way) -> bool:
+    def is_down(self, hop: Endpoint) -> bool:
         """Say whether nothing can go to *hop* now."""
-        if hop in self._down or hop.door in self._closed:
+        if hop in self._down or hop.transport in self._closed:
             return True
-        return self._prober is not None and self._prober.is_dead(hop)
+        return self._hop_prober is not None and self._hop_prober.is_dead(hop)
 
-    def why_down(self, hop: Way) -> str:
+    def why_down(self, hop: Endpoint) -> str:
         """Return in words why nothing can go to *hop* now; empty if it can."""
-        if hop.door not in self._doors:
-            return f"this station has no door {hop.door}"
-        if why := self._down.get(hop) or self._closed.get(hop.door):
+        if hop.transport not in self._transports:
+            return f"this station has no door {hop.transport}"
+        if why := self._down.get(hop) or self._closed.get(hop.transport):
             return why
-        is_dead = self._prober is not None and self._prober.is_dead(hop)
+        is_dead = self._hop_prober is not None and self._hop_prober.is_dead(hop)
         return "it does not answer" if is_dead else ""
 
     def find_obstacle(self, route: Route) -> Obstacle | None:
@@ -112,12 +113,12 @@ class Judge:
         why = self.why_down(route.hop)
         if not why:
             return None
-        door = route.hop.door
-        if route.is_client and door in self._doors and door not in self._opened:
+        transport = route.hop.transport
+        if route.is_client and transport in self._transports and transport not in self._opened:
             return Obstacle(RouteState.CLIENT, f"not listening: {why}")
         return Obstacle(RouteState.DOWN, why)
 
-    def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
+    def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | Refusal:
         """Return how a request goes on that is for nobody here."""
         found = self._table.find(header.target)
         if found is None:
@@ -127,13 +128,13 @@ class Judge:
             # Whoever has a route for the station's NetIDs would send it back here.
             text = f"this station has no NetID {header.target}"
             return Refusal(AdsError.TARGET_MACHINE, text)
-        return self._find_obstacle(header, way, route) or route
+        return self._find_obstacle(header, endpoint, route) or route
 
-    def is_again(self, header: AmsHeader, onward: bytes, way: Way) -> bool:
+    def is_again(self, header: AmsHeader, onward: bytes, endpoint: Endpoint) -> bool:
         """Say whether it is a doubled packet, or asked again, while the first one waits."""
-        if self._doors[way.door].is_stream:
+        if self._transports[endpoint.transport].is_stream:
             return False
-        return self._in_flight.is_asked(way, onward, header.invoke_id)
+        return self._in_flight.is_asked(endpoint, onward, header.invoke_id)
 
     def find_circle(self, header: AmsHeader, onward: bytes, route: Route) -> Refusal | None:
         """Say whether a request was passed on from here already."""
@@ -145,31 +146,34 @@ class Judge:
         text = f"it was passed on from here already: routes to {header.target} run in a circle"
         return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
 
-    def find_room(self, way: Way) -> Refusal | None:
+    def find_room(self, endpoint: Endpoint) -> Refusal | None:
         """Say whether too many requests wait for one more."""
-        waiting = self._in_flight.count(way)
-        of_door = self._in_flight.count_of_door(way.door)
+        waiting = self._in_flight.count(endpoint)
+        of_door = self._in_flight.count_of_door(endpoint.transport)
         if waiting >= self._limits.per_connection:
             text = f"{self._limits.per_connection} requests of the connection wait already"
             return Refusal(AdsError.MAILBOX_FULL, text)
-        if waiting >= self._limits.per_door - of_door:
-            text = f"{of_door} requests by {way.door} wait already, {waiting} of this connection"
+        if waiting >= self._limits.per_transport - of_door:
+            by = endpoint.transport
+            text = f"{of_door} requests by {by} wait already, {waiting} of this connection"
             return Refusal(AdsError.MAILBOX_FULL, text)
         if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
             text = f"{self._limits.in_flight} requests wait already"
             return Refusal(AdsError.MAILBOX_FULL, text)
         return None
 
-    def _find_obstacle(self, header: AmsHeader, way: Way, route: Route) -> Refusal | None:
+    def _find_obstacle(self, header: AmsHeader, endpoint: Endpoint, route: Route) -> Refusal | None:
         back = self._table.find(header.source)
         if back is not None and back[1] >= STATION_OCTETS and back[0].is_unidirectional:
             text = f"route {back[0].name} is unidirectional: nothing may be asked from there"
             return Refusal(AdsError.ACCESS_DENIED, text, back[0])
         hop = route.hop
-        if hop.door not in self._doors:
-            text = f"route {route.name} is by {hop.door}, which this station does not have"
+        if hop.transport not in self._transports:
+            text = f"route {route.name} is by {hop.transport}, which this station does not have"
             return Refusal(AdsError.HOST_UNREACHABLE, text, route)
-        if hop.door == way.door and (hop == way or not self._doors[hop.door].is_hub):
+        if hop.transport == endpoint.transport and (
+            hop == endpoint or not self._transports[hop.transport].is_hub
+        ):
             text = f"route {route.name} leads back to where it came from"
             return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
         if self.is_down(hop):

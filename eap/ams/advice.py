@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from eap.ams.report import Obstacle, RouteReport, RouteState
-from eap.ams.spec import DoorKind
+from eap.ams.spec import TransportKind
 from eap.codec.ads import AdsError
 from eap.ids import NetId
 
 _ALIVE = frozenset({AdsError.TARGET_PORT})
 """Errors of the AMS header that only who has the NetID answers with."""
 _UNREACHED: dict[str, str] = {
-    DoorKind.AMS_TCP: "see whether it is switched on, and listens on that TCP port (a firewall?)",
-    DoorKind.UDP: "see whether it is switched on, in the same network, and its station runs",
-    DoorKind.TCP: "see whether its station runs, and takes connections on that port",
-    DoorKind.ETHERNET: "see to the cable and the MAC address, and whether its station runs",
-    DoorKind.MQTT: "see whether both stations are connected to the broker, under the same network",
+    TransportKind.AMS_TCP: "see whether it is on and listens on that TCP port (a firewall?)",
+    TransportKind.UDP: "see whether it is switched on, in the same network, and its station runs",
+    TransportKind.TCP: "see whether its station runs, and takes connections on that port",
+    TransportKind.ETHERNET: "see to the cable and the MAC address, and whether its station runs",
+    TransportKind.MQTT: "see whether both stations are connected to the broker, same network",
 }
 """What to do about a hop that is down, by the kind of the door."""
 _CLIENT = "nothing is wrong if it only asks; to be asked, it has to listen there"

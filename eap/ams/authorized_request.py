@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, OperationOutcome
 from eap.ads.part import encode_sum, part_of, split_answer
 from eap.ads.request import AdsRequest
-from eap.ams.access import Verdict
-from eap.ams.endpoint import Way
+from eap.ams.access import Decision
 from eap.ams.spec import AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
@@ -31,16 +31,16 @@ class AuditedOperation(NamedTuple):
     """One operation, what was decided on it, and how it came out."""
 
     operation: Operation | AddRoute
-    verdict: Verdict
+    decision: Decision
     result: int | None
     """None if nobody knows: there was no answer, or none that can be read."""
 
     @property
     def is_told(self) -> bool:
         """Whether an audit tells of it: it changed something, or was refused."""
-        if not self.verdict.is_allowed:
+        if not self.decision.is_allowed:
             return True
-        if self.verdict.service is AccessService.READ:
+        if self.decision.service is AccessService.READ:
             return False
         # Of a file the opening is told; a megabyte of it is a thousand writes.
         is_piece = getattr(self.operation, "group", None) == IndexGroup.FOE_WRITE
@@ -50,7 +50,7 @@ class AuditedOperation(NamedTuple):
 class AuditEntry(NamedTuple):
     """What somebody had changed, or wanted to."""
 
-    way: Way
+    endpoint: Endpoint
     header: AmsHeader
     """Of the request, as it came."""
     route: str
@@ -58,36 +58,36 @@ class AuditEntry(NamedTuple):
     operations: tuple[AuditedOperation, ...]
 
 
-class Judged(NamedTuple):
+class AuthorizedRequest(NamedTuple):
     """A request and what was decided on its operations."""
 
-    way: Way
+    endpoint: Endpoint
     header: AmsHeader
     route: str
     """As in the audit."""
     request: AdsRequest
-    verdicts: tuple[Verdict, ...]
+    decisions: tuple[Decision, ...]
 
     @property
-    def refused(self) -> list[Verdict]:
+    def refused(self) -> list[Decision]:
         """The verdicts on what may not be done."""
-        return [each for each in self.verdicts if not each.is_allowed]
+        return [each for each in self.decisions if not each.is_allowed]
 
     @property
     def changes(self) -> AuditEntry:
         """Entry of the changes in the request that are allowed; none of them is done yet."""
-        entry = self._entry([None] * len(self.verdicts))
-        allowed = tuple(each for each in entry.operations if each.verdict.is_allowed)
+        entry = self._entry([None] * len(self.decisions))
+        allowed = tuple(each for each in entry.operations if each.decision.is_allowed)
         return entry._replace(operations=allowed)
 
-    def refuse_changes(self, why: str) -> Judged:
+    def refuse_changes(self, why: str) -> AuthorizedRequest:
         """Return the request with all that changes something refused."""
         return self._replace(
-            verdicts=tuple(
+            decisions=tuple(
                 each
                 if each.service is AccessService.READ or not each.is_allowed
                 else each._replace(is_allowed=False, why=why)
-                for each in self.verdicts
+                for each in self.decisions
             )
         )
 
@@ -110,7 +110,7 @@ class Judged(NamedTuple):
             if self.refused:
                 left = iter(outcomes)
                 body = self.request.encode_answer(
-                    [next(left) if each.is_allowed else _DENIED for each in self.verdicts]
+                    [next(left) if each.is_allowed else _DENIED for each in self.decisions]
                 )
         return body, self._entry(results)
 
@@ -120,25 +120,25 @@ class Judged(NamedTuple):
         Args:
             error_code: That its client got; None if it got nothing.
         """
-        return self._entry([error_code] * len(self.verdicts))
+        return self._entry([error_code] * len(self.decisions))
 
     def _part(self) -> AdsRequest:
         if not self.refused:
             return self.request
-        pairs = zip(self.request.operations, self.verdicts, strict=True)
-        return part_of(self.request, [each for each, verdict in pairs if verdict.is_allowed])
+        pairs = zip(self.request.operations, self.decisions, strict=True)
+        return part_of(self.request, [each for each, decision in pairs if decision.is_allowed])
 
     def _entry(self, results: Sequence[int | None]) -> AuditEntry:
         """Return an entry; *results* are those of what was allowed."""
         left = iter(results)
         operations = (
             AuditedOperation(
-                operation, verdict, next(left) if verdict.is_allowed else _DENIED.result
+                operation, decision, next(left) if decision.is_allowed else _DENIED.result
             )
-            for operation, verdict in zip(self.request.operations, self.verdicts, strict=True)
+            for operation, decision in zip(self.request.operations, self.decisions, strict=True)
         )
         told = tuple(each for each in operations if each.is_told)
-        return AuditEntry(self.way, self.header, self.route, told)
+        return AuditEntry(self.endpoint, self.header, self.route, told)
 
 
 def _first_result(body: bytes) -> int | None:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 from eap.ams.spec import DirectoryPort, DirectoryStation
 from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
 from eap.ids import NetId
-from eap.suggest import suggest
 from eap.od.profiles.router9000 import ROUTER
+from eap.suggest import suggest
 
 _MAX_PORT = 0xFFFF
 

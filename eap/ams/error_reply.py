@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from eap.ads.answer import AmsAnswer, response_to
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Action, Outcome, Trace
-from eap.ams.endpoint import Way
 from eap.ams.record import Record, describe
 from eap.ams.routes import Route
-from eap.ams.transport_table import Outlet
+from eap.ams.transport_table import TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 
@@ -34,36 +34,43 @@ def wants_answer(header: AmsHeader) -> bool:
     return not (header.state_flags & _NO_RETURN or header.command == _NOTIFICATION)
 
 
-class Refuser:
+class ErrorReplier:
     """Answers with errors, and remembers each."""
 
-    def __init__(self, outlet: Outlet, record: Record) -> None:
-        self._outlet = outlet
+    def __init__(self, transports: TransportTable, record: Record) -> None:
+        self._transports = transports
         self._record = record
 
     def refuse(
-        self, header: AmsHeader, way: Way | None, why: Refusal, at_ns: int, took_ns: int = 0
+        self,
+        header: AmsHeader,
+        endpoint: Endpoint | None,
+        why: Refusal,
+        at_ns: int,
+        took_ns: int = 0,
     ) -> list[Action]:
-        """Answer the request with *header*, as it came by *way*; None if nobody waits."""
-        text = f"{describe(header, way)}: {why.text}"
+        """Answer the request with *header*, as it came by *endpoint*; None if nobody waits."""
+        text = f"{describe(header, endpoint)}: {why.text}"
         hop = None
         if why.route is not None:
             hop = why.route.hop
             self._record.routes.of(why.route.key, at_ns).fail(why.text)
-        self._record.enter(Trace(at_ns, why.outcome, way, hop, header, why.error, took_ns, text))
-        if way is None or not wants_answer(header):
+        self._record.enter(
+            Trace(at_ns, why.outcome, endpoint, hop, header, why.error, took_ns, text)
+        )
+        if endpoint is None or not wants_answer(header):
             return []
         packet = response_to(header, AmsAnswer(why.body, 0 if why.body else why.error))
-        traffic = self._record.connections.of(way, at_ns)
+        traffic = self._record.connections.of(endpoint, at_ns)
         traffic.fail(why.text)
         traffic.answer(len(packet), took_ns)
-        return [self._outlet.reply(way, packet)]
+        return [self._transports.reply(endpoint, packet)]
 
     def drop(
-        self, way: Way, header: AmsHeader | None, outcome: Outcome, text: str, at_ns: int
+        self, endpoint: Endpoint, header: AmsHeader | None, outcome: Outcome, text: str, at_ns: int
     ) -> list[Action]:
         """Say nothing to anybody, and remember it."""
-        subject = str(way) if header is None else describe(header, way)
+        subject = str(endpoint) if header is None else describe(header, endpoint)
         text = f"{subject}: {text}"
-        self._record.enter(Trace(at_ns, outcome, way, None, header, 0, 0, text))
+        self._record.enter(Trace(at_ns, outcome, endpoint, None, header, 0, 0, text))
         return []

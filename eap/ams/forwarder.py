@@ -8,20 +8,20 @@ router before this one gave is kept: a packet that runs in a circle is known by 
 from __future__ import annotations
 
 from eap.ads.answer import AmsAnswer, response_to
-from eap.ams.access_filter import Gate, exchange_body
+from eap.ads.endpoint import Endpoint
+from eap.ams.access_filter import AccessFilter, exchange_body
 from eap.ams.action import Action, Outcome, Trace
-from eap.ams.admission import Judge, Limits
-from eap.ams.authorized_request import Judged
-from eap.ams.endpoint import Way
-from eap.ams.error_reply import Refusal, Refuser, wants_answer
-from eap.ams.hop_prober import Prober
+from eap.ams.admission import Admission, Limits
+from eap.ams.authorized_request import AuthorizedRequest
+from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
+from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import InFlight, Pending
 from eap.ams.invoke import InvokeIds, is_marked
-from eap.ams.loop_detector import Passed
-from eap.ams.notification_cleanup import Ending
+from eap.ams.loop_detector import LoopDetector
+from eap.ams.notification_cleanup import NotificationCleanup
 from eap.ams.notification_forwarder import (
     FOLLOWED,
-    Notifier,
+    NotificationForwarder,
     Samples,
     deleted_handles,
     encode_deleted,
@@ -29,9 +29,9 @@ from eap.ams.notification_forwarder import (
 from eap.ams.record import Record, describe
 from eap.ams.report import Obstacle, RouteState
 from eap.ams.routes import Route, RouteTable
-from eap.ams.subscription_restorer import Restorer
+from eap.ams.subscription_restorer import SubscriptionRestorer
 from eap.ams.subscriptions import MAX_PER_CLIENT, MAX_TOTAL, Subscription
-from eap.ams.transport_table import Outlet
+from eap.ams.transport_table import TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
 from eap.ids import NetId
@@ -43,50 +43,52 @@ _INVOKE_ID = 28
 """Where it stands in a packet; between the addresses and it nothing changes on the way."""
 
 
-class Passage:
+class Forwarder:
     """What a router passes on.
 
     Attributes:
         in_flight: What waits for an answer.
-        notifier: Notifications that pass.
-        restorer: Subscriptions that are interrupted.
+        notification_forwarder: Notifications that pass.
+        subscription_restorer: Subscriptions that are interrupted.
     """
 
     def __init__(
         self,
         net_id: NetId,
         table: RouteTable,
-        outlet: Outlet,
-        refuser: Refuser,
+        transports: TransportTable,
+        error_replier: ErrorReplier,
         record: Record,
-        gate: Gate,
+        access_filter: AccessFilter,
         *,
         first_invoke_id: int,
         limits: Limits,
-        prober: Prober | None = None,
+        hop_prober: HopProber | None = None,
     ) -> None:
         self.in_flight = InFlight()
-        self.notifier = Notifier(outlet)
+        self.notification_forwarder = NotificationForwarder(transports)
         self._table = table
-        self._outlet = outlet
-        self._refuser = refuser
+        self._transports = transports
+        self._error_replier = error_replier
         self._record = record
-        self._gate = gate
+        self._access_filter = access_filter
         self._limits = limits
-        self._prober = prober
+        self._hop_prober = hop_prober
         self._ids = InvokeIds(first_invoke_id)
-        self._judge = Judge(net_id, table, outlet.doors, self.in_flight, limits, prober)
-        self._passed = Passed()
-        self._ending = Ending(outlet, self.in_flight, self._ids, limits)
-        self.restorer = Restorer(
-            self.notifier.subscriptions, outlet, self.in_flight, self._ids, self._ending, refuser,
-            limits, self._find_way,
+        self._admission = Admission(
+            net_id, table, transports.transports, self.in_flight, limits, hop_prober
+        )
+        self._loop_detector = LoopDetector()
+        self._ending = NotificationCleanup(transports, self.in_flight, self._ids, limits)
+        self.subscription_restorer = SubscriptionRestorer(
+            self.notification_forwarder.subscriptions, transports, self.in_flight, self._ids,
+            self._ending, error_replier, limits, self._find_way,
         )  # fmt: skip
-        if prober is not None:
-            prober.watched = self.notifier.subscriptions.hops
+        if hop_prober is not None:
+            hop_prober.watched = self.notification_forwarder.subscriptions.hops
 
     def take_notification(
-        self, header: AmsHeader, data: bytes, way: Way, now_ns: int, *, is_own: bool
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, *, is_own: bool
     ) -> list[Action]:
         """Hand samples to the clients that subscribed, whatever NetID these have.
 
@@ -96,27 +98,27 @@ class Passage:
         Args:
             header: Of the notification.
             data: All of the packet.
-            way: That it came by.
+            endpoint: That it came by.
             now_ns: The time on the monotonic clock.
             is_own: Whether its target is of this station.
 
         Raises:
             CodecError: it is shorter or longer than it says.
         """
-        samples = self.notifier.hand_on(
-            header, data, now_ns, lambda hop: self._outlet.is_from(hop, way)
+        samples = self.notification_forwarder.hand_on(
+            header, data, now_ns, lambda hop: self._transports.is_from(hop, endpoint)
         )
         if samples.hop is not None:
-            if self._prober is not None:
-                self._prober.hear(samples.hop, now_ns)
-            actions = [*samples.replies, *self.restorer.ended(samples.ended, now_ns)]
-            return actions + self._end_unwanted(header, samples, way)
-        found = None if is_own else self._judge.find_route(header, way)
+            if self._hop_prober is not None:
+                self._hop_prober.hear(samples.hop, now_ns)
+            actions = [*samples.replies, *self.subscription_restorer.ended(samples.ended, now_ns)]
+            return actions + self._end_unwanted(header, samples, endpoint)
+        found = None if is_own else self._admission.find_route(header, endpoint)
         if found is not None and not self._is_refused_for_good(found):
-            return self.take_request(header, data, way, now_ns)
+            return self.take_request(header, data, endpoint, now_ns)
         text = "no client here subscribed to it, or not any more"
-        self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
-        return self._end_unwanted(header, samples, way)
+        self._error_replier.drop(endpoint, header, Outcome.LATE, text, now_ns)
+        return self._end_unwanted(header, samples, endpoint)
 
     def _is_refused_for_good(self, found: Route | Refusal) -> bool:
         """Return whether samples for a client that is not connected here can never reach it.
@@ -127,93 +129,106 @@ class Passage:
             return False
         if found.error == AdsError.TARGET_MACHINE:
             return True
-        obstacle = None if found.route is None else self._judge.find_obstacle(found.route)
+        obstacle = None if found.route is None else self._admission.find_obstacle(found.route)
         return obstacle is not None and obstacle.state is RouteState.CLIENT
 
-    def _end_unwanted(self, header: AmsHeader, samples: Samples, way: Way) -> list[Action]:
+    def _end_unwanted(
+        self, header: AmsHeader, samples: Samples, endpoint: Endpoint
+    ) -> list[Action]:
         """Have one notification ended that no client has; the others come again."""
         if not samples.unknown:
             return []
-        return self._ending.end_unwanted(header, samples.unknown[0], way)
+        return self._ending.end_unwanted(header, samples.unknown[0], endpoint)
 
-    def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
+    def take_request(
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
+    ) -> list[Action]:
         """Pass a request on that is for nobody here, or refuse it."""
         is_followed = header.command in FOLLOWED
-        own = self.notifier.find_own(header, data, way) if is_followed else None
+        own = self.notification_forwarder.find_own(header, data, endpoint) if is_followed else None
         if own is not None and own[0].request is not None:
-            return self._delete(header, data, own, way, now_ns)
-        found = self._let_on(header, data, way, now_ns)
+            return self._delete(header, data, own, endpoint, now_ns)
+        found = self._let_on(header, data, endpoint, now_ns)
         if isinstance(found, Refusal):
-            return self._refuser.refuse(header, way, found, now_ns)
-        route, data, judged = found
+            return self._error_replier.refuse(header, endpoint, found, now_ns)
+        route, data, authorized = found
         if own is not None:
-            self.notifier.forget(own)
-        if is_followed and not self.notifier.has_room(header, data, way):
-            return self._refuse_subscriptions(header, judged, way, now_ns)
-        onward = self._onward(header, way, route)
+            self.notification_forwarder.forget(own)
+        if is_followed and not self.notification_forwarder.has_room(header, data, endpoint):
+            return self._refuse_subscriptions(header, authorized, endpoint, now_ns)
+        onward = self._onward(header, endpoint, route)
         if not wants_answer(header):
-            if judged is not None:
-                self._gate.give_up(judged)
-            return self._pass_once(header, data, onward, way, route, now_ns)
-        pending = self._admit(header, data, onward, way, route, judged, now_ns)
+            if authorized is not None:
+                self._access_filter.give_up(authorized)
+            return self._pass_once(header, data, onward, endpoint, route, now_ns)
+        pending = self._admit(header, data, onward, endpoint, route, authorized, now_ns)
         if not isinstance(pending, Pending):
             return pending
         if is_followed:
-            self.notifier.follow_request(pending, data[AmsHeader.SIZE :], way)
+            self.notification_forwarder.follow_request(pending, data[AmsHeader.SIZE :], endpoint)
         return [self._forward(pending.invoke_id, data, onward, route)]
 
     def wait_for_service(
-        self, header: AmsHeader, data: bytes, way: Way, judged: Judged | None, now_ns: int
+        self,
+        header: AmsHeader,
+        data: bytes,
+        endpoint: Endpoint,
+        authorized: AuthorizedRequest | None,
+        now_ns: int,
     ) -> int | list[Action]:
         """Remember a request that a service of this station gets; return its ticket, or refuse."""
-        pending = self._admit(header, data, data[: ADDRESSES.size], way, None, judged, now_ns)
+        pending = self._admit(
+            header, data, data[: ADDRESSES.size], endpoint, None, authorized, now_ns
+        )
         return pending.invoke_id if isinstance(pending, Pending) else pending
 
-    def take_answer(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
+    def take_answer(
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
+    ) -> list[Action]:
         """Send an answer back to who asked, unless it is late or comes from somewhere else."""
         pending = self.in_flight.get(header.invoke_id)
-        if pending is None or not self._is_answer(header, data, way, pending):
-            return self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
+        if pending is None or not self._is_answer(header, data, endpoint, pending):
+            return self._error_replier.drop(endpoint, None, Outcome.LATE, _unasked(header), now_ns)
         self.in_flight.pop(header.invoke_id)
-        if self._prober is not None and pending.route is not None:
-            self._prober.hear(pending.route.hop, now_ns)
+        if self._hop_prober is not None and pending.route is not None:
+            self._hop_prober.hear(pending.route.hop, now_ns)
         if pending.step is not None:
             body = data[AmsHeader.SIZE :]
-            return self.restorer.receive_answer(pending, header, body, now_ns)
+            return self.subscription_restorer.receive_answer(pending, header, body, now_ns)
         actions: list[Action] = []
         granted = None
         if pending.handles or pending.asked_for:
             body = data[AmsHeader.SIZE :]
-            granted = self.notifier.follow_answer(pending, header, body, now_ns)
+            granted = self.notification_forwarder.follow_answer(pending, header, body, now_ns)
         if granted is not None:
             actions += self._ending.end(granted.surplus, now_ns)
-            actions += self.restorer.displaced(granted.displaced, now_ns)
+            actions += self.subscription_restorer.displaced(granted.displaced, now_ns)
             data = data[: AmsHeader.SIZE] + granted.body
         if pending.came_by is None:
             if header.command != AmsCommand.DELETE_NOTIFICATION:  # most of those are our own
-                self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
+                self._error_replier.drop(endpoint, None, Outcome.LATE, _unasked(header), now_ns)
             return actions
         asked = pending.header
-        if pending.judged is not None:
+        if pending.authorized is not None:
             body = data[AmsHeader.SIZE :]
-            body = self._gate.take_answer(pending.judged, header.error_code, body)
+            body = self._access_filter.take_answer(pending.authorized, header.error_code, body)
             data = exchange_body(data, body)
         back = ADDRESSES.pack(asked.source, asked.source_port, asked.target, asked.target_port)
         number = asked.invoke_id.to_bytes(4, "little")
         packet = back + data[ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
         actions += self._send_back(pending, pending.came_by, packet, header.error_code, now_ns)
         for subscription in () if granted is None else granted.new:
-            actions += self.restorer.granted(subscription, now_ns)
+            actions += self.subscription_restorer.granted(subscription, now_ns)
         return actions
 
     def answer_now(
-        self, header: AmsHeader, way: Way, answer: AmsAnswer, took_ns: int, now_ns: int
+        self, header: AmsHeader, endpoint: Endpoint, answer: AmsAnswer, took_ns: int, now_ns: int
     ) -> list[Action]:
         """Send back what a service had at hand for a request that never waited."""
         packet = response_to(header, answer)
-        self._record.connections.of(way, now_ns).answer(len(packet), took_ns)
-        self._record.enter(Trace(now_ns, _ANSWERED, way, None, header, 0, took_ns, ""))
-        return [self._outlet.reply(way, packet)]
+        self._record.connections.of(endpoint, now_ns).answer(len(packet), took_ns)
+        self._record.enter(Trace(now_ns, _ANSWERED, endpoint, None, header, 0, took_ns, ""))
+        return [self._transports.reply(endpoint, packet)]
 
     def answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
         """Send back what a service says to the request with *ticket*, if it still waits."""
@@ -221,8 +236,10 @@ class Passage:
         if pending is None or pending.route is not None or pending.came_by is None:
             return []
         self.in_flight.pop(ticket)
-        if pending.judged is not None:
-            body = self._gate.take_answer(pending.judged, answer.error_code, answer.data)
+        if pending.authorized is not None:
+            body = self._access_filter.take_answer(
+                pending.authorized, answer.error_code, answer.data
+            )
             answer = answer._replace(data=body)
         packet = response_to(pending.header, answer)
         why = _with_result(answer)
@@ -233,62 +250,65 @@ class Passage:
         pending = self.in_flight.pop(ticket)
         return [] if pending is None else self._fail(pending, text, now_ns)
 
-    def ways_of(self, door: str) -> set[Way]:
+    def ways_of(self, transport: str) -> set[Endpoint]:
         """Return by which ways of a door somebody waits here for something."""
-        ways = {*self.in_flight.ways(), *self.notifier.subscriptions.ways()}
-        return {way for way in ways if way.door == door}
+        endpoints = {
+            *self.in_flight.endpoints(),
+            *self.notification_forwarder.subscriptions.endpoints(),
+        }
+        return {endpoint for endpoint in endpoints if endpoint.transport == transport}
 
-    def connection_closed(self, way: Way, now_ns: int) -> list[Action]:
-        """Forget who waits at *way*, and end their notifications."""
-        for pending in self.in_flight.abandon(way):
+    def connection_closed(self, endpoint: Endpoint, now_ns: int) -> list[Action]:
+        """Forget who waits at *endpoint*, and end their notifications."""
+        for pending in self.in_flight.abandon(endpoint):
             self._give_up(pending)
             if pending.route is None:
                 self.in_flight.pop(pending.invoke_id)
-        return self._ending.end(self.notifier.close(way), now_ns)
+        return self._ending.end(self.notification_forwarder.close(endpoint), now_ns)
 
-    def hop_down(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
+    def hop_down(self, transport: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop, and refuse what will be for it."""
-        self._judge.hop_down(door, address, text)
-        return self.hop_lost(door, address, text, now_ns)
+        self._admission.hop_down(transport, address, text)
+        return self.hop_lost(transport, address, text, now_ns)
 
-    def hop_lost(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
+    def hop_lost(self, transport: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop: it will not."""
-        actions = self.subscriptions_lost(door, address, text, now_ns)
-        for pending in self.in_flight.on(door, address):
+        actions = self.subscriptions_lost(transport, address, text, now_ns)
+        for pending in self.in_flight.on(transport, address):
             self.in_flight.pop(pending.invoke_id)
             actions += self._fail(pending, text, now_ns)
         return actions
 
     def subscriptions_lost(
-        self, door: str, address: str | None, text: str, now_ns: int
+        self, transport: str, address: str | None, text: str, now_ns: int
     ) -> list[Action]:
         """Restore the subscriptions by a hop, or tell the router before this one."""
-        lost = self.notifier.subscriptions.of_hop(door, address)
-        return self.restorer.interrupt(lost, text, now_ns)
+        lost = self.notification_forwarder.subscriptions.of_hop(transport, address)
+        return self.subscription_restorer.interrupt(lost, text, now_ns)
 
-    def hop_up(self, door: str, address: str | None) -> None:
+    def hop_up(self, transport: str, address: str | None) -> None:
         """Pass requests on to a hop again."""
-        self._judge.hop_up(door, address)
+        self._admission.hop_up(transport, address)
 
     def door_removed(self, name: str) -> None:
         """Forget everything about a door."""
-        self._judge.door_removed(name)
+        self._admission.door_removed(name)
 
     def find_obstacle(self, route: Route) -> Obstacle | None:
         """Return why nothing can go by *route* now; None if something can."""
-        return self._judge.find_obstacle(route)
+        return self._admission.find_obstacle(route)
 
-    def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
+    def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | Refusal:
         """Return how a request would go on that is for nobody here."""
-        return self._judge.find_route(header, way)
+        return self._admission.find_route(header, endpoint)
 
-    def is_down(self, hop: Way) -> bool:
+    def is_down(self, hop: Endpoint) -> bool:
         """Say whether nothing can go to a hop now."""
-        return self._judge.is_down(hop)
+        return self._admission.is_down(hop)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
-        times = (self.in_flight.next_timeout(), self.restorer.next_timeout())
+        times = (self.in_flight.next_timeout(), self.subscription_restorer.next_timeout())
         return min((each for each in times if each is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> list[Action]:
@@ -298,78 +318,87 @@ class Passage:
             self.in_flight.pop(pending.invoke_id)
             if pending.came_by is not None or pending.step is not None:
                 actions += self._time_out(pending, now_ns)
-        return actions + self.restorer.handle_timeout(now_ns)
+        return actions + self.subscription_restorer.handle_timeout(now_ns)
 
     def _find_way(
-        self, header: AmsHeader, packet: bytes, way: Way, now_ns: int
+        self, header: AmsHeader, packet: bytes, endpoint: Endpoint, now_ns: int
     ) -> tuple[Route, bytes] | Refusal:
         """Return by which route a request of a client goes on now, and with which addresses."""
-        found = self._let_on(header, packet, way, now_ns)
+        found = self._let_on(header, packet, endpoint, now_ns)
         if isinstance(found, Refusal):
             return found
-        route, _, judged = found
-        if judged is not None:
-            self._gate.give_up(judged)
-        return route, self._onward(header, way, route)
+        route, _, authorized = found
+        if authorized is not None:
+            self._access_filter.give_up(authorized)
+        return route, self._onward(header, endpoint, route)
 
-    def _onward(self, header: AmsHeader, way: Way, route: Route) -> bytes:
+    def _onward(self, header: AmsHeader, endpoint: Endpoint, route: Route) -> bytes:
         return ADDRESSES.pack(
             route.to_real(header.target), header.target_port,
-            self._table.to_virtual(header.source, way), header.source_port,
+            self._table.to_virtual(header.source, endpoint), header.source_port,
         )  # fmt: skip
 
     def _delete(
-        self, header: AmsHeader, data: bytes, own: list[Subscription], way: Way, now_ns: int
+        self,
+        header: AmsHeader,
+        data: bytes,
+        own: list[Subscription],
+        endpoint: Endpoint,
+        now_ns: int,
     ) -> list[Action]:
         """End subscriptions that this router restores, whatever is wrong with the way."""
         known = {each.handle for each in own}
         handles = deleted_handles(header, data)
-        grants = self.notifier.forget(own)
+        grants = self.notification_forwarder.forget(own)
         actions: list[Action] = []
         if wants_answer(header):
             results = [
                 AdsError.NONE if each in known else AdsError.NOTIFICATION_HANDLE for each in handles
             ]
             answer = AmsAnswer(encode_deleted(header, results))
-            actions += self.answer_now(header, way, answer, 0, now_ns)
+            actions += self.answer_now(header, endpoint, answer, 0, now_ns)
         return actions + self._ending.end(grants, now_ns)
 
     def _refuse_subscriptions(
-        self, header: AmsHeader, judged: Judged | None, way: Way, now_ns: int
+        self,
+        header: AmsHeader,
+        authorized: AuthorizedRequest | None,
+        endpoint: Endpoint,
+        now_ns: int,
     ) -> list[Action]:
-        if judged is not None:
-            self._gate.give_up(judged, AdsError.NO_MORE_HANDLES)
+        if authorized is not None:
+            self._access_filter.give_up(authorized, AdsError.NO_MORE_HANDLES)
         text = f"no more than {MAX_PER_CLIENT} notifications a client, {MAX_TOTAL} in all"
         body = AdsError.NO_MORE_HANDLES.to_bytes(4, "little") + bytes(4)
         why = Refusal(AdsError.NO_MORE_HANDLES, text, body=body)
-        return self._refuser.refuse(header, way, why, now_ns)
+        return self._error_replier.refuse(header, endpoint, why, now_ns)
 
     def _let_on(
-        self, header: AmsHeader, data: bytes, way: Way, now_ns: int
-    ) -> tuple[Route, bytes, Judged | None] | Refusal:
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
+    ) -> tuple[Route, bytes, AuthorizedRequest | None] | Refusal:
         """Return by which route a request goes on, and as what."""
-        route = self._judge.find_route(header, way)
+        route = self._admission.find_route(header, endpoint)
         if isinstance(route, Refusal):
             return route
-        through = self._gate.let_through(header, data, way, now_ns, route.name)
+        through = self._access_filter.let_through(header, data, endpoint, now_ns, route.name)
         return through if isinstance(through, Refusal) else (route, *through)
 
     def _admit(
-        self, header: AmsHeader, data: bytes, onward: bytes, way: Way, route: Route | None,
-        judged: Judged | None, now_ns: int,
+        self, header: AmsHeader, data: bytes, onward: bytes, endpoint: Endpoint,
+        route: Route | None, authorized: AuthorizedRequest | None, now_ns: int,
     ) -> Pending | list[Action]:  # fmt: skip
         """Remember a request that has an answer, unless something speaks against it."""
-        if self._judge.is_again(header, onward, way):
-            if judged is not None:
-                self._gate.give_up(judged)
+        if self._admission.is_again(header, onward, endpoint):
+            if authorized is not None:
+                self._access_filter.give_up(authorized)
             text = "the same request waits already"
-            return self._refuser.drop(way, header, Outcome.DROPPED, text, now_ns)
-        why = None if route is None else self._judge.find_circle(header, onward, route)
-        why = why or self._judge.find_room(way)
+            return self._error_replier.drop(endpoint, header, Outcome.DROPPED, text, now_ns)
+        why = None if route is None else self._admission.find_circle(header, onward, route)
+        why = why or self._admission.find_room(endpoint)
         if why is not None:
-            if judged is not None:
-                self._gate.give_up(judged, why.error)
-            return self._refuser.refuse(header, way, why, now_ns)
+            if authorized is not None:
+                self._access_filter.give_up(authorized, why.error)
+            return self._error_replier.refuse(header, endpoint, why, now_ns)
         invoke_id = header.invoke_id
         if route is None or not is_marked(invoke_id) or invoke_id in self.in_flight:
             invoke_id = self._ids.take(self.in_flight)
@@ -377,41 +406,49 @@ class Passage:
         if route is not None:
             allowed = route.timeout_ns or allowed
             self._record.routes.of(route.key, now_ns).ask(len(data))
-        pending = Pending(invoke_id, header, way, route, onward, now_ns, now_ns + allowed)
-        pending.judged = judged
+        pending = Pending(invoke_id, header, endpoint, route, onward, now_ns, now_ns + allowed)
+        pending.authorized = authorized
         self.in_flight.add(pending)
         return pending
 
     def _pass_once(
-        self, header: AmsHeader, data: bytes, onward: bytes, way: Way, route: Route, now_ns: int
+        self,
+        header: AmsHeader,
+        data: bytes,
+        onward: bytes,
+        endpoint: Endpoint,
+        route: Route,
+        now_ns: int,
     ) -> list[Action]:
         """Pass on what has no answer, unless it was passed on a short time ago."""
         invoke_id = header.invoke_id
         if is_marked(invoke_id):
-            if (invoke_id, onward) in self._passed:
+            if (invoke_id, onward) in self._loop_detector:
                 text = f"passed on already: doubled, or routes to {header.target} run in a circle"
-                return self._refuser.drop(way, header, Outcome.LOOP, text, now_ns)
+                return self._error_replier.drop(endpoint, header, Outcome.LOOP, text, now_ns)
         else:
             invoke_id = self._ids.take(self.in_flight)
-        self._passed.add(invoke_id, onward)
+        self._loop_detector.add(invoke_id, onward)
         self._record.routes.of(route.key, now_ns).ask(len(data))
         return [self._forward(invoke_id, data, onward, route)]
 
     def _forward(self, invoke_id: int, data: bytes, onward: bytes, route: Route) -> Action:
         number = invoke_id.to_bytes(4, "little")
         packet = onward + data[ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
-        return self._outlet.forward(route.hop, packet, invoke_id)
+        return self._transports.forward(route.hop, packet, invoke_id)
 
-    def _is_answer(self, header: AmsHeader, data: bytes, way: Way, pending: Pending) -> bool:
+    def _is_answer(
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint, pending: Pending
+    ) -> bool:
         return (
             pending.route is not None
-            and self._outlet.is_from(pending.route.hop, way)
+            and self._transports.is_from(pending.route.hop, endpoint)
             and header.command == pending.header.command
             and data[:_HALF] == pending.onward[_HALF:]
         )
 
     def _send_back(
-        self, pending: Pending, way: Way, packet: bytes, error_code: int, now_ns: int,
+        self, pending: Pending, endpoint: Endpoint, packet: bytes, error_code: int, now_ns: int,
         why: str = "",
     ) -> list[Action]:  # fmt: skip
         route = pending.route
@@ -419,28 +456,30 @@ class Passage:
         hop = None
         if error_code and not why:
             why = f"{AdsError.words_of(error_code)} from a service of this station"
-        text = f"{describe(pending.header, way)}: {why}" if why else ""
+        text = f"{describe(pending.header, endpoint)}: {why}" if why else ""
         if route is not None:
             hop = route.hop
             traffic = self._record.routes.of(route.key, now_ns)
             if error_code:
                 error = AdsError.words_of(error_code)
                 why = f"{error} from {self._table.describe_hop(route)} or from behind it"
-                text = f"{describe(pending.header, way)}: {why}"
+                text = f"{describe(pending.header, endpoint)}: {why}"
                 traffic.fail(why)
             traffic.answer(len(packet), took_ns)
-        connection = self._record.connections.of(way, now_ns)
+        connection = self._record.connections.of(endpoint, now_ns)
         if error_code:
             connection.fail(text)
         connection.answer(len(packet), took_ns)
         self._record.enter(
-            Trace(now_ns, _ANSWERED, way, hop, pending.header, error_code, took_ns, text)
+            Trace(now_ns, _ANSWERED, endpoint, hop, pending.header, error_code, took_ns, text)
         )
-        return [self._outlet.reply(way, packet)]
+        return [self._transports.reply(endpoint, packet)]
 
     def _fail(self, pending: Pending, text: str, now_ns: int) -> list[Action]:
         if pending.step is not None:
-            return self.restorer.request_failed(pending, AdsError.HOST_UNREACHABLE, now_ns)
+            return self.subscription_restorer.request_failed(
+                pending, AdsError.HOST_UNREACHABLE, now_ns
+            )
         if pending.route is None or pending.came_by is None:
             return []
         route = pending.route
@@ -451,7 +490,7 @@ class Passage:
 
     def _time_out(self, pending: Pending, now_ns: int) -> list[Action]:
         if pending.step is not None:
-            actions = self.restorer.request_failed(pending, AdsError.TIMEOUT, now_ns)
+            actions = self.subscription_restorer.request_failed(pending, AdsError.TIMEOUT, now_ns)
         else:
             allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
             route = pending.route
@@ -469,12 +508,12 @@ class Passage:
         """Answer a request that nothing came back for."""
         self._give_up(pending, why.error)
         took_ns = now_ns - pending.at_ns
-        return self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
+        return self._error_replier.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
 
     def _give_up(self, pending: Pending, error_code: int | None = None) -> None:
-        if pending.judged is not None:
-            self._gate.give_up(pending.judged, error_code)
-            pending.judged = None
+        if pending.authorized is not None:
+            self._access_filter.give_up(pending.authorized, error_code)
+            pending.authorized = None
 
 
 def _with_result(answer: AmsAnswer) -> str:

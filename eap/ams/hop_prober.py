@@ -15,7 +15,7 @@ from collections.abc import Callable, Container, Iterator
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import RouteTable
 from eap.codec.ads import AdsRange, AdsSystemState, IndexGroup
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
@@ -42,7 +42,7 @@ _HEAD = 8
 class Probe(NamedTuple):
     """A question that is due."""
 
-    hop: Way
+    hop: Endpoint
     packet: bytes
     is_found_dead: bool
     """Whether the questions before it make the hop a dead one, which it was not yet."""
@@ -76,7 +76,7 @@ class _Hop:
         return now_ns - self.asked_at_ns >= interval_ns * (_BUSY if is_busy else 1)
 
 
-class Prober:
+class HopProber:
     """Asks the hops of a table of routes.
 
     Attributes:
@@ -92,34 +92,34 @@ class Prober:
         self._net_id = net_id
         self._table = table
         self._interval_ns = interval_ns
-        self._hops: dict[Way, _Hop] = {}
-        self._by_number: dict[int, Way] = {}
-        self._paused: set[Way] = set()
+        self._hops: dict[Endpoint, _Hop] = {}
+        self._by_number: dict[int, Endpoint] = {}
+        self._paused: set[Endpoint] = set()
         self._closed: set[str] = set()
         self._turns: list[tuple[int, int]] = []
         self._number = 0
         self._version = -1
-        self.watched: Container[Way] = ()
+        self.watched: Container[Endpoint] = ()
 
-    def pause(self, door: str, address: str | None) -> None:
+    def pause(self, transport: str, address: str | None) -> None:
         """Ask no more: the door itself knows that there is no way."""
         if address is None:
-            self._closed.add(door)
+            self._closed.add(transport)
         else:
-            self._paused.add(Way(door, address))
+            self._paused.add(Endpoint(transport, address))
 
-    def resume(self, door: str, address: str | None) -> None:
+    def resume(self, transport: str, address: str | None) -> None:
         """Ask again, and take the hop for alive until it misses questions."""
         if address is None:
-            self._closed.discard(door)
+            self._closed.discard(transport)
         else:
-            self._paused.discard(Way(door, address))
-        for way, hop in self._hops.items():
-            if way.door == door and address in {None, way.connection}:
+            self._paused.discard(Endpoint(transport, address))
+        for endpoint, hop in self._hops.items():
+            if endpoint.transport == transport and address in {None, endpoint.connection}:
                 hop.asked_at_ns, hop.misses, hop.is_down = None, 0, False
                 hop.restart_index, hop.has_restart_index = None, True
 
-    def hear(self, hop: Way, now_ns: int) -> None:
+    def hear(self, hop: Endpoint, now_ns: int) -> None:
         """Note that a hop answered a request."""
         known = self._hops.get(hop)
         if known is not None:
@@ -131,15 +131,15 @@ class Prober:
         return header.target_port == PROBE_PORT and header.target == self._net_id
 
     def take_answer(
-        self, header: AmsHeader, body: bytes, way: Way, now_ns: int,
-        is_from: Callable[[Way, Way], bool],
-    ) -> Way | None:  # fmt: skip
+        self, header: AmsHeader, body: bytes, endpoint: Endpoint, now_ns: int,
+        is_from: Callable[[Endpoint, Endpoint], bool],
+    ) -> Endpoint | None:  # fmt: skip
         """Note an answer: its hop is alive.
 
         Args:
             header: Of the answer.
             body: What follows the header.
-            way: That it came by.
+            endpoint: That it came by.
             now_ns: The time on the monotonic clock.
             is_from: Says of a hop and a way whether it may come from there.
 
@@ -147,7 +147,7 @@ class Prober:
             The hop, if its router was started again since the answer before.
         """
         hop = self._by_number.get(header.invoke_id)
-        if hop is None or not is_from(hop, way):
+        if hop is None or not is_from(hop, endpoint):
             return None
         self.hear(hop, now_ns)
         known = self._hops[hop]
@@ -158,17 +158,17 @@ class Prober:
             known.round_trip_ns = now_ns - known.asked_at_ns
         return None
 
-    def is_dead(self, hop: Way) -> bool:
+    def is_dead(self, hop: Endpoint) -> bool:
         """Say whether a hop does not answer."""
         known = self._hops.get(hop)
         return known is not None and known.is_down
 
-    def is_heard(self, hop: Way) -> bool:
+    def is_heard(self, hop: Endpoint) -> bool:
         """Say whether a hop is asked, and has ever answered anything."""
         known = self._hops.get(hop)
         return known is not None and known.heard_at_ns >= 0
 
-    def round_trip_ns(self, hop: Way) -> int | None:
+    def round_trip_ns(self, hop: Endpoint) -> int | None:
         """Return how long a hop took to answer last; None if it is not asked or does not."""
         known = self._hops.get(hop)
         return None if known is None or known.is_down else known.round_trip_ns
@@ -186,17 +186,17 @@ class Prober:
         interval_ns = max(self._interval_ns, len(self._hops) * _SPACING_NS)
         while self._turns and self._turns[0][0] <= now_ns:
             _, number = heappop(self._turns)
-            way = self._by_number[number]
+            endpoint = self._by_number[number]
             heappush(self._turns, (now_ns + interval_ns, number))
-            hop = self._hops[way]
-            if way in self._paused or way.door in self._closed:
+            hop = self._hops[endpoint]
+            if endpoint in self._paused or endpoint.transport in self._closed:
                 hop.asked_at_ns = None
-            elif way in self.watched or hop.is_due(now_ns, interval_ns):
-                yield self._ask(way, hop, now_ns)
-                if way in self.watched and hop.has_restart_index and not hop.is_down:
-                    yield Probe(way, self._header(hop, AmsCommand.READ) + _STATE, False)
+            elif endpoint in self.watched or hop.is_due(now_ns, interval_ns):
+                yield self._ask(endpoint, hop, now_ns)
+                if endpoint in self.watched and hop.has_restart_index and not hop.is_down:
+                    yield Probe(endpoint, self._header(hop, AmsCommand.READ) + _STATE, False)
 
-    def _ask(self, way: Way, hop: _Hop, now_ns: int) -> Probe:
+    def _ask(self, endpoint: Endpoint, hop: _Hop, now_ns: int) -> Probe:
         if hop.asked_at_ns is not None and hop.heard_at_ns < hop.asked_at_ns:
             hop.misses += 1
         hop.asked_at_ns = now_ns
@@ -209,7 +209,7 @@ class Prober:
         is_gone = hop.is_down and hop.gone_at_ns is not None and now_ns >= hop.gone_at_ns
         if is_gone:
             hop.gone_at_ns = None
-        return Probe(way, self._header(hop, AmsCommand.READ_STATE), is_found_dead, is_gone)
+        return Probe(endpoint, self._header(hop, AmsCommand.READ_STATE), is_found_dead, is_gone)
 
     def _header(self, hop: _Hop, command: AmsCommand) -> bytes:
         return AmsHeader(
@@ -229,7 +229,7 @@ class Prober:
                     hop = _Hop(self._number, target)
                     self._turns.append((now_ns, hop.number))
                 self._hops[route.hop] = hop
-        self._by_number = {hop.number: way for way, hop in self._hops.items()}
+        self._by_number = {hop.number: endpoint for endpoint, hop in self._hops.items()}
         self._turns = [each for each in self._turns if each[1] in self._by_number]
         heapify(self._turns)
 

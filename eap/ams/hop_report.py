@@ -41,7 +41,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         next_net_id: NetID of the router at the other end of it, as this one knows it; empty if it
             does not know that.
         next_name: Name of that router, as this one knows it.
-        door: By which packets leave.
+        transport: By which packets leave.
         address: That they go to.
         target: NetID of the target over there.
         state: Of the route: ``up``, ``down`` or ``unknown``.
@@ -58,7 +58,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     route: str = ""
     next_net_id: str = ""
     next_name: str = ""
-    door: str = ""
+    transport: str = msgspec.field(name="door", default="")
     address: str = ""
     target: str = ""
     state: str = ""
@@ -87,7 +87,7 @@ def report_of(
         route=route.name,
         next_net_id="" if next_router is None else str(next_router),
         next_name=found.next_name,
-        door=route.hop.door,
+        transport=route.hop.transport,
         address=route.hop.connection,
         target=str(route.to_real(target)),
         state=found.state,
@@ -116,7 +116,7 @@ def decode_report(data: bytes) -> HopReport:
 
 def _require_printable(report: HopReport) -> None:
     """Raise ValueError for a text that would do something to a terminal."""
-    texts = (report.station, report.route, report.next_name, report.door, report.address)
+    texts = (report.station, report.route, report.next_name, report.transport, report.address)
     for text in (*texts, report.why):
         if not text.isprintable():
             raise ValueError(f"{text!r} cannot be printed")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 
-from eap.ams.authorized_request import Judged
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
+from eap.ams.authorized_request import AuthorizedRequest
 from eap.ams.routes import Route
 from eap.codec.ams import AmsHeader
 
@@ -25,14 +25,25 @@ class Pending:
         handles: How many notifications it asks for.
         asked_for: What it asks for, if a subscription is restored by it here later: its body.
         step: That of a restoration which the request is; None for a client's.
-        judged: What access rules say of it, where its answer matters to them.
+        authorized: What access rules say of it, where its answer matters to them.
     """
 
-    __slots__ = ("asked_for", "at_ns", "came_by", "deadline_ns", "handles", "header", "invoke_id",
-                 "judged", "onward", "route", "step")  # fmt: skip
+    __slots__ = (
+        "asked_for",
+        "at_ns",
+        "authorized",
+        "came_by",
+        "deadline_ns",
+        "handles",
+        "header",
+        "invoke_id",
+        "onward",
+        "route",
+        "step",
+    )  # fmt: skip
 
     def __init__(
-        self, invoke_id: int, header: AmsHeader, came_by: Way | None, route: Route | None,
+        self, invoke_id: int, header: AmsHeader, came_by: Endpoint | None, route: Route | None,
         onward: bytes, at_ns: int, deadline_ns: int,
     ) -> None:  # fmt: skip
         self.invoke_id = invoke_id
@@ -45,7 +56,7 @@ class Pending:
         self.handles = 0
         self.asked_for = b""
         self.step: object | None = None
-        self.judged: Judged | None = None
+        self.authorized: AuthorizedRequest | None = None
 
 
 class InFlight:
@@ -57,10 +68,10 @@ class InFlight:
 
     def __init__(self) -> None:
         self._by_id: dict[int, Pending] = {}
-        self._by_way: dict[Way, dict[int, Pending]] = {}
+        self._by_way: dict[Endpoint, dict[int, Pending]] = {}
         self._by_door: dict[str, int] = {}
         self._by_time: dict[int, OrderedDict[int, Pending]] = {}
-        self._asked: dict[tuple[Way, bytes, int], int] = {}
+        self._asked: dict[tuple[Endpoint, bytes, int], int] = {}
         self._abandoned: OrderedDict[int, None] = OrderedDict()
 
     def __len__(self) -> int:
@@ -76,36 +87,36 @@ class InFlight:
         """Return the request with this id."""
         return self._by_id.get(invoke_id)
 
-    def ways(self) -> list[Way]:
+    def endpoints(self) -> list[Endpoint]:
         """Return by which ways there came requests that wait."""
         return list(self._by_way)
 
-    def count(self, way: Way) -> int:
-        """Return how many came by *way*."""
-        return len(self._by_way.get(way, ()))
+    def count(self, endpoint: Endpoint) -> int:
+        """Return how many came by *endpoint*."""
+        return len(self._by_way.get(endpoint, ()))
 
-    def count_of_door(self, door: str) -> int:
-        """Return how many came by any connection of *door*."""
-        return self._by_door.get(door, 0)
+    def count_of_door(self, transport: str) -> int:
+        """Return how many came by any connection of *transport*."""
+        return self._by_door.get(transport, 0)
 
     def add(self, pending: Pending) -> None:
         """Remember a request."""
-        way = pending.came_by
+        endpoint = pending.came_by
         key = pending.invoke_id
         self._by_id[key] = pending
-        if way is not None:
-            self._by_way.setdefault(way, {})[key] = pending
-            self._by_door[way.door] = self._by_door.get(way.door, 0) + 1
-            self._asked[way, pending.onward, pending.header.invoke_id] = key
+        if endpoint is not None:
+            self._by_way.setdefault(endpoint, {})[key] = pending
+            self._by_door[endpoint.transport] = self._by_door.get(endpoint.transport, 0) + 1
+            self._asked[endpoint, pending.onward, pending.header.invoke_id] = key
         elif pending.step is None:
             self._abandoned[key] = None
         # The times allowed are few, so that each has its requests in the order of their deadlines.
         allowed = pending.deadline_ns - pending.at_ns
         self._by_time.setdefault(allowed, OrderedDict())[key] = pending
 
-    def is_asked(self, way: Way, onward: bytes, invoke_id: int) -> bool:
+    def is_asked(self, endpoint: Endpoint, onward: bytes, invoke_id: int) -> bool:
         """Say whether a request with these addresses and this id of its client waits."""
-        return (way, onward, invoke_id) in self._asked
+        return (endpoint, onward, invoke_id) in self._asked
 
     def pop(self, invoke_id: int) -> Pending | None:
         """Forget and return the request with this id."""
@@ -121,12 +132,12 @@ class InFlight:
             del self._by_time[allowed]
         return pending
 
-    def abandon(self, way: Way) -> list[Pending]:
-        """Return the requests that came by *way*; nobody waits for their answers any more.
+    def abandon(self, endpoint: Endpoint) -> list[Pending]:
+        """Return the requests that came by *endpoint*; nobody waits for their answers any more.
 
         They stay until their time is up: a packet that runs in a circle is still known.
         """
-        left = list(self._by_way.get(way, {}).values())
+        left = list(self._by_way.get(endpoint, {}).values())
         for pending in left:
             self._leave(pending)
             pending.came_by = None
@@ -140,13 +151,13 @@ class InFlight:
         self.pop(next(iter(self._abandoned)))
         return True
 
-    def on(self, door: str, address: str | None) -> list[Pending]:
-        """Return what went on by *door*, to *address* or to any."""
+    def on(self, transport: str, address: str | None) -> list[Pending]:
+        """Return what went on by *transport*, to *address* or to any."""
         return [
             each
             for each in self
             if each.route is not None
-            and each.route.hop.door == door
+            and each.route.hop.transport == transport
             and address in {None, each.route.hop.connection}
         ]
 
@@ -166,14 +177,14 @@ class InFlight:
         return sorted(found, key=lambda each: each.deadline_ns)
 
     def _leave(self, pending: Pending) -> None:
-        way = pending.came_by
-        if way is None:
+        endpoint = pending.came_by
+        if endpoint is None:
             return
-        of_way = self._by_way[way]
+        of_way = self._by_way[endpoint]
         del of_way[pending.invoke_id]
         if not of_way:
-            del self._by_way[way]
-        self._by_door[way.door] -= 1
-        asked = way, pending.onward, pending.header.invoke_id
+            del self._by_way[endpoint]
+        self._by_door[endpoint.transport] -= 1
+        asked = endpoint, pending.onward, pending.header.invoke_id
         if self._asked.get(asked) == pending.invoke_id:
             del self._asked[asked]

@@ -8,7 +8,7 @@ MAX_PASSED = 1024
 """Packets that are remembered; one that runs in a circle comes again long before so many others."""
 
 
-class Passed:
+class LoopDetector:
     """The latest packets, by invoke id and addresses."""
 
     def __init__(self) -> None:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from struct import Struct
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Action
 from eap.ams.admission import Limits
-from eap.ams.endpoint import Way
 from eap.ams.inflight import InFlight, Pending
 from eap.ams.invoke import InvokeIds
 from eap.ams.subscriptions import Grant
-from eap.ams.transport_table import Outlet
+from eap.ams.transport_table import TransportTable
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.ids import NetId
@@ -23,18 +23,20 @@ from eap.ids import NetId
 _WRITE = Struct("<III")  # group, offset, length
 
 
-class Ending:
+class NotificationCleanup:
     """Asks servers to end notifications.
 
     Args:
-        outlet: By which they are asked.
+        transports: By which they are asked.
         in_flight: What waits for an answer, these requests too.
         ids: Of requests of this router.
         limits: How much may wait, and for how long.
     """
 
-    def __init__(self, outlet: Outlet, in_flight: InFlight, ids: InvokeIds, limits: Limits) -> None:
-        self._outlet = outlet
+    def __init__(
+        self, transports: TransportTable, in_flight: InFlight, ids: InvokeIds, limits: Limits
+    ) -> None:
+        self._transports = transports
         self._in_flight = in_flight
         self._ids = ids
         self._limits = limits
@@ -43,7 +45,7 @@ class Ending:
         """Have notifications ended, for nobody and as long as there is room to wait for it."""
         actions: list[Action] = []
         for grant in grants:
-            if grant.route.hop.door not in self._outlet.doors:
+            if grant.route.hop.transport not in self._transports.transports:
                 continue
             if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
                 break
@@ -60,12 +62,12 @@ class Ending:
         body = _WRITE.pack(IndexGroup.RELEASE_HANDLE, 0, len(handle)) + handle
         return [self._ask(grant, AmsCommand.WRITE, body, now_ns)]
 
-    def end_unwanted(self, header: AmsHeader, handle: int, way: Way) -> list[Action]:
+    def end_unwanted(self, header: AmsHeader, handle: int, endpoint: Endpoint) -> list[Action]:
         """Return what ends a notification that no client here has, at the server that sent it.
 
         Not while the answer may still come that tells its handle: datagrams overtake each other.
         """
-        if any(pending.handles for pending in self._in_flight.on(way.door, None)):
+        if any(pending.handles for pending in self._in_flight.on(endpoint.transport, None)):
             return []
         head = AmsHeader(
             header.source,
@@ -75,7 +77,7 @@ class Ending:
             AmsCommand.DELETE_NOTIFICATION,
             StateFlags.ADS | StateFlags.NO_RETURN,
         )
-        return [self._outlet.reply(way, encode_packet(head, handle.to_bytes(4, "little")))]
+        return [self._transports.reply(endpoint, encode_packet(head, handle.to_bytes(4, "little")))]
 
     def _ask(self, grant: Grant, command: AmsCommand, body: bytes, now_ns: int) -> Action:
         invoke_id = self._ids.take(self._in_flight)
@@ -84,7 +86,7 @@ class Ending:
         self._in_flight.add(
             Pending(invoke_id, header, None, route, grant.onward, now_ns, deadline_ns)
         )
-        return self._outlet.forward(route.hop, encode_packet(header, body), invoke_id)
+        return self._transports.forward(route.hop, encode_packet(header, body), invoke_id)
 
 
 def header_to(addresses: bytes, command: int, invoke_id: int) -> AmsHeader:

@@ -11,12 +11,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Reply
-from eap.ams.endpoint import Way
 from eap.ams.inflight import Pending
 from eap.ams.invoke import is_marked
 from eap.ams.subscriptions import MAX_PER_CLIENT, Grant, Subscription, Subscriptions, divide
-from eap.ams.transport_table import Outlet
+from eap.ams.transport_table import TransportTable
 from eap.codec.ads import AdsError, AdsReadWrite, IndexGroup
 from eap.codec.adsnotification import AddNotification, decode_notification
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
@@ -69,23 +69,25 @@ class Samples(NamedTuple):
     """Subscriptions that their server has ended."""
     unknown: list[int]
     """Handles that no client here has."""
-    hop: Way | None
+    hop: Endpoint | None
     """That samples of known subscriptions came from; None if there are none."""
 
 
-class Notifier:
+class NotificationForwarder:
     """Follows requests for notifications and their answers, and hands notifications on.
 
     Attributes:
         subscriptions: What is known.
     """
 
-    def __init__(self, outlet: Outlet) -> None:
+    def __init__(self, transports: TransportTable) -> None:
         self.subscriptions = Subscriptions()
-        self._outlet = outlet
-        self._symbols: dict[Way, OrderedDict[tuple[bytes, int, int], bytes]] = {}
+        self._transports = transports
+        self._symbols: dict[Endpoint, OrderedDict[tuple[bytes, int, int], bytes]] = {}
 
-    def find_own(self, header: AmsHeader, data: bytes, way: Way) -> list[Subscription] | None:
+    def find_own(
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint
+    ) -> list[Subscription] | None:
         """Return the subscriptions of this client that a request deletes.
 
         None says that it deletes nothing that is known here.
@@ -95,34 +97,36 @@ class Notifier:
             return None
         asked = data[: ADDRESSES.size]
         find = self.subscriptions.find_of_client
-        found = [find(way, asked, handle) for handle in handles]
+        found = [find(endpoint, asked, handle) for handle in handles]
         return [each for each in found if each is not None] or None
 
-    def has_room(self, header: AmsHeader, data: bytes, way: Way) -> bool:
+    def has_room(self, header: AmsHeader, data: bytes, endpoint: Endpoint) -> bool:
         """Say whether a client may have the notifications that it asks for."""
         count = _count_of(header, data[AmsHeader.SIZE :])
-        return not count or self.subscriptions.has_room(way, data[: ADDRESSES.size], count)
+        return not count or self.subscriptions.has_room(endpoint, data[: ADDRESSES.size], count)
 
-    def follow_request(self, pending: Pending, body: bytes, way: Way) -> None:
+    def follow_request(self, pending: Pending, body: bytes, endpoint: Endpoint) -> None:
         """Note which notifications a client asks for, and which symbol it looks up."""
         header = pending.header
         pending.handles = _count_of(header, body)
         if pending.handles or _group_of(header, body) in _LOOKUPS:
-            door = self._outlet.doors[way.door]
+            transport = self._transports.transports[endpoint.transport]
             # Where clients have no connection it is never known that they are gone.
-            is_first = (door.is_stream or door.is_shared) and not is_marked(header.invoke_id)
+            is_first = (transport.is_stream or transport.is_shared) and not is_marked(
+                header.invoke_id
+            )
             pending.asked_for = body if is_first else b""
 
     def follow_answer(
         self, pending: Pending, header: AmsHeader, body: bytes, now_ns: int
     ) -> Granted | None:
         """Note the notifications that were granted, if any were asked for."""
-        way, route = pending.came_by, pending.route
+        endpoint, route = pending.came_by, pending.route
         if header.error_code or route is None:
             return None
         if not pending.handles:
-            if pending.asked_for and way is not None:
-                self._note_symbol(pending, body, way)
+            if pending.asked_for and endpoint is not None:
+                self._note_symbol(pending, body, endpoint)
             return None
         start = 0 if header.command == AmsCommand.ADD_NOTIFICATION else _SUM_HEAD
         granted = Granted(body, [], [], [])
@@ -136,12 +140,12 @@ class Notifier:
             if result:
                 continue
             grant = Grant(pending.onward, handle, route)
-            if way is None:
+            if endpoint is None:
                 granted.surplus.append(grant)
                 continue
             request = requests[number] if requests else None
-            symbol = self._symbol_of(way, asked, request)
-            subscription = Subscription(way, asked, grant, now_ns, request, symbol)
+            symbol = self._symbol_of(endpoint, asked, request)
+            subscription = Subscription(endpoint, asked, grant, now_ns, request, symbol)
             displaced = self.subscriptions.add(subscription)
             granted.new.append(subscription)
             if displaced is not None:
@@ -167,7 +171,7 @@ class Notifier:
         return any(self.subscriptions.find(onward, handle) is not None for handle in handles)
 
     def hand_on(
-        self, header: AmsHeader, data: bytes, now_ns: int, is_hop: Callable[[Way], bool]
+        self, header: AmsHeader, data: bytes, now_ns: int, is_hop: Callable[[Endpoint], bool]
     ) -> Samples:
         """Return what the clients get of a notification.
 
@@ -177,32 +181,34 @@ class Notifier:
         body = data[AmsHeader.SIZE :]
         division = divide(body, _back(header), self.subscriptions, now_ns, is_hop)
         replies = []
-        for way, asked, part in division.parts:
+        for endpoint, asked, part in division.parts:
             addresses = asked[8:] + asked[:8]
             length = len(part).to_bytes(4, "little")
             head = data[ADDRESSES.size : _LENGTH.start] + length
             packet = addresses + head + data[_LENGTH.stop : AmsHeader.SIZE] + part
-            replies.append(self._outlet.reply(way, packet))
+            replies.append(self._transports.reply(endpoint, packet))
         return Samples(replies, division.ended, division.unknown, division.hop)
 
-    def close(self, way: Way) -> list[Grant]:
+    def close(self, endpoint: Endpoint) -> list[Grant]:
         """Forget the clients of a connection; return what servers gave them."""
-        self._symbols.pop(way, None)
-        return self.subscriptions.close(way)
+        self._symbols.pop(endpoint, None)
+        return self.subscriptions.close(endpoint)
 
-    def _note_symbol(self, pending: Pending, body: bytes, way: Way) -> None:
+    def _note_symbol(self, pending: Pending, body: bytes, endpoint: Endpoint) -> None:
         place = symbol_place(pending.asked_for, body)
         if place is None or len(pending.asked_for) > _LONGEST_LOOKUP:
             return
-        mine = self._symbols.setdefault(way, OrderedDict())
+        mine = self._symbols.setdefault(endpoint, OrderedDict())
         key = _addresses(pending.header), *place
         mine[key] = pending.asked_for
         mine.move_to_end(key)
         if len(mine) > _MAX_SYMBOLS:
             mine.popitem(last=False)
 
-    def _symbol_of(self, way: Way, asked: bytes, request: AddNotification | None) -> bytes:
-        mine = self._symbols.get(way)
+    def _symbol_of(
+        self, endpoint: Endpoint, asked: bytes, request: AddNotification | None
+    ) -> bytes:
+        mine = self._symbols.get(endpoint)
         if request is None or mine is None:
             return b""
         group = IndexGroup.VALUE_BY_HANDLE if request.group in BY_HANDLE else request.group

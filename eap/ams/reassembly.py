@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.fragment import Assembler, Taken
 from eap.codec.ams import AmsHeader
 from eap.errors import MalformedError
@@ -27,7 +27,7 @@ class Reassembly:
 
     def __init__(self) -> None:
         self.dropped = 0
-        self._senders: OrderedDict[Way, Assembler] = OrderedDict()
+        self._senders: OrderedDict[Endpoint, Assembler] = OrderedDict()
         self._octets = 0
 
     @property
@@ -35,55 +35,55 @@ class Reassembly:
         """Octets that are kept."""
         return self._octets
 
-    def receive(self, way: Way, header: AmsHeader, body: bytes, now_ns: int) -> Taken:
-        """Take a fragment that came by *way*.
+    def receive(self, endpoint: Endpoint, header: AmsHeader, body: bytes, now_ns: int) -> Taken:
+        """Take a fragment that came by *endpoint*.
 
         Raises:
             MalformedError: it does not fit to the one before it, the whole is too long, or too
                 much is kept already.
         """
-        assembler = self._of(way, now_ns)
+        assembler = self._of(endpoint, now_ns)
         before = assembler.octets, assembler.dropped
         try:
             taken = assembler.receive(header, body, now_ns)
         finally:
-            self._account(way, assembler, before)
+            self._account(endpoint, assembler, before)
         if self._octets > MAX_OCTETS:
-            self._drop(way)
+            self._drop(endpoint)
             raise MalformedError(
                 f"{MAX_OCTETS} octets of fragments are kept already", layout="AmsHeader"
             )
         return taken
 
-    def forget(self, way: Way) -> None:
-        """Forget what came by *way*."""
-        assembler = self._senders.pop(way, None)
+    def forget(self, endpoint: Endpoint) -> None:
+        """Forget what came by *endpoint*."""
+        assembler = self._senders.pop(endpoint, None)
         if assembler is not None:
             self._octets -= assembler.octets
 
-    def _of(self, way: Way, now_ns: int) -> Assembler:
-        assembler = self._senders.get(way)
+    def _of(self, endpoint: Endpoint, now_ns: int) -> Assembler:
+        assembler = self._senders.get(endpoint)
         if assembler is not None:
             return assembler
         if len(self._senders) >= MAX_SENDERS:
             self._expire(now_ns)
         if len(self._senders) >= MAX_SENDERS:
             self._drop(next(iter(self._senders)))
-        assembler = self._senders[way] = Assembler()
+        assembler = self._senders[endpoint] = Assembler()
         return assembler
 
     def _expire(self, now_ns: int) -> None:
-        for way, assembler in list(self._senders.items()):
+        for endpoint, assembler in list(self._senders.items()):
             before = assembler.octets, assembler.dropped
             assembler.expire(now_ns)
-            self._account(way, assembler, before)
+            self._account(endpoint, assembler, before)
 
-    def _account(self, way: Way, assembler: Assembler, before: tuple[int, int]) -> None:
+    def _account(self, endpoint: Endpoint, assembler: Assembler, before: tuple[int, int]) -> None:
         self._octets += assembler.octets - before[0]
         self.dropped += assembler.dropped - before[1]
         if not len(assembler):
-            self.forget(way)
+            self.forget(endpoint)
 
-    def _drop(self, way: Way) -> None:
-        self.dropped += len(self._senders[way])
-        self.forget(way)
+    def _drop(self, endpoint: Endpoint) -> None:
+        self.dropped += len(self._senders[endpoint])
+        self.forget(endpoint)

@@ -6,8 +6,8 @@ from collections import deque
 
 import msgspec
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Outcome, Trace
-from eap.ams.endpoint import Way
 from eap.ams.hop_prober import PROBE_PORT
 from eap.ams.routes import RouteKey
 from eap.ams.traffic import TrafficTable
@@ -33,7 +33,7 @@ class Record:
     def __init__(self) -> None:
         self.latest: deque[Trace] = deque(maxlen=MAX_LATEST)
         self.counts = dict.fromkeys(Outcome, 0)
-        self.connections: TrafficTable[Way] = TrafficTable()
+        self.connections: TrafficTable[Endpoint] = TrafficTable()
         self.routes: TrafficTable[RouteKey] = TrafficTable()
         self._events: deque[Trace] = deque(maxlen=MAX_EVENTS)
 
@@ -94,9 +94,9 @@ def reason_of(trace: Trace) -> str:
     return trace.text.removeprefix(f"{describe(trace.header, trace.came_by)}: ")
 
 
-def describe(header: AmsHeader, way: Way | None = None) -> str:
+def describe(header: AmsHeader, endpoint: Endpoint | None = None) -> str:
     """Return a request in words: service, target and source."""
-    where = f" ({way})" if way is not None else ""
+    where = f" ({endpoint})" if endpoint is not None else ""
     return (
         f"{AmsCommand.name_of(header.command)} of {header.target}:{header.target_port}"
         f" for {header.source}:{header.source_port}{where}"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
-from eap.ams.endpoint import Way
-from eap.ams.hop_prober import Prober
+from eap.ads.endpoint import Endpoint
+from eap.ams.hop_prober import HopProber
 from eap.ams.routes import Route
 from eap.ams.spec import AccessService
 from eap.ams.traffic import Traffic
@@ -53,7 +53,7 @@ class RouteReport(NamedTuple):
 class ConnectionReport(NamedTuple):
     """Who asks."""
 
-    way: Way
+    endpoint: Endpoint
     traffic: Traffic
 
 
@@ -74,7 +74,8 @@ class Location(NamedTuple):
 
 
 def report_route(
-    route: Route, obstacle: Obstacle | None, traffic: Traffic | None, prober: Prober | None, *,
+    route: Route, obstacle: Obstacle | None, traffic: Traffic | None, hop_prober: HopProber | None,
+    *,
     next_name: str,
 ) -> RouteReport:  # fmt: skip
     """Return what is known of a route.
@@ -83,15 +84,15 @@ def report_route(
         route: The route.
         obstacle: Reason why nothing can go there; None if something can.
         traffic: By the route so far; None for none.
-        prober: Of its router, if that has one.
+        hop_prober: Of its router, if that has one.
         next_name: Name of the router at the next hop.
     """
     known = traffic or Traffic()
-    round_trip_ns = None if prober is None else prober.round_trip_ns(route.hop)
+    round_trip_ns = None if hop_prober is None else hop_prober.round_trip_ns(route.hop)
     if obstacle is not None:
         return RouteReport(route, obstacle.state, obstacle.why, None, known, next_name)
     if round_trip_ns is None and known.answers:
         round_trip_ns = known.round_trip_ns
-    is_up = known.is_answered or (prober is not None and prober.is_heard(route.hop))
+    is_up = known.is_answered or (hop_prober is not None and hop_prober.is_heard(route.hop))
     state = RouteState.UP if is_up else RouteState.UNKNOWN
     return RouteReport(route, state, "", round_trip_ns, known, next_name)

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ids import NetId, prefix_text
 
 MAX_LEARNED = 10_000
@@ -37,7 +37,7 @@ class Origin(IntEnum):
     """The station itself told of it, or answered a scan; such a route expires."""
 
 
-RouteKey: TypeAlias = tuple[NetId, Way]
+RouteKey: TypeAlias = tuple[NetId, Endpoint]
 """NetID and hop of a route."""
 
 
@@ -47,7 +47,7 @@ class Route(msgspec.Struct, frozen=True):
     Attributes:
         net_id: Of the station, as it is addressed from here.
         name: As people call it.
-        hop: Door and address that packets go to.
+        hop: Transport and address that packets go to.
         origin: Who says so.
         octets: How many octets of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
             default route.
@@ -68,7 +68,7 @@ class Route(msgspec.Struct, frozen=True):
 
     net_id: NetId
     name: str
-    hop: Way
+    hop: Endpoint
     origin: Origin = Origin.STATIC
     octets: int = 4
     is_unidirectional: bool = False
@@ -140,7 +140,7 @@ class RouteTable:
         self.version = 0
         self._routes: dict[RouteKey, _Ranked] = {}
         self._by_prefix: dict[bytes, list[_Ranked]] = {}
-        self._translated: dict[Way, list[Route]] = {}
+        self._translated: dict[Endpoint, list[Route]] = {}
         self._learned = 0
         self._number = 0
         self._next_expiry: int | None = None
@@ -182,7 +182,7 @@ class RouteTable:
             self._next_expiry = min(route.expires_at_ns, known)
         return True
 
-    def remove(self, net_id: NetId, hop: Way) -> bool:
+    def remove(self, net_id: NetId, hop: Endpoint) -> bool:
         """Forget a route; return whether there was one."""
         ranked = self._routes.pop((net_id, hop), None)
         if ranked is None:
@@ -234,7 +234,7 @@ class RouteTable:
         hop = self.describe_hop(route)
         return hop if self.next_name(route) == route.name else f"{hop} or from behind it"
 
-    def to_virtual(self, source: NetId, hop: Way) -> NetId:
+    def to_virtual(self, source: NetId, hop: Endpoint) -> NetId:
         """Return the NetID by which *source*, met at *hop*, is known here."""
         for route in self._translated.get(hop, ()):
             virtual = route.to_virtual(source)

@@ -21,7 +21,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all specifications."""
 
 
-class DoorKind(StrEnum):
+class TransportKind(StrEnum):
     """How packets come in and go out."""
 
     UDP = "udp"
@@ -36,7 +36,7 @@ class DoorKind(StrEnum):
     """Programs of this appliance."""
 
 
-IP_DOORS = frozenset((DoorKind.AMS_TCP, DoorKind.UDP, DoorKind.TCP))
+IP_DOORS = frozenset((TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP))
 """Kinds of doors whose connections begin with an IPv4 address."""
 
 
@@ -52,7 +52,7 @@ class HopSpec(Record, frozen=True):
             router (MQTT).
     """
 
-    kind: DoorKind
+    kind: TransportKind
     port: str
     address: str
 
@@ -153,7 +153,7 @@ class AccessRule(Record, frozen=True):
         networks: IPv4 networks that a connection comes from (``10.0.0.0/24``).
         macs: MAC addresses that frames come from on Ethernet; who is in one of the two fits.
         net_ids: Source NetIDs, by their first four, five or all six octets; they prove nothing.
-        doors: Doors (``mqtt:line``) or kinds of them (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
+        transports: Names (``mqtt:line``) or kinds (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
             ``mqtt``, ``local``).
         targets: What is asked.
         services: What is to be done.
@@ -164,7 +164,7 @@ class AccessRule(Record, frozen=True):
     allow: bool = True
     networks: tuple[str, ...] = ()
     net_ids: tuple[str, ...] = ()
-    doors: tuple[str, ...] = ()
+    transports: tuple[str, ...] = msgspec.field(name="doors", default=())
     targets: tuple[AccessTarget, ...] = ()
     services: tuple[AccessService, ...] = ()
     objects: tuple[ObjectRange, ...] = ()
@@ -248,13 +248,13 @@ class RoutingSpec(Record, frozen=True, kw_only=True):
         """Say whether routes are learned from what routers tell in an MQTT network."""
         if isinstance(self.learn, bool):
             return self.learn
-        return f"{DoorKind.MQTT}:{network}" in self.learn
+        return f"{TransportKind.MQTT}:{network}" in self.learn
 
     def learns_from(self, address: str) -> bool:
         """Say whether routes are learned from a router that answers a scan at an IPv4 address."""
         if isinstance(self.learn, bool):
             return self.learn
-        networks = (each for each in self.learn if not each.startswith(f"{DoorKind.MQTT}:"))
+        networks = (each for each in self.learn if not each.startswith(f"{TransportKind.MQTT}:"))
         return any(IPv4Address(address) in IPv4Network(each) for each in networks)
 
 

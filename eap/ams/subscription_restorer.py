@@ -25,17 +25,17 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Action, Outcome
 from eap.ams.admission import Limits
-from eap.ams.endpoint import Way
-from eap.ams.error_reply import Refusal, Refuser
+from eap.ams.error_reply import ErrorReplier, Refusal
 from eap.ams.inflight import InFlight, Pending
 from eap.ams.invoke import InvokeIds
-from eap.ams.notification_cleanup import Ending, header_to
+from eap.ams.notification_cleanup import NotificationCleanup, header_to
 from eap.ams.notification_forwarder import BY_HANDLE, symbol_place
 from eap.ams.routes import Route
 from eap.ams.subscriptions import Grant, Subscription, Subscriptions, key_of
-from eap.ams.transport_table import Outlet
+from eap.ams.transport_table import TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
 
@@ -79,18 +79,28 @@ _OF_THE_START = frozenset(
 )  # fmt: skip
 """Errors that may pass when the server has started, or has forgotten others."""
 
-FindWay: TypeAlias = Callable[[AmsHeader, bytes, Way, int], tuple[Route, bytes] | Refusal]
+FindWay: TypeAlias = Callable[[AmsHeader, bytes, Endpoint, int], tuple[Route, bytes] | Refusal]
 """Returns by which route and with which addresses a request goes on now, or why it does not."""
 
 
 class _Session:
     """Subscriptions with the same addresses of server and client that are to be established."""
 
-    __slots__ = ("asked", "at_ns", "interrupted_at_ns", "is_trying", "outstanding", "restored",
-                 "stale", "timeouts", "waiting", "way")  # fmt: skip
+    __slots__ = (
+        "asked",
+        "at_ns",
+        "endpoint",
+        "interrupted_at_ns",
+        "is_trying",
+        "outstanding",
+        "restored",
+        "stale",
+        "timeouts",
+        "waiting",
+    )  # fmt: skip
 
-    def __init__(self, way: Way, asked: bytes, at_ns: int) -> None:
-        self.way = way
+    def __init__(self, endpoint: Endpoint, asked: bytes, at_ns: int) -> None:
+        self.endpoint = endpoint
         self.asked = asked
         self.at_ns = at_ns
         self.interrupted_at_ns: int | None = None
@@ -117,7 +127,7 @@ class _Step(NamedTuple):
 class Interruption(NamedTuple):
     """Subscriptions of one client at one server to which nothing comes."""
 
-    way: Way
+    endpoint: Endpoint
     asked: bytes
     """Addresses of server and client."""
     number: int
@@ -125,30 +135,31 @@ class Interruption(NamedTuple):
     why: str
 
 
-class Restorer:
+class SubscriptionRestorer:
     """Establishes subscriptions again.
 
     Args:
         subscriptions: All that pass the router.
-        outlet: By which servers are asked.
+        transports: By which servers are asked.
         in_flight: What waits for an answer, these requests too.
         ids: Of requests of this router.
         ending: Ends what was granted in vain.
-        refuser: Takes note of what is given up.
+        error_replier: Takes note of what is given up.
         limits: How much may wait.
         find_way: Finds the route of a client's request, by the access rules too.
     """
 
     def __init__(
-        self, subscriptions: Subscriptions, outlet: Outlet, in_flight: InFlight, ids: InvokeIds,
-        ending: Ending, refuser: Refuser, limits: Limits, find_way: FindWay,
+        self, subscriptions: Subscriptions, transports: TransportTable, in_flight: InFlight,
+        ids: InvokeIds,
+                ending: NotificationCleanup, error_replier: ErrorReplier, limits: Limits, find_way: FindWay,
     ) -> None:  # fmt: skip
         self._subscriptions = subscriptions
-        self._outlet = outlet
+        self._transports = transports
         self._in_flight = in_flight
         self._ids = ids
         self._ending = ending
-        self._refuser = refuser
+        self._error_replier = error_replier
         self._limits = limits
         self._find_way = find_way
         self._sessions: dict[bytes, _Session] = {}
@@ -212,7 +223,7 @@ class Restorer:
         actions: list[Action] = []
         for each in subscriptions:
             if each.is_closed:
-                actions.append(self._outlet.reply(each.way, each.encode_end(now_ns)))
+                actions.append(self._transports.reply(each.endpoint, each.encode_end(now_ns)))
             else:
                 actions += self.interrupt([each], "its server was started again", now_ns)
         return actions
@@ -250,12 +261,12 @@ class Restorer:
 
     def interruptions(self) -> list[Interruption]:
         """Return what is interrupted now, by client and server."""
-        found: dict[tuple[Way, bytes], Interruption] = {}
+        found: dict[tuple[Endpoint, bytes], Interruption] = {}
         for each in self._subscriptions if self._sessions else ():
             since_ns = each.interrupted_at_ns
             if since_ns is None:
                 continue
-            key = each.way, each.asked
+            key = each.endpoint, each.asked
             known = found.get(key, Interruption(*key, 0, since_ns, each.why))
             found[key] = known._replace(
                 number=known.number + 1, since_ns=min(since_ns, known.since_ns)
@@ -294,7 +305,7 @@ class Restorer:
         session = self._sessions.get(subscription.asked)
         if session is None:
             session = self._sessions[subscription.asked] = _Session(
-                subscription.way, subscription.asked, now_ns
+                subscription.endpoint, subscription.asked, now_ns
             )
             self._schedule(session, now_ns)
         if not subscription.is_queued:
@@ -305,7 +316,7 @@ class Restorer:
     def _note(self, session: _Session, outcome: Outcome, text: str, now_ns: int) -> None:
         """Have it in the log: once for all subscriptions of a session."""
         header = header_to(session.asked, AmsCommand.ADD_NOTIFICATION, 0)
-        self._refuser.drop(session.way, header, outcome, text, now_ns)
+        self._error_replier.drop(session.endpoint, header, outcome, text, now_ns)
 
     def _schedule(self, session: _Session, at_ns: int) -> None:
         session.at_ns = at_ns
@@ -347,7 +358,7 @@ class Restorer:
         invoke_id = self._ids.take(self._in_flight)
         header = header_to(subscription.asked, command, invoke_id)
         packet = encode_packet(header, body)
-        found = self._find_way(header, packet, subscription.way, now_ns)
+        found = self._find_way(header, packet, subscription.endpoint, now_ns)
         if isinstance(found, Refusal):
             return self._failed(
                 session, subscription, found.error, found.text, now_ns, _LOOK_SPACING_NS
@@ -370,7 +381,7 @@ class Restorer:
         self._in_flight.add(pending)
         self._asked += 1
         step.session.outstanding += 1
-        return [self._outlet.forward(route.hop, packet, header.invoke_id)]
+        return [self._transports.forward(route.hop, packet, header.invoke_id)]
 
     def _answered(
         self, pending: Pending, step: _Step, error: int, body: bytes, now_ns: int
@@ -458,10 +469,10 @@ class Restorer:
     def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
         """Forget a subscription, and tell its client."""
         self._subscriptions.remove(subscription)
-        way = subscription.way
-        if way.door not in self._outlet.doors:
+        endpoint = subscription.endpoint
+        if endpoint.transport not in self._transports.transports:
             return []
-        return [self._outlet.reply(way, subscription.encode_end(now_ns))]
+        return [self._transports.reply(endpoint, subscription.encode_end(now_ns))]
 
     def _go_on(self, session: _Session, now_ns: int) -> list[Action]:
         """Delete what was granted before, then ask for more, when all requests are answered."""
@@ -488,7 +499,7 @@ class Restorer:
     def _delete(
         self, session: _Session, grant: Grant, *, is_check: bool, now_ns: int
     ) -> list[Action]:
-        if grant.route.hop.door not in self._outlet.doors:
+        if grant.route.hop.transport not in self._transports.transports:
             return []
         self._deleting.add(key_of(grant))
         step = _Step(session, None, grant, is_check)

@@ -12,8 +12,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.access import host_of
-from eap.ams.endpoint import Way
 from eap.ams.routes import Route
 from eap.codec.adsnotification import (
     UNIT_NS,
@@ -54,7 +54,7 @@ class Subscription:
     """One notification of one client.
 
     Attributes:
-        way: Connection of the client.
+        endpoint: Connection of the client.
         asked: Addresses of the server and of the client as the client's request has them, 16 bytes.
         handle: That the client knows.
         grant: What the server gave last; None if it is known to be gone.
@@ -75,16 +75,31 @@ class Subscription:
     """
 
     __slots__ = (
-        "asked", "digest", "ends", "established_at_ns", "fruitless", "grant", "handle",
-        "heard_at_ns", "interrupted_at_ns", "is_closed", "is_queued", "refused_at_ns", "request",
-        "skips_repeat", "symbol", "time", "way", "why",
+        "asked",
+        "digest",
+        "endpoint",
+        "ends",
+        "established_at_ns",
+        "fruitless",
+        "grant",
+        "handle",
+        "heard_at_ns",
+        "interrupted_at_ns",
+        "is_closed",
+        "is_queued",
+        "refused_at_ns",
+        "request",
+        "skips_repeat",
+        "symbol",
+        "time",
+        "why",
     )  # fmt: skip
 
     def __init__(
-        self, way: Way, asked: bytes, grant: Grant, now_ns: int,
+        self, endpoint: Endpoint, asked: bytes, grant: Grant, now_ns: int,
         request: AddNotification | None = None, symbol: bytes = b"",
     ) -> None:  # fmt: skip
-        self.way = way
+        self.endpoint = endpoint
         self.asked = asked
         self.handle = grant.handle
         self.grant: Grant | None = grant
@@ -144,9 +159,9 @@ class Subscriptions:
     """
 
     def __init__(self) -> None:
-        self.hops: dict[Way, int] = {}
+        self.hops: dict[Endpoint, int] = {}
         self._by_grant: dict[tuple[bytes, int], Subscription] = {}
-        self._by_client: dict[Way, dict[bytes, dict[int, Subscription]]] = {}
+        self._by_client: dict[Endpoint, dict[bytes, dict[int, Subscription]]] = {}
         self._counts: Counter[str] = Counter()
         """By host."""
         self._own_handle = 0
@@ -160,12 +175,12 @@ class Subscriptions:
             for handles in clients.values():
                 yield from handles.values()
 
-    def has_room(self, way: Way, asked: bytes, count: int) -> bool:
+    def has_room(self, endpoint: Endpoint, asked: bytes, count: int) -> bool:
         """Say whether a client may have *count* more."""
-        mine = self._by_client.get(way, {}).get(asked, ())
+        mine = self._by_client.get(endpoint, {}).get(asked, ())
         return (
             len(mine) + count <= MAX_PER_CLIENT
-            and self._counts[host_of(way)] + count <= MAX_TOTAL - self._total
+            and self._counts[host_of(endpoint)] + count <= MAX_TOTAL - self._total
         )
 
     def add(self, subscription: Subscription) -> Subscription | None:
@@ -174,19 +189,19 @@ class Subscriptions:
         Returns:
             The one that had its grant; the server does not know that one any more.
         """
-        way = subscription.way
+        endpoint = subscription.endpoint
         grant, subscription.grant = subscription.grant, None
         displaced = None if grant is None else self._by_grant.get(key_of(grant))
         if displaced is not None and displaced.request is None:
             self.remove(displaced)
         elif displaced is not None:
             self.detach(displaced)
-        mine = self._by_client.setdefault(way, {}).setdefault(subscription.asked, {})
+        mine = self._by_client.setdefault(endpoint, {}).setdefault(subscription.asked, {})
         while subscription.handle in mine:
             subscription.handle = _FIRST_OWN_HANDLE + self._own_handle % (1 << 30)
             self._own_handle += 1
         mine[subscription.handle] = subscription
-        self._counts[host_of(way)] += 1
+        self._counts[host_of(endpoint)] += 1
         self._total += 1
         if grant is not None:
             self.attach(subscription, grant)
@@ -231,45 +246,47 @@ class Subscriptions:
         """Return whose a sample with *handle* is, from the first to the second address."""
         return self._by_grant.get((onward, handle))
 
-    def find_of_client(self, way: Way, asked: bytes, handle: int) -> Subscription | None:
+    def find_of_client(self, endpoint: Endpoint, asked: bytes, handle: int) -> Subscription | None:
         """Return the one that a client knows by *handle*."""
-        return self._by_client.get(way, {}).get(asked, {}).get(handle)
+        return self._by_client.get(endpoint, {}).get(asked, {}).get(handle)
 
     def remove(self, subscription: Subscription) -> Grant | None:
         """Forget a subscription; return what the server gave for it."""
-        way, asked = subscription.way, subscription.asked
-        clients = self._by_client[way]
+        endpoint, asked = subscription.endpoint, subscription.asked
+        clients = self._by_client[endpoint]
         del clients[asked][subscription.handle]
         if not clients[asked]:
             del clients[asked]
-        host = host_of(way)
+        host = host_of(endpoint)
         self._counts[host] -= 1
         if not self._counts[host]:
             del self._counts[host]
         self._total -= 1
         if not clients:
-            del self._by_client[way]
+            del self._by_client[endpoint]
         subscription.is_closed = True
         return self.detach(subscription)
 
-    def ways(self) -> list[Way]:
+    def endpoints(self) -> list[Endpoint]:
         """Return the connections whose clients have any."""
         return list(self._by_client)
 
-    def close(self, way: Way) -> list[Grant]:
-        """Forget those of *way*; return what the servers gave for them."""
+    def close(self, endpoint: Endpoint) -> list[Grant]:
+        """Forget those of *endpoint*; return what the servers gave for them."""
         mine = [
-            each for handles in self._by_client.get(way, {}).values() for each in handles.values()
+            each
+            for handles in self._by_client.get(endpoint, {}).values()
+            for each in handles.values()
         ]
         grants = [self.remove(each) for each in mine]
         return [grant for grant in grants if grant is not None]
 
-    def of_hop(self, door: str, address: str | None) -> list[Subscription]:
+    def of_hop(self, transport: str, address: str | None) -> list[Subscription]:
         """Return those whose samples come from a hop, or from any of a door."""
         found = []
         for each in self._by_grant.values():
             hop = each.grant.route.hop if each.grant is not None else None
-            if hop is not None and hop.door == door and address in {None, hop.connection}:
+            if hop is not None and hop.transport == transport and address in {None, hop.connection}:
                 found.append(each)
         return found
 
@@ -277,19 +294,19 @@ class Subscriptions:
 class Division(NamedTuple):
     """Samples of one notification, divided by client."""
 
-    parts: list[tuple[Way, bytes, bytes]]
+    parts: list[tuple[Endpoint, bytes, bytes]]
     """Connection of a client, the addresses that it asked with, and the data that it gets."""
     ended: list[Subscription]
     """Subscriptions that their server has ended by a sample without bytes."""
     unknown: list[int]
     """Handles that no client here has."""
-    hop: Way | None
+    hop: Endpoint | None
     """That samples of known subscriptions came from; None if there are none."""
 
 
 def divide(
     body: bytes, onward: bytes, subscriptions: Subscriptions, now_ns: int,
-    is_hop: Callable[[Way], bool],
+    is_hop: Callable[[Endpoint], bool],
 ) -> Division:  # fmt: skip
     """Return which connection gets what of a notification.
 
@@ -298,10 +315,10 @@ def divide(
     Raises:
         CodecError: the notification is shorter or longer than it says.
     """
-    parts: dict[tuple[Way, bytes], list[tuple[int, Sample]]] = {}
+    parts: dict[tuple[Endpoint, bytes], list[tuple[int, Sample]]] = {}
     ended: list[Subscription] = []
     unknown: list[int] = []
-    hop: Way | None = None
+    hop: Endpoint | None = None
     is_as_it_came = True
     for stamp in decode_notification(body):
         for sample in stamp.samples:
@@ -317,7 +334,7 @@ def divide(
             elif not _take(found, stamp.time, sample.data, now_ns):
                 is_as_it_came = False
             else:
-                mine = parts.setdefault((found.way, found.asked), [])
+                mine = parts.setdefault((found.endpoint, found.asked), [])
                 if sample.handle == found.handle:
                     mine.append((stamp.time, sample))
                 else:

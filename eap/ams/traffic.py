@@ -70,26 +70,28 @@ class TrafficTable(Generic[KeyT]):
     """The traffic of all ways, by what they are known by."""
 
     def __init__(self) -> None:
-        self._ways: OrderedDict[KeyT, Traffic] = OrderedDict()
+        self._endpoints: OrderedDict[KeyT, Traffic] = OrderedDict()
 
-    def of(self, way: KeyT, now_ns: int) -> Traffic:
-        """Return the traffic of *way*, which may be new."""
-        traffic = self._ways.get(way)
+    def of(self, endpoint: KeyT, now_ns: int) -> Traffic:
+        """Return the traffic of *endpoint*, which may be new."""
+        traffic = self._endpoints.get(endpoint)
         if traffic is None:
-            if len(self._ways) >= MAX_WAYS:
-                self._ways.popitem(last=False)
-            traffic = self._ways[way] = Traffic(now_ns)
+            if len(self._endpoints) >= MAX_WAYS:
+                self._endpoints.popitem(last=False)
+            traffic = self._endpoints[endpoint] = Traffic(now_ns)
         return traffic
 
-    def get(self, way: KeyT) -> Traffic | None:
-        """Return a copy of the traffic of *way*, None if it was never used."""
-        traffic = self._ways.get(way)
+    def get(self, endpoint: KeyT) -> Traffic | None:
+        """Return a copy of the traffic of *endpoint*, None if it was never used."""
+        traffic = self._endpoints.get(endpoint)
         return None if traffic is None else msgspec.structs.replace(traffic)
 
-    def forget(self, way: KeyT) -> None:
-        """Leave *way* out from now on: it is closed."""
-        self._ways.pop(way, None)
+    def forget(self, endpoint: KeyT) -> None:
+        """Leave *endpoint* out from now on: it is closed."""
+        self._endpoints.pop(endpoint, None)
 
     def snapshot(self) -> dict[KeyT, Traffic]:
         """Return a copy of all."""
-        return {way: msgspec.structs.replace(each) for way, each in self._ways.items()}
+        return {
+            endpoint: msgspec.structs.replace(each) for endpoint, each in self._endpoints.items()
+        }

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from eap.ams.action import Forward, Reply
 import msgspec
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
+from eap.ams.action import Forward, Reply
 from eap.ams.fragment import iter_fragments
 from eap.codec.ams import AmsHeader
 
 
-class Door(msgspec.Struct, frozen=True):
+class Transport(msgspec.Struct, frozen=True):
     """What a router has to know of one way to come in and go out.
 
     Attributes:
@@ -32,61 +32,65 @@ class Door(msgspec.Struct, frozen=True):
     is_hub: bool = False
 
 
-class Outlet:
+class TransportTable:
     """The doors of a router, seen from inside; raises as :meth:`add`."""
 
-    def __init__(self, doors: Iterable[Door]) -> None:
-        self._doors: dict[str, Door] = {}
+    def __init__(self, transports: Iterable[Transport]) -> None:
+        self._transports: dict[str, Transport] = {}
         self._number = 0
-        self._places: dict[Way, str] = {}
-        for door in doors:
-            self.add(door)
+        self._places: dict[Endpoint, str] = {}
+        for transport in transports:
+            self.add(transport)
 
-    def add(self, door: Door) -> None:
+    def add(self, transport: Transport) -> None:
         """Take one more door.
 
         Raises:
             ValueError: it has not even room for a fragment, or the name of another.
         """
-        if door.name in self._doors:
-            raise ValueError(f"two doors {door.name!r}")
-        if door.room and door.room <= AmsHeader.SIZE:
+        if transport.name in self._transports:
+            raise ValueError(f"two doors {transport.name!r}")
+        if transport.room and transport.room <= AmsHeader.SIZE:
             raise ValueError(
-                f"door {door.name!r}: {door.room} octets, expected more than {AmsHeader.SIZE}"
+                f"transport {transport.name!r}: {transport.room} bytes,"
+                f" expected more than {AmsHeader.SIZE}"
             )
-        self._doors[door.name] = door
+        self._transports[transport.name] = transport
 
     def remove(self, name: str) -> None:
         """Forget a door; nothing goes back by it any more."""
-        del self._doors[name]
+        del self._transports[name]
 
     @property
-    def doors(self) -> Mapping[str, Door]:
+    def transports(self) -> Mapping[str, Transport]:
         """All doors by name."""
-        return self._doors
+        return self._transports
 
-    def note_place(self, hop: Way, connection: str) -> None:
+    def note_place(self, hop: Endpoint, connection: str) -> None:
         """Know that what comes from *hop*, which has a name, comes by *connection*."""
         self._places[hop] = connection
 
-    def is_from(self, hop: Way, way: Way) -> bool:
-        """Say whether what comes by *way* may come from *hop*."""
-        if hop == way:
+    def is_from(self, hop: Endpoint, endpoint: Endpoint) -> bool:
+        """Say whether what comes by *endpoint* may come from *hop*."""
+        if hop == endpoint:
             return True
-        if hop.door != way.door:
+        if hop.transport != endpoint.transport:
             return False
-        return self._doors[way.door].is_shared or self._places.get(hop) == way.connection
+        return (
+            self._transports[endpoint.transport].is_shared
+            or self._places.get(hop) == endpoint.connection
+        )
 
-    def reply(self, way: Way, packet: bytes) -> Reply:
-        """Return how *packet* goes back by *way*."""
-        return Reply(way, self._cut(way.door, packet))
+    def reply(self, endpoint: Endpoint, packet: bytes) -> Reply:
+        """Return how *packet* goes back by *endpoint*."""
+        return Reply(endpoint, self._cut(endpoint.transport, packet))
 
-    def forward(self, hop: Way, packet: bytes, ticket: int) -> Forward:
+    def forward(self, hop: Endpoint, packet: bytes, ticket: int) -> Forward:
         """Return how *packet* goes on to *hop*."""
-        return Forward(hop, self._cut(hop.door, packet), ticket)
+        return Forward(hop, self._cut(hop.transport, packet), ticket)
 
-    def _cut(self, door: str, packet: bytes) -> tuple[bytes, ...]:
-        room = self._doors[door].room
+    def _cut(self, transport: str, packet: bytes) -> tuple[bytes, ...]:
+        room = self._transports[transport].room
         if not room or len(packet) <= room:
             return (packet,)
         self._number += 1

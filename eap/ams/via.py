@@ -15,7 +15,7 @@ from functools import cache
 from ipaddress import AddressValueError, IPv4Address
 
 from eap.ams.directory import Directory
-from eap.ams.spec import DirectoryPort, DirectoryStation, DoorKind, HopSpec
+from eap.ams.spec import DirectoryPort, DirectoryStation, HopSpec, TransportKind
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import InterfaceUri, MacAddr, NetId, parse_host
@@ -43,7 +43,7 @@ def parse_via(
         ValueError: that is nowhere; the message says what is expected.
     """
     kind, colon, rest = _complete(text).partition(":")
-    if kind == DoorKind.MQTT and rest:
+    if kind == TransportKind.MQTT and rest:
         return _by_mqtt(rest, net_id, directory)
     if colon and rest and kind in _READERS:
         return _READERS[kind](rest, _ports(own, port))
@@ -78,7 +78,7 @@ def _hop(mine: DirectoryPort, there: DirectoryPort) -> HopSpec | None:
     if here.scheme in _IP and target.scheme in _IP:
         return ip_hop(mine.name, here, target)
     if here.scheme == target.scheme == "ethernet" and here.host == target.host:
-        return HopSpec(DoorKind.ETHERNET, mine.name, str(there.net_id))
+        return HopSpec(TransportKind.ETHERNET, mine.name, str(there.net_id))
     return None
 
 
@@ -90,7 +90,7 @@ def ip_hop(port: str, here: InterfaceUri, there: InterfaceUri) -> HopSpec | None
     own, other = read_address(here.host), read_address(there.host)
     if other.is_unspecified or (not own.is_unspecified and own.is_loopback != other.is_loopback):
         return None
-    kind = DoorKind.UDP if here.scheme == there.scheme == "udp" else DoorKind.TCP
+    kind = TransportKind.UDP if here.scheme == there.scheme == "udp" else TransportKind.TCP
     return HopSpec(kind, port, f"{there.host}:{there.port or EAP_PORT}")
 
 
@@ -108,22 +108,22 @@ def _complete(text: str) -> str:
     if "/" in text or text.partition(":")[0] in _READERS:
         return text
     if text.count(".") == _NET_ID_DOTS or _MAC.fullmatch(text):
-        return f"{DoorKind.ETHERNET}:{text}"
-    return f"{DoorKind.UDP}:{text}" if _ADDRESS.fullmatch(text) else text
+        return f"{TransportKind.ETHERNET}:{text}"
+    return f"{TransportKind.UDP}:{text}" if _ADDRESS.fullmatch(text) else text
 
 
 def _by_ams_tcp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
     del ports
     host, port = parse_host(rest, AMS_TCP_PORT)
-    return HopSpec(DoorKind.AMS_TCP, "", f"{host}:{port}")
+    return HopSpec(TransportKind.AMS_TCP, "", f"{host}:{port}")
 
 
 def _by_udp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
-    return HopSpec(DoorKind.UDP, _first(ports, ("udp",)), _ip_address(rest))
+    return HopSpec(TransportKind.UDP, _first(ports, ("udp",)), _ip_address(rest))
 
 
 def _by_tcp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
-    return HopSpec(DoorKind.TCP, _first(ports, _IP), _ip_address(rest))
+    return HopSpec(TransportKind.TCP, _first(ports, _IP), _ip_address(rest))
 
 
 def _by_ethernet(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
@@ -132,22 +132,22 @@ def _by_ethernet(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
         address = NetId.parse(rest) if rest.count(".") else MacAddr.parse(rest)
     except ValueError as exc:
         raise ValueError(f"via ethernet: {exc}") from None
-    return HopSpec(DoorKind.ETHERNET, name, str(address))
+    return HopSpec(TransportKind.ETHERNET, name, str(address))
 
 
 def _by_mqtt(rest: str, net_id: str, directory: Directory) -> HopSpec:
     network, _, router = rest.partition("/")
     known = directory.stations.get(router)
     if known:
-        return HopSpec(DoorKind.MQTT, network, str(known.net_id))
-    return HopSpec(DoorKind.MQTT, network, str(NetId.parse(router or net_id)))
+        return HopSpec(TransportKind.MQTT, network, str(known.net_id))
+    return HopSpec(TransportKind.MQTT, network, str(NetId.parse(router or net_id)))
 
 
 _READERS: dict[str, Callable[[str, Sequence[DirectoryPort]], HopSpec]] = {
-    DoorKind.AMS_TCP: _by_ams_tcp,
-    DoorKind.UDP: _by_udp,
-    DoorKind.TCP: _by_tcp,
-    DoorKind.ETHERNET: _by_ethernet,
+    TransportKind.AMS_TCP: _by_ams_tcp,
+    TransportKind.UDP: _by_udp,
+    TransportKind.TCP: _by_tcp,
+    TransportKind.ETHERNET: _by_ethernet,
 }
 
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.cli.table import Column, Styled, TextTable, count, duration
 from eap.control.routes import (
     ConnectionRow,
+    EndpointRow,
     ImportRow,
     NeighbourRow,
     RequestRow,
     RouteRow,
     RouterRow,
-    WayRow,
     interruption_text,
 )
 from eap.ops.route_lists import RouterList, TestedTarget
@@ -168,19 +168,19 @@ def short(number: int) -> str:
     )
 
 
-def octets_of(row: WayRow) -> str:
+def octets_of(row: EndpointRow) -> str:
     """Return all octets, both ways."""
     return short(row.octets_in + row.octets_out)
 
 
-def transport_of(row: WayRow) -> str:
+def transport_of(row: EndpointRow) -> str:
     """Return the transport; one to a fixed address is shown by its kind."""
     return row.transport.removesuffix(f":{row.address}")
 
 
-def path_of(row: WayRow) -> str:
+def path_of(row: EndpointRow) -> str:
     """Return address and transport."""
-    return str(Way(row.transport, row.address))
+    return str(Endpoint(row.transport, row.address))
 
 
 def round_trip(us: int | None) -> str:
@@ -217,7 +217,7 @@ def route_state(row: RouteRow) -> str:
     return f"{row.state}: {rest}" if rest else row.state
 
 
-def figures(row: WayRow) -> str:
+def figures(row: EndpointRow) -> str:
     """Return all figures of a row in words."""
     return (
         f"{count(row.requests, 'request')}, {count(row.answers, 'answer')},"

@@ -7,7 +7,14 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import TypeVar
 
-from eap.ams.spec import IP_DOORS, AccessRule, AccessService, AccessTarget, DoorKind, ObjectRange
+from eap.ams.spec import (
+    IP_DOORS,
+    AccessRule,
+    AccessService,
+    AccessTarget,
+    ObjectRange,
+    TransportKind,
+)
 from eap.config.brokers import brokers_of, check_file
 from eap.config.check_ports import check_names
 from eap.config.finding import FindingReport, one_of
@@ -15,8 +22,8 @@ from eap.config.index import Index
 from eap.config.routes import WHOLE, MisfitError, net_ids_of, without_prefix
 from eap.config.structs import AccessSection, PortSection, StationSection
 from eap.ids import STATION_OCTETS, MacAddr, ObjectId
-from eap.suggest import suggest
 from eap.pd.spec import PortKind
+from eap.suggest import suggest
 
 ALL = "all"
 SERVICES = (ALL, *map(str, AccessService))
@@ -42,7 +49,7 @@ def access_rules(index: Index, station: StationSection, loose: set[str]) -> Iter
             net_ids=tuple(
                 net_id for text in access.net_ids for net_id in parse_source(index, text, loose)
             ),
-            doors=access.doors,
+            transports=access.doors,
             targets=tuple(
                 target for text in access.to for target in parse_target(index, text, loose)
             ),
@@ -63,7 +70,9 @@ def parse_services(texts: tuple[str, ...]) -> tuple[AccessService, ...]:
         if text == ALL:
             return ()
         if text not in SERVICES:
-            raise MisfitError("", f"no access is called {text!r}{suggest(text, SERVICES)}", _SERVICES)
+            raise MisfitError(
+                "", f"no access is called {text!r}{suggest(text, SERVICES)}", _SERVICES
+            )
         found += _WRITES if text == AccessService.WRITE else [AccessService(text)]
     return tuple(dict.fromkeys(found))
 
@@ -223,22 +232,22 @@ def _check_rule(
     try_all("net_ids", access.net_ids, lambda text: parse_source(index, text, loose))
     try_all("to", access.to, lambda text: parse_target(index, text, loose))
     try_all("objects", access.objects, parse_objects)
-    known = _doors(station)
+    known = _transports(station)
     try_all("doors", access.doors, lambda text: _check_door(text, known))
     return is_fine
 
 
-def _doors(station: StationSection) -> list[str]:
-    """Return all that ``doors`` may name at *station*."""
-    found = [*map(str, DoorKind)]
+def _transports(station: StationSection) -> list[str]:
+    """Return all that ``transports`` may name at *station*."""
+    found = [*map(str, TransportKind)]
     names = [port.name for port in station.ports if port.kind is PortKind.EAP]
-    doors = [f"{kind}:{name}" for name in names for kind in ("udp", "tcp", "ethernet")]
-    return [*found, *doors, *(f"mqtt:{route.network}" for route in brokers_of(station))]
+    transports = [f"{kind}:{name}" for name in names for kind in ("udp", "tcp", "ethernet")]
+    return [*found, *transports, *(f"mqtt:{route.network}" for route in brokers_of(station))]
 
 
 def _check_door(text: str, known: list[str]) -> None:
     if text not in known:
-        expected = f"{one_of(DoorKind)}, or one door such as udp:PORT or mqtt:NETWORK"
+        expected = f"{one_of(TransportKind)}, or one door such as udp:PORT or mqtt:NETWORK"
         raise MisfitError("", f"no door {text!r}{suggest(text, known)}", expected)
 
 
@@ -264,10 +273,10 @@ def _check_order(
 
 
 def _why_never(rule: AccessRule) -> str:
-    kinds = {_kind(door) for door in rule.doors}
+    kinds = {_kind(transport) for transport in rule.transports}
     is_known = kinds.isdisjoint(IP_DOORS) if rule.networks else bool(rule.macs)
-    if kinds and is_known and not (rule.macs and DoorKind.ETHERNET in kinds):
-        return f"who comes by {', '.join(rule.doors)} has no such address"
+    if kinds and is_known and not (rule.macs and TransportKind.ETHERNET in kinds):
+        return f"who comes by {', '.join(rule.transports)} has no such address"
     if rule.objects and rule.services and _OBJECT_SERVICES.isdisjoint(rule.services):
         return f"{', '.join(rule.services)} is not about objects"
     return ""
@@ -278,7 +287,9 @@ def _covers(one: AccessRule, other: AccessRule) -> bool:
     return (
         _covers_senders(one, other)
         and _all_in(one.net_ids, other.net_ids, _begins)
-        and _all_in(one.doors, other.doors, lambda outer, inner: outer in {inner, _kind(inner)})
+        and _all_in(
+            one.transports, other.transports, lambda outer, inner: outer in {inner, _kind(inner)}
+        )
         and _all_in(
             one.targets,
             other.targets,
@@ -318,5 +329,5 @@ def _begins(outer: str, inner: str) -> bool:
     return f"{inner}.".startswith(f"{outer}.")
 
 
-def _kind(door: str) -> str:
-    return door.partition(":")[0]
+def _kind(transport: str) -> str:
+    return transport.partition(":")[0]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from eap.ams.mqtt.topics import check_network
-from eap.ams.spec import DoorKind, MqttSpec, TlsSpec
+from eap.ams.spec import MqttSpec, TlsSpec, TransportKind
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
 from eap.config.structs import RouteSection, StationSection, TlsSection
@@ -189,7 +189,7 @@ def why_unreadable(file: Path) -> str:
     return ""
 
 
-_MQTT = f"{DoorKind.MQTT}:"
+_MQTT = f"{TransportKind.MQTT}:"
 _SOURCES = "mqtt:NETWORK of a broker of the station, or an IPv4 address or network"
 
 

@@ -16,10 +16,10 @@ from eap.config.destination import EXPECTED, check_address, check_monitoring, re
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import FrameSection, PublishSection, StationSection, SubscribeSection
-from eap.suggest import suggest
 from eap.pd import rules
 from eap.pd.device import FaultCode
 from eap.pd.spec import REQUESTER, PortKind
+from eap.suggest import suggest
 
 
 def check_publish(index: Index, report: FindingReport) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from itertools import count
 from pathlib import Path
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, RouteTable
 from eap.ams.routes import Route as AmsRoute
 from eap.ams.spec import DEFAULT_TARGET, RouteSpec, RoutingSpec
@@ -229,7 +229,7 @@ def _routes(specs: tuple[RouteSpec, ...]) -> Iterator[AmsRoute]:
         yield AmsRoute(
             NetId.parse(spec.virtual) if spec.virtual else net_id,
             spec.name,
-            Way(spec.hop.kind, str(number)),
+            Endpoint(spec.hop.kind, str(number)),
             Origin.STATIC,
             spec.octets,
             real=net_id if spec.virtual else None,

@@ -10,10 +10,10 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import ANY_SOURCE, FromSection, StationSection, SubscribeSection
 from eap.ids import NetId
-from eap.suggest import suggest
 from eap.pd import rules
 from eap.pd.address import is_group_source, source_octets
 from eap.pd.spec import REQUESTER
+from eap.suggest import suggest
 
 
 def check_subscribe(index: Index, report: FindingReport) -> None:

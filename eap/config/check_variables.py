@@ -11,7 +11,6 @@ from eap.config.check_ports import check_names
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.structs import StationSection, VariableSection
-from eap.suggest import suggest
 from eap.pd.rules import MADE_SUFFIXES
 from eap.pd.spec import (
     INTERFACE_MEASURES,
@@ -24,6 +23,7 @@ from eap.pd.spec import (
     SineSource,
     Source,
 )
+from eap.suggest import suggest
 
 
 def check_variables(index: Index, report: FindingReport, folder: Path) -> None:

@@ -17,7 +17,7 @@ from eap.config.document import Node, ScalarNode
 from eap.config.finding import FindingReport, one_of
 from eap.config.structs import NO_NET_ID, PlantFile, Section
 from eap.ids import NetId
-from eap.suggest import suggest, nearest
+from eap.suggest import nearest, suggest
 
 T = TypeVar("T")
 

@@ -17,10 +17,10 @@ from eap.ams.spec import (
     AmsUser,
     DirectoryPort,
     DirectoryStation,
-    DoorKind,
     HopSpec,
     RouteSpec,
     RoutingSpec,
+    TransportKind,
 )
 from eap.codec import datatypes
 from eap.config.access import access_rules
@@ -393,7 +393,7 @@ def _derived(
         hop = find_hop(index, station, target)
         network = "" if hop else shared_network(station, target)
         if network:
-            hop = HopSpec(DoorKind.MQTT, network, router)
+            hop = HopSpec(TransportKind.MQTT, network, router)
         if hop is None:
             continue
         for net_id, octets in known[target.name]:
@@ -404,6 +404,6 @@ def _derived(
                 octets=octets,
                 router=router,
                 # The broker tells who is there; all asking all each second is a load of its own.
-                is_probed=hop.kind is not DoorKind.MQTT,
+                is_probed=hop.kind is not TransportKind.MQTT,
                 is_derived=True,
             )

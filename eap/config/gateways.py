@@ -10,8 +10,8 @@ from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.routes import MisfitError
 from eap.config.structs import Plain, PortSection, StationSection
-from eap.suggest import suggest
 from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
+from eap.suggest import suggest
 
 MASTER_PORT = 0xFFFF
 ADDRESS = "a mailbox address from 1 to 0xFFFE"

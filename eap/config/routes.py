@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from ipaddress import IPv4Address
 from typing import NamedTuple
 
-from eap.ams.spec import DEFAULT_TARGET, DoorKind, HopSpec
+from eap.ams.spec import DEFAULT_TARGET, HopSpec, TransportKind
 from eap.ams.via import ip_hop, read_address
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
@@ -23,8 +23,8 @@ from eap.ids import (
     NetId,
     parse_host,
 )
-from eap.suggest import suggest
 from eap.pd.spec import PortKind
+from eap.suggest import suggest
 
 VIA = "STATION/PORT, mqtt:NETWORK, an IPv4 address, tcp:// and one, a MAC address or a NetID"
 MQTT = "mqtt:"
@@ -36,10 +36,10 @@ _SCHEMES = {
     DestinationKind.NET_ID: ("ethernet",),
 }
 _KINDS = {
-    DestinationKind.IP: DoorKind.UDP,
-    DestinationKind.TCP: DoorKind.TCP,
-    DestinationKind.MAC: DoorKind.ETHERNET,
-    DestinationKind.NET_ID: DoorKind.ETHERNET,
+    DestinationKind.IP: TransportKind.UDP,
+    DestinationKind.TCP: TransportKind.TCP,
+    DestinationKind.MAC: TransportKind.ETHERNET,
+    DestinationKind.NET_ID: TransportKind.ETHERNET,
 }
 
 
@@ -95,7 +95,9 @@ def next_hop(index: Index, station: StationSection, route: RouteSection) -> Next
 def _check_own_port(index: Index, station: StationSection, route: RouteSection) -> None:
     if route.port and index.eap_port(station, route.port) is None:
         names = [port.name for port in station.ports if port.kind is PortKind.EAP]
-        message = f"station {station.name} has no EAP port {route.port!r}{suggest(route.port, names)}"
+        message = (
+            f"station {station.name} has no EAP port {route.port!r}{suggest(route.port, names)}"
+        )
         raise MisfitError("port", message, one_of(names))
 
 
@@ -154,7 +156,7 @@ def _by_ams_tcp(index: Index, station: StationSection, route: RouteSection) -> N
 
 
 def _ams_tcp(host: str, port: int) -> HopSpec:
-    return HopSpec(DoorKind.AMS_TCP, "", f"{host}:{port}")
+    return HopSpec(TransportKind.AMS_TCP, "", f"{host}:{port}")
 
 
 def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> NextHop:
@@ -172,7 +174,7 @@ def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> Next
         message = f"station {other.name} is in no MQTT network {network!r}"
         raise MisfitError("via", message, "a network that both are in")
     router = str(other.net_id) if other is not None else _foreign_router(route)
-    return NextHop(HopSpec(DoorKind.MQTT, network, router), router)
+    return NextHop(HopSpec(TransportKind.MQTT, network, router), router)
 
 
 def _foreign_router(route: RouteSection) -> str:
@@ -264,7 +266,7 @@ def prefixes(station: StationSection) -> set[bytes]:
 
 
 _IP_SCHEMES = {"udp", "tcp"}
-_PREFERENCE = (DoorKind.UDP, DoorKind.TCP, DoorKind.ETHERNET)
+_PREFERENCE = (TransportKind.UDP, TransportKind.TCP, TransportKind.ETHERNET)
 """UDP first: it needs no connection, and the kernel knows who has an address."""
 
 
@@ -330,7 +332,7 @@ def _hop(
         port, there = index.ports[own], index.ports[other]
         if is_wanted or (uri.host == target.host and _vid(port) == _vid(there)):
             address = MacAddr.parse(there.mac) if there.mac else there.net_id
-            return HopSpec(DoorKind.ETHERNET, own[1], str(address)), 0
+            return HopSpec(TransportKind.ETHERNET, own[1], str(address)), 0
     return None
 
 

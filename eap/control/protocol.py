@@ -14,8 +14,8 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 import msgspec
 
 from eap.errors import ControlError, EnvironmentalError
-from eap.suggest import suggest
 from eap.pd.report import PdRow
+from eap.suggest import suggest
 
 VERSION = 1
 MAX_LINE = 1 << 23

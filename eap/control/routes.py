@@ -128,7 +128,7 @@ class RoutesIntroduceParameters(Parameters, frozen=True, kw_only=True):
     wait_ms: Annotated[int, Meta(ge=10, le=60_000)] = 5_000
 
 
-class WayRow(Document, frozen=True, kw_only=True):
+class EndpointRow(Document, frozen=True, kw_only=True):
     """One path of packets, and the figures of its requests.
 
     Attributes:
@@ -152,7 +152,7 @@ class WayRow(Document, frozen=True, kw_only=True):
     last_error: str = ""
 
 
-class RouteRow(WayRow, frozen=True, kw_only=True):
+class RouteRow(EndpointRow, frozen=True, kw_only=True):
     """One route: a way to the next hop.
 
     Attributes:
@@ -192,7 +192,7 @@ class RouteRow(WayRow, frozen=True, kw_only=True):
         return ".".join([*octets, *["*"] * (6 - self.octets)]) if self.octets else "default"
 
 
-class ConnectionRow(WayRow, frozen=True, kw_only=True):
+class ConnectionRow(EndpointRow, frozen=True, kw_only=True):
     """One connection that requests came by, or one sender where there are none.
 
     Attributes:
@@ -507,7 +507,7 @@ def hop_row(report: HopReport, took_us: int, spent_us: int, *, is_opaque: bool) 
         net_id=report.net_id,
         opaque=is_opaque,
         route=report.route,
-        transport=report.door,
+        transport=report.transport,
         address=report.address,
         state=report.state,
         why=report.why,

@@ -39,7 +39,7 @@ from devicebus.mailbox.conversation import (
 )
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_browse import IdnDescription
-from eap.closeable import Closing
+from eap.closeable import Closeable
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.sdo import EXPEDITED_SIZE
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
@@ -57,7 +57,7 @@ _S, _MS = 1_000_000_000, 1_000_000
 _LARGEST = 4096
 
 
-class GatewayClient(Closing):
+class GatewayClient(Closeable):
     """A blocking client.
 
     Args:

@@ -54,10 +54,10 @@ def refuse(kind: MailboxType, request: bytes, cause: Cause, text: str = "") -> A
         cause: Why it is refused.
         text: More than *cause* says, where the protocol has room for words.
     """
-    refuser = _REFUSERS.get(kind)
-    if refuser is None:
+    error_replier = _REFUSERS.get(kind)
+    if error_replier is None:
         return mailbox_error(cause.mailbox)
-    body = refuser(request, cause, text or cause.text)
+    body = error_replier(request, cause, text or cause.text)
     return mailbox_error(cause.mailbox) if body is None else Answer(kind, body)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import NamedTuple
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 
 _S = 1_000_000_000
 
@@ -120,18 +120,18 @@ class RequestTracker:
 
     def __init__(self, limits: ClientLimits | None = None) -> None:
         self._limits = limits or ClientLimits()
-        self._clients: dict[Way, _TrackedClient] = {}
+        self._clients: dict[Endpoint, _TrackedClient] = {}
         self._in_flight = 0
 
-    def admit(self, way: Way, frame: bytes, now_ns: int) -> RequestAdmission:
+    def admit(self, endpoint: Endpoint, frame: bytes, now_ns: int) -> RequestAdmission:
         """Decide on a request; one that is taken waits until :meth:`answered`.
 
         Args:
-            way: Connection, or address, of the client.
+            endpoint: Connection, or address, of the client.
             frame: All octets of the request.
             now_ns: The time on the monotonic clock.
         """
-        client = self._client(way, now_ns)
+        client = self._client(endpoint, now_ns)
         if client is None:
             return RequestAdmission.CROWDED
         if frame in client.waiting:
@@ -148,46 +148,46 @@ class RequestTracker:
         self._in_flight += 1
         return RequestAdmission.TAKEN
 
-    def answered(self, way: Way, frame: bytes) -> None:
+    def answered(self, endpoint: Endpoint, frame: bytes) -> None:
         """Note that a request waits no more, however it ended."""
-        client = self._clients.get(way)
+        client = self._clients.get(endpoint)
         if client is not None and frame in client.waiting:
             client.waiting.discard(frame)
             self._in_flight -= 1
 
-    def waiting(self, way: Way) -> int:
+    def waiting(self, endpoint: Endpoint) -> int:
         """Return how many requests of a client wait."""
-        client = self._clients.get(way)
+        client = self._clients.get(endpoint)
         return len(client.waiting) if client else 0
 
-    def counts_of(self, way: Way) -> Counts | None:
+    def counts_of(self, endpoint: Endpoint) -> Counts | None:
         """Return what was done for a client that is known."""
-        client = self._clients.get(way)
+        client = self._clients.get(endpoint)
         return client.counts if client else None
 
-    def forget(self, way: Way) -> None:
+    def forget(self, endpoint: Endpoint) -> None:
         """Forget a client whose connection is closed."""
-        client = self._clients.pop(way, None)
+        client = self._clients.pop(endpoint, None)
         if client is not None:
             self._in_flight -= len(client.waiting)
 
-    def table(self) -> dict[Way, Counts]:
+    def table(self) -> dict[Endpoint, Counts]:
         """Return all known clients, the most recent one at the end."""
-        return {way: client.counts for way, client in self._clients.items()}
+        return {endpoint: client.counts for endpoint, client in self._clients.items()}
 
-    def _client(self, way: Way, now_ns: int) -> _TrackedClient | None:
-        client = self._clients.pop(way, None)
+    def _client(self, endpoint: Endpoint, now_ns: int) -> _TrackedClient | None:
+        client = self._clients.pop(endpoint, None)
         if client is None:
             if len(self._clients) >= self._limits.clients and not self._make_room():
                 return None
             client = _TrackedClient(self._limits.rate, now_ns)
-        self._clients[way] = client  # at the end: the one in front has been silent longest
+        self._clients[endpoint] = client  # at the end: the one in front has been silent longest
         return client
 
     def _make_room(self) -> bool:
-        for way, client in self._clients.items():
+        for endpoint, client in self._clients.items():
             if not client.waiting:
-                del self._clients[way]
+                del self._clients[endpoint]
                 return True
         return False
 
@@ -210,19 +210,19 @@ class Ticket:
 
     Args:
         tracker: That took it.
-        way: Connection, or address, of the client.
+        endpoint: Connection, or address, of the client.
         frame: All octets of the request.
     """
 
-    __slots__ = ("_frame", "_tracker", "_way")
+    __slots__ = ("_endpoint", "_frame", "_tracker")
 
-    def __init__(self, tracker: RequestTracker, way: Way, frame: bytes) -> None:
+    def __init__(self, tracker: RequestTracker, endpoint: Endpoint, frame: bytes) -> None:
         self._tracker: RequestTracker | None = tracker
-        self._way = way
+        self._endpoint = endpoint
         self._frame = frame
 
     def give_back(self) -> None:
         """The request waits no more; harmless the second time."""
         tracker, self._tracker = self._tracker, None
         if tracker is not None:
-            tracker.answered(self._way, self._frame)
+            tracker.answered(self._endpoint, self._frame)

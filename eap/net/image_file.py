@@ -18,7 +18,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from eap.closeable import Closing
+from eap.closeable import Closeable
 from eap.errors import EnvironmentalError, ImageError, WriterConflictError
 from eap.pd.handover import ImageHandover
 from eap.pd.image import Image, format_image, read_generation, read_header
@@ -40,7 +40,7 @@ _PID_WORD = {
 }
 
 
-class ImageFile(Closing):
+class ImageFile(Closeable):
     """A mapped process image; use it as a context manager or :meth:`close` it.
 
     Attributes:

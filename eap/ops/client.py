@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from eap.closeable import Closing
+from eap.closeable import Closeable
 from eap.control.protocol import (
     MAX_LINE,
     SUBSCRIBE,
@@ -26,9 +26,9 @@ from eap.control.protocol import (
     encode_request,
 )
 from eap.errors import ControlError
-from eap.suggest import suggest
 from eap.runtime.bus_errors import ErrorRecord, to_error
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, describe_roots, find_running
+from eap.suggest import suggest
 
 TIMEOUT_S = 10.0
 """Time for one answer: services may be on their way back from a restart."""
@@ -36,7 +36,7 @@ _CONNECT_PAUSE_S = 0.02
 _EVENT = partial(msgspec.convert, type=ValuesEvent)
 
 
-class ControlClient(Closing):
+class ControlClient(Closeable):
     """One connection to one running appliance."""
 
     def __init__(

@@ -33,11 +33,11 @@ from eap.control.device import (
 from eap.control.protocol import AnswerT, ErrorCode, Method, ParametersT
 from eap.device.rollout import Step, steps, without_alternates
 from eap.errors import ConfigError, ControlError
-from eap.suggest import suggest
 from eap.ops.client import ControlClient, connect_those
 from eap.pd.spec import StationSpec
 from eap.runtime.plantfile import load_plant
 from eap.runtime.store import new_cause
+from eap.suggest import suggest
 
 STATION_S = 60.0
 """Time for one station: it is checked, stored, and built anew between two cycles."""

@@ -17,9 +17,8 @@ from pathlib import Path
 from time import monotonic_ns, time_ns
 from typing import Any
 
-from eap.closeable import Closing
+from eap.closeable import Closeable
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
-from eap.suggest import suggest
 from eap.pd.image import Image
 from eap.pd.layout import VAR_CTRL
 from eap.pd.report import station_status
@@ -28,13 +27,14 @@ from eap.pd.trigger import EVENT_BIT
 from eap.pd.words import StationWord
 from eap.runtime.folder import describe_roots, find_running
 from eap.runtime.station_image import StationImage
+from eap.suggest import suggest
 
 _GONE_AFTER_S = 2.0
 """Without a cycle for this long the engine counts as gone; a restart takes less."""
 _GONE_AFTER_CYCLES = 10
 
 
-class AttachedStation(Closing):
+class AttachedStation(Closeable):
     """The variables of one running station; made by :func:`attach`."""
 
     def __init__(self, path: Path) -> None:

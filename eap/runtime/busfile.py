@@ -22,8 +22,8 @@ from eap.config.convert import convert_to
 from eap.config.document import read
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.errors import ConfigError
-from eap.suggest import suggest
 from eap.od.dictionary import ObjectDictionary
+from eap.suggest import suggest
 
 MAX_RESOURCE = 16 << 20
 """Octets of the largest file that a bus file may refer to."""

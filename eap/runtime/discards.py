@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum, auto
 from pathlib import Path
 
-from eap.closeable import Closing
+from eap.closeable import Closeable
 from eap.errors import EnvironmentalError
 
 
@@ -65,7 +65,7 @@ _REFUSALS = tuple(Refusal)
 _COLUMN = {reason: index for index, reason in enumerate(_REFUSALS)}
 
 
-class DiscardCounters(Closing):
+class DiscardCounters(Closeable):
     """One 64-bit word for each station and reason; each process has its own file.
 
     Raises:

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import msgspec
 
-from eap.closeable import Closing
+from eap.closeable import Closeable
 from eap.errors import EnvironmentalError
 
 VARIABLE = "EAP_RUNTIME_DIR"
@@ -147,7 +147,7 @@ def folder_name(plant: str, subset: Sequence[str] = ()) -> str:
     return f"{safe[:_MAX_NAME].lstrip('.')}-{digest}"
 
 
-class ApplianceFolder(Closing):
+class ApplianceFolder(Closeable):
     """The paths of one appliance's folder; whoever claims it holds its lock until ``close``."""
 
     def __init__(self, path: Path, lock_fd: int = -1) -> None:

@@ -68,7 +68,7 @@ from eap.services.transports.accepting import Listeners
 if TYPE_CHECKING:
     from eap.services.device.master_values import MasterDictionaryProvider
     from eap.services.gateway.gateway import MailboxGateway
-    from eap.services.transports.mqtt_transport import MqttDoor
+    from eap.services.transports.mqtt_transport import MqttTransport
 
 STATUS_PATIENCE_S = 0.3
 """How long ``status`` waits for what the engine says of its buses."""
@@ -115,7 +115,7 @@ class Services:
         self._startup.step("opening gateways and sockets")
         clients = open_buses(link, [bus.owner for bus in self._handover.buses])
         providers, gateways = self._gateways(clients, devices.routers)
-        doors = open_doors(
+        transports = open_doors(
             self._handover,
             devices.routers,
             {name: each.routes for name, each in devices.routing.items()},
@@ -134,7 +134,7 @@ class Services:
             control = partial(server.serve, self._listener, self._listeners)
             tasks = [group.create_task(_keep_serving(control))]
             tasks.append(group.create_task(_keep_serving(self._listeners.serve)))
-            tasks += [group.create_task(_keep_serving(each.serve)) for each in doors]
+            tasks += [group.create_task(_keep_serving(each.serve)) for each in transports]
             tasks += [group.create_task(_keep_serving(each.serve)) for each in brokers]
             tasks.append(group.create_task(devices.serve()))
             tasks.append(group.create_task(audit.serve()))
@@ -190,7 +190,7 @@ class Services:
         providers = open_dictionaries(self._handover, clients, RELEASE)
         return providers, open_gateways(self._handover, clients, providers, routers)
 
-    def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttDoor]:
+    def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttTransport]:
         routing = self._handover.routing
         if not any(told.mqtt for told in routing.values()):
             return ()

@@ -9,8 +9,8 @@ from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import TYPE_CHECKING
 
-from eap.ams.endpoint import Door
-from eap.ams.spec import DoorKind
+from eap.ams.spec import TransportKind
+from eap.ams.transport_table import Transport
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, NetId
@@ -22,31 +22,31 @@ from eap.pd.link import FrameOrigin
 from eap.pd.spec import StationSpec
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
-from eap.services.gateway.gateway_transport import GatewayDoor
+from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.routing.ams_requests import AmsQuestions
-from eap.services.routing.route_admin import RouteDesk
+from eap.services.routing.route_admin import RouteAdmin
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.accepting import Listeners
 from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
-from eap.services.transports.ams_transport import AmsClients, AmsDoor
+from eap.services.transports.ams_transport import AmsClients, AmsTransport
 from eap.services.transports.ams_uplink import AmsUplinks
-from eap.services.transports.demultiplexer import Entrance
+from eap.services.transports.demultiplexer import Demultiplexer
 from eap.services.transports.intake import FrameIntake, watch_channel
 from eap.services.transports.link_watch import LinkWatch
 from eap.services.transports.mailbox_frames import (
     FRAME_OVERHEAD,
-    ChannelCarrier,
+    ChannelSender,
     MailboxIntake,
 )
 from eap.services.transports.mailbox_stream import LARGEST_FRAME, MailboxStreams
-from eap.services.transports.segment import Segment, SegmentCarrier
-from eap.services.transports.tcp_transport import TcpDoor
+from eap.services.transports.segment import Segment, SegmentSender
+from eap.services.transports.tcp_transport import TcpTransport
 
 if TYPE_CHECKING:
     from eap.services.gateway.gateway import MailboxGateway
 
-AMS_DOOR = DoorKind.AMS_TCP
+AMS_TRANSPORT = TransportKind.AMS_TCP
 """By which clients come in that connect to AMS/TCP."""
 
 
@@ -59,7 +59,7 @@ def open_doors(
     link: socket.socket,
     listeners: Listeners,
     resources: ExitStack,
-) -> list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch]:
+) -> list[TcpTransport | AmsTransport | AmsUplinks | LinkWatch]:
     """Take frames from all sockets of *handover*, as long as the running loop lives.
 
     Args:
@@ -75,8 +75,8 @@ def open_doors(
     Returns:
         The listeners for TCP, the connections to others and the watch over links, to be served.
     """
-    doors = _Sockets(handover, routers, routes, gateways, counters, listeners, resources)
-    return doors.open(link)
+    transports = _Sockets(handover, routers, routes, gateways, counters, listeners, resources)
+    return transports.open(link)
 
 
 class _Sockets:
@@ -106,7 +106,9 @@ class _Sockets:
         self._ams_stations: set[str] = set()
         self._links: dict[str, list[tuple[StationRouter, str]]] = {}
 
-    def open(self, link: socket.socket) -> list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch]:
+    def open(
+        self, link: socket.socket
+    ) -> list[TcpTransport | AmsTransport | AmsUplinks | LinkWatch]:
         by_kind: dict[SocketKind, list[SharedSocket]] = {kind: [] for kind in SocketKind}
         for shared in self._handover.sockets:
             by_kind[shared.kind].append(shared)
@@ -120,33 +122,41 @@ class _Sockets:
             self._watch_discovery(shared)
         for shared in by_kind[SocketKind.GATEWAY_UDP]:
             self._watch_gateway(shared)
-        doors: list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch] = []
-        doors += [self._door(shared, link) for shared in by_kind[SocketKind.TCP]]
-        doors += [self._gateway_door(shared, link) for shared in by_kind[SocketKind.GATEWAY_TCP]]
-        doors += [self._ams_door(shared) for shared in by_kind[SocketKind.AMS_TCP]]
-        doors += [self._uplinks(station) for station in self._handover.stations]
-        doors.append(LinkWatch(self._links))
-        return doors
+        transports: list[TcpTransport | AmsTransport | AmsUplinks | LinkWatch] = []
+        transports += [self._transport(shared, link) for shared in by_kind[SocketKind.TCP]]
+        transports += [
+            self._gateway_door(shared, link) for shared in by_kind[SocketKind.GATEWAY_TCP]
+        ]
+        transports += [self._ams_door(shared) for shared in by_kind[SocketKind.AMS_TCP]]
+        transports += [self._uplinks(station) for station in self._handover.stations]
+        transports.append(LinkWatch(self._links))
+        return transports
 
     def _channel(self, shared: SharedSocket) -> UdpChannel:
         channel = UdpChannel(socket.socket(fileno=shared.services_fd), self._batch)
         self._resources.callback(channel.close)
         return channel
 
-    def _entrance(self, kind: str, owners: Sequence[PortName]) -> Entrance:
+    def _demultiplexer(self, kind: str, owners: Sequence[PortName]) -> Demultiplexer:
         """Return the way in to the stations of *owners*, by the doors of their ports."""
-        doors = _doors(kind, owners)
-        return Entrance([(self._routers[station], door) for station, door in doors.items()])
-
-    def _gateway(self, kind: str, owners: Sequence[PortName]) -> GatewayDoor:
-        """Return the way in to the gateways of their stations' first buses."""
-        doors = _doors(kind, owners)
-        gateways = self._first_gateways
-        return GatewayDoor(
-            [(gateways[station], door) for station, door in doors.items() if station in gateways]
+        transports = _transports(kind, owners)
+        return Demultiplexer(
+            [(self._routers[station], transport) for station, transport in transports.items()]
         )
 
-    def _own_gateway(self, kind: str, shared: SharedSocket) -> GatewayDoor:
+    def _gateway(self, kind: str, owners: Sequence[PortName]) -> GatewayTransport:
+        """Return the way in to the gateways of their stations' first buses."""
+        transports = _transports(kind, owners)
+        gateways = self._first_gateways
+        return GatewayTransport(
+            [
+                (gateways[station], transport)
+                for station, transport in transports.items()
+                if station in gateways
+            ]
+        )
+
+    def _own_gateway(self, kind: str, shared: SharedSocket) -> GatewayTransport:
         """Return the way in to the gateway that has a port number to itself."""
         (owner,) = shared.owners
         spec = next(each for each in self._handover.stations if each.name == owner.station)
@@ -155,14 +165,14 @@ class _Sockets:
             for port in spec.ports
             if InterfaceUri.parse(port.interface).host == shared.address
         )
-        return GatewayDoor([(self._gateways[owner], f"{kind}:{at}")])
+        return GatewayTransport([(self._gateways[owner], f"{kind}:{at}")])
 
     def _watch_gateway(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
         mailbox = MailboxIntake(
-            Entrance([]),
+            Demultiplexer([]),
             self._own_gateway("udp", shared),
-            ChannelCarrier(channel),
+            ChannelSender(channel),
             lambda data: False,
             is_aoe_here=False,
         )
@@ -172,38 +182,38 @@ class _Sockets:
         )
         watch_channel(channel)
 
-    def _gateway_door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
-        refuse = self._refuser(_stations_of(shared))
+    def _gateway_door(self, shared: SharedSocket, link: socket.socket) -> TcpTransport:
+        refuse = self._error_replier(_stations_of(shared))
         gateway = self._own_gateway("tcp", shared)
-        streams = MailboxStreams(Entrance([]), gateway, refuse, is_aoe_here=False)
-        return TcpDoor(self._socket(shared), (), link, refuse, streams, self._listeners)
+        streams = MailboxStreams(Demultiplexer([]), gateway, refuse, is_aoe_here=False)
+        return TcpTransport(self._socket(shared), (), link, refuse, streams, self._listeners)
 
     def _watch_unicast(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
-        carrier = ChannelCarrier(channel)
+        sender = ChannelSender(channel)
         for owner in shared.owners:
-            door = Door(f"udp:{owner.port}", MAX_UDP_FRAME - FRAME_OVERHEAD, is_hub=True)
-            self._routers[owner.station].add_door(door, carrier)
-            self._watch_link(shared.address, owner, door)
-        self._take_datagrams(shared.owners, channel, carrier, lambda data: False)
+            transport = Transport(f"udp:{owner.port}", MAX_UDP_FRAME - FRAME_OVERHEAD, is_hub=True)
+            self._routers[owner.station].add_transport(transport, sender)
+            self._watch_link(shared.address, owner, transport)
+        self._take_datagrams(shared.owners, channel, sender, lambda data: False)
         watch_channel(channel)
 
     def _watch_group(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
-        carrier = ChannelCarrier(channel)
+        sender = ChannelSender(channel)
         for owner in shared.owners:
-            self._take_datagrams([owner], channel, carrier, lambda data: True)
+            self._take_datagrams([owner], channel, sender, lambda data: True)
         watch_channel(channel)
 
     def _take_datagrams(
         self,
         owners: Sequence[PortName],
         channel: UdpChannel,
-        carrier: ChannelCarrier,
+        sender: ChannelSender,
         is_for_many: Callable[[memoryview], bool],
     ) -> None:
-        entrance, gateway = self._entrance("udp", owners), self._gateway("udp", owners)
-        mailbox = MailboxIntake(entrance, gateway, carrier, is_for_many)
+        demultiplexer, gateway = self._demultiplexer("udp", owners), self._gateway("udp", owners)
+        mailbox = MailboxIntake(demultiplexer, gateway, sender, is_for_many)
         stations = list(dict.fromkeys(owner.station for owner in owners))
         intake = FrameIntake(stations, self._counters, self._now_ns, mailbox.take)
         channel.takers.append(intake.take)
@@ -229,18 +239,18 @@ class _Sockets:
                 in_vlan[owner] = port
         for vlan_id, (first, *others) in intakes.items():
             there = [*ports[vlan_id]]
-            segment = Segment(self._entrance("ethernet", there), interface.address)
-            carrier = ChannelCarrier(ports[vlan_id][there[0]])
+            segment = Segment(self._demultiplexer("ethernet", there), interface.address)
+            sender = ChannelSender(ports[vlan_id][there[0]])
             gateway = self._gateway("ethernet", there)
-            mailbox = MailboxIntake(segment, gateway, carrier, interface.is_for_many)
+            mailbox = MailboxIntake(segment, gateway, sender, interface.is_for_many)
             first.mailbox = mailbox.take
             for each in others:
-                each.mailbox = mailbox.judge
+                each.mailbox = mailbox.admission
             for owner, port in ports[vlan_id].items():
                 router = self._routers[owner.station]
-                door = Door(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
-                router.add_door(door, SegmentCarrier(segment, port, router.net_id))
-                self._links.setdefault(shared.address, []).append((router, door.name))
+                transport = Transport(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
+                router.add_transport(transport, SegmentSender(segment, port, router.net_id))
+                self._links.setdefault(shared.address, []).append((router, transport.name))
         watch_channel(port)
 
     def _watch_discovery(self, shared: SharedSocket) -> None:
@@ -250,10 +260,10 @@ class _Sockets:
             for station in self._handover.stations
             if station.name in names
         ]
-        desk = RouteDesk([self._routes[name] for name in names])
+        desk = RouteAdmin([self._routes[name] for name in names])
         sock = self._socket(shared)
         questions = AmsQuestions(sock, [router.net_id for router in routers])
-        discovery = AmsDiscovery(sock, routers, desk, questions, self._refuser(names))
+        discovery = AmsDiscovery(sock, routers, desk, questions, self._error_replier(names))
         discovery.watch()
         for other in self._handover.sockets:
             is_for_it = other.kind is SocketKind.AMS_BROADCAST and other.address == shared.address
@@ -262,17 +272,21 @@ class _Sockets:
         for name in names:
             self._routes[name].scanners.append(questions)
 
-    def _ams_door(self, shared: SharedSocket) -> AmsDoor:
+    def _ams_door(self, shared: SharedSocket) -> AmsTransport:
         """Return the listener of an address; a station with several has one door for all."""
         stations = _stations_of(shared)
         for station in stations:
             if station not in self._ams_stations:
                 self._ams_stations.add(station)
-                door = Door(AMS_DOOR, is_stream=True, is_hub=True)
-                self._routers[station].add_door(door, self._ams_clients)
-        entrance = Entrance([(self._routers[station], AMS_DOOR) for station in stations])
-        refuse = self._refuser(stations)
-        return AmsDoor(self._socket(shared), entrance, self._ams_clients, refuse, self._listeners)
+                transport = Transport(AMS_TRANSPORT, is_stream=True, is_hub=True)
+                self._routers[station].add_transport(transport, self._ams_clients)
+        demultiplexer = Demultiplexer(
+            [(self._routers[station], AMS_TRANSPORT) for station in stations]
+        )
+        refuse = self._error_replier(stations)
+        return AmsTransport(
+            self._socket(shared), demultiplexer, self._ams_clients, refuse, self._listeners
+        )
 
     def _uplinks(self, station: StationSpec) -> AmsUplinks:
         sources = [
@@ -280,21 +294,21 @@ class _Sockets:
             for port in station.ports
             if (uri := InterfaceUri.parse(port.interface)).scheme in {"udp", "tcp"}
         ]
-        return AmsUplinks(self._routers[station.name], sources, self._refuser([station.name]))
+        return AmsUplinks(self._routers[station.name], sources, self._error_replier([station.name]))
 
-    def _door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
-        refuse = self._refuser(_stations_of(shared))
-        entrance, gateway = (
-            self._entrance("tcp", shared.owners),
+    def _transport(self, shared: SharedSocket, link: socket.socket) -> TcpTransport:
+        refuse = self._error_replier(_stations_of(shared))
+        demultiplexer, gateway = (
+            self._demultiplexer("tcp", shared.owners),
             self._gateway("tcp", shared.owners),
         )
-        streams = MailboxStreams(entrance, gateway, refuse, shared.address)
+        streams = MailboxStreams(demultiplexer, gateway, refuse, shared.address)
         for owner in shared.owners:
             room = LARGEST_FRAME - FRAME_OVERHEAD
-            door = Door(f"tcp:{owner.port}", room, is_stream=True, is_hub=True)
-            self._routers[owner.station].add_door(door, streams)
-            self._watch_link(shared.address, owner, door)
-        return TcpDoor(
+            transport = Transport(f"tcp:{owner.port}", room, is_stream=True, is_hub=True)
+            self._routers[owner.station].add_transport(transport, streams)
+            self._watch_link(shared.address, owner, transport)
+        return TcpTransport(
             self._socket(shared),
             tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
             link,
@@ -303,18 +317,18 @@ class _Sockets:
             self._listeners,
         )
 
-    def _watch_link(self, address: str, owner: PortName, door: Door) -> None:
+    def _watch_link(self, address: str, owner: PortName, transport: Transport) -> None:
         """Have an eye on the link of the interface with *address*, unless it is this host alone."""
         if IPv4Address(address).is_loopback or IPv4Address(address).is_unspecified:
             return
         with suppress(EnvironmentalError):  # the address has been taken from this machine
-            doors = self._links.setdefault(interface_of(address), [])
-            doors.append((self._routers[owner.station], door.name))
+            transports = self._links.setdefault(interface_of(address), [])
+            transports.append((self._routers[owner.station], transport.name))
 
     def _socket(self, shared: SharedSocket) -> socket.socket:
         return self._resources.enter_context(socket.socket(fileno=shared.services_fd))
 
-    def _refuser(self, stations: Sequence[str]) -> Callable[[Refusal], None]:
+    def _error_replier(self, stations: Sequence[str]) -> Callable[[Refusal], None]:
         def refuse(reason: Refusal) -> None:
             for station in stations:
                 self._counters.count(station, reason)
@@ -326,12 +340,12 @@ class _Sockets:
         return port.tcp or InterfaceUri.parse(port.interface).scheme == "tcp"
 
 
-def _doors(kind: str, owners: Sequence[PortName]) -> dict[str, str]:
+def _transports(kind: str, owners: Sequence[PortName]) -> dict[str, str]:
     """Return by what name each station of *owners* knows the door: that of its first port."""
-    doors: dict[str, str] = {}
+    transports: dict[str, str] = {}
     for owner in owners:
-        doors.setdefault(owner.station, f"{kind}:{owner.port}")
-    return doors
+        transports.setdefault(owner.station, f"{kind}:{owner.port}")
+    return transports
 
 
 def _stations_of(shared: SharedSocket) -> list[str]:

@@ -21,7 +21,6 @@ from msgspec.structs import replace
 from eap.ams.spec import RoutingSpec
 from eap.config.load import Plant
 from eap.errors import ConfigError, EnvironmentalError
-from eap.suggest import suggest
 from eap.net.descriptors import raise_descriptor_limit
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -30,6 +29,7 @@ from eap.runtime.handover import EngineOptions, Handover, SegmentHandover
 from eap.runtime.plantfile import load_plant, require_own_buses
 from eap.runtime.signals import catch_end_signals
 from eap.runtime.store import StationStore, effective, settle
+from eap.suggest import suggest
 from eap.supervisor.bus_sockets import segments
 from eap.supervisor.child import Child, describe_end
 from eap.supervisor.output import OutputHandler

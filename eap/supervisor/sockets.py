@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from eap.closeable import Closing
+from eap.closeable import Closeable
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
@@ -97,7 +97,7 @@ def _ams_address(port: PortSpec) -> str:
     return uri.host if port.ams and uri.scheme in {"udp", "tcp"} else ""
 
 
-class SharedSockets(Closing):
+class SharedSockets(Closeable):
     """All open descriptors of an appliance; whoever opened them closes them at its very end.
 
     Attributes:

@@ -8,10 +8,10 @@ from shutil import copy
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write
 from eap.ams.access import AccessList
 from eap.ams.directory import Directory
-from eap.ams.endpoint import Way
 from eap.codec.ads import IndexGroup
 from eap.ids import NetId
 from eap.runtime.plantfile import load_plant
@@ -20,14 +20,14 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "access.md").read_text()
 (PLANT,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 G = IndexGroup
-LAPTOP, SERVER = Way("ams-tcp", "10.0.7.20:1"), Way("ams-tcp", "10.0.0.5:1")
-NEIGHBOUR = Way("udp:eap0", "10.0.0.2:34980")
+LAPTOP, SERVER = Endpoint("ams-tcp", "10.0.7.20:1"), Endpoint("ams-tcp", "10.0.0.5:1")
+NEIGHBOUR = Endpoint("udp:eap0", "10.0.0.2:34980")
 READ, POSITION = Read(G.SDO, 0x1018_0001, 4), Write(G.SDO, 0x607A_0000, bytes(4))
 SAFETY, FILE = Write(G.SDO, 0x9C01_0001, b"x"), ReadWrite(G.FOE_OPEN_WRITE, 0, 4, b"x.bin")
 
 
 @pytest.mark.parametrize(
-    ("way", "operation", "target", "rule"),
+    ("endpoint", "operation", "target", "rule"),
     [
         (LAPTOP, POSITION, "press/bus0/1001", "engineers allows"),
         (LAPTOP, SAFETY, "press/bus0/1001", "safety refuses"),
@@ -37,13 +37,13 @@ SAFETY, FILE = Write(G.SDO, 0x9C01_0001, b"x"), ReadWrite(G.FOE_OPEN_WRITE, 0, 4
         (SERVER, Write(G.SDO, 0x6040_0000, b""), "press/bus0/1001", "no rule allows"),
         (NEIGHBOUR, FILE, "press/bus0/1001", "updates allows"),
         (NEIGHBOUR, POSITION, "press/bus0/1001", "no rule allows"),
-        (Way("mqtt:line", "9.9.9.9.1.1"), READ, "press/bus0/1001", "no-broker refuses"),
-        (Way("ams-tcp", "10.9.9.9:1"), READ, "press/eap0", "no rule refuses"),
-        (Way("ams-tcp", "127.0.0.1:1"), FILE, "press/eap0", "no rule refuses it to this host"),
+        (Endpoint("mqtt:line", "9.9.9.9.1.1"), READ, "press/bus0/1001", "no-broker refuses"),
+        (Endpoint("ams-tcp", "10.9.9.9:1"), READ, "press/eap0", "no rule refuses"),
+        (Endpoint("ams-tcp", "127.0.0.1:1"), FILE, "press/eap0", "no rule refuses it to this host"),
     ],
 )
 def test_rules_of_the_page(
-    tmp_path: Path, way: Way, operation: Operation, target: str, rule: str
+    tmp_path: Path, endpoint: Endpoint, operation: Operation, target: str, rule: str
 ) -> None:
     copy(ROOT / "config" / "buses" / "drive.yaml", tmp_path)
     (tmp_path / "cell.yaml").write_text(PLANT)
@@ -54,4 +54,4 @@ def test_rules_of_the_page(
     access = AccessList(plant.routing["press"].access)
     address = Directory(plant.directory).find(target)
     source = NetId.parse("10.0.7.20.1.1")
-    assert rule in access.grants(way, source, *address).judge(operation).why
+    assert rule in access.grants(endpoint, source, *address).admission(operation).why

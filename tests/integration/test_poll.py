@@ -169,13 +169,13 @@ def test_answers_come_back_on_the_connection_of_the_request(farm: Plants) -> Non
 @pytest.mark.parametrize("transport", ["ethernet", "udp"])
 def test_quality_is_the_captured_response_time(farm: Plants, transport: str) -> None:
     line = "ethernet://line0"
-    ways = {
+    endpoints = {
         "ethernet": over(desk=line, mill=line, lathe=line, to="multicast"),
         "udp": over(
             desk="udp://10.88.164.1", mill="udp://10.88.164.2", lathe="udp://10.88.164.3", to=GROUP
         ),
     }
-    plant = farm.write(ways[transport])
+    plant = farm.write(endpoints[transport])
     with cable(addresses=True) as (left, right):
         right.ip("addr", "add", "10.88.164.3/24", "dev", "line0")
         servers = farm.run(plant, "--station", "mill", "--station", "lathe", prefix=right.prefix)

@@ -129,9 +129,9 @@ def test_a_change_of_layouts_loses_nothing(heard, renewed, version):
     line = Line(old)
     line.run(20)
     for there, back in ((old, new), (new, old)):
-        way = steps(there, back)
-        assert len(way) >= len(renewed)
-        for step in way:
+        endpoint = steps(there, back)
+        assert len(endpoint) >= len(renewed)
+        for step in endpoint:
             line.configure(step.station, step.spec)
             line.run(7)
         assert {name: station.spec for name, station in line.stations.items()} == back

@@ -7,8 +7,8 @@ import struct
 import pytest
 
 from eap.ads.answer import response_to
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
-from eap.ams.endpoint import Way
 from eap.codec.ams import AmsCommand, decode_packet
 from eap.ids import NetId
 from tests.support.adsdevice import DictStore, Station, variable_device
@@ -18,7 +18,7 @@ from tests.support.vectors import load
 
 pytestmark = pytest.mark.tshark
 
-CLIENT = Client(Way("tcp", "1"), NetId.parse("127.0.0.1.1.1"), 30000)
+CLIENT = Client(Endpoint("tcp", "1"), NetId.parse("127.0.0.1.1.1"), 30000)
 
 
 def frame(packet: bytes) -> bytes:

@@ -67,7 +67,7 @@ stations:
 """
 
 
-class Way:
+class Endpoint:
     """One way for frames to go, and where to listen."""
 
     def __init__(self, source: str, sink: str, to: str, *, port: str = "", tcp: str = "") -> None:
@@ -79,13 +79,13 @@ class Way:
 
 ETHERNET, HERE, THERE = "ethernet://line0", "udp://127.9.8.1", "udp://127.9.8.2"
 WAYS = {
-    "ethernet": Way(ETHERNET, ETHERNET, "multicast"),
-    "ethernet-broadcast": Way(ETHERNET, ETHERNET, "broadcast"),
-    "vlan": Way(ETHERNET, ETHERNET, "multicast", port=", vlan: {id: 7, priority: 5}"),
-    "udp": Way(HERE, THERE, "127.9.8.2"),
-    "udp-multicast": Way(HERE, THERE, "239.9.8.1"),
-    "udp-broadcast": Way("udp://10.88.164.1", "udp://10.88.164.2", "broadcast"),
-    "tcp": Way(HERE, THERE, "tcp://127.9.8.2", tcp=", tcp: true"),
+    "ethernet": Endpoint(ETHERNET, ETHERNET, "multicast"),
+    "ethernet-broadcast": Endpoint(ETHERNET, ETHERNET, "broadcast"),
+    "vlan": Endpoint(ETHERNET, ETHERNET, "multicast", port=", vlan: {id: 7, priority: 5}"),
+    "udp": Endpoint(HERE, THERE, "127.9.8.2"),
+    "udp-multicast": Endpoint(HERE, THERE, "239.9.8.1"),
+    "udp-broadcast": Endpoint("udp://10.88.164.1", "udp://10.88.164.2", "broadcast"),
+    "tcp": Endpoint(HERE, THERE, "tcp://127.9.8.2", tcp=", tcp: true"),
 }
 
 
@@ -108,7 +108,7 @@ def capture(path: Path, interface: str, prefix: Sequence[str]) -> Iterator[None]
 
 
 def run_both(
-    farm: Plants, way: Way, path: Path, prefixes: Sequence[Sequence[str]]
+    farm: Plants, way: Endpoint, path: Path, prefixes: Sequence[Sequence[str]]
 ) -> tuple[list[dict[str, Any]], dict[str, Any], list[dict[str, Any]]]:
     """Run sink and source for some 100 cycles; return PDs sent, PDs received, what was watched."""
     plant = farm.write(way.plant)

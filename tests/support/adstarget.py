@@ -6,11 +6,11 @@ from contextlib import ExitStack
 from typing import Any
 
 from eap.ads.device import AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
 from eap.ads.objects import ObjectSpace
 from eap.ads.operation import WriteControl
 from eap.ads.state import al_state_for, states_of
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsDeviceInfo, AdsStates, device_name
 from eap.control.protocol import ErrorCode
 from eap.control.routes import TracedPath
@@ -21,7 +21,7 @@ from eap.od.model import OdState
 from tests.support.controlstub import ControlStub
 
 TARGET = "far/bus0/1001"
-NOBODY = Client(Way("local", "1"), NetId(bytes(6)), 1)
+NOBODY = Client(Endpoint("local", "1"), NetId(bytes(6)), 1)
 
 
 class AdsTarget:

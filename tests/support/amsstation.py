@@ -46,11 +46,13 @@ class EchoStation:
     def net_ids(self) -> set[NetId]:
         return self._devices
 
-    def is_waiting_for(self, header: AmsHeader, body: bytes, door: str) -> bool:
+    def is_waiting_for(self, header: AmsHeader, body: bytes, transport: str) -> bool:
         return False
 
-    def receive(self, data: bytes, door: str, connection: str, *, for_all: bool = False) -> None:
-        self.seen.append((data, door, connection))
+    def receive(
+        self, data: bytes, transport: str, connection: str, *, for_all: bool = False
+    ) -> None:
+        self.seen.append((data, transport, connection))
         header = AmsHeader.decode(data)
         error = AdsError.TARGET_MACHINE
         if header.target in self._devices | self._routes:
@@ -61,8 +63,8 @@ class EchoStation:
         if not self._is_slow:
             self.answer()
 
-    def connection_closed(self, door: str, connection: str) -> None:
-        self.closed.append((door, connection))
+    def connection_closed(self, transport: str, connection: str) -> None:
+        self.closed.append((transport, connection))
 
     def answer(self, number: int = 0) -> None:
         """Send the answer to the request with this number of those that wait."""

@@ -15,8 +15,8 @@ from collections.abc import Mapping
 from typing import Self
 
 from eap.ads.device import AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
-from eap.ams.endpoint import Way
 from eap.codec.adsnotification import to_filetime
 from eap.ids import NetId
 
@@ -99,7 +99,7 @@ class AmsTcpServer:
         del self._buffers[connection], self._numbers[number]
         with self.lock:
             for device in self._devices.values():
-                device.notifications.forget(Way("tcp", str(number)))
+                device.notifications.forget(Endpoint("tcp", str(number)))
 
     def _answer(self, connection: socket.socket, number: int, packet: bytes) -> None:
         target, port, source, source_port, command, flags, *_, invoke_id = _HEADER.unpack_from(
@@ -109,7 +109,7 @@ class AmsTcpServer:
         error, body = 7, b""
         if device is not None:
             with self.lock:
-                client = Client(Way("tcp", str(number)), NetId(source), source_port)
+                client = Client(Endpoint("tcp", str(number)), NetId(source), source_port)
                 answer = device.answer(command, packet[_HEADER.size :], client, time.monotonic_ns())
             error, body = answer.error_code, answer.data
         header = _HEADER.pack(
@@ -124,7 +124,7 @@ class AmsTcpServer:
                     time.monotonic_ns(), to_filetime(time.time_ns())
                 )
             for notice in notices:
-                if connection := self._numbers.get(int(notice.client.way.connection)):
+                if connection := self._numbers.get(int(notice.client.endpoint.connection)):
                     self._send(connection, notice.encode(NetId(target), port))
 
     def _send(self, connection: socket.socket, packet: bytes) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
 from eap.ams.action import Action, Deliver, Forward, Outcome, Reply
 from eap.ams.admission import Limits
-from eap.ams.endpoint import Door, Way
-from eap.ams.hop_prober import Prober
+from eap.ams.hop_prober import HopProber
 from eap.ams.router import AnswerNow, Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule
+from eap.ams.transport_table import Transport
 from eap.ids import NetId
 from tests.support.ams import Ams, parse
 
@@ -20,21 +21,21 @@ DEVICE = "5.1.1.1.2.1:65535"
 CLIENT = "192.168.0.9.1.1:30000"
 FAR = "6.1.1.1.1.1"
 FAR_DEVICE = f"{FAR}:851"
-LINK = Way("link", "10.0.0.6")
-SECOND_LINK = Way("link", "10.0.0.7")
+LINK = Endpoint("link", "10.0.0.6")
+SECOND_LINK = Endpoint("link", "10.0.0.7")
 DOORS = (
-    Door("tcp", is_stream=True, is_hub=True),
-    Door("local", is_stream=True, is_hub=True),
-    Door("link", is_hub=True, is_stream=True),
-    Door("segment"),
-    Door("broker", is_shared=True),
-    Door("narrow", room=60),
+    Transport("tcp", is_stream=True, is_hub=True),
+    Transport("local", is_stream=True, is_hub=True),
+    Transport("link", is_hub=True, is_stream=True),
+    Transport("segment"),
+    Transport("broker", is_shared=True),
+    Transport("narrow", room=60),
 )
 
 ANYTHING = AccessRule("anything")
 
 
-def route(net_id: str, hop: Way, name: str = "", **more: object) -> Route:
+def route(net_id: str, hop: Endpoint, name: str = "", **more: object) -> Route:
     return Route(NetId.parse(net_id), name or f"to {net_id}", hop, **more)
 
 
@@ -47,41 +48,42 @@ class Station:
                  answer_now: AnswerNow | None = None) -> None:  # fmt: skip
         self.table = RouteTable([*routes])
         net_id = NetId.parse(ROUTER)
-        prober = Prober(net_id, self.table) if is_probing else None
+        hop_prober = HopProber(net_id, self.table) if is_probing else None
         self.router = Router(
-            net_id, self.table, DOORS, first_invoke_id=first_id, limits=limits, prober=prober,
+            net_id, self.table, DOORS, first_invoke_id=first_id, limits=limits,
+            hop_prober=hop_prober,
             access=AccessList([*rules]), answer_now=answer_now,
         )  # fmt: skip
         self.router.add_device(NetId.parse(ROUTER), {10000})
         self.router.add_device(NetId.parse("5.1.1.1.2.1"), {65535})
         self.now_ns = 0
 
-    def give(self, packet: Ams, way: Way, **more: bool) -> list[Action]:
+    def give(self, packet: Ams, endpoint: Endpoint, **more: bool) -> list[Action]:
         return self.router.receive_packet(
-            packet.octets(), way.door, way.connection, self.now_ns, **more
+            packet.octets(), endpoint.transport, endpoint.connection, self.now_ns, **more
         )
 
-    def forwarded(self, packet: Ams, way: Way) -> Ams:
+    def forwarded(self, packet: Ams, endpoint: Endpoint) -> Ams:
         """Give a request that goes on; return what the hop gets."""
-        (action,) = self.give(packet, way)
+        (action,) = self.give(packet, endpoint)
         assert isinstance(action, Forward), action
         return parse(*action.packets)
 
-    def delivered(self, packet: Ams, way: Way) -> Deliver:
+    def delivered(self, packet: Ams, endpoint: Endpoint) -> Deliver:
         """Give a request for a service; return what that gets."""
-        (action,) = self.give(packet, way)
+        (action,) = self.give(packet, endpoint)
         assert isinstance(action, Deliver), action
         return action
 
-    def replied(self, packet: Ams, way: Way) -> tuple[Way, Ams]:
+    def replied(self, packet: Ams, endpoint: Endpoint) -> tuple[Endpoint, Ams]:
         """Give a packet that something goes back for; return where, and what."""
-        return only_reply(self.give(packet, way))
+        return only_reply(self.give(packet, endpoint))
 
     def events(self) -> list[tuple[Outcome, str]]:
         return [(each.outcome, each.text) for each in iter(self.router.next_event, None)]
 
 
-def only_reply(actions: list[Action]) -> tuple[Way, Ams]:
+def only_reply(actions: list[Action]) -> tuple[Endpoint, Ams]:
     (action,) = actions
     assert isinstance(action, Reply), action
-    return action.way, parse(*action.packets)
+    return action.endpoint, parse(*action.packets)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite, Write
 from eap.ads.query import decode_outcome, encode_query
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
@@ -42,12 +42,12 @@ class Client:
         self,
         service: BusService,
         bus: BusClient,
-        told: Sequence[tuple[Way, bytes]] = (),
+        told: Sequence[tuple[Endpoint, bytes]] = (),
         net_id: NetId = TOOL,
     ) -> None:
         self.service = service
         self.net_id = net_id
-        self.way = Way("ams-tcp", "1")
+        self.endpoint = Endpoint("ams-tcp", "1")
         self.why = ""
         self.bus = bus
         self.told = told
@@ -55,7 +55,7 @@ class Client:
     async def answer(self, port: int, command: int, body: bytes) -> AmsAnswer:
         """Return the answer as it is."""
         header = AmsHeader(BUS, port, self.net_id, 30000, command, length=len(body))
-        answer = await self.service.answer(LocalRequest(header, body, self.way))
+        answer = await self.service.answer(LocalRequest(header, body, self.endpoint))
         self.why = answer.why
         return answer
 
@@ -150,10 +150,10 @@ def play(
         engine = FakeEngine(FakeBus(_line(name)))
         link = EngineLink(engine.services, look_s=look_s)
         bus = BusClient(link, 0, PORT)
-        told: list[tuple[Way, bytes]] = []
+        told: list[tuple[Endpoint, bytes]] = []
         provider = MasterDictionaryProvider(bus, "1.2.3")
         service = BusService(
-            bus, BUS, "1.2.3", lambda way, packet: told.append((way, packet)), provider
+            bus, BUS, "1.2.3", lambda endpoint, packet: told.append((endpoint, packet)), provider
         )
         try:
             async with asyncio.timeout(20):

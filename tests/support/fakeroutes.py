@@ -104,12 +104,12 @@ class FakeRoutes:
 
     def _add(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, RoutesAddParameters)
-        door, _, address = wanted.via.partition(":")
+        transport, _, address = wanted.via.partition(":")
         if not address:
             reason = f"via {wanted.via!r} is no port of the plant"
             raise ControlError(reason, code=ErrorCode.VALUE)
         row = RouteRow(
-            name=wanted.name, net_id=wanted.net_id, octets=wanted.octets, transport=door,
+            name=wanted.name, net_id=wanted.net_id, octets=wanted.octets, transport=transport,
             address=address, origin="added", state="unknown", unidirectional=wanted.unidirectional,
             timeout_ms=wanted.timeout_ms, probed=wanted.probed, real=wanted.virtual,
         )  # fmt: skip

@@ -17,7 +17,7 @@ _SO_RCVBUFFORCE = 33
 
 
 @dataclass(frozen=True)
-class Passed:
+class LoopDetector:
     """One frame of process data, from its EtherCAT header on."""
 
     frame: bytes
@@ -40,9 +40,9 @@ class Listener:
         sock.setblocking(False)
         self._sock = sock
         self._skip = skip
-        self._seen: list[Passed] = []
+        self._seen: list[LoopDetector] = []
 
-    def seen(self) -> list[Passed]:
+    def seen(self) -> list[LoopDetector]:
         """Return all so far, oldest first."""
         while True:
             try:
@@ -50,7 +50,7 @@ class Listener:
             except BlockingIOError:
                 return self._seen
             seconds, rest = struct.unpack("@qq", ancillary[0][2])
-            self._seen.append(Passed(data[self._skip :], seconds * 1_000_000_000 + rest))
+            self._seen.append(LoopDetector(data[self._skip :], seconds * 1_000_000_000 + rest))
 
     def cycles(self) -> list[int]:
         """Return the cycle counters so far, without their wrapping."""

@@ -12,7 +12,7 @@ from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.match import answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
 from eap.runtime.bus_request import SlaveDescription
@@ -23,7 +23,7 @@ from eap.services.slaves.mailbox_queue import MailboxTurn
 from tests.support.mailbox import Line, open_line
 
 T = TypeVar("T")
-CLIENT = Way("udp:eap0", "127.0.0.1:1")
+CLIENT = Endpoint("udp:eap0", "127.0.0.1:1")
 
 
 class MemoryMailbox:

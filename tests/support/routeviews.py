@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.directory import Directory
-from eap.ams.endpoint import Door, Way
 from eap.ams.spec import (
     DirectoryPort,
     DirectoryStation,
-    DoorKind,
     HopSpec,
     RouteSpec,
     RoutingSpec,
+    TransportKind,
 )
+from eap.ams.transport_table import Transport
 from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
 from eap.runtime.store import StationStore
@@ -30,7 +31,7 @@ DIRECTORY = Directory([
     for number, name in ((1, "left"), (2, "right"), (3, "third"))
 ])  # fmt: skip
 RIGHT = RouteSpec(
-    name="right", net_id="127.0.9.2.1.1", hop=HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980"),
+    name="right", net_id="127.0.9.2.1.1", hop=HopSpec(TransportKind.UDP, "eap0", "127.0.9.2:34980"),
     router="127.0.9.2.1.1", is_derived=True,
 )  # fmt: skip
 
@@ -54,8 +55,8 @@ class Left:
         net_id = station.net_id
         self.router = StationRouter("left", net_id, net_ids)
         self.router.add_service(net_id, StubService(_run, SYSTEM_PORT))
-        self.carrier = KeepingCarrier()
-        self.router.add_door(Door("udp:eap0", is_hub=True), self.carrier)
+        self.sender = KeepingCarrier()
+        self.router.add_transport(Transport("udp:eap0", is_hub=True), self.sender)
         self.routes = StationRoutes(
             self.router, RoutingSpec(routes=(RIGHT,)), StationStore("hall", "left").routes,
             open_hop=self._open,
@@ -63,13 +64,13 @@ class Left:
         self.routes.start()
         self.view = RouterView(self.router, self.routes)
 
-    def _open(self, hop: HopSpec) -> Way:
+    def _open(self, hop: HopSpec) -> Endpoint:
         name = f"{hop.kind}:{hop.port or hop.address}"
-        if hop.kind is DoorKind.AMS_TCP and name not in self._doors():
-            self.router.add_door(Door(name, is_stream=True), self.carrier)
-        if name not in self._doors():
+        if hop.kind is TransportKind.AMS_TCP and name not in self._transports():
+            self.router.add_transport(Transport(name, is_stream=True), self.sender)
+        if name not in self._transports():
             raise ValueError(f"this station has no door {name}")
-        return Way(name, hop.address)
+        return Endpoint(name, hop.address)
 
-    def _doors(self) -> object:
-        return self.router._carriers
+    def _transports(self) -> object:
+        return self.router._senders

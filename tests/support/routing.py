@@ -7,11 +7,11 @@ from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ids import NetId
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
-from eap.services.transports.demultiplexer import Entrance
+from eap.services.transports.demultiplexer import Demultiplexer
 from tests.support import aoe
 from tests.support.ams import Ams, parse
 
@@ -28,14 +28,14 @@ class StubService:
 
     def __init__(self, reply: Reply = echo, *ports: int) -> None:
         self.ports = set(ports or (aoe.DEVICE,))
-        self.gone: list[Way] = []
+        self.gone: list[Endpoint] = []
         self._reply = reply
 
     def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
         return self._reply(request)
 
-    def client_gone(self, way: Way) -> None:
-        self.gone.append(way)
+    def client_gone(self, endpoint: Endpoint) -> None:
+        self.gone.append(endpoint)
 
 
 class KeepingCarrier:
@@ -61,8 +61,8 @@ def station(
     return router
 
 
-def entrance(*stations: StationRouter, door: str = "door") -> Entrance:
-    return Entrance([(each, door) for each in stations])
+def demultiplexer(*stations: StationRouter, transport: str = "door") -> Demultiplexer:
+    return Demultiplexer([(each, transport) for each in stations])
 
 
 async def while_serving(script: Coroutine[Any, Any, Any], *stations: StationRouter) -> Any:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import ReadWrite
 from eap.ads.request import parse_request
 from eap.ams.access import AccessList
-from eap.ams.endpoint import Door, Way
 from eap.ams.hop_report import HopQuestion, encode_report
 from eap.ams.report import Location
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule
+from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError, IndexGroup, encode_result
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId
@@ -49,21 +50,23 @@ class Station:
         self.router = Router(
             self.net_id,
             RouteTable([*routes]),
-            [Door("local"), Door("link", is_hub=True)],
+            [Transport("local"), Transport("link", is_hub=True)],
             first_invoke_id=1,
             access=AccessList([*rules]),
         )
         self.router.add_device(self.net_id, {300, SYSTEM_PORT})
         self.router.add_device(NetId.parse(f"5.1.1.{number}.3.1"), {0xFFFF, 1001})
 
-    def locate(self, header: AmsHeader, way: Way) -> Location:
-        return self.router.locate(header, way)
+    def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
+        return self.router.locate(header, endpoint)
 
     async def ask(
         self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
     ) -> AmsAnswer:
         del timeout_s
-        return await self.line.carry(self, Way("local", "1"), target, target_port, command, body)
+        return await self.line.carry(
+            self, Endpoint("local", "1"), target, target_port, command, body
+        )
 
 
 class Line:
@@ -85,31 +88,37 @@ class Line:
         return station
 
     async def carry(
-        self, station: Station, way: Way, target: NetId, port: int, command: int, body: bytes
+        self,
+        station: Station,
+        endpoint: Endpoint,
+        target: NetId,
+        port: int,
+        command: int,
+        body: bytes,
     ) -> AmsAnswer:
         header = AmsHeader(target, port, station.net_id, 1, command)
-        location = station.locate(header, way)
+        location = station.locate(header, endpoint)
         if location.is_here:
-            return await self._serve(station, way, port, command, body)
+            return await self._serve(station, endpoint, port, command, body)
         if location.why or location.route is None:
             return AmsAnswer(error_code=AdsError.TARGET_MACHINE)
         hop = location.route.route.hop
         if hop.connection in self.dead:
             return AmsAnswer(error_code=AdsError.TIMEOUT)
         further = self.stations[hop.connection]
-        back = Way("link", station.name)
+        back = Endpoint("link", station.name)
         target = location.route.route.to_real(target)
         return await self.carry(further, back, target, port, command, body)
 
     async def _serve(
-        self, station: Station, way: Way, port: int, command: int, body: bytes
+        self, station: Station, endpoint: Endpoint, port: int, command: int, body: bytes
     ) -> AmsAnswer:
         if port == SYSTEM_PORT and command == AmsCommand.READ_WRITE and station.is_ours:
             (asked,) = parse_request(command, body).operations
             assert isinstance(asked, ReadWrite)
             assert asked.group == IndexGroup.WHEREABOUTS
             question = HopQuestion.decode(asked.data)
-            report = await answer_question(station, question, way, NetId.parse("9.9.9.9.1.1"))
+            report = await answer_question(station, question, endpoint, NetId.parse("9.9.9.9.1.1"))
             return AmsAnswer(encode_result(0, encode_report(report)))
         return station.serve(port, command, body)
 
@@ -120,7 +129,7 @@ def to(number: int, through: int | None = None, **more: object) -> Route:
     return Route(
         NetId.parse(f"5.1.1.{number}.1.1"),
         f"island-{number:02}",
-        Way("link", f"island-{next_one:02}"),
+        Endpoint("link", f"island-{next_one:02}"),
         router=NetId.parse(f"5.1.1.{next_one}.1.1"),
         **more,  # type: ignore[arg-type]
     )

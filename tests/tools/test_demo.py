@@ -8,7 +8,7 @@ from rich.console import Console
 
 from eap.config.load import load
 from eap.runtime.busfile import describe
-from tools.demo import PLANT, SHOWN, WAYS, Look, RateMeter, Way, as_line, as_screen
+from tools.demo import PLANT, SHOWN, WAYS, Endpoint, Look, RateMeter, as_line, as_screen
 
 
 def look(at_s: float, received: int, **row: Any) -> Look:
@@ -24,7 +24,7 @@ def look(at_s: float, received: int, **row: Any) -> Look:
     return Look(at_s, values, {way.key: counters | row for way in WAYS})
 
 
-def lines(at: Look, rates: dict[Way, float], width: int = 80) -> list[str]:
+def lines(at: Look, rates: dict[Endpoint, float], width: int = 80) -> list[str]:
     console = Console(file=io.StringIO(), width=width, highlight=False)
     console.print(as_screen(at, rates))
     return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
@@ -67,7 +67,7 @@ def test_demo_screen_of_a_narrow_terminal_leaves_out_stations() -> None:
 
 
 @pytest.mark.parametrize("rates", [{}, dict.fromkeys(WAYS, 5000.0)])
-def test_demo_line_is_short(rates: dict[Way, float]) -> None:
+def test_demo_line_is_short(rates: dict[Endpoint, float]) -> None:
     assert len(as_line(look(100_000, 10**9), rates)) <= 110
     assert len(as_line(look(100, 1, late=0, lost=0), rates)) <= 100
 

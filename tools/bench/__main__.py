@@ -17,9 +17,9 @@ import msgspec
 
 from tools.bench import machine
 from tools.bench.figures import (
+    Decision,
     Figure,
     SkippedError,
-    Verdict,
     markdown_table,
     replace_between,
     skipped,
@@ -61,7 +61,7 @@ def main(arguments: list[str]) -> int:
         Path(options.json).write_bytes(msgspec.json.format(msgspec.json.encode(data)) + b"\n")
     if options.markdown:
         _write_page(about, sections)
-    missed = [f.name for s in sections for f in s.figures if f.verdict is Verdict.MISSED]
+    missed = [f.name for s in sections for f in s.figures if f.verdict is Decision.MISSED]
     print(f"\n{len(missed)} targets missed" + "".join(f"\n  {name}" for name in missed))
     return 0
 
@@ -88,7 +88,7 @@ def _run(name: str, settings: Settings) -> Section:
     except SkippedError as reason:
         figures = [skipped(name, reason)]
     except (RuntimeError, subprocess.SubprocessError) as error:
-        figures = [Figure(name, f"failed: {error}", verdict=Verdict.MISSED)]
+        figures = [Figure(name, f"failed: {error}", verdict=Decision.MISSED)]
     return Section(name, module.TITLE, figures)
 
 

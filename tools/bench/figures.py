@@ -10,7 +10,7 @@ from statistics import median
 import msgspec
 
 
-class Verdict(StrEnum):
+class Decision(StrEnum):
     """What became of a target."""
 
     OK = "ok"
@@ -26,7 +26,7 @@ class Figure(msgspec.Struct, frozen=True):
     name: str
     measured: str
     target: str = ""
-    verdict: Verdict = Verdict.REPORTED
+    verdict: Decision = Decision.REPORTED
     value: float | None = None
 
 
@@ -36,13 +36,13 @@ class SkippedError(Exception):
 
 def at_least(name: str, value: float, target: float, detail: str = "") -> Figure:
     """Return a ratio that should not be smaller than *target*."""
-    verdict = Verdict.OK if value >= target else Verdict.MISSED
+    verdict = Decision.OK if value >= target else Decision.MISSED
     return Figure(name, _with(f"{value:.2f}", detail), f"≥ {target:g}", verdict, value)
 
 
 def at_most(name: str, value: float, target: float, unit: str = "", detail: str = "") -> Figure:
     """Return a figure that should not be larger than *target*."""
-    verdict = Verdict.OK if value <= target else Verdict.MISSED
+    verdict = Decision.OK if value <= target else Decision.MISSED
     shown = f"{value:.2f}" if not unit else f"{value:.3g}{unit}"
     return Figure(name, _with(shown, detail), f"≤ {target:g}{unit}", verdict, value)
 
@@ -54,7 +54,7 @@ def report(name: str, measured: str, value: float | None = None) -> Figure:
 
 def skipped(name: str, reason: object) -> Figure:
     """Return what stands in the table for a benchmark that could not run."""
-    return Figure(name, str(reason), verdict=Verdict.SKIPPED)
+    return Figure(name, str(reason), verdict=Decision.SKIPPED)
 
 
 def percentile(values: Sequence[int], share: float) -> int:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from time import perf_counter_ns
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Forward
-from eap.ams.endpoint import Door, Way
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
+from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet, encode_packet
 from eap.ids import NetId
 from tools.bench.figures import Figure, at_most, report
@@ -18,7 +19,7 @@ TITLE = "AoE routing: look-up among 10 and 10,000 routes, a request and its answ
 _CALLS = 5000
 _FEW, _MANY = 10, 10_000
 _FLAT = 1.5
-_CLIENT, _HOP = Way("tcp", "client"), Way("link", "hop")
+_CLIENT, _HOP = Endpoint("tcp", "client"), Endpoint("link", "hop")
 _TARGETS = 64
 """NetIDs looked up in turn."""
 
@@ -86,8 +87,11 @@ def _passages(repeats: int) -> list[Figure]:
 
 
 def _exchange(table: RouteTable, request: bytes) -> Callable[[], object]:
-    doors = [Door("tcp", is_stream=True, is_hub=True), Door("link", is_stream=True, is_hub=True)]
-    router = Router(NetId.parse("9.1.1.1.1.1"), table, doors, first_invoke_id=1)
+    transports = [
+        Transport("tcp", is_stream=True, is_hub=True),
+        Transport("link", is_stream=True, is_hub=True),
+    ]
+    router = Router(NetId.parse("9.1.1.1.1.1"), table, transports, first_invoke_id=1)
 
     def exchange() -> None:
         (forward,) = router.receive_packet(request, *_CLIENT, 0)

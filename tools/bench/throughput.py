@@ -40,7 +40,7 @@ CASES = (
 )
 
 
-class Way(NamedTuple):
+class Endpoint(NamedTuple):
     """A pair of roles that carries frames from one end to the other.
 
     *spin* keeps a raw receiver from sleeping; *window* is False for a sender that never waits for
@@ -53,11 +53,11 @@ class Way(NamedTuple):
     window: bool = True
 
 
-OURS = Way("product_roles.publish", "product_roles.subscribe")
-RAW = Way("raw_roles.send", "raw_roles.receive")
-SPINNING = Way("raw_roles.send", "raw_roles.receive", spin=True)
-ZMQ = Way("zmq_roles.publish", "zmq_roles.subscribe", window=False)
-ZMQ_WINDOW = Way("zmq_roles.publish", "zmq_roles.subscribe")
+OURS = Endpoint("product_roles.publish", "product_roles.subscribe")
+RAW = Endpoint("raw_roles.send", "raw_roles.receive")
+SPINNING = Endpoint("raw_roles.send", "raw_roles.receive", spin=True)
+ZMQ = Endpoint("zmq_roles.publish", "zmq_roles.subscribe", window=False)
+ZMQ_WINDOW = Endpoint("zmq_roles.publish", "zmq_roles.subscribe")
 
 
 def run(settings: Settings) -> list[Figure]:
@@ -70,7 +70,7 @@ def run(settings: Settings) -> list[Figure]:
     with cable() as link:
         for case in CASES:
             settings.tell(f"throughput: {case.name}")
-            rates: dict[Way, list[float]] = {way: [] for way in ways}
+            rates: dict[Endpoint, list[float]] = {way: [] for way in ways}
             for number in range(settings.rounds):
                 for way in ways:
                     swap = bool(number % 2)
@@ -79,8 +79,8 @@ def run(settings: Settings) -> list[Figure]:
     return figures
 
 
-def _figures(case: Case, rates: dict[Way, list[float]]) -> list[Figure]:
-    def compared(way: Way, what: str, target: float | None = None) -> Figure:
+def _figures(case: Case, rates: dict[Endpoint, list[float]]) -> list[Figure]:
+    def compared(way: Endpoint, what: str, target: float | None = None) -> Figure:
         name = f"{case.name}: of {what}"
         if way not in rates:
             return skipped(name, "needs pyzmq")
@@ -99,7 +99,7 @@ def _figures(case: Case, rates: dict[Way, list[float]]) -> list[Figure]:
     ]
 
 
-def _rate(link: Cable, way: Way, shape: Shape, settings: Settings, *, swap: bool) -> float:
+def _rate(link: Cable, way: Endpoint, shape: Shape, settings: Settings, *, swap: bool) -> float:
     """Return the frames received per second of one run.
 
     Raises:

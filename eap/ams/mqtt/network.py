@@ -122,20 +122,20 @@ class MqttNetwork:
         spec: The network and the broker.
         net_id: Of this station's router.
         name: Of the station.
-        door: Name of the door by which the network is reached.
+        transport: Name of the door by which the network is reached.
         table: Routes of the station.
         learns: Whether routes are added to them.
     """
 
     def __init__(
         self, spec: MqttSpec, net_id: NetId, name: str, *,
-        door: str, table: RouteTable, learns: bool = True,
+        transport: str, table: RouteTable, learns: bool = True,
     ) -> None:  # fmt: skip
         self._spec = spec
         self._net_id = net_id
         self._info = Info(name, is_online=True, is_unidirectional=spec.is_unidirectional)
         self._topics = Topics(spec.network, net_id)
-        self._peers = Peers(net_id, door, table, learns=learns)
+        self._peers = Peers(net_id, transport, table, learns=learns)
         self._ports = ClientPorts(net_id)
         self._senders: OrderedDict[str, _Sender] = OrderedDict()
         self._connected_at_ns: int | None = None

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.mqtt.info import Info
 from eap.ams.routes import Origin, Route, RouteTable
 from eap.ids import STATION_OCTETS, NetId
@@ -45,14 +45,16 @@ class Peers:
 
     Args:
         net_id: Of this station's router.
-        door: By which they are reached.
+        transport: By which they are reached.
         table: Routes of this station.
         learns: Whether routes are added to them.
     """
 
-    def __init__(self, net_id: NetId, door: str, table: RouteTable, *, learns: bool = True) -> None:
+    def __init__(
+        self, net_id: NetId, transport: str, table: RouteTable, *, learns: bool = True
+    ) -> None:
         self._net_id = net_id
-        self._door = door
+        self._transport = transport
         self._table = table
         self._learns = learns
         self._peers: dict[NetId, _Peer] = {}
@@ -83,7 +85,7 @@ class Peers:
         needed = {
             each.hop.connection
             for each in self._table
-            if each.hop.door == self._door and not each.is_probed
+            if each.hop.transport == self._transport and not each.is_probed
             if each.origin is not Origin.LEARNED
         }
         return sorted(needed - there)
@@ -124,7 +126,7 @@ class Peers:
         route = Route(
             net_id,
             name,
-            Way(self._door, str(net_id)),
+            Endpoint(self._transport, str(net_id)),
             Origin.LEARNED,
             # Another router on this computer; this station's own NetIDs stay its own.
             octets=6 if net_id.station == self._net_id.station else STATION_OCTETS,

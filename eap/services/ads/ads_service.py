@@ -9,11 +9,11 @@ from time import monotonic_ns
 
 from eap.ads.answer import AmsAnswer
 from eap.ads.device import AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client, NotificationTable
 from eap.ads.operation import Operation, OperationOutcome, WriteControl
 from eap.ads.space import AdsSpace
 from eap.ads.state import states_of
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsDeviceInfo, AdsStates
 from eap.services.ads.ads_requests import begin_answer
 from eap.services.ads.state_control import control_state
@@ -62,10 +62,10 @@ class AdsService:
         perform = partial(self.perform, header.target_port, client)
         return begin_answer(header.command, request.body, perform)
 
-    def client_gone(self, way: Way) -> None:
+    def client_gone(self, endpoint: Endpoint) -> None:
         """End the notifications of a connection."""
         for device in self.devices.values():
-            device.notifications.forget(way)
+            device.notifications.forget(endpoint)
 
     def perform(
         self, port: int, client: Client, operation: Operation

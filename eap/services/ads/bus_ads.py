@@ -14,6 +14,7 @@ from itertools import islice
 from typing import TypeAlias
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
 from eap.ads.operation import (
     AdsRefusedError,
@@ -22,7 +23,6 @@ from eap.ads.operation import (
     ReadDeviceInfo,
     ReadState,
 )
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import DEVICE_PORT
 from eap.errors import EapError
@@ -90,9 +90,9 @@ class BusService:
         result = int.from_bytes(answer.data[:_RESULT_SIZE], "little")
         return AmsAnswer(error_code=result, why=answer.why) if result in _IN_HEADER else answer
 
-    def client_gone(self, way: Way) -> None:
+    def client_gone(self, endpoint: Endpoint) -> None:
         """Forget what belongs to a connection that is closed; files stay open for another one."""
-        self._master.client_gone(way)
+        self._master.client_gone(endpoint)
 
     async def _performer(self, ams_port: int, client: Client) -> Perform:
         """Return the function that does operations for a port; raise AdsRefusedError for no port.

@@ -17,6 +17,7 @@ from devicebus.master.access import DatagramReply, DatagramRequest, brd
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command, DatagramHeader, WorkingCounter
 from eap.ads.device import AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.master import MasterSpace, SlaveState
 from eap.ads.notifications import Client, NotificationTable
 from eap.ads.objects import ObjectSpace
@@ -29,7 +30,6 @@ from eap.ads.operation import (
 )
 from eap.ads.state import INIT, al_state_for, states_of
 from eap.ams.access import place_of
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, to_filetime
 from eap.codec.ams import DEVICE_PORT
@@ -55,7 +55,7 @@ _COUNTING = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.BRD))
 
 Look: TypeAlias = Callable[[], Awaitable[None]]
 """Brings what notifications show up to date; raises EapError."""
-Send: TypeAlias = Callable[[Way, bytes], object]
+Send: TypeAlias = Callable[[Endpoint, bytes], object]
 """Sends a packet to a client, and does not wait for that."""
 
 logger = logging.getLogger(__name__)
@@ -192,9 +192,9 @@ class MasterAds:
             self._watched.add(offset >> 16)
         return outcome
 
-    def client_gone(self, way: Way) -> None:
+    def client_gone(self, endpoint: Endpoint) -> None:
         """End the notifications of a connection that is closed."""
-        self._device.notifications.forget(way)
+        self._device.notifications.forget(endpoint)
 
     async def _send_commands(self, operation: ReadWrite) -> bytes:
         commands = RawCommands(operation.data)
@@ -249,7 +249,7 @@ class NotificationSender:
                 logger.debug("notifications of %s wait: %s", self._net_id, exc)
                 continue
             for notice in self._table.handle_cycle(monotonic_ns(), to_filetime(time_ns())):
-                self._send(notice.client.way, notice.encode(self._net_id, self._port))
+                self._send(notice.client.endpoint, notice.encode(self._net_id, self._port))
 
 
 class RawCommands:

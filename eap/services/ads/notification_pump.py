@@ -15,16 +15,16 @@ from collections.abc import Callable
 from time import monotonic_ns, time_ns
 from typing import NamedTuple, TypeAlias
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import NotificationTable
 from eap.ads.operation import AdsRefusedError
-from eap.ams.endpoint import Way
 from eap.codec.adsnotification import to_filetime
 from eap.ids import NetId
 from eap.pd.samples import ImageSamples
 from eap.pd.words import StationWord
 from eap.services.ads.image_variables import StationSymbols
 
-Send: TypeAlias = Callable[[Way, bytes], object]
+Send: TypeAlias = Callable[[Endpoint, bytes], object]
 """Sends a packet to a client, and does not wait for that."""
 
 _LOOK_NS = 200_000_000
@@ -137,7 +137,7 @@ class NotificationPump:
             if due_ns is not None and due_ns <= at_ns:
                 looked_at += len(table)
                 for notice in table.handle_cycle(at_ns, time):
-                    self._send(notice.client.way, notice.encode(net_id, port))
+                    self._send(notice.client.endpoint, notice.encode(net_id, port))
         return looked_at
 
     def _due_ns(self) -> int | None:

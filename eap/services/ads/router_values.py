@@ -130,7 +130,7 @@ _OF_ROUTE: dict[RouterLive, Callable[[Route], Any]] = {
     RouterLive.ROUTE_NET_ID: lambda route: route.net_id,
     RouterLive.ROUTE_OCTETS: lambda route: route.octets,
     RouterLive.ROUTE_NAME: lambda route: route.name,
-    RouterLive.ROUTE_DOOR: lambda route: route.hop.door,
+    RouterLive.ROUTE_TRANSPORT: lambda route: route.hop.transport,
     RouterLive.ROUTE_ADDRESS: lambda route: route.hop.connection,
     RouterLive.ROUTE_ORIGIN: lambda route: int(route.origin),
 }

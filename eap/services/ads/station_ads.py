@@ -15,7 +15,7 @@ from eap.services.ads.router_ads import RouterAds
 from eap.services.ads.router_values import LiveRouter
 from eap.services.ads.system_ads import SystemAds
 from eap.services.device.station_device import StationDevice
-from eap.services.routing.route_query import Whereabouts
+from eap.services.routing.route_query import RouteQuery
 from eap.services.routing.station_router import StationRouter
 
 
@@ -52,7 +52,7 @@ class StationAds:
         router.add_service(router.net_id, own)
         self._drive(own, router.net_id)
         system = SystemAds(device, info)
-        router.add_service(router.net_id, Whereabouts(router, system))
+        router.add_service(router.net_id, RouteQuery(router, system))
         self._drive(system, router.net_id)
         net_ids = {port.name: NetId.parse(port.net_id) for port in station.ports}
         for port in device.dictionaries:

@@ -121,7 +121,7 @@ class Audit:
 
     def begin(self, station: str, entry: AuditEntry) -> str:
         """Write down what a station is going to change; return why that cannot be done."""
-        client = station, entry.way.door, host_of(entry.way)
+        client = station, entry.endpoint.transport, host_of(entry.endpoint)
         if not all(self._take(client) for _ in entry.operations):
             return TOO_MANY
         head = self._head(station, entry)
@@ -150,11 +150,11 @@ class Audit:
 
     def write(self, station: str, entry: AuditEntry) -> None:
         """Write down what a station did, or refused."""
-        client = station, entry.way.door, host_of(entry.way)
+        client = station, entry.endpoint.transport, host_of(entry.endpoint)
         head = self._head(station, entry)
         lines = []
         for each in entry.operations:
-            has_begun = self.is_required and each.verdict.is_allowed
+            has_begun = self.is_required and each.decision.is_allowed
             if has_begun or self._take(client):
                 lines.append(head | _words(each))
             else:
@@ -186,21 +186,29 @@ class Audit:
         """Write how many lines were left out, for each client that had some."""
         skipped, self._skipped = self._skipped, {}
         lines = [
-            {"time": self._time(), "station": station, "door": door, "from": who, "skipped": count}
-            for (station, door, who), count in skipped.items()
+            {
+                "time": self._time(),
+                "station": station,
+                "door": transport,
+                "from": who,
+                "skipped": count,
+            }
+            for (station, transport, who), count in skipped.items()
         ]
         if lines:
             self._append(lines)
 
     def _take(self, client: _Client) -> bool:
         """Take one line for a client; return whether its rate and that of its door allow it."""
-        station, door, who = client
+        station, transport, who = client
         now = self._clock()
-        limiter = self._limiters.get((station, door))
+        limiter = self._limiters.get((station, transport))
         if limiter is None:
             # Each command is a process of its own, and a new client of the control socket.
-            rates = _CONTROL_RATES if door == CONTROL else _RATES
-            limiter = self._limiters[station, door] = SourceRateLimiter(rates, _MAX_CLIENTS, now)
+            rates = _CONTROL_RATES if transport == CONTROL else _RATES
+            limiter = self._limiters[station, transport] = SourceRateLimiter(
+                rates, _MAX_CLIENTS, now
+            )
         return limiter.take(who, now)
 
     def _skip(self, client: _Client) -> None:
@@ -214,8 +222,8 @@ class Audit:
         return {
             "time": self._time(),
             "station": station,
-            "door": entry.way.door,
-            "from": entry.way.connection,
+            "door": entry.endpoint.transport,
+            "from": entry.endpoint.connection,
             "source": f"{header.source}:{header.source_port}",
             "target": f"{header.target}:{header.target_port}",
             "name": self._directory.name_of(header.target, header.target_port),
@@ -277,17 +285,17 @@ def _text_of(time_s: float) -> str:
 
 
 def _begins(each: AuditedOperation) -> dict[str, Any]:
-    verdict = each.verdict
-    said = {"service": verdict.service, "allowed": True, "why": verdict.why, "begins": True}
+    decision = each.decision
+    said = {"service": decision.service, "allowed": True, "why": decision.why, "begins": True}
     return dict(operation_words(each.operation)) | said
 
 
 def _words(each: AuditedOperation) -> dict[str, Any]:
-    verdict, result = each.verdict, each.result
+    decision, result = each.decision, each.result
     return dict(operation_words(each.operation)) | {
-        "service": verdict.service,
-        "allowed": verdict.is_allowed,
-        "why": verdict.why,
+        "service": decision.service,
+        "allowed": decision.is_allowed,
+        "why": decision.why,
         "result": result,
         "error": "" if not result else AdsError.words_of(result),
     }

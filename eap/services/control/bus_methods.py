@@ -17,13 +17,13 @@ from eap.codec.mailbox import MailboxType
 from eap.control import bus as words
 from eap.control.protocol import ErrorCode, of_station
 from eap.errors import ControlError, EapError
-from eap.suggest import suggest
 from eap.pd.spec import PortKind, StationSpec
 from eap.runtime.bus_request import BusReport
 from eap.runtime.handover import PortName
 from eap.services.slaves.bus_client import BusClient
 from eap.services.slaves.mailbox_queue import MailboxTurn
 from eap.services.slaves.segment_link import SegmentLink
+from eap.suggest import suggest
 
 
 class Buses:

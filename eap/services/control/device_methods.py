@@ -13,11 +13,11 @@ from eap.control.protocol import ErrorCode, of_station
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.router_dictionary import RouterDictionary
 from eap.errors import ControlError
-from eap.suggest import suggest
 from eap.od.model import Access, OdObject
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.router9000 import ROUTER
 from eap.services.device.station_device import StationDevice
+from eap.suggest import suggest
 
 RowT = TypeVar("RowT")
 

@@ -11,8 +11,8 @@ from eap.control import gateway as words
 from eap.control.gateway import GatewayParameters, GatewayRow
 from eap.control.protocol import ErrorCode
 from eap.errors import ControlError
-from eap.suggest import suggest
 from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.suggest import suggest
 
 if TYPE_CHECKING:
     from eap.services.gateway.gateway import MailboxGateway
@@ -117,19 +117,19 @@ def gateway_row(owner: PortName, gateway: MailboxGateway, served: list[str]) -> 
         ),
         clients=[
             words.GatewayClientRow(
-                transport=way.door,
-                address=way.connection,
+                transport=endpoint.transport,
+                address=endpoint.connection,
                 requests=counts.requests,
                 repeated=counts.repeated,
                 errors=counts.errors,
-                waiting=gateway.tracker.waiting(way),
+                waiting=gateway.tracker.waiting(endpoint),
                 transfers=[
                     words.TransferRow(key.address, key.kind.name)
                     for key in transfers
-                    if key.way == way
+                    if key.endpoint == endpoint
                 ],
             )
-            for way, counts in gateway.tracker.table().items()
+            for endpoint, counts in gateway.tracker.table().items()
         ],
         slaves=msgspec.convert(gateway.statistics.report(), list[words.MailboxFigures]),
     )

@@ -9,7 +9,7 @@ from time import monotonic_ns
 from typing import Any
 
 from eap.ams.directory import Directory
-from eap.ams.spec import DoorKind, RouteSpec
+from eap.ams.spec import RouteSpec, TransportKind
 from eap.ams.via import parse_via
 from eap.codec import staticroutes
 from eap.codec.ads import AdsError
@@ -19,7 +19,6 @@ from eap.control import routes as words
 from eap.control.protocol import ErrorCode, of_station, unless_unavailable
 from eap.errors import ControlError
 from eap.ids import NetId
-from eap.suggest import suggest
 from eap.services.routing.neighbours import (
     Found,
     Introduction,
@@ -28,6 +27,7 @@ from eap.services.routing.neighbours import (
 )
 from eap.services.routing.route_probe import find_target, probe_target
 from eap.services.routing.route_rows import RouterView, route_row
+from eap.suggest import suggest
 
 _ANY = NetId(bytes(6))
 """Stands in a default route."""
@@ -74,7 +74,9 @@ class RouteMethods:
     async def _remove(self, wanted: words.RoutesRemoveParameters) -> words.RouteAnswer:
         routes = self._view(wanted.station).routes
         with unless_unavailable():
-            spec = await routes.remove(wanted.route, door=wanted.transport, address=wanted.address)
+            spec = await routes.remove(
+                wanted.route, transport=wanted.transport, address=wanted.address
+            )
         return words.RouteAnswer(route=_removed(spec))
 
     async def _test(self, wanted: words.RoutesTestParameters) -> words.TestResult:
@@ -128,7 +130,7 @@ class RouteMethods:
         routes, left_out = [], []
         for route in view.router.table:
             is_plain = route.octets and route.real is None
-            if is_plain and route.hop.kind == DoorKind.AMS_TCP:
+            if is_plain and route.hop.kind == TransportKind.AMS_TCP:
                 address = route.hop.connection.removesuffix(_USUAL_PORT)
                 routes.append(StaticRoute(route.name, str(route.net_id), address))
             else:
@@ -140,7 +142,7 @@ class RouteMethods:
     async def _import_one(
         self, view: RouterView, route: StaticRoute, *, dry_run: bool
     ) -> words.ImportRow:
-        via, reason = f"{DoorKind.AMS_TCP}:{route.address}", ""
+        via, reason = f"{TransportKind.AMS_TCP}:{route.address}", ""
         wanted = words.RoutesAddParameters(
             station=view.router.name, name=route.name, net_id=route.net_id, via=via
         )

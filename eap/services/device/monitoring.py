@@ -79,9 +79,9 @@ class _Row:
 class SubscriberWatch:
     """Monitors the subscribers of all frames of the *images*, by station, that say so."""
 
-    def __init__(self, images: Mapping[str, ImageHolder], ways: Ways) -> None:
+    def __init__(self, images: Mapping[str, ImageHolder], endpoints: Ways) -> None:
         self._holders = images
-        self._ways = ways
+        self._endpoints = endpoints
         self._images: dict[str, Image] = {}
         self._rows: dict[str, _Row] = {}
         self._monitor = SubscriberMonitor(0)
@@ -90,7 +90,11 @@ class SubscriberWatch:
     async def run(self) -> None:
         """Go on until cancelled."""
         loop = asyncio.get_running_loop()
-        owners = {sock.fileno(): way for way in self._ways.udp.values() for sock in way.sockets}
+        owners = {
+            sock.fileno(): endpoint
+            for endpoint in self._endpoints.udp.values()
+            for sock in endpoint.sockets
+        }
         with select.epoll() as errors:
             for fd in owners:
                 # Errors alone, and each once: the frames that arrive there are for others.
@@ -158,54 +162,56 @@ class SubscriberWatch:
         self._asked = {}
         targets: dict[UdpWay, list[Destination]] = {}
         for row in self._rows.values():
-            if prober := self._prober(row):
-                key = prober, IPv4Address(row.place.monitor_ip)
+            if hop_prober := self._hop_prober(row):
+                key = hop_prober, IPv4Address(row.place.monitor_ip)
                 self._asked.setdefault(key, []).append(row.name)
-            way = self._ways.udp.get(row.port)
-            if way is not None and (target := _ip_of(row)) is not None:
-                targets.setdefault(way, []).append(target)
-        for way in set(self._ways.udp.values()):
-            way.watch(targets.get(way, ()))
-        for prober in set(self._ways.arp.values()):
+            endpoint = self._endpoints.udp.get(row.port)
+            if endpoint is not None and (target := _ip_of(row)) is not None:
+                targets.setdefault(endpoint, []).append(target)
+        for endpoint in set(self._endpoints.udp.values()):
+            endpoint.watch(targets.get(endpoint, ()))
+        for hop_prober in set(self._endpoints.arp.values()):
             try:
-                prober.watch(address for each, address in self._asked if each is prober)
+                hop_prober.watch(address for each, address in self._asked if each is hop_prober)
             except EnvironmentalError as exc:
                 logger.warning("%s", exc)
 
     def _hear(self, now_ns: int) -> None:
-        for prober in set(self._ways.arp.values()):
-            for heard in prober.drain():
-                for name in self._asked.get((prober, heard.address), ()):
+        for hop_prober in set(self._endpoints.arp.values()):
+            for heard in hop_prober.drain():
+                for name in self._asked.get((hop_prober, heard.address), ()):
                     if heard.is_claim:
                         self._monitor.receive_claim(name, heard.mac, now_ns)
                     else:
                         self._monitor.receive_reply(name, heard.mac, now_ns)
-        refused = {way: way.hear(now_ns) for way in set(self._ways.udp.values())}
+        refused = {
+            endpoint: endpoint.hear(now_ns) for endpoint in set(self._endpoints.udp.values())
+        }
         for row in self._rows_by_udp():
             target = _ip_of(row)
-            if target is not None and key_of(target) in refused[self._ways.udp[row.port]]:
+            if target is not None and key_of(target) in refused[self._endpoints.udp[row.port]]:
                 self._monitor.receive_evidence(row.name, Evidence.ABSENT, now_ns)
 
     def _rows_by_udp(self) -> Iterator[_Row]:
-        return (row for row in self._rows.values() if row.port in self._ways.udp)
+        return (row for row in self._rows.values() if row.port in self._endpoints.udp)
 
     def _ask(self, row: _Row) -> Evidence | None:
         """Ask for the subscriber of *row*; return what is known at once, None if it may answer."""
-        if prober := self._prober(row):
-            return None if prober.probe(IPv4Address(row.place.monitor_ip)) else Evidence.BLIND
-        target, way = _ip_of(row), self._ways.udp.get(row.port)
-        if target is None or way is None:
+        if hop_prober := self._hop_prober(row):
+            return None if hop_prober.probe(IPv4Address(row.place.monitor_ip)) else Evidence.BLIND
+        target, endpoint = _ip_of(row), self._endpoints.udp.get(row.port)
+        if target is None or endpoint is None:
             return Evidence.BLIND
-        return way.look(target, row.word(FrameWord.SENT_AT_NS))
+        return endpoint.look(target, row.word(FrameWord.SENT_AT_NS))
 
-    def _prober(self, row: _Row) -> ArpProber | None:
+    def _hop_prober(self, row: _Row) -> ArpProber | None:
         """Return who asks by ARP for the subscriber of *row*, None where that is no way."""
         destination = row.destination
         if destination is None or destination.kind is not DestinationKind.MAC:
             return None
         if destination.is_group or not row.place.monitor_ip:
             return None
-        return self._ways.arp.get(row.port)
+        return self._endpoints.arp.get(row.port)
 
     def _tell(self) -> None:
         while event := self._monitor.next_event():

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxType
 from eap.errors import CodecError, EapError, TruncatedError
@@ -215,7 +215,7 @@ def text_of(error: EapError) -> str:
 class SessionKey(NamedTuple):
     """The client of a session, its slave, and the protocol."""
 
-    way: Way
+    endpoint: Endpoint
     address: int
     """Station address, virtual address, or 0 for the master."""
     kind: MailboxType
@@ -269,9 +269,9 @@ class SessionTable(Generic[S]):
         if session is not None:
             session.close()
 
-    def close_of(self, way: Way) -> None:
+    def close_of(self, endpoint: Endpoint) -> None:
         """End the sessions of a client."""
-        for key in [key for key in self._open if key.way == way]:
+        for key in [key for key in self._open if key.endpoint == endpoint]:
             self.drop(key)
 
     def close(self) -> None:

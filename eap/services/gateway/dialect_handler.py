@@ -11,8 +11,8 @@ from collections.abc import Awaitable, Callable
 from typing import TypeAlias
 
 from devicebus.errors import FoeError, MailboxRefusedError, SoeError
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, ReadWrite
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxType
@@ -88,7 +88,7 @@ class DialectHandler:
         self,
         kind: MailboxType,
         body: bytes,
-        way: Way,
+        endpoint: Endpoint,
         target: RuleTarget,
         find: FindTarget,
     ) -> tuple[bytes, Cause | None]:
@@ -97,13 +97,13 @@ class DialectHandler:
         Args:
             kind: The protocol.
             body: Behind the mailbox header.
-            way: Connection, or address, of the client.
+            endpoint: Connection, or address, of the client.
             target: Its name in access rules.
             find: Returns the slave or the master.
         """
         try:
             task = decode(kind, body)
-            data = await self._perform_allowed(task, way, target, find)
+            data = await self._perform_allowed(task, endpoint, target, find)
             return encode_done(body, task, data), None
         except MalformedError as exc:
             error = DialectError(DialectFailure.COMMAND, str(exc))
@@ -113,21 +113,21 @@ class DialectHandler:
         return answer, error.cause
 
     async def _perform_allowed(
-        self, task: Task, way: Way, target: RuleTarget, find: FindTarget
+        self, task: Task, endpoint: Endpoint, target: RuleTarget, find: FindTarget
     ) -> bytes:
         operation = operation_of(task)
-        verdict = self._guard.judge(way, target, operation)
+        decision = self._guard.admission(endpoint, target, operation)
         result: int | None = AdsError.GENERAL
         try:
-            if not verdict.is_allowed:
-                raise _refusal(GatewayError(reason_of_refusal(verdict)))
+            if not decision.is_allowed:
+                raise _refusal(GatewayError(reason_of_refusal(decision)))
             subject = await find()
             if isinstance(subject, Cause):
                 raise _refusal(GatewayError(subject))
             data = await self._perform(task, subject)
             result = 0
         finally:
-            self._guard.tell(way, target, operation, verdict, result)
+            self._guard.tell(endpoint, target, operation, decision, result)
         return data
 
     async def _perform(self, task: Task, subject: DialectTarget) -> bytes:

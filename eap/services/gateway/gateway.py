@@ -20,10 +20,10 @@ from msgspec.structs import replace
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.wire.sii import SiiProtocol
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation
 from eap.ams.access import AccessList, host_of
-from eap.ams.endpoint import Way
-from eap.ams.spec import DoorKind
+from eap.ams.spec import TransportKind
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.errors import EngineGoneError
 from eap.gateway import dialect
@@ -84,7 +84,7 @@ OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
 
 _NOT_TAKEN = {RequestAdmission.CROWDED: Cause.CROWDED, RequestAdmission.TOO_FAST: Cause.TOO_FAST}
 
-_BY_TCP = f"{DoorKind.TCP}:"
+_BY_TCP = f"{TransportKind.TCP}:"
 """Prefix of the names of TCP transports."""
 
 logger = logging.getLogger(__name__)
@@ -170,12 +170,12 @@ class MailboxGateway:
         """Return the transfers that are under way."""
         return [*self._slaves.running()]
 
-    def receive(self, frame: bytes, way: Way, send: Send) -> asyncio.Task[None] | None:
+    def receive(self, frame: bytes, endpoint: Endpoint, send: Send) -> asyncio.Task[None] | None:
         """Take a request; its answers go back by *send*, until the task that is returned is done.
 
         Args:
             frame: From its EtherCAT header on.
-            way: Connection, or address, of the client.
+            endpoint: Connection, or address, of the client.
             send: Takes whole frames.
 
         Raises:
@@ -184,42 +184,42 @@ class MailboxGateway:
         """
         header, body = decode_frame(frame)
         key = frame
-        if way.door.startswith(_BY_TCP):  # TCP repeats nothing by itself
+        if endpoint.transport.startswith(_BY_TCP):  # TCP repeats nothing by itself
             self._count += 1
             key += self._count.to_bytes(8)
         now_ns = monotonic_ns()
-        admission = self.tracker.admit(way, key, now_ns)
+        admission = self.tracker.admit(endpoint, key, now_ns)
         if admission is RequestAdmission.REPEATED:
             return None
-        request = GatewayRequest(header, bytes(body), way, send)
+        request = GatewayRequest(header, bytes(body), endpoint, send)
         if admission is not RequestAdmission.TAKEN:
             self._encoder.refuse(request, _NOT_TAKEN[admission])
             return None
         if self._answer_at_once(request, key, now_ns):
             return None
-        request = replace(request, ticket=Ticket(self.tracker, way, key))
+        request = replace(request, ticket=Ticket(self.tracker, endpoint, key))
         task = self._tasks.start(self._serve(request))
         task.add_done_callback(lambda _: request.give_back())
         return task
 
-    def connection_closed(self, way: Way) -> None:
+    def connection_closed(self, endpoint: Endpoint) -> None:
         """Forget a client, and end what it had under way."""
-        self.tracker.forget(way)
-        self._listeners.forget(way)
-        self._slaves.close_of(way)
-        self._masters.close_of(way)
+        self.tracker.forget(endpoint)
+        self._listeners.forget(endpoint)
+        self._slaves.close_of(endpoint)
+        self._masters.close_of(endpoint)
 
-    async def wait_below(self, way: Way, count: int) -> None:
+    async def wait_below(self, endpoint: Endpoint, count: int) -> None:
         """Wait until fewer than *count* requests of a client wait."""
-        while self.tracker.waiting(way) >= count and len(self._tasks):
+        while self.tracker.waiting(endpoint) >= count and len(self._tasks):
             await self._tasks.wait_any()
 
     async def close(self) -> None:
         """End everything that is under way."""
         await self._tasks.close()
-        for way in self.tracker.table():
-            self.tracker.forget(way)
-            self._listeners.forget(way)
+        for endpoint in self.tracker.table():
+            self.tracker.forget(endpoint)
+            self._listeners.forget(endpoint)
         self._slaves.close()
         self._masters.close()
 
@@ -247,24 +247,24 @@ class MailboxGateway:
 
     def _answer_at_once(self, request: GatewayRequest, key: bytes, start_ns: int) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
-        header, body, way = request.header, request.body, request.way
+        header, body, endpoint = request.header, request.body, request.endpoint
         if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
             return False
-        if self.tracker.waiting(way) > 1:
+        if self.tracker.waiting(endpoint) > 1:
             return False  # what came first is answered first
         operation = operation_of(MailboxType.COE, body)
-        key_of_session = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
+        key_of_session = SessionKey(endpoint, MASTER_ADDRESS, MailboxType.COE)
         master = self._masters.take(key_of_session, self._open_master)
         if not master.is_ready(operation):
             return False
-        self.tracker.answered(way, key)
-        judged = self._judge(way, MASTER_ADDRESS, self._master, operation)
+        self.tracker.answered(endpoint, key)
+        authorized = self._admission(endpoint, MASTER_ADDRESS, self._master, operation)
         replies = (
             master.ask_now(body)
-            if judged.is_allowed
-            else refusals(MailboxType.COE, body, reason_of_refusal(judged.verdict))
+            if authorized.is_allowed
+            else refusals(MailboxType.COE, body, reason_of_refusal(authorized.decision))
         )
-        self._finish(request, judged, MASTER_ADDRESS, replies, start_ns)
+        self._finish(request, authorized, MASTER_ADDRESS, replies, start_ns)
         return True
 
     async def _ask(
@@ -276,24 +276,24 @@ class MailboxGateway:
         is_group: bool = False,
     ) -> None:
         """Have the master or a slave answer a request, from *address*."""
-        kind, body, way = request.header.type, request.body, request.way
+        kind, body, endpoint = request.header.type, request.body, request.endpoint
         start_ns = monotonic_ns()
         operation = operation_of(kind, body)
         station = destination.station if isinstance(destination, SlaveAddress) else address
         target = self._target(destination)
-        judged = self._judge(way, station, target, operation, by_rule=is_group)
-        if judged.is_allowed:
+        authorized = self._admission(endpoint, station, target, operation, by_rule=is_group)
+        if authorized.is_allowed:
             is_step = operation is None
             replies = await self._ask_allowed(request, destination, station, is_step=is_step)
         else:
-            replies = refusals(kind, body, reason_of_refusal(judged.verdict))
-        self._finish(request, judged, address, replies, start_ns)
+            replies = refusals(kind, body, reason_of_refusal(authorized.decision))
+        self._finish(request, authorized, address, replies, start_ns)
 
     async def _ask_allowed(
         self, request: GatewayRequest, destination: Destination, station: int, *, is_step: bool
     ) -> list[GatewayReply]:
-        kind, body, way = request.header.type, request.body, request.way
-        key = SessionKey(way, station, kind)
+        kind, body, endpoint = request.header.type, request.body, request.endpoint
+        key = SessionKey(endpoint, station, kind)
         match destination:
             case MasterAddress():
                 return await self._masters.take(key, self._open_master).ask(kind, body)
@@ -306,34 +306,36 @@ class MailboxGateway:
             case GroupAddress():  # a group within a group
                 return refusals(kind, body, Cause.NO_SLAVE)
 
-    def _judge(
+    def _admission(
         self,
-        way: Way,
+        endpoint: Endpoint,
         station: int,
         target: RuleTarget,
         operation: Operation | None,
         *,
         by_rule: bool = False,
     ) -> RequestDecision:
-        if operation is None or self.guard.may_read(way, target, operation):
+        if operation is None or self.guard.may_read(endpoint, target, operation):
             return RequestDecision(station, target, None, None)
-        verdict = self.guard.judge(way, target, operation, by_rule=by_rule)
-        return RequestDecision(station, target, operation, verdict)
+        decision = self.guard.admission(endpoint, target, operation, by_rule=by_rule)
+        return RequestDecision(station, target, operation, decision)
 
     def _finish(
         self,
         request: GatewayRequest,
-        judged: RequestDecision,
+        authorized: RequestDecision,
         address: int,
         replies: Sequence[GatewayReply],
         start_ns: int,
     ) -> None:
         """Tell the audit, count, and answer from *address*."""
-        operation, verdict = judged.operation, judged.verdict
-        if operation is not None and verdict is not None:
-            self.guard.tell(request.way, judged.target, operation, verdict, result_of(replies))
+        operation, decision = authorized.operation, authorized.decision
+        if operation is not None and decision is not None:
+            self.guard.tell(
+                request.endpoint, authorized.target, operation, decision, result_of(replies)
+            )
         took_ns = monotonic_ns() - start_ns
-        self._encoder.answer(request, judged.station, address, replies, took_ns)
+        self._encoder.answer(request, authorized.station, address, replies, took_ns)
 
     def _target(self, destination: Destination) -> RuleTarget:
         """Return the name of a destination in access rules."""
@@ -356,7 +358,7 @@ class MailboxGateway:
             return refusals(kind, body, cause)
         if kind is MailboxType.EOE:
             address, now_ns = request.header.address, monotonic_ns()
-            self._listeners.note(station, request.way, address, request.send, now_ns)
+            self._listeners.note(station, request.endpoint, address, request.send, now_ns)
         session = self._slaves.take(key, partial(self._begin_local, key, slave))
         sizes = session.codec.sizes
         if (sizes.to_slave, sizes.to_master) != (slave.to_slave, slave.to_master):
@@ -388,15 +390,15 @@ class MailboxGateway:
 
     def _begin_local(self, key: SessionKey, slave: SlaveDescription) -> ClientSession:
         sizes = MailboxSizes(slave.to_slave, slave.to_master)
-        return self._begin(key, self._open_local(slave, key.way), sizes)
+        return self._begin(key, self._open_local(slave, key.endpoint), sizes)
 
-    def _open_local(self, slave: SlaveDescription, way: Way) -> LocalSlave:
-        return LocalSlave(self._bus, slave, way, turn_s=self.settings.answer_s)
+    def _open_local(self, slave: SlaveDescription, endpoint: Endpoint) -> LocalSlave:
+        return LocalSlave(self._bus, slave, endpoint, turn_s=self.settings.answer_s)
 
     def _begin(self, key: SessionKey, access: SlaveAccess, sizes: MailboxSizes) -> ClientSession:
         answer_s = self.settings.answer_s
         budget = self.file_memory if key.kind is MailboxType.FOE else self.memory
-        memory = MemoryShare(budget, host_of(key.way))
+        memory = MemoryShare(budget, host_of(key.endpoint))
         # The rest of the time is for the probe of a station that lets a client wait.
         codec = codec_for(key.kind, access, sizes, memory, wait_s=answer_s / 3)
         return ClientSession(key.kind, codec, answer_s=answer_s)
@@ -409,8 +411,8 @@ class MailboxGateway:
             if isinstance(codec, FileCodec) and codec.stalled_since_s < limit_s:
                 logger.info(
                     "gateway %s: file of slave %d given up: %s has paused for %g s, and %s waits",
-                    self.settings.name, key.address, other.way.connection, STALL_S,
-                    key.way.connection,
+                    self.settings.name, key.address, other.endpoint.connection, STALL_S,
+                    key.endpoint.connection,
                 )  # fmt: skip
                 session.close()
 
@@ -427,14 +429,14 @@ class MailboxGateway:
         if isinstance(destination, GroupAddress):
             destination = SlaveAddress(address)  # the dialect has no groups: no slave is there
         answer, cause = await self._dialect.answer(
-            kind, request.body, request.way, self._target(destination),
-            partial(self._dialect_target, kind, destination, request.way),
+            kind, request.body, request.endpoint, self._target(destination),
+            partial(self._dialect_target, kind, destination, request.endpoint),
         )  # fmt: skip
         took_ns = monotonic_ns() - start_ns
         self._encoder.answer_dialect(request, kind, answer, cause, took_ns)
 
     async def _dialect_target(
-        self, kind: MailboxType, destination: Destination, way: Way
+        self, kind: MailboxType, destination: Destination, endpoint: Endpoint
     ) -> DialectTarget | Cause:
         match destination:
             case MasterAddress():
@@ -445,7 +447,7 @@ class MailboxGateway:
                 slave = await self._find(station)
                 if isinstance(slave, Cause):
                     return slave
-                return find_refusal(kind, b"", slave) or self._open_local(slave, way)
+                return find_refusal(kind, b"", slave) or self._open_local(slave, endpoint)
         return Cause.NO_SLAVE
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxError, encode_plain_frame
 from eap.errors import MalformedError, TruncatedError
 from eap.gateway.refusal import mailbox_error
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _ADDRESS = slice(4, 6)
 
 
-class GatewayDoor:
+class GatewayTransport:
     """One socket or listener, and the gateway behind it.
 
     Args:
@@ -57,7 +57,7 @@ class GatewayDoor:
             send(connection, frame)
 
         try:
-            self._gateway.receive(frame, Way(self._name, connection), answer)
+            self._gateway.receive(frame, Endpoint(self._name, connection), answer)
         except TruncatedError:
             return Refusal.TRUNCATED
         except MalformedError:
@@ -69,18 +69,18 @@ class GatewayDoor:
     def connection_closed(self, connection: str) -> None:
         """Forget a client whose connection is closed."""
         if self._gateway is not None:
-            self._gateway.connection_closed(Way(self._name, connection))
+            self._gateway.connection_closed(Endpoint(self._name, connection))
 
     def waiting(self, connection: str) -> int:
         """Return how many requests of a connection wait for their answers."""
         if self._gateway is None:
             return 0
-        return self._gateway.tracker.waiting(Way(self._name, connection))
+        return self._gateway.tracker.waiting(Endpoint(self._name, connection))
 
     async def wait_below(self, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait."""
         if self._gateway is not None:
-            await self._gateway.wait_below(Way(self._name, connection), count)
+            await self._gateway.wait_below(Endpoint(self._name, connection), count)
 
 
 def _refuse_type(frame: bytes, answer: Callable[[bytes], None]) -> None:

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import msgspec
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read
-from eap.ams.access import AccessList, Verdict
+from eap.ams.access import AccessList, Decision
 from eap.ams.authorized_request import AuditedOperation, AuditEntry
-from eap.ams.endpoint import Way
 from eap.ams.spec import AccessService
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
@@ -52,18 +52,18 @@ class RequestDecision(msgspec.Struct, frozen=True):
         target: Its name in access rules.
         operation: None for what needs no verdict: a step of what was judged when it began, and a
             read where everything may be read.
-        verdict: Likewise.
+        decision: Likewise.
     """
 
     station: int
     target: RuleTarget
     operation: Operation | None
-    verdict: Verdict | None
+    decision: Decision | None
 
     @property
     def is_allowed(self) -> bool:
         """Whether it may be done."""
-        return self.verdict is None or self.verdict.is_allowed
+        return self.decision is None or self.decision.is_allowed
 
 
 class Guard:
@@ -83,67 +83,67 @@ class Guard:
         self.before_change: Callable[[AuditEntry], str] | None = None
         self._access = access
 
-    def may_read(self, way: Way, target: RuleTarget, operation: Operation) -> bool:
+    def may_read(self, endpoint: Endpoint, target: RuleTarget, operation: Operation) -> bool:
         """Return whether an operation is a read where the client may read everything."""
         if not isinstance(operation, Read):
             return False
-        return self._access().grants(way, NOBODY, *target).may_read
+        return self._access().grants(endpoint, NOBODY, *target).may_read
 
-    def judge(
-        self, way: Way, target: RuleTarget, operation: Operation, *, by_rule: bool = False
-    ) -> Verdict:
+    def admission(
+        self, endpoint: Endpoint, target: RuleTarget, operation: Operation, *, by_rule: bool = False
+    ) -> Decision:
         """Decide on an operation; *by_rule*: a change only if a rule says so."""
-        verdict = self._access().grants(way, NOBODY, *target).judge(operation)
-        if by_rule and verdict.service is not AccessService.READ and not verdict.is_by_rule:
+        decision = self._access().grants(endpoint, NOBODY, *target).admission(operation)
+        if by_rule and decision.service is not AccessService.READ and not decision.is_by_rule:
             why = "only a rule allows it for several slaves at once"
-            return verdict._replace(is_allowed=False, why=why)
-        return self._record_first(way, target, operation, verdict)
+            return decision._replace(is_allowed=False, why=why)
+        return self._record_first(endpoint, target, operation, decision)
 
     def _record_first(
-        self, way: Way, target: RuleTarget, operation: Operation, verdict: Verdict
-    ) -> Verdict:
+        self, endpoint: Endpoint, target: RuleTarget, operation: Operation, decision: Decision
+    ) -> Decision:
         """Return the verdict on a change when it has been recorded, where that is required."""
-        change = AuditedOperation(operation, verdict, None)
-        is_change = verdict.is_allowed and change.is_told
+        change = AuditedOperation(operation, decision, None)
+        is_change = decision.is_allowed and change.is_told
         if self.before_change is None or not is_change:
-            return verdict
-        why = self.before_change(_entry(way, target, change))
+            return decision
+        why = self.before_change(_entry(endpoint, target, change))
         if not why:
-            return verdict
-        return verdict._replace(is_allowed=False, is_recordable=False, why=why)
+            return decision
+        return decision._replace(is_allowed=False, is_recordable=False, why=why)
 
     def tell(
         self,
-        way: Way,
+        endpoint: Endpoint,
         target: RuleTarget,
         operation: Operation,
-        verdict: Verdict,
+        decision: Decision,
         result: int | None,
     ) -> None:
         """Have the audit written of what was decided and how it came out.
 
         Args:
-            way: Connection, or address, of the client.
+            endpoint: Connection, or address, of the client.
             target: Its name in access rules.
             operation: What was to be done.
-            verdict: Whether it may be.
+            decision: Whether it may be.
             result: An error of ADS, 0 for none, None if it is unknown.
         """
-        if not verdict.is_allowed:
+        if not decision.is_allowed:
             result = AdsError.ACCESS_DENIED
-        audited = AuditedOperation(operation, verdict, result)
+        audited = AuditedOperation(operation, decision, result)
         if audited.is_told:
             for write in self.on_audit:
-                write(_entry(way, target, audited))
+                write(_entry(endpoint, target, audited))
 
 
-def _entry(way: Way, target: RuleTarget, audited: AuditedOperation) -> AuditEntry:
-    return AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
+def _entry(endpoint: Endpoint, target: RuleTarget, audited: AuditedOperation) -> AuditEntry:
+    return AuditEntry(endpoint, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
 
 
-def reason_of_refusal(verdict: Verdict | None) -> Cause:
+def reason_of_refusal(decision: Decision | None) -> Cause:
     """Return why a request with this verdict is refused."""
-    is_recordable = verdict is None or verdict.is_recordable
+    is_recordable = decision is None or decision.is_recordable
     return Cause.DENIED if is_recordable else Cause.NOT_RECORDED
 
 

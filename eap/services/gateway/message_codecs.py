@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from devicebus.errors import SoeError
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.fragment import Assembler, iter_fragments
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.codec.eoe import EoeType
@@ -212,15 +212,20 @@ class EoeListeners:
     """The listeners of all slaves of a bus."""
 
     def __init__(self) -> None:
-        self._of: dict[int, OrderedDict[Way, EoeListener]] = {}
+        self._of: dict[int, OrderedDict[Endpoint, EoeListener]] = {}
 
     def note(
-        self, station: int, way: Way, address: int, send: Callable[[bytes], None], now_ns: int
+        self,
+        station: int,
+        endpoint: Endpoint,
+        address: int,
+        send: Callable[[bytes], None],
+        now_ns: int,
     ) -> None:
         """Note that a client talks to a slave; the one that did so least lately makes room."""
         of_slave = self._of.setdefault(station, OrderedDict())
-        of_slave[way] = EoeListener(address, send, now_ns + LISTENS_NS)
-        of_slave.move_to_end(way)
+        of_slave[endpoint] = EoeListener(address, send, now_ns + LISTENS_NS)
+        of_slave.move_to_end(endpoint)
         if len(of_slave) > MAX_LISTENERS:
             of_slave.popitem(last=False)
 
@@ -229,14 +234,16 @@ class EoeListeners:
         of_slave = self._of.get(station)
         if of_slave is None:
             return []
-        for way in [way for way, each in of_slave.items() if each.until_ns <= now_ns]:
-            del of_slave[way]
+        for endpoint in [
+            endpoint for endpoint, each in of_slave.items() if each.until_ns <= now_ns
+        ]:
+            del of_slave[endpoint]
         return [*of_slave.values()]
 
-    def forget(self, way: Way) -> None:
+    def forget(self, endpoint: Endpoint) -> None:
         """Forget a client whose connection is closed."""
         for of_slave in self._of.values():
-            of_slave.pop(way, None)
+            of_slave.pop(endpoint, None)
 
 
 _MESSAGES: dict[MailboxType, type[ElementCodec | VendorCodec | AdsCodec | EthernetCodec]] = {

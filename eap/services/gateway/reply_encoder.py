@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 import msgspec
 
 from devicebus.mailbox.counter import next_counter
+from eap.ads.endpoint import Endpoint
 from eap.ams.access import host_of
-from eap.ams.endpoint import Way
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_plain_frame
 from eap.gateway import dialect
 from eap.gateway.error_table import Cause
@@ -124,16 +124,16 @@ class RefusalLog:
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def write(self, way: Way, address: int, kind: MailboxType, reason: Cause) -> None:
+    def write(self, endpoint: Endpoint, address: int, kind: MailboxType, reason: Cause) -> None:
         """Log that a request was refused."""
         if reason not in _LOGGED:
             return
-        host = host_of(way)
-        cause = self._name, way.door, host, address, kind, reason
+        host = host_of(endpoint)
+        cause = self._name, endpoint.transport, host, address, kind, reason
         logger.warning(
             "gateway %s: %s of %s (%s) to address %d refused: %s",
-            self._name, kind.name, way.connection, way.door, address, reason.text,
-            extra=caused_by(cause, f"{self._name} {way.door} {host}"),
+            self._name, kind.name, endpoint.connection, endpoint.transport, address, reason.text,
+            extra=caused_by(cause, f"{self._name} {endpoint.transport} {host}"),
         )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ class GatewayRequest(msgspec.Struct, frozen=True):
 
     header: MailboxHeader
     body: bytes
-    way: Way
+    endpoint: Endpoint
     send: Send
     ticket: Ticket | None = None
     """None if it was not taken."""
@@ -186,7 +186,7 @@ class ReplyEncoder:
         self.statistics.note(station, kind, reasons, took_ns)
         self._note_refusals(request, kind, reasons)
         if replies and replies[0].is_again:
-            self._note_repeated(request.way)
+            self._note_repeated(request.endpoint)
         if address == request.header.address:  # not one of many
             request.give_back()
         for reply in replies:
@@ -220,8 +220,8 @@ class ReplyEncoder:
         counter = self._counters[address] = next_counter(self._counters[address])
         send(encode_plain_frame(kind, address, counter, body))
 
-    def _note_repeated(self, way: Way) -> None:
-        counts = self._tracker.counts_of(way)
+    def _note_repeated(self, endpoint: Endpoint) -> None:
+        counts = self._tracker.counts_of(endpoint)
         if counts is not None:
             counts.repeated += 1
 
@@ -234,7 +234,7 @@ class ReplyEncoder:
                 break
         else:
             return
-        counts = self._tracker.counts_of(request.way)
+        counts = self._tracker.counts_of(request.endpoint)
         if counts is not None:
             counts.errors += 1
-        self._log.write(request.way, request.header.address, kind, reason)
+        self._log.write(request.endpoint, request.header.address, kind, reason)

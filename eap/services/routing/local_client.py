@@ -7,13 +7,13 @@ from itertools import count
 from typing import Protocol
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Door
-from eap.ams.spec import DoorKind
+from eap.ams.spec import TransportKind
+from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.ids import NetId
 
-LOCAL_DOOR = Door(DoorKind.LOCAL, is_stream=True, is_hub=True)
+LOCAL_TRANSPORT = Transport(TransportKind.LOCAL, is_stream=True, is_hub=True)
 """By which a station's own requests come into its router."""
 _FIRST_PORT = 0x8000
 """As clients of AMS routers have them."""
@@ -23,9 +23,9 @@ class _Station(Protocol):
     @property
     def net_id(self) -> NetId: ...
 
-    def receive(self, data: bytes, door: str, connection: str) -> None: ...
+    def receive(self, data: bytes, transport: str, connection: str) -> None: ...
 
-    def connection_closed(self, door: str, connection: str) -> None: ...
+    def connection_closed(self, transport: str, connection: str) -> None: ...
 
 
 class LocalClient:
@@ -53,14 +53,14 @@ class LocalClient:
             invoke_id=number & 0xFFFFFFFF,
         )  # fmt: skip
         try:
-            self._station.receive(encode_packet(header, body), LOCAL_DOOR.name, connection)
+            self._station.receive(encode_packet(header, body), LOCAL_TRANSPORT.name, connection)
             async with asyncio.timeout(timeout_s):
                 return await answer
         except TimeoutError:
             return AmsAnswer(error_code=AdsError.TIMEOUT)
         finally:
             del self._waiting[connection]
-            self._station.connection_closed(LOCAL_DOOR.name, connection)
+            self._station.connection_closed(LOCAL_TRANSPORT.name, connection)
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
         """Take an answer."""

@@ -103,20 +103,20 @@ class Ways(NamedTuple):
 
 def open_ways(handover: Handover, resources: ExitStack) -> Ways:
     """Return the ways of all EAP ports; *resources* closes what they need."""
-    ways = Ways({}, {})
+    endpoints = Ways({}, {})
     table = _open_table(resources)
     for shared in handover.sockets:
         if shared.kind is SocketKind.UDP:
-            way = UdpWay(_both(shared), table, shared.address)
-            resources.callback(way.close)
-            ways.udp.update(dict.fromkeys(shared.owners, way))
+            endpoint = UdpWay(_both(shared), table, shared.address)
+            resources.callback(endpoint.close)
+            endpoints.udp.update(dict.fromkeys(shared.owners, endpoint))
         elif shared.kind is SocketKind.ARP:
             spec = handover.port(shared.owners[0])
             sock = socket.socket(fileno=shared.services_fd)
-            prober = ArpProber(sock, vlan_id=shared.vlan_id, priority=spec.vlan_priority)
-            resources.callback(prober.close)
-            ways.arp.update(dict.fromkeys(shared.owners, prober))
-    return ways
+            hop_prober = ArpProber(sock, vlan_id=shared.vlan_id, priority=spec.vlan_priority)
+            resources.callback(hop_prober.close)
+            endpoints.arp.update(dict.fromkeys(shared.owners, hop_prober))
+    return endpoints
 
 
 def _open_table(resources: ExitStack) -> NeighbourTable | None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from ipaddress import IPv4Address
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
-from eap.ams.endpoint import Way
 from eap.ams.routes import Origin, Route
-from eap.ams.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import Destination, DestinationKind, InterfaceUri, NetId
 from eap.net.interface import own_addresses
@@ -17,9 +17,9 @@ from eap.services.routing.station_router import StationRouter
 
 _IP_SCHEMES = ("udp", "tcp")
 _ADDRESSES = {
-    DoorKind.UDP: (DestinationKind.IP,),
-    DoorKind.TCP: (DestinationKind.IP,),
-    DoorKind.ETHERNET: (DestinationKind.MAC, DestinationKind.NET_ID),
+    TransportKind.UDP: (DestinationKind.IP,),
+    TransportKind.TCP: (DestinationKind.IP,),
+    TransportKind.ETHERNET: (DestinationKind.MAC, DestinationKind.NET_ID),
 }
 
 
@@ -30,7 +30,7 @@ def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
     return StationRouter(station.name, net_id, net_ids, access=access_of(station, routing))
 
 
-def to_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:
+def to_route(spec: RouteSpec, hop: Endpoint, origin: Origin) -> Route:
     """Return the route that *spec* describes, by *hop*; raise ValueError if there can be none."""
     net_id = NetId.parse(spec.net_id)
     return Route(
@@ -48,14 +48,14 @@ def to_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:
     )
 
 
-def to_way(hop: HopSpec) -> Way:
+def to_way(hop: HopSpec) -> Endpoint:
     """Return door and address of a hop; each AMS/TCP connection to others is a door of its own.
 
     Raises:
         ValueError: the address is none of one station, or none for this door.
     """
-    if hop.kind is DoorKind.AMS_TCP:
-        return Way(f"{hop.kind}:{hop.address}", hop.address)
+    if hop.kind is TransportKind.AMS_TCP:
+        return Endpoint(f"{hop.kind}:{hop.address}", hop.address)
     address = hop.address
     if hop.kind in _ADDRESSES:
         where = Destination.parse(address)
@@ -64,13 +64,13 @@ def to_way(hop: HopSpec) -> Way:
         address = where.host
         if where.kind is DestinationKind.IP:
             address += f":{where.port or EAP_PORT}"
-    return Way(f"{hop.kind}:{hop.port}", address)
+    return Endpoint(f"{hop.kind}:{hop.port}", address)
 
 
 def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
     """Return the access rules of a station; first those of networks that may ask nothing."""
     closed = tuple(
-        AccessRule(f"unidirectional of {spec.network}", allow=False, doors=(mqtt_door(spec),))
+        AccessRule(f"unidirectional of {spec.network}", allow=False, transports=(mqtt_door(spec),))
         for spec in routing.mqtt
         if spec.is_unidirectional
     )
@@ -79,7 +79,7 @@ def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
 
 def mqtt_door(spec: MqttSpec) -> str:
     """Return the name of the door to a network."""
-    return f"{DoorKind.MQTT}:{spec.network}"
+    return f"{TransportKind.MQTT}:{spec.network}"
 
 
 def _own_addresses(station: StationSpec) -> Iterator[IPv4Address]:

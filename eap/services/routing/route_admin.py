@@ -13,11 +13,11 @@ from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
-from eap.ams.access import Verdict
+from eap.ads.endpoint import Endpoint
+from eap.ams.access import Decision
 from eap.ams.authorized_request import AddRoute, AuditedOperation, AuditEntry
-from eap.ams.endpoint import Way
 from eap.ams.routes import Origin, RouteTable
-from eap.ams.spec import AccessService, AmsUser, DoorKind, HopSpec, RouteSpec
+from eap.ams.spec import AccessService, AmsUser, HopSpec, RouteSpec, TransportKind
 from eap.codec.ads import AdsError
 from eap.codec.ams import SYSTEM_PORT, AmsHeader
 from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
@@ -50,7 +50,7 @@ class _Request(NamedTuple):
     is_kept: bool
 
 
-class RouteDesk:
+class RouteAdmin:
     """Takes the requests that come to one address.
 
     Args:
@@ -112,10 +112,10 @@ def _audited(
         decode_text(question.find(Tag.HOST) or b"")[:_SHOWN],
         decode_text(question.find(Tag.USER) or b"")[:_SHOWN],
     )
-    verdict = Verdict(AccessService.CONTROL, result != AdsError.ACCESS, why)
+    decision = Decision(AccessService.CONTROL, result != AdsError.ACCESS, why)
     header = AmsHeader(router, SYSTEM_PORT, NetId(octets), 0, 0)
-    done = AuditedOperation(wanted, verdict, result)
-    return AuditEntry(Way("ams-udp", sender), header, "", (done,))
+    done = AuditedOperation(wanted, decision, result)
+    return AuditEntry(Endpoint("ams-udp", sender), header, "", (done,))
 
 
 async def _decide(
@@ -190,7 +190,7 @@ def _written(table: RouteTable, net_id: NetId) -> str:
 
 async def _add(station: StationRoutes, wanted: _Request) -> None:
     """Add a route for all NetIDs that begin as the wanted one, or for that alone."""
-    hop = HopSpec(DoorKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
+    hop = HopSpec(TransportKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
     is_here = station.has(wanted.net_id.station)
     spec = RouteSpec(
         name=wanted.name,

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Awaitable, Container
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import AdsRefusedError, OperationOutcome, ReadWrite
 from eap.ads.request import encode_outcome, parse_request
-from eap.ams.endpoint import Way
 from eap.ams.hop_report import HopQuestion, encode_report
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
@@ -19,7 +19,7 @@ from eap.services.routing.service import LocalRequest, Service
 from eap.services.routing.tracing import TracedStation, answer_question
 
 
-class Whereabouts:
+class RouteQuery:
     """Stands before the system service of *station*, and answers questions of traces.
 
     Args:
@@ -41,9 +41,9 @@ class Whereabouts:
         asked = _asked(request)
         return self._rest.answer(request) if asked is None else self._tell(request, asked)
 
-    def client_gone(self, way: Way) -> None:
+    def client_gone(self, endpoint: Endpoint) -> None:
         """Pass it on."""
-        self._rest.client_gone(way)
+        self._rest.client_gone(endpoint)
 
     async def _tell(self, request: LocalRequest, asked: ReadWrite) -> AmsAnswer:
         try:

@@ -92,7 +92,7 @@ def interruption_row(found: Interruption, now_ns: int) -> InterruptionRow:
     """Return in plain values what is interrupted for one client."""
     target, port, source, source_port = ADDRESSES.unpack(found.asked)
     return InterruptionRow(
-        client=str(found.way),
+        client=str(found.endpoint),
         source=f"{NetId(source)}:{source_port}",
         target=f"{NetId(target)}:{port}",
         count=found.number,
@@ -128,7 +128,7 @@ def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow
         name=route.name,
         net_id=str(route.net_id),
         octets=route.octets,
-        transport=route.hop.door,
+        transport=route.hop.transport,
         address=route.hop.connection,
         origin="derived" if is_derived else _ORIGINS[route.origin],
         state=report.state.value,
@@ -151,10 +151,10 @@ def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow
 
 def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
     """Return a connection in plain values."""
-    way, traffic = report
+    endpoint, traffic = report
     return ConnectionRow(
-        transport=way.door,
-        address=way.connection,
+        transport=endpoint.transport,
+        address=endpoint.connection,
         since_s=(now_ns - traffic.since_ns) // _S,
         net_ids=[str(each) for each in traffic.sources],
         took_us=traffic.round_trip_ns // 1000 if traffic.answers else None,
@@ -179,7 +179,7 @@ def request_row(trace: Trace, now_ns: int) -> RequestRow:
         at=round(time() - (now_ns - trace.at_ns) / _S, 3),
         outcome=trace.outcome,
         came_by="" if trace.came_by is None else str(trace.came_by),
-        transport="" if hop is None else hop.door,
+        transport="" if hop is None else hop.transport,
         address="" if hop is None else hop.connection,
         error=trace.error_code,
         took_us=trace.took_ns // 1000,

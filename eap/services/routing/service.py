@@ -1,6 +1,6 @@
 """Services of a station: their interface, the table by NetID and port, and the queues before them.
 
-A *service* answers requests for a NetID of the station, at the AMS ports that it has.  A *carrier*
+A *service* answers requests for a NetID of the station, at the AMS ports that it has.  A *sender*
 is the sending half of a door: it takes packets to a connection or an address.  Both are given to
 :class:`~eap.services.routing.station_router.StationRouter`, which calls them from the
 running loop only, so neither needs locks.
@@ -18,7 +18,7 @@ from time import monotonic_ns
 from typing import NamedTuple, Protocol, TypeAlias
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
@@ -34,7 +34,7 @@ class LocalRequest(NamedTuple):
 
     header: AmsHeader
     body: bytes
-    came_by: Way
+    came_by: Endpoint
 
 
 AnswerNow: TypeAlias = Callable[[AmsHeader, bytes], AmsAnswer | None]
@@ -61,14 +61,14 @@ class Service(Protocol):
         router answers in its place what takes longer than its limit, and drops what comes then.
         """
 
-    def client_gone(self, way: Way) -> None:
+    def client_gone(self, endpoint: Endpoint) -> None:
         """End what belongs to the clients of a connection that is closed: notifications, handles.
 
         An address without connections (a datagram's sender) is never closed.
         """
 
 
-class Carrier(Protocol):
+class TransportSender(Protocol):
     """The sending half of a door."""
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
@@ -126,11 +126,11 @@ class ServiceTable:
             return None
         return None if answer is None else (answer, monotonic_ns() - began_ns)
 
-    def client_gone(self, way: Way) -> None:
+    def client_gone(self, endpoint: Endpoint) -> None:
         """Tell all of them that a connection is closed."""
         for services in self._services.values():
             for service in services:
-                service.client_gone(way)
+                service.client_gone(endpoint)
 
 
 class _Ports:
@@ -155,7 +155,7 @@ _FULL = AmsAnswer(error_code=AdsError.MAILBOX_FULL)
 
 Finish: TypeAlias = Callable[[int, AmsAnswer], None]
 """Takes the answer to the request with a ticket."""
-_Key: TypeAlias = tuple[Way, bytes]
+_Key: TypeAlias = tuple[Endpoint, bytes]
 
 logger = logging.getLogger(__name__)
 
@@ -175,9 +175,9 @@ class SerialQueues:
         self._tasks = TaskSet("AoE requests")
         self._octets = 0
 
-    def has_work(self, way: Way, header: AmsHeader) -> bool:
+    def has_work(self, endpoint: Endpoint, header: AmsHeader) -> bool:
         """Say whether something is under way, or waits, of the client and port of a request."""
-        return bool(self._queues) and (way, _addresses(header)) in self._queues
+        return bool(self._queues) and (endpoint, _addresses(header)) in self._queues
 
     def put(self, ticket: int, service: Service, request: LocalRequest) -> None:
         """Have *service* answer a request when its turn comes."""
@@ -198,10 +198,10 @@ class SerialQueues:
             self._octets += len(request.body)
             queue.append(waiting)
 
-    def forget(self, way: Way) -> None:
-        """Leave out what waits for its turn and came by *way*; what has begun goes on."""
+    def forget(self, endpoint: Endpoint) -> None:
+        """Leave out what waits for its turn and came by *endpoint*; what has begun goes on."""
         for key, queue in self._queues.items():
-            if key[0] == way:
+            if key[0] == endpoint:
                 self._octets -= sum(len(each.request.body) for each in queue)
                 queue.clear()
 

@@ -2,10 +2,10 @@
 
 How the parts meet:
 
-- A **door** brings packets: whoever receives one calls :meth:`StationRouter.receive` with the
-  door's name and the connection that it came by, or the sender's address.  Answers and packets for
-  the next hop leave by the :class:`~.service.Carrier` that was given with the door.  Where several
-  stations are behind one socket, an :class:`~.entrance.Entrance` finds out whose a packet is.
+- A **transport** receives and sends packets.  Its receiver calls :meth:`StationRouter.receive` with
+  the transport's name and the connection or the sender's address.  Answers, and packets for the next
+  hop, leave by the :class:`~.service.TransportSender` of the transport.  Where several stations share
+  a socket, a :class:`~eap.services.transports.demultiplexer.Demultiplexer` finds a packet's station.
 - A **service** answers for one NetID and its AMS ports, see :class:`~.service.Service`.
 - **Routes** are in :attr:`StationRouter.table`; they are added and removed by the methods here, so
   that hops are asked for life from then on.
@@ -23,27 +23,28 @@ from collections.abc import Callable, Collection, Hashable
 from time import monotonic_ns
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList, host_of
 from eap.ams.action import Action, Forward, Outcome, Reply, Trace
 from eap.ams.admission import Limits
 from eap.ams.authorized_request import AuditEntry
-from eap.ams.endpoint import Door, Way
-from eap.ams.hop_prober import Prober
+from eap.ams.hop_prober import HopProber
 from eap.ams.record import Record, Stats, reason_of
 from eap.ams.report import ConnectionReport, Location, RouteReport
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
+from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.services.log_limits import caused_by
-from eap.services.routing.local_client import LOCAL_DOOR, LocalClient
+from eap.services.routing.local_client import LOCAL_TRANSPORT, LocalClient
 from eap.services.routing.service import (
-    Carrier,
     LocalRequest,
     SerialQueues,
     Service,
     ServiceTable,
+    TransportSender,
 )
 
 _SHORTEST_WAIT_S = 0.001
@@ -134,10 +135,12 @@ class TraceLog:
         if not logger.isEnabledFor(level):
             return
         host = "" if trace.came_by is None else host_of(trace.came_by)
-        door = "" if trace.came_by is None else trace.came_by.door
+        transport = "" if trace.came_by is None else trace.came_by.transport
         # Results inside an answer are in the text.
         code = f" (0x{trace.error_code:x})" if trace.error_code else ""
-        extra = caused_by((self._station, *_cause(trace, host)), f"{self._station} {door} {host}")
+        extra = caused_by(
+            (self._station, *_cause(trace, host)), f"{self._station} {transport} {host}"
+        )
         logger.log(level, "%s: %s%s", self._station, trace.text, code, extra=extra)
 
 
@@ -189,25 +192,25 @@ class StationRouter:
         self.table = RouteTable()
         self.on_trace: list[Callable[[Trace], None]] = [TraceLog(name).write]
         self.on_audit: list[Callable[[AuditEntry], None]] = []
-        self.on_routes: list[Callable[[Way], None]] = []
+        self.on_routes: list[Callable[[Endpoint], None]] = []
         self._router = Router(
             net_id,
             self.table,
             [],
             first_invoke_id=int.from_bytes(os.urandom(4), "little"),
             limits=limits,
-            prober=Prober(net_id, self.table),
+            hop_prober=HopProber(net_id, self.table),
             access=access,
             answer_now=self._answer_now,
         )
-        self._carriers: dict[str, Carrier] = {}
+        self._senders: dict[str, TransportSender] = {}
         self._services = ServiceTable((net_id, *net_ids))
         for each in self._services.net_ids:
             self._router.add_device(each, self._services.ports(each))
         self._queues = SerialQueues(self._finish)
         self._client = LocalClient(self)
-        self.add_door(LOCAL_DOOR, self._client)
-        self._settling: dict[Way, tuple[int, asyncio.Event]] = {}
+        self.add_transport(LOCAL_TRANSPORT, self._client)
+        self._settling: dict[Endpoint, tuple[int, asyncio.Event]] = {}
         self._timer = RouterTimer(self._router.next_timeout, self._handle_timeout)
 
     @property
@@ -235,19 +238,19 @@ class StationRouter:
     @property
     def access(self) -> AccessList:
         """The access rules that are in force."""
-        return self._router.gate.access
+        return self._router.access_filter.access
 
     def set_access(self, access: AccessList) -> None:
         """Judge requests by other rules from now on."""
-        self._router.gate.access = access
+        self._router.access_filter.access = access
 
     def require_record(self, record: Callable[[AuditEntry], str]) -> None:
         """Refuse changes that cannot be recorded: *record* returns why, empty for one that was."""
-        self._router.gate.before_change = record
+        self._router.access_filter.before_change = record
 
     def why_not_recorded(self, entry: AuditEntry) -> str:
         """Record a change before it is done, where that is required; return why it cannot be."""
-        record = self._router.gate.before_change
+        record = self._router.access_filter.before_change
         return record(entry) if record is not None else ""
 
     def stats(self) -> Stats:
@@ -263,15 +266,15 @@ class StationRouter:
             self._timer.stop()
             await self._queues.close()
 
-    def add_door(self, door: Door, carrier: Carrier) -> None:
-        """Let packets come and go by *door*; raises ValueError if there is one of its name."""
-        self._router.add_door(door)
-        self._carriers[door.name] = carrier
+    def add_transport(self, transport: Transport, sender: TransportSender) -> None:
+        """Let packets come and go by *transport*; raises ValueError if there is one of its name."""
+        self._router.add_transport(transport)
+        self._senders[transport.name] = sender
 
-    def remove_door(self, name: str) -> None:
+    def remove_transport(self, name: str) -> None:
         """Forget a door; what waits for those behind it is answered with 0x1B."""
-        self._act(self._router.remove_door(name, monotonic_ns()))
-        del self._carriers[name]
+        self._act(self._router.remove_transport(name, monotonic_ns()))
+        del self._senders[name]
 
     def add_service(self, net_id: NetId, service: Service) -> None:
         """Let *service* answer for *net_id*, one of the station; the first that has a port does.
@@ -289,7 +292,7 @@ class StationRouter:
         self._timer.set()
         return is_taken
 
-    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+    def remove_route(self, net_id: NetId, hop: Endpoint) -> bool:
         """Forget a route; return whether there was one."""
         was_there = self.table.remove(net_id, hop)
         for follow in self.on_routes:
@@ -297,69 +300,73 @@ class StationRouter:
         self._timer.set()
         return was_there
 
-    def is_down(self, hop: Way) -> bool:
+    def is_down(self, hop: Endpoint) -> bool:
         """Say whether a hop is known not to answer now."""
         return self._router.is_down(hop)
 
-    def hop_is_at(self, door: str, address: str, connection: str) -> None:
+    def hop_is_at(self, transport: str, address: str, connection: str) -> None:
         """Take what comes by *connection* for what comes from the hop that is named *address*."""
-        self._router.hop_is_at(door, address, connection)
+        self._router.hop_is_at(transport, address, connection)
 
-    def is_wanted(self, hop: Way) -> bool:
+    def is_wanted(self, hop: Endpoint) -> bool:
         """Say whether a route leads to a hop."""
         return any(route.hop == hop for route in self.table)
 
-    def is_awaited(self, hop: Way) -> bool:
+    def is_awaited(self, hop: Endpoint) -> bool:
         """Say whether an answer from a hop is waited for, or subscriptions come from it."""
         return self._router.is_awaited(hop)
 
-    def locate(self, header: AmsHeader, way: Way) -> Location:
-        """Say where a request would go that came by *way*."""
-        return self._router.locate(header, way)
+    def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
+        """Say where a request would go that came by *endpoint*."""
+        return self._router.locate(header, endpoint)
 
-    def is_waiting_for(self, header: AmsHeader, body: bytes, door: str) -> bool:
+    def is_waiting_for(self, header: AmsHeader, body: bytes, transport: str) -> bool:
         """Say whether a client of this router waits for a packet."""
-        return self._router.is_waiting_for(header, body, door)
+        return self._router.is_waiting_for(header, body, transport)
 
-    def receive(self, data: bytes, door: str, connection: str, *, for_all: bool = False) -> None:
+    def receive(
+        self, data: bytes, transport: str, connection: str, *, for_all: bool = False
+    ) -> None:
         """Act on an AMS packet, or on the fragment of one.
 
         Args:
             data: Header and what follows it.
-            door: Name of the door that it came by.
+            transport: Name of the door that it came by.
             connection: That it came by, or its sender's address; where that is of IP, the name
                 begins with ``ADDRESS:``, for the access rules.
             for_all: Whether others got it too: who is not meant says nothing.
         """
         self._act(
-            self._router.receive_packet(data, door, connection, monotonic_ns(), for_all=for_all)
+            self._router.receive_packet(
+                data, transport, connection, monotonic_ns(), for_all=for_all
+            )
         )
 
-    def connection_closed(self, door: str, connection: str) -> None:
+    def connection_closed(self, transport: str, connection: str) -> None:
         """Forget whom nobody can answer any more, and tell the services."""
-        way = Way(door, connection)
-        self._queues.forget(way)
-        self._services.client_gone(way)
-        self._act(self._router.connection_closed(door, connection, monotonic_ns()))
+        endpoint = Endpoint(transport, connection)
+        self._queues.forget(endpoint)
+        self._services.client_gone(endpoint)
+        self._act(self._router.connection_closed(transport, connection, monotonic_ns()))
 
-    def hop_down(self, door: str, address: str | None, text: str) -> None:
+    def hop_down(self, transport: str, address: str | None, text: str) -> None:
         """Answer what waits for a hop, and what will be for it, with 0x1B.
 
         Args:
-            door: By which it is reached.
+            transport: By which it is reached.
             address: None for all that are reached by the door.
             text: Why, for people.
         """
-        self._act(self._router.hop_down(door, address, text, monotonic_ns()))
+        self._act(self._router.hop_down(transport, address, text, monotonic_ns()))
 
-    def hop_up(self, door: str, address: str | None) -> None:
+    def hop_up(self, transport: str, address: str | None) -> None:
         """Pass requests on again; the arguments are those of :meth:`hop_down`."""
-        self._router.hop_up(door, address)
+        self._router.hop_up(transport, address)
         self._timer.set()
 
-    def send_notification(self, way: Way, packet: bytes) -> None:
+    def send_notification(self, endpoint: Endpoint, packet: bytes) -> None:
         """Send what a service has for a client of it, in fragments where they are needed."""
-        self._act(self._router.notify(way, packet))
+        self._act(self._router.notify(endpoint, packet))
 
     async def ask(
         self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
@@ -372,24 +379,24 @@ class StationRouter:
         """
         return await self._client.ask(target, target_port, command, body, timeout_s=timeout_s)
 
-    def waiting(self, way: Way) -> int:
-        """Return how many requests that came by *way* wait for their answers."""
-        return self._router.waiting(way)
+    def waiting(self, endpoint: Endpoint) -> int:
+        """Return how many requests that came by *endpoint* wait for their answers."""
+        return self._router.waiting(endpoint)
 
-    async def wait_below(self, door: str, connection: str, count: int) -> None:
+    async def wait_below(self, transport: str, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait for their answers.
 
         Only its reader calls this: by waiting here it takes no more than it can answer.
         """
-        way = Way(door, connection)
-        if self._router.waiting(way) < count:
+        endpoint = Endpoint(transport, connection)
+        if self._router.waiting(endpoint) < count:
             return
         event = asyncio.Event()
-        self._settling[way] = count, event
+        self._settling[endpoint] = count, event
         try:
             await event.wait()
         finally:
-            del self._settling[way]
+            del self._settling[endpoint]
 
     def _act(self, actions: list[Action]) -> None:
         if self._router.has_news:
@@ -402,8 +409,8 @@ class StationRouter:
                 self._forward(*action)
             else:
                 self._deliver(*action)
-        for way, (count, event) in self._settling.items():
-            if self._router.waiting(way) < count:
+        for endpoint, (count, event) in self._settling.items():
+            if self._router.waiting(endpoint) < count:
                 event.set()
         self._timer.set_soon()
 
@@ -411,28 +418,30 @@ class StationRouter:
         while (trace := self._router.next_event()) is not None:
             for tell in self.on_trace:
                 tell(trace)
-        while (entry := self._router.gate.next_entry()) is not None:
+        while (entry := self._router.access_filter.next_entry()) is not None:
             for write in self.on_audit:
                 write(entry)
 
-    def _reply(self, way: Way, packets: tuple[bytes, ...]) -> None:
-        self._carriers[way.door].send(way.connection, packets)
+    def _reply(self, endpoint: Endpoint, packets: tuple[bytes, ...]) -> None:
+        self._senders[endpoint.transport].send(endpoint.connection, packets)
 
-    def _forward(self, hop: Way, packets: tuple[bytes, ...], ticket: int) -> None:
-        text = self._carriers[hop.door].send(hop.connection, packets)
+    def _forward(self, hop: Endpoint, packets: tuple[bytes, ...], ticket: int) -> None:
+        text = self._senders[hop.transport].send(hop.connection, packets)
         if text is not None:
             self._act(self._router.send_failed(ticket, text, monotonic_ns()))
 
-    def _answer_now(self, header: AmsHeader, body: bytes, way: Way) -> tuple[AmsAnswer, int] | None:
+    def _answer_now(
+        self, header: AmsHeader, body: bytes, endpoint: Endpoint
+    ) -> tuple[AmsAnswer, int] | None:
         """Return what a service has at hand, unless its client waits there for something else."""
-        if self._queues.has_work(way, header):
+        if self._queues.has_work(endpoint, header):
             return None
         return self._services.answer_now(header, body)
 
-    def _deliver(self, ticket: int, header: AmsHeader, body: bytes, way: Way) -> None:
+    def _deliver(self, ticket: int, header: AmsHeader, body: bytes, endpoint: Endpoint) -> None:
         service = self._services.find(header)
         if service is not None:
-            self._queues.put(ticket, service, LocalRequest(header, body, way))
+            self._queues.put(ticket, service, LocalRequest(header, body, endpoint))
 
     def _finish(self, ticket: int, answer: AmsAnswer) -> None:
         self._act(self._router.receive_answer(ticket, answer, monotonic_ns()))

@@ -16,10 +16,10 @@ from typing import Protocol
 
 from msgspec.structs import replace
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.authorized_request import AuditEntry
-from eap.ams.endpoint import Way
 from eap.ams.routes import Origin, Route, RouteTable
-from eap.ams.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.errors import ControlError
 from eap.ids import STATION_OCTETS, NetId, prefix_text
@@ -61,7 +61,7 @@ class RoutedStation(Protocol):
     def add_route(self, route: Route) -> bool:
         """Take a route into the table; return whether it was taken."""
 
-    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+    def remove_route(self, net_id: NetId, hop: Endpoint) -> bool:
         """Forget a route; return whether there was one."""
 
 
@@ -85,7 +85,7 @@ class StationRoutes:
         spec: RoutingSpec,
         store: StationFile[tuple[RouteSpec, ...]],
         *,
-        open_hop: Callable[[HopSpec], Way] = to_way,
+        open_hop: Callable[[HopSpec], Endpoint] = to_way,
     ) -> None:
         self.router = router
         self.scanners: list[Scanner] = []
@@ -94,7 +94,7 @@ class StationRoutes:
         self._open_hop = open_hop
         self._added: dict[RouteSpec, bool] = {}
         """With whether it is kept over restarts."""
-        self._written: dict[tuple[NetId, Way], RouteSpec] = {}
+        self._written: dict[tuple[NetId, Endpoint], RouteSpec] = {}
         self._jobs = Jobs("routes")
 
     @property
@@ -162,7 +162,7 @@ class StationRoutes:
             known, octets = found
             if octets >= STATION_OCTETS and known.origin is not Origin.LEARNED:
                 return False
-        hop = to_way(HopSpec(DoorKind.AMS_TCP, "", f"{address}:{AMS_TCP_PORT}"))
+        hop = to_way(HopSpec(TransportKind.AMS_TCP, "", f"{address}:{AMS_TCP_PORT}"))
         route = Route(
             net_id,
             _plain(name) or address,
@@ -173,16 +173,16 @@ class StationRoutes:
         )
         return self.router.add_route(route)
 
-    async def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
+    async def remove(self, text: str, *, transport: str = "", address: str = "") -> RouteSpec:
         """Remove an added route by its name or NetID, and return it.
 
-        *door* and *address* choose where there are several.
+        *transport* and *address* choose where there are several.
 
         Raises:
             ControlError: there is none that can be removed, or too many changes wait already.
             EnvironmentalError: that cannot be kept.
         """
-        return await self._jobs.do(partial(self._remove, text, door, address))
+        return await self._jobs.do(partial(self._remove, text, transport, address))
 
     async def _add(self, spec: RouteSpec, replaces: str, *, is_kept: bool) -> Route:
         spec, old = self._checked(spec, replaces)
@@ -194,11 +194,11 @@ class StationRoutes:
         self.router.add_route(route)
         return route
 
-    async def _remove(self, text: str, door: str, address: str) -> RouteSpec:
+    async def _remove(self, text: str, transport: str, address: str) -> RouteSpec:
         found = [
             spec
             for spec in self._added
-            if text in _names(spec) and self._is_at(spec, door, address)
+            if text in _names(spec) and self._is_at(spec, transport, address)
         ]
         if not found:
             raise ControlError(self._why_not_removed(text))
@@ -277,11 +277,11 @@ class StationRoutes:
             if route.origin is Origin.STATIC and _takes(route, net_id, spec.octets):
                 raise ControlError(_hidden_by(route.name))
 
-    def _is_at(self, spec: RouteSpec, door: str, address: str) -> bool:
-        if not door and not address:
+    def _is_at(self, spec: RouteSpec, transport: str, address: str) -> bool:
+        if not transport and not address:
             return True
         hop = self._open_hop(spec.hop)
-        return door in {"", hop.door} and address in {"", hop.connection}
+        return transport in {"", hop.transport} and address in {"", hop.connection}
 
     def _why_not_removed(self, text: str) -> str:
         for route in self.router.table:

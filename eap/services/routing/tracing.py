@@ -13,9 +13,9 @@ from typing import NamedTuple, Protocol
 from msgspec.structs import replace
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, OperationOutcome, ReadState, ReadWrite
 from eap.ads.query import decode_outcome, encode_query
-from eap.ams.endpoint import Way
 from eap.ams.hop_report import (
     MAX_FURTHER,
     MAX_REPORT,
@@ -25,13 +25,13 @@ from eap.ams.hop_report import (
     report_of,
 )
 from eap.ams.report import Location
-from eap.ams.spec import DoorKind
+from eap.ams.spec import TransportKind
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.ams import SYSTEM_PORT, AmsHeader
 from eap.errors import CodecError
 from eap.ids import NetId
 
-HERE = Way(DoorKind.LOCAL, "trace")
+HERE = Endpoint(TransportKind.LOCAL, "trace")
 TARGET_PATIENCE_S = 5.0
 """For the target itself: a router gives up before."""
 SUSPECT_PATIENCE_S = 2.0
@@ -65,8 +65,8 @@ class TracedStation(Protocol):
     def net_id(self) -> NetId:
         """Its own."""
 
-    def locate(self, header: AmsHeader, way: Way) -> Location:
-        """Say where a request would go that came by *way*."""
+    def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
+        """Say where a request would go that came by *endpoint*."""
 
     async def ask(
         self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
@@ -122,18 +122,18 @@ async def ask_one(
 
 
 async def answer_question(
-    station: TracedStation, question: HopQuestion, way: Way, source: NetId
+    station: TracedStation, question: HopQuestion, endpoint: Endpoint, source: NetId
 ) -> HopReport:
     """Return what a router says of an address, or what the routers behind it do.
 
     Args:
         station: Whose router it is.
         question: What somebody wants to know.
-        way: That the question came by.
+        endpoint: That the question came by.
         source: NetID of who asks.
     """
     header = AmsHeader(question.target, question.port, source, 0, 0)
-    location = station.locate(header, way)
+    location = station.locate(header, endpoint)
     report = report_of(station.name, station.net_id, question.target, location, monotonic_ns())
     if not question.further or report.is_here or report.why or not report.next_net_id:
         return report
@@ -220,7 +220,7 @@ def _goes_on(hop: Hop) -> bool:
 def _explain(report: HopReport) -> str:
     """Return why the router behind *report* says nothing; empty if it only does not know how."""
     if report.error in _NO_ANSWER:
-        where = f"{report.address} by {report.door}"
+        where = f"{report.address} by {report.transport}"
         text = AdsError.words_of(report.error)
         return f"{_next_name(report)}: it does not answer {report.station} at {where}: {text}"
     if report.error == AdsError.ACCESS_DENIED:

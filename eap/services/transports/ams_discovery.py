@@ -31,7 +31,7 @@ from eap.ids import NetId
 from eap.release import RELEASE
 from eap.runtime.discards import Refusal
 from eap.services.routing.ams_requests import AmsQuestions
-from eap.services.routing.route_admin import RouteDesk
+from eap.services.routing.route_admin import RouteAdmin
 from eap.services.tasks import TaskSet
 
 _VERSION = encode_version(RELEASE)
@@ -65,14 +65,14 @@ class AmsDiscovery:
         self,
         sock: socket.socket,
         routers: Sequence[RouterName],
-        desk: RouteDesk,
+        desk: RouteAdmin,
         questions: AmsQuestions,
         refuse: Callable[[Refusal], None],
     ) -> None:
         self._sock = sock
         self._own = sock.getsockname()[0]
         self._routers = routers
-        self._desk = desk
+        self._route_admin = desk
         self._questions = questions
         self._refuse = refuse
         self._tasks = TaskSet("AMS discovery")
@@ -103,7 +103,7 @@ class AmsDiscovery:
                 yield _answer(router, service, number, [name, (Tag.VERSION, _VERSION)])
         elif service == DiscoveryService.ADD_ROUTE:
             is_this_host = sender == self._own or IPv4Address(sender).is_loopback
-            result = await self._desk.take(question, sender, is_this_host=is_this_host)
+            result = await self._route_admin.take(question, sender, is_this_host=is_this_host)
             if result is not None:
                 tag = Tag.RESULT, result.to_bytes(4, "little")
                 yield _answer(self._routers[0], service, number, [tag])

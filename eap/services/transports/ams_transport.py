@@ -14,7 +14,7 @@ from eap.net.tcp import set_stream_options
 from eap.runtime.discards import Refusal
 from eap.services.transports.accepting import Listeners, ListeningSocket, connection_name
 from eap.services.transports.ams_connection import AmsConnection, ClientAddresses
-from eap.services.transports.demultiplexer import Entrance
+from eap.services.transports.demultiplexer import Demultiplexer
 
 LIMITS = Limits()
 
@@ -49,7 +49,7 @@ class AmsClients:
         return "the connection was closed" if found is None else found.send(packets)
 
 
-class AmsDoor:
+class AmsTransport:
     """One listening socket and the stations behind it.
 
     A peer that has vanished without a word is found out by the kernel within a minute.
@@ -65,13 +65,13 @@ class AmsDoor:
     def __init__(
         self,
         listener: socket.socket,
-        entrance: Entrance,
+        demultiplexer: Demultiplexer,
         clients: AmsClients,
         refuse: Callable[[Refusal], None],
         listeners: Listeners,
     ) -> None:
         self.refuse = refuse
-        self._entrance = entrance
+        self._demultiplexer = demultiplexer
         self._clients = clients
         name = "ams-tcp {}:{}".format(*listener.getsockname())
         self._listening = ListeningSocket(listener, name, self, listeners, LIMITS)
@@ -113,11 +113,11 @@ class AmsDoor:
         """Let others have its place (PacketTaker)."""
         logger.debug("AMS/TCP connection %s: %s", connection.name, why)
         self._clients.remove(connection)
-        self._entrance.connection_closed(connection.name)
+        self._demultiplexer.connection_closed(connection.name)
 
     def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
         """Hand a request to the stations (PacketTaker)."""
-        self._entrance.receive(packet, connection.name)
+        self._demultiplexer.receive(packet, connection.name)
 
     def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
         """Count a response: nothing is asked by connections that others opened (PacketTaker)."""
@@ -125,4 +125,4 @@ class AmsDoor:
         self.refuse(Refusal.AMS_UNASKED)
 
     def _give_address(self, host: str) -> tuple[NetId, int]:
-        return self._clients.addresses.next(host, self._entrance.has)
+        return self._clients.addresses.next(host, self._demultiplexer.has)

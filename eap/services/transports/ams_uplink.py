@@ -14,16 +14,17 @@ from collections.abc import Callable, Collection, Iterable
 from time import monotonic_ns
 from typing import NamedTuple, Protocol
 
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Route
-from eap.ams.spec import DoorKind
+from eap.ams.spec import TransportKind
+from eap.ams.transport_table import Transport
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.ids import parse_host
 from eap.net.connections import OVERDUE_NS, CloseReason
 from eap.net.reconnecting import Pauses, ReconnectingLink, connect_tcp
 from eap.runtime.discards import Refusal
 from eap.services.routing.resolving import resolve
-from eap.services.routing.service import Carrier
+from eap.services.routing.service import TransportSender
 from eap.services.transports.ams_connection import AmsConnection
 
 CONNECT_S = 3.0
@@ -38,7 +39,7 @@ _STABLE_S = 10.0
 """A connection that lasted so long was a good one: the next is tried soon."""
 
 
-DOOR = f"{DoorKind.AMS_TCP}:"
+DOOR = f"{TransportKind.AMS_TCP}:"
 """Begin of the names of doors to peers; the address of the peer follows."""
 
 logger = logging.getLogger(__name__)
@@ -51,16 +52,16 @@ class Hops(Protocol):
     def name(self) -> str:
         """Name of the station."""
 
-    def receive(self, data: bytes, door: str, connection: str) -> None:
+    def receive(self, data: bytes, transport: str, connection: str) -> None:
         """Act on a packet; what has to be said goes to ``AmsUplink.send``."""
 
-    def connection_closed(self, door: str, connection: str) -> None:
+    def connection_closed(self, transport: str, connection: str) -> None:
         """Forget what the peer asked for."""
 
-    def hop_down(self, door: str, address: str | None, text: str) -> None:
+    def hop_down(self, transport: str, address: str | None, text: str) -> None:
         """Answer what waits for the peer, and what will be for it."""
 
-    def hop_up(self, door: str, address: str | None) -> None:
+    def hop_up(self, transport: str, address: str | None) -> None:
         """Pass requests on to it again."""
 
 
@@ -80,7 +81,7 @@ class AmsUplink(ReconnectingLink):
 
     Args:
         peer: Whom to connect to.
-        door: Its name at the router.
+        transport: Its name at the router.
         address: By which routes name the peer.
         router: Of the station.
         sources: The station's own IPv4 addresses.
@@ -93,7 +94,7 @@ class AmsUplink(ReconnectingLink):
     def __init__(
         self,
         peer: Peer,
-        door: str,
+        transport: str,
         address: str,
         router: Hops,
         *,
@@ -108,7 +109,7 @@ class AmsUplink(ReconnectingLink):
         self._may_be_client = may_be_client
         self._was_open = False
         self.refuse = refuse
-        self._way = door, address
+        self._endpoint = transport, address
         self._router = router
         self._sources = sources
         self._claims = claims
@@ -118,7 +119,7 @@ class AmsUplink(ReconnectingLink):
         self._early: list[bytes] | None = []
 
     def send(self, connection: str, packets: Iterable[bytes]) -> str | None:
-        """Send packets to the peer; return why not if that cannot be done (Carrier)."""
+        """Send packets to the peer; return why not if that cannot be done (TransportSender)."""
         del connection  # there is one
         if self._connection is not None:
             return self._connection.send(packets)
@@ -134,25 +135,25 @@ class AmsUplink(ReconnectingLink):
         self._connection = connection
         self._was_open = True
         early, self._early = self._early, None
-        self._router.hop_up(*self._way)
+        self._router.hop_up(*self._endpoint)
         if early:
             connection.send(early)
 
     def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
         """Hand a request of the peer on (PacketTaker)."""
         del connection
-        self._router.receive(packet, *self._way)
+        self._router.receive(packet, *self._endpoint)
 
     def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
         """Hand an answer of the peer on (PacketTaker)."""
         del connection
-        self._router.receive(packet, *self._way)
+        self._router.receive(packet, *self._endpoint)
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
         """Tell the router (PacketTaker)."""
         if self._connection is connection:
             self._connection = None
-            self._router.connection_closed(*self._way)
+            self._router.connection_closed(*self._endpoint)
             self._closed.set_result(why)
 
     def end(self) -> None:
@@ -165,7 +166,7 @@ class AmsUplink(ReconnectingLink):
         """Tell the router, and the log if the reason is another one."""
         del has_lasted
         self._early = None
-        self._router.hop_down(*self._way, reason)
+        self._router.hop_down(*self._endpoint, reason)
         if self._is_news(reason):
             if self._may_be_client() and not self._was_open:
                 text = "%s: %s; a client added the route to it, and does not listen"
@@ -254,16 +255,16 @@ class UplinkRouter(Hops, Protocol):
         on_routes: Called with the hop of each route that was added or removed.
     """
 
-    on_routes: list[Callable[[Way], None]]
+    on_routes: list[Callable[[Endpoint], None]]
 
     @property
     def table(self) -> Iterable[Route]:
         """All routes."""
 
-    def add_door(self, door: Door, carrier: Carrier) -> None:
-        """Let packets come and go by *door*."""
+    def add_transport(self, transport: Transport, sender: TransportSender) -> None:
+        """Let packets come and go by *transport*."""
 
-    def remove_door(self, name: str) -> None:
+    def remove_transport(self, name: str) -> None:
         """Forget a door."""
 
 
@@ -282,8 +283,8 @@ class AmsUplinks:
         self._router = router
         self._sources = sources
         self._refuse = refuse
-        self._uplinks: dict[Way, AmsUplink] = {}
-        self._tasks: dict[Way, asyncio.Task[None]] = {}
+        self._uplinks: dict[Endpoint, AmsUplink] = {}
+        self._tasks: dict[Endpoint, asyncio.Task[None]] = {}
         self._claims: dict[tuple[str, int], AmsUplink] = {}
         self._group: asyncio.TaskGroup | None = None
         for route in router.table:
@@ -293,13 +294,13 @@ class AmsUplinks:
     async def serve(self) -> None:
         """Keep the connections until cancelled."""
         async with asyncio.TaskGroup() as self._group:
-            for way in self._uplinks:
-                self._start(way)
+            for endpoint in self._uplinks:
+                self._start(endpoint)
             await asyncio.Event().wait()
 
-    def _follow(self, hop: Way) -> None:
+    def _follow(self, hop: Endpoint) -> None:
         """Open the connection to *hop*, or close it, as there are routes to it or none."""
-        if not hop.door.startswith(DOOR):
+        if not hop.transport.startswith(DOOR):
             return
         is_used = any(route.hop == hop for route in self._router.table)
         if is_used and hop not in self._uplinks:
@@ -307,7 +308,7 @@ class AmsUplinks:
         elif not is_used and hop in self._uplinks:
             self._close(hop)
 
-    def _open(self, hop: Way) -> None:
+    def _open(self, hop: Endpoint) -> None:
         try:
             peer = Peer(*parse_host(hop.connection, AMS_TCP_PORT))
         except ValueError as exc:
@@ -324,16 +325,16 @@ class AmsUplinks:
                 route.is_client for route in self._router.table if route.hop == hop
             ),
         )
-        self._router.add_door(Door(hop.door, is_stream=True, is_hub=True), uplink)
+        self._router.add_transport(Transport(hop.transport, is_stream=True, is_hub=True), uplink)
         self._start(hop)
 
-    def _close(self, hop: Way) -> None:
+    def _close(self, hop: Endpoint) -> None:
         if (task := self._tasks.pop(hop, None)) is not None:
             task.cancel()
         self._uplinks.pop(hop).end()
         self._router.hop_up(*hop)  # nothing is known of it any more
-        self._router.remove_door(hop.door)
+        self._router.remove_transport(hop.transport)
 
-    def _start(self, hop: Way) -> None:
+    def _start(self, hop: Endpoint) -> None:
         if self._group is not None:
             self._tasks[hop] = self._group.create_task(self._uplinks[hop].run())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from time import monotonic_ns
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import Reassembly
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError
@@ -13,7 +13,7 @@ from eap.ids import NetId
 from eap.services.routing.station_router import StationRouter
 
 
-class Entrance:
+class Demultiplexer:
     """One way in.
 
     A packet is for the station that has its target, or where somebody waits for it; a request for
@@ -30,25 +30,25 @@ class Entrance:
     def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
         """Act on a packet; the arguments are those of :meth:`StationRouter.receive`."""
         if len(self._behind) == 1 or for_all:
-            for station, door in self._behind:
-                station.receive(data, door, connection, for_all=for_all)
+            for station, transport in self._behind:
+                station.receive(data, transport, connection, for_all=for_all)
             return
         try:
             whole = self._whole(data, connection)
             if whole is None:
                 return
             header, body = decode_packet(whole)
-            station, door = self._find(header, bytes(body))
+            station, transport = self._find(header, bytes(body))
         except CodecError:
             whole = data
-            station, door = self._behind[0]  # which remembers that it came
-        station.receive(whole, door, connection)
+            station, transport = self._behind[0]  # which remembers that it came
+        station.receive(whole, transport, connection)
 
     def connection_closed(self, connection: str) -> None:
         """Tell the stations that a connection has ended."""
-        for station, door in self._behind:
-            self._fragments.forget(Way(door, connection))
-            station.connection_closed(door, connection)
+        for station, transport in self._behind:
+            self._fragments.forget(Endpoint(transport, connection))
+            station.connection_closed(transport, connection)
 
     def has(self, net_id: NetId) -> bool:
         """Say whether a NetID is of one of the stations."""
@@ -56,35 +56,41 @@ class Entrance:
 
     def hop_is_at(self, address: str, connection: str) -> None:
         """Tell the stations that what comes by *connection* comes from the hop *address*."""
-        for station, door in self._behind:
-            station.hop_is_at(door, address, connection)
+        for station, transport in self._behind:
+            station.hop_is_at(transport, address, connection)
 
     def hop_down(self, address: str, text: str) -> None:
         """Tell the stations that nothing can go to *address* by this door; *text* says why."""
-        for station, door in self._behind:
-            station.hop_down(door, address, text)
+        for station, transport in self._behind:
+            station.hop_down(transport, address, text)
 
     def hop_up(self, address: str) -> None:
         """Take back what :meth:`hop_down` said."""
-        for station, door in self._behind:
-            station.hop_up(door, address)
+        for station, transport in self._behind:
+            station.hop_up(transport, address)
 
     def is_wanted(self, address: str) -> bool:
         """Say whether a route of a station leads to *address* by this door."""
-        return any(station.is_wanted(Way(door, address)) for station, door in self._behind)
+        return any(
+            station.is_wanted(Endpoint(transport, address)) for station, transport in self._behind
+        )
 
     def is_awaited(self, address: str) -> bool:
         """Say whether a station waits for an answer from there."""
-        return any(station.is_awaited(Way(door, address)) for station, door in self._behind)
+        return any(
+            station.is_awaited(Endpoint(transport, address)) for station, transport in self._behind
+        )
 
     def waiting(self, connection: str) -> int:
         """Return how many requests of a connection wait for their answers."""
-        return sum(station.waiting(Way(door, connection)) for station, door in self._behind)
+        return sum(
+            station.waiting(Endpoint(transport, connection)) for station, transport in self._behind
+        )
 
     async def wait_below(self, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait at each station."""
-        for station, door in self._behind:
-            await station.wait_below(door, connection, count)
+        for station, transport in self._behind:
+            await station.wait_below(transport, connection, count)
 
     def _whole(self, data: bytes, connection: str) -> bytes | None:
         """Return the packet that *data* is or completes; None if more is to come.
@@ -97,20 +103,22 @@ class Entrance:
             return data
         if header.state_flags & StateFlags.RESPONSE:
             return None
-        station, door = self._behind[0]
-        way = Way(door, connection)
-        packet, acknowledgement = self._fragments.receive(way, header, bytes(body), monotonic_ns())
+        station, transport = self._behind[0]
+        endpoint = Endpoint(transport, connection)
+        packet, acknowledgement = self._fragments.receive(
+            endpoint, header, bytes(body), monotonic_ns()
+        )
         if acknowledgement is not None:
-            station.send_notification(way, acknowledgement)
+            station.send_notification(endpoint, acknowledgement)
         return packet
 
     def _find(self, header: AmsHeader, body: bytes) -> tuple[StationRouter, str]:
-        for station, door in self._behind:
-            if station.is_waiting_for(header, body, door):
-                return station, door
-        for station, door in self._behind:
+        for station, transport in self._behind:
+            if station.is_waiting_for(header, body, transport):
+                return station, transport
+        for station, transport in self._behind:
             if header.target in station.net_ids:
-                return station, door
+                return station, transport
         return max(self._behind, key=lambda each: _match(each[0], header))
 
 

@@ -88,7 +88,7 @@ class MailboxCounters:
         return encode_plain_frame(MailboxType.AOE, 0, counter, packet)
 
 
-class WayIn(Protocol):
+class Ingress(Protocol):
     """Where packets of a channel go."""
 
     def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
@@ -101,23 +101,23 @@ class MailboxIntake:
     Args:
         entrance: To these stations.
         gateway: For what is no AoE to a station; a frame for many is for no gateway.
-        carrier: Sends what the gateway answers.
+        sender: Sends what the gateway answers.
         is_for_many: Tells of a frame whether it was meant for many.
         is_aoe_here: Whether AoE is for the stations; otherwise that is for the gateway too.
     """
 
     def __init__(
         self,
-        entrance: WayIn,
+        demultiplexer: Ingress,
         gateway: FrameTaker,
-        carrier: ChannelCarrier,
+        sender: ChannelSender,
         is_for_many: Callable[[memoryview], bool],
         *,
         is_aoe_here: bool = True,
     ) -> None:
-        self._entrance = entrance
+        self._demultiplexer = demultiplexer
         self._gateway = gateway
-        self._carrier = carrier
+        self._sender = sender
         self._is_for_many = is_for_many
         self._is_aoe_here = is_aoe_here
 
@@ -130,13 +130,15 @@ class MailboxIntake:
         frame, is_for_many = data[:size], self._is_for_many(data)
         packet = aoe_packet(frame) if self._is_aoe_here else None
         if packet is not None:
-            self._entrance.receive(packet, sender, for_all=is_for_many)
+            self._demultiplexer.receive(packet, sender, for_all=is_for_many)
             return None
         if is_for_many:
             return refusal_of(frame)
-        return self._gateway.receive(bytes(frame), sender, self._carrier.send_frame)
+        return self._gateway.receive(bytes(frame), sender, self._sender.send_frame)
 
-    def judge(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
+    def admission(
+        self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin
+    ) -> Refusal | None:
         """Return why a frame is not taken that this intake gets too, without acting on it."""
         del at_ns, origin
         if aoe_packet(data[:size]) is not None:
@@ -146,7 +148,7 @@ class MailboxIntake:
         return None if is_taken and reason is Refusal.MAILBOX else reason
 
 
-class ChannelCarrier:
+class ChannelSender:
     """Sends packets in frames to addresses that *channel* reaches."""
 
     def __init__(self, channel: FrameChannel) -> None:

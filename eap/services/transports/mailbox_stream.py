@@ -23,7 +23,7 @@ from eap.runtime.discards import Refusal
 from eap.services.tasks import TaskSet
 from eap.services.transports.accepting import TaskConnection, connection_name
 from eap.services.transports.ams_connection import SubscriptionCounter
-from eap.services.transports.demultiplexer import Entrance
+from eap.services.transports.demultiplexer import Demultiplexer
 from eap.services.transports.mailbox_frames import FrameTaker, MailboxCounters, aoe_packet
 
 CONNECT_S = 3.0
@@ -224,18 +224,18 @@ class MailboxStreams:
 
     def __init__(
         self,
-        entrance: Entrance,
+        demultiplexer: Demultiplexer,
         gateway: FrameTaker,
         refuse: Callable[[Refusal], None],
         source: str = "",
         *,
         is_aoe_here: bool = True,
     ) -> None:
-        self._entrance = entrance
+        self._demultiplexer = demultiplexer
         self._gateway = gateway
         self._refuse = refuse
         self._is_aoe_here = is_aoe_here
-        self._uplinks = Uplinks(entrance, self._serve_uplink, source)
+        self._uplinks = Uplinks(demultiplexer, self._serve_uplink, source)
         self._counters = MailboxCounters()
         self._streams: dict[str, tuple[asyncio.StreamWriter, StreamConnection]] = {}
 
@@ -247,12 +247,12 @@ class MailboxStreams:
         reader, writer = await asyncio.open_connection(sock=sock)
         name = connection_name(sock)
         self._streams[name] = writer, connection
-        connection.waiting = lambda: self._entrance.waiting(name) + self._gateway.waiting(name)
+        connection.waiting = lambda: self._demultiplexer.waiting(name) + self._gateway.waiting(name)
         try:
             await self._take(reader, writer, name, connection)
             async with asyncio.timeout(SLOW_READER_S):
                 # Who has only closed its sending side still listens.
-                await self._entrance.wait_below(name, 1)
+                await self._demultiplexer.wait_below(name, 1)
                 await self._gateway.wait_below(name, 1)
                 writer.close()
                 await writer.wait_closed()
@@ -263,7 +263,7 @@ class MailboxStreams:
         finally:
             writer.transport.abort()
             del self._streams[name]
-            self._entrance.connection_closed(name)
+            self._demultiplexer.connection_closed(name)
             self._gateway.connection_closed(name)
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
@@ -297,7 +297,7 @@ class MailboxStreams:
         try:
             await self._take(reader, writer, name, StreamConnection(OWN_HOST))
         finally:
-            self._entrance.connection_closed(name)
+            self._demultiplexer.connection_closed(name)
 
     async def _take(
         self,
@@ -323,8 +323,8 @@ class MailboxStreams:
             packet = aoe_packet(frame) if self._is_aoe_here else None
             if packet is not None:
                 connection.subscriptions.take_request(packet)
-                self._entrance.receive(packet, name)
-                await self._entrance.wait_below(name, MAX_UNANSWERED)
+                self._demultiplexer.receive(packet, name)
+                await self._demultiplexer.wait_below(name, MAX_UNANSWERED)
             else:
                 refusal = self._gateway.receive(frame, name, self.send_frame)
                 if refusal is not None:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from time import monotonic_ns
 
-from eap.ams.endpoint import Door
 from eap.ams.mqtt.network import (
     Action,
     Arrived,
@@ -22,6 +21,7 @@ from eap.ams.mqtt.network import (
     Subscribe,
 )
 from eap.ams.spec import MqttSpec, RoutingSpec
+from eap.ams.transport_table import Transport
 from eap.net.mqtt import Handlers, MqttLink
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.services.routing.planned import mqtt_door
@@ -41,7 +41,7 @@ def open_mqtt_doors(
     routing: Mapping[str, RoutingSpec],
     routers: Mapping[str, StationRouter],
     counters: DiscardCounters,
-) -> list[MqttDoor]:
+) -> list[MqttTransport]:
     """Return the doors of all stations to brokers, to be served.
 
     Args:
@@ -53,7 +53,7 @@ def open_mqtt_doors(
         EnvironmentalError: there are some, and MQTT is not installed.
     """
     return [
-        MqttDoor(
+        MqttTransport(
             spec,
             routers[station],
             partial(counters.count, station),
@@ -64,7 +64,7 @@ def open_mqtt_doors(
     ]
 
 
-class MqttDoor:
+class MqttTransport:
     """One network of one station; packets for it are handed to the router as they come.
 
     Nobody who comes by it is this host, whatever NetID he says he has.
@@ -87,7 +87,7 @@ class MqttDoor:
         self._router = router
         self._refuse = refuse
         self._network = MqttNetwork(
-            spec, router.net_id, router.name, door=self.name, table=router.table, learns=learns
+            spec, router.net_id, router.name, transport=self.name, table=router.table, learns=learns
         )
         self._link = MqttLink(
             spec,
@@ -97,7 +97,7 @@ class MqttDoor:
         )
         self._timer: asyncio.TimerHandle | None = None
         self._due_ns: int | None = None
-        router.add_door(Door(self.name, is_shared=True, is_hub=True), self)
+        router.add_transport(Transport(self.name, is_shared=True, is_hub=True), self)
         router.hop_down(self.name, None, "there was no connection to its broker yet")
 
     async def serve(self) -> None:

@@ -18,8 +18,8 @@ from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
 from eap.errors import CodecError
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
 from eap.pd.link import FrameChannel
-from eap.services.transports.demultiplexer import Entrance
-from eap.services.transports.mailbox_frames import ChannelCarrier
+from eap.services.transports.demultiplexer import Demultiplexer
+from eap.services.transports.mailbox_frames import ChannelSender
 
 ASK_NS = 1_000_000_000
 """Between two questions for a NetID that nobody answered."""
@@ -41,20 +41,20 @@ class Segment:
         mac: Own address.
     """
 
-    def __init__(self, entrance: Entrance, mac: MacAddr) -> None:
+    def __init__(self, demultiplexer: Demultiplexer, mac: MacAddr) -> None:
         self.mac = str(mac)
-        self._entrance = entrance
+        self._demultiplexer = demultiplexer
         self._places: dict[NetId, _Place] = {}
 
     def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
-        """Act on a packet; the arguments are those of :meth:`Entrance.receive`."""
+        """Act on a packet; the arguments are those of :meth:`Demultiplexer.receive`."""
         self._learn(data, connection)
-        self._entrance.receive(data, connection, for_all=for_all)
+        self._demultiplexer.receive(data, connection, for_all=for_all)
 
     def find(self, net_id: NetId, now_ns: int, ask: Callable[[], object]) -> str:
         """Return the MAC address of a port, empty while it is not known; *ask* when it is time."""
-        if self._entrance.has(net_id):
-            self._entrance.hop_is_at(str(net_id), self.mac)
+        if self._demultiplexer.has(net_id):
+            self._demultiplexer.hop_is_at(str(net_id), self.mac)
             return self.mac
         place = self._places.get(net_id, _Place("", None))
         pause_ns = ASK_AGAIN_NS if place.mac else ASK_NS
@@ -73,12 +73,12 @@ class Segment:
         place = self._places.get(header.source)
         if place is None or header.target_port != PROBE_PORT or not _is_response(header):
             return
-        if place.mac != mac and self._entrance.has(header.target):
+        if place.mac != mac and self._demultiplexer.has(header.target):
             self._places[header.source] = place._replace(mac=mac)
-            self._entrance.hop_is_at(str(header.source), mac)
+            self._demultiplexer.hop_is_at(str(header.source), mac)
 
 
-class SegmentCarrier:
+class SegmentSender:
     """Sends packets of one station to MAC addresses, and to NetIDs of ports.
 
     Args:
@@ -89,7 +89,7 @@ class SegmentCarrier:
 
     def __init__(self, segment: Segment, channel: FrameChannel, net_id: NetId) -> None:
         self._segment = segment
-        self._carrier = ChannelCarrier(channel)
+        self._sender = ChannelSender(channel)
         self._net_id = net_id
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
@@ -101,7 +101,7 @@ class SegmentCarrier:
         if not mac:
             return "nobody has said yet which MAC address it has"
         if mac != self._segment.mac:
-            return self._carrier.send(mac, packets)
+            return self._sender.send(mac, packets)
         loop = asyncio.get_running_loop()
         for packet in packets:  # a packet socket does not get what its own host sends
             loop.call_soon(self._segment.receive, packet, mac)
@@ -111,7 +111,7 @@ class SegmentCarrier:
         question = AmsHeader(
             net_id, DEVICE_PORT, self._net_id, PROBE_PORT, AmsCommand.READ_STATE
         ).encode()
-        self._carrier.send(str(EAP_MULTICAST_MAC), (question,))
+        self._sender.send(str(EAP_MULTICAST_MAC), (question,))
 
 
 def _is_response(header: AmsHeader) -> bool:

@@ -27,7 +27,7 @@ _PEEK_PAUSE_S = 0.02
 logger = logging.getLogger(__name__)
 
 
-class TcpDoor:
+class TcpTransport:
     """One listening socket and the ports behind it.
 
     Connections of type 4 leave the account of this process when they go to the engine, which has

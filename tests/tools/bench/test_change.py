@@ -6,16 +6,16 @@ import pytest
 
 from tools.bench.change import Change, lateness_figures, swap_figures
 from tools.bench.change_roles import station
-from tools.bench.figures import Verdict
+from tools.bench.figures import Decision
 
 
 def test_swaps_are_held_against_the_target():
     changes = [Change(2_000_000, swap, 30_000, 10_000) for swap in (100_000, 200_000, 900_000)]
     swap, build = swap_figures(1000, changes, 0.3)
-    assert (swap.name, swap.value, swap.verdict) == ("1,000 PDs each way: swap", 0.2, Verdict.OK)
+    assert (swap.name, swap.value, swap.verdict) == ("1,000 PDs each way: swap", 0.2, Decision.OK)
     assert "max 0.90 ms; the cycle after it 30 us, others 10 us" in swap.measured
     assert build.measured == "2.0 ms"
-    assert swap_figures(1000, changes, 0.1)[0].verdict is Verdict.MISSED
+    assert swap_figures(1000, changes, 0.1)[0].verdict is Decision.MISSED
 
 
 def test_lateness_is_told_apart():

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tools.bench.cycle import SLAVES, figures
-from tools.bench.figures import Figure, Verdict
+from tools.bench.figures import Decision, Figure
 
 TIMES = {"p50": 20_000, "p99": 50_000, "max": 200_000}
 
@@ -27,7 +27,7 @@ def shown(**busy: int) -> dict[str, Figure]:
 def test_cycles_skipped_by_the_master_itself_are_told_from_others() -> None:
     found = shown(skipped=5, skipped_by_work=2)
     assert found["cycles skipped by mailbox work"].value == 2
-    assert found["cycles skipped by mailbox work"].verdict is Verdict.MISSED
+    assert found["cycles skipped by mailbox work"].verdict is Decision.MISSED
     others = "cycles skipped while others had the processor, with and without mailbox traffic"
     assert found[others].measured == "3 and 0"
 
@@ -38,7 +38,7 @@ def test_times_are_in_microseconds() -> None:
 
 def test_a_request_that_failed_is_told() -> None:
     found = shown()["requests that failed"]
-    assert (found.verdict, found.measured) == (Verdict.MISSED, "1  (no)")
+    assert (found.verdict, found.measured) == (Decision.MISSED, "1  (no)")
 
 
 def test_a_missing_slave_is_no_measurement() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tools.bench.figures import (
+    Decision,
     Figure,
-    Verdict,
     at_least,
     at_most,
     markdown_table,
@@ -21,14 +21,14 @@ from tools.bench.figures import (
 @pytest.mark.parametrize(
     ("figure", "verdict"),
     [
-        (at_least("a", 0.7, 0.7), Verdict.OK),
-        (at_least("a", 0.69, 0.7), Verdict.MISSED),
-        (at_most("a", 1.3, 1.3), Verdict.OK),
-        (at_most("a", 1.31, 1.3), Verdict.MISSED),
-        (skipped("a", "needs root"), Verdict.SKIPPED),
+        (at_least("a", 0.7, 0.7), Decision.OK),
+        (at_least("a", 0.69, 0.7), Decision.MISSED),
+        (at_most("a", 1.3, 1.3), Decision.OK),
+        (at_most("a", 1.31, 1.3), Decision.MISSED),
+        (skipped("a", "needs root"), Decision.SKIPPED),
     ],
 )
-def test_verdict_follows_the_target(figure: Figure, verdict: Verdict) -> None:
+def test_verdict_follows_the_target(figure: Figure, verdict: Decision) -> None:
     assert figure.verdict is verdict
 
 

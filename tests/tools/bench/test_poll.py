@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tools.bench.figures import Verdict
+from tools.bench.figures import Decision
 from tools.bench.poll import figures_of
 
 COLD = [9] * 20
@@ -17,7 +17,7 @@ def found(*trips: int) -> dict[str, object]:
 
 def test_the_first_answers_are_left_out() -> None:
     trip, response = figures_of(500, found(1, 1, 1, 2))
-    assert (trip.value, trip.verdict) == (1, Verdict.OK)
+    assert (trip.value, trip.verdict) == (1, Decision.OK)
     assert trip.measured == "1 cycles (p99 2, max 2, of 4 answers)"
     assert response.measured == "p50 535 µs, p99 639 µs, max 1200 µs"
 
@@ -25,14 +25,14 @@ def test_the_first_answers_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("phase_us", "trips", "verdict"),
     [
-        (500, (2, 2, 2), Verdict.MISSED),
-        (0, (2, 2, 2), Verdict.OK),
-        (750, (2, 2, 1), Verdict.OK),
-        (750, (3, 3, 3), Verdict.MISSED),
+        (500, (2, 2, 2), Decision.MISSED),
+        (0, (2, 2, 2), Decision.OK),
+        (750, (2, 2, 1), Decision.OK),
+        (750, (3, 3, 3), Decision.MISSED),
     ],
 )
 def test_an_answer_waits_for_two_cycles_at_most(
-    phase_us: int, trips: tuple[int, ...], verdict: Verdict
+    phase_us: int, trips: tuple[int, ...], verdict: Decision
 ) -> None:
     assert figures_of(phase_us, found(*trips))[0].verdict is verdict
 

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from eap.closeable import Closing
+from eap.closeable import Closeable
 
 
-class Door(Closing):
+class Transport(Closeable):
     def __init__(self) -> None:
         self.is_open = True
 
@@ -14,9 +14,9 @@ class Door(Closing):
 
 
 def test_it_is_closed_at_the_end_whatever_happens() -> None:
-    with Door() as door:
+    with Transport() as door:
         assert door.is_open
     assert not door.is_open
-    with pytest.raises(ValueError, match="oh"), Door() as door:
+    with pytest.raises(ValueError, match="oh"), Transport() as door:
         raise ValueError("oh")
     assert not door.is_open

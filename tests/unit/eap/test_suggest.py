@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.suggest import suggest, nearest
+from eap.suggest import nearest, suggest
 
 
 def test_near_names_are_offered() -> None:

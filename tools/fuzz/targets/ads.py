@@ -7,11 +7,11 @@ from itertools import cycle
 from struct import Struct
 
 from eap.ads.device import AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
 from eap.ads.request import MAX_ANSWER
 from eap.ads.symbol_table import SymbolTable, Variable
 from eap.ads.symbols import SymbolSpace
-from eap.ams.endpoint import Way
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name
 from eap.codec.adsnotification import decode_notification
@@ -21,7 +21,7 @@ from tools.fuzz.messages import cut
 
 _TYPES = {"flags": "WORD", "name": "STRING(20)", "curve": "REAL[4]", "depth": "INT24"}
 _HEAD = Struct("<5I")
-_CLIENT = Client(Way("door", "connection"), NetId(bytes(6)), 1)
+_CLIENT = Client(Endpoint("door", "connection"), NetId(bytes(6)), 1)
 _COMMANDS = tuple(AmsCommand)
 _GROUPS = tuple(IndexGroup)
 

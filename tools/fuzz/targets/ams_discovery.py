@@ -8,8 +8,8 @@ import socket
 from collections.abc import Callable, Collection
 from pathlib import Path
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.authorized_request import AuditEntry
-from eap.ams.endpoint import Way
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AmsUser, RouteSpec, RoutingSpec
 from eap.codec.amsdiscovery import (
@@ -24,7 +24,7 @@ from eap.ids import NetId
 from eap.runtime.discards import Refusal
 from eap.runtime.store import StationFile
 from eap.services.routing.ams_requests import AmsQuestions
-from eap.services.routing.route_admin import RouteDesk
+from eap.services.routing.route_admin import RouteAdmin
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
 
@@ -61,7 +61,7 @@ class _Router:
     def why_not_recorded(self, entry: AuditEntry) -> str:
         return ""
 
-    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+    def remove_route(self, net_id: NetId, hop: Endpoint) -> bool:
         return self.table.remove(net_id, hop)
 
 
@@ -88,7 +88,7 @@ async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     routes = StationRoutes(_Router(), RoutingSpec(users=users), _Store())
     refused: list[Refusal] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        desk = RouteDesk([routes])
+        desk = RouteAdmin([routes])
         questions = AmsQuestions(sock, [OWN])
         if questions.take(data, "127.0.0.1"):
             raise AssertionError("the answer to a question that was not asked")

@@ -38,7 +38,7 @@ from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.runtime.bus_request import SlaveDescription
 from eap.services.gateway.gateway import MailboxGateway, Settings
-from eap.services.gateway.gateway_transport import GatewayDoor
+from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.gateway.master_session import MasterSession
 from eap.services.slaves.bus_client import BusClient
 from eap.services.slaves.bus_view import BusDescription
@@ -194,11 +194,11 @@ async def _serve(data: bytes) -> None:
         AddressMap({_VIRTUAL: RemoteAddress(_SETTINGS.net_id, 1001)}),
         lambda slave: link,
     )
-    door = GatewayDoor([(gateway, "udp:eap0")])
+    transport = GatewayTransport([(gateway, "udp:eap0")])
     answered: list[bytes] = []
     for frame, client in zip(_frames(data), cycle("ab"), strict=False):
-        door.receive(frame, client, lambda to, octets: answered.append(octets))
-        await door.wait_below(client, 1)
+        transport.receive(frame, client, lambda to, octets: answered.append(octets))
+        await transport.wait_below(client, 1)
     for octets in answered:
         decode_frame(octets)
     await gateway.close()

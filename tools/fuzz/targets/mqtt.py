@@ -21,7 +21,7 @@ _TOPICS = (
 def fuzz_one(data: bytes) -> None:
     """Publish *data* everywhere; then cut, each piece where its first octet says."""
     spec = MqttSpec(network="hall", host="", no_retain=True)
-    network = MqttNetwork(spec, _OWN, "fuzz", door="mqtt:hall", table=RouteTable())
+    network = MqttNetwork(spec, _OWN, "fuzz", transport="mqtt:hall", table=RouteTable())
     network.connected(0)
     for topic in _TOPICS:
         _give(network, topic, data)

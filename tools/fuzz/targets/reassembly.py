@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import Reassembly
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet
 from eap.errors import CodecError
 from eap.ids import NetId
 from tools.fuzz.messages import cut
 
-_WAYS = tuple(Way("fuzz", str(number)) for number in range(3))
+_WAYS = tuple(Endpoint("fuzz", str(number)) for number in range(3))
 _HEAD = AmsHeader(NetId(b"target"), 1, NetId(b"source"), 2, AmsCommand.FRAGMENT)
 
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
 from eap.ams.action import Deliver, Forward, Reply
-from eap.ams.endpoint import Door, Way
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule, ObjectRange
+from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsHeader, decode_packet
 from eap.ids import NetId
 from tools.fuzz.messages import cut
 
 _OWN = NetId.parse("5.1.1.1.1.1")
 _FAR = NetId.parse("6.1.1.1.1.1")
-_CLIENTS = (Way("tcp", "1"), Way("segment", "2"))
-_LINK = Way("link", "6")
+_CLIENTS = (Endpoint("tcp", "1"), Endpoint("segment", "2"))
+_LINK = Endpoint("link", "6")
 _NET_IDS = (_OWN, _FAR, NetId.parse("6.1.1.1.9.9"), NetId.parse("9.9.9.9.9.9"))
 _OBJECTS = AccessRule("objects", objects=(ObjectRange(0, 0x7FFF),))
 _CLIENT_IDS = (NetId.parse("7.1.1.1.1.1"), NetId.parse("7.1.1.1.1.2"), _OWN, _FAR)
@@ -27,15 +28,19 @@ def fuzz_one(data: bytes) -> None:
     router = Router(
         _OWN,
         RouteTable([Route(_FAR, "far", _LINK)]),
-        [Door("tcp", is_stream=True), Door("segment", room=60), Door("link", room=200)],
+        [
+            Transport("tcp", is_stream=True),
+            Transport("segment", room=60),
+            Transport("link", room=200),
+        ],
         first_invoke_id=1,
-        access=AccessList([AccessRule("wide", doors=("tcp",)), _OBJECTS]),
+        access=AccessList([AccessRule("wide", transports=("tcp",)), _OBJECTS]),
     )
     router.add_device(_OWN, {1, 2, 3})
     _give(router, data, _CLIENTS[0])
     for message in cut(data):
-        for way in _CLIENTS:
-            _give(router, message, way)
+        for endpoint in _CLIENTS:
+            _give(router, message, endpoint)
         if message:
             _give(router, _addressed(message), _CLIENTS[message[0] >> 7])
     router.handle_timeout(1 << 40)
@@ -54,11 +59,11 @@ def _addressed(message: bytes) -> bytes:
     return header.encode() + body
 
 
-def _give(router: Router, data: bytes, way: Way) -> None:
-    for action in router.receive_packet(data, *way, 0):
+def _give(router: Router, data: bytes, endpoint: Endpoint) -> None:
+    for action in router.receive_packet(data, *endpoint, 0):
         if isinstance(action, Reply):
-            if action.way != way:
-                raise AssertionError(f"an answer for {action.way}, which asked nothing")
+            if action.endpoint != endpoint:
+                raise AssertionError(f"an answer for {action.endpoint}, which asked nothing")
         elif isinstance(action, Deliver):
             router.receive_answer(action.ticket, AmsAnswer(b"that"), 0)
         else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import refuse
@@ -10,7 +10,7 @@ from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestT
 from eap.gateway.rights import operation_of
 from tools.fuzz.messages import cut
 
-_WAYS = tuple(Way("door", str(number)) for number in range(5))
+_WAYS = tuple(Endpoint("door", str(number)) for number in range(5))
 _CAUSES = tuple(Cause)
 
 
@@ -30,16 +30,19 @@ def _keep_books(messages: list[bytes]) -> None:
     """Admit and answer requests of more clients than there is room for."""
     limits = ClientLimits(in_flight=2, rate=3, clients=3, in_flight_in_all=4)
     tracker = RequestTracker(limits)
-    waiting: list[tuple[Way, bytes]] = []
+    waiting: list[tuple[Endpoint, bytes]] = []
     for number, body in enumerate(messages):
-        way = _WAYS[len(body) % len(_WAYS)]
-        if tracker.admit(way, body, number) is RequestAdmission.TAKEN:
-            waiting.append((way, body))
+        endpoint = _WAYS[len(body) % len(_WAYS)]
+        if tracker.admit(endpoint, body, number) is RequestAdmission.TAKEN:
+            waiting.append((endpoint, body))
         if len(waiting) > limits.in_flight_in_all:
             raise AssertionError(f"{len(waiting)} requests wait")
         if number % 3 == 0 and waiting:
             tracker.answered(*waiting.pop(0))
-    for way, body in waiting:
-        tracker.answered(way, body)
-    if any(tracker.waiting(way) for way in _WAYS) or len(tracker.table()) > limits.clients:
+    for endpoint, body in waiting:
+        tracker.answered(endpoint, body)
+    if (
+        any(tracker.waiting(endpoint) for endpoint in _WAYS)
+        or len(tracker.table()) > limits.clients
+    ):
         raise AssertionError("clients or requests are left over")

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from eap.ads.answer import AmsAnswer
 from eap.ads.device import FIRST_CHANGE_NS, AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
 from eap.ads.operation import Read, Write
 from eap.ads.request import MAX_ANSWER
 from eap.ads.space import AdsSpace
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError, AdsState, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
 from eap.codec.ams import AmsCommand
@@ -20,7 +20,7 @@ from eap.ids import NetId
 from tests.support.adsdevice import DictStore, Station, info, variable_device
 
 G = IndexGroup
-CLIENT = Client(Way("tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
+CLIENT = Client(Endpoint("tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
 
 
 class Bench:

@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 from eap.ads import notifications as ads_notifications
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import FULL_PACKET, MAX_WATCHED, Client, Notice, NotificationTable
 from eap.ads.operation import AdsRefusedError
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
     AddNotification,
@@ -19,8 +19,8 @@ from eap.codec.ams import AmsHeader, decode_packet
 from eap.ids import NetId
 
 MS = 1_000_000
-ME = Client(Way("tcp", "1"), NetId(b"client"), 30000)
-YOU = ME._replace(way=Way("tcp", "2"))
+ME = Client(Endpoint("tcp", "1"), NetId(b"client"), 30000)
+YOU = ME._replace(endpoint=Endpoint("tcp", "2"))
 OTHER = ME._replace(port=30001)
 CYCLE = TransMode.SERVER_CYCLE
 CHANGE = TransMode.SERVER_ON_CHANGE
@@ -193,11 +193,11 @@ def test_connections_that_are_gone_are_forgotten(table) -> None:
     for client in (ME, ME, OTHER, YOU):
         table.add(client, asked(CYCLE, delay_ms=100), Value(), 0)
     assert cycle(table, 1) == []
-    table.forget(ME.way)
+    table.forget(ME.endpoint)
     assert tuple(table._clients) == (YOU,)
     assert [client for client, _ in cycle(table, 1000)] == [YOU]
-    table.forget(YOU.way)
-    table.forget(YOU.way)
+    table.forget(YOU.endpoint)
+    table.forget(YOU.endpoint)
     assert table.stats()[:2] == (0, 0)
     assert table.next_timeout() is None
 

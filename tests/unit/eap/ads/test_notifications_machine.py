@@ -70,10 +70,10 @@ class Watched(RuleBasedStateMachine):
             with pytest.raises(AdsRefusedError):
                 self.table.delete(ME, handle)
 
-    @rule(way=st.sampled_from([ME.way, YOU.way]))
-    def leave(self, way):
-        self.table.forget(way)
-        for handle in [h for h, (owner, *_) in self.alive.items() if owner.way == way]:
+    @rule(endpoint=st.sampled_from([ME.endpoint, YOU.endpoint]))
+    def leave(self, endpoint):
+        self.table.forget(endpoint)
+        for handle in [h for h, (owner, *_) in self.alive.items() if owner.endpoint == endpoint]:
             del self.alive[handle]
 
     @rule(handle=handles, octets=st.sampled_from([b"x", b"y", b"z", None]))

@@ -4,6 +4,7 @@ from ipaddress import IPv4Address
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import (
     DeleteNotification,
     Operation,
@@ -15,7 +16,6 @@ from eap.ads.operation import (
     WriteControl,
 )
 from eap.ams.access import AccessList, Grants, address_of, host_of, objects_of, service_of
-from eap.ams.endpoint import Way
 from eap.ams.spec import AccessRule, AccessTarget, ObjectRange
 from eap.ams.spec import AccessService as Service
 from eap.codec.ads import IndexGroup
@@ -29,11 +29,11 @@ READ = Read(G.SDO, 0x1018_0001, 4)
 WRITE = Write(G.SDO, 0x8000_0001, bytes(4))
 WHOLE = Write(G.SDO, 0x8000_0100, bytes(6))
 CONTROL = WriteControl(5, 0, b"")
-LAPTOP = Way("ams-tcp", "10.0.0.5:49152")
+LAPTOP = Endpoint("ams-tcp", "10.0.0.5:49152")
 
 
-def grants(*rules: AccessRule, way: Way = LAPTOP, source: NetId = ENGINEER) -> Grants:
-    return AccessList(rules).grants(way, source, *SLAVE)
+def grants(*rules: AccessRule, endpoint: Endpoint = LAPTOP, source: NetId = ENGINEER) -> Grants:
+    return AccessList(rules).grants(endpoint, source, *SLAVE)
 
 
 @pytest.mark.parametrize(
@@ -85,18 +85,18 @@ def test_objects_of_operations() -> None:
 
 
 def test_host_of_a_way() -> None:
-    assert host_of(Way("ams-tcp", "10.0.0.2:40000#7")) == "10.0.0.2"
-    assert host_of(Way("ethernet:eap0", "02:00:00:00:00:01")) == "02:00:00:00:00:01"
-    assert host_of(Way("mqtt:line", "5.1.1.1.1.1")) == "5.1.1.1.1.1"
-    assert not host_of(Way("local", "17"))
+    assert host_of(Endpoint("ams-tcp", "10.0.0.2:40000#7")) == "10.0.0.2"
+    assert host_of(Endpoint("ethernet:eap0", "02:00:00:00:00:01")) == "02:00:00:00:00:01"
+    assert host_of(Endpoint("mqtt:line", "5.1.1.1.1.1")) == "5.1.1.1.1.1"
+    assert not host_of(Endpoint("local", "17"))
 
 
 def test_without_rules_this_host_does_everything_and_others_read() -> None:
-    here = grants(way=Way("ams-tcp", "127.0.0.1:40000"))
-    assert all(here.judge(each).is_allowed for each in (READ, WRITE, CONTROL))
+    here = grants(endpoint=Endpoint("ams-tcp", "127.0.0.1:40000"))
+    assert all(here.admission(each).is_allowed for each in (READ, WRITE, CONTROL))
     others = grants()
-    assert others.judge(READ)[:3] == (Service.READ, True, "no rule refuses reading")
-    refused = others.judge(WRITE)
+    assert others.admission(READ)[:3] == (Service.READ, True, "no rule refuses reading")
+    refused = others.admission(WRITE)
     assert refused[:3] == (Service.WRITE, False, "no rule allows it, and other hosts only read")
     assert others.may_read
     assert others.may(Service.WRITE) is False
@@ -104,29 +104,29 @@ def test_without_rules_this_host_does_everything_and_others_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("way", "here"),
+    ("endpoint", "here"),
     [
-        (Way("local", ""), True),
-        (Way("ams-tcp", "127.0.1.1:40000"), True),
-        (Way("ams-tcp", "10.0.0.1:40000"), True),
-        (Way("ams-tcp:plc", "127.0.1.2:48898"), True),
-        (Way("udp:eap0", "127.0.1.2:34980"), True),
-        (Way("tcp:eap0", "10.0.0.1:34980"), True),
-        (Way("udp:eap0", "10.0.0.2:34980"), False),
-        (Way("ams-tcp", "10.0.0.2:40000"), False),
-        (Way("ethernet:eap0", "02:00:00:00:00:01"), False),
-        (Way("mqtt:line", "127.0.1.1.1.1"), False),
+        (Endpoint("local", ""), True),
+        (Endpoint("ams-tcp", "127.0.1.1:40000"), True),
+        (Endpoint("ams-tcp", "10.0.0.1:40000"), True),
+        (Endpoint("ams-tcp:plc", "127.0.1.2:48898"), True),
+        (Endpoint("udp:eap0", "127.0.1.2:34980"), True),
+        (Endpoint("tcp:eap0", "10.0.0.1:34980"), True),
+        (Endpoint("udp:eap0", "10.0.0.2:34980"), False),
+        (Endpoint("ams-tcp", "10.0.0.2:40000"), False),
+        (Endpoint("ethernet:eap0", "02:00:00:00:00:01"), False),
+        (Endpoint("mqtt:line", "127.0.1.1.1.1"), False),
     ],
 )
-def test_who_is_this_host(way: Way, *, here: bool) -> None:
+def test_who_is_this_host(endpoint: Endpoint, *, here: bool) -> None:
     access = AccessList(own=[IPv4Address("10.0.0.1")])
-    assert access.is_this_host(way) is here
+    assert access.is_this_host(endpoint) is here
 
 
 def test_address_of_a_way() -> None:
-    assert address_of(Way("udp:eap0", "10.0.0.2:34980")) == IPv4Address("10.0.0.2")
-    assert address_of(Way("tcp:eap0", "nobody")) is None
-    assert address_of(Way("mqtt:line", "10.0.0.2")) is None
+    assert address_of(Endpoint("udp:eap0", "10.0.0.2:34980")) == IPv4Address("10.0.0.2")
+    assert address_of(Endpoint("tcp:eap0", "nobody")) is None
+    assert address_of(Endpoint("mqtt:line", "10.0.0.2")) is None
 
 
 def test_first_rule_that_fits_counts() -> None:
@@ -134,10 +134,10 @@ def test_first_rule_that_fits_counts() -> None:
         AccessRule("not-the-axis", allow=False, objects=(ObjectRange(0x8000, 0x8000),)),
         AccessRule("engineering", services=(Service.WRITE,)),
     )
-    refused = both.judge(WRITE)
+    refused = both.admission(WRITE)
     assert refused[:4] == (Service.WRITE, False, "rule not-the-axis refuses it", True)
-    assert both.judge(Write(G.SDO, 0x8001_0001, b"")).why == "rule engineering allows it"
-    assert not both.judge(CONTROL).is_allowed
+    assert both.admission(Write(G.SDO, 0x8001_0001, b"")).why == "rule engineering allows it"
+    assert not both.admission(CONTROL).is_allowed
     assert both.may(Service.WRITE) is None
     assert both.may(Service.CONTROL) is False
 
@@ -149,28 +149,28 @@ def test_one_object_range_is_opened_for_one_network() -> None:
         services=(Service.WRITE,),
         objects=(ObjectRange(0x8000, 0x8FFF, 1, 1),),
     )
-    near, far = grants(rule), grants(rule, way=Way("ams-tcp", "10.0.1.5:1"))
-    assert near.judge(WRITE).is_allowed
-    assert not near.judge(Write(G.SDO, 0x9000_0001, b"")).is_allowed
-    assert not near.judge(WHOLE).is_allowed, "complete access writes more than the rule opens"
-    assert not near.judge(Write(G.DATA, 0, b"")).is_allowed
-    assert not far.judge(WRITE).is_allowed
+    near, far = grants(rule), grants(rule, endpoint=Endpoint("ams-tcp", "10.0.1.5:1"))
+    assert near.admission(WRITE).is_allowed
+    assert not near.admission(Write(G.SDO, 0x9000_0001, b"")).is_allowed
+    assert not near.admission(WHOLE).is_allowed, "complete access writes more than the rule opens"
+    assert not near.admission(Write(G.DATA, 0, b"")).is_allowed
+    assert not far.admission(WRITE).is_allowed
 
 
 def test_a_refusal_of_an_entry_refuses_complete_access_to_its_object() -> None:
     rule = AccessRule("secret", allow=False, objects=(ObjectRange(0x1018, 0x1018, 4, 4),))
     hidden = grants(rule)
-    assert hidden.judge(READ).is_allowed
-    assert not hidden.judge(Read(G.SDO, 0x1018_0004, 4)).is_allowed
-    assert not hidden.judge(Read(G.SDO, 0x1018_0100, 64)).is_allowed
+    assert hidden.admission(READ).is_allowed
+    assert not hidden.admission(Read(G.SDO, 0x1018_0004, 4)).is_allowed
+    assert not hidden.admission(Read(G.SDO, 0x1018_0100, 64)).is_allowed
     assert not hidden.may_read
 
 
 def test_rules_may_lock_this_host_out() -> None:
-    rule = AccessRule("nobody-here", allow=False, doors=("local", "ams-tcp"))
-    here = grants(rule, way=Way("ams-tcp", "127.0.0.1:1"))
-    assert not here.judge(READ).is_allowed
-    assert grants(rule, way=Way("udp:eap0", "127.0.1.1:1")).judge(WRITE).is_allowed
+    rule = AccessRule("nobody-here", allow=False, transports=("local", "ams-tcp"))
+    here = grants(rule, endpoint=Endpoint("ams-tcp", "127.0.0.1:1"))
+    assert not here.admission(READ).is_allowed
+    assert grants(rule, endpoint=Endpoint("udp:eap0", "127.0.1.1:1")).admission(WRITE).is_allowed
 
 
 @pytest.mark.parametrize(
@@ -179,8 +179,8 @@ def test_rules_may_lock_this_host_out() -> None:
         (AccessRule("r", net_ids=("192.168.0.9.1.1",)), True),
         (AccessRule("r", net_ids=("192.168.0.9",)), True),
         (AccessRule("r", net_ids=("192.168.0.8", "192.168.0.7")), False),
-        (AccessRule("r", doors=("mqtt:line",)), False),
-        (AccessRule("r", doors=("ams-tcp",)), True),
+        (AccessRule("r", transports=("mqtt:line",)), False),
+        (AccessRule("r", transports=("ams-tcp",)), True),
         (AccessRule("r", targets=(AccessTarget("5.1.1.1"),)), True),
         (AccessRule("r", targets=(AccessTarget("5.1.1.1.3.1", 1001),)), True),
         (AccessRule("r", targets=(AccessTarget("5.1.1.1.3.1", 1002),)), False),
@@ -189,12 +189,16 @@ def test_rules_may_lock_this_host_out() -> None:
     ],
 )
 def test_every_condition_of_a_rule_has_to_fit(rule: AccessRule, *, fits: bool) -> None:
-    assert grants(rule).judge(WRITE).is_allowed is fits
+    assert grants(rule).admission(WRITE).is_allowed is fits
 
 
 def test_a_network_is_no_matter_of_doors_without_addresses() -> None:
     rule = AccessRule("all", networks=("0.0.0.0/0",))
-    assert not grants(rule, way=Way("ethernet:eap0", "02:00:00:00:00:01")).judge(WRITE).is_allowed
+    assert (
+        not grants(rule, endpoint=Endpoint("ethernet:eap0", "02:00:00:00:00:01"))
+        .admission(WRITE)
+        .is_allowed
+    )
 
 
 def test_what_is_remembered_of_clients_is_bounded() -> None:
@@ -207,7 +211,7 @@ def test_what_is_remembered_of_clients_is_bounded() -> None:
 
 
 @pytest.mark.parametrize(
-    ("door", "connection", "fits"),
+    ("transport", "connection", "fits"),
     [
         ("ethernet:eap0", "02:00:00:00:00:0a", True),
         ("ethernet:eap0", "02:00:00:00:00:0b", False),
@@ -216,8 +220,14 @@ def test_what_is_remembered_of_clients_is_bounded() -> None:
         ("mqtt:line", "5.1.2.3.1.1", False),
     ],
 )
-def test_senders_on_ethernet_have_mac_addresses(door, connection, fits) -> None:
+def test_senders_on_ethernet_have_mac_addresses(transport, connection, fits) -> None:
     rule = AccessRule("x", networks=("10.0.0.5/32",), macs=("02-00-00-00-00-0A",))
-    assert grants(rule, way=Way(door, connection)).judge(WRITE).is_allowed is fits
+    assert (
+        grants(rule, endpoint=Endpoint(transport, connection)).admission(WRITE).is_allowed is fits
+    )
     only = AccessRule("x", networks=("0.0.0.0/0",))
-    assert not grants(only, way=Way("ethernet:eap0", "02:00:00:00:00:0a")).judge(WRITE).is_allowed
+    assert (
+        not grants(only, endpoint=Endpoint("ethernet:eap0", "02:00:00:00:00:0a"))
+        .admission(WRITE)
+        .is_allowed
+    )

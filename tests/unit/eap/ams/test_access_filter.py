@@ -4,6 +4,7 @@ import struct
 from collections.abc import Iterator
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write
 from eap.ads.part import encode_sum
 from eap.ads.request import AdsRequest
@@ -11,7 +12,6 @@ from eap.ams.access_filter import MAX_ENTRIES
 from eap.ams.action import Deliver, Forward, Outcome
 from eap.ams.admission import Limits
 from eap.ams.authorized_request import AuditEntry
-from eap.ams.endpoint import Way
 from eap.ams.spec import AccessRule, ObjectRange
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
@@ -20,7 +20,7 @@ from tests.support.aoerouter import CLIENT, DEVICE, FAR, FAR_DEVICE, LINK, Stati
 
 G = IndexGroup
 WRITE, WRITE_CONTROL = 3, 5
-LAPTOP = Way("tcp", "10.0.0.5:49152")
+LAPTOP = Endpoint("tcp", "10.0.0.5:49152")
 DRIVES = AccessRule("drives", networks=("10.0.0.0/24",), objects=(ObjectRange(0x8000, 0x8FFF),))
 SDO_WRITE = struct.pack("<3I", G.SDO, 0x8000_0001, 2) + b"\1\2"
 OTHER_WRITE = struct.pack("<3I", G.SDO, 0x9000_0001, 2) + b"\1\2"
@@ -45,7 +45,7 @@ def sum_body(group: int, operations: tuple[Operation, ...], offset: int | None =
 
 
 def entries(which: Station) -> Iterator[AuditEntry]:
-    return iter(which.router.gate.next_entry, None)
+    return iter(which.router.access_filter.next_entry, None)
 
 
 def results(entry: AuditEntry) -> list[int | None]:
@@ -84,7 +84,7 @@ class TestWhole:
         assert answer.body == bytes(4)
         refused, done = entries(here)
         assert (results(refused), results(done)) == ([0x706], [0])
-        assert done.operations[0].verdict.why == "rule drives allows it"
+        assert done.operations[0].decision.why == "rule drives allows it"
         assert here.replied(ask(WRITE, OTHER_WRITE), LAPTOP)[1].error == 0x723
 
     def test_what_cannot_be_read_is_answered_so(self) -> None:
@@ -191,14 +191,14 @@ class TestRequiredRecord:
 
     def test_change_goes_in_when_it_was_recorded(self) -> None:
         here, recorded = station(DRIVES), []
-        here.router.gate.before_change = lambda entry: recorded.append(entry) or ""
+        here.router.access_filter.before_change = lambda entry: recorded.append(entry) or ""
         assert isinstance(here.give(ask(WRITE, SDO_WRITE), LAPTOP)[0], Deliver)
         assert isinstance(here.give(ask(READ, SDO_WRITE[:12]), LAPTOP)[0], Deliver)
         assert [results(each) for each in recorded] == [[None]]
 
     def test_change_that_cannot_be_recorded_is_refused_here_and_at_hops(self) -> None:
         here = station(DRIVES)
-        here.router.gate.before_change = lambda _: "the audit cannot be written"
+        here.router.access_filter.before_change = lambda _: "the audit cannot be written"
         for target in (DEVICE, FAR_DEVICE):
             assert here.replied(ask(WRITE, SDO_WRITE, target), LAPTOP)[1].error == 0x723
         assert here.events()[0][1].endswith("write refused: the audit cannot be written")
@@ -206,7 +206,7 @@ class TestRequiredRecord:
 
     def test_sum_command_keeps_its_reads(self) -> None:
         here = station(DRIVES, AccessRule("all"))
-        here.router.gate.before_change = lambda _: "the audit cannot be written"
+        here.router.access_filter.before_change = lambda _: "the audit cannot be written"
         body = sum_body(G.SUM_READ_WRITE, (
             ReadWrite(G.SYMBOL_HANDLE, 0, 4, b"x"), ReadWrite(G.SDO, 0x8000_0001, 4, b"\1"),
         ))  # fmt: skip
@@ -215,7 +215,7 @@ class TestRequiredRecord:
 
     def test_request_that_cannot_be_read_cannot_be_recorded(self) -> None:
         here = station(AccessRule("anything"))
-        here.router.gate.before_change = lambda _: ""
+        here.router.access_filter.before_change = lambda _: ""
         assert here.replied(ask(77, b""), LAPTOP)[1].error == 8
 
 

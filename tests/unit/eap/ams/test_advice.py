@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.advice import advise
-from eap.ams.endpoint import Way
 from eap.ams.report import RouteReport, RouteState
 from eap.ams.traffic import Traffic
 from eap.codec.ads import AdsError
@@ -11,7 +11,7 @@ from eap.ids import NetId
 from tests.support.aoerouter import FAR, ROUTER, route
 
 TARGET, OWN = NetId.parse(FAR), NetId.parse(ROUTER)
-HOP = Way("udp:eap0", "10.0.0.6:34980")
+HOP = Endpoint("udp:eap0", "10.0.0.6:34980")
 UP = RouteReport(route(FAR, HOP, "island"), RouteState.UP, "", 1, Traffic(), "island")
 DOWN = UP._replace(state=RouteState.DOWN, why="it does not answer")
 

@@ -2,24 +2,24 @@ from __future__ import annotations
 
 import struct
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Read, Write
 from eap.ads.request import AdsRequest, parse_request
-from eap.ams.access import Verdict
-from eap.ams.authorized_request import AuditedOperation, Judged
-from eap.ams.endpoint import Way
+from eap.ams.access import Decision
+from eap.ams.authorized_request import AuditedOperation, AuthorizedRequest
 from eap.ams.spec import AccessService
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 
-WAY = Way("ams-tcp", "10.0.0.5:49152")
+WAY = Endpoint("ams-tcp", "10.0.0.5:49152")
 HEADER = AmsHeader(NetId(b"\1\1\1\1\1\1"), 851, NetId(b"\2\2\2\2\1\1"), 30000, 9, 4)
-READ = Verdict(AccessService.READ, True, "")
-WRITE = Verdict(AccessService.WRITE, True, "")
-DENIED = Verdict(AccessService.WRITE, False, "")
+READ = Decision(AccessService.READ, True, "")
+WRITE = Decision(AccessService.WRITE, True, "")
+DENIED = Decision(AccessService.WRITE, False, "")
 ITEMS = (Write(1, 2, b"a"), Write(3, 4, b"b"), Write(5, 6, b"c"))
 SUM = AdsRequest(AmsCommand.READ_WRITE, ITEMS, IndexGroup.SUM_WRITE, 12, 3)
-MIXED = Judged(WAY, HEADER, "", SUM, (WRITE, DENIED, WRITE))
+MIXED = AuthorizedRequest(WAY, HEADER, "", SUM, (WRITE, DENIED, WRITE))
 
 
 def test_part_of_a_sum() -> None:
@@ -45,7 +45,7 @@ def test_an_answer_that_cannot_be_read_is_left_as_it_is() -> None:
 
 def test_what_is_told() -> None:
     read, piece = Read(1, 2, 3), Write(IndexGroup.FOE_WRITE, 7, b"a")
-    files = Verdict(AccessService.FILES, True, "")
+    files = Decision(AccessService.FILES, True, "")
     assert not AuditedOperation(read, READ, 0).is_told
     assert AuditedOperation(read, READ._replace(is_allowed=False), 0x723).is_told
     assert AuditedOperation(ITEMS[0], WRITE, None).is_told

@@ -2,19 +2,19 @@ from __future__ import annotations
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Outcome
-from eap.ams.endpoint import Door, Way
-from eap.ams.error_reply import Refusal, Refuser, wants_answer
+from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
 from eap.ams.record import Record
 from eap.ams.routes import Route
-from eap.ams.transport_table import Outlet
+from eap.ams.transport_table import Transport, TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 from eap.ids import NetId
 from tests.support.ams import Ams
 from tests.support.aoerouter import only_reply
 
-WAY, HOP = Way("tcp", "1"), Way("link", "6")
+WAY, HOP = Endpoint("tcp", "1"), Endpoint("link", "6")
 ASKED = Ams("6.1.1.1.1.1:1", "7.1.1.1.1.1:2")
 HEADER = AmsHeader.decode(ASKED.octets())
 ROUTE = Route(NetId.parse("6.1.1.1.1.1"), "far", HOP)
@@ -23,8 +23,11 @@ WHY = Refusal(AdsError.HOST_UNREACHABLE, "the cable is cut", ROUTE)
 
 def test_refusal_is_answered_counted_and_traced() -> None:
     record = Record()
-    refuser = Refuser(Outlet([Door("tcp")]), record)
-    assert only_reply(refuser.refuse(HEADER, WAY, WHY, 9, 4)) == (WAY, ASKED.answer(b"", 0x1B))
+    error_replier = ErrorReplier(TransportTable([Transport("tcp")]), record)
+    assert only_reply(error_replier.refuse(HEADER, WAY, WHY, 9, 4)) == (
+        WAY,
+        ASKED.answer(b"", 0x1B),
+    )
     trace = record.next_event()
     assert trace is not None
     assert trace[:4] == (9, Outcome.FAILED, WAY, HOP)
@@ -35,8 +38,8 @@ def test_refusal_is_answered_counted_and_traced() -> None:
 
 
 def test_nobody_is_answered_when_nobody_waits() -> None:
-    refuser = Refuser(Outlet([Door("tcp")]), Record())
-    assert refuser.refuse(HEADER, None, WHY, 9) == []
+    error_replier = ErrorReplier(TransportTable([Transport("tcp")]), Record())
+    assert error_replier.refuse(HEADER, None, WHY, 9) == []
 
 
 @pytest.mark.parametrize(
@@ -54,9 +57,9 @@ def test_some_packets_have_no_answer(flags: int, command: int, *, wanted: bool) 
 
 def test_dropped_packets_are_traced() -> None:
     record = Record()
-    refuser = Refuser(Outlet([]), record)
-    assert refuser.drop(WAY, None, Outcome.DROPPED, "broken", 3) == []
-    assert refuser.drop(WAY, HEADER, Outcome.LOOP, "again", 3) == []
+    error_replier = ErrorReplier(TransportTable([]), record)
+    assert error_replier.drop(WAY, None, Outcome.DROPPED, "broken", 3) == []
+    assert error_replier.drop(WAY, HEADER, Outcome.LOOP, "again", 3) == []
     assert [each.text for each in iter(record.next_event, None)] == [
         "1 by tcp: broken", f"READ of {ASKED.target} for {ASKED.source} ({WAY}): again"
     ]  # fmt: skip

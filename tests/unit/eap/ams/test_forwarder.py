@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Forward, Outcome
 from eap.ams.admission import Limits
-from eap.ams.endpoint import Way
 from eap.ams.invoke import is_marked
 from eap.ams.routes import Route
 from eap.codec.ams import StateFlags
@@ -26,7 +26,7 @@ from tests.support.aoerouter import (
 )
 
 SECOND = 1_000_000_000
-ONE, TWO = (Way("tcp", f"10.0.0.9:{port}") for port in (4711, 4712))
+ONE, TWO = (Endpoint("tcp", f"10.0.0.9:{port}") for port in (4711, 4712))
 ASKED = Ams(FAR_DEVICE, CLIENT, invoke_id=1, body=b"which")
 
 
@@ -41,7 +41,7 @@ def test_request_goes_on_with_another_id_and_its_answer_comes_back_with_the_firs
 
 def test_equal_requests_of_one_address_on_two_connections_are_kept_apart() -> None:
     station = Station([route(FAR, LINK)])
-    first, second = (station.forwarded(ASKED, way) for way in (ONE, TWO))
+    first, second = (station.forwarded(ASKED, endpoint) for endpoint in (ONE, TWO))
     assert first.invoke_id != second.invoke_id
     assert station.replied(second.answer(b"2"), LINK) == (TWO, ASKED.answer(b"2"))
     assert station.replied(first.answer(b"1"), LINK) == (ONE, ASKED.answer(b"1"))
@@ -60,7 +60,7 @@ def test_error_from_behind_the_hop_is_passed_back_and_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "way"),
+    ("change", "endpoint"),
     [
         ({"invoke_id": 5}, LINK),
         ({"command": 3}, LINK),
@@ -69,10 +69,10 @@ def test_error_from_behind_the_hop_is_passed_back_and_named() -> None:
         ({}, ONE),
     ],
 )
-def test_answers_that_nobody_asked_for_are_dropped(change: dict, way: Way) -> None:
+def test_answers_that_nobody_asked_for_are_dropped(change: dict, endpoint: Endpoint) -> None:
     station = Station([route(FAR, LINK)])
     answer = station.forwarded(ASKED, ONE).answer()
-    assert station.give(answer._replace(**change), way) == []
+    assert station.give(answer._replace(**change), endpoint) == []
     (event,) = station.events()
     assert event[0] is Outcome.LATE
     assert "nobody waits for" in event[1]
@@ -89,9 +89,9 @@ def test_answer_for_a_service_by_a_packet_is_nobodys() -> None:
 
 
 def test_all_answers_of_a_broker_come_by_one_connection() -> None:
-    station = Station([route(FAR, Way("broker", FAR))])
+    station = Station([route(FAR, Endpoint("broker", FAR))])
     onward = station.forwarded(ASKED, ONE)
-    assert station.replied(onward.answer(), Way("broker", "it")) == (ONE, ASKED.answer())
+    assert station.replied(onward.answer(), Endpoint("broker", "it")) == (ONE, ASKED.answer())
 
 
 def test_time_out_is_answered_before_the_client_gives_up_and_names_the_hop() -> None:
@@ -172,7 +172,7 @@ def test_what_a_door_cannot_send_is_answered() -> None:
 
 def test_closed_connection_gets_nothing_and_leaves_others_alone() -> None:
     station = Station([route(FAR, LINK)])
-    gone, stays = (station.forwarded(ASKED, way) for way in (ONE, TWO))
+    gone, stays = (station.forwarded(ASKED, endpoint) for endpoint in (ONE, TWO))
     ticket = station.delivered(ASKED._replace(target=DEVICE), ONE).ticket
     assert station.router.connection_closed(*ONE, 1) == []
     assert station.router.receive_answer(ticket, AmsAnswer(), 1) == []
@@ -217,11 +217,11 @@ def test_unidirectional_route_lets_nobody_ask_from_there() -> None:
 
 
 def test_nothing_goes_back_to_where_it_came_from() -> None:
-    segment = Way("segment", "02:00:00:00:00:06")
+    segment = Endpoint("segment", "02:00:00:00:00:06")
     station = Station([route(FAR, segment), route("7.1.1.1.1.1", LINK)])
-    for asked, way in ((ASKED, Way("segment", "02:00:00:00:00:07")),
+    for asked, endpoint in ((ASKED, Endpoint("segment", "02:00:00:00:00:07")),
                        (ASKED._replace(target="7.1.1.1.1.1:1"), LINK)):  # fmt: skip
-        assert station.replied(asked, way) == (way, asked.answer(b"", 7))
+        assert station.replied(asked, endpoint) == (endpoint, asked.answer(b"", 7))
         (event,) = station.events()
         assert event[0] is Outcome.LOOP
         assert "leads back to where it came from" in event[1]
@@ -232,9 +232,9 @@ def test_circle_of_stations_is_found_in_one_round() -> None:
     first = Station([route(FAR, LINK)], first_id=1)
     second = Station([route(FAR, SECOND_LINK)], first_id=1)
     once = first.forwarded(ASKED, ONE)
-    twice = second.forwarded(once, Way("tcp", "first"))
+    twice = second.forwarded(once, Endpoint("tcp", "first"))
     assert twice == once
-    back = Way("tcp", "second")
+    back = Endpoint("tcp", "second")
     assert first.replied(twice, back) == (back, twice.answer(b"", 7))
     (event,) = first.events()
     assert event[0] is Outcome.LOOP
@@ -274,7 +274,7 @@ def test_packet_without_answer_is_passed_once() -> None:
 
 def test_request_asked_again_is_passed_once_where_packets_may_be_doubled() -> None:
     station = Station([route(FAR, LINK)])
-    there = Way("segment", "02:00:00:00:00:09")
+    there = Endpoint("segment", "02:00:00:00:00:09")
     onward = station.forwarded(ASKED, there)
     assert station.give(ASKED, there) == []
     assert station.events()[0][0] is Outcome.DROPPED
@@ -305,32 +305,32 @@ def test_requests_that_wait_are_limited() -> None:
 
 
 def test_flood_by_one_door_leaves_room_for_the_others() -> None:
-    station = Station([route(FAR, LINK)], limits=Limits(per_door=2))
+    station = Station([route(FAR, LINK)], limits=Limits(per_transport=2))
     for number in range(2):
-        station.forwarded(ASKED, Way("segment", str(number)))
-    there = Way("segment", "2")
+        station.forwarded(ASKED, Endpoint("segment", str(number)))
+    there = Endpoint("segment", "2")
     assert station.replied(ASKED, there) == (there, ASKED.answer(b"", 4))
     assert "2 requests by segment wait already, 0 of this" in station.events()[0][1]
     assert station.forwarded(ASKED, ONE)
 
 
 def test_flood_by_some_connections_of_a_door_leaves_room_for_another_one() -> None:
-    station = Station([route(FAR, LINK)], limits=Limits(per_door=16))
+    station = Station([route(FAR, LINK)], limits=Limits(per_transport=16))
     for port in range(4):
-        way = Way("tcp", f"10.0.0.5:{port}")
-        while isinstance(station.give(ASKED, way)[0], Forward):
+        endpoint = Endpoint("tcp", f"10.0.0.5:{port}")
+        while isinstance(station.give(ASKED, endpoint)[0], Forward):
             pass
     assert station.forwarded(ASKED, ONE)
 
 
 def test_route_by_a_door_that_is_not_there_is_answered() -> None:
-    station = Station([route(FAR, Way("nowhere", "1"), "island")])
+    station = Station([route(FAR, Endpoint("nowhere", "1"), "island")])
     assert station.replied(ASKED, ONE) == (ONE, ASKED.answer(b"", 0x1B))
     assert "route island is by nowhere" in station.events()[0][1]
 
 
 def test_long_request_goes_on_in_fragments() -> None:
-    station = Station([route(FAR, Way("narrow", "1"))])
+    station = Station([route(FAR, Endpoint("narrow", "1"))])
     (action,) = station.give(ASKED._replace(body=bytes(100)), ONE)
     assert isinstance(action, Forward)
     assert len(action.packets) == 5

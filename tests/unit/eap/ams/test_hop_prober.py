@@ -1,8 +1,8 @@
 from __future__ import annotations
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Forward, Outcome
-from eap.ams.endpoint import Way
-from eap.ams.hop_prober import PROBE_PORT, Prober
+from eap.ams.hop_prober import PROBE_PORT, HopProber
 from eap.ams.routes import RouteTable
 from eap.codec.ams import SYSTEM_PORT, AmsCommand
 from eap.ids import NetId
@@ -19,7 +19,7 @@ from tests.support.aoerouter import (
 )
 
 SECOND = 1_000_000_000
-TCP = Way("tcp", "1")
+TCP = Endpoint("tcp", "1")
 ASKED = Ams(FAR_DEVICE, CLIENT)
 
 
@@ -27,7 +27,7 @@ def probing(*routes, **more) -> Station:
     return Station(routes or (route(FAR, LINK, "island"),), is_probing=True, **more)
 
 
-def tick(station: Station, now_ns: int) -> tuple[list[Ams], list[tuple[Way, Ams]]]:
+def tick(station: Station, now_ns: int) -> tuple[list[Ams], list[tuple[Endpoint, Ams]]]:
     """Let time pass; return the probes that go out, and what is answered."""
     station.now_ns = now_ns
     probes, replies = [], []
@@ -37,14 +37,14 @@ def tick(station: Station, now_ns: int) -> tuple[list[Ams], list[tuple[Way, Ams]
             assert action.ticket == 0
             probes.append(packet)
         else:
-            replies.append((action.way, packet))
+            replies.append((action.endpoint, packet))
     return probes, replies
 
 
 def test_router_of_each_hop_is_asked_for_its_state() -> None:
     station = probing(route(FAR, LINK), route("6.1.1.1.7.1", LINK),
                       route("7.1.1.1.1.1", SECOND_LINK), route("8.1.1.1.1.1", TCP, is_probed=False),
-                      route("0.0.0.0.0.0", Way("tcp", "9"), octets=0))  # fmt: skip
+                      route("0.0.0.0.0.0", Endpoint("tcp", "9"), octets=0))  # fmt: skip
     assert station.router.next_timeout() == 0
     probes, _ = tick(station, 5)
     assert [each.target for each in probes] == [
@@ -118,11 +118,11 @@ def test_answer_from_elsewhere_is_no_sign_of_life() -> None:
 
 
 def test_answer_by_a_broker_names_no_hop_but_the_question_does() -> None:
-    station = probing(route(FAR, Way("broker", FAR)))
+    station = probing(route(FAR, Endpoint("broker", FAR)))
     ((probe,), _) = tick(station, 0)
     for now_ns in (SECOND, 2 * SECOND):
         tick(station, now_ns)
-    station.give(probe.answer(), Way("broker", "it"))
+    station.give(probe.answer(), Endpoint("broker", "it"))
     assert station.forwarded(ASKED, TCP)
 
 
@@ -156,7 +156,7 @@ def test_hops_come_and_go_with_the_routes() -> None:
 
 
 def test_hop_by_a_door_that_is_not_there_is_not_asked() -> None:
-    station = probing(route(FAR, Way("nowhere", "1")))
+    station = probing(route(FAR, Endpoint("nowhere", "1")))
     assert tick(station, 0) == ([], [])
 
 
@@ -192,11 +192,11 @@ def test_a_default_route_is_asked_only_if_its_router_is_known() -> None:
 
 
 def test_many_hops_are_asked_less_often() -> None:
-    table = RouteTable(route(f"6.1.{n // 200}.{n % 200}.1.1", Way("link", str(n)))
+    table = RouteTable(route(f"6.1.{n // 200}.{n % 200}.1.1", Endpoint("link", str(n)))
                        for n in range(500))  # fmt: skip
-    prober = Prober(NetId.parse(ROUTER), table)
-    assert len(list(prober.probes_due(0))) == 500
-    assert list(prober.probes_due(4 * SECOND)) == []
-    assert prober.next_timeout() == 5 * SECOND
-    assert not prober.is_dead(Way("link", "0"))
-    assert not prober.is_dead(Way("link", "none"))
+    hop_prober = HopProber(NetId.parse(ROUTER), table)
+    assert len(list(hop_prober.probes_due(0))) == 500
+    assert list(hop_prober.probes_due(4 * SECOND)) == []
+    assert hop_prober.next_timeout() == 5 * SECOND
+    assert not hop_prober.is_dead(Endpoint("link", "0"))
+    assert not hop_prober.is_dead(Endpoint("link", "none"))

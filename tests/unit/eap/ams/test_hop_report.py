@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.hop_report import (
     MAX_REPORT,
     HopQuestion,
@@ -18,13 +18,13 @@ from eap.errors import CodecError
 from eap.ids import NetId
 from tests.support.aoerouter import FAR, LINK, ROUTER, Station, route
 
-LAPTOP = Way("tcp", "10.0.0.5:49152")
+LAPTOP = Endpoint("tcp", "10.0.0.5:49152")
 SOURCE = NetId.parse("192.168.0.9.1.1")
 
 
-def ask(station: Station, net_id: str, port: int, way: Way = LAPTOP) -> HopReport:
+def ask(station: Station, net_id: str, port: int, endpoint: Endpoint = LAPTOP) -> HopReport:
     target = NetId.parse(net_id)
-    location = station.router.locate(AmsHeader(target, port, SOURCE, 1, 4), way)
+    location = station.router.locate(AmsHeader(target, port, SOURCE, 1, 4), endpoint)
     return report_of("island", NetId.parse(ROUTER), target, location, station.now_ns)
 
 
@@ -48,7 +48,7 @@ def test_what_is_behind_a_route() -> None:
     far = route("10.6.6.6.1.1", LINK, "far", router=near, real=NetId.parse(FAR))
     onward = ask(Station([far], rules=(objects,)), "10.6.6.6.3.1", 1001)
     assert (onward.is_here, onward.route, onward.next_net_id) == (False, "far", str(near))
-    assert (onward.door, onward.address, onward.state, onward.why) == (*LINK, "unknown", "")
+    assert (onward.transport, onward.address, onward.state, onward.why) == (*LINK, "unknown", "")
     assert onward.target == "6.1.1.1.3.1"
     assert onward.may[Service.WRITE] is None
 

@@ -1,21 +1,21 @@
 from __future__ import annotations
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.inflight import InFlight, Pending
 from eap.ams.routes import Route
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 
-ONE, TWO, LINK = Way("tcp", "1"), Way("tcp", "2"), Way("link", "6")
+ONE, TWO, LINK = Endpoint("tcp", "1"), Endpoint("tcp", "2"), Endpoint("link", "6")
 ROUTE = Route(NetId(b"target"), "far", LINK)
 
 
 def pending(
-    invoke_id: int, way: Way | None = ONE, at_ns: int = 0, allowed_ns: int = 10,
+    invoke_id: int, endpoint: Endpoint | None = ONE, at_ns: int = 0, allowed_ns: int = 10,
     route: Route | None = ROUTE,
 ) -> Pending:  # fmt: skip
     header = AmsHeader(NetId(b"target"), 1, NetId(b"source"), 2, 2, invoke_id=7)
-    return Pending(invoke_id, header, way, route, b"addresses", at_ns, at_ns + allowed_ns)
+    return Pending(invoke_id, header, endpoint, route, b"addresses", at_ns, at_ns + allowed_ns)
 
 
 def filled(*items: Pending) -> InFlight:
@@ -31,7 +31,7 @@ def test_request_is_found_until_it_is_taken_out() -> None:
     assert waiting.get(1) is first
     assert 1 in waiting
     assert (len(waiting), waiting.count(ONE)) == (2, 1)
-    assert [waiting.count_of_door(door) for door in ("tcp", "link")] == [2, 0]
+    assert [waiting.count_of_door(transport) for transport in ("tcp", "link")] == [2, 0]
     assert waiting.is_asked(ONE, b"addresses", 7)
     assert waiting.pop(1) is first
     assert waiting.pop(1) is None
@@ -81,7 +81,7 @@ def test_request_of_nobody_makes_room_too() -> None:
 
 
 def test_requests_of_a_hop_are_found() -> None:
-    other = Route(NetId(b"target"), "other", Way("link", "7"))
+    other = Route(NetId(b"target"), "other", Endpoint("link", "7"))
     waiting = filled(pending(1), pending(2, route=other), pending(3, route=None))
     assert [each.invoke_id for each in waiting.on("link", "6")] == [1]
     assert [each.invoke_id for each in waiting.on("link", None)] == [1, 2]

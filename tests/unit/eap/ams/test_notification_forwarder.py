@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import struct
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Forward
-from eap.ams.endpoint import Way
 from eap.ams.invoke import InvokeIds
 from eap.ams.routes import Route
 from eap.ams.subscriptions import MAX_PER_CLIENT
@@ -30,8 +30,8 @@ from tests.support.aoerouter import (
 from tests.unit.eap.ams.test_subscriptions import stream
 
 SECOND = 1_000_000_000
-ONE, TWO = Way("tcp", "1"), Way("tcp", "2")
-LOCAL, ALSO_LOCAL = Way("local", "1"), Way("local", "2")
+ONE, TWO = Endpoint("tcp", "1"), Endpoint("tcp", "2")
+LOCAL, ALSO_LOCAL = Endpoint("local", "1"), Endpoint("local", "2")
 ADD = Ams(FAR_DEVICE, CLIENT, ADD_NOTIFICATION, body=bytes(40))
 NOTICE = Ams(CLIENT, FAR_DEVICE, NOTIFICATION)
 
@@ -40,55 +40,55 @@ def granted(handle: int, result: int = 0) -> bytes:
     return result.to_bytes(4, "little") + handle.to_bytes(4, "little")
 
 
-def subscribed(*ways: Way, routes: tuple[Route, ...] = (route(FAR, LINK),)) -> Station:
+def subscribed(*endpoints: Endpoint, routes: tuple[Route, ...] = (route(FAR, LINK),)) -> Station:
     """Return a station by which each way has one notification; the handles count from 1."""
     station = Station(routes)
     asked = ADD._replace(target=f"{routes[0].net_id}:851")
-    for handle, way in enumerate(ways, 1):
-        onward = station.forwarded(asked, way)
-        assert station.replied(onward.answer(granted(handle)), LINK)[0] == way
+    for handle, endpoint in enumerate(endpoints, 1):
+        onward = station.forwarded(asked, endpoint)
+        assert station.replied(onward.answer(granted(handle)), LINK)[0] == endpoint
     return station
 
 
 def test_notification_goes_to_who_asked_for_it_with_one_address_for_both() -> None:
     station = subscribed(ONE, TWO)
-    for handle, way in ((1, ONE), (2, TWO)):
+    for handle, endpoint in ((1, ONE), (2, TWO)):
         notice = NOTICE._replace(body=stream((5, {handle: b"data"})))
-        assert station.replied(notice, LINK) == (way, notice)
+        assert station.replied(notice, LINK) == (endpoint, notice)
     both = NOTICE._replace(body=stream((5, {1: b"a", 2: b"b"})))
-    parts = {each.way: parse(*each.packets).body for each in station.give(both, LINK)}
+    parts = {each.endpoint: parse(*each.packets).body for each in station.give(both, LINK)}
     assert parts == {ONE: stream((5, {1: b"a"})), TWO: stream((5, {2: b"b"}))}
 
 
 def test_notifications_reach_clients_with_the_net_id_of_the_router() -> None:
     station = Station([route(FAR, LINK)])
     own = f"{ROUTER}:30000"
-    for handle, way in ((1, LOCAL), (2, ALSO_LOCAL)):
-        onward = station.forwarded(ADD._replace(source=own), way)
-        assert station.replied(onward.answer(granted(handle)), LINK)[0] == way
+    for handle, endpoint in ((1, LOCAL), (2, ALSO_LOCAL)):
+        onward = station.forwarded(ADD._replace(source=own), endpoint)
+        assert station.replied(onward.answer(granted(handle)), LINK)[0] == endpoint
         notice = NOTICE._replace(target=own, body=stream((5, {handle: b"data"})))
-        assert station.replied(notice, LINK) == (way, notice)
+        assert station.replied(notice, LINK) == (endpoint, notice)
 
 
 def test_notification_for_the_router_that_no_client_has_is_ended() -> None:
     station = Station([route(FAR, LINK)])
     notice = NOTICE._replace(target=f"{ROUTER}:30000", body=stream((5, {9: b"data"})))
-    way, end = station.replied(notice, LINK)
-    assert (way, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
+    endpoint, end = station.replied(notice, LINK)
+    assert (endpoint, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
 
 
 def test_notification_for_a_client_that_does_not_listen_is_ended() -> None:
     station = Station([route("192.168.0.9.1.1", SECOND_LINK, is_client=True)])
     notice = NOTICE._replace(body=stream((5, {9: b"data"})))
     station.forwarded(notice, LINK)  # nothing is known of it yet
-    station.router.hop_down(SECOND_LINK.door, SECOND_LINK.connection, "connection refused", 0)
-    way, end = station.replied(notice, LINK)
-    assert (way, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
+    station.router.hop_down(SECOND_LINK.transport, SECOND_LINK.connection, "connection refused", 0)
+    endpoint, end = station.replied(notice, LINK)
+    assert (endpoint, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
 
 
 def test_notification_for_a_router_that_is_down_for_now_is_not_ended() -> None:
     station = Station([route("192.168.0.9.1.1", SECOND_LINK)])
-    station.router.hop_down(SECOND_LINK.door, SECOND_LINK.connection, "connection refused", 0)
+    station.router.hop_down(SECOND_LINK.transport, SECOND_LINK.connection, "connection refused", 0)
     assert station.give(NOTICE._replace(body=stream((5, {9: b"data"}))), LINK) == []
 
 

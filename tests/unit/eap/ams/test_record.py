@@ -1,7 +1,7 @@
 from __future__ import annotations
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Outcome, Trace
-from eap.ams.endpoint import Way
 from eap.ams.record import MAX_EVENTS, MAX_LATEST, Record, describe
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
@@ -43,4 +43,4 @@ def test_traces_are_limited() -> None:
 def test_requests_are_described_for_people() -> None:
     header = AmsHeader(NetId.parse("5.1.1.1.1.1"), 851, NetId.parse("6.1.1.1.1.1"), 3000, 2)
     assert describe(header) == "READ of 5.1.1.1.1.1:851 for 6.1.1.1.1.1:3000"
-    assert describe(header, Way("tcp", "x")).endswith("3000 (x by tcp)")
+    assert describe(header, Endpoint("tcp", "x")).endswith("3000 (x by tcp)")

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.report import Obstacle, RouteState, report_route
 from eap.ams.traffic import Traffic
+from eap.ams.transport_table import Transport
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, Station, route
 
-TCP = Way("tcp", "1")
+TCP = Endpoint("tcp", "1")
 ASKED = Ams(FAR_DEVICE, CLIENT)
 MS = 1_000_000
 
@@ -88,7 +89,7 @@ def test_route_of_a_client_that_listens_is_up_and_then_down() -> None:
 def test_route_of_a_client_is_forgotten_with_its_door() -> None:
     station = Station([route(FAR, LINK, "tool", is_client=True)])
     station.router.hop_down("link", LINK.connection, "refused", 0)
-    station.router.remove_door("link", 0)
+    station.router.remove_transport("link", 0)
     assert report(station)[1:3] == (RouteState.DOWN, "this station has no door link")
-    station.router.add_door(Door("link"))
+    station.router.add_transport(Transport("link"))
     assert report(station).state is RouteState.UNKNOWN

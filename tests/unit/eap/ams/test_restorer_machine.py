@@ -7,8 +7,8 @@ from collections import deque
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Action, Forward, Reply
-from eap.ams.endpoint import Way
 from eap.codec.adsnotification import (
     AddNotification,
     Sample,
@@ -71,47 +71,47 @@ class RestorerMachine(RuleBasedStateMachine):
         self.is_up = True
         self.loses = False
         self.number = 0
-        self.clients: set[Way] = set()
-        self.asked: dict[tuple[Way, int], Ams] = {}
-        self.subscribed: dict[tuple[Way, int], int] = {}
-        self.came: dict[tuple[Way, int], int] = {}
+        self.clients: set[Endpoint] = set()
+        self.asked: dict[tuple[Endpoint, int], Ams] = {}
+        self.subscribed: dict[tuple[Endpoint, int], int] = {}
+        self.came: dict[tuple[Endpoint, int], int] = {}
 
     def act(self, actions: list[Action]) -> None:
         for action in actions:
-            if isinstance(action, Forward) or action.way == LINK:
+            if isinstance(action, Forward) or action.endpoint == LINK:
                 if self.is_up:
                     self.to_server.append(parse(*action.packets))
             else:
                 assert isinstance(action, Reply)
-                self.finish(action.way, parse(*action.packets))
+                self.finish(action.endpoint, parse(*action.packets))
 
-    def finish(self, way: Way, packet: Ams) -> None:
-        if way not in self.clients:
+    def finish(self, endpoint: Endpoint, packet: Ams) -> None:
+        if endpoint not in self.clients:
             return
         if packet.command == NOTIFICATION:
             for stamp in decode_notification(packet.body):
                 for sample in stamp.samples:
-                    self.take_sample(way, *sample)
+                    self.take_sample(endpoint, *sample)
             return
-        request = self.asked.pop((way, packet.invoke_id))
+        request = self.asked.pop((endpoint, packet.invoke_id))
         if request.command == ADD_NOTIFICATION and not packet.error and not any(packet.body[:4]):
-            key = way, int.from_bytes(packet.body[4:], "little")
+            key = endpoint, int.from_bytes(packet.body[4:], "little")
             assert key not in self.subscribed
             self.subscribed[key] = AddNotification.decode(request.body).offset
             self.came[key] = self.station.now_ns
 
-    def take_sample(self, way: Way, handle: int, data: bytes) -> None:
+    def take_sample(self, endpoint: Endpoint, handle: int, data: bytes) -> None:
         if not data:
-            del self.subscribed[way, handle]
+            del self.subscribed[endpoint, handle]
         else:
-            assert int.from_bytes(data, "little") == self.subscribed[way, handle]
-            self.came[way, handle] = self.station.now_ns
+            assert int.from_bytes(data, "little") == self.subscribed[endpoint, handle]
+            self.came[endpoint, handle] = self.station.now_ns
 
-    def ask(self, way: Way, command: int, body: bytes) -> None:
+    def ask(self, endpoint: Endpoint, command: int, body: bytes) -> None:
         self.number += 1
         packet = Ams(FAR_DEVICE, CLIENT, command, invoke_id=self.number, body=body)
-        self.asked[way, self.number] = packet
-        self.act(self.station.give(packet, way))
+        self.asked[endpoint, self.number] = packet
+        self.act(self.station.give(packet, endpoint))
 
     @initialize(
         loses=st.booleans(), modes=st.lists(st.sampled_from([3, 4]), min_size=1, max_size=4)
@@ -127,13 +127,13 @@ class RestorerMachine(RuleBasedStateMachine):
         self.settle()
 
     def open_and_subscribe(self, mode: int) -> None:
-        way = Way("tcp", f"10.0.0.9:{self.number}")
-        self.clients.add(way)
-        self.ask_for(way, mode)
+        endpoint = Endpoint("tcp", f"10.0.0.9:{self.number}")
+        self.clients.add(endpoint)
+        self.ask_for(endpoint, mode)
 
-    def ask_for(self, way: Way, mode: int) -> None:
+    def ask_for(self, endpoint: Endpoint, mode: int) -> None:
         request = AddNotification(0x4040, self.number + 1, 4, TransMode(mode), 0, 500_000)
-        self.ask(way, ADD_NOTIFICATION, request.encode())
+        self.ask(endpoint, ADD_NOTIFICATION, request.encode())
 
     @rule()
     def settle(self) -> None:
@@ -158,19 +158,19 @@ class RestorerMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.subscribed)
     @rule(data=st.data())
     def delete(self, data: st.DataObject) -> None:
-        way, handle = data.draw(st.sampled_from(sorted(self.subscribed)))
-        del self.subscribed[way, handle]
-        self.ask(way, DELETE_NOTIFICATION, handle.to_bytes(4, "little"))
+        endpoint, handle = data.draw(st.sampled_from(sorted(self.subscribed)))
+        del self.subscribed[endpoint, handle]
+        self.ask(endpoint, DELETE_NOTIFICATION, handle.to_bytes(4, "little"))
 
     @precondition(lambda self: self.clients)
     @rule(data=st.data())
     def close(self, data: st.DataObject) -> None:
-        way = data.draw(st.sampled_from(sorted(self.clients)))
-        self.clients.remove(way)
+        endpoint = data.draw(st.sampled_from(sorted(self.clients)))
+        self.clients.remove(endpoint)
         for known in (self.subscribed, self.asked):
-            for key in [key for key in known if key[0] == way]:
+            for key in [key for key in known if key[0] == endpoint]:
                 del known[key]
-        self.act(self.station.router.connection_closed(*way, self.station.now_ns))
+        self.act(self.station.router.connection_closed(*endpoint, self.station.now_ns))
 
     @precondition(lambda self: self.to_server)
     @rule(is_lost=st.booleans())

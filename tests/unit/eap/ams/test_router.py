@@ -3,10 +3,11 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Deliver, Outcome, Reply
-from eap.ams.endpoint import Door, Way
 from eap.ams.fragment import iter_fragments
 from eap.ams.routes import Origin
+from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsHeader, StateFlags, decode_packet
 from eap.ids import NetId
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams, parse
@@ -24,8 +25,8 @@ from tests.support.aoerouter import (
 from tests.unit.eap.ams.test_subscriptions import stream
 
 SECOND = 1_000_000_000
-TCP, UDP = Way("tcp", "10.0.0.9:4711 #1"), Way("segment", "02:00:00:00:00:09")
-OWN = Way("local", "1")
+TCP, UDP = Endpoint("tcp", "10.0.0.9:4711 #1"), Endpoint("segment", "02:00:00:00:00:09")
+OWN = Endpoint("local", "1")
 
 
 def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
@@ -44,8 +45,10 @@ def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
 def test_what_is_at_hand_goes_back_at_once() -> None:
     asked = []
 
-    def answer_now(header: AmsHeader, body: bytes, way: Way) -> tuple[AmsAnswer, int] | None:
-        asked.append((header.invoke_id, body, way))
+    def answer_now(
+        header: AmsHeader, body: bytes, endpoint: Endpoint
+    ) -> tuple[AmsAnswer, int] | None:
+        asked.append((header.invoke_id, body, endpoint))
         return (AmsAnswer(b"data"), 77) if body == b"known" else None
 
     station = Station(answer_now=answer_now)
@@ -115,8 +118,8 @@ def test_own_source_is_refused_unless_it_is_of_this_host() -> None:
     (event,) = station.events()
     assert event[0] is Outcome.LOOP
     assert "comes back to where it began" in event[1]
-    assert station.delivered(asked, Way("local", "1")).header.source_port == 30000
-    assert station.forwarded(asked._replace(target=FAR_DEVICE), Way("local", "1"))
+    assert station.delivered(asked, Endpoint("local", "1")).header.source_port == 30000
+    assert station.forwarded(asked._replace(target=FAR_DEVICE), Endpoint("local", "1"))
 
 
 def test_what_came_by_multicast_is_for_who_is_meant() -> None:
@@ -138,28 +141,28 @@ def test_request_without_answer_gets_none() -> None:
 
 
 def test_doors_come_and_go() -> None:
-    station = Station([route(FAR, Way("new", "1"))])
+    station = Station([route(FAR, Endpoint("new", "1"))])
     assert station.replied(Ams(FAR_DEVICE, CLIENT), TCP)[1].error == 0x1B
-    station.router.add_door(Door("new"))
+    station.router.add_transport(Transport("new"))
     with pytest.raises(ValueError, match="two doors"):
-        station.router.add_door(Door("new"))
+        station.router.add_transport(Transport("new"))
     station.forwarded(Ams(FAR_DEVICE, CLIENT), TCP)
-    served = station.delivered(Ams(DEVICE, CLIENT), Way("new", "2"))
-    assert station.router.waiting(Way("new", "2")) == 1
-    way, answer = only_reply(station.router.remove_door("new", 0))
-    assert (way, answer.error) == (TCP, 0x1B)
-    assert station.router.waiting(Way("new", "2")) == 0
+    served = station.delivered(Ams(DEVICE, CLIENT), Endpoint("new", "2"))
+    assert station.router.waiting(Endpoint("new", "2")) == 1
+    endpoint, answer = only_reply(station.router.remove_transport("new", 0))
+    assert (endpoint, answer.error) == (TCP, 0x1B)
+    assert station.router.waiting(Endpoint("new", "2")) == 0
     assert station.router.receive_answer(served.ticket, AmsAnswer(), 0) == []
-    assert station.router.notify(Way("new", "2"), b"packet") == []
+    assert station.router.notify(Endpoint("new", "2"), b"packet") == []
     assert station.router.notify(TCP, b"packet") == [Reply(TCP, (b"packet",))]
 
 
 def test_router_is_waiting_for_answers_and_samples_of_its_clients_only() -> None:
     station = Station([route(FAR, LINK)])
 
-    def is_waiting_for(packet: Ams, door: str = "link") -> bool:
+    def is_waiting_for(packet: Ams, transport: str = "link") -> bool:
         header, body = decode_packet(packet.octets())
-        return station.router.is_waiting_for(header, bytes(body), door)
+        return station.router.is_waiting_for(header, bytes(body), transport)
 
     client = f"{ROUTER}:30000"  # the NetID says nothing
     onward = station.forwarded(Ams(FAR_DEVICE, client, ADD_NOTIFICATION, body=bytes(40)), OWN)
@@ -202,7 +205,7 @@ def test_surplus_octets_go_no_further() -> None:
 
 def test_fragments_are_put_together_and_what_is_too_long_goes_in_fragments() -> None:
     station = Station()
-    narrow = Way("narrow", "1")
+    narrow = Endpoint("narrow", "1")
     asked = Ams(DEVICE, CLIENT, invoke_id=9, body=bytes(range(90)))
     *before, last = iter_fragments(asked.octets(), 4, 28)
     for each in before:
@@ -256,7 +259,7 @@ def test_what_passes_is_counted() -> None:
     assert isinstance(reply, Reply)
     (client,) = station.router.connections()
     hop = station.router.report(*station.table)
-    assert (client.way, hop.route.hop) == (TCP, LINK)
+    assert (client.endpoint, hop.route.hop) == (TCP, LINK)
     assert client.traffic.sources == (NetId.parse(CLIENT.partition(":")[0]),)
     for traffic in (client.traffic, hop.traffic):
         assert (traffic.requests, traffic.answers, traffic.errors) == (1, 1, 0)

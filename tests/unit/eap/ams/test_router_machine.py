@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Action, Deliver, Forward, Reply
 from eap.ams.admission import Limits
-from eap.ams.endpoint import Way
 from eap.ams.fragment import Assembler
 from eap.codec.ams import decode_packet
 from eap.ids import NetId
@@ -30,8 +30,8 @@ from tests.unit.eap.ams.test_router import SECOND
 class Client:
     """A connection of a program; all programs have one AMS address and count from 1."""
 
-    def __init__(self, way: Way) -> None:
-        self.way = way
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
         self.count = 0
         self.is_open = True
         self.waiting: dict[int, tuple[Ams, int]] = {}
@@ -52,18 +52,18 @@ class RouterMachine(RuleBasedStateMachine):
         super().__init__()
         virtual = NetId.parse("7.1.1.1.9.9")
         routes = [route(FAR, LINK), route("7.1.1.1.1.1", SECOND_LINK, timeout_ns=SECOND),
-                  route("10.0.0.1.1.1", Way("narrow", "box"), real=virtual)]  # fmt: skip
+                  route("10.0.0.1.1.1", Endpoint("narrow", "box"), real=virtual)]  # fmt: skip
         self.station = Station(routes, limits=self.LIMITS, is_probing=True)
-        self.probes: list[tuple[Way, Ams]] = []
+        self.probes: list[tuple[Endpoint, Ams]] = []
         self.clients: list[Client] = []
         self.asked: list[Deliver] = []
         self.onward: list[tuple[Forward, Ams]] = []
-        self.answers: list[tuple[Way, Ams]] = []
-        self.assemblers: dict[Way, Assembler] = {}
+        self.answers: list[tuple[Endpoint, Ams]] = []
+        self.assemblers: dict[Endpoint, Assembler] = {}
         self.opened = 0
 
-    def client_of(self, way: Way) -> Client:
-        (client,) = [each for each in self.clients if each.way == way and each.is_open]
+    def client_of(self, endpoint: Endpoint) -> Client:
+        (client,) = [each for each in self.clients if each.endpoint == endpoint and each.is_open]
         return client
 
     def act(self, actions: list[Action]) -> None:
@@ -76,9 +76,9 @@ class RouterMachine(RuleBasedStateMachine):
                 packet = self.whole(action.hop, action.packets)
                 self.onward.append((action, packet))
             else:
-                self.finish(self.client_of(action.way), parse(*action.packets))
+                self.finish(self.client_of(action.endpoint), parse(*action.packets))
 
-    def whole(self, hop: Way, packets: tuple[bytes, ...]) -> Ams:
+    def whole(self, hop: Endpoint, packets: tuple[bytes, ...]) -> Ams:
         if len(packets) == 1:
             return parse(packets[0])
         assembler = self.assemblers.setdefault(hop, Assembler())
@@ -97,28 +97,28 @@ class RouterMachine(RuleBasedStateMachine):
         unknown = {"9.9.9.9.9.9:1": 7, "5.1.1.1.2.1:1": 6}.get(request.target, 0)
         assert answer.error in {unknown or 0, *(() if unknown else (4, 0x1B, 0x719))}
 
-    @rule(door=st.sampled_from(["tcp", "segment"]))
-    def connect(self, door: str) -> None:
+    @rule(transport=st.sampled_from(["tcp", "segment"]))
+    def connect(self, transport: str) -> None:
         self.opened += 1
-        self.clients.append(Client(Way(door, f"10.0.0.9:{self.opened}")))
+        self.clients.append(Client(Endpoint(transport, f"10.0.0.9:{self.opened}")))
 
     @precondition(lambda self: self.open_clients())
     @rule(data=st.data(), whom=st.sampled_from(TARGETS), size=st.sampled_from([0, 100]))
     def ask(self, data: st.DataObject, whom: str, size: int) -> None:
         client = data.draw(st.sampled_from(self.open_clients()))
         client.count += 1
-        body = f"{client.way} {client.count}".encode() + bytes(size)
+        body = f"{client.endpoint} {client.count}".encode() + bytes(size)
         request = Ams(whom, CLIENT, invoke_id=client.count, body=body)
         client.waiting[client.count] = request, self.station.now_ns
-        self.act(self.station.give(request, client.way))
+        self.act(self.station.give(request, client.endpoint))
 
     @precondition(lambda self: any(each.waiting for each in self.open_clients()))
     @rule(data=st.data())
     def ask_the_same_again_where_packets_may_be_doubled(self, data: st.DataObject) -> None:
         client = data.draw(st.sampled_from([each for each in self.open_clients() if each.waiting]))
         request, _ = data.draw(st.sampled_from(list(client.waiting.values())))
-        if client.way.door == "segment":
-            assert self.station.give(request, client.way) == []
+        if client.endpoint.transport == "segment":
+            assert self.station.give(request, client.endpoint) == []
 
     @precondition(lambda self: self.asked)
     @rule(data=st.data())
@@ -141,38 +141,38 @@ class RouterMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.answers)
     @rule(data=st.data(), is_lost=st.booleans())
     def answer_comes_back(self, data: st.DataObject, *, is_lost: bool) -> None:
-        way, packet = self.answers.pop(data.draw(st.integers(0, len(self.answers) - 1)))
+        endpoint, packet = self.answers.pop(data.draw(st.integers(0, len(self.answers) - 1)))
         if not is_lost:
-            self.act(self.station.give(packet, way))
+            self.act(self.station.give(packet, endpoint))
 
     @precondition(lambda self: self.answers and self.open_clients())
     @rule(data=st.data())
     def answer_comes_by_somebody_else(self, data: st.DataObject) -> None:
         _, packet = data.draw(st.sampled_from(self.answers))
         client = data.draw(st.sampled_from(self.open_clients()))
-        assert self.station.give(packet, client.way) == []
+        assert self.station.give(packet, client.endpoint) == []
 
     @precondition(lambda self: self.open_clients())
     @rule(data=st.data())
     def close(self, data: st.DataObject) -> None:
         client = data.draw(st.sampled_from(self.open_clients()))
         client.is_open = False
-        self.act(self.station.router.connection_closed(*client.way, self.station.now_ns))
+        self.act(self.station.router.connection_closed(*client.endpoint, self.station.now_ns))
 
     @precondition(lambda self: self.probes)
     @rule(data=st.data())
     def probe_is_answered(self, data: st.DataObject) -> None:
-        way, packet = self.probes.pop(data.draw(st.integers(0, len(self.probes) - 1)))
-        assert self.station.give(packet.answer(), way) == []
+        endpoint, packet = self.probes.pop(data.draw(st.integers(0, len(self.probes) - 1)))
+        assert self.station.give(packet.answer(), endpoint) == []
 
-    @rule(hop=st.sampled_from([LINK, SECOND_LINK, Way("link", "")]), is_up=st.booleans())
-    def link_changes(self, hop: Way, *, is_up: bool) -> None:
+    @rule(hop=st.sampled_from([LINK, SECOND_LINK, Endpoint("link", "")]), is_up=st.booleans())
+    def link_changes(self, hop: Endpoint, *, is_up: bool) -> None:
         address = hop.connection or None
         if is_up:
-            self.station.router.hop_up(hop.door, address)
+            self.station.router.hop_up(hop.transport, address)
         else:
             router, now_ns = self.station.router, self.station.now_ns
-            self.act(router.hop_down(hop.door, address, "cut", now_ns))
+            self.act(router.hop_down(hop.transport, address, "cut", now_ns))
 
     @rule(step_ns=st.sampled_from([0, SECOND // 2, SECOND, 5 * SECOND]))
     def time_passes(self, step_ns: int) -> None:
@@ -202,8 +202,8 @@ class RouterMachine(RuleBasedStateMachine):
         self.time_passes(10 * SECOND)
         assert not any(each.waiting for each in self.open_clients())
         assert self.station.router.stats().in_flight == 0
-        for way, packet in self.answers:
-            assert self.station.give(packet, way) == []
+        for endpoint, packet in self.answers:
+            assert self.station.give(packet, endpoint) == []
 
     def open_clients(self) -> list[Client]:
         return [each for each in self.clients if each.is_open]
@@ -223,29 +223,31 @@ def test_stations_with_any_routes_answer_everything_and_nothing_goes_on_for_ever
     for number, name in enumerate("abcd"):
         stations[name] = Station(first_id=number * 7)
         if name in next_of:
-            stations[name].table.add(route(FAR, Way("link", next_of[name])))
+            stations[name].table.add(route(FAR, Endpoint("link", next_of[name])))
     stations["d"].router.add_device(NetId.parse(FAR), {851})
-    clients = [Way("tcp", f"client {number}") for number in range(3)]
+    clients = [Endpoint("tcp", f"client {number}") for number in range(3)]
     request = Ams(FAR_DEVICE, CLIENT, body=b"x")
-    moving: list[tuple[str, Way, bytes]] = [(first, each, request.octets()) for each in clients]
-    answered: list[Way] = []
+    moving: list[tuple[str, Endpoint, bytes]] = [
+        (first, each, request.octets()) for each in clients
+    ]
+    answered: list[Endpoint] = []
     steps = 0
     while moving:
         steps += 1
-        here, way, packet = moving.pop((order.pop() if order else 0) % len(moving))
+        here, endpoint, packet = moving.pop((order.pop() if order else 0) % len(moving))
         router = stations[here].router
-        actions = router.receive_packet(packet, *way, 0)
+        actions = router.receive_packet(packet, *endpoint, 0)
         for action in [*actions]:
             if isinstance(action, Deliver):
                 actions += router.receive_answer(action.ticket, AmsAnswer(b"that"), 0)
         for action in actions:
             if isinstance(action, Forward):
-                moving.append((action.hop.connection, Way("tcp", here), *action.packets))
-            elif isinstance(action, Reply) and action.way in clients:
-                answered.append(action.way)
+                moving.append((action.hop.connection, Endpoint("tcp", here), *action.packets))
+            elif isinstance(action, Reply) and action.endpoint in clients:
+                answered.append(action.endpoint)
                 assert parse(*action.packets).body in {b"", b"that"}
             elif isinstance(action, Reply):
-                back = Way("link", here)
-                moving.append((action.way.connection, back, *action.packets))
+                back = Endpoint("link", here)
+                moving.append((action.endpoint.connection, back, *action.packets))
     assert sorted(answered) == clients
     assert steps <= len(clients) * 2 * (len(stations) + 1)

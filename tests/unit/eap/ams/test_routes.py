@@ -4,25 +4,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import MAX_LEARNED, Origin, Route, RouteTable
 from eap.ids import NetId
 
-A, B, C = (Way("tcp", name) for name in "abc")
+A, B, C = (Endpoint("tcp", name) for name in "abc")
 
 
-def route(net_id: str, hop: Way = A, **more: object) -> Route:
+def route(net_id: str, hop: Endpoint = A, **more: object) -> Route:
     return Route(NetId.parse(net_id), hop.connection, hop, **more)
 
 
-def hop_of(table: RouteTable, net_id: str) -> Way | None:
+def hop_of(table: RouteTable, net_id: str) -> Endpoint | None:
     found = table.find(NetId.parse(net_id))
     return found and found[0].hop
 
 
 def test_longest_match_is_taken() -> None:
     table = RouteTable([
-        route("0.0.0.0.0.0", Way("mqtt", "rest"), octets=0),
+        route("0.0.0.0.0.0", Endpoint("mqtt", "rest"), octets=0),
         route("5.1.1.1.2.1", A),
         route("5.1.1.1.3.1", B, octets=5),
         route("5.1.1.1.3.2", C, octets=6),
@@ -30,7 +30,7 @@ def test_longest_match_is_taken() -> None:
     assert hop_of(table, "5.1.1.1.3.2") == C
     assert hop_of(table, "5.1.1.1.3.9") == B
     assert hop_of(table, "5.1.1.1.9.9") == A
-    assert hop_of(table, "5.1.1.2.3.2") == Way("mqtt", "rest")
+    assert hop_of(table, "5.1.1.2.3.2") == Endpoint("mqtt", "rest")
     assert [table.find(NetId.parse(each))[1] for each in ("5.1.1.1.3.2", "5.1.1.1.3.9")] == [6, 5]
     assert hop_of(RouteTable([route("5.1.1.1.3.2", octets=6)]), "5.1.1.1.3.1") is None
 
@@ -144,7 +144,7 @@ routes = st.builds(
 @given(st.lists(routes, max_size=20), st.lists(st.tuples(net_ids, st.sampled_from([A, B, C]))),
        net_ids)  # fmt: skip
 def test_found_is_what_a_search_through_all_finds(
-    given_routes: list[Route], removed: list[tuple[NetId, Way]], target: NetId
+    given_routes: list[Route], removed: list[tuple[NetId, Endpoint]], target: NetId
 ) -> None:
     table = RouteTable(given_routes)
     for key in removed:

@@ -3,9 +3,17 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from eap.ams.routing_change import describe_routing, routing_needs_new_start
-from eap.ams.spec import AccessRule, AmsUser, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import (
+    AccessRule,
+    AmsUser,
+    HopSpec,
+    MqttSpec,
+    RouteSpec,
+    RoutingSpec,
+    TransportKind,
+)
 
-HOP = HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980")
+HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")
 ROUTES = tuple(RouteSpec(name="mill", net_id=f"10.0.0.2.{n}.1", hop=HOP, octets=6) for n in (1, 2))
 OLD = RoutingSpec(
     routes=ROUTES,

@@ -8,13 +8,13 @@ from eap.ams.spec import (
     AccessService,
     AccessTarget,
     AmsUser,
-    DoorKind,
     HopSpec,
     MqttSpec,
     ObjectRange,
     RouteSpec,
     RoutingSpec,
     TlsSpec,
+    TransportKind,
 )
 
 
@@ -35,7 +35,7 @@ def test_what_no_rule_has_is_refused():
 
 
 def test_what_a_router_is_told_comes_out_of_json_as_it_went_in():
-    hop = HopSpec(DoorKind.AMS_TCP, "", "plc.example:48898")
+    hop = HopSpec(TransportKind.AMS_TCP, "", "plc.example:48898")
     whole = RoutingSpec(
         routes=(RouteSpec(name="plc", net_id="5.1.2.3.1.1", hop=hop, virtual="10.0.0.9.1.1"),),
         mqtt=(MqttSpec(network="plant", host="broker", tls=TlsSpec(ca="/ca.pem")),),

@@ -77,7 +77,12 @@ def test_subscription_is_restored_with_its_handle_and_the_one_before_is_deleted(
     scene = Scene(CYCLIC)
     assert scene.lose_hop() == []
     (missing,) = scene.station.router.interruptions()
-    assert (missing.way, missing.number, missing.since_ns, missing.why) == (ONE, 1, 0, "no link")
+    assert (missing.endpoint, missing.number, missing.since_ns, missing.why) == (
+        ONE,
+        1,
+        0,
+        "no link",
+    )
     assert scene.passes(0) == []
     (add,) = scene.asked
     assert (add.command, add.body) == (ADD_NOTIFICATION, CYCLIC.encode())

@@ -5,8 +5,8 @@ from itertools import count
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ams import subscriptions as module
-from eap.ams.endpoint import Way
 from eap.ams.routes import Route
 from eap.ams.subscriptions import (
     MAX_PER_CLIENT,
@@ -21,7 +21,7 @@ from eap.errors import TruncatedError
 from eap.ids import NetId
 from tests.support.ams import parse
 
-ONE, TWO, LINK = Way("tcp", "1"), Way("tcp", "2"), Way("link", "6")
+ONE, TWO, LINK = Endpoint("tcp", "1"), Endpoint("tcp", "2"), Endpoint("link", "6")
 ROUTE = Route(NetId(b"target"), "far", LINK)
 ASKED, ONWARD = b"virtual_client__", b"server__client__"
 CYCLIC = AddNotification(0x4040, 0, 4, TransMode.SERVER_CYCLE, 0, 500_000)
@@ -34,9 +34,12 @@ def grant(handle: int, route: Route = ROUTE) -> Grant:
 
 
 def one(
-    handle: int, way: Way = ONE, route: Route = ROUTE, request: AddNotification | None = CYCLIC
+    handle: int,
+    endpoint: Endpoint = ONE,
+    route: Route = ROUTE,
+    request: AddNotification | None = CYCLIC,
 ) -> Subscription:
-    return Subscription(way, ASKED, grant(handle, route), 0, request)
+    return Subscription(endpoint, ASKED, grant(handle, route), 0, request)
 
 
 def added(all_: Subscriptions, *these: Subscription) -> list[Subscription]:
@@ -54,7 +57,9 @@ def stream(*stamps: tuple[int, dict[int, bytes]]) -> bytes:
     return struct.pack("<II", len(content) + 4, len(stamps)) + content
 
 
-def divided(body: bytes, all_: Subscriptions, onward: bytes = ONWARD, hop: Way = LINK) -> Division:
+def divided(
+    body: bytes, all_: Subscriptions, onward: bytes = ONWARD, hop: Endpoint = LINK
+) -> Division:
     return divide(body, onward, all_, 7, lambda each: each == hop)
 
 
@@ -68,7 +73,7 @@ def test_subscriptions_is_found_by_what_the_server_gave_and_by_what_the_client_k
     assert all_.hops == {LINK: 2}
     assert all_.remove(first) == grant(1)
     assert all_.close(TWO) == [grant(2)]
-    assert (len(all_), all_.hops, all_.ways(), first.is_closed) == (0, {}, [], True)
+    assert (len(all_), all_.hops, all_.endpoints(), first.is_closed) == (0, {}, [], True)
 
 
 def test_subscriptions_displaces_what_had_the_same_handle_before() -> None:
@@ -103,10 +108,10 @@ def test_subscriptions_of_few_hosts_leave_room_for_others(
     all_ = Subscriptions()
     hosts = ("10.0.0.5", "10.0.0.6", "10.0.0.7")
     handles = count()
-    for way in [Way("ams-tcp", f"{host}:{port}") for host in hosts for port in range(32)]:
-        while all_.has_room(way, ASKED, 1):
-            added(all_, one(next(handles), way))
-    assert all_.has_room(Way("ams-tcp", "10.0.0.8:1"), ASKED, 6)
+    for endpoint in [Endpoint("ams-tcp", f"{host}:{port}") for host in hosts for port in range(32)]:
+        while all_.has_room(endpoint, ASKED, 1):
+            added(all_, one(next(handles), endpoint))
+    assert all_.has_room(Endpoint("ams-tcp", "10.0.0.8:1"), ASKED, 6)
 
 
 def test_subscriptions_has_room_for_so_many_of_a_client() -> None:
@@ -119,7 +124,7 @@ def test_subscriptions_has_room_for_so_many_of_a_client() -> None:
 
 def test_subscriptions_of_a_hop_are_found() -> None:
     all_ = Subscriptions()
-    other = Route(NetId(b"target"), "other", Way("link", "7"))
+    other = Route(NetId(b"target"), "other", Endpoint("link", "7"))
     first, second = added(all_, one(1), one(2, route=other))
     assert all_.of_hop("link", "6") == [first]
     assert all_.of_hop("link", None) == [first, second]

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ams.directory import Directory
-from eap.ams.spec import DirectoryPort, DirectoryStation, DoorKind, HopSpec
+from eap.ams.spec import DirectoryPort, DirectoryStation, HopSpec, TransportKind
 from eap.ams.via import parse_via
 from eap.ids import NetId
 
@@ -34,28 +34,28 @@ PLANT = Directory([
 @pytest.mark.parametrize(
     ("text", "hop"),
     [
-        ("s2/eap0", HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980")),
-        ("s2", HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980")),
-        ("s3/eap0", HopSpec(DoorKind.ETHERNET, "eap1", "5.1.1.3.2.1")),
-        ("s4/eap0", HopSpec(DoorKind.TCP, "eap0", "10.0.0.4:40000")),
-        ("s7", HopSpec(DoorKind.TCP, "eap2", "127.0.0.7:34980")),
-        ("ams-tcp:plc.hall", HopSpec(DoorKind.AMS_TCP, "", "plc.hall:48898")),
-        ("ams-tcp:10.0.0.9:1000", HopSpec(DoorKind.AMS_TCP, "", "10.0.0.9:1000")),
-        ("udp:10.0.0.9", HopSpec(DoorKind.UDP, "eap0", "10.0.0.9:34980")),
-        ("tcp:10.0.0.9:1000", HopSpec(DoorKind.TCP, "eap0", "10.0.0.9:1000")),
+        ("s2/eap0", HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")),
+        ("s2", HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")),
+        ("s3/eap0", HopSpec(TransportKind.ETHERNET, "eap1", "5.1.1.3.2.1")),
+        ("s4/eap0", HopSpec(TransportKind.TCP, "eap0", "10.0.0.4:40000")),
+        ("s7", HopSpec(TransportKind.TCP, "eap2", "127.0.0.7:34980")),
+        ("ams-tcp:plc.hall", HopSpec(TransportKind.AMS_TCP, "", "plc.hall:48898")),
+        ("ams-tcp:10.0.0.9:1000", HopSpec(TransportKind.AMS_TCP, "", "10.0.0.9:1000")),
+        ("udp:10.0.0.9", HopSpec(TransportKind.UDP, "eap0", "10.0.0.9:34980")),
+        ("tcp:10.0.0.9:1000", HopSpec(TransportKind.TCP, "eap0", "10.0.0.9:1000")),
         (
             "ethernet:02-00-00-00-00-09",
-            HopSpec(DoorKind.ETHERNET, "eap1", "02:00:00:00:00:09"),
+            HopSpec(TransportKind.ETHERNET, "eap1", "02:00:00:00:00:09"),
         ),
-        ("ethernet:9.1.1.1.2.1", HopSpec(DoorKind.ETHERNET, "eap1", "9.1.1.1.2.1")),
-        ("mqtt:line", HopSpec(DoorKind.MQTT, "line", FAR)),
-        ("10.0.0.9", HopSpec(DoorKind.UDP, "eap0", "10.0.0.9:34980")),
-        ("10.0.0.9:35000", HopSpec(DoorKind.UDP, "eap0", "10.0.0.9:35000")),
-        ("tcp://10.0.0.9", HopSpec(DoorKind.TCP, "eap0", "10.0.0.9:34980")),
-        ("02:00:00:00:00:09", HopSpec(DoorKind.ETHERNET, "eap1", "02:00:00:00:00:09")),
-        ("9.1.1.1.2.1", HopSpec(DoorKind.ETHERNET, "eap1", "9.1.1.1.2.1")),
-        ("mqtt:line/s5", HopSpec(DoorKind.MQTT, "line", "5.1.1.5.1.1")),
-        ("mqtt:line/9.9.9.9.1.1", HopSpec(DoorKind.MQTT, "line", "9.9.9.9.1.1")),
+        ("ethernet:9.1.1.1.2.1", HopSpec(TransportKind.ETHERNET, "eap1", "9.1.1.1.2.1")),
+        ("mqtt:line", HopSpec(TransportKind.MQTT, "line", FAR)),
+        ("10.0.0.9", HopSpec(TransportKind.UDP, "eap0", "10.0.0.9:34980")),
+        ("10.0.0.9:35000", HopSpec(TransportKind.UDP, "eap0", "10.0.0.9:35000")),
+        ("tcp://10.0.0.9", HopSpec(TransportKind.TCP, "eap0", "10.0.0.9:34980")),
+        ("02:00:00:00:00:09", HopSpec(TransportKind.ETHERNET, "eap1", "02:00:00:00:00:09")),
+        ("9.1.1.1.2.1", HopSpec(TransportKind.ETHERNET, "eap1", "9.1.1.1.2.1")),
+        ("mqtt:line/s5", HopSpec(TransportKind.MQTT, "line", "5.1.1.5.1.1")),
+        ("mqtt:line/9.9.9.9.1.1", HopSpec(TransportKind.MQTT, "line", "9.9.9.9.1.1")),
     ],
 )
 def test_places(text: str, hop: HopSpec) -> None:

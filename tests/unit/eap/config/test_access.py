@@ -37,7 +37,7 @@ def test_a_rule_says_what_its_texts_stand_for(index):
             networks=("10.0.0.0/24",),
             macs=("02:00:00:00:00:0a",),
             net_ids=("127.0.9.1",),
-            doors=("mqtt",),
+            transports=("mqtt",),
             targets=(AccessTarget("5.1.2.3", 851),),
             services=writes,
             objects=(ObjectRange(0x6000, 0x6FFF),),

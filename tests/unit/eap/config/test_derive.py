@@ -7,9 +7,9 @@ from eap.ams.spec import (
     AmsUser,
     DirectoryPort,
     DirectoryStation,
-    DoorKind,
     HopSpec,
     RouteSpec,
+    TransportKind,
 )
 from eap.ids import NetId
 from eap.pd.spec import LinkSpec, OnChangeSpec, Substitute, TriggerSpec, Wake, Writer
@@ -265,7 +265,7 @@ def test_stations_that_share_an_interface_have_routes_to_each_other(plant):
         RouteSpec(
             name="right",
             net_id="127.0.9.2.1.1",
-            hop=HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980"),
+            hop=HopSpec(TransportKind.UDP, "eap0", "127.0.9.2:34980"),
             router="127.0.9.2.1.1",
             is_derived=True,
         ),
@@ -311,7 +311,7 @@ def test_a_route_that_is_written_stands_for_the_derived_ones(plant):
         RouteSpec(
             name="right",
             net_id="127.0.9.2.1.1",
-            hop=HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980"),
+            hop=HopSpec(TransportKind.UDP, "eap0", "127.0.9.2:34980"),
             router="127.0.9.2.1.1",
             virtual="9.9.9.9.1.1",
             is_unidirectional=True,
@@ -338,7 +338,9 @@ def test_stations_that_share_but_a_network_reach_each_other_by_its_broker(plant)
         (LEFT_EAP_PORT, LEFT_EAP_PORT.replace("udp://127.0.9.1", "udp://10.0.0.1") + f"\n{broker}"),
         (right, f"{right}\n{broker}"),
     ).routing["left"]
-    assert [route.hop for route in told.routes] == [HopSpec(DoorKind.MQTT, "n", "127.0.9.2.1.1")]
+    assert [route.hop for route in told.routes] == [
+        HopSpec(TransportKind.MQTT, "n", "127.0.9.2.1.1")
+    ]
     assert not told.routes[0].is_probed
     assert [each.host for each in told.mqtt] == ["b"]
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.spec import DoorKind, HopSpec
+from eap.ams.spec import HopSpec, TransportKind
 from eap.config.routes import (
     MisfitError,
     find_hop,
@@ -45,24 +45,27 @@ def follow(index):
 @pytest.mark.parametrize(
     ("route", "hop", "router"),
     [
-        (Route(to="right"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
-        (Route(to="right", port="eap0"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
-        (Route(to="x", via="right/eap0"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
-        (Route(to="x", via="10.0.0.9"), (DoorKind.UDP, "far", "10.0.0.9:34980"), ""),
-        (Route(to="x", via="10.0.0.9:1"), (DoorKind.UDP, "far", "10.0.0.9:1"), ""),
-        (Route(to="x", via="10.0.0.9", port="eap0"), (DoorKind.UDP, "eap0", "10.0.0.9:34980"), ""),
-        (Route(to="x", via="tcp://127.0.0.9"), (DoorKind.TCP, "eap0", "127.0.0.9:34980"), ""),
-        (Route(to="x", via="02-00-00-00-00-0A"), (DoorKind.ETHERNET, "eth0", "02:00:00:00:00:0a"),
+        (Route(to="right"), (TransportKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="right", port="eap0"), (TransportKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="x", via="right/eap0"), (TransportKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="x", via="10.0.0.9"), (TransportKind.UDP, "far", "10.0.0.9:34980"), ""),
+        (Route(to="x", via="10.0.0.9:1"), (TransportKind.UDP, "far", "10.0.0.9:1"), ""),
+        (Route(to="x", via="10.0.0.9", port="eap0"),
+         (TransportKind.UDP, "eap0", "10.0.0.9:34980"), ""),
+        (Route(to="x", via="tcp://127.0.0.9"), (TransportKind.TCP, "eap0", "127.0.0.9:34980"), ""),
+        (Route(to="x", via="02-00-00-00-00-0A"),
+         (TransportKind.ETHERNET, "eth0", "02:00:00:00:00:0a"),
          ""),
-        (Route(to="x", via="5.1.2.3.1.1"), (DoorKind.ETHERNET, "eth0", "5.1.2.3.1.1"), ""),
-        (Route(to="right", via="127.0.9.2"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
-        (Route(to="x", ams_tcp="plc"), (DoorKind.AMS_TCP, "", "plc:48898"), ""),
-        (Route(to="right", ams_tcp="h:1"), (DoorKind.AMS_TCP, "", "h:1"), RIGHT),
-        (Route(to="x", ams_tcp="right/eap0"), (DoorKind.AMS_TCP, "", "127.0.9.2:48898"), RIGHT),
-        (Route(to="right", via="mqtt:plant"), (DoorKind.MQTT, "plant", RIGHT), RIGHT),
-        (Route(to="default", via="mqtt:plant/right"), (DoorKind.MQTT, "plant", RIGHT), RIGHT),
+        (Route(to="x", via="5.1.2.3.1.1"), (TransportKind.ETHERNET, "eth0", "5.1.2.3.1.1"), ""),
+        (Route(to="right", via="127.0.9.2"), (TransportKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="x", ams_tcp="plc"), (TransportKind.AMS_TCP, "", "plc:48898"), ""),
+        (Route(to="right", ams_tcp="h:1"), (TransportKind.AMS_TCP, "", "h:1"), RIGHT),
+        (Route(to="x", ams_tcp="right/eap0"),
+         (TransportKind.AMS_TCP, "", "127.0.9.2:48898"), RIGHT),
+        (Route(to="right", via="mqtt:plant"), (TransportKind.MQTT, "plant", RIGHT), RIGHT),
+        (Route(to="default", via="mqtt:plant/right"), (TransportKind.MQTT, "plant", RIGHT), RIGHT),
         (Route(to="x", net_id="5.1.2.3.1.1", via="mqtt:alone"),
-         (DoorKind.MQTT, "alone", "5.1.2.3.1.1"), "5.1.2.3.1.1"),
+         (TransportKind.MQTT, "alone", "5.1.2.3.1.1"), "5.1.2.3.1.1"),
     ],
 )  # fmt: skip
 def test_a_route_leads_to_its_next_hop(follow, route, hop, router):
@@ -236,7 +239,7 @@ def hop(index):
 
 
 def test_udp_ports_reach_each_other_at_their_addresses(hop):
-    assert hop() == HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980")
+    assert hop() == HopSpec(TransportKind.UDP, "eap0", "127.0.9.2:34980")
     assert hop(right("udp://127.0.9.2:40000")).address == "127.0.9.2:40000"
 
 
@@ -246,13 +249,13 @@ def test_udp_ports_reach_each_other_at_their_addresses(hop):
 )
 def test_where_one_has_no_udp_it_is_a_tcp_connection(hop, mine, theirs):
     found = hop(left(f"{mine}://127.0.9.1"), right(f"{theirs}://127.0.9.2"))
-    assert found == HopSpec(DoorKind.TCP, "eap0", "127.0.9.2:34980")
+    assert found == HopSpec(TransportKind.TCP, "eap0", "127.0.9.2:34980")
 
 
 def test_on_ethernet_a_port_is_its_mac_address_or_its_net_id(hop):
     line = left("ethernet://eth0")
     by_net_id = hop(line, right("ethernet://eth0"))
-    assert by_net_id == HopSpec(DoorKind.ETHERNET, "eap0", "127.0.9.2.2.1")
+    assert by_net_id == HopSpec(TransportKind.ETHERNET, "eap0", "127.0.9.2.2.1")
     by_mac = hop(line, right("ethernet://eth0", more=", mac: 02-00-00-00-00-0A"))
     assert by_mac.address == "02:00:00:00:00:0a"
 
@@ -274,14 +277,14 @@ def test_what_is_not_shared_is_no_way(hop, mine, theirs, more):
 
 def test_interfaces_of_other_names_are_one_wire_if_somebody_says_so(hop):
     found = hop(left("ethernet://eth0"), right("ethernet://eth1"), other="eap0")
-    assert found == HopSpec(DoorKind.ETHERNET, "eap0", "127.0.9.2.2.1")
+    assert found == HopSpec(TransportKind.ETHERNET, "eap0", "127.0.9.2.2.1")
 
 
 def test_of_several_ways_the_one_in_the_same_network_is_taken_udp_before_others(hop):
     both = [left("udp://10.1.0.1", "udp://10.2.0.1"), right("udp://10.2.0.2", "udp://10.3.0.2")]
-    assert hop(*both) == HopSpec(DoorKind.UDP, "eap1", "10.2.0.2:34980")
+    assert hop(*both) == HopSpec(TransportKind.UDP, "eap1", "10.2.0.2:34980")
     mixed = [left("ethernet://eth0", "udp://10.2.0.1"), right("ethernet://eth0", "udp://10.9.0.2")]
-    assert hop(*mixed) == HopSpec(DoorKind.UDP, "eap1", "10.9.0.2:34980")
+    assert hop(*mixed) == HopSpec(TransportKind.UDP, "eap1", "10.9.0.2:34980")
 
 
 def test_a_port_that_is_named_is_the_only_one_that_counts(hop):

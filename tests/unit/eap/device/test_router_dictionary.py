@@ -31,7 +31,7 @@ def route(name):
         RouterLive.ROUTE_NET_ID: NetId.parse("5.6.7.8.1.1"),
         RouterLive.ROUTE_OCTETS: 4,
         RouterLive.ROUTE_NAME: name,
-        RouterLive.ROUTE_DOOR: "udp:eap0",
+        RouterLive.ROUTE_TRANSPORT: "udp:eap0",
         RouterLive.ROUTE_ADDRESS: "10.0.0.8:34980",
         RouterLive.ROUTE_ORIGIN: 1,
         RouterLive.ROUTE_STATE: 2,

@@ -21,7 +21,7 @@ from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName
 from eap.runtime.passing import PassedConnection
 from eap.supervisor.sockets import SharedSockets
-from tests.unit.eap.runtime.conftest import eap_port, left, right
+from tests.unit.eap.conftest import eap_port, left, right
 
 
 class Running:

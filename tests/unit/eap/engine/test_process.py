@@ -21,7 +21,7 @@ from eap.net.image_file import open_image
 from eap.pd.words import StationWord
 from eap.runtime.handover import EngineOptions, Handover
 from tests.support.startup import read_reports
-from tests.unit.eap.runtime.conftest import eap_port, left, right
+from tests.unit.eap.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
 

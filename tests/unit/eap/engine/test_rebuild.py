@@ -20,7 +20,7 @@ from eap.pd.words import StationWord
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import Handover
 from eap.runtime.station_request import Configure, SetState
-from tests.unit.eap.runtime.conftest import eap_port, left, right
+from tests.unit.eap.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
 

@@ -13,7 +13,7 @@ from eap.pd.layout import plan_layout
 from eap.pd.spec import Writer
 from eap.pd.station import Station
 from tests.support.cyclic import MS
-from tests.unit.eap.runtime.conftest import eap_port, left
+from tests.unit.eap.conftest import eap_port, left
 
 pytestmark = pytest.mark.net
 

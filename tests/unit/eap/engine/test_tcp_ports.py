@@ -18,7 +18,7 @@ from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
 from eap.pd.spec import REQUESTER, TxFrameSpec, TxPdSpec
 from eap.pd.station import Station
-from tests.unit.eap.runtime.conftest import eap_port, left
+from tests.unit.eap.conftest import eap_port, left
 
 pytestmark = pytest.mark.net
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestTracker, Ticket
 
-A, B, C = (Way("udp", f"10.0.0.{number}:5") for number in (1, 2, 3))
+A, B, C = (Endpoint("udp", f"10.0.0.{number}:5") for number in (1, 2, 3))
 SECOND = 1_000_000_000
 
 

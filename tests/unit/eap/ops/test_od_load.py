@@ -17,7 +17,7 @@ from eap.ops.od import LoadedEntries, load
 from eap.runtime.plantfile import load_plant
 from tests.support.oddevice import MemoryDevice, mixer
 
-CONFIG = Path(__file__).parents[5] / "config"
+CONFIG = Path(__file__).parents[4] / "config"
 
 
 def test_order():

@@ -8,7 +8,7 @@ import pytest
 
 from eap.ops.plant_check import check_plant
 
-PLANTS = sorted((Path(__file__).parents[5] / "config").glob("*.yaml"))
+PLANTS = sorted((Path(__file__).parents[4] / "config").glob("*.yaml"))
 PLANT = """\
 plant: line
 stations:

@@ -53,7 +53,7 @@ from tests.support.runstations import (
     succeed,
     succeed_with_values,
 )
-from tests.unit.eap.runtime.conftest import eap_port, left
+from tests.unit.eap.conftest import eap_port, left
 
 THIRD = "5.99.99.99.1.1"
 VALUES: dict[str, list[Any]] = {

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from eap.ams.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.config.load import load
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_records import read_back
@@ -416,7 +416,9 @@ def test_a_file_is_set_aside_and_brought_back(file):
 
 
 ROUTES = (
-    RouteSpec(name="plc", net_id="5.1.2.3.1.1", hop=HopSpec(DoorKind.AMS_TCP, "", "plc:48898")),
+    RouteSpec(
+        name="plc", net_id="5.1.2.3.1.1", hop=HopSpec(TransportKind.AMS_TCP, "", "plc:48898")
+    ),
 )
 
 

@@ -22,7 +22,7 @@ from eap.supervisor.sockets import SharedSockets
 from tests.support import aoe
 from tests.support.eventually import eventually
 from tests.support.routing import station
-from tests.unit.eap.runtime.conftest import eap_port, left, right
+from tests.unit.eap.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
 
@@ -52,11 +52,11 @@ def script_on(tmp_path):
                     name: StationRoutes(router, RoutingSpec(), StationStore("plant", name).routes)
                     for name, router in routers.items()
                 }
-                doors = open_doors(
+                transports = open_doors(
                     handover, routers, routes, {}, counters, ours, Listeners(), resources
                 )
                 serving = [
-                    asyncio.ensure_future(each.serve()) for each in (*routers.values(), *doors)
+                    asyncio.ensure_future(each.serve()) for each in (*routers.values(), *transports)
                 ]
                 try:
                     await script(counters)

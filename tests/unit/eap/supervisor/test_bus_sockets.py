@@ -11,7 +11,7 @@ from eap.errors import EnvironmentalError
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec, StationSpec
 from eap.runtime.handover import NO_DESCRIPTOR, PortName
 from eap.supervisor.bus_sockets import bus_ports, open_buses, open_message_pair, segments
-from tests.unit.eap.runtime.conftest import eap_port
+from tests.unit.eap.conftest import eap_port
 
 SIM = BusPortSpec("/plants/io.yaml")
 

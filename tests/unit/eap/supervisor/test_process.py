@@ -22,7 +22,7 @@ from eap.supervisor.process import Supervisor, make_info, run
 from eap.supervisor.sockets import SharedSockets
 from tests.support.eventually import wait_until
 
-DEMO = Path(__file__).parents[5] / "config" / "demo.yaml"
+DEMO = Path(__file__).parents[4] / "config" / "demo.yaml"
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from eap.errors import EnvironmentalError
 from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec
 from eap.runtime.handover import NO_DESCRIPTOR, PortName, SocketKind
 from eap.supervisor.sockets import SharedSockets, plan_sockets
-from tests.unit.eap.runtime.conftest import eap_port, left, right
+from tests.unit.eap.conftest import eap_port, left, right
 
 LEFT, RIGHT = PortName("left", "eap0"), PortName("right", "eap0")
 

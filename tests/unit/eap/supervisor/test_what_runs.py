@@ -9,7 +9,7 @@ from eap.pd.spec import PortKind, PortSpec, RxPdSpec, TxFrameSpec, TxPdSpec
 from eap.runtime.handover import Handover
 from eap.runtime.store import StationStore, Stored, digest_of
 from eap.supervisor.what_runs import what_runs_now, why_not_built
-from tests.unit.eap.runtime.conftest import eap_port, left, right
+from tests.unit.eap.conftest import eap_port, left, right
 
 
 def handover():

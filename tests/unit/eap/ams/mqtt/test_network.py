@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.mqtt import network as mqtt_network
 from eap.ams.mqtt.info import Info, encode_info
 from eap.ams.mqtt.network import (
@@ -44,7 +44,7 @@ class Place:
         spec = MqttSpec(network="hall", host="broker", **settings)
         self.table = RouteTable()
         self.network = MqttNetwork(
-            spec, NetId.parse(OWN), "island-01", door="mqtt:hall", table=self.table
+            spec, NetId.parse(OWN), "island-01", transport="mqtt:hall", table=self.table
         )
         self.now_ns = 100 * SECOND
         self.first = self.network.connected(self.now_ns)
@@ -110,7 +110,7 @@ def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
 def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
     place = Place()
     far = NetId.parse(FAR)
-    place.table.add(Route(far, "far", Way("mqtt:hall", FAR), is_probed=False))
+    place.table.add(Route(far, "far", Endpoint("mqtt:hall", FAR), is_probed=False))
     place.network.disconnected()
     awaited = HopDown(FAR, "it has not told of itself yet")
     assert place.network.connected(place.now_ns) == [awaited, *place.first]
@@ -153,7 +153,7 @@ def test_two_routers_without_retained_messages_meet_and_fall_silent() -> None:
     one, two = Place(no_retain=True), Place(no_retain=True)
     two.network = MqttNetwork(
         MqttSpec(network="hall", host="broker", no_retain=True),
-        NetId.parse(FAR), "island-02", door="mqtt:hall", table=two.table,
+        NetId.parse(FAR), "island-02", transport="mqtt:hall", table=two.table,
     )  # fmt: skip
     two.now_ns += 60 * SECOND
     one.now_ns = two.now_ns

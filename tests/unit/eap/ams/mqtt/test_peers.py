@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.mqtt import peers as mqtt_peers
 from eap.ams.mqtt.info import Info
 from eap.ams.mqtt.peers import EXPIRY_NS, REFRESH_NS, Change, Peers
@@ -34,7 +34,7 @@ def test_route_is_learned_and_expires() -> None:
     peers_with(table).tell(FAR, HERE, 5)
     (route,) = table
     assert route == Route(
-        FAR, "far", Way(DOOR, str(FAR)), Origin.LEARNED, 4,
+        FAR, "far", Endpoint(DOOR, str(FAR)), Origin.LEARNED, 4,
         expires_at_ns=5 + EXPIRY_NS, is_probed=False,
     )  # fmt: skip
     assert table.expire(5 + EXPIRY_NS) == [route]
@@ -54,7 +54,7 @@ def test_route_is_renewed_now_and_then_and_when_its_name_changes() -> None:
 
 
 def test_nothing_is_learned_that_is_not_to_be_learned() -> None:
-    table = RouteTable([Route(FAR, "configured", Way(DOOR, str(FAR)))])
+    table = RouteTable([Route(FAR, "configured", Endpoint(DOOR, str(FAR)))])
     peers = peers_with(table)
     assert peers.tell(FAR, HERE, 0) is Change.UP
     peers.tell(NEAR, HERE._replace(is_unidirectional=True), 0)
@@ -66,10 +66,10 @@ def test_nothing_is_learned_that_is_not_to_be_learned() -> None:
 
 def test_hops_that_nothing_probes_are_awaited() -> None:
     table = RouteTable([
-        Route(FAR, "far", Way(DOOR, str(FAR)), is_probed=False),
-        Route(NEAR, "near", Way(DOOR, str(NEAR)), is_probed=False),
-        Route(OWN, "probed", Way(DOOR, str(OWN))),
-        Route(OWN, "elsewhere", Way("mqtt:line", str(OWN)), is_probed=False),
+        Route(FAR, "far", Endpoint(DOOR, str(FAR)), is_probed=False),
+        Route(NEAR, "near", Endpoint(DOOR, str(NEAR)), is_probed=False),
+        Route(OWN, "probed", Endpoint(DOOR, str(OWN))),
+        Route(OWN, "elsewhere", Endpoint("mqtt:line", str(OWN)), is_probed=False),
     ])  # fmt: skip
     peers = peers_with(table)
     assert peers.awaited() == [str(FAR), str(NEAR)]
@@ -103,7 +103,7 @@ def test_route_that_somebody_added_meanwhile_is_not_forgotten() -> None:
     table = RouteTable()
     peers = peers_with(table)
     peers.tell(FAR, HERE, 1)
-    table.add(Route(FAR, "added", Way(DOOR, str(FAR)), Origin.ADDED))
+    table.add(Route(FAR, "added", Endpoint(DOOR, str(FAR)), Origin.ADDED))
     peers.forget(5, 12)
     assert table.expire(12) == []
     assert [each.name for each in table] == ["added"]

@@ -8,8 +8,8 @@ import struct
 import pytest
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.space import AdsSpace
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode
@@ -23,7 +23,7 @@ from tests.support import aoe
 from tests.support.stationengine import make_device
 
 ONE, OTHER = 300, 301
-WAY, OTHER_WAY = Way("ams-tcp", "1"), Way("ams-tcp", "2")
+WAY, OTHER_WAY = Endpoint("ams-tcp", "1"), Endpoint("ams-tcp", "2")
 CLIENT = NetId.parse("1.2.3.4.1.1")
 OK = bytes(4)
 
@@ -46,9 +46,9 @@ class Bench:
         spaces = {ONE: [Echo(1)], OTHER: [Echo(2)]}
         self.service = AdsService(self.device, device_info("left", "1.2.3"), spaces)
 
-    def ask(self, port, command, body=b"", way=WAY):
+    def ask(self, port, command, body=b"", endpoint=WAY):
         header = AmsHeader(CLIENT, port, CLIENT, 1, command)
-        answer = self.service.answer(LocalRequest(header, body, way))
+        answer = self.service.answer(LocalRequest(header, body, endpoint))
         if isinstance(answer, AmsAnswer):
             return answer.data
         return asyncio.run(answer).data
@@ -80,8 +80,8 @@ def test_states_are_those_of_the_station(bench):
 
 def test_notifications_end_with_their_connection(bench):
     watched = struct.pack("<6I16x", G.DEVICE_DATA, 0, 4, TransMode.SERVER_CYCLE, 0, 0)
-    for port, way in ((ONE, WAY), (OTHER, WAY), (OTHER, OTHER_WAY)):
-        assert bench.ask(port, AmsCommand.ADD_NOTIFICATION, watched, way)[:4] == OK
+    for port, endpoint in ((ONE, WAY), (OTHER, WAY), (OTHER, OTHER_WAY)):
+        assert bench.ask(port, AmsCommand.ADD_NOTIFICATION, watched, endpoint)[:4] == OK
     assert bench.watchers() == [1, 2]
     bench.service.client_gone(WAY)
     assert bench.watchers() == [0, 1]

@@ -8,8 +8,8 @@ import struct
 import pytest
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
@@ -27,7 +27,7 @@ from tests.support.stationengine import make_device
 
 TXPD, CONTROL = 0xD000, 0xF200
 OK = bytes(4)
-CLIENT = Client(Way("ams-tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
+CLIENT = Client(Endpoint("ams-tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
 TARGET = NetId.parse("1.2.3.4.5.1")
 INFO = device_info("left/eap0", "1.2.3")
 
@@ -41,7 +41,7 @@ class Bench:
 
     async def ask(self, command, body=b""):
         header = AmsHeader(TARGET, DEVICE_PORT, CLIENT.net_id, CLIENT.port, command)
-        answer = self.ads.answer(LocalRequest(header, body, CLIENT.way))
+        answer = self.ads.answer(LocalRequest(header, body, CLIENT.endpoint))
         return answer if isinstance(answer, AmsAnswer) else await answer
 
     async def read(self, offset, group=G.SDO):

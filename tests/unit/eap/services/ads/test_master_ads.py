@@ -103,9 +103,9 @@ def _soon(monkeypatch):
 
 def samples(client) -> list[tuple[int, bytes]]:
     found = []
-    for way, packet in client.told:
+    for endpoint, packet in client.told:
         header, body = decode_packet(packet)
-        assert way == client.way
+        assert endpoint == client.endpoint
         assert (header.source, header.source_port) == (BUS, MASTER)
         assert header.command == AmsCommand.NOTIFICATION
         for stamp in decode_notification(bytes(body)):
@@ -135,7 +135,7 @@ def test_notification_sends_each_state_of_a_slave_until_it_is_deleted():
 def test_notification_ends_with_its_connection():
     async def scene(client, engine):
         await client.good(MASTER, CYCLIC)
-        client.service.client_gone(client.way)
+        client.service.client_gone(client.endpoint)
         await elapse(1)
         assert not client.told
 

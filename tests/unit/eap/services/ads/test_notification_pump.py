@@ -9,8 +9,8 @@ from time import monotonic_ns
 import pytest
 from msgspec.structs import replace
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client, NotificationTable
-from eap.ams.endpoint import Way
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification, to_filetime
 from eap.codec.ams import AmsCommand, decode_packet
@@ -28,7 +28,7 @@ from tests.support.eventually import eventually
 MS = 1_000_000
 CYCLE = 10 * MS
 NET_ID, PORT = NetId.parse("1.2.3.4.5.1"), 0xFFFF
-WAY = Way("ams-tcp", "127.0.0.1:5 #1")
+WAY = Endpoint("ams-tcp", "127.0.0.1:5 #1")
 CLIENT = Client(WAY, NetId.parse("1.2.3.4.1.1"), 30000)
 UNIX_AT_0 = 1_700_000_000 * 10**9
 
@@ -62,7 +62,7 @@ class Bench:
 
     def __init__(self, engine, station) -> None:
         self.engine = engine
-        self.sent: list[tuple[Way, bytes]] = []
+        self.sent: list[tuple[Endpoint, bytes]] = []
         self.symbols = StationSymbols(station)
         self.table = NotificationTable()
         self.pump = NotificationPump(self.symbols, lambda *packet: self.sent.append(packet))
@@ -83,9 +83,9 @@ class Bench:
     def told(self) -> list[tuple[int, int]]:
         """Return time in cycles and value of all samples since the last call."""
         found = []
-        for way, packet in self.sent:
+        for endpoint, packet in self.sent:
             header, body = decode_packet(packet)
-            assert (way, header.target, header.target_port) == CLIENT
+            assert (endpoint, header.target, header.target_port) == CLIENT
             assert (header.source, header.source_port) == (NET_ID, PORT)
             assert header.command == AmsCommand.NOTIFICATION
             for stamp in decode_notification(body):

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import AmsCommand, AmsHeader
@@ -27,7 +27,7 @@ from tests.support import aoe
 from tests.support.stationengine import make_device
 
 IO, DEVICE = 300, 0xFFFF
-WAY = Way("ams-tcp", "1")
+WAY = Endpoint("ams-tcp", "1")
 CLIENT = NetId.parse("1.2.3.4.1.1")
 OK = bytes(4)
 

@@ -7,8 +7,9 @@ from time import monotonic_ns
 import pytest
 from msgspec.structs import replace
 
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
+from eap.ams.transport_table import Transport
 from eap.device.eap_objects import DeviceIdentity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
@@ -21,7 +22,9 @@ from eap.services.routing.station_router import StationRouter
 from tests.support.routing import KeepingCarrier
 from tests.support.stationengine import make_device
 
-ROUTE = Route(NetId.parse("5.6.7.8.1.1"), "plc", Way("udp:eap0", "10.0.0.8:34980"), Origin.ADDED)
+ROUTE = Route(
+    NetId.parse("5.6.7.8.1.1"), "plc", Endpoint("udp:eap0", "10.0.0.8:34980"), Origin.ADDED
+)
 
 
 @pytest.fixture
@@ -41,7 +44,7 @@ def station(stations):
 @pytest.fixture
 def router(station):
     router = StationRouter("left", NetId.parse(station.net_id))
-    router.add_door(Door("udp:eap0"), KeepingCarrier())
+    router.add_transport(Transport("udp:eap0"), KeepingCarrier())
     router.add_route(ROUTE)
     return router
 
@@ -89,7 +92,7 @@ def test_routes_are_told_as_they_do(router, values):
         RouterLive.ROUTE_NET_ID: ROUTE.net_id,
         RouterLive.ROUTE_OCTETS: 4,
         RouterLive.ROUTE_NAME: "plc",
-        RouterLive.ROUTE_DOOR: "udp:eap0",
+        RouterLive.ROUTE_TRANSPORT: "udp:eap0",
         RouterLive.ROUTE_ADDRESS: "10.0.0.8:34980",
         RouterLive.ROUTE_ORIGIN: 1,
         RouterLive.ROUTE_STATE: 0,

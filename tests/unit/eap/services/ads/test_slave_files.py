@@ -118,8 +118,8 @@ def test_file_that_is_too_long_is_refused_when_it_is_closed():
 def test_file_handle_belongs_to_a_net_id_through_any_connection():
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_READ, b"a.bin")
-        client.service.client_gone(client.way)
-        client.way = client.way._replace(connection="2")
+        client.service.client_gone(client.endpoint)
+        client.endpoint = client.endpoint._replace(connection="2")
         assert await client.ask(DISK, READ, handle, length=5) == b"first"
         stranger = Client(client.service, client.bus, net_id=NetId.parse("8.8.8.8.1.1"))
         theirs = await stranger.do(DISK, ReadWrite(READ, handle, 5, b""))

@@ -8,7 +8,7 @@ from time import monotonic_ns
 
 import pytest
 
-from eap.ams.endpoint import Door
+from eap.ams.transport_table import Transport
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode, decode_notification
 from eap.codec.ams import AmsCommand
@@ -28,16 +28,16 @@ CONNECTION = "127.0.0.1:9 #1"
 
 
 @pytest.fixture
-def carrier():
+def sender():
     return KeepingCarrier()
 
 
 @pytest.fixture
-def router(stations, carrier):
+def router(stations, sender):
     station = stations[0]
     net_ids = [NetId.parse(port.net_id) for port in station.ports]
     router = StationRouter(station.name, NetId.parse(station.net_id), net_ids)
-    router.add_door(Door("ams-tcp", is_stream=True), carrier)
+    router.add_transport(Transport("ams-tcp", is_stream=True), sender)
     return router
 
 
@@ -47,17 +47,17 @@ def ads(stations, images, router):
     return StationAds(stations[0], device, images["left"], router, DeviceIdentity())
 
 
-def ask(router, carrier, target, command, body=b"", *, port=0xFFFF):
-    before = len(carrier.sent)
+def ask(router, sender, target, command, body=b"", *, port=0xFFFF):
+    before = len(sender.sent)
     packet = aoe.packet(target, command, body, port=port)
     router.receive(packet, "ams-tcp", CONNECTION)
-    ((_, answer),) = carrier.sent[before:]
+    ((_, answer),) = sender.sent[before:]
     assert not answer.error
     return answer.body
 
 
 @pytest.mark.usefixtures("ads")
-def test_every_net_id_of_its_own_answers(router, carrier, stations):
+def test_every_net_id_of_its_own_answers(router, sender, stations):
     station = stations[0]
     for net_id, port, name in (
         (station.net_id, 0xFFFF, b"left"),
@@ -66,11 +66,11 @@ def test_every_net_id_of_its_own_answers(router, carrier, stations):
         (station.ports[0].net_id, 10_000, b"left"),
         (station.ports[0].net_id, 0xFFFF, b"left/eap0"),
     ):
-        info = ask(router, carrier, net_id, AmsCommand.READ_DEVICE_INFO, port=port)
+        info = ask(router, sender, net_id, AmsCommand.READ_DEVICE_INFO, port=port)
         assert info[8:] == name.ljust(16, b"\0")
 
 
-def test_notifications_leave_by_the_router(ads, router, carrier, stations, files):
+def test_notifications_leave_by_the_router(ads, router, sender, stations, files):
     target = stations[0].ports[0].net_id
     image = files["left"].image
     sampler = Sampler(image, Inputs(image).memory)
@@ -80,18 +80,18 @@ def test_notifications_leave_by_the_router(ads, router, carrier, stations, files
         await asyncio.sleep(0)
         name = b"ticks\0"
         asked = struct.pack("<4I", G.SYMBOL_HANDLE, 0, 4, len(name)) + name
-        handle = int.from_bytes(ask(router, carrier, target, 9, asked)[8:], "little")
+        handle = int.from_bytes(ask(router, sender, target, 9, asked)[8:], "little")
         watch = struct.pack("<6I16x", G.VALUE_BY_HANDLE, handle, 2, TransMode.SERVER_CYCLE, 0, 0)
-        added = ask(router, carrier, target, AmsCommand.ADD_NOTIFICATION, watch)
+        added = ask(router, sender, target, AmsCommand.ADD_NOTIFICATION, watch)
         await asyncio.sleep(0)
         image.words[StationWord.CYCLE] = 1
         ran_ns = monotonic_ns()
         image.words[StationWord.CYCLE_AT_NS] = ran_ns
         sampler.end_cycle(1, ran_ns)
-        count = len(carrier.sent)
-        await eventually(lambda: len(carrier.sent) != count)
+        count = len(sender.sent)
+        await eventually(lambda: len(sender.sent) != count)
         serving.cancel()
-        return added, carrier.sent[-1]
+        return added, sender.sent[-1]
 
     added, (connection, told) = asyncio.run(run())
     assert (connection, told.command) == (CONNECTION, AmsCommand.NOTIFICATION)

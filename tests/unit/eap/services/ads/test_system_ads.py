@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import AmsCommand, AmsHeader
@@ -20,7 +20,7 @@ from eap.services.routing.service import LocalRequest
 from tests.support import aoe
 from tests.support.stationengine import make_device
 
-WAY = Way("ams-tcp", "1")
+WAY = Endpoint("ams-tcp", "1")
 HERE = NetId.parse("1.2.3.4.1.1")
 OK = bytes(4)
 

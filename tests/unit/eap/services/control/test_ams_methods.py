@@ -7,14 +7,14 @@ import msgspec
 import pytest
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.directory import Directory
-from eap.ams.endpoint import Way
 from eap.ams.routes import Route
 from eap.ams.spec import DirectoryStation
 from eap.errors import ControlError
 from eap.ids import NetId
 from eap.services.control.ams_methods import AmsMethods
-from eap.services.routing.route_query import Whereabouts
+from eap.services.routing.route_query import RouteQuery
 from eap.services.routing.station_router import StationRouter
 from tests.support.routing import StubService
 
@@ -27,10 +27,10 @@ def call(method: str, **params: Any) -> Any:
         router = StationRouter("island-01", NET_ID)
         router.add_service(
             NET_ID,
-            Whereabouts(router, StubService(lambda _: AmsAnswer(bytes(4) + b"\5\0\0\0"), 10_000)),
+            RouteQuery(router, StubService(lambda _: AmsAnswer(bytes(4) + b"\5\0\0\0"), 10_000)),
         )
         router.add_route(
-            Route(NetId.parse("6.1.1.1.1.1"), "far", Way("udp:none", "10.0.0.6:34980"))
+            Route(NetId.parse("6.1.1.1.1.1"), "far", Endpoint("udp:none", "10.0.0.6:34980"))
         )
         methods = AmsMethods({"island-01": router}, PLANT, {"island-01": "127.0.1.1"})
         return msgspec.to_builtins(await methods.table()[method](params))

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, ReadWrite, Write, WriteControl
-from eap.ams.access import Verdict
+from eap.ams.access import Decision
 from eap.ams.authorized_request import AddRoute, AuditedOperation, AuditEntry
 from eap.ams.directory import Directory
-from eap.ams.endpoint import Way
 from eap.ams.spec import AccessService, DirectoryPort, DirectoryStation
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
@@ -21,7 +21,7 @@ from eap.services.control import audit_file
 from eap.services.control.audit import BURST, Audit
 from eap.services.control.audit_file import KEPT, AuditFile
 
-LAPTOP = Way("ams-tcp", "10.0.0.5:49152")
+LAPTOP = Endpoint("ams-tcp", "10.0.0.5:49152")
 HEADER = AmsHeader(
     NetId.parse("5.1.1.1.3.1"), 1001, NetId.parse("192.168.0.9.1.1"), 30000, 3, 4, invoke_id=1
 )
@@ -35,7 +35,7 @@ NAMES = Directory(
     ]
 )
 WRITE = Write(IndexGroup.SDO, 0x8000_0001, b"\1\2\3\4")
-ALLOWED = Verdict(AccessService.WRITE, True, "rule drives allows it")
+ALLOWED = Decision(AccessService.WRITE, True, "rule drives allows it")
 
 
 class Clock:
@@ -61,11 +61,13 @@ def entry(
     operation: Operation | AddRoute = WRITE,
     result: int | None = 0,
     *,
-    verdict: Verdict = ALLOWED,
+    decision: Decision = ALLOWED,
     count: int = 1,
-    way: Way = LAPTOP,
+    endpoint: Endpoint = LAPTOP,
 ) -> AuditEntry:
-    return AuditEntry(way, HEADER, "", (AuditedOperation(operation, verdict, result),) * count)
+    return AuditEntry(
+        endpoint, HEADER, "", (AuditedOperation(operation, decision, result),) * count
+    )
 
 
 def lines(audit: Audit) -> list[dict[str, Any]]:
@@ -146,8 +148,8 @@ def test_what_was_to_be_done(
 
 
 def test_a_refusal(audit: Audit) -> None:
-    denied = Verdict(AccessService.WRITE, False, "no rule allows it, and other hosts only read")
-    audit.write("island-01", entry(result=0x723, verdict=denied))
+    denied = Decision(AccessService.WRITE, False, "no rule allows it, and other hosts only read")
+    audit.write("island-01", entry(result=0x723, decision=denied))
     (line,) = lines(audit)
     assert not line["allowed"]
     assert line["error"] == "error 0x723 (access rules forbid it)"
@@ -155,7 +157,7 @@ def test_a_refusal(audit: Audit) -> None:
 
 def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: Clock) -> None:
     audit.write("island-01", entry(count=BURST + 20))
-    audit.write("island-01", entry(way=Way("ams-tcp", "10.0.0.6:1")))
+    audit.write("island-01", entry(endpoint=Endpoint("ams-tcp", "10.0.0.6:1")))
     assert len(lines(audit)) == BURST + 1
     audit.tell_skipped()
     audit.tell_skipped()
@@ -175,20 +177,20 @@ def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: C
 
 def test_a_flood_from_many_addresses_is_bounded_by_its_door(audit: Audit) -> None:
     for number in range(12):
-        way = Way("udp:eap0", f"10.0.0.{number}:34980")
-        audit.write("island-01", entry(way=way, count=BURST))
+        endpoint = Endpoint("udp:eap0", f"10.0.0.{number}:34980")
+        audit.write("island-01", entry(endpoint=endpoint, count=BURST))
     audit.write("island-01", entry())
     # The first line of each client counts among those of new ones.
     assert len(lines(audit)) == module.DOOR_RATE.burst + 12 + 1
 
 
 def test_flood_from_invented_addresses_leaves_known_clients_their_lines(audit: Audit) -> None:
-    known = Way("udp:eap0", "10.0.0.5:34980")
-    audit.write("island-01", entry(way=known))
+    known = Endpoint("udp:eap0", "10.0.0.5:34980")
+    audit.write("island-01", entry(endpoint=known))
     for number in range(module.NEW_RATE.burst + 10):
-        way = Way("udp:eap0", f"10.1.{number >> 8}.{number & 255}:34980")
-        audit.write("island-01", entry(way=way))
-    audit.write("island-01", entry(way=known))
+        endpoint = Endpoint("udp:eap0", f"10.1.{number >> 8}.{number & 255}:34980")
+        audit.write("island-01", entry(endpoint=endpoint))
+    audit.write("island-01", entry(endpoint=known))
     found = [line["from"] for line in lines(audit)]
     assert found.count(known.connection) == 2
     assert len(found) == module.NEW_RATE.burst + 1, "one of the new ones is the known client"
@@ -197,8 +199,8 @@ def test_flood_from_invented_addresses_leaves_known_clients_their_lines(audit: A
 def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None:
     audit.write("island-01", entry(count=BURST + 1))
     for number in range(1100):
-        way = Way("ams-tcp", f"10.1.{number // 250}.{number % 250}:1")
-        audit.write("island-01", entry(way=way))
+        endpoint = Endpoint("ams-tcp", f"10.1.{number // 250}.{number % 250}:1")
+        audit.write("island-01", entry(endpoint=endpoint))
     audit.tell_skipped()
     skipped = {line["from"]: line["skipped"] for line in lines(audit) if "skipped" in line}
     assert skipped["10.0.0.5"] == 1

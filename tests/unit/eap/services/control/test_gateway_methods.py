@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
 from eap.gateway.request_tracker import RequestTracker
@@ -21,7 +21,7 @@ from eap.services.gateway.gateway import Settings
 from eap.services.gateway.reply_encoder import GatewayStatistics
 from tests.support.cyclic import station
 
-HERE = Way("udp:eap0", "127.0.0.1:9")
+HERE = Endpoint("udp:eap0", "127.0.0.1:9")
 FIRST, SECOND = PortName("left", "bus0"), PortName("left", "bus1")
 PORT = PortName("left", "eap0")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
 from eap.codec.staticroutes import StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
@@ -92,7 +92,7 @@ def test_replaced_route_goes(ask, left):
 
 def test_what_speaks_against_a_route_is_told(ask, left):
     net_id = NetId.parse(PLC["net_id"])
-    left.router.add_route(Route(net_id, "first", Way("udp:eap0", "127.0.9.9:34980"), octets=6))
+    left.router.add_route(Route(net_id, "first", Endpoint("udp:eap0", "127.0.9.9:34980"), octets=6))
     (warning,) = ask("add", **PLC).warnings
     assert warning.startswith("route plc (5.1.2.3.1.1, 10.0.0.5:48898 by ams-tcp)")
     assert "is not taken for 5.1.2.3.1.1: first" in warning

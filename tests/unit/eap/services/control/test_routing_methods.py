@@ -6,7 +6,7 @@ from inspect import isawaitable
 import msgspec
 import pytest
 
-from eap.ams.spec import DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.control.device import RoutingDifference, RunningRouting
 from eap.errors import ControlError
 from eap.runtime.store import StationStore
@@ -15,7 +15,7 @@ from eap.services.routing.station_routes import StationRoutes
 from eap.services.routing.station_routing import StationRouting
 from tests.support.routing import station
 
-HOP = HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980")
+HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")
 OLD = RoutingSpec()
 NEW = RoutingSpec(routes=(RouteSpec(name="mill", net_id="10.0.0.2.1.1", hop=HOP),))
 

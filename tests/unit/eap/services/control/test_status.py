@@ -28,7 +28,7 @@ from eap.services.control.status import (
     take_snapshot,
 )
 from tests.support.eventually import eventually
-from tests.unit.eap.runtime.conftest import left
+from tests.unit.eap.conftest import left
 
 
 def now_ns() -> int:

@@ -18,7 +18,7 @@ from eap.runtime.bus_request import EngineReply, EngineRequest, EngineStarted
 from eap.runtime.station_request import Configure, SetState
 from eap.services.device.engine_client import EngineClient
 from eap.services.engine_link import EngineLink
-from tests.unit.eap.runtime.conftest import left
+from tests.unit.eap.conftest import left
 
 pytestmark = pytest.mark.net
 

@@ -73,13 +73,13 @@ def frame(destination: str, name: str = "f", **more: object) -> TxFrameSpec:
 
 
 @pytest.fixture
-def way():
+def endpoint():
     table = NeighbourTable()
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind(("127.9.2.8", 0))
-    way = UdpWay([sock], table, "127.9.2.8")
-    yield way
-    way.close()
+    endpoint = UdpWay([sock], table, "127.9.2.8")
+    yield endpoint
+    endpoint.close()
     table.close()
 
 
@@ -90,36 +90,36 @@ def closed():
         return "{}:{}".format(*sock.getsockname())
 
 
-def send(way, holder, target, now_ns):
+def send(endpoint, holder, target, now_ns):
     host, _, port = target.partition(":")
-    way.sockets[0].sendto(b"frame", (host, int(port)))
+    endpoint.sockets[0].sendto(b"frame", (host, int(port)))
     holder.put(FrameWord.SENT_AT_NS, now_ns)
 
 
-def test_a_refused_frame_has_no_subscriber(way, closed, caplog):
+def test_a_refused_frame_has_no_subscriber(endpoint, closed, caplog):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
     watch.step(SECOND)
     assert (holder.status(), holder.state()) == ("unknown", 0)
-    send(way, holder, closed, 2 * SECOND)
+    send(endpoint, holder, closed, 2 * SECOND)
     watch.step(2 * SECOND)
     assert (holder.status(), holder.state()) == ("missing", 4)
     assert f"a/f: subscriber at {closed} is missing" in caplog.text
 
 
-def test_a_listener_on_this_machine_is_unknown_never_present(way, closed, caplog):
+def test_a_listener_on_this_machine_is_unknown_never_present(endpoint, closed, caplog):
     caplog.set_level(logging.INFO)
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
     watch.step(SECOND)
-    send(way, holder, closed, 2 * SECOND)
+    send(endpoint, holder, closed, 2 * SECOND)
     watch.step(2 * SECOND)
     found = set()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         host, _, port = closed.partition(":")
         listener.bind((host, int(port)))
         for second in range(3, 20):
-            send(way, holder, closed, second * SECOND)
+            send(endpoint, holder, closed, second * SECOND)
             watch.step(second * SECOND)
             found.add(holder.status())
     assert holder.status() == "unknown"
@@ -130,19 +130,19 @@ def test_a_listener_on_this_machine_is_unknown_never_present(way, closed, caplog
 @pytest.mark.parametrize(
     "destination", ["239.1.1.1", "tcp://10.0.0.1", "5.5.5.5.1.1", NOBODY, "01:01:05:04:00:00"]
 )
-def test_where_nothing_can_be_told_it_is_unknown(way, destination):
+def test_where_nothing_can_be_told_it_is_unknown(endpoint, destination):
     holder = Holder(frame(destination))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
     for second in range(1, 10):
         watch.step(second * SECOND)
     assert holder.status() == "unknown"
 
 
-def test_frame_that_is_sent_elsewhere_is_judged_anew(way, closed):
+def test_frame_that_is_sent_elsewhere_is_judged_anew(endpoint, closed):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
     watch.step(SECOND)
-    send(way, holder, closed, 2 * SECOND)
+    send(endpoint, holder, closed, 2 * SECOND)
     watch.step(2 * SECOND)
     assert holder.status() == "missing"
     holder.put(FrameWord.ADDRESS, to_word("127.9.2.7"))
@@ -150,46 +150,46 @@ def test_frame_that_is_sent_elsewhere_is_judged_anew(way, closed):
     assert holder.status() == "unknown"
 
 
-def test_a_station_may_be_configured_anew(way, closed):
+def test_a_station_may_be_configured_anew(endpoint, closed):
     holder = Holder(frame(closed), frame("127.9.2.7", "g"))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
     watch.step(SECOND)
     holder.current = None
     watch.step(2 * SECOND)
     holder.replace(frame("127.9.2.7", "g"), frame(closed, "h", monitor_interval_ms=0))
     watch.step(3 * SECOND)
-    send(way, holder, closed, 4 * SECOND)
+    send(endpoint, holder, closed, 4 * SECOND)
     watch.step(4 * SECOND)
     assert (holder.status(0), holder.status(1)) == ("unknown", "unknown")
 
 
-def test_what_is_known_of_a_frame_that_stays_is_kept(way, closed):
+def test_what_is_known_of_a_frame_that_stays_is_kept(endpoint, closed):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
     watch.step(SECOND)
-    send(way, holder, closed, 2 * SECOND)
+    send(endpoint, holder, closed, 2 * SECOND)
     watch.step(2 * SECOND)
     holder.replace(frame("127.9.2.7", "g"), frame(closed))
     watch.step(2 * SECOND + 1)
     assert (holder.status(0), holder.status(1)) == ("unknown", "missing")
 
 
-def test_nothing_to_monitor_is_looked_for_now_and_then(way):
-    watch = SubscriberWatch({"a": Holder()}, Ways({}, {PORT: way}))
+def test_nothing_to_monitor_is_looked_for_now_and_then(endpoint):
+    watch = SubscriberWatch({"a": Holder()}, Ways({}, {PORT: endpoint}))
     assert watch.step(SECOND) == SECOND + LOOK_NS
 
 
-def test_errors_are_taken_as_they_come(way, closed):
+def test_errors_are_taken_as_they_come(endpoint, closed):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
 
     async def scenario() -> float:
         task = asyncio.get_running_loop().create_task(watch.run())
         await settle()
         # What the engine receives is none of its business and wakes nobody.
-        way.sockets[0].sendto(b"frame", way.sockets[0].getsockname())
+        endpoint.sockets[0].sendto(b"frame", endpoint.sockets[0].getsockname())
         started = time.monotonic()
-        send(way, holder, closed, time.monotonic_ns())
+        send(endpoint, holder, closed, time.monotonic_ns())
         await eventually(lambda: holder.status() == "missing")
         took = time.monotonic() - started
         task.cancel()
@@ -200,7 +200,7 @@ def test_errors_are_taken_as_they_come(way, closed):
         return await asyncio.wait_for(scenario(), 5)
 
     assert asyncio.run(bounded()) < 2
-    assert way.sockets[0].recv(10) == b"frame"
+    assert endpoint.sockets[0].recv(10) == b"frame"
 
 
 class Host:
@@ -222,17 +222,17 @@ class Host:
 @pytest.fixture
 def ends(cable):
     """A prober at one end of a cable, and a host at the other."""
-    prober, host = ArpProber(open_arp(cable[0])), Host(cable[1])
-    yield prober, host
-    prober.close()
+    hop_prober, host = ArpProber(open_arp(cable[0])), Host(cable[1])
+    yield hop_prober, host
+    hop_prober.close()
     host.sock.close()
 
 
 @pytest.mark.root
 def test_arp_tells_who_is_there_and_who_is_gone(ends):
-    prober, host = ends
+    hop_prober, host = ends
     holder = Holder(frame(str(host.mac), monitor_ip="10.77.0.2"))
-    watch = SubscriberWatch({"a": holder}, Ways({PORT: prober}, {}))
+    watch = SubscriberWatch({"a": holder}, Ways({PORT: hop_prober}, {}))
     watch.step(SECOND)
     host.answer()
     watch.step(SECOND + LOOK_NS)
@@ -244,9 +244,9 @@ def test_arp_tells_who_is_there_and_who_is_gone(ends):
 
 @pytest.mark.root
 def test_another_host_with_the_address_is_not_the_subscriber(ends, caplog):
-    prober, host = ends
+    hop_prober, host = ends
     holder = Holder(frame(NOBODY, monitor_ip="10.77.0.2"))
-    watch = SubscriberWatch({"a": holder}, Ways({PORT: prober}, {}))
+    watch = SubscriberWatch({"a": holder}, Ways({PORT: hop_prober}, {}))
     for half in range(2, 12):
         watch.step(half * SECOND // 2)
         if not half % 2:
@@ -257,12 +257,12 @@ def test_another_host_with_the_address_is_not_the_subscriber(ends, caplog):
 
 @pytest.mark.root
 def test_more_addresses_than_one_socket_takes_are_told(ends, caplog):
-    prober, _ = ends
+    hop_prober, _ = ends
     frames = [
         frame(NOBODY, f"f{n}", monitor_ip=str(IPv4Address(0x0A4D0000 + n))) for n in range(1001)
     ]
     holder = Holder(*frames)
-    watch = SubscriberWatch({"a": holder}, Ways({PORT: prober}, {}))
+    watch = SubscriberWatch({"a": holder}, Ways({PORT: hop_prober}, {}))
     watch.step(SECOND)
     assert "1001 addresses to monitor on one interface" in caplog.text
     holder.replace(msgspec.structs.replace(frames[0], destination=NOBODY))

@@ -15,7 +15,7 @@ from eap.errors import WriterConflictError
 from eap.pd.spec import CsvSource, HostSource, Measure, Writer
 from eap.services.device.sources import SourcePlayer, fit, play_sources
 from tests.support.eventually import elapse, eventually, settle
-from tests.unit.eap.runtime.conftest import left
+from tests.unit.eap.conftest import left
 
 
 @pytest.mark.parametrize(

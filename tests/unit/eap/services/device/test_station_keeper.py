@@ -21,7 +21,7 @@ from eap.runtime.store import (
 )
 from eap.services.device.station_keeper import StationKeeper
 from tests.support.stationengine import StationEngine
-from tests.unit.eap.runtime.conftest import right
+from tests.unit.eap.conftest import right
 
 OLD, NEW = {"eap0": "old"}, {"eap0": "new"}
 

@@ -20,8 +20,8 @@ from devicebus.errors import (
     NoMailboxError,
 )
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Read
-from eap.ams.endpoint import Way
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError, EngineGoneError
@@ -47,7 +47,7 @@ COE, SOE, FOE, VOE, AOE, EOE = (
 )
 UPLOAD = "0020 40 0080 01 00000000"
 SEGMENT = "0020 60 00000000000000"
-HERE, THERE = Way("udp:a", "1"), Way("udp:a", "2")
+HERE, THERE = Endpoint("udp:a", "1"), Endpoint("udp:a", "2")
 SLAVE = SlaveDescription(
     station=1001, name="s", vendor=1, product=2, revision=3, serial=4, alias=0, state=8, target=8,
     to_slave=64, to_master=64, protocols=0x0C,
@@ -283,8 +283,8 @@ class Session:
         self.is_closed = True
 
 
-def key(way: Way = HERE, address: int = 1001) -> SessionKey:
-    return SessionKey(way, address, COE)
+def key(endpoint: Endpoint = HERE, address: int = 1001) -> SessionKey:
+    return SessionKey(endpoint, address, COE)
 
 
 def test_session_table_keeps_a_clients_session() -> None:

@@ -17,9 +17,9 @@ from devicebus.errors import (
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write
 from eap.ams.access import AccessList, service_of
-from eap.ams.endpoint import Way
 from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
@@ -58,7 +58,7 @@ HEAD = 10
 UPLOAD = ReadSdo(0x1018, 1, complete=False)
 MESSAGE = bytes.fromhex("5a0e0000 0100")
 BUS = RuleTarget(NetId(bytes(6)), 1001)
-HERE = Way("udp:eap0", "127.0.0.1:1")
+HERE = Endpoint("udp:eap0", "127.0.0.1:1")
 
 
 def handler(room: int = 100, answer_s: float = 1.0, *rules: AccessRule) -> DialectHandler:

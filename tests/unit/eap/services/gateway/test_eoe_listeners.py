@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.services.gateway.message_codecs import LISTENS_NS, MAX_LISTENERS, EoeListeners
 
-A, B = Way("udp:e", "10.0.0.1:1"), Way("udp:e", "10.0.0.2:1")
+A, B = Endpoint("udp:e", "10.0.0.1:1"), Endpoint("udp:e", "10.0.0.2:1")
 
 
 def send(frame: bytes) -> None:
@@ -27,5 +27,5 @@ def test_clients_hear_a_slave_for_a_while_after_they_talked_to_it() -> None:
 def test_the_least_lately_heard_makes_room() -> None:
     listeners = EoeListeners()
     for number in range(MAX_LISTENERS + 1):
-        listeners.note(1001, Way("udp:e", str(number)), number, send, 0)
+        listeners.note(1001, Endpoint("udp:e", str(number)), number, send, 0)
     assert [each.address for each in listeners.of(1001, 1)] == [*range(1, MAX_LISTENERS + 1)]

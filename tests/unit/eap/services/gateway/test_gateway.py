@@ -10,9 +10,9 @@ import pytest
 from msgspec.structs import replace
 
 from devicebus.master.mailboxes import Unsolicited
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Read
 from eap.ams.access import AccessList
-from eap.ams.endpoint import Way
 from eap.ams.spec import AccessRule, AccessTarget
 from eap.codec.ads import IndexGroup
 from eap.codec.ethercat import EtherCatHeader
@@ -43,8 +43,8 @@ COE, FOE, SOE, VOE, AOE, EOE = (
 )
 ELSEWHERE_BUS = NetId.parse("127.0.1.2.3.1")
 NET_ID = NetId.parse("127.0.1.1.3.1")
-HERE, ALSO_HERE = Way("udp:eap0", "127.0.0.1:1"), Way("udp:eap0", "127.0.0.1:2")
-ELSEWHERE = Way("udp:eap0", "10.0.0.9:1")
+HERE, ALSO_HERE = Endpoint("udp:eap0", "127.0.0.1:1"), Endpoint("udp:eap0", "127.0.0.1:2")
+ELSEWHERE = Endpoint("udp:eap0", "10.0.0.9:1")
 FILE = b"firmware.bin".hex()
 VENDOR = "0020 40 1810 01 00000000"
 MASTER = ObjectDictionary(
@@ -90,43 +90,43 @@ class Desk:
         return self.station.link()
 
     async def ask(
-        self, kind: MailboxType, address: int, octets: str | bytes, way: Way = HERE
+        self, kind: MailboxType, address: int, octets: str | bytes, endpoint: Endpoint = HERE
     ) -> list[tuple[MailboxHeader, bytes]]:
         """Return the answers to a request."""
         body = bytes.fromhex(octets) if isinstance(octets, str) else octets
         frame = encode_frame(MailboxHeader(0, address, type=kind, counter=3), body)
-        return [decoded(each) for each in await self.ask_frame(frame, way)]
+        return [decoded(each) for each in await self.ask_frame(frame, endpoint)]
 
-    async def ask_frame(self, frame: bytes, way: Way = HERE) -> list[bytes]:
+    async def ask_frame(self, frame: bytes, endpoint: Endpoint = HERE) -> list[bytes]:
         answers: list[bytes] = []
-        task = self.gateway.receive(frame, way, answers.append)
+        task = self.gateway.receive(frame, endpoint, answers.append)
         if task is not None:
             await task
         return answers
 
     async def one(
-        self, kind: MailboxType, address: int, octets: str | bytes, way: Way = HERE
+        self, kind: MailboxType, address: int, octets: str | bytes, endpoint: Endpoint = HERE
     ) -> str:
         """Return the only answer, in hex, of the protocol that was asked."""
-        ((header, body),) = await self.ask(kind, address, octets, way)
+        ((header, body),) = await self.ask(kind, address, octets, endpoint)
         assert header.type is kind
         assert header.address == address
         return body.hex(" ")
 
-    async def begin_file(self, body: str, way: Way = HERE) -> str:
+    async def begin_file(self, body: str, endpoint: Endpoint = HERE) -> str:
         """Return the answer to a request of FoE, when it is another one than BUSY."""
         async with asyncio.timeout(20):
-            while (answer := await self.one(FOE, 1001, body, way)).startswith("06"):
+            while (answer := await self.one(FOE, 1001, body, endpoint)).startswith("06"):
                 pass
         return answer
 
-    async def write_file(self, name: str, content: bytes, way: Way = HERE) -> None:
+    async def write_file(self, name: str, content: bytes, endpoint: Endpoint = HERE) -> None:
         """Write a file of the drive."""
         room = 1024 - 12
-        await self.begin_file("02 00 00000000" + name, way)
+        await self.begin_file("02 00 00000000" + name, endpoint)
         for number, at in enumerate(range(0, len(content) + 1, room), 1):
             packet = bytes((3, 0)) + number.to_bytes(4, "little") + content[at : at + room]
-            while (answer := await self.one(FOE, 1001, packet, way))[:2] == "06":
+            while (answer := await self.one(FOE, 1001, packet, endpoint))[:2] == "06":
                 pass
             assert answer == (bytes((4, 0)) + number.to_bytes(4, "little")).hex(" ")
 

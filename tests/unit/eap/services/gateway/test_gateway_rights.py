@@ -76,9 +76,11 @@ def test_changes_and_refusals_are_audited() -> None:
         await desk.one(COE, 1001, WRITE, ELSEWHERE)
         await desk.one(COE, 1001, WRITE)
         await desk.ask(COE, 0xFFFF, WRITE)
-        told = [(each.way, each.header.target_port, each.operations[0].result) for each in entries]
+        told = [
+            (each.endpoint, each.header.target_port, each.operations[0].result) for each in entries
+        ]
         assert told == [(ELSEWHERE, 1001, 0x723), (HERE, 1001, 0), (HERE, 1001, 0x723)]
-        assert entries[2].operations[0].verdict.why == (
+        assert entries[2].operations[0].decision.why == (
             "only a rule allows it for several slaves at once"
         )
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import decode_frame
 from eap.ids import NetId
 from eap.runtime.discards import Refusal
 from eap.services.gateway.gateway import Settings
-from eap.services.gateway.gateway_transport import GatewayDoor
+from eap.services.gateway.gateway_transport import GatewayTransport
 
 UPLOAD = bytes.fromhex("10 50 0a 00 e9 03 00 23 00 20 41 18 10 02 00 00 00 00")
 
@@ -22,43 +22,46 @@ class Gateway:
         self.turned_away = 0
         self.heard: list[Any] = []
 
-    def receive(self, frame, way, send) -> None:
+    def receive(self, frame, endpoint, send) -> None:
         header, body = decode_frame(frame)
-        self.heard.append((header.address, bytes(body), way))
+        self.heard.append((header.address, bytes(body), endpoint))
         send(b"answer")
 
-    def connection_closed(self, way) -> None:
-        self.heard.append(("closed", way))
+    def connection_closed(self, endpoint) -> None:
+        self.heard.append(("closed", endpoint))
 
-    async def wait_below(self, way, count) -> None:
-        self.heard.append(("below", way, count))
+    async def wait_below(self, endpoint, count) -> None:
+        self.heard.append(("below", endpoint, count))
 
 
 def test_the_first_station_with_a_bus_has_the_gateway() -> None:
     first, second = Gateway(), Gateway()
-    door = GatewayDoor([(first, "udp:a"), (second, "udp:b")])
+    transport = GatewayTransport([(first, "udp:a"), (second, "udp:b")])
     sent = []
-    assert door.receive(UPLOAD, "me", lambda *each: sent.append(each)) is None
-    assert first.heard == [(1001, UPLOAD[8:], Way("udp:a", "me"))]
+    assert transport.receive(UPLOAD, "me", lambda *each: sent.append(each)) is None
+    assert first.heard == [(1001, UPLOAD[8:], Endpoint("udp:a", "me"))]
     assert not second.heard
     assert sent == [("me", b"answer")]
-    door.connection_closed("me")
-    asyncio.run(door.wait_below("me", 3))
-    assert first.heard[1:] == [("closed", Way("udp:a", "me")), ("below", Way("udp:a", "me"), 3)]
+    transport.connection_closed("me")
+    asyncio.run(transport.wait_below("me", 3))
+    assert first.heard[1:] == [
+        ("closed", Endpoint("udp:a", "me")),
+        ("below", Endpoint("udp:a", "me"), 3),
+    ]
 
 
 def test_without_a_bus_nobody_answers() -> None:
-    door = GatewayDoor([])
-    assert door.receive(UPLOAD, "me", lambda *each: None) is Refusal.MAILBOX
-    door.connection_closed("me")
-    asyncio.run(door.wait_below("me", 1))
+    transport = GatewayTransport([])
+    assert transport.receive(UPLOAD, "me", lambda *each: None) is Refusal.MAILBOX
+    transport.connection_closed("me")
+    asyncio.run(transport.wait_below("me", 1))
 
 
 def test_a_protocol_that_nobody_knows_is_refused_by_a_mailbox_error() -> None:
-    door = GatewayDoor([(Gateway(), "udp:a")])
+    transport = GatewayTransport([(Gateway(), "udp:a")])
     sent = []
     frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
-    assert door.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
+    assert transport.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
     assert sent == [("me", bytes.fromhex("0a50 0400 e903 00 00 0100 0200"))]
 
 
@@ -67,20 +70,20 @@ def test_a_silent_gateway_does_not_refuse_a_protocol_either() -> None:
     gateway.settings = gateway.settings._replace(is_silent=True)
     frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
     sent = []
-    door = GatewayDoor([(gateway, "udp:a")])
-    assert door.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
+    transport = GatewayTransport([(gateway, "udp:a")])
+    assert transport.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
     assert not sent
 
 
 def test_a_gateway_that_is_stopped_turns_frames_away() -> None:
     gateway = Gateway()
     gateway.is_open = False
-    door = GatewayDoor([(gateway, "udp:a")])
-    assert door.receive(UPLOAD, "me", lambda *each: None) is Refusal.GATEWAY_OFF
+    transport = GatewayTransport([(gateway, "udp:a")])
+    assert transport.receive(UPLOAD, "me", lambda *each: None) is Refusal.GATEWAY_OFF
     assert gateway.turned_away == 1
     assert not gateway.heard
 
 
 def test_a_frame_that_is_cut_is_counted() -> None:
-    door = GatewayDoor([(Gateway(), "udp:a")])
-    assert door.receive(UPLOAD[:-2], "me", lambda *each: None) is Refusal.TRUNCATED
+    transport = GatewayTransport([(Gateway(), "udp:a")])
+    assert transport.receive(UPLOAD[:-2], "me", lambda *each: None) is Refusal.TRUNCATED

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import (
     MailboxHeader,
     encode_frame,
@@ -33,12 +33,14 @@ def test_what_is_asked_twice_at_once_is_answered_twice_on_a_connection() -> None
         MailboxHeader(0, 1001, type=COE, counter=3), bytes.fromhex("0020 40 1810 01 00000000")
     )
 
-    async def answers(desk: Desk, way: Way) -> int:
-        return sum(map(len, await asyncio.gather(*(desk.ask_frame(request, way) for _ in "123"))))
+    async def answers(desk: Desk, endpoint: Endpoint) -> int:
+        return sum(
+            map(len, await asyncio.gather(*(desk.ask_frame(request, endpoint) for _ in "123")))
+        )
 
     async def scene(desk: Desk) -> None:
         assert await answers(desk, HERE) == 1
-        assert await answers(desk, Way("tcp:eap0", "127.0.0.1:1")) == 3
+        assert await answers(desk, Endpoint("tcp:eap0", "127.0.0.1:1")) == 3
 
     play(scene)
 
@@ -68,14 +70,14 @@ def test_who_is_too_fast_is_told_so() -> None:
 def test_two_clients_transfers_do_not_mix() -> None:
     first, second = b"a" * 3000, b"b" * 2500
 
-    async def write(desk: Desk, name: bytes, data: bytes, way: Way) -> None:
+    async def write(desk: Desk, name: bytes, data: bytes, endpoint: Endpoint) -> None:
         body = bytes.fromhex("02 00 00000000") + name
-        while (await desk.one(FOE, 1001, body, way))[:2] == "06":
+        while (await desk.one(FOE, 1001, body, endpoint))[:2] == "06":
             pass
         room = 1024 - 12
         for number, at in enumerate(range(0, len(data) + 1, room), 1):
             packet = bytes((3, 0)) + number.to_bytes(4, "little") + data[at : at + room]
-            answer = await desk.one(FOE, 1001, packet, way)
+            answer = await desk.one(FOE, 1001, packet, endpoint)
             assert answer == (bytes((4, 0)) + number.to_bytes(4, "little")).hex(" ")
 
     async def read(desk: Desk, name: bytes) -> bytes:
@@ -145,7 +147,7 @@ def test_who_is_stopped_lets_go_of_everything() -> None:
     async def scene(desk: Desk) -> None:
         await desk.one(FOE, 1001, "01 00 00000000" + FILE)
         (running,) = desk.gateway.transfers()
-        assert (running.way, running.address, running.kind) == (HERE, 1001, FOE)
+        assert (running.endpoint, running.address, running.kind) == (HERE, 1001, FOE)
         await desk.gateway.stop()
         assert not desk.gateway.is_open
         assert not desk.gateway.transfers()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Read, Write
 from eap.ams.access import AccessList
 from eap.ams.authorized_request import AuditEntry
-from eap.ams.endpoint import Way
 from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
@@ -18,29 +18,31 @@ from eap.services.gateway.client_session import GatewayReply
 from eap.services.gateway.guard import Guard, RuleTarget, reason_of_refusal, result_of
 
 TARGET = RuleTarget(NetId.parse("5.1.1.1.3.1"), 1001)
-HERE, ELSEWHERE = Way("udp:eap0", "127.0.0.1:1"), Way("udp:eap0", "10.0.0.9:1")
+HERE, ELSEWHERE = Endpoint("udp:eap0", "127.0.0.1:1"), Endpoint("udp:eap0", "10.0.0.9:1")
 READ, WRITE = Read(IndexGroup.SDO, 0x1018_0001, 4), Write(IndexGroup.SDO, 0x6040_0000, b"1")
 
 
 def test_rules_that_change_count_at_once() -> None:
     rules: list[AccessRule] = []
     guard = Guard(lambda: AccessList(tuple(rules)))
-    assert guard.judge(HERE, TARGET, WRITE).is_allowed
-    assert not guard.judge(HERE, TARGET, WRITE, by_rule=True).is_allowed
-    assert guard.judge(HERE, TARGET, READ, by_rule=True).is_allowed
-    assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+    assert guard.admission(HERE, TARGET, WRITE).is_allowed
+    assert not guard.admission(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert guard.admission(HERE, TARGET, READ, by_rule=True).is_allowed
+    assert not guard.admission(ELSEWHERE, TARGET, WRITE).is_allowed
     rules.append(AccessRule("all", services=(AccessService.WRITE,)))
-    assert guard.judge(HERE, TARGET, WRITE, by_rule=True).is_allowed
-    assert guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+    assert guard.admission(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert guard.admission(ELSEWHERE, TARGET, WRITE).is_allowed
 
 
 def test_the_audit_is_told_of_changes_and_refusals() -> None:
     guard = Guard(AccessList)
     told: list[AuditEntry] = []
     guard.on_audit.append(told.append)
-    for way, operation in ((HERE, READ), (HERE, WRITE), (ELSEWHERE, WRITE)):
-        guard.tell(way, TARGET, operation, guard.judge(way, TARGET, operation), 0)
-    assert [(each.way, each.header.target_port, each.operations[0].result) for each in told] == [
+    for endpoint, operation in ((HERE, READ), (HERE, WRITE), (ELSEWHERE, WRITE)):
+        guard.tell(endpoint, TARGET, operation, guard.admission(endpoint, TARGET, operation), 0)
+    assert [
+        (each.endpoint, each.header.target_port, each.operations[0].result) for each in told
+    ] == [
         (HERE, 1001, 0),
         (ELSEWHERE, 1001, AdsError.ACCESS_DENIED),
     ]
@@ -50,12 +52,12 @@ def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
     guard = Guard(AccessList)
     recorded: list[AuditEntry] = []
     guard.before_change = lambda entry: recorded.append(entry) or "the audit cannot be written"  # type: ignore[func-returns-value]
-    verdict = guard.judge(HERE, TARGET, WRITE)
-    assert (verdict.is_allowed, verdict.why) == (False, "the audit cannot be written")
-    assert reason_of_refusal(verdict) is Cause.NOT_RECORDED
-    assert reason_of_refusal(guard.judge(ELSEWHERE, TARGET, WRITE)) is Cause.DENIED
-    assert guard.judge(HERE, TARGET, READ).is_allowed
-    assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+    decision = guard.admission(HERE, TARGET, WRITE)
+    assert (decision.is_allowed, decision.why) == (False, "the audit cannot be written")
+    assert reason_of_refusal(decision) is Cause.NOT_RECORDED
+    assert reason_of_refusal(guard.admission(ELSEWHERE, TARGET, WRITE)) is Cause.DENIED
+    assert guard.admission(HERE, TARGET, READ).is_allowed
+    assert not guard.admission(ELSEWHERE, TARGET, WRITE).is_allowed
     assert [each.operations[0].operation for each in recorded] == [WRITE]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker
@@ -16,8 +16,8 @@ from eap.services.gateway.reply_encoder import (
     ReplyEncoder,
 )
 
-HERE = Way("udp:eap0", "127.0.0.1:1")
-NEAR, THERE = Way("udp:eap0", "10.0.0.8:1"), Way("udp:eap0", "10.0.0.9:1")
+HERE = Endpoint("udp:eap0", "127.0.0.1:1")
+NEAR, THERE = Endpoint("udp:eap0", "10.0.0.8:1"), Endpoint("udp:eap0", "10.0.0.9:1")
 COE = MailboxType.COE
 
 
@@ -107,8 +107,8 @@ def test_refusal_log_names_client_address_and_cause(caplog):
 def test_refusal_log_client_that_asks_again_is_the_same_cause_and_another_is_not(caplog):
     log = RefusalLog("mill/bus0")
     again = NEAR._replace(connection="10.0.0.8:2")
-    for way in (NEAR, again, THERE):
-        log.write(way, 1001, MailboxType.COE, Cause.DENIED)
+    for endpoint in (NEAR, again, THERE):
+        log.write(endpoint, 1001, MailboxType.COE, Cause.DENIED)
     log.write(NEAR, 1002, MailboxType.COE, Cause.DENIED)
     first, second, *others = (record.cause for record in caplog.records)
     assert first == second

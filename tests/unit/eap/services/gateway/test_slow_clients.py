@@ -106,7 +106,7 @@ def test_file_left_in_the_middle_gives_way_to_another_client(
         begin = "01 00 00000000" + FILE
         assert (await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06")
         (held, waiting) = desk.gateway.transfers()
-        assert (held.way, waiting.way) == (HERE, ALSO_HERE)
+        assert (held.endpoint, waiting.endpoint) == (HERE, ALSO_HERE)
         monkeypatch.setattr(gateway, "STALL_S", 0.0)
         assert (await desk.begin_file(begin, ALSO_HERE)).startswith("03 00 01 00 00 00")
         late = await desk.one(FOE, 1001, "03 00 01000000 61")

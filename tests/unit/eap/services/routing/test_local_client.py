@@ -45,17 +45,17 @@ def test_errors_are_answers():
 
 
 def test_whoever_waits_no_longer_is_told_so_and_a_late_answer_is_dropped():
-    gate = asyncio.Event()
+    access_filter = asyncio.Event()
 
     async def slow(request):
-        await gate.wait()
+        await access_filter.wait()
         return AmsAnswer()
 
     there = station(reply=slow)
 
     async def script():
         answer = await there.ask(TARGET, 0xFFFF, aoe.READ, timeout_s=0.01)
-        gate.set()
+        access_filter.set()
         await asyncio.sleep(0)
         return answer
 

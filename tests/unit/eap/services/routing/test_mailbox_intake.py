@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.endpoint import Door
+from eap.ams.transport_table import Transport
 from eap.runtime.discards import Refusal
-from eap.services.gateway.gateway_transport import GatewayDoor
-from eap.services.transports.mailbox_frames import ChannelCarrier, MailboxIntake
+from eap.services.gateway.gateway_transport import GatewayTransport
+from eap.services.transports.mailbox_frames import ChannelSender, MailboxIntake
 from tests.support import aoe
-from tests.support.routing import entrance, station
+from tests.support.routing import demultiplexer, station
 
 TARGET = "1.1.1.1.2.1"
 
@@ -37,9 +37,11 @@ class Wire:
 
 def tell(wire: Wire, frame: bytes, *, for_many: bool = False, room: int = 0) -> Refusal | None:
     there = station(TARGET)
-    carrier = ChannelCarrier(wire)
-    there.add_door(Door("door", room), carrier)
-    intake = MailboxIntake(entrance(there), GatewayDoor([]), carrier, lambda data: for_many)
+    sender = ChannelSender(wire)
+    there.add_transport(Transport("door", room), sender)
+    intake = MailboxIntake(
+        demultiplexer(there), GatewayTransport([]), sender, lambda data: for_many
+    )
     return intake.take(memoryview(frame + bytes(20)), len(frame), 0, wire)
 
 
@@ -80,7 +82,7 @@ def test_answers_fit_the_transport():
 def test_frame_that_the_network_does_not_take():
     wire = Wire()
     wire.is_broken = True
-    assert ChannelCarrier(wire).send("peer", (b"x" * 32,)) == "the network took no frame"
+    assert ChannelSender(wire).send("peer", (b"x" * 32,)) == "the network took no frame"
 
 
 @pytest.mark.parametrize(("for_many", "answers"), [(False, 1), (True, 0)])
@@ -105,7 +107,7 @@ def test_what_is_not_taken_has_a_reason():
     ],
 )
 def test_frame_that_another_intake_takes_is_only_judged(frame, behind, for_many, reason):
-    gateway = GatewayDoor([(object(), name) for name in behind])
-    carrier = ChannelCarrier(Wire())
-    intake = MailboxIntake(entrance(station(TARGET)), gateway, carrier, lambda data: for_many)
-    assert intake.judge(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason
+    gateway = GatewayTransport([(object(), name) for name in behind])
+    sender = ChannelSender(Wire())
+    intake = MailboxIntake(demultiplexer(station(TARGET)), gateway, sender, lambda data: for_many)
+    assert intake.admission(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason

@@ -15,7 +15,7 @@ from eap.runtime.handover import Handover, PortName
 from eap.services.routing import monitor_addresses as monitor_ways
 from eap.services.routing.monitor_addresses import REFUSAL_NS, UdpWay, key_of, open_ways
 from eap.supervisor.sockets import SharedSockets
-from tests.unit.eap.runtime.conftest import left, right
+from tests.unit.eap.conftest import left, right
 
 pytestmark = pytest.mark.net
 
@@ -32,78 +32,78 @@ def closed():
 
 
 @pytest.fixture
-def way():
+def endpoint():
     table = NeighbourTable()
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind(("127.9.2.8", 0))
-    way = UdpWay([sock], table, "127.9.2.8")
-    yield way
-    way.close()
+    endpoint = UdpWay([sock], table, "127.9.2.8")
+    yield endpoint
+    endpoint.close()
     table.close()
 
 
-def send(way, target):
-    way.sockets[0].sendto(b"frame", (target.host, target.port))
+def send(endpoint, target):
+    endpoint.sockets[0].sendto(b"frame", (target.host, target.port))
 
 
-def test_nobody_listens(way, closed):
-    way.watch([closed])
-    send(way, closed)
-    assert way.hear(5 * SECOND) == {key_of(closed)}
-    assert way.hear(5 * SECOND) == set()
-    assert way.look(closed, 5 * SECOND) is Evidence.ABSENT
+def test_nobody_listens(endpoint, closed):
+    endpoint.watch([closed])
+    send(endpoint, closed)
+    assert endpoint.hear(5 * SECOND) == {key_of(closed)}
+    assert endpoint.hear(5 * SECOND) == set()
+    assert endpoint.look(closed, 5 * SECOND) is Evidence.ABSENT
 
 
-def test_refusal_holds_until_frames_went_on_without_another(way, closed):
-    way.watch([closed])
-    send(way, closed)
-    way.hear(5 * SECOND)
-    assert way.look(closed, 5 * SECOND + REFUSAL_NS - 1) is Evidence.ABSENT
-    assert way.look(closed, 5 * SECOND + REFUSAL_NS) is Evidence.BLIND  # our own machine
-    assert way.look(closed, 5 * SECOND) is Evidence.BLIND
+def test_refusal_holds_until_frames_went_on_without_another(endpoint, closed):
+    endpoint.watch([closed])
+    send(endpoint, closed)
+    endpoint.hear(5 * SECOND)
+    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS - 1) is Evidence.ABSENT
+    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS) is Evidence.BLIND  # our own machine
+    assert endpoint.look(closed, 5 * SECOND) is Evidence.BLIND
 
 
-def test_targets_that_nobody_watches_are_not_told(way, closed):
-    way.watch([closed])
-    send(way, closed)
-    way.watch([Destination.parse("127.9.2.9:9")])
-    assert way.hear(5 * SECOND) == set()
+def test_targets_that_nobody_watches_are_not_told(endpoint, closed):
+    endpoint.watch([closed])
+    send(endpoint, closed)
+    endpoint.watch([Destination.parse("127.9.2.9:9")])
+    assert endpoint.hear(5 * SECOND) == set()
 
 
-def test_a_target_that_stays_keeps_its_refusal(way, closed):
-    way.watch([closed])
-    send(way, closed)
-    way.hear(5 * SECOND)
-    way.watch([closed, Destination.parse("127.9.2.9:9")])
-    assert way.look(closed, 5 * SECOND) is Evidence.ABSENT
+def test_a_target_that_stays_keeps_its_refusal(endpoint, closed):
+    endpoint.watch([closed])
+    send(endpoint, closed)
+    endpoint.hear(5 * SECOND)
+    endpoint.watch([closed, Destination.parse("127.9.2.9:9")])
+    assert endpoint.look(closed, 5 * SECOND) is Evidence.ABSENT
 
 
-def test_nothing_is_asked_of_the_kernel_before_there_is_a_target(way, closed):
-    send(way, closed)
-    assert way.hear(SECOND) == set()
-    way.watch([])
-    send(way, closed)
-    way.watch([closed])
-    assert way.hear(SECOND) == set()
+def test_nothing_is_asked_of_the_kernel_before_there_is_a_target(endpoint, closed):
+    send(endpoint, closed)
+    assert endpoint.hear(SECOND) == set()
+    endpoint.watch([])
+    send(endpoint, closed)
+    endpoint.watch([closed])
+    assert endpoint.hear(SECOND) == set()
 
 
-def test_more_errors_than_one_call_takes(way, closed):
-    way.watch([closed])
+def test_more_errors_than_one_call_takes(endpoint, closed):
+    endpoint.watch([closed])
     for _ in range(600):
-        send(way, closed)
-        way.sockets[0].getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    assert way.hear(5 * SECOND) == {key_of(closed)}
-    assert way.hear(6 * SECOND) == set()
+        send(endpoint, closed)
+        endpoint.sockets[0].getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    assert endpoint.hear(5 * SECOND) == {key_of(closed)}
+    assert endpoint.hear(6 * SECOND) == set()
 
 
-def test_listener_of_this_machine_is_unknown(way):
+def test_listener_of_this_machine_is_unknown(endpoint):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.9.2.9", 0))
         target = Destination.parse("{}:{}".format(*listener.getsockname()))
-        way.watch([target])
-        send(way, target)
-        assert way.hear(SECOND) == set()
-        assert way.look(target, SECOND) is Evidence.BLIND
+        endpoint.watch([target])
+        send(endpoint, target)
+        assert endpoint.hear(SECOND) == set()
+        assert endpoint.look(target, SECOND) is Evidence.BLIND
 
 
 def test_usual_port_has_no_need_to_be_named():
@@ -117,12 +117,12 @@ def handover(tmp_path, sockets):
 
 def test_every_udp_port_has_a_way(tmp_path):
     with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
-        ways = open_ways(handover(tmp_path, sockets), opened)
-        assert set(ways.udp) == {PortName("left", "eap0"), PortName("right", "eap0")}
-        assert ways.arp == {}
-        for way in ways.udp.values():
-            assert len({sock.getsockname() for sock in way.sockets}) == 1
-            assert len(way.sockets) == 2
+        endpoints = open_ways(handover(tmp_path, sockets), opened)
+        assert set(endpoints.udp) == {PortName("left", "eap0"), PortName("right", "eap0")}
+        assert endpoints.arp == {}
+        for endpoint in endpoints.udp.values():
+            assert len({sock.getsockname() for sock in endpoint.sockets}) == 1
+            assert len(endpoint.sockets) == 2
 
 
 def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog, closed):
@@ -131,7 +131,7 @@ def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog,
 
     monkeypatch.setattr(monitor_ways, "NeighbourTable", refuse)
     with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
-        ways = open_ways(handover(tmp_path, sockets), opened)
-        way = ways.udp[PortName("left", "eap0")]
-        assert way.look(closed, 0) is Evidence.BLIND
+        endpoints = open_ways(handover(tmp_path, sockets), opened)
+        endpoint = endpoints.udp[PortName("left", "eap0")]
+        assert endpoint.look(closed, 0) is Evidence.BLIND
     assert "forbidden; subscribers on UDP are known to be missing by ICMP alone" in caplog.text

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
-from eap.ams.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.ids import NetId
 from eap.services.routing import planned
 from eap.services.routing.planned import access_of, make_router, to_route, to_way
-from tests.unit.eap.runtime.conftest import eap_port, left
+from tests.unit.eap.conftest import eap_port, left
 
-UDP = HopSpec(DoorKind.UDP, "eap0", "127.0.1.2:34980")
-WAY = Way("udp:eap0", "127.0.1.2:34980")
+UDP = HopSpec(TransportKind.UDP, "eap0", "127.0.1.2:34980")
+WAY = Endpoint("udp:eap0", "127.0.1.2:34980")
 THERE = NetId.parse("5.1.2.3.1.1")
 
 
@@ -36,25 +36,26 @@ def test_virtual_net_id_is_the_one_that_is_known_here():
 
 
 @pytest.mark.parametrize(
-    ("hop", "way"),
+    ("hop", "endpoint"),
     [
-        (UDP, Way("udp:eap0", "127.0.1.2:34980")),
-        (HopSpec(DoorKind.ETHERNET, "eap1", "1.2.3.4.5.6"), Way("ethernet:eap1", "1.2.3.4.5.6")),
-        (HopSpec(DoorKind.AMS_TCP, "", "10.0.0.5:48898"),
-         Way("ams-tcp:10.0.0.5:48898", "10.0.0.5:48898")),
-        (HopSpec(DoorKind.MQTT, "line", "1.2.3.4.5.6"), Way("mqtt:line", "1.2.3.4.5.6")),
+        (UDP, Endpoint("udp:eap0", "127.0.1.2:34980")),
+        (HopSpec(TransportKind.ETHERNET, "eap1", "1.2.3.4.5.6"),
+         Endpoint("ethernet:eap1", "1.2.3.4.5.6")),
+        (HopSpec(TransportKind.AMS_TCP, "", "10.0.0.5:48898"),
+         Endpoint("ams-tcp:10.0.0.5:48898", "10.0.0.5:48898")),
+        (HopSpec(TransportKind.MQTT, "line", "1.2.3.4.5.6"), Endpoint("mqtt:line", "1.2.3.4.5.6")),
     ],
 )  # fmt: skip
-def test_hops(hop, way):
-    assert to_way(hop) == way
+def test_hops(hop, endpoint):
+    assert to_way(hop) == endpoint
 
 
 @pytest.mark.parametrize(
     ("kind", "text", "address"),
     [
-        (DoorKind.UDP, "10.0.0.5", "10.0.0.5:34980"),
-        (DoorKind.TCP, "10.0.0.5:7", "10.0.0.5:7"),
-        (DoorKind.ETHERNET, "02-00-00-00-0A-01", "02:00:00:00:0a:01"),
+        (TransportKind.UDP, "10.0.0.5", "10.0.0.5:34980"),
+        (TransportKind.TCP, "10.0.0.5:7", "10.0.0.5:7"),
+        (TransportKind.ETHERNET, "02-00-00-00-0A-01", "02:00:00:00:0a:01"),
     ],
 )
 def test_each_address_is_written_in_one_way(kind, text, address):
@@ -64,12 +65,12 @@ def test_each_address_is_written_in_one_way(kind, text, address):
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
-        (DoorKind.UDP, "mill"),
-        (DoorKind.UDP, "10.0.0.5:0x10"),
-        (DoorKind.TCP, "02:00:00:00:00:01"),
-        (DoorKind.UDP, "239.1.1.1"),
-        (DoorKind.ETHERNET, "10.0.0.5"),
-        (DoorKind.ETHERNET, "01:01:05:04:00:00"),
+        (TransportKind.UDP, "mill"),
+        (TransportKind.UDP, "10.0.0.5:0x10"),
+        (TransportKind.TCP, "02:00:00:00:00:01"),
+        (TransportKind.UDP, "239.1.1.1"),
+        (TransportKind.ETHERNET, "10.0.0.5"),
+        (TransportKind.ETHERNET, "01:01:05:04:00:00"),
     ],
 )
 def test_what_is_no_address_of_a_station_is_refused(kind, text):
@@ -80,10 +81,10 @@ def test_what_is_no_address_of_a_station_is_refused(kind, text):
 def test_addresses_of_the_station_are_this_host():
     station = left(eap_port(1, interface="udp://10.0.0.1"))
     access = access_of(station, RoutingSpec(access=(AccessRule("no", allow=False),)))
-    assert access.is_this_host(Way("ams-tcp", "10.0.0.1:4711#1"))
-    assert not access.is_this_host(Way("ams-tcp", "10.0.0.2:4711#1"))
-    way = Way("ams-tcp", "10.0.0.2:4711#1")
-    assert not access.grants(way, THERE, THERE, 1).may_read
+    assert access.is_this_host(Endpoint("ams-tcp", "10.0.0.1:4711#1"))
+    assert not access.is_this_host(Endpoint("ams-tcp", "10.0.0.2:4711#1"))
+    endpoint = Endpoint("ams-tcp", "10.0.0.2:4711#1")
+    assert not access.grants(endpoint, THERE, THERE, 1).may_read
 
 
 def test_network_that_may_ask_nothing_is_refused_whatever_the_rules_say():
@@ -92,8 +93,8 @@ def test_network_that_may_ask_nothing_is_refused_whatever_the_rules_say():
         MqttSpec(network="line", host="b"),
     )
     access = access_of(left(), RoutingSpec(mqtt=brokers, access=(AccessRule("all"),)))
-    granted = [access.grants(Way(door, "5.1.2.3.1.1"), THERE, THERE, 1).may_read
-               for door in ("mqtt:hall", "mqtt:line")]  # fmt: skip
+    granted = [access.grants(Endpoint(transport, "5.1.2.3.1.1"), THERE, THERE, 1).may_read
+               for transport in ("mqtt:hall", "mqtt:line")]  # fmt: skip
     assert granted == [False, True]
 
 
@@ -105,5 +106,5 @@ def test_router_knows_its_net_ids():
 def test_all_addresses_of_the_machine_are_those_of_a_port_at_any(monkeypatch):
     monkeypatch.setattr(planned, "own_addresses", lambda: [("eth7", "10.0.0.7")])
     access = access_of(left(eap_port(1, interface="udp://0.0.0.0")), RoutingSpec())
-    assert access.is_this_host(Way("ams-tcp", "10.0.0.7:4711#1"))
-    assert not access.is_this_host(Way("ams-tcp", "10.0.0.8:4711#1"))
+    assert access.is_this_host(Endpoint("ams-tcp", "10.0.0.7:4711#1"))
+    assert not access.is_this_host(Endpoint("ams-tcp", "10.0.0.8:4711#1"))

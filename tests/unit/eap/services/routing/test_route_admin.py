@@ -9,7 +9,7 @@ import os
 import pytest
 
 from eap.ams.routes import Origin
-from eap.ams.spec import AmsUser, DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import AmsUser, HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import (
     TEMPORARY,
@@ -20,7 +20,7 @@ from eap.codec.amsdiscovery import (
 )
 from eap.ids import NetId
 from eap.runtime.store import StationStore
-from eap.services.routing.route_admin import RATES, RouteDesk
+from eap.services.routing.route_admin import RATES, RouteAdmin
 from eap.services.routing.station_routes import StationRoutes
 from tests.support.routing import station
 from tests.support.vectors import load
@@ -31,7 +31,7 @@ TOOL = NetId.parse("192.168.0.10.1.1")
 ADDED = RouteSpec(
     name="myroute",
     net_id=str(TOOL),
-    hop=HopSpec(DoorKind.AMS_TCP, "", "myhost:48898"),
+    hop=HopSpec(TransportKind.AMS_TCP, "", "myhost:48898"),
     is_probed=False,
     is_client=True,
 )
@@ -50,8 +50,8 @@ def routes(name="left", **told) -> StationRoutes:
 
 
 def ask(found, question=ADD_ROUTE, sender="10.0.0.5", *, is_this_host=False):
-    desk = RouteDesk([found], clock=lambda: 0.0)
-    return asyncio.run(desk.take(question, sender, is_this_host=is_this_host))
+    route_admin = RouteAdmin([found], clock=lambda: 0.0)
+    return asyncio.run(route_admin.take(question, sender, is_this_host=is_this_host))
 
 
 def asked(**tags) -> Discovery:
@@ -126,8 +126,11 @@ def test_a_password_that_cannot_be_read_lets_nobody_in(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("tags", "change"),
     [
-        ({"host": None}, {"hop": HopSpec(DoorKind.AMS_TCP, "", "10.0.0.5:48898")}),
-        ({"host": b"10.0.0.7:4000\0"}, {"hop": HopSpec(DoorKind.AMS_TCP, "", "10.0.0.7:4000")}),
+        ({"host": None}, {"hop": HopSpec(TransportKind.AMS_TCP, "", "10.0.0.5:48898")}),
+        (
+            {"host": b"10.0.0.7:4000\0"},
+            {"hop": HopSpec(TransportKind.AMS_TCP, "", "10.0.0.7:4000")},
+        ),
         ({"route_name": None}, {"name": "myhost"}),
         ({"net_id": bytes((10, 0, 0, 1, 7, 7))}, {"net_id": "10.0.0.1.7.7", "octets": 6}),
     ],
@@ -158,7 +161,9 @@ def test_what_cannot_be_is_refused(caplog, tags, why):
 
 
 def test_a_route_of_the_plant_file_stays_as_it_is():
-    written = RouteSpec(name="tool", net_id=str(TOOL), hop=HopSpec(DoorKind.UDP, "eap0", "1.1.1.1"))
+    written = RouteSpec(
+        name="tool", net_id=str(TOOL), hop=HopSpec(TransportKind.UDP, "eap0", "1.1.1.1")
+    )
     found = routes(routes=(written,))
     assert ask(found, is_this_host=True) == AdsError.NONE
     assert found.added == ()
@@ -182,7 +187,7 @@ def test_a_route_that_cannot_be_kept_is_not_added(monkeypatch, caplog):
 
 def test_all_stations_of_an_address_get_the_route():
     both = [routes(), routes("right")]
-    taking = RouteDesk(both).take(ADD_ROUTE, "127.0.0.1", is_this_host=True)
+    taking = RouteAdmin(both).take(ADD_ROUTE, "127.0.0.1", is_this_host=True)
     assert asyncio.run(taking) == AdsError.NONE
     assert [each.added for each in both] == [(ADDED,), (ADDED,)]
 
@@ -193,11 +198,14 @@ def test_who_asked_is_audited():
     ask(found, asked(user=b"maria\0"))
     ask(found, is_this_host=True)
     refused = entries[0]
-    assert (refused.way, str(refused.header.target)) == (("ams-udp", "10.0.0.5"), "10.0.0.1.1.1")
+    assert (refused.endpoint, str(refused.header.target)) == (
+        ("ams-udp", "10.0.0.5"),
+        "10.0.0.1.1.1",
+    )
     assert refused.operations[0].operation == ("myroute", str(TOOL), "myhost", "maria")
-    assert refused.operations[0].verdict.why.startswith("refused: the station has no users")
+    assert refused.operations[0].decision.why.startswith("refused: the station has no users")
     assert [each.operations[0].result for each in entries] == [AdsError.ACCESS, AdsError.NONE]
-    assert [each.operations[0].verdict.is_allowed for each in entries] == [False, True]
+    assert [each.operations[0].decision.is_allowed for each in entries] == [False, True]
 
 
 class Desk:
@@ -205,45 +213,48 @@ class Desk:
 
     def __init__(self) -> None:
         self.now = 0.0
-        self.desk = RouteDesk([routes()], clock=lambda: self.now)
+        self.route_admin = RouteAdmin([routes()], clock=lambda: self.now)
 
     def ask(self, sender, count=1, *, is_this_host=False):
         takings = [
-            self.desk.take(ADD_ROUTE, sender, is_this_host=is_this_host) for _ in range(count)
+            self.route_admin.take(ADD_ROUTE, sender, is_this_host=is_this_host)
+            for _ in range(count)
         ]
         return [asyncio.run(each) for each in takings]
 
 
 def test_route_desk_sender_guesses_passwords_is_limited():
-    desk = Desk()
+    route_admin = Desk()
     burst = RATES.source.burst
-    assert desk.ask("10.0.0.5", burst + 2) == [AdsError.ACCESS] * burst + [None] * 2
-    desk.now = 2.0
-    assert desk.ask("10.0.0.5", 3) == [AdsError.ACCESS] * 2 + [None]
+    assert route_admin.ask("10.0.0.5", burst + 2) == [AdsError.ACCESS] * burst + [None] * 2
+    route_admin.now = 2.0
+    assert route_admin.ask("10.0.0.5", 3) == [AdsError.ACCESS] * 2 + [None]
 
 
 def test_route_desk_flood_of_one_sender_others_are_answered():
-    desk = Desk()
-    desk.ask("10.0.0.5", 10 * RATES.source.burst)
-    assert desk.ask("10.0.0.6") == [AdsError.ACCESS]
-    assert desk.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
+    route_admin = Desk()
+    route_admin.ask("10.0.0.5", 10 * RATES.source.burst)
+    assert route_admin.ask("10.0.0.6") == [AdsError.ACCESS]
+    assert route_admin.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
 
 
 def test_route_desk_flood_of_many_senders_known_ones_and_this_host_are_answered():
-    desk = Desk()
-    assert desk.ask("10.0.0.5") == [AdsError.ACCESS]
-    answers = [desk.ask(f"10.1.{number // 250}.{number % 250}") for number in range(5000)]
+    route_admin = Desk()
+    assert route_admin.ask("10.0.0.5") == [AdsError.ACCESS]
+    answers = [route_admin.ask(f"10.1.{number // 250}.{number % 250}") for number in range(5000)]
     assert answers.count([AdsError.ACCESS]) == RATES.new.burst - 1
-    assert desk.ask("10.0.0.5") == [AdsError.ACCESS]
-    assert desk.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
+    assert route_admin.ask("10.0.0.5") == [AdsError.ACCESS]
+    assert route_admin.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
 
 
 def test_route_desk_known_senders_are_limited_together_and_new_ones_are_answered():
-    desk = Desk()
+    route_admin = Desk()
     senders = [f"10.0.0.{number}" for number in range(1, 30)]
     for sender in senders:
-        desk.ask(sender)
-        desk.now += 1.0
-    answers = [each for sender in senders for each in desk.ask(sender, RATES.source.burst - 2)]
+        route_admin.ask(sender)
+        route_admin.now += 1.0
+    answers = [
+        each for sender in senders for each in route_admin.ask(sender, RATES.source.burst - 2)
+    ]
     assert answers.count(AdsError.ACCESS) == RATES.known.burst
-    assert desk.ask("10.0.1.1") == [AdsError.ACCESS]
+    assert route_admin.ask("10.0.1.1") == [AdsError.ACCESS]

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.directory import AmsAddress
-from eap.ams.endpoint import Way
 from eap.ams.routes import Route
 from eap.errors import ControlError
 from eap.ids import NetId
@@ -17,7 +17,7 @@ from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 
 BEYOND = Route(
-    NetId.parse("127.0.9.3.1.1"), "third", Way("udp:eap0", "127.0.9.2:34980"),
+    NetId.parse("127.0.9.3.1.1"), "third", Endpoint("udp:eap0", "127.0.9.2:34980"),
     router=NetId.parse("127.0.9.2.1.1"),
 )  # fmt: skip
 RIGHT = AmsAddress(NetId.parse("127.0.9.2.1.1"), 10000)
@@ -64,9 +64,9 @@ def probe(
         task = asyncio.ensure_future(probe_target(left.router, target, 0.2))
         await settle()
         if data is not None:
-            for way, packet in list(left.carrier.sent):
+            for endpoint, packet in list(left.sender.sent):
                 answer: Ams = packet.answer(data, error)
-                left.router.receive(answer.octets(), "udp:eap0", way)
+                left.router.receive(answer.octets(), "udp:eap0", endpoint)
         return await task
 
     return asyncio.run(while_serving(script(), left.router))

@@ -6,18 +6,18 @@ from collections.abc import Awaitable
 import pytest
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read, ReadState, ReadWrite
 from eap.ads.query import decode_outcome, encode_query
-from eap.ams.endpoint import Way
 from eap.ams.hop_report import HopQuestion, decode_report
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
-from eap.services.routing.route_query import Whereabouts
+from eap.services.routing.route_query import RouteQuery
 from eap.services.routing.service import LocalRequest
 from tests.support.tracedplant import Line, to
 
-WAY = Way("link", "island-09")
+WAY = Endpoint("link", "island-09")
 TARGET = NetId.parse("5.1.1.2.3.1")
 G = IndexGroup
 
@@ -28,20 +28,20 @@ class Rest:
     ports = frozenset((10_000,))
 
     def __init__(self) -> None:
-        self.gone: list[Way] = []
+        self.gone: list[Endpoint] = []
 
     def answer(self, request: LocalRequest) -> AmsAnswer:
         return AmsAnswer(b"rest" + bytes((request.header.command,)))
 
-    def client_gone(self, way: Way) -> None:
-        self.gone.append(way)
+    def client_gone(self, endpoint: Endpoint) -> None:
+        self.gone.append(endpoint)
 
 
-def service(rest: Rest) -> Whereabouts:
+def service(rest: Rest) -> RouteQuery:
     line = Line()
     station = line.add(1, to(2))
     line.add(2)
-    return Whereabouts(station, rest)
+    return RouteQuery(station, rest)
 
 
 def ask(operation: Operation) -> AmsAnswer:

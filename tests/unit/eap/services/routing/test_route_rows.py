@@ -6,8 +6,8 @@ from time import monotonic_ns, time
 import pytest
 from msgspec.structs import replace
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Outcome, Trace
-from eap.ams.endpoint import Way
 from eap.ams.report import ConnectionReport, RouteReport, RouteState
 from eap.ams.routes import Origin, Route
 from eap.ams.traffic import Traffic
@@ -24,7 +24,7 @@ from tests.support.ams import Ams
 from tests.support.routeviews import Left
 
 FAR = NetId.parse("127.0.9.2.1.1")
-HOP = Way("udp:eap0", "127.0.9.2:34980")
+HOP = Endpoint("udp:eap0", "127.0.9.2:34980")
 TRAFFIC = Traffic(5 * 10**9, 3, 2, 1, 90, 80, 1_500_000, "lost", (FAR,))
 HEADER = AmsHeader(FAR, 851, NetId.parse("5.1.1.1.1.1"), 30000, 2)
 
@@ -60,7 +60,7 @@ def test_router_in_a_row() -> None:
 def test_routes_are_found_by_what_is_told_of_them(match: str, names: list[str]) -> None:
     left = Left()
     plc = Route(
-        NetId.parse("9.9.9.9.1.1"), "plc", Way("ams-tcp:10.0.0.9", "10.0.0.9"), Origin.ADDED
+        NetId.parse("9.9.9.9.1.1"), "plc", Endpoint("ams-tcp:10.0.0.9", "10.0.0.9"), Origin.ADDED
     )
     left.router.add_route(plc)
     found = row(left, match=match)
@@ -71,7 +71,7 @@ def test_routes_are_found_by_what_is_told_of_them(match: str, names: list[str]) 
 
 def test_warnings_and_circles_are_told() -> None:
     left = Left()
-    shadowed = Route(FAR, "other", Way("udp:eap0", "127.0.9.3:34980"), Origin.ADDED)
+    shadowed = Route(FAR, "other", Endpoint("udp:eap0", "127.0.9.3:34980"), Origin.ADDED)
     left.router.add_route(shadowed)
     for number in range(MAX_LOOPS + 3):
         left.router.record.enter(loop(f"circle {number}"))
@@ -127,8 +127,8 @@ def test_all_of_a_connection_is_told() -> None:
 
 
 def test_all_of_a_request_is_told() -> None:
-    way = Way("ams-tcp", "127.0.0.1:1")
-    trace = Trace(10**9, Outcome.ANSWERED, way, HOP, HEADER, 6, 2_000_000, "no such port")
+    endpoint = Endpoint("ams-tcp", "127.0.0.1:1")
+    trace = Trace(10**9, Outcome.ANSWERED, endpoint, HOP, HEADER, 6, 2_000_000, "no such port")
     found = request_row(trace, 4 * 10**9)
     assert abs(time() - 3 - found.at) < 1
     assert (found.service, found.target) == ("READ", "127.0.9.2.1.1:851")

@@ -9,11 +9,11 @@ import pytest
 
 from eap.ads.answer import AmsAnswer
 from eap.ads.device import AdsDevice
+from eap.ads.endpoint import Endpoint
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace
 from eap.ads.master import MasterSpace, SlaveState
 from eap.ads.notifications import Client
 from eap.ams.directory import Directory
-from eap.ams.endpoint import Way
 from eap.ams.routes import Route
 from eap.ams.spec import DirectoryPort, DirectoryStation
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_name
@@ -24,7 +24,7 @@ from eap.services.routing.scanning import scan, stations_of
 from tests.support.eventually import elapse
 from tests.support.tracedplant import Line, Station, to
 
-NOBODY = Client(Way("x", "1"), NetId(bytes(6)), 1)
+NOBODY = Client(Endpoint("x", "1"), NetId(bytes(6)), 1)
 
 
 class Master:
@@ -184,7 +184,7 @@ def test_scan_station_behind_a_dead_one_names_the_dead_one() -> None:
 
 
 def test_default_routes_are_no_stations() -> None:
-    everything = Route(NetId(bytes(6)), "default", Way("link", "x"), octets=0)
+    everything = Route(NetId(bytes(6)), "default", Endpoint("link", "x"), octets=0)
     assert [each.name for each in stations_of(Directory([]), [everything, to(3)])] == ["island-03"]
 
 

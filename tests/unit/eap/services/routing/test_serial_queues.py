@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.ads import AdsError
 from eap.codec.ams import decode_packet
 from eap.services.routing import service as service_module
@@ -13,12 +13,12 @@ from eap.services.routing.service import LocalRequest, SerialQueues
 from tests.support import aoe
 from tests.support.routing import StubService
 
-ONE, OTHER = Way("door", "1"), Way("door", "2")
+ONE, OTHER = Endpoint("door", "1"), Endpoint("door", "2")
 
 
-def request(body: bytes = b"", way: Way = ONE, port: int = 0xFFFF) -> LocalRequest:
+def request(body: bytes = b"", endpoint: Endpoint = ONE, port: int = 0xFFFF) -> LocalRequest:
     header, data = decode_packet(aoe.packet("1.1.1.1.2.1", aoe.READ, body, port=port))
-    return LocalRequest(header, bytes(data), way)
+    return LocalRequest(header, bytes(data), endpoint)
 
 
 class Slow:
@@ -26,11 +26,11 @@ class Slow:
 
     def __init__(self) -> None:
         self.begun: list[bytes] = []
-        self.gate = asyncio.Event()
+        self.access_filter = asyncio.Event()
 
     async def __call__(self, request: LocalRequest) -> AmsAnswer:
         self.begun.append(request.body)
-        await self.gate.wait()
+        await self.access_filter.wait()
         return AmsAnswer(request.body)
 
 
@@ -72,7 +72,7 @@ def test_requests_of_a_client_to_a_port_keep_their_order_and_others_overtake():
         queues.put(5, quick, request(b"5", port=1001))
         await settle()
         assert slow.begun == [b"1"]
-        slow.gate.set()
+        slow.access_filter.set()
         await settle()
         queues.put(6, quick, request(b"6"))
 
@@ -86,7 +86,7 @@ def test_crowd_is_turned_away(monkeypatch):
         for ticket in range(1, 5):
             queues.put(ticket, StubService(slow), request())
         await settle()
-        slow.gate.set()
+        slow.access_filter.set()
         await settle()
 
     full = AmsAnswer(error_code=AdsError.MAILBOX_FULL)
@@ -102,9 +102,9 @@ def test_octets_that_wait_are_limited_and_free_again(monkeypatch):
             for ticket in range(1, 4):
                 queues.put(ticket, service, request(bytes(40)))
             queues.forget(ONE)
-            slow.gate.set()
+            slow.access_filter.set()
             await settle()
-            slow.gate.clear()
+            slow.access_filter.clear()
 
     answers = play(script)
     assert [(ticket, each.error_code) for ticket, each in answers] == [
@@ -115,10 +115,10 @@ def test_octets_that_wait_are_limited_and_free_again(monkeypatch):
 
 def test_what_waits_for_a_turn_is_forgotten_with_its_connection():
     async def script(queues, slow):
-        for ticket, way in ((1, ONE), (2, ONE), (3, OTHER), (4, OTHER)):
-            queues.put(ticket, StubService(slow), request(str(ticket).encode(), way))
+        for ticket, endpoint in ((1, ONE), (2, ONE), (3, OTHER), (4, OTHER)):
+            queues.put(ticket, StubService(slow), request(str(ticket).encode(), endpoint))
         queues.forget(ONE)
-        slow.gate.set()
+        slow.access_filter.set()
         await settle()
 
     assert sorted(ticket for ticket, _ in play(script)) == [1, 3, 4]

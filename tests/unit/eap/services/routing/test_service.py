@@ -8,9 +8,9 @@ import pytest
 
 from eap.services.ads.ads_service import AdsService
 from eap.services.routing.local_client import LocalClient
-from eap.services.routing.service import Carrier, Service
+from eap.services.routing.service import Service, TransportSender
 from eap.services.transports.ams_transport import AmsClients
-from eap.services.transports.mailbox_frames import ChannelCarrier
+from eap.services.transports.mailbox_frames import ChannelSender
 from eap.services.transports.mailbox_stream import MailboxStreams
 from tests.support.routing import KeepingCarrier, StubService
 
@@ -23,7 +23,7 @@ def test_services(service):
 
 
 @pytest.mark.parametrize(
-    "carrier", [AmsClients, ChannelCarrier, KeepingCarrier, LocalClient, MailboxStreams]
+    "sender", [AmsClients, ChannelSender, KeepingCarrier, LocalClient, MailboxStreams]
 )
-def test_carriers(carrier):
-    assert [*signature(carrier.send).parameters] == [*signature(Carrier.send).parameters]
+def test_carriers(sender):
+    assert [*signature(sender.send).parameters] == [*signature(TransportSender.send).parameters]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.services.routing.service import ServiceTable
@@ -71,5 +71,5 @@ def test_all_are_told_who_is_gone(table) -> None:
     services = [StubService(), StubService()]
     table.add(ROUTER, services[0])
     table.add(DEVICE, services[1])
-    table.client_gone(Way("tcp", "1"))
-    assert [each.gone for each in services] == [[Way("tcp", "1")]] * 2
+    table.client_gone(Endpoint("tcp", "1"))
+    assert [each.gone for each in services] == [[Endpoint("tcp", "1")]] * 2

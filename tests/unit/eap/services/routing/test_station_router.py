@@ -7,11 +7,12 @@ import asyncio
 import pytest
 
 from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
 from eap.ams.admission import Limits
-from eap.ams.endpoint import Door, Way
 from eap.ams.routes import Route
 from eap.ams.spec import AccessRule
+from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.services.routing import station_router
@@ -24,13 +25,13 @@ from tests.support.routing import KeepingCarrier, StubService, while_serving
 ROUTER, DEVICE = NetId.parse("1.1.1.1.1.1"), NetId.parse("1.1.1.1.2.1")
 CLIENT = "192.168.9.9.1.1:33000"
 FAR = "7.7.7.7.1.1:851"
-HOP = Way("out", "hop")
-PEER = Way("in", "peer")
+HOP = Endpoint("out", "hop")
+PEER = Endpoint("in", "peer")
 DOORS = (
-    Door("in", is_stream=True, is_hub=True),
-    Door("out"),
-    Door("narrow", room=60),
-    Door("ams-tcp", is_stream=True),
+    Transport("in", is_stream=True, is_hub=True),
+    Transport("out"),
+    Transport("narrow", room=60),
+    Transport("ams-tcp", is_stream=True),
 )
 
 
@@ -38,23 +39,23 @@ class Scene:
     """A station with doors whose packets are kept."""
 
     def __init__(self, **more: object) -> None:
-        self.carrier = KeepingCarrier()
+        self.sender = KeepingCarrier()
         self.service = StubService()
         self.station = StationRouter("island", ROUTER, [DEVICE], **more)
         self.station.add_service(DEVICE, self.service)
-        for door in DOORS:
-            self.station.add_door(door, self.carrier)
+        for transport in DOORS:
+            self.station.add_transport(transport, self.sender)
 
     def add_route(self, **more: object) -> None:
         net_id = NetId.parse(FAR.partition(":")[0])
         self.station.add_route(Route(net_id, "far", HOP, is_probed=False, **more))
 
-    def ask(self, target: str = f"{DEVICE}:65535", way: Way = PEER, **more) -> None:
-        self.station.receive(Ams(target, CLIENT, **more).octets(), *way)
+    def ask(self, target: str = f"{DEVICE}:65535", endpoint: Endpoint = PEER, **more) -> None:
+        self.station.receive(Ams(target, CLIENT, **more).octets(), *endpoint)
 
     @property
     def sent(self) -> list[Ams]:
-        return [packet for _, packet in self.carrier.sent]
+        return [packet for _, packet in self.sender.sent]
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def scene() -> Scene:
 
 def test_service_answers_where_the_request_came_from(scene):
     scene.ask(body=b"abc", invoke_id=5)
-    ((connection, answer),) = scene.carrier.sent
+    ((connection, answer),) = scene.sender.sent
     assert connection == "peer"
     assert (answer.target, answer.source) == (CLIENT, f"{DEVICE}:65535")
     assert (answer.flags, answer.invoke_id, answer.body) == (5, 5, b"\0\0\0\0\2cba")
@@ -108,19 +109,19 @@ def test_what_a_service_has_at_hand_is_answered_without_its_lane(scene):
 
 
 def test_what_is_at_hand_does_not_overtake_what_its_client_asked_before(scene):
-    gate = asyncio.Event()
+    access_filter = asyncio.Event()
 
     async def wait(request):
-        await gate.wait()
+        await access_filter.wait()
         return AmsAnswer(request.body)
 
     async def script():
         scene.station.add_service(DEVICE, PromptService(wait, 1001))
-        other = Way("in", "other")
+        other = Endpoint("in", "other")
         scene.ask(f"{DEVICE}:1001", body=b"slow")
         scene.ask(f"{DEVICE}:1001", body=b"fast")
         scene.ask(f"{DEVICE}:1001", other, body=b"fast of another")
-        gate.set()
+        access_filter.set()
         await settle()
 
     asyncio.run(while_serving(script(), scene.station))
@@ -128,7 +129,7 @@ def test_what_is_at_hand_does_not_overtake_what_its_client_asked_before(scene):
 
 
 def test_long_answer_goes_in_fragments_where_the_door_is_narrow(scene):
-    scene.ask(way=Way("narrow", "peer"), body=b"x" * 100)
+    scene.ask(endpoint=Endpoint("narrow", "peer"), body=b"x" * 100)
     assert [each.command for each in scene.sent] == [0x0902] * 5
 
 
@@ -160,18 +161,18 @@ def test_source_of_this_station_is_believed_to_programs_of_this_host_only(scene)
 def test_request_goes_on_and_its_answer_comes_back(scene):
     scene.add_route()
     scene.ask(FAR, invoke_id=5)
-    assert scene.carrier.sent[0][0] == "hop"
+    assert scene.sender.sent[0][0] == "hop"
     scene.station.receive(scene.sent[0].answer(b"far").octets(), *HOP)
-    connection, answer = scene.carrier.sent[1]
+    connection, answer = scene.sender.sent[1]
     assert (connection, answer.invoke_id, answer.body) == ("peer", 5, b"far")
 
 
 def test_what_a_door_cannot_send_is_answered_and_named(scene, caplog):
     scene.add_route()
-    scene.station.add_door(Door("dead"), carrier := KeepingCarrier())
-    carrier.error = "no cable"
+    scene.station.add_transport(Transport("dead"), sender := KeepingCarrier())
+    sender.error = "no cable"
     net_id = NetId.parse("8.8.8.8.1.1")
-    scene.station.add_route(Route(net_id, "dead end", Way("dead", "hop"), is_probed=False))
+    scene.station.add_route(Route(net_id, "dead end", Endpoint("dead", "hop"), is_probed=False))
     scene.ask("8.8.8.8.1.1:1")
     assert [each.error for each in scene.sent] == [0x1B]
     assert "island: READ of 8.8.8.8.1.1:1" in caplog.text
@@ -226,7 +227,7 @@ def test_hops_are_asked_for_life_from_the_moment_there_is_a_route(scene):
 
 def test_services_are_told_of_a_connection_that_is_closed(scene):
     scene.station.connection_closed("in", "peer")
-    assert scene.service.gone == [Way("in", "peer")]
+    assert scene.service.gone == [Endpoint("in", "peer")]
 
 
 def test_services_are_told_of_a_hop_that_has_been_dead_for_long(scene, monkeypatch):
@@ -241,16 +242,16 @@ def test_services_are_told_of_a_hop_that_has_been_dead_for_long(scene, monkeypat
 
 def test_notifications_go_to_their_clients_and_pass(scene):
     notice = Ams(CLIENT, f"{DEVICE}:65535", NOTIFICATION).octets()
-    scene.station.send_notification(Way("in", "peer"), notice)
-    scene.station.send_notification(Way("gone", "peer"), notice)
-    assert [name for name, _ in scene.carrier.sent] == ["peer"]
+    scene.station.send_notification(Endpoint("in", "peer"), notice)
+    scene.station.send_notification(Endpoint("gone", "peer"), notice)
+    assert [name for name, _ in scene.sender.sent] == ["peer"]
     scene.add_route()
     scene.ask(FAR, command=ADD_NOTIFICATION, body=bytes(40))
     scene.station.receive(scene.sent[1].answer(bytes(4) + b"\7\0\0\0").octets(), *HOP)
     sample = bytes.fromhex("15000000 01000000 0000000000000000 01000000 07000000 01000000 55")
     scene.station.receive(Ams(CLIENT, FAR, NOTIFICATION, body=sample).octets(), *HOP)
-    connection, passed = scene.carrier.sent[3]
-    assert (connection, passed.command, passed.body) == ("peer", NOTIFICATION, sample)
+    connection, loop_detector = scene.sender.sent[3]
+    assert (connection, loop_detector.command, loop_detector.body) == ("peer", NOTIFICATION, sample)
     scene.station.connection_closed("in", "peer")
     assert (scene.sent[4].target, scene.sent[4].command) == (FAR, 7)
 
@@ -258,22 +259,22 @@ def test_notifications_go_to_their_clients_and_pass(scene):
 def test_door_that_is_removed_takes_with_it_who_waits_there(scene):
     scene.add_route()
     scene.ask(FAR)
-    scene.station.remove_door("out")
+    scene.station.remove_transport("out")
     scene.ask(FAR, invoke_id=2)
     assert [each.error for each in scene.sent[1:]] == [0x1B, 0x1B]
     scene.add_route()
-    scene.station.add_door(Door("out"), scene.carrier)
+    scene.station.add_transport(Transport("out"), scene.sender)
     scene.ask(FAR, invoke_id=3)
-    scene.station.remove_door("in")
+    scene.station.remove_transport("in")
     scene.station.receive(scene.sent[3].answer().octets(), *HOP)
     assert len(scene.sent) == 4
 
 
 def test_reader_waits_while_too_many_of_its_requests_do(scene):
-    gate = asyncio.Event()
+    access_filter = asyncio.Event()
 
     async def slow(request):
-        await gate.wait()
+        await access_filter.wait()
         return AmsAnswer()
 
     scene.station.add_service(ROUTER, StubService(slow, 1))
@@ -284,7 +285,7 @@ def test_reader_waits_while_too_many_of_its_requests_do(scene):
         await scene.station.wait_below("in", "peer", 3)
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(scene.station.wait_below("in", "peer", 2), 0.01)
-        gate.set()
+        access_filter.set()
         await scene.station.wait_below("in", "peer", 1)
 
     asyncio.run(while_serving(script(), scene.station))
@@ -307,7 +308,7 @@ def test_station_knows_its_net_ids(scene):
 
 def test_whoever_follows_the_routes_is_told_of_each() -> None:
     scene = Scene()
-    told: list[Way] = []
+    told: list[Endpoint] = []
     scene.station.on_routes.append(told.append)
     scene.add_route()
     scene.station.remove_route(NetId.parse("7.7.7.7.1.1"), HOP)

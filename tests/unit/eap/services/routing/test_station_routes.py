@@ -6,9 +6,9 @@ import threading
 import pytest
 from msgspec.structs import replace
 
-from eap.ams.endpoint import Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route, RouteTable
-from eap.ams.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.errors import ControlError
 from eap.ids import NetId
 from eap.runtime.store import StationFile, StationStore
@@ -19,11 +19,13 @@ OWN = NetId.parse("10.0.0.1.1.1")
 STATIC = RouteSpec(
     name="mill",
     net_id="10.0.0.2.1.1",
-    hop=HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980"),
+    hop=HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980"),
     router="10.0.0.2.1.1",
     is_derived=True,
 )
-PLC = RouteSpec(name="plc", net_id="5.1.2.3.1.1", hop=HopSpec(DoorKind.AMS_TCP, "", "plc:48898"))
+PLC = RouteSpec(
+    name="plc", net_id="5.1.2.3.1.1", hop=HopSpec(TransportKind.AMS_TCP, "", "plc:48898")
+)
 
 WITH_STATIC = RoutingSpec(routes=(STATIC,))
 
@@ -48,7 +50,7 @@ class House:
     def open(self, hop):
         if hop.port == "gone":
             raise ValueError("there is no door udp:gone")
-        return Way(f"{hop.kind}:{hop.port}", hop.address)
+        return Endpoint(f"{hop.kind}:{hop.port}", hop.address)
 
     def names(self):
         return {route.name: route.origin for route in self.router.table}
@@ -75,7 +77,7 @@ def test_an_added_route_is_there_again_after_a_new_start():
     [
         ({"net_id": "6.1.2.3.1.1"}, ""),
         ({"name": "other"}, ""),
-        ({"hop": HopSpec(DoorKind.UDP, "eap0", "10.0.0.9:34980")}, ""),
+        ({"hop": HopSpec(TransportKind.UDP, "eap0", "10.0.0.9:34980")}, ""),
         ({"name": "other", "net_id": "6.1.2.3.1.1"}, "plc"),
         ({"name": "other", "net_id": "6.1.2.3.1.1"}, "5.1.2.3.1.1"),
     ],
@@ -100,7 +102,7 @@ def test_a_route_takes_the_place_of_the_one_of_its_name_or_net_id(change, replac
         ({"net_id": "10.0.0.2.9.9"}, "route 'mill' of the plant file is for the same NetIDs and"),
         ({"net_id": STATIC.net_id, "octets": 6}, "route 'mill' of the plant file is for the same"),
         ({"octets": 3}, "3 octets to match, expected 6, 5, 4 or 0"),
-        ({"hop": HopSpec(DoorKind.UDP, "gone", "1.1.1.1:1")}, "there is no door udp:gone"),
+        ({"hop": HopSpec(TransportKind.UDP, "gone", "1.1.1.1:1")}, "there is no door udp:gone"),
     ],
 )
 def test_a_route_that_cannot_be_changes_nothing(change, reason):
@@ -151,7 +153,7 @@ def test_only_added_routes_are_removed(text, reason):
     written = replace(STATIC, name="written", net_id="7.1.1.1.1.1", is_derived=False)
     house = House(RoutingSpec(routes=(STATIC, written)))
     asyncio.run(house.routes.add(PLC))
-    seen = Route(NetId.parse("8.1.1.1.1.1"), "seen", Way("mqtt:n", "8"), Origin.LEARNED)
+    seen = Route(NetId.parse("8.1.1.1.1.1"), "seen", Endpoint("mqtt:n", "8"), Origin.LEARNED)
     house.router.table.add(seen)
     with pytest.raises(ControlError) as caught:
         asyncio.run(house.routes.remove(text))
@@ -165,8 +167,8 @@ def test_a_door_and_an_address_choose_what_is_removed():
     with pytest.raises(ControlError, match="no route 'plc' was added"):
         asyncio.run(house.routes.remove("plc", address="elsewhere:48898"))
     with pytest.raises(ControlError, match="no route 'plc' was added"):
-        asyncio.run(house.routes.remove("plc", door="udp:eap0"))
-    assert asyncio.run(house.routes.remove("plc", door="ams-tcp:", address="plc:48898")) == PLC
+        asyncio.run(house.routes.remove("plc", transport="udp:eap0"))
+    assert asyncio.run(house.routes.remove("plc", transport="ams-tcp:", address="plc:48898")) == PLC
 
 
 def test_another_plant_file_takes_over_and_added_routes_stay():
@@ -198,8 +200,10 @@ def test_a_route_that_stays_is_not_touched():
 
 
 def test_what_cannot_be_taken_is_told_and_kept_for_later(caplog):
-    House().store.save([replace(PLC, hop=HopSpec(DoorKind.UDP, "gone", "1.1.1.1:1"))])
-    house = House(RoutingSpec(routes=(replace(STATIC, hop=HopSpec(DoorKind.UDP, "gone", "x")),)))
+    House().store.save([replace(PLC, hop=HopSpec(TransportKind.UDP, "gone", "1.1.1.1:1"))])
+    house = House(
+        RoutingSpec(routes=(replace(STATIC, hop=HopSpec(TransportKind.UDP, "gone", "x")),))
+    )
     assert house.names() == {}
     assert "route mill of the plant file is left out: route 'mill': there is no door" in caplog.text
     assert "added route plc is left out" in caplog.text
@@ -215,7 +219,7 @@ def test_who_answered_has_a_route_for_ten_minutes():
     house = House()
     assert learned(house, name="seen\n")
     [route] = [each for each in house.router.table if each.origin is Origin.LEARNED]
-    assert (route.name, route.hop) == ("seen", Way("ams-tcp:10.0.0.9:48898", "10.0.0.9:48898"))
+    assert (route.name, route.hop) == ("seen", Endpoint("ams-tcp:10.0.0.9:48898", "10.0.0.9:48898"))
     assert learned(house, now_ns=5)
     assert house.router.table.expire(LEARNED_NS) == []
     assert [each.name for each in house.router.table.expire(LEARNED_NS + 5)] == ["seen"]

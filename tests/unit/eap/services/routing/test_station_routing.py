@@ -5,14 +5,14 @@ import asyncio
 import pytest
 from msgspec.structs import replace
 
-from eap.ams.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
+from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.errors import ControlError, EnvironmentalError
 from eap.runtime.store import StationStore
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.routing.station_routing import StationRouting
 from tests.support.routing import station
 
-HOP = HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980")
+HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")
 MILL = RouteSpec(name="mill", net_id="10.0.0.2.1.1", hop=HOP)
 SAW = RouteSpec(name="saw", net_id="10.0.0.3.1.1", hop=HOP)
 FILE = RoutingSpec(routes=(MILL,))

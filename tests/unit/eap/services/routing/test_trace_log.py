@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import logging
 
+from eap.ads.endpoint import Endpoint
 from eap.ams.action import Outcome, Trace
-from eap.ams.endpoint import Way
 from eap.ams.record import describe
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.services.routing.station_router import TraceLog
 
-HOP = Way("udp:eap0", "10.0.0.2:34980")
+HOP = Endpoint("udp:eap0", "10.0.0.2:34980")
 FIRST, SECOND = NetId.parse("5.1.1.2.1.1"), NetId.parse("5.1.1.3.1.1")
 
 
 def trace(
     outcome: Outcome = Outcome.FAILED, *, target: NetId = FIRST, port: int = 10_000,
-    connection: str = "10.0.0.9:40000", hop: Way | None = HOP, why: str = "island is down",
+    connection: str = "10.0.0.9:40000", hop: Endpoint | None = HOP, why: str = "island is down",
 ) -> Trace:  # fmt: skip
-    way = Way("ams-tcp", connection)
+    endpoint = Endpoint("ams-tcp", connection)
     header = AmsHeader(target, port, NetId.parse("10.0.0.9.1.1"), 32_000, 4)
-    text = f"{describe(header, way)}: {why}"
-    return Trace(0, outcome, way, hop, header, 0x1B, 0, text)
+    text = f"{describe(header, endpoint)}: {why}"
+    return Trace(0, outcome, endpoint, hop, header, 0x1B, 0, text)
 
 
 def causes(caplog, *traces: Trace) -> int:
@@ -68,7 +68,7 @@ def test_trace_log_hop_that_is_down_is_one_cause_whoever_asks_for_what(caplog):
 def test_trace_log_other_causes_are_told_apart(caplog):
     asked = [
         trace(),
-        trace(hop=Way("udp:eap0", "10.0.0.3:34980")),
+        trace(hop=Endpoint("udp:eap0", "10.0.0.3:34980")),
         trace(why="no answer"),
         trace(hop=None),
         trace(hop=None, target=SECOND),

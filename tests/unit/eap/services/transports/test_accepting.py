@@ -67,8 +67,8 @@ def serve(script, *, limits=LIMITS, patience_ns=10_000_000_000, family=socket.AF
                 sock.settimeout(5)
                 return sock
 
-            door = ListeningSocket(listener, "test", echo, listeners, limits)
-            tasks = [asyncio.ensure_future(each.serve()) for each in (door, listeners)]
+            transport = ListeningSocket(listener, "test", echo, listeners, limits)
+            tasks = [asyncio.ensure_future(each.serve()) for each in (transport, listeners)]
             try:
                 await asyncio.wait_for(asyncio.to_thread(script, connect, echo, listeners), 20)
             finally:
@@ -208,10 +208,10 @@ def test_listener_that_fails_is_asked_again(monkeypatch):
     async def run():
         listeners = Listeners()
         with socket.create_server(("127.0.0.1", 0)) as listener:
-            door = ListeningSocket(listener, "test", Echo(), listeners, LIMITS)
+            transport = ListeningSocket(listener, "test", Echo(), listeners, LIMITS)
             monkeypatch.setattr(accepting, "wait_readable", lambda _: asyncio.sleep(0))
-            monkeypatch.setattr(door, "_socket", Broken(asked))
-            serving = asyncio.ensure_future(door.serve())
+            monkeypatch.setattr(transport, "_socket", Broken(asked))
+            serving = asyncio.ensure_future(transport.serve())
             await eventually(lambda: len(asked) > 2)
             serving.cancel()
             await asyncio.wait([serving])

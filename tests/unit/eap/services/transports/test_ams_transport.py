@@ -14,8 +14,8 @@ from eap.runtime.discards import Refusal
 from eap.services.transports import accepting
 from eap.services.transports import ams_transport as ams_door
 from eap.services.transports.accepting import Listeners
-from eap.services.transports.ams_transport import AmsClients, AmsDoor
-from eap.services.transports.demultiplexer import Entrance
+from eap.services.transports.ams_transport import AmsClients, AmsTransport
+from eap.services.transports.demultiplexer import Demultiplexer
 from tests.support import aoe
 from tests.support.amsstation import EchoStation
 from tests.support.eventually import eventually
@@ -46,18 +46,18 @@ def play(
     async def run():
         with socket.create_server(("127.0.0.1", 0)) as listener:
             clients = AmsClients()
-            entrance = Entrance([(station, "ams-tcp") for station in there])
+            demultiplexer = Demultiplexer([(station, "ams-tcp") for station in there])
             listeners = Listeners(int(patience_s * 1e9))
-            door = AmsDoor(listener, entrance, clients, refused.append, listeners)
-            door.address, door.listeners = listener.getsockname(), listeners
+            transport = AmsTransport(listener, demultiplexer, clients, refused.append, listeners)
+            transport.address, transport.listeners = listener.getsockname(), listeners
             for station in there:
                 station.send = clients.send
-            serving = [asyncio.ensure_future(each.serve()) for each in (door, listeners)]
+            serving = [asyncio.ensure_future(each.serve()) for each in (transport, listeners)]
 
             async def connect():
                 return await asyncio.open_connection(*listener.getsockname())
 
-            await asyncio.wait_for(script(connect, door), 10)
+            await asyncio.wait_for(script(connect, transport), 10)
             for task in serving:
                 task.cancel()
             await asyncio.wait(serving)
@@ -79,7 +79,7 @@ def test_each_answer_goes_back_on_the_connection_of_its_question():
             assert await hear(reader) == body
         writer.close()
 
-    async def script(connect, door):
+    async def script(connect, transport):
         await asyncio.gather(*(client(connect, name) for name in range(20)))
 
     refused, stations = play(script)
@@ -97,7 +97,7 @@ def test_packet_is_for_the_station_that_has_its_target_else_for_one_with_a_route
         EchoStation(routes=["7.7.7.7.1.1"]),
     ]
 
-    async def script(connect, door):
+    async def script(connect, transport):
         reader, writer = await connect()
         for target in (*TARGETS, "7.7.7.7.1.1", "8.8.8.8.1.1"):
             writer.write(question(target.encode(), target))
@@ -110,7 +110,7 @@ def test_packet_is_for_the_station_that_has_its_target_else_for_one_with_a_route
 
 
 def test_names_of_connections_do_not_come_again():
-    async def script(connect, door):
+    async def script(connect, transport):
         with socket.socket() as sock:
             sock.bind(("127.0.0.1", 0))
             port = sock.getsockname()[1]
@@ -121,7 +121,7 @@ def test_names_of_connections_do_not_come_again():
                 sock.setblocking(False)
                 sock.bind(("127.0.0.1", port))
                 loop = asyncio.get_running_loop()
-                await loop.sock_connect(sock, door.address)
+                await loop.sock_connect(sock, transport.address)
                 await loop.sock_sendall(sock, question(b"x"))
                 assert await loop.sock_recv(sock, 100)
 
@@ -129,12 +129,12 @@ def test_names_of_connections_do_not_come_again():
     names = [connection for _, _, connection in stations[0].seen]
     assert len(set(names)) == 3
     assert len({name.partition("#")[0] for name in names}) == 1
-    assert {door for _, door, _ in stations[0].seen} == {"ams-tcp"}
+    assert {transport for _, transport, _ in stations[0].seen} == {"ams-tcp"}
     assert {name.partition(":")[0] for name in names} == {"127.0.0.1"}
 
 
 def test_who_sends_ahead_lets_others_in_between():
-    async def script(connect, door):
+    async def script(connect, transport):
         greedy, writer = await connect()
         reader, other = await connect()
         writer.write(question(b"greedy") * 500)
@@ -153,7 +153,7 @@ def test_who_sends_ahead_lets_others_in_between():
 
 
 def test_client_that_dies_leaves_the_others_alone():
-    async def script(connect, door):
+    async def script(connect, transport):
         reader, writer = await connect()
         for _ in range(20):
             _, dying = await connect()
@@ -173,7 +173,7 @@ def test_silent_connections_make_room_for_others(monkeypatch):
     monkeypatch.setattr(accepting, "host_of", lambda peer, own: "10.0.0.1")
     monkeypatch.setattr(ams_door, "LIMITS", Limits(total=3, reserved=0))
 
-    async def script(connect, door):
+    async def script(connect, transport):
         async def ask(reader, writer):
             writer.write(question(b"x"))
             return await hear(reader)
@@ -187,10 +187,10 @@ def test_silent_connections_make_room_for_others(monkeypatch):
         clients.append(refused := await connect())
         assert await refused[0].read() == b""
         used[0][1].close()
-        await eventually(lambda: door.listeners.stats()[0].open == 2)
+        await eventually(lambda: transport.listeners.stats()[0].open == 2)
         clients.append(late := await connect())
         assert await ask(*late) == b"x"
-        (stats,) = door.listeners.stats()
+        (stats,) = transport.listeners.stats()
         assert (stats.open, stats.limit, stats.refused, stats.evicted) == (3, 3, 1, 1)
         for _, writer in clients:
             writer.close()
@@ -199,7 +199,7 @@ def test_silent_connections_make_room_for_others(monkeypatch):
 
 
 def test_client_that_breaks_the_rules_is_disconnected():
-    async def script(connect, door):
+    async def script(connect, transport):
         for octets in (b"\2\0" + bytes(4), question(b"x")[:10]):
             reader, writer = await connect()
             writer.write(octets)
@@ -210,7 +210,7 @@ def test_client_that_breaks_the_rules_is_disconnected():
 
 
 def test_answers_that_nobody_asked_for_are_counted():
-    async def script(connect, door):
+    async def script(connect, transport):
         reader, writer = await connect()
         writer.write(question(b"x", flags=5) + question(b"y"))
         assert await hear(reader) == b"y"
@@ -226,11 +226,11 @@ def test_nothing_can_be_sent_by_what_is_closed():
 
 
 def test_connection_that_is_reset_before_it_is_accepted_is_no_matter():
-    async def script(connect, door):
+    async def script(connect, transport):
         for _ in range(5):
             with socket.socket() as sock:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                sock.connect(door.address)
+                sock.connect(transport.address)
         reader, writer = await connect()
         writer.write(question(b"x"))
         assert await hear(reader) == b"x"
@@ -243,13 +243,13 @@ def test_connection_that_cannot_be_served_gives_its_place_back(monkeypatch):
     def refuse(sock):
         raise OSError(22, "Invalid argument")
 
-    async def script(connect, door):
+    async def script(connect, transport):
         with monkeypatch.context() as patch:
             patch.setattr(ams_door, "set_stream_options", refuse)
             reader, writer = await connect()
             assert await reader.read() == b""
             writer.close()
-        assert door.listeners.stats()[0].open == 0
+        assert transport.listeners.stats()[0].open == 0
         reader, writer = await connect()
         writer.write(question(b"x"))
         assert await hear(reader) == b"x"
@@ -259,10 +259,10 @@ def test_connection_that_cannot_be_served_gives_its_place_back(monkeypatch):
 
 
 def test_connections_are_closed_when_the_door_is():
-    async def script(connect, door):
+    async def script(connect, transport):
         client.setblocking(False)
         loop = asyncio.get_running_loop()
-        await loop.sock_connect(client, door.address)
+        await loop.sock_connect(client, transport.address)
         await loop.sock_sendall(client, question(b"x"))
         assert await loop.sock_recv(client, 100)
 

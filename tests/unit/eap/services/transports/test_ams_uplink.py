@@ -34,20 +34,20 @@ class Router:
         self.seen: list[str | bytes] = []
         self.went_on = asyncio.Event()
 
-    def receive(self, data, door, connection):
-        assert (door, connection) == WAY
+    def receive(self, data, transport, connection):
+        assert (transport, connection) == WAY
         self._note(data)
 
-    def connection_closed(self, door, connection):
-        assert (door, connection) == WAY
+    def connection_closed(self, transport, connection):
+        assert (transport, connection) == WAY
         self._note("closed")
 
-    def hop_down(self, door, address, text):
-        assert (door, address) == WAY
+    def hop_down(self, transport, address, text):
+        assert (transport, address) == WAY
         self._note(text)
 
-    def hop_up(self, door, address):
-        assert (door, address) == WAY
+    def hop_up(self, transport, address):
+        assert (transport, address) == WAY
         self._note("up")
 
     def _note(self, what):

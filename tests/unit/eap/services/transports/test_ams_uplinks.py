@@ -9,8 +9,9 @@ from contextlib import asynccontextmanager, contextmanager
 
 import pytest
 
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Route
+from eap.ams.transport_table import Transport
 from eap.ids import NetId
 from eap.services.transports.ams_uplink import AmsUplinks
 from tests.support.eventually import eventually
@@ -25,9 +26,9 @@ class Router:
 
     def __init__(self, *routes: Route) -> None:
         self.table: list[Route] = list(routes)
-        self.doors: dict[str, Door] = {}
-        self.up: set[Way] = set()
-        self.on_routes: list[Callable[[Way], None]] = []
+        self.transports: dict[str, Transport] = {}
+        self.up: set[Endpoint] = set()
+        self.on_routes: list[Callable[[Endpoint], None]] = []
 
     def add(self, route: Route) -> None:
         self.table.append(route)
@@ -37,30 +38,30 @@ class Router:
         self.table.remove(route)
         self.on_routes[0](route.hop)
 
-    def add_door(self, door, carrier):
-        assert door.name not in self.doors
-        self.doors[door.name] = door
+    def add_transport(self, transport, sender):
+        assert transport.name not in self.transports
+        self.transports[transport.name] = transport
 
-    def remove_door(self, name):
-        del self.doors[name]
+    def remove_transport(self, name):
+        del self.transports[name]
 
-    def receive(self, data, door, connection):
+    def receive(self, data, transport, connection):
         raise AssertionError("nobody asks")
 
-    def connection_closed(self, door, connection):
-        assert door in self.doors
-        self.up.discard(Way(door, connection))
+    def connection_closed(self, transport, connection):
+        assert transport in self.transports
+        self.up.discard(Endpoint(transport, connection))
 
-    def hop_up(self, door, address):
-        assert door in self.doors
-        self.up.add(Way(door, address))
+    def hop_up(self, transport, address):
+        assert transport in self.transports
+        self.up.add(Endpoint(transport, address))
 
-    def hop_down(self, door, address, text):
-        assert door in self.doors
+    def hop_down(self, transport, address, text):
+        assert transport in self.transports
 
 
-def route(address: str, net_id: str = "1.1.1.1.1.1", door: str = "ams-tcp:") -> Route:
-    return Route(NetId.parse(net_id), "plc", Way(door + address, address))
+def route(address: str, net_id: str = "1.1.1.1.1.1", transport: str = "ams-tcp:") -> Route:
+    return Route(NetId.parse(net_id), "plc", Endpoint(transport + address, address))
 
 
 @asynccontextmanager
@@ -95,8 +96,8 @@ def test_one_connection_for_all_routes_to_a_peer_until_the_last_is_removed():
         first, second = route(address), route(address, "1.1.1.2.1.1")
         router = Router(first)
         async with serving(AmsUplinks(router, [], [].append)):
-            assert router.doors == {
-                first.hop.door: Door(first.hop.door, is_stream=True, is_hub=True)
+            assert router.transports == {
+                first.hop.transport: Transport(first.hop.transport, is_stream=True, is_hub=True)
             }
             router.add(second)
             await eventually(lambda: router.up == {first.hop})
@@ -106,7 +107,7 @@ def test_one_connection_for_all_routes_to_a_peer_until_the_last_is_removed():
                 with pytest.raises(BlockingIOError):
                     listener.accept()
                 router.remove(second)
-                assert router.doors == {}
+                assert router.transports == {}
                 await asyncio.sleep(0)
                 assert sock.recv(1) == b""
             router.up.clear()
@@ -132,14 +133,14 @@ def test_two_stations_have_a_connection_each():
 
 
 def test_routes_by_other_doors_are_for_others():
-    router = Router(route("eap0", door="udp:"))
+    router = Router(route("eap0", transport="udp:"))
     AmsUplinks(router, [], [].append)
-    router.add(route("eap0", door="ams-tcp"))
-    assert router.doors == {}
+    router.add(route("eap0", transport="ams-tcp"))
+    assert router.transports == {}
 
 
 def test_address_that_is_none_is_said(caplog):
     router = Router(route("plc:nothing"))
     AmsUplinks(router, [], [].append)
-    assert router.doors == {}
+    assert router.transports == {}
     assert "'nothing' is not a port" in caplog.messages[0]

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.fragment import iter_fragments
 from eap.ams.routes import Route
+from eap.ams.transport_table import Transport
 from eap.ids import NetId
-from eap.services.transports.demultiplexer import Entrance
+from eap.services.transports.demultiplexer import Demultiplexer
 from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams
-from tests.support.routing import KeepingCarrier, entrance, station
+from tests.support.routing import KeepingCarrier, demultiplexer, station
 
 CLIENT = "192.168.9.9.1.1:33000"
 FAR = "7.7.7.7.1.1:851"
-HOP = Way("out", "hop")
+HOP = Endpoint("out", "hop")
 
 
 @pytest.fixture
-def carrier() -> KeepingCarrier:
+def sender() -> KeepingCarrier:
     return KeepingCarrier()
 
 
 @pytest.fixture
-def stations(carrier):
+def stations(sender):
     there = [station(target, name=target) for target in ("1.1.1.1.2.1", "2.2.2.2.2.1")]
     for each in there:
-        each.add_door(Door("door"), carrier)
-        each.add_door(Door("out"), carrier)
+        each.add_transport(Transport("door"), sender)
+        each.add_transport(Transport("out"), sender)
     return there
 
 
@@ -39,11 +40,11 @@ def route(net_id: str, octets: int = 4) -> Route:
     return Route(NetId.parse(net_id), "far", HOP, octets=octets, is_probed=False)
 
 
-def test_request_goes_to_the_station_that_is_meant(stations, carrier):
-    way_in = entrance(*stations)
+def test_request_goes_to_the_station_that_is_meant(stations, sender):
+    way_in = demultiplexer(*stations)
     for target in ("2.2.2.2.2.1:65535", "1.1.1.1.2.1:65535", "9.9.9.9.1.1:1"):
         way_in.receive(ask(target), "peer")
-    assert [(name, each.source, each.error) for name, each in carrier.sent] == [
+    assert [(name, each.source, each.error) for name, each in sender.sent] == [
         ("peer", "2.2.2.2.2.1:65535", 0),
         ("peer", "1.1.1.1.2.1:65535", 0),
         ("peer", "9.9.9.9.1.1:1", 7),
@@ -51,42 +52,42 @@ def test_request_goes_to_the_station_that_is_meant(stations, carrier):
     assert [each.record.counts["failed"] for each in stations] == [1, 0]
 
 
-def test_request_for_others_goes_where_the_best_route_is(stations, carrier):
+def test_request_for_others_goes_where_the_best_route_is(stations, sender):
     first, second = stations
     first.add_route(route("0.0.0.0.0.0", octets=0))
     second.add_route(route("7.7.7.7.1.1"))
-    way_in = entrance(first, second)
+    way_in = demultiplexer(first, second)
     way_in.receive(ask(FAR), "peer")
     way_in.receive(ask("8.8.8.8.1.1:1"), "peer")
-    assert [name for name, _ in carrier.sent] == ["hop", "hop"]
+    assert [name for name, _ in sender.sent] == ["hop", "hop"]
     assert [each.stats().in_flight for each in stations] == [1, 1]
 
 
-def test_answers_and_notifications_go_to_who_asked(stations, carrier):
+def test_answers_and_notifications_go_to_who_asked(stations, sender):
     _, second = stations
     second.add_route(route("7.7.7.7.1.1"))
-    entrance(*stations).receive(ask(FAR, command=ADD_NOTIFICATION, body=bytes(40)), "peer")
-    (_, asked), *_ = carrier.sent
-    back = entrance(*stations, door="out")
+    demultiplexer(*stations).receive(ask(FAR, command=ADD_NOTIFICATION, body=bytes(40)), "peer")
+    (_, asked), *_ = sender.sent
+    back = demultiplexer(*stations, transport="out")
     back.receive(asked.answer(bytes(4) + b"\7\0\0\0").octets(), "hop")
     sample = bytes.fromhex("15000000 01000000 0000000000000000 01000000 07000000 01000000 55")
     notice = Ams(CLIENT, FAR, NOTIFICATION, body=sample).octets()
     back.receive(notice, "hop")
-    assert [(name, each.command) for name, each in carrier.sent[1:]] == [
+    assert [(name, each.command) for name, each in sender.sent[1:]] == [
         ("peer", ADD_NOTIFICATION),
         ("peer", NOTIFICATION),
     ]
     back.receive(notice.replace(b"\7\0\0\0", b"\6\0\0\0"), "hop")
-    (ended,) = carrier.sent[3:]
+    (ended,) = sender.sent[3:]
     assert (ended[0], ended[1].command) == ("hop", DELETE_NOTIFICATION)
 
 
-def test_fragments_are_put_together_before_anybody_is_asked(stations, carrier):
-    way_in = entrance(*stations)
+def test_fragments_are_put_together_before_anybody_is_asked(stations, sender):
+    way_in = demultiplexer(*stations)
     packet = ask("2.2.2.2.2.1:65535", body=b"x" * 100)
     for fragment in iter_fragments(packet, 1, 40):
         way_in.receive(fragment, "peer")
-    ((_, answer),) = carrier.sent
+    ((_, answer),) = sender.sent
     assert answer.body.endswith(b"x" * 100)
     *_, last = iter_fragments(packet, 2, 40)
     way_in.receive(last, "peer")
@@ -95,36 +96,38 @@ def test_fragments_are_put_together_before_anybody_is_asked(stations, carrier):
     waits = bytearray(first)
     waits[18] = 4
     way_in.receive(bytes(waits), "peer")
-    assert [each.flags for _, each in carrier.sent[1:]] == [5]
+    assert [each.flags for _, each in sender.sent[1:]] == [5]
     way_in.connection_closed("peer")
-    assert len(carrier.sent) == 2
+    assert len(sender.sent) == 2
 
 
-def test_what_was_for_all_is_answered_by_who_is_meant_only(stations, carrier):
-    way_in = entrance(*stations)
+def test_what_was_for_all_is_answered_by_who_is_meant_only(stations, sender):
+    way_in = demultiplexer(*stations)
     way_in.receive(ask("2.2.2.2.2.1:65535"), "peer", for_all=True)
     way_in.receive(ask("9.9.9.9.1.1:1"), "peer", for_all=True)
-    assert [each.source for _, each in carrier.sent] == ["2.2.2.2.2.1:65535"]
+    assert [each.source for _, each in sender.sent] == ["2.2.2.2.2.1:65535"]
 
 
-def test_each_station_has_its_own_name_for_a_door(stations, carrier):
-    stations[1].remove_door("door")
-    stations[1].add_door(Door("other"), carrier)
-    way_in = Entrance([(stations[0], "door"), (stations[1], "other")])
+def test_each_station_has_its_own_name_for_a_door(stations, sender):
+    stations[1].remove_transport("door")
+    stations[1].add_transport(Transport("other"), sender)
+    way_in = Demultiplexer([(stations[0], "door"), (stations[1], "other")])
     way_in.receive(ask("2.2.2.2.2.1:65535"), "peer")
-    assert [way.door for way in stations[1].record.connections.snapshot()] == ["other"]
+    assert [endpoint.transport for endpoint in stations[1].record.connections.snapshot()] == [
+        "other"
+    ]
 
 
-def test_broken_packet_is_remembered_by_the_first(stations, carrier):
-    entrance(*stations).receive(ask("2.2.2.2.2.1:65535", body=b"xx")[:-1], "peer")
-    assert carrier.sent == []
+def test_broken_packet_is_remembered_by_the_first(stations, sender):
+    demultiplexer(*stations).receive(ask("2.2.2.2.2.1:65535", body=b"xx")[:-1], "peer")
+    assert sender.sent == []
     assert [each.record.counts["dropped"] for each in stations] == [1, 0]
 
 
-def test_hops_are_those_of_all_stations(stations, carrier):
+def test_hops_are_those_of_all_stations(stations, sender):
     _, second = stations
     second.add_route(route("7.7.7.7.1.1"))
-    way_in = entrance(*stations, door="out")
+    way_in = demultiplexer(*stations, transport="out")
     assert [way_in.is_wanted(address) for address in ("hop", "other")] == [True, False]
     assert [way_in.has(NetId.parse(each)) for each in ("2.2.2.2.1.1", "7.7.7.7.1.1")] == [
         True,
@@ -139,5 +142,5 @@ def test_hops_are_those_of_all_stations(stations, carrier):
     assert [each.is_down(HOP) for each in stations] == [False, False]
     way_in.hop_is_at("hop", "place")
     second.receive(ask(FAR, invoke_id=2), "door", "peer")
-    way_in.receive(carrier.sent[-1][1].answer(b"far").octets(), "place")
-    assert carrier.sent[-1][1].body == b"far"
+    way_in.receive(sender.sent[-1][1].answer(b"far").octets(), "place")
+    assert sender.sent[-1][1].body == b"far"

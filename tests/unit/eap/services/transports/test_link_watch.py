@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
+from eap.ams.transport_table import Transport
 from eap.services.transports.link_watch import LinkWatch
 from tests.support.eventually import eventually
 from tests.support.routing import KeepingCarrier, station, while_serving
 
-HOP = Way("door", "hop")
+HOP = Endpoint("door", "hop")
 
 
 def test_hops_behind_a_link_are_down_and_up_with_it():
     there = station()
-    there.add_door(Door("door"), KeepingCarrier())
+    there.add_transport(Transport("door"), KeepingCarrier())
     up = {"eth7": True}
     watch = LinkWatch({"eth7": [(there, "door")]}, up.__getitem__)
     seen = []
@@ -33,7 +34,7 @@ def test_it_looks_again_and_again():
         looks.append(name)
         return False
 
-    there.add_door(Door("door"), KeepingCarrier())
+    there.add_transport(Transport("door"), KeepingCarrier())
     watch = LinkWatch({"eth7": [(there, "door")]}, is_up)
 
     async def script():

@@ -8,17 +8,18 @@ import socket
 import pytest
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Route
+from eap.ams.transport_table import Transport
 from eap.ids import NetId
 from eap.net.connections import OWN_HOST
 from eap.runtime.discards import Refusal
-from eap.services.gateway.gateway_transport import GatewayDoor
+from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import mailbox_stream
 from eap.services.transports.mailbox_stream import MailboxStreams, StreamConnection
 from tests.support import aoe
 from tests.support.eventually import settle
-from tests.support.routing import entrance, station, while_serving
+from tests.support.routing import demultiplexer, station, while_serving
 
 pytestmark = pytest.mark.net
 
@@ -33,8 +34,8 @@ def talk(script, there=None) -> list[Refusal]:
     """Run ``script(reader, writer)`` on a connection that is being served."""
     there = there or station(TARGET)
     refused: list[Refusal] = []
-    streams = MailboxStreams(entrance(there), GatewayDoor([]), refused.append)
-    there.add_door(Door("door", 2000, is_stream=True), streams)
+    streams = MailboxStreams(demultiplexer(there), GatewayTransport([]), refused.append)
+    there.add_transport(Transport("door", 2000, is_stream=True), streams)
 
     async def run():
         ours, theirs = socket.socketpair()
@@ -129,16 +130,19 @@ def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
     here, there = station("2.2.2.2.2.1"), station(TARGET)
     refused: list[Refusal] = []
     near, far = (
-        MailboxStreams(entrance(each), GatewayDoor([]), refused.append) for each in (here, there)
+        MailboxStreams(demultiplexer(each), GatewayTransport([]), refused.append)
+        for each in (here, there)
     )
-    here.add_door(Door("door", 2000, is_stream=True), near)
-    there.add_door(Door("door", 2000, is_stream=True), far)
+    here.add_transport(Transport("door", 2000, is_stream=True), near)
+    there.add_transport(Transport("door", 2000, is_stream=True), far)
 
     async def run():
         with socket.create_server(("127.0.0.1", 0)) as listener:
             listener.setblocking(False)
             hop = f"127.0.0.1:{listener.getsockname()[1]}"
-            here.add_route(Route(NetId.parse(TARGET), "there", Way("door", hop), is_probed=False))
+            here.add_route(
+                Route(NetId.parse(TARGET), "there", Endpoint("door", hop), is_probed=False)
+            )
             asking = asyncio.ensure_future(here.ask(NetId.parse(TARGET), 0xFFFF, 4, timeout_s=5))
             connection, _ = await asyncio.get_running_loop().sock_accept(listener)
             stream = asyncio.ensure_future(far.serve(StreamConnection(OWN_HOST), connection))

@@ -8,13 +8,14 @@ from contextlib import asynccontextmanager
 import pytest
 
 from eap.ads.answer import AmsAnswer
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
 from eap.ams.spec import MqttSpec, RoutingSpec
+from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand
 from eap.ids import NetId
 from eap.runtime.discards import DiscardCounters, Refusal
-from eap.services.transports.mqtt_transport import MqttDoor, open_mqtt_doors
+from eap.services.transports.mqtt_transport import MqttTransport, open_mqtt_doors
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.busads import until
 from tests.support.eventually import eventually
@@ -40,16 +41,16 @@ class Place:
     def __init__(self, net_id: NetId, *specs: MqttSpec, learns: bool = True) -> None:
         self.router = station(str(net_id), name=f"of {net_id[0]}")
         self.refused: list[Refusal] = []
-        self.doors = [
-            MqttDoor(each, self.router, self.refused.append, learns=learns)
+        self.transports = [
+            MqttTransport(each, self.router, self.refused.append, learns=learns)
             for each in specs or (spec(),)
         ]
 
     async def serve(self) -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(self.router.serve())
-            for door in self.doors:
-                group.create_task(door.serve())
+            for transport in self.transports:
+                group.create_task(transport.serve())
 
     def knows(self, net_id: NetId) -> bool:
         return self.router.table.find(net_id) is not None
@@ -97,7 +98,7 @@ def test_service_resumes_when_the_broker_does(tmp_path):
         async with running(one, two):
             await eventually(lambda: one.knows(TWO) and two.knows(ONE))
             server.stop()
-            hop = Way("mqtt:hall", "6.1.1.1.1.1")
+            hop = Endpoint("mqtt:hall", "6.1.1.1.1.1")
             await eventually(lambda: one.router.is_down(hop))
             assert (await one.read(TWO)).error_code == 0x1B
             server.start()
@@ -116,8 +117,8 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
 
     async def story():
         one, two = Place(ONE), Place(TWO)
-        carrier = KeepingCarrier()
-        one.router.add_door(Door("ams-tcp", is_stream=True, is_hub=True), carrier)
+        sender = KeepingCarrier()
+        one.router.add_transport(Transport("ams-tcp", is_stream=True, is_hub=True), sender)
         asked = []
         async with running(two), running(one):
             await eventually(lambda: one.knows(TWO))
@@ -128,8 +129,8 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
             )
             request = Ams(f"{TWO}:65535", tool, command=ADD_NOTIFICATION, body=bytes(40))
             one.router.receive(request.octets(), "ams-tcp", "10.0.0.9:1#1")
-            await eventually(lambda: carrier.sent)
-            assert carrier.sent[0][1] == request.answer(bytes(4) + b"M\0\0\0")
+            await eventually(lambda: sender.sent)
+            assert sender.sent[0][1] == request.answer(bytes(4) + b"M\0\0\0")
             (there,) = asked
             assert str(there.header.source) == "5.1.1.1.1.1"
             stamps = bytes.fromhex("01000000 0000000000000000 01000000 4d000000 02000000 6869")
@@ -137,10 +138,10 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
             news = Ams(f"{there.header.source}:{there.header.source_port}", request.target,
                        command=NOTIFICATION, body=body)  # fmt: skip
             two.router.send_notification(there.came_by, news.octets())
-            await eventually(lambda: len(carrier.sent) == 2)
-            assert carrier.sent[1] == ("10.0.0.9:1#1", news._replace(target=tool))
-            one_is_gone = [Way("mqtt:hall", "5.1.1.1.1.1")]
-            one.doors[0]._link.send(one.doors[0]._network.will())
+            await eventually(lambda: len(sender.sent) == 2)
+            assert sender.sent[1] == ("10.0.0.9:1#1", news._replace(target=tool))
+            one_is_gone = [Endpoint("mqtt:hall", "5.1.1.1.1.1")]
+            one.transports[0]._link.send(one.transports[0]._network.will())
             await eventually(lambda: service.gone == one_is_gone)
 
     with broker(tmp_path, ADDRESS):
@@ -160,7 +161,7 @@ def test_client_of_another_make_asks_and_is_asked(tmp_path, is_prefixed):
                 await eventually(lambda: place.knows(NetId.parse(PEER)))
                 assert (await place.read(NetId.parse(PEER))).data == b"peer was asked"
                 assert peer.forms == {is_prefixed}
-            hop = Way("mqtt:hall", PEER)
+            hop = Endpoint("mqtt:hall", PEER)
             await eventually(lambda: place.router.is_down(hop))
 
     with broker(tmp_path, ADDRESS):
@@ -173,12 +174,12 @@ def test_two_brokers_are_two_doors_and_a_station_between_them_passes_on(tmp_path
         middle = Place(NetId.parse("8.1.1.1.2.1"), spec("near"), spec("far", port=1884))
         two = Place(TWO, spec("far", port=1884))
         for place, target in ((one, TWO), (two, ONE)):
-            hop = Way(place.doors[0].name, "8.1.1.1.1.1")
+            hop = Endpoint(place.transports[0].name, "8.1.1.1.1.1")
             route = Route(target, "through", hop, is_probed=False)
             place.router.add_route(route)
         async with running(one, middle, two):
             await eventually(lambda: middle.knows(ONE) and middle.knows(TWO))
-            await eventually(lambda: not one.router.is_down(Way("mqtt:near", "8.1.1.1.1.1")))
+            await eventually(lambda: not one.router.is_down(Endpoint("mqtt:near", "8.1.1.1.1.1")))
             assert (await one.read(TWO)).data == b"\0\0\0\0\2cba"
             assert (await two.read(ONE)).data == b"\0\0\0\0\2cba"
 
@@ -238,12 +239,16 @@ def test_stations_get_the_doors_of_their_plant_file(tmp_path):
         routers = {"a": station("5.1.1.1.2.1"), "b": station("6.1.1.1.2.1")}
         routing = {"a": RoutingSpec(mqtt=(spec("x"), spec("y"))), "b": RoutingSpec()}
         with DiscardCounters(tmp_path / "counters", [*routers]) as counters:
-            doors = open_mqtt_doors(routing, routers, counters)
-            doors[0]._overrun()
+            transports = open_mqtt_doors(routing, routers, counters)
+            transports[0]._overrun()
             assert counters.stats() == {"a": {"mqtt_full": 1}, "b": {}}
-        assert [door.name for door in doors] == ["mqtt:x", "mqtt:y"]
-        assert doors[0].send("6.1.1.1.1.1", (bytes(32),)).startswith("no connection to MQTT broker")
-        assert routers["a"].is_down(Way("mqtt:x", "6.1.1.1.1.1"))
+        assert [transport.name for transport in transports] == ["mqtt:x", "mqtt:y"]
+        assert (
+            transports[0]
+            .send("6.1.1.1.1.1", (bytes(32),))
+            .startswith("no connection to MQTT broker")
+        )
+        assert routers["a"].is_down(Endpoint("mqtt:x", "6.1.1.1.1.1"))
 
     asyncio.run(story())
 
@@ -253,15 +258,15 @@ def test_mqtt_door_learns_in_the_networks_that_the_plant_file_names(tmp_path):
         one, two = station("5.1.1.1.2.1"), Place(TWO, spec("y"), spec("x"))
         told = RoutingSpec(mqtt=(spec("x"), spec("y")), learn=("mqtt:y",))
         with DiscardCounters(tmp_path / "counters", ["a"]) as counters:
-            doors = open_mqtt_doors({"a": told}, {"a": one}, counters)
-            tasks = [asyncio.ensure_future(door.serve()) for door in doors]
+            transports = open_mqtt_doors({"a": told}, {"a": one}, counters)
+            tasks = [asyncio.ensure_future(transport.serve()) for transport in transports]
             async with running(two):
                 await eventually(lambda: len([*one.table]) == 1)
                 await eventually(lambda: len([*two.router.table]) == 2)
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
-        assert [each.hop.door for each in one.table] == ["mqtt:y"]
+        assert [each.hop.transport for each in one.table] == ["mqtt:y"]
 
     with broker(tmp_path, ADDRESS):
         asyncio.run(story())

@@ -6,16 +6,17 @@ import asyncio
 
 import pytest
 
-from eap.ams.endpoint import Door, Way
+from eap.ads.endpoint import Endpoint
 from eap.ams.hop_prober import PROBE_PORT
 from eap.ams.routes import Route
+from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
 from eap.services.transports import segment as segment_module
-from eap.services.transports.segment import Segment, SegmentCarrier
+from eap.services.transports.segment import Segment, SegmentSender
 from tests.support import aoe
 from tests.support.ams import Ams, parse
-from tests.support.routing import entrance, station
+from tests.support.routing import demultiplexer, station
 
 OWN, PEER, OTHER = "02:00:00:00:00:01", "02:00:00:00:00:02", "02:00:00:00:00:03"
 HERE, THERE = "1.1.1.1.2.1", "2.2.2.2.2.1"
@@ -45,14 +46,14 @@ class Scene:
         self.station = station(HERE)
         self.wire = Wire()
         self.segment = Segment(
-            entrance(self.station, *others, door="ethernet:eap0"), MacAddr.parse(OWN)
+            demultiplexer(self.station, *others, transport="ethernet:eap0"), MacAddr.parse(OWN)
         )
         for each in (self.station, *others):
-            carrier = SegmentCarrier(self.segment, self.wire, each.net_id)
-            each.add_door(Door("ethernet:eap0"), carrier)
-        way = Way("ethernet:eap0", THERE)
-        self.station.add_route(Route(NetId.parse(THERE), "there", way, is_probed=False))
-        self.station.add_door(Door("ams-tcp", is_stream=True), self)
+            sender = SegmentSender(self.segment, self.wire, each.net_id)
+            each.add_transport(Transport("ethernet:eap0"), sender)
+        endpoint = Endpoint("ethernet:eap0", THERE)
+        self.station.add_route(Route(NetId.parse(THERE), "there", endpoint, is_probed=False))
+        self.station.add_transport(Transport("ams-tcp", is_stream=True), self)
         self.replies: list[Ams] = []
 
     def send(self, connection, packets):

@@ -9,22 +9,22 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from eap.ams.endpoint import Door
+from eap.ams.transport_table import Transport
 from eap.codec.ethercat import EtherCatHeader
 from eap.net import connections
 from eap.net.connections import OWN_HOST, Activity, Limits
 from eap.runtime.discards import Refusal
 from eap.runtime.handover import PortName
 from eap.runtime.passing import take_connection
-from eap.services.gateway.gateway_transport import GatewayDoor
+from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import accepting
 from eap.services.transports import tcp_transport as tcp_door
 from eap.services.transports.accepting import Listeners
 from eap.services.transports.mailbox_stream import MailboxStreams, StreamConnection
-from eap.services.transports.tcp_transport import TcpDoor
+from eap.services.transports.tcp_transport import TcpTransport
 from tests.support import aoe
 from tests.support.eventually import eventually, settle
-from tests.support.routing import entrance, station
+from tests.support.routing import demultiplexer, station
 
 pytestmark = pytest.mark.net
 
@@ -69,11 +69,13 @@ def play(
         services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with services, engine, socket.create_server(("127.0.0.1", 0)) as listener:
             there = station(TARGET)
-            streams = MailboxStreams(entrance(there), GatewayDoor([]), refused.append)
-            there.add_door(Door("door", is_stream=True), streams)
+            streams = MailboxStreams(demultiplexer(there), GatewayTransport([]), refused.append)
+            there.add_transport(Transport("door", is_stream=True), streams)
             listeners = Listeners(int(patience_s * 1e9))
-            door = TcpDoor(listener, takers, services, refused.append, streams, listeners)
-            serving = [asyncio.ensure_future(each.serve()) for each in (door, there, listeners)]
+            transport = TcpTransport(listener, takers, services, refused.append, streams, listeners)
+            serving = [
+                asyncio.ensure_future(each.serve()) for each in (transport, there, listeners)
+            ]
             await script(Scene(listener, engine, refused, listeners))
             for task in serving:
                 task.cancel()
