@@ -151,8 +151,8 @@ class SubscriptionRestorer:
 
     def __init__(
         self, subscriptions: Subscriptions, transports: TransportTable, in_flight: InFlight,
-        ids: InvokeIds,
-                ending: NotificationCleanup, error_replier: ErrorReplier, limits: Limits, find_way: FindWay,
+        ids: InvokeIds, ending: NotificationCleanup, error_replier: ErrorReplier, limits: Limits,
+        find_way: FindWay,
     ) -> None:  # fmt: skip
         self._subscriptions = subscriptions
         self._transports = transports

@@ -2,10 +2,10 @@
 
 How the parts meet:
 
-- A **transport** receives and sends packets.  Its receiver calls :meth:`StationRouter.receive` with
-  the transport's name and the connection or the sender's address.  Answers, and packets for the next
-  hop, leave by the :class:`~.service.TransportSender` of the transport.  Where several stations share
-  a socket, a :class:`~eap.services.transports.demultiplexer.Demultiplexer` finds a packet's station.
+- A **transport** receives and sends packets.  Its receiver calls :meth:`StationRouter.receive`
+  with the transport's name and the connection or the sender's address.  Answers, and packets for
+  the next hop, leave by the :class:`~.service.TransportSender` of the transport.  Where several
+  stations share a socket, a demultiplexer finds the station of a packet.
 - A **service** answers for one NetID and its AMS ports, see :class:`~.service.Service`.
 - **Routes** are in :attr:`StationRouter.table`; they are added and removed by the methods here, so
   that hops are asked for life from then on.
