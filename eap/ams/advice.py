@@ -12,11 +12,15 @@ from eap.ids import NetId
 _ALIVE = frozenset({AdsError.TARGET_PORT})
 """Errors of the AMS header that only who has the NetID answers with."""
 _UNREACHED: dict[str, str] = {
-    TransportKind.AMS_TCP: "see whether it is on and listens on that TCP port (a firewall?)",
+    TransportKind.AMS_TCP: (
+        "see whether it is switched on, and listens on that TCP port (a firewall?)"
+    ),
     TransportKind.UDP: "see whether it is switched on, in the same network, and its station runs",
     TransportKind.TCP: "see whether its station runs, and takes connections on that port",
     TransportKind.ETHERNET: "see to the cable and the MAC address, and whether its station runs",
-    TransportKind.MQTT: "see whether both stations are connected to the broker, same network",
+    TransportKind.MQTT: (
+        "see whether both stations are connected to the broker, under the same network"
+    ),
 }
 """What to do about a hop that is down, by the kind of the door."""
 _CLIENT = "nothing is wrong if it only asks; to be asked, it has to listen there"
