@@ -11,6 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 import click
@@ -36,12 +37,20 @@ class LazyGroup(click.Group):
 
     Args:
         commands_at: ``module:attribute`` of each subcommand.
+        former_names: Hidden former names of subcommands, with the present ones.
         **settings: As ``click.Group`` takes them.
     """
 
-    def __init__(self, *, commands_at: Mapping[str, str], **settings: Any) -> None:
+    def __init__(
+        self,
+        *,
+        commands_at: Mapping[str, str],
+        former_names: Mapping[str, str] = MappingProxyType({}),
+        **settings: Any,
+    ) -> None:
         super().__init__(**settings)
         self._commands_at = commands_at
+        self._former_names = former_names
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Name every subcommand without importing one."""
@@ -49,7 +58,7 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import one subcommand."""
-        target = self._commands_at.get(cmd_name)
+        target = self._commands_at.get(self._former_names.get(cmd_name, cmd_name))
         if target is None:
             return None
         module, _, attribute = target.partition(":")
@@ -60,7 +69,8 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the subcommand that *args* start with; raise UsageError with one that comes near."""
-        if args[0] not in self._commands_at and not ctx.resilient_parsing:
+        is_known = args[0] in self._commands_at or args[0] in self._former_names
+        if not is_known and not ctx.resilient_parsing:
             known = ", ".join(self.list_commands(ctx))
             hint = suggest(args[0], self._commands_at) or f": there are {known}"
             raise click.UsageError(f"no command {args[0]!r}{hint}", ctx)

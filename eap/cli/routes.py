@@ -25,14 +25,15 @@ _FILE = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
     cls=LazyGroup,
     commands_at={
         "add": "eap.cli.routes:add",
+        "add-remote": "eap.cli.routes:add_remote",
         "export": "eap.cli.routes:export",
         "import": "eap.cli.routes:import_routes",
-        "introduce": "eap.cli.routes:introduce",
         "list": "eap.cli.routes:list_all",
         "remove": "eap.cli.routes:remove",
         "scan": "eap.cli.routes:scan",
         "test": "eap.cli.routes:test",
     },
+    former_names={"introduce": "add-remote"},
     short_help="Show, add, remove and test routes; without a command: a live view.",
     invoke_without_command=True,
     epilog=examples(
@@ -337,10 +338,11 @@ def _read(file: Path) -> str:
 
 
 @click.command(
+    "add-remote",
     short_help="Add a route to a station at another router.",
     epilog=examples(
-        "eapctl routes introduce island-01 192.168.1.5 --user Administrator",
-        "eapctl routes introduce island-01 192.168.1.5 --user Administrator --password-file pw",
+        "eapctl routes add-remote island-01 192.168.1.5 --user Administrator",
+        "eapctl routes add-remote island-01 192.168.1.5 --user Administrator --password-file pw",
     ),
 )
 @click.argument("station")
@@ -367,7 +369,7 @@ def _read(file: Path) -> str:
 @plant_option
 @json_option("Print one object: ok, result, text.")
 @click.pass_context
-def introduce(
+def add_remote(
     ctx: click.Context,
     station: str,
     address: str,
@@ -386,12 +388,12 @@ def introduce(
     Exits with 1 when the other router refuses, or does not answer.
     """
     password = _password(user, password_file)
-    from eap.control.routes import ROUTES_INTRODUCE
+    from eap.control.routes import ROUTES_ADD_REMOTE
     from eap.ops.client import connect_station
 
     with connect_station(station, plant) as client:
         answer = client.call(
-            ROUTES_INTRODUCE,
+            ROUTES_ADD_REMOTE,
             within_s=wait_ms / 1000 + ANSWER_MARGIN_S,
             station=station,
             address=address,

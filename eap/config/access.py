@@ -49,7 +49,7 @@ def access_rules(index: Index, station: StationSection, loose: set[str]) -> Iter
             net_ids=tuple(
                 net_id for text in access.net_ids for net_id in parse_source(index, text, loose)
             ),
-            transports=access.doors,
+            transports=access.transports or access.doors,
             targets=tuple(
                 target for text in access.to for target in parse_target(index, text, loose)
             ),
@@ -233,7 +233,12 @@ def _check_rule(
     try_all("to", access.to, lambda text: parse_target(index, text, loose))
     try_all("objects", access.objects, parse_objects)
     known = _transports(station)
-    try_all("doors", access.doors, lambda text: _check_door(text, known))
+    if access.transports and access.doors:
+        message = "access rule has both transports and doors"
+        report.add(access.at, message, "transports alone; doors is its former name")
+        is_fine = False
+    key = "transports" if access.transports else "doors"
+    try_all(key, access.transports or access.doors, lambda text: _check_transport(text, known))
     return is_fine
 
 
@@ -245,10 +250,10 @@ def _transports(station: StationSection) -> list[str]:
     return [*found, *transports, *(f"mqtt:{route.network}" for route in brokers_of(station))]
 
 
-def _check_door(text: str, known: list[str]) -> None:
+def _check_transport(text: str, known: list[str]) -> None:
     if text not in known:
-        expected = f"{one_of(TransportKind)}, or one door such as udp:PORT or mqtt:NETWORK"
-        raise MisfitError("", f"no door {text!r}{suggest(text, known)}", expected)
+        expected = f"{one_of(TransportKind)}, or one transport such as udp:PORT or mqtt:NETWORK"
+        raise MisfitError("", f"no transport {text!r}{suggest(text, known)}", expected)
 
 
 def _check_order(

@@ -312,7 +312,9 @@ class AccessSection(Section, frozen=True):
     deny: tuple[str, ...] = ()
     networks: tuple[str, ...] = msgspec.field(name="from", default=())
     net_ids: tuple[str, ...] = ()
+    transports: tuple[str, ...] = ()
     doors: tuple[str, ...] = ()
+    """Former name of *transports*; plant files of before have it."""
     to: tuple[str, ...] = ()
     objects: tuple[str, ...] = ()
 

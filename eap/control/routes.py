@@ -114,8 +114,8 @@ class RoutesScanParameters(Parameters, frozen=True, kw_only=True):
     wait_ms: Annotated[int, Meta(ge=10, le=60_000)] = 1_000
 
 
-class RoutesIntroduceParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_introduce``: asks the router at *address* for a route to that of *station*.
+class RoutesAddRemoteParameters(Parameters, frozen=True, kw_only=True):
+    """``routes_add_remote``: asks the router at *address* for a route to that of *station*.
 
     User and password are those of the other system; they are sent in clear.
     """
@@ -317,7 +317,7 @@ class NeighbourRow(Document, frozen=True, kw_only=True):
     is_learned: bool
 
 
-class IntroducedRow(Document, frozen=True, kw_only=True):
+class RemoteRouteResult(Document, frozen=True, kw_only=True):
     """Answer of another router to a request to add a route.
 
     Attributes:
@@ -494,7 +494,7 @@ ROUTES_TEST = Method("routes_test", RoutesTestParameters, TestResult)
 ROUTES_IMPORT = Method("routes_import", RoutesImportParameters, list[ImportRow])
 ROUTES_EXPORT = Method("routes_export", RoutesExportParameters, Export)
 ROUTES_SCAN = Method("routes_scan", RoutesScanParameters, list[NeighbourRow])
-ROUTES_INTRODUCE = Method("routes_introduce", RoutesIntroduceParameters, IntroducedRow)
+ROUTES_ADD_REMOTE = Method("routes_add_remote", RoutesAddRemoteParameters, RemoteRouteResult)
 SCAN = Method("scan", ScanParameters, PlantScan)
 TRACE = Method("trace", TraceParameters, TracedPath)
 AMS_ASK = Method("ams_ask", AskParameters, AmsReply)

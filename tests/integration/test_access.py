@@ -161,4 +161,4 @@ def test_a_neighbour_on_the_cable_reads_by_type_5_and_does_not_write(cell: Cell)
         assert (answer.error, answer.result) == (0, 0)
         assert ask_by_frame(aoe.WRITE, aoe.write_body(OPEN, bytes(4))).error == 0x723
     (told,) = cell.audit()
-    assert (told["door"], told["from"]) == ("ethernet:eap1", cell.there.mac())
+    assert (told["transport"], told["from"]) == ("ethernet:eap1", cell.there.mac())

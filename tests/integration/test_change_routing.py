@@ -27,7 +27,7 @@ stations:
     ports:
       - {name: eap0, kind: eap, interface: "udp://127.9.72.2", net_id: 127.9.72.2.2.1}
 """
-RULE = "2.1}\n    access: [{name: nobody, deny: [all], doors: [ams-tcp]}]\n  - name: right"
+RULE = "2.1}\n    access: [{name: nobody, deny: [all], transports: [ams-tcp]}]\n  - name: right"
 DENIED = 0x723
 
 

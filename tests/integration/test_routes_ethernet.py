@@ -43,13 +43,13 @@ stations:
       - {name: eap0, kind: eap, interface: "ethernet://west0", net_id: 5.1.1.2.2.1}
       - {name: eap1, kind: eap, interface: "ethernet://east0", net_id: 5.1.1.2.2.2}
     routes: [{to: c, via: c/eap0, port: eap1}]
-    access: [{allow: [all], net_ids: [10.88.170.1], doors: ["ethernet:eap0"]}]
+    access: [{allow: [all], net_ids: [10.88.170.1], transports: ["ethernet:eap0"]}]
   - name: c
     net_id: 5.1.1.3.1.1
     ports:
       - {name: eap0, kind: eap, interface: "ethernet://west0", net_id: 5.1.1.3.2.1}
       - {name: bus0, kind: bus, interface: "sim://drive.yaml", net_id: 5.1.1.3.3.1}
-    access: [{allow: [all], net_ids: [10.88.170.1], doors: [ethernet]}]
+    access: [{allow: [all], net_ids: [10.88.170.1], transports: [ethernet]}]
 """
 BUSES = Path(__file__).parents[2] / "config" / "buses"
 BEGIN = """
@@ -200,7 +200,7 @@ def test_cable_that_is_pulled_is_answered_for_at_once(line: Row) -> None:
 
 def test_each_station_on_the_way_judges(line: Row) -> None:
     strict = PLANT.replace(
-        "access: [{allow: [all], net_ids: [10.88.170.1], doors: [ethernet]}]", ""
+        "access: [{allow: [all], net_ids: [10.88.170.1], transports: [ethernet]}]", ""
     )
     for name in "cba":
         line.start(name, strict if name == "c" else PLANT)

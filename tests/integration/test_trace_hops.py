@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.net, pytest.mark.root]
 
 SLAVE = "c/bus0/1001"
 CLOSED = PLANT.replace(
-    "access: [{allow: [all], net_ids: [10.88.170.1], doors: [ethernet]}]",
+    "access: [{allow: [all], net_ids: [10.88.170.1], transports: [ethernet]}]",
     "access: [{name: nobody, deny: [all], to: [c/bus0]}]",
 )
 

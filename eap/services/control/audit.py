@@ -30,12 +30,12 @@ from eap.services.rate_limiter import Rate, SourceRateLimiter, SourceRates
 
 BURST, PER_S = 500, 50
 """Lines that a client may cause at once, and in each second for long."""
-DOOR_RATE = Rate(5000, 500)
+TRANSPORT_RATE = Rate(5000, 500)
 """Likewise, of all clients of a transport."""
 NEW_RATE = Rate(500, 50)
 """Likewise, of all its clients that were never seen: their addresses can be invented."""
 CONTROL = "control"
-"""Stands for a door in lines about clients of the control socket."""
+"""Stands for a transport in lines about clients of the control socket."""
 TOO_MANY = f"the audit is required, and records {PER_S} changes a second of a client for long"
 _MAX_CLIENTS = 1024
 """More than can be new at once: invented addresses do not make known clients forgotten."""
@@ -44,10 +44,12 @@ _PLAIN = 8
 _TELL_AFTER_S = 1.0
 _COMPLETE = 0x100
 
-_CONTROL_RATES = SourceRates(Rate(BURST, PER_S), known=DOOR_RATE, new=DOOR_RATE, local=DOOR_RATE)
-_RATES = SourceRates(Rate(BURST, PER_S), known=DOOR_RATE, new=NEW_RATE, local=DOOR_RATE)
+_CONTROL_RATES = SourceRates(
+    Rate(BURST, PER_S), known=TRANSPORT_RATE, new=TRANSPORT_RATE, local=TRANSPORT_RATE
+)
+_RATES = SourceRates(Rate(BURST, PER_S), known=TRANSPORT_RATE, new=NEW_RATE, local=TRANSPORT_RATE)
 _Client: TypeAlias = tuple[str, str, str]
-"""Station, door, and address without its TCP port."""
+"""Station, transport, and address without its TCP port."""
 
 logger = logging.getLogger(__name__)
 
@@ -180,7 +182,7 @@ class Audit:
             self._skip(client)
 
     def _request_head(self, who: str, station: str) -> dict[str, Any]:
-        return {"time": self._time(), "station": station, "door": CONTROL, "from": who}
+        return {"time": self._time(), "station": station, "transport": CONTROL, "from": who}
 
     def tell_skipped(self) -> None:
         """Write how many lines were left out, for each client that had some."""
@@ -189,7 +191,7 @@ class Audit:
             {
                 "time": self._time(),
                 "station": station,
-                "door": transport,
+                "transport": transport,
                 "from": who,
                 "skipped": count,
             }
@@ -199,7 +201,7 @@ class Audit:
             self._append(lines)
 
     def _take(self, client: _Client) -> bool:
-        """Take one line for a client; return whether its rate and that of its door allow it."""
+        """Take one line for a client; return whether the rates allow it."""
         station, transport, who = client
         now = self._clock()
         limiter = self._limiters.get((station, transport))
@@ -222,7 +224,7 @@ class Audit:
         return {
             "time": self._time(),
             "station": station,
-            "door": entry.endpoint.transport,
+            "transport": entry.endpoint.transport,
             "from": entry.endpoint.connection,
             "source": f"{header.source}:{header.source_port}",
             "target": f"{header.target}:{header.target_port}",

@@ -53,7 +53,7 @@ class RouteMethods:
                 words.ROUTES_LIST.served_by(self._list),
                 words.ROUTES_ADD.served_by(self._add),
                 words.ROUTES_REMOVE.served_by(self._remove),
-                words.ROUTES_INTRODUCE.served_by(self._introduce),
+                words.ROUTES_ADD_REMOTE.served_by(self._add_remote),
                 words.ROUTES_SCAN.served_by(self._scan),
                 words.ROUTES_TEST.served_by(self._test),
                 words.ROUTES_IMPORT.served_by(self._import),
@@ -93,7 +93,7 @@ class RouteMethods:
         rows = await asyncio.gather(*(self._scan_from(view, wanted) for view in views))
         return [row for each in rows for row in each]
 
-    async def _introduce(self, wanted: words.RoutesIntroduceParameters) -> words.IntroducedRow:
+    async def _add_remote(self, wanted: words.RoutesAddRemoteParameters) -> words.RemoteRouteResult:
         view, address = self._view(wanted.station), _address(wanted.address)
         name = wanted.name or view.router.name
         if "\0" in name + wanted.user + wanted.password:
@@ -102,9 +102,9 @@ class RouteMethods:
         with unless_unavailable():
             result = await introduce(view.routes, route, address, wanted.wait_ms / 1000)
         if result is None:
-            return words.IntroducedRow(ok=False, result=None, text="no answer by UDP 48899")
+            return words.RemoteRouteResult(ok=False, result=None, text="no answer by UDP 48899")
         text = "added" if result == AdsError.NONE else AdsError.words_of(result)
-        return words.IntroducedRow(ok=result == AdsError.NONE, result=result, text=text)
+        return words.RemoteRouteResult(ok=result == AdsError.NONE, result=result, text=text)
 
     async def _scan_from(
         self, view: RouterView, wanted: words.RoutesScanParameters

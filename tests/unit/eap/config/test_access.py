@@ -26,7 +26,8 @@ def plant(index):
 def test_a_rule_says_what_its_texts_stand_for(index):
     access = (
         "access: [{deny: [write], from: [10.0.0.7/24, 02-00-00-00-00-0A], net_ids: [left],"
-        " doors: [mqtt], to: [5.1.2.3:851], objects: [0x6000-0x6FFF]}, {name: rest, allow: [all]}]"
+        " transports: [mqtt], to: [5.1.2.3:851], objects: [0x6000-0x6FFF]},"
+        " {name: rest, allow: [all]}]"
     )
     plant = index((LEFT_PORT, f"{LEFT_PORT}\n    {access}"))
     writes = AccessService.WRITE, AccessService.CONTROL, AccessService.FILES, AccessService.RAW
@@ -159,6 +160,12 @@ def access(*items, key="access"):
     return PORT, f"{PORT}\n    {key}:{lines}"
 
 
+def test_access_rule_with_former_key_doors_names_its_transports(index):
+    plant = index((LEFT_PORT, f"{LEFT_PORT}\n    access: [{{deny: [all], doors: [mqtt]}}]"))
+    (rule,) = access_rules(plant, plant.stations["left"], set())
+    assert rule.transports == ("mqtt",)
+
+
 @pytest.mark.parametrize(
     ("items", "finding"),
     [
@@ -171,13 +178,16 @@ def access(*items, key="access"):
         (["allow: [all], net_ids: [rihgt]"], "8: net_ids: 'rihgt' is no NetID, nor the first num"),
         (["allow: [all], to: [right/eap1]"], "8: to: station right has no port 'eap1', did you me"),
         (["allow: [all], objects: [x]"], "8: objects: 'x' names no objects; INDEX, INDEX:SUB"),
-        (["allow: [all], doors: [upd]"], "8: doors: no door 'upd', did you mean udp?; one of ud"),
-        (["allow: [all], doors: [mqtt:x]"], "8: doors: no door 'mqtt:x'"),
-        (["name: a, allow: [read], doors: [udp]", "name: a, allow: [all]"],
+        (["allow: [all], transports: [upd]"], "8: transports: no transport 'upd', did you mean u"),
+        (["allow: [all], transports: [mqtt:x]"], "8: transports: no transport 'mqtt:x'"),
+        (["allow: [all], doors: [upd]"], "8: doors: no transport 'upd', did you mean udp?; one of"),
+        (["allow: [all], transports: [udp], doors: [udp]"],
+         "8: access rule has both transports and doors; transports alone; doors is its former "),
+        (["name: a, allow: [read], transports: [udp]", "name: a, allow: [all]"],
          "9: access rule 'a' exists already (line 8); a name of its own"),
-        (["allow: [all], from: [10.0.0.1], doors: [mqtt]"],
+        (["allow: [all], from: [10.0.0.1], transports: [mqtt]"],
          "8: access rule can never fit: who comes by mqtt has no such address; a rule that can"),
-        (["allow: [all], from: ['02:00:00:00:00:01'], doors: [udp]"],
+        (["allow: [all], from: ['02:00:00:00:00:01'], transports: [udp]"],
          "8: access rule can never fit: who comes by udp has no such address; a rule that can"),
         (["allow: [all], from: ['02:00:00:00:00:0x']"], "8: from: '02:00:00:00:00:0x' is no IPv4"),
         (["allow: [files, raw], objects: [0x6000]"],
@@ -204,7 +214,7 @@ NEVER = "9: access rule is never asked: the one of line 8 fits before it; it bef
         ),
         ("deny: [read], to: [right]", "allow: [read], to: [right/eap0]"),
         ("deny: [read], to: [right]", "allow: [read], to: ['right:851']"),
-        ("deny: [all], doors: [udp, mqtt]", "allow: [all], doors: [udp:eap0]"),
+        ("deny: [all], transports: [udp, mqtt]", "allow: [all], transports: [udp:eap0]"),
         ("deny: [all], net_ids: [5.1.2.3]", "allow: [all], net_ids: [5.1.2.3.1.1]"),
         ("deny: [all], objects: [0x6000-0x6FFF]", "allow: [read], objects: [0x6040:1]"),
     ],
@@ -223,10 +233,10 @@ def test_a_rule_behind_one_that_always_fits_is_a_finding(findings, first, second
         ("deny: [all], from: [02-00-00-00-00-01]", "allow: [all]"),
         (
             "deny: [all], from: [02-00-00-00-00-01]",
-            "allow: [all], from: [02-00-00-00-00-02], doors: [ethernet]",
+            "allow: [all], from: [02-00-00-00-00-02], transports: [ethernet]",
         ),
         ("deny: [read], to: ['right:851']", "allow: [read], to: [right]"),
-        ("deny: [all], doors: [udp:eap0]", "allow: [all], doors: [udp]"),
+        ("deny: [all], transports: [udp:eap0]", "allow: [all], transports: [udp]"),
         ("deny: [all], net_ids: [5.1.2.3]", "allow: [all], net_ids: [5.1.2.30.1.1]"),
         ("deny: [all], objects: [0x6040:1]", "allow: [all], objects: [0x6040]"),
         ("deny: [all], objects: [0x6040]", "allow: [all]"),

@@ -82,7 +82,7 @@ def test_clients_of_the_control_socket_have_lines_and_limits(audit: Audit, clock
     clock.now += 1
     audit.tell_skipped()
     told = lines(audit)
-    head = {"time": "2023-11-14T22:13:20.250+00:00", "station": "island-01", "door": "control"}
+    head = {"time": "2023-11-14T22:13:20.250+00:00", "station": "island-01", "transport": "control"}
     assert told[0] == head | {"from": "uid 0, pid 7"} | words
     assert [each["from"] for each in told].count("uid 0, pid 7") == BURST + 1
     assert told[-2] == told[0] | {"from": "uid 0, pid 8"}
@@ -95,7 +95,7 @@ def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
         {
             "time": "2023-11-14T22:13:20.250+00:00",
             "station": "island-01",
-            "door": "ams-tcp",
+            "transport": "ams-tcp",
             "from": "10.0.0.5:49152",
             "source": "192.168.0.9.1.1:30000",
             "target": "5.1.1.1.3.1:1001",
@@ -165,7 +165,7 @@ def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: C
         {
             "time": "2023-11-14T22:13:20.250+00:00",
             "station": "island-01",
-            "door": "ams-tcp",
+            "transport": "ams-tcp",
             "from": "10.0.0.5",
             "skipped": 20,
         }
@@ -181,7 +181,7 @@ def test_a_flood_from_many_addresses_is_bounded_by_its_door(audit: Audit) -> Non
         audit.write("island-01", entry(endpoint=endpoint, count=BURST))
     audit.write("island-01", entry())
     # The first line of each client counts among those of new ones.
-    assert len(lines(audit)) == module.DOOR_RATE.burst + 12 + 1
+    assert len(lines(audit)) == module.TRANSPORT_RATE.burst + 12 + 1
 
 
 def test_flood_from_invented_addresses_leaves_known_clients_their_lines(audit: Audit) -> None:

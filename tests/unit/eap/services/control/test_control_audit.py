@@ -34,8 +34,8 @@ def test_reading_is_not_told(method: str) -> None:
 
 
 def test_a_change_is_told_without_secrets_and_at_no_length() -> None:
-    found = told("routes_introduce", station="left", address="10.0.0.5", password="p")
-    assert found == ("left", {"operation": "routes_introduce", "asked": {"address": "10.0.0.5"}})
+    found = told("routes_add_remote", station="left", address="10.0.0.5", password="p")
+    assert found == ("left", {"operation": "routes_add_remote", "asked": {"address": "10.0.0.5"}})
     found = told("od_write", target="left/eap0", index=0x8000, subindex=1, data="00" * 200)
     assert found is not None
     assert found[0] == "left"

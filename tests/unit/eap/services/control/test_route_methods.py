@@ -249,7 +249,7 @@ class Introducer:
 def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
     left.routes.scanners.append(other := Introducer(result))
     login = {"user": "Administrator", "password": "1"}
-    row = ask("introduce", station="left", address="10.0.0.5", **login, wait_ms=20)
+    row = ask("add_remote", station="left", address="10.0.0.5", **login, wait_ms=20)
     assert (row.ok, row.result, row.text) == (ok, result, text)
     net_id = NetId.parse("127.0.9.1.1.1")
     assert other.asked == [("left", net_id, "Administrator", "1", "10.0.0.5", 0.02)]
@@ -265,4 +265,4 @@ def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
 )
 def test_introduction_that_cannot_be(ask, params, text):
     with pytest.raises(ControlError, match=text):
-        ask("introduce", station="left", **params)
+        ask("add_remote", station="left", **params)

@@ -1,4 +1,4 @@
-"""``eapctl routes introduce``."""
+"""``eapctl routes add-remote``."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ WRONG = {"ok": False, "result": 0x704, "text": "user or password is wrong"}
 def run(runtime):
     """Run the command against a station whose peer takes the password ``1``."""
     with ExitStack() as stack:
-        methods = {"routes_introduce": lambda params: ADDED if params["password"] == "1" else WRONG}
+        methods = {
+            "routes_add_remote": lambda params: ADDED if params["password"] == "1" else WRONG
+        }
         stub = ControlStub("line", ["left"], methods, stack)
 
-        def run_command(*words, typed=None):
-            result = CliRunner().invoke(main, ["routes", "introduce", *words], input=typed)
-            asked = [params for method, params in stub.requests if method == "routes_introduce"]
+        def run_command(*words, typed=None, command="add-remote"):
+            result = CliRunner().invoke(main, ["routes", command, *words], input=typed)
+            asked = [params for method, params in stub.requests if method == "routes_add_remote"]
             return result, asked
 
         yield run_command
@@ -63,3 +65,12 @@ def test_a_refusal_fails(run):
     result, _ = run("left", "10.0.0.5")
     assert result.exit_code == 1
     assert result.output == "10.0.0.5: user or password is wrong\n"
+
+
+def test_add_remote_by_its_former_name_introduce_sends_the_same_request(run):
+    results = [run("left", "10.0.0.5", "--user", "x", typed="1\n", command=command)
+               for command in ("add-remote", "introduce")]  # fmt: skip
+    (new, asked_new), (former, asked_former) = results
+    assert (former.exit_code, former.output) == (new.exit_code, new.output)
+    assert asked_former == 2 * asked_new
+    assert "introduce" not in CliRunner().invoke(main, ["routes", "--help"]).output
