@@ -11,8 +11,13 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from devicebus.errors import MailboxRefusedError
-from devicebus.mailbox.counter import CounterWatch, next_counter
-from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer, refuse
+from devicebus.mailbox.protocol import (
+    CounterWatch,
+    MailboxSizes,
+    ProtocolServer,
+    next_counter,
+    refuse,
+)
 from eap.codec.mailbox import (
     MailboxError,
     MailboxErrorReply,

@@ -6,6 +6,8 @@ that end in another IDN were late, and are dropped.
 
 from __future__ import annotations
 
+import msgspec
+
 from devicebus.errors import BusError, MailboxProtocolError, MailboxTimeoutError, SoeError
 from devicebus.mailbox.conversation import (
     Conversation,
@@ -15,21 +17,25 @@ from devicebus.mailbox.conversation import (
     reading,
 )
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.mailbox.soe_procedure import CLEAR, START
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import (
+    COMMAND_CLEAR,
+    COMMAND_START,
     DATA_OVERHEAD,
     DataState,
     Element,
     Idn,
+    SoeAttribute,
     SoeHeader,
     SoeOpcode,
+    decode_list,
     decode_message,
     encode_fragments,
     encode_message,
     error_code_of,
 )
 from eap.codec.soeerror import SoeErrorCode, name_of
+from eap.codec.soevalue import SoeScalar, SoeValue, decode_scalar, decode_value
 
 MAX_SIZE = 0x80020
 """Octets of the longest answer: eight elements that are lists as long as there can be."""
@@ -150,7 +156,7 @@ def execute(
         MailboxProtocolError: an answer is no answer.
     """
     what = f"procedure command {idn} at drive {drive}"
-    yield from write(idn, START.to_bytes(2, "little"), sizes, drive=drive)
+    yield from write(idn, COMMAND_START.to_bytes(2, "little"), sizes, drive=drive)
     state = DataState.BUSY
     since_ns: int | None = None
     for _ in range(max(1, timeout_ns // POLL_DELAY_NS)):
@@ -164,7 +170,7 @@ def execute(
         if message.at_ns - since_ns > timeout_ns:
             break
     try:
-        yield from write(idn, CLEAR.to_bytes(2, "little"), sizes, drive=drive)
+        yield from write(idn, COMMAND_CLEAR.to_bytes(2, "little"), sizes, drive=drive)
     except BusError:
         if not state & DataState.EXECUTING:
             raise  # else that it was not done says more
@@ -178,3 +184,70 @@ def _refusal(what: str, body: memoryview) -> SoeError:
     with reading(what):
         code = error_code_of(body)
     return SoeError(f"{what}: {name_of(code)} (0x{code:04X})", code=code)
+
+
+LIST_OF_ALL = Idn.parse("S-0-0017")
+_IDNS = SoeAttribute(length=1, is_list=1)
+
+
+class IdnDescription(msgspec.Struct, frozen=True):
+    """One IDN with the elements that it has; None for those it has not."""
+
+    idn: Idn
+    attribute: SoeAttribute
+    value: SoeValue
+    name: str | None = None
+    unit: str | None = None
+    minimum: SoeScalar | None = None
+    maximum: SoeScalar | None = None
+    default: SoeValue | None = None
+    data_state: int | None = None
+    """Of a procedure command; other IDNs usually have none."""
+
+
+def idn_list(idn: Idn = LIST_OF_ALL, *, drive: int = 0) -> Conversation[list[Idn]]:
+    """Read a list of IDNs, such as that of all of them; raises as read() does."""
+    octets = yield from read(idn, drive=drive)
+    with reading(f"IDN list {idn}"):
+        _, numbers = decode_list(octets)
+        return [Idn.of(int(decode_scalar(_IDNS, numbers[at:]))) for at in range(0, len(numbers), 2)]
+
+
+def describe(idn: Idn, *, drive: int = 0) -> Conversation[IdnDescription]:
+    """Read everything about an IDN, one element at a time; raises as read() does.
+
+    An element that the drive refuses is missing, except attribute and value.
+    """
+    octets = yield from read(idn, Element.ATTRIBUTE, drive=drive)
+    with reading(f"attribute of {idn}"):
+        attribute = SoeAttribute.decode(octets)
+    value = yield from read(idn, drive=drive)
+    name = yield from _read_if_any(idn, Element.NAME, drive)
+    unit = yield from _read_if_any(idn, Element.UNIT, drive)
+    minimum = yield from _read_if_any(idn, Element.MINIMUM, drive)
+    maximum = yield from _read_if_any(idn, Element.MAXIMUM, drive)
+    default = yield from _read_if_any(idn, Element.DEFAULT, drive)
+    state = yield from _read_if_any(idn, Element.DATA_STATE, drive)
+    with reading(f"elements of {idn}"):
+        return IdnDescription(
+            idn,
+            attribute,
+            decode_value(attribute, value),
+            _text(name),
+            _text(unit),
+            None if minimum is None else decode_scalar(attribute, minimum),
+            None if maximum is None else decode_scalar(attribute, maximum),
+            None if default is None else decode_value(attribute, default),
+            None if state is None else int.from_bytes(state, "little"),
+        )
+
+
+def _read_if_any(idn: Idn, element: Element, drive: int) -> Conversation[bytes | None]:
+    try:
+        return (yield from read(idn, element, drive=drive))
+    except SoeError:
+        return None
+
+
+def _text(octets: bytes | None) -> str | None:
+    return None if octets is None else decode_list(octets)[1].rstrip(b"\0").decode(errors="replace")

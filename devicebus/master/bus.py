@@ -4,24 +4,68 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 
 from devicebus.master.clocks import Sync0, drift_access
 from devicebus.master.cycle import Cycle, Presence
-from devicebus.master.event import BusBack, BusLost, Event
-from devicebus.master.expected import ExpectedSlave
 from devicebus.master.image import BusImage
-from devicebus.master.link import RETRIES, Link
+from devicebus.master.link import CEILING_NS, RETRIES, Link
 from devicebus.master.mailboxes import Mailbox, Unsolicited
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.pdo import Channel, PdoChoice
-from devicebus.master.roundtrip import CEILING_NS
-from devicebus.master.runner import Runner
-from devicebus.master.scan import FIRST_STATION, FoundSlave
-from devicebus.master.task import Task
+from devicebus.master.procedure import Runner, Task
+from devicebus.master.scan import FIRST_STATION, ExpectedSlave, FoundSlave
 from devicebus.wire.alstatus import AlState
+
+
+class SlaveLost(msgspec.Struct, frozen=True):
+    """A slave does not answer any more."""
+
+    station: int
+    at_ns: int
+
+
+class SlaveLeft(msgspec.Struct, frozen=True):
+    """A slave has left its state by itself; *status* and *code* as in its AL status."""
+
+    station: int
+    status: int
+    code: int
+    at_ns: int
+
+
+class SlaveBack(msgspec.Struct, frozen=True):
+    """A slave is back in the state where it belongs, so long after it was missed."""
+
+    station: int
+    duration_ns: int
+    at_ns: int
+
+
+class SlaveFailed(msgspec.Struct, frozen=True):
+    """A slave could not be brought back; it is tried again."""
+
+    station: int
+    reason: str
+    at_ns: int
+
+
+class BusLost(msgspec.Struct, frozen=True):
+    """No frame comes back."""
+
+    at_ns: int
+
+
+class BusBack(msgspec.Struct, frozen=True):
+    """Frames come back again."""
+
+    at_ns: int
+
+
+Event: TypeAlias = SlaveLost | SlaveLeft | SlaveBack | SlaveFailed | BusLost | BusBack | Unsolicited
+
 
 MAX_EVENTS = 1000
 """Events that wait for the user; the oldest are dropped."""

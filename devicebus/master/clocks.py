@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 import msgspec
 
-from devicebus.master.access import DatagramRequest, bwr, fprd, frmw
 from devicebus.master.procedure import Procedure, not_answered, read, write
-from devicebus.master.scan import FoundSlave
-from devicebus.master.topology import Joint
+from devicebus.master.scan import FoundSlave, Joint
+from devicebus.wire.datagram import DatagramRequest, bwr, fprd, frmw
 from devicebus.wire.register import Register
 
 _U32 = 0xFFFF_FFFF

@@ -14,11 +14,9 @@ from typing import NamedTuple
 import msgspec
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import DatagramReply, DatagramRequest, logical
-from devicebus.master.image import BusImage
-from devicebus.master.layout import Group, Place
+from devicebus.master.image import BusImage, Group, Place
 from devicebus.master.link import Exchange, Link
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, logical
 
 MAX_UNDER_WAY = 2
 """Cycles under way at once: more would only make those behind them late, acyclic frames too."""

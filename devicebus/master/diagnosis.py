@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 import msgspec
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import DatagramReply, fprd, fpwr
 from devicebus.master.procedure import Procedure
-from devicebus.master.topology import find_joints
+from devicebus.master.scan import find_joints
 from devicebus.wire.alstatus import ERROR, name_of, state_name
+from devicebus.wire.datagram import DatagramReply, fprd, fpwr
 from devicebus.wire.register import AlStatus, DlStatus, Register
 
 _PORTS = 4

@@ -5,8 +5,7 @@ from __future__ import annotations
 from devicebus.errors import SiiError
 from devicebus.master.procedure import Procedure, Sleep, read, write
 from devicebus.wire.register import EepromCommand, EepromControl, Register
-from devicebus.wire.sii import CategoryHeader
-from devicebus.wire.siirecord import SiiFixed
+from devicebus.wire.sii import CategoryHeader, SiiFixed
 
 BUSY_TIMEOUT_NS = 20_000_000
 """How long the EEPROM may work on one command."""

@@ -2,10 +2,204 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import msgspec
+
 from devicebus.errors import BusError
-from devicebus.master.layout import Layout, Variable
+from devicebus.master.link import MAX_DATA
+from devicebus.master.pdo import Channel
+from devicebus.wire.register import FMMU_READ, FMMU_WRITE, Fmmu, SyncManager
 from eap.codec import datatypes
 from eap.codec.values import DataType, Value
+
+BASE = 0x0001_0000
+"""First logical address."""
+MAX_FMMUS = 16
+"""Of a controller, whatever it says of itself."""
+_STRIDE = 0x0800
+"""Between the addresses of two datagrams; more than the octets of one."""
+
+
+class SlaveShape(NamedTuple):
+    """What a slave needs: its process data, and how many FMMUs it has for that."""
+
+    station: int
+    channels: tuple[Channel, ...]
+    fmmus: int = 16
+
+
+class Place(NamedTuple):
+    """A slave's part of the image, outputs and inputs each from an octet on."""
+
+    station: int
+    outputs: int
+    outputs_size: int
+    inputs: int
+    inputs_size: int
+    group: int
+    """Which of the datagrams carries it."""
+    fmmus: tuple[Fmmu, ...]
+    sync_managers: tuple[tuple[int, SyncManager], ...]
+
+
+class Group(NamedTuple):
+    """What one LRW, or one LWR and one LRD, exchange."""
+
+    address: int
+    outputs: int
+    outputs_size: int
+    inputs: int
+    inputs_size: int
+
+
+class Variable(msgspec.Struct, frozen=True):
+    """An entry of a PDO in the image."""
+
+    station: int
+    name: str
+    is_output: bool
+    bit_offset: int
+    """From the start of all outputs, or of all inputs."""
+    bit_length: int
+    data_type: int
+    index: int
+    subindex: int
+
+
+class Layout(NamedTuple):
+    """All of it."""
+
+    places: dict[int, Place]
+    """By station address."""
+    groups: tuple[Group, ...]
+    variables: tuple[Variable, ...]
+
+    @property
+    def outputs_size(self) -> int:
+        """Octets of all outputs."""
+        return sum(group.outputs_size for group in self.groups)
+
+    @property
+    def inputs_size(self) -> int:
+        """Octets of all inputs."""
+        return sum(group.inputs_size for group in self.groups)
+
+
+def lay_out(slaves: Sequence[SlaveShape]) -> Layout:
+    """Give every slave its place.
+
+    Raises:
+        BusError: a slave has more process data than a frame holds, or too few FMMUs.
+    """
+    places: dict[int, Place] = {}
+    groups: list[Group] = []
+    variables: list[Variable] = []
+    outputs = inputs = 0
+    for number, members in enumerate(_group(slaves)):
+        address = BASE + number * _STRIDE
+        group_outputs = sum(_size(slave, is_output=True) for slave in members)
+        start = outputs, inputs
+        for slave in members:
+            shift = (address - start[0], address + group_outputs - start[1])
+            place = _place(slave, number, (outputs, inputs), shift)
+            places[slave.station] = place
+            variables += _variables(slave, place)
+            outputs += place.outputs_size
+            inputs += place.inputs_size
+        groups.append(Group(address, start[0], outputs - start[0], start[1], inputs - start[1]))
+    return Layout(places, tuple(groups), tuple(variables))
+
+
+def _group(slaves: Sequence[SlaveShape]) -> Iterator[list[SlaveShape]]:
+    """Divide the slaves with process data into as few datagrams as their order allows."""
+    members: list[SlaveShape] = []
+    total = 0
+    for slave in slaves:
+        size = sum(channel.size for channel in slave.channels)
+        if size > MAX_DATA:
+            raise BusError(
+                f"slave {slave.station}: {size} octets of process data, expected at most {MAX_DATA}"
+            )
+        if members and total + size > MAX_DATA:
+            yield members
+            members, total = [], 0
+        members.append(slave)
+        total += size
+    if total:
+        yield members
+
+
+def _size(slave: SlaveShape, *, is_output: bool) -> int:
+    return sum(each.size for each in slave.channels if each.is_output is is_output)
+
+
+def _place(slave: SlaveShape, group: int, start: tuple[int, int], shift: tuple[int, int]) -> Place:
+    """Place one slave; *shift* leads from offsets in the image to logical addresses."""
+    ends = list(start)
+    fmmus = []
+    managers = []
+    for channel in slave.channels:
+        side = 0 if channel.is_output else 1
+        managers.append((channel.number, _sync_manager(channel)))
+        if not channel.size:
+            continue
+        fmmus.append(
+            Fmmu(
+                shift[side] + ends[side],
+                channel.size,
+                physical_start=channel.start,
+                type=FMMU_WRITE if channel.is_output else FMMU_READ,
+                activate=1,
+            )
+        )
+        ends[side] += channel.size
+    if len(fmmus) > min(slave.fmmus, MAX_FMMUS):
+        raise BusError(
+            f"slave {slave.station}: {len(fmmus)} sync managers with process data, but"
+            f" {min(slave.fmmus, MAX_FMMUS)} FMMUs"
+        )
+    sizes = [end - begin for begin, end in zip(start, ends, strict=True)]
+    return Place(
+        slave.station, start[0], sizes[0], start[1], sizes[1], group, tuple(fmmus), tuple(managers)
+    )
+
+
+def _sync_manager(channel: Channel) -> SyncManager:
+    control = channel.control
+    return SyncManager(
+        channel.start,
+        channel.size,
+        mode=control & 3,
+        direction=control >> 2 & 3,
+        ecat_interrupt=control >> 4 & 1,
+        pdi_interrupt=control >> 5 & 1,
+        watchdog=control >> 6 & 1,
+        enable=int(channel.size > 0),
+    )
+
+
+def _variables(slave: SlaveShape, place: Place) -> Iterator[Variable]:
+    ends = [place.outputs * 8, place.inputs * 8]
+    names: set[tuple[bool, str]] = set()
+    for channel in slave.channels:
+        side = 0 if channel.is_output else 1
+        offset = ends[side]
+        for entry in (entry for pdo in channel.pdos for entry in pdo.entries):
+            if entry.index:
+                plain = f"{entry.index:04X}:{entry.subindex:02X}"
+                name = entry.name or plain
+                if (channel.is_output, name) in names:
+                    name = f"{name} {plain}"
+                names.add((channel.is_output, name))
+                yield Variable(
+                    slave.station, name, channel.is_output, offset, entry.bit_length,
+                    entry.data_type, entry.index, entry.subindex,
+                )  # fmt: skip
+            offset += entry.bit_length
+        ends[side] += 8 * channel.size
+
 
 _NAMES = (
     "BOOL", "SINT", "INT", "DINT", "USINT", "UINT", "UDINT", "REAL", "LREAL", "INT24", "LINT",

@@ -23,17 +23,14 @@ from devicebus.errors import (
     MailboxTimeoutError,
 )
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.mailbox.counter import CounterWatch, next_counter
-from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.protocol import CounterWatch, MailboxSizes, next_counter
 from devicebus.master.conversation_queue import (
     ConversationQueue,
     QueuedConversation,
     is_unsolicited,
 )
 from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted
-from devicebus.master.procedure import Procedure, Sleep
-from devicebus.master.runner import Runner
-from devicebus.master.task import Task
+from devicebus.master.procedure import Procedure, Runner, Sleep, Task
 from eap.codec.mailbox import (
     MailboxError,
     MailboxErrorReply,

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 from devicebus.errors import BusError, FrameLostError
 from devicebus.mailbox.protocol import MINIMUM_SIZE
-from devicebus.master.access import fprd, fpwr
 from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure, Sleep, read, write
+from devicebus.wire.datagram import fprd, fpwr
 from devicebus.wire.register import Register, SmStatus, SyncManager
 
 REPEAT_TIMEOUT_NS = 100_000_000

@@ -9,22 +9,22 @@ import msgspec
 
 from devicebus.errors import BusError, MailboxClosedError, NoMailboxError
 from devicebus.mailbox.conversation import Conversation
-from devicebus.master.bring import bring
-from devicebus.master.bus import Bus, MasterSettings, Unit
-from devicebus.master.configure import standard_mailbox
+from devicebus.master.bring import bring, standard_mailbox
+from devicebus.master.bus import Bus, Event, MasterSettings, Unit
 from devicebus.master.cycle import Cycle, CycleStats
-from devicebus.master.event import Event
 from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
-from devicebus.master.look import look_around
 from devicebus.master.mailboxes import MailboxStats
-from devicebus.master.porterrors import PERIOD_NS as ERRORS_NS
-from devicebus.master.porterrors import PortErrorLog, look_at_errors
-from devicebus.master.procedure import Procedure
+from devicebus.master.procedure import Procedure, Task
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import shut_down, start_up
-from devicebus.master.task import Task
-from devicebus.master.watch import watch
+from devicebus.master.watch import (
+    ERRORS_PERIOD_NS,
+    PortErrorLog,
+    look_around,
+    look_at_errors,
+    watch,
+)
 from devicebus.wire.alstatus import AlState
 from eap.codec.wire import Buffer
 
@@ -183,7 +183,7 @@ class Master:
             if self._look is None or self._look.is_done:
                 self._look = self.run(look_around(self._bus), now_ns, "looking into mailboxes")
         if now_ns >= self._errors_ns and self._bus.cycle is not None:
-            self._errors_ns = now_ns + ERRORS_NS
+            self._errors_ns = now_ns + ERRORS_PERIOD_NS
             self.run(look_at_errors(self._bus, self.port_errors), now_ns, "reading error counters")
 
     def next_event(self) -> Event | None:

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import msgspec
 
 from devicebus.errors import MailboxProtocolError
-from devicebus.mailbox import coe_client, coeinfo_client
+from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.wire.sii import Sii, SiiPdo
-from devicebus.wire.siirecord import SiiSyncManager
+from devicebus.wire.sii import Sii, SiiPdo, SiiSyncManager
 from eap.ids import ObjectId
 from eap.od.abort import SdoAbortError
 
@@ -182,7 +181,7 @@ def _with_name(entry: PdoEntry) -> Conversation[PdoEntry]:
     if entry.name or not entry.index:
         return entry
     try:
-        text = yield from coeinfo_client.entry_description(entry.index, entry.subindex, 0)
+        text = yield from coe_client.entry_description(entry.index, entry.subindex, 0)
     except (SdoAbortError, MailboxProtocolError):
         return entry
     return PdoEntry(entry.index, entry.subindex, entry.bit_length, text.name, text.data_type)

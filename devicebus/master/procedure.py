@@ -12,14 +12,83 @@ in when frames do not come back, and is closed to cancel it.
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Generator, Sequence
-from typing import Generic, NamedTuple, TypeAlias, TypeVar
+from itertools import count
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
-from devicebus.errors import FrameLostError, WorkingCounterError
-from devicebus.master.access import AS_SET, DatagramReply, DatagramRequest, fprd, fpwr
+from devicebus.errors import BusError, FrameLostError, WorkingCounterError
+from devicebus.master.link import Exchange, Link
+from devicebus.wire.datagram import AS_SET, DatagramReply, DatagramRequest, fprd, fpwr
 from eap.errors import EapError
 
 T = TypeVar("T")
+
+
+def _nothing() -> None:
+    """There is nothing to stop any more."""
+
+
+class Task(Generic[T]):
+    """A procedure or a conversation that runs.
+
+    Args:
+        name: What it does, for messages.
+        stop: Ends what is behind it, for :meth:`cancel`.
+    """
+
+    def __init__(self, name: str, stop: Callable[[], None]) -> None:
+        self.name = name
+        self.error: EapError | None = None
+        self._stop = stop
+        self._value: list[T] = []
+        self._watchers: list[Callable[[Task[T]], None]] = []
+
+    @property
+    def is_done(self) -> bool:
+        """Whether there is a result or an error."""
+        return bool(self._value) or self.error is not None
+
+    def result(self) -> T:
+        """Return what came out, or raise what went wrong.
+
+        Raises:
+            BusError: it still runs, or was cancelled.
+        """
+        if self.error is not None:
+            raise self.error
+        if not self._value:
+            raise BusError(f"{self.name} is not done yet")
+        return self._value[0]
+
+    def watch(self, callback: Callable[[Task[T]], None]) -> None:
+        """Call back once it is done, at once if it already is."""
+        if self.is_done:
+            callback(self)
+        else:
+            self._watchers.append(callback)
+
+    def cancel(self) -> None:
+        """End it where it stands; nothing more is sent for it.  Harmless when it is done."""
+        if not self.is_done:
+            self._stop()
+            self.fail(BusError(f"{self.name} was cancelled"))
+
+    def finish(self, value: T) -> None:
+        """It has a result: for whoever runs it."""
+        self._value.append(value)
+        self._tell()
+
+    def fail(self, error: EapError) -> None:
+        """It went wrong: for whoever runs it."""
+        self.error = error
+        self._tell()
+
+    def _tell(self) -> None:
+        self._stop = _nothing  # whoever is behind it knows the task: this would be a circle
+        watchers, self._watchers = self._watchers, []
+        for callback in watchers:
+            callback(self)
 
 
 class Sleep(NamedTuple):
@@ -137,3 +206,84 @@ def _ask_for(asking: Sequence[_Child[T]]) -> Procedure[int]:
         child.resume(StepReplies(replies[start:end], now_ns))
         start = end
     return now_ns
+
+
+class Runner:
+    """Starts procedures, hands them what the link brings, and wakes them in time."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._sleeping: list[tuple[int, int, _Run]] = []
+        self._number = count()
+
+    def start(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
+        """Run a procedure; its first accesses are queued at once."""
+        run = _Run(procedure, self)
+        run.task = Task(name, run.stop)
+        run.advance(lambda: next(procedure), now_ns)
+        return run.task
+
+    def next_timeout(self) -> int | None:
+        """Return the time at which the next sleeper wakes."""
+        while self._sleeping and self._sleeping[0][2].task.is_done:
+            heapq.heappop(self._sleeping)
+        return self._sleeping[0][0] if self._sleeping else None
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Resume sleepers that are due."""
+        while self._sleeping and self._sleeping[0][0] <= now_ns:
+            _, _, run = heapq.heappop(self._sleeping)
+            if not run.task.is_done:
+                run.resume(StepReplies((), now_ns))
+
+    def take_step(self, run: _Run, step: Step, now_ns: int) -> None:
+        """Queue the next step of a procedure."""
+        if isinstance(step, Sleep):
+            entry = (now_ns + step.duration_ns, next(self._number), run)
+            heapq.heappush(self._sleeping, entry)
+        else:
+            run.exchange = self._link.submit(step, run.take)
+
+
+class _Run:
+    """One procedure that runs."""
+
+    __slots__ = ("_procedure", "_runner", "exchange", "task")
+
+    def __init__(self, procedure: Procedure[Any], runner: Runner) -> None:
+        self.task: Task[Any]
+        self.exchange: Exchange | None = None
+        self._procedure = procedure
+        self._runner = runner
+
+    def take(self, outcome: list[DatagramReply] | FrameLostError, now_ns: int) -> None:
+        """The link has answered."""
+        self.exchange = None
+        if isinstance(outcome, FrameLostError):
+            error = outcome
+            self.advance(lambda: self._procedure.throw(error), now_ns)
+        else:
+            self.resume(StepReplies(outcome, now_ns))
+
+    def resume(self, answer: StepReplies) -> None:
+        """Resume the procedure with the result of its step."""
+        self.advance(lambda: self._procedure.send(answer), answer.now_ns)
+
+    def advance(self, action: Callable[[], Step], now_ns: int) -> None:
+        """Run it up to its next step, or to its end; sleeps of no length are none."""
+        try:
+            step = action()
+            while isinstance(step, Sleep) and step.duration_ns <= 0:
+                step = self._procedure.send(StepReplies((), now_ns))
+        except StopIteration as end:
+            self.task.finish(end.value)
+        except EapError as error:
+            self.task.fail(error)
+        else:
+            self._runner.take_step(self, step, now_ns)
+
+    def stop(self) -> None:
+        """Close the procedure and drop its step."""
+        if self.exchange is not None:
+            self.exchange.cancel()
+        self._procedure.close()

@@ -2,20 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from difflib import SequenceMatcher
 from typing import NamedTuple
 
-from devicebus.errors import BusError
-from devicebus.master.access import DatagramReply, DatagramRequest, aprd, apwr, brd, fprd
+import msgspec
+
+from devicebus.errors import BusError, IdentityError
 from devicebus.master.eeprom import read_image, read_words, take_over
 from devicebus.master.procedure import Procedure, not_answered, together
-from devicebus.master.topology import Joint, find_joints
 from devicebus.wire import sii
+from devicebus.wire.datagram import DatagramReply, DatagramRequest, aprd, apwr, brd, fprd
 from devicebus.wire.register import AlStatus, DlStatus, Register
-from devicebus.wire.sii import Sii
-from devicebus.wire.siirecord import SiiFixed
+from devicebus.wire.sii import Sii, SiiFixed
 from eap.codec.wire import WireStruct, u8, u16, u32
 from eap.errors import EapError
+
+_ORDER = (3, 1, 2)
+
+
+class Joint(NamedTuple):
+    """How a slave hangs on the bus."""
+
+    ports: tuple[int, ...]
+    """Open ports."""
+    parent: int | None
+    """Position of the slave that it is wired to; None for the master."""
+    parent_port: int
+    entry_port: int
+
+
+def open_ports(status: DlStatus) -> tuple[int, ...]:
+    """Return the ports with communication whose loop is open."""
+    pairs = (
+        (status.loop0, status.communication0),
+        (status.loop1, status.communication1),
+        (status.loop2, status.communication2),
+        (status.loop3, status.communication3),
+    )
+    return tuple(port for port, (loop, alive) in enumerate(pairs) if alive and not loop)
+
+
+def find_joints(statuses: Sequence[DlStatus]) -> tuple[Joint, ...]:
+    """Return where each slave hangs, in the order of positions.
+
+    Open ports that lead nowhere are tolerated: a slave behind them may be gone by now.
+    """
+    joints: list[Joint] = []
+    exits: list[tuple[int, list[int]]] = []  # slaves with ports that no slave was found at yet
+    for position, status in enumerate(statuses):
+        ports = open_ports(status)
+        while exits and not exits[-1][1]:
+            exits.pop()
+        parent, port = (exits[-1][0], exits[-1][1].pop(0)) if exits else (None, 0)
+        entry = 0 if 0 in ports or not ports else ports[0]
+        joints.append(Joint(ports, parent, port, entry))
+        exits.append((position, [each for each in _ORDER if each in ports and each != entry]))
+    return tuple(joints)
+
 
 FIRST_STATION = 1001
 """Station address of the first slave, as TwinCAT counts."""
@@ -206,3 +250,116 @@ def _in_pieces(accesses: Sequence[DatagramRequest]) -> Procedure[list[DatagramRe
         answers, _ = yield accesses[start : start + _PER_STEP]
         replies += answers
     return replies
+
+
+class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
+    """A slave that a configuration names; what is None may be anything."""
+
+    name: str
+    vendor: int
+    product: int
+    revision: int | None = None
+    serial: int | None = None
+    alias: int | None = None
+    """With one, other than 0, it may be anywhere in the line (:func:`arrange`)."""
+
+
+def fits(expected: ExpectedSlave, identity: Identity) -> bool:
+    """Whether a slave may stand for the expected one."""
+    return (
+        (expected.vendor, expected.product) == (identity.vendor, identity.product)
+        and expected.revision in {None, identity.revision}
+        and expected.serial in {None, identity.serial}
+    )
+
+
+def check_bus(expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]) -> None:
+    """Compare the bus with what was found; raise IdentityError that lists every difference."""
+    lines = list(iter_differences(expected, found))
+    if lines:
+        text = "\n  ".join(lines)
+        raise IdentityError(
+            f"the bus is not as configured ({len(expected)} slaves expected, {len(found)} found):"
+            f"\n  {text}"
+        )
+
+
+def arrange(expected: Sequence[ExpectedSlave], aliases: Sequence[int]) -> tuple[int, ...]:
+    """Return which of the expected slaves is to stand at each position, by their numbers.
+
+    A slave that is expected with an alias is looked for wherever in the line it is, and those
+    behind it up to the next with an alias stay behind it.  If an alias is missing or there twice,
+    the order is the expected one.
+
+    Args:
+        expected: In the order of the configuration.
+        aliases: Of the slaves that are there, in the order of the line.
+    """
+    blocks: dict[int, list[int]] = {0: []}
+    for number, each in enumerate(expected):
+        if each.alias and each.alias in blocks:
+            return tuple(range(len(expected)))
+        if each.alias:
+            blocks[each.alias] = []
+        blocks[next(reversed(blocks))].append(number)
+    order = [alias for alias in aliases if alias and alias in blocks]
+    if sorted([0, *order]) != sorted(blocks):
+        return tuple(range(len(expected)))
+    return tuple(number for alias in (0, *order) for number in blocks[alias])
+
+
+def iter_differences(
+    expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]
+) -> Iterator[str]:
+    """Yield one line a difference; a missing slave does not make all behind it different.
+
+    With as many slaves as expected, position is compared with position.
+    """
+    if len(expected) == len(found):
+        for each, slave in zip(expected, found, strict=True):
+            yield from _compare(each, slave)
+        return
+    matcher = SequenceMatcher(
+        None,
+        [(each.vendor, each.product) for each in expected],
+        [(each.identity.vendor, each.identity.product) for each in found],
+        autojunk=False,
+    )
+    for _, start, end, there, there_end in matcher.get_opcodes():
+        pairs = min(end - start, there_end - there)
+        for offset in range(pairs):
+            yield from _compare(expected[start + offset], found[there + offset])
+        for missing in expected[start + pairs : end]:
+            before = f"after {found[there - 1 + pairs].name}" if there + pairs else "at the start"
+            yield f"{missing.name} is missing {before}, expected {_describe(missing)}"
+        for slave in found[there + pairs : there_end]:
+            yield f"{_place(slave)}: {slave.fault or slave.identity}, expected no slave here"
+
+
+def _compare(expected: ExpectedSlave, slave: FoundSlave) -> Iterator[str]:
+    if slave.fault:
+        yield f"{_place(slave)}: {slave.fault}, expected {expected.name}"
+    elif not fits(expected, slave.identity):
+        serial = f", serial {slave.identity.serial}" if expected.serial is not None else ""
+        yield (
+            f"{_place(slave)}: {slave.identity}{serial},"
+            f" expected {expected.name} with {_describe(expected)}"
+        )
+    elif expected.alias not in {None, slave.alias}:
+        yield (
+            f"{_place(slave)}: alias {slave.alias}, expected {expected.name} with alias"
+            f" {expected.alias}"
+        )
+
+
+def _place(slave: FoundSlave) -> str:
+    return f"position {slave.position} (station {slave.station})"
+
+
+def _describe(expected: ExpectedSlave) -> str:
+    text = f"vendor 0x{expected.vendor:08X}, product 0x{expected.product:08X}"
+    if expected.revision is not None:
+        text += f", revision 0x{expected.revision:08X}"
+    if expected.serial is not None:
+        text += f", serial {expected.serial}"
+    return text

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from devicebus.errors import BusError, StateTimeoutError
-from devicebus.master.access import brd, bwr
 from devicebus.master.bring import bring, read_process_data, set_clocks
 from devicebus.master.bus import Bus, Unit
 from devicebus.master.cycle import Cycle
 from devicebus.master.esm import POLL_NS, TIMEOUT_NS
-from devicebus.master.expected import arrange, check_bus
 from devicebus.master.findings import join_errors
-from devicebus.master.image import BusImage
-from devicebus.master.layout import SlaveShape, lay_out
+from devicebus.master.image import BusImage, SlaveShape, lay_out
 from devicebus.master.pdo import Channel, channels_from_sii
 from devicebus.master.procedure import Procedure, Sleep, together
-from devicebus.master.scan import FoundSlave, assign_stations, scan
+from devicebus.master.scan import FoundSlave, arrange, assign_stations, check_bus, scan
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import brd, bwr
 from devicebus.wire.register import AlControl, AlStatus, Register
 from eap.errors import EapError
 

@@ -6,19 +6,106 @@ The others notice nothing: every step is an acyclic access within the budget of 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from devicebus.errors import FrameLostError, IdentityError, WorkingCounterError
-from devicebus.master.access import DatagramReply, fprd, fpwr
 from devicebus.master.bring import bring, set_clocks
-from devicebus.master.bus import Bus, Unit
+from devicebus.master.bus import (
+    Bus,
+    BusBack,
+    BusLost,
+    SlaveBack,
+    SlaveFailed,
+    SlaveLeft,
+    SlaveLost,
+    Unit,
+)
 from devicebus.master.cycle import Presence
-from devicebus.master.event import BusBack, BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
-from devicebus.master.procedure import Procedure, Sleep
+from devicebus.master.diagnosis import COUNTERS, port_counters
+from devicebus.master.mailboxport import STATUS
+from devicebus.master.procedure import Procedure, Sleep, Task
 from devicebus.master.scan import assign_stations, count_slaves, read_identity, read_stations
-from devicebus.master.task import Task
 from devicebus.wire.alstatus import ERROR, AlState
-from devicebus.wire.register import AlStatus, Register
+from devicebus.wire.datagram import DatagramReply, fprd, fpwr
+from devicebus.wire.register import AlStatus, Register, SmStatus
 from eap.errors import EapError
+
+_PER_STEP = 15
+"""As many as share one frame."""
+
+
+def look_around(bus: Bus) -> Procedure[None]:
+    """Have the mailboxes read that are full and that nobody is busy with."""
+    idle = [unit.mailbox for unit in bus.units.values() if unit.mailbox is not None]
+    idle = [mailbox for mailbox in idle if not mailbox.is_busy]
+    for start in range(0, len(idle), _PER_STEP):
+        part = idle[start : start + _PER_STEP]
+        try:
+            replies, now_ns = yield [fprd(each.station, STATUS, 1, tries=1) for each in part]
+        except FrameLostError:
+            continue  # the next look comes soon
+        for mailbox, reply in zip(part, replies, strict=True):
+            if reply.wkc and reply.data[0] & SmStatus.MAILBOX_FULL:
+                mailbox.look(now_ns)
+
+
+ERRORS_PERIOD_NS = 1_000_000_000
+
+
+class Growth(NamedTuple):
+    """First and last time at which more errors were seen at a port."""
+
+    since_ns: int
+    until_ns: int
+
+
+class PortErrorLog:
+    """When the counters of each port have grown, by station address and port."""
+
+    def __init__(self) -> None:
+        self._counters: dict[int, tuple[int, ...]] = {}
+        self._growth: dict[int, dict[int, Growth]] = {}
+
+    def of(self, station: int) -> dict[int, Growth]:
+        """Return by port when errors were seen; a port that was quiet is not there."""
+        return self._growth.get(station, {})
+
+    def clear(self) -> None:
+        """Forget all times; what the counters show now is not new."""
+        self._growth.clear()
+
+    def take(self, station: int, octets: bytes, now_ns: int) -> None:
+        """Take the counters of a slave as they are now.
+
+        What they show at the first look has happened at an unknown time.  Counters that are smaller
+        than before were cleared, or the slave was switched off: older times go with them.
+        """
+        counters = port_counters(octets)
+        before = self._counters.get(station, counters)
+        self._counters[station] = counters
+        if any(now < old for now, old in zip(counters, before, strict=True)):
+            self._growth.pop(station, None)
+            before = (0,) * len(counters)
+        for port, (now, old) in enumerate(zip(counters, before, strict=True)):
+            if now > old:
+                ports = self._growth.setdefault(station, {})
+                first = ports[port].since_ns if port in ports else now_ns
+                ports[port] = Growth(first, now_ns)
+
+
+def look_at_errors(bus: Bus, log: PortErrorLog) -> Procedure[None]:
+    """Read the error counters of all slaves that answer."""
+    stations = [unit.station for unit in bus.units.values() if not unit.is_lost]
+    for start in range(0, len(stations), _PER_STEP):
+        part = stations[start : start + _PER_STEP]
+        try:
+            replies, now_ns = yield [fprd(at, Register.RX_ERROR, COUNTERS, tries=1) for at in part]
+        except FrameLostError:
+            return  # the next look comes soon
+        for station, reply in zip(part, replies, strict=True):
+            if reply.wkc:
+                log.take(station, reply.data, now_ns)
+
 
 PERIOD_NS = 100_000_000
 """Between two looks at all slaves while nothing is wrong."""
@@ -26,7 +113,7 @@ SLICE_NS = 5_000_000
 """After trouble in the cycle the next look comes this soon."""
 RETRY_NS = 1_000_000_000
 """Before a slave that could not be brought back is tried again."""
-_PER_STEP = 60
+_STATES_PER_STEP = 60
 """Slaves whose states are read together."""
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 _STATES = {int(state): state for state in AlState}
@@ -71,8 +158,8 @@ def _pause(bus: Bus) -> Procedure[int]:
 
 def _read_states(stations: Sequence[int]) -> Procedure[list[DatagramReply]]:
     replies: list[DatagramReply] = []
-    for start in range(0, len(stations), _PER_STEP):
-        part = stations[start : start + _PER_STEP]
+    for start in range(0, len(stations), _STATES_PER_STEP):
+        part = stations[start : start + _STATES_PER_STEP]
         answers, _ = yield [fprd(at, Register.AL_STATUS, AlStatus.SIZE) for at in part]
         replies += answers
     return replies

@@ -11,17 +11,147 @@ from collections.abc import Callable, Iterable
 from itertools import count
 from typing import Any, NamedTuple
 
-from devicebus.sim.devices.pdoobjects import TX_PDO
-from devicebus.sim.findentry import find_entry
-from devicebus.sim.segment import Segment
+import msgspec
+
+from devicebus.mailbox.coe_server import CoeServer
+from devicebus.mailbox.foe_server import FoeServer
+from devicebus.sim.device import Device, FaultyDictionary
+from devicebus.sim.devices.drive import Axes
+from devicebus.sim.devices.objects import TX_PDO
+from devicebus.sim.segment import Segment, Side
 from devicebus.sim.slave import Slave
-from devicebus.sim.slavefault import SLAVE_FAULTS
-from devicebus.sim.spec import FaultKind, FaultSpec
-from devicebus.sim.wiring import Side
-from devicebus.wire.alstatus import AlState
+from devicebus.sim.spec import FaultKind, FaultSpec, Value
+from devicebus.wire.alstatus import AlState, AlStatusCode
 from devicebus.wire.datagram import OVERHEAD, DatagramHeader
 from eap.codec.ethercat import EtherCatHeader
+from eap.codec.mailbox import MailboxType
 from eap.ids import ObjectId
+from eap.od.abort import AbortCode
+
+
+def _mailbox(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    del spec, now_ns
+    slave.esc.channels[0].is_stuck = on
+
+
+def _foe(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Be busy with every message, or refuse every request with a code."""
+    del now_ns
+    mailbox = slave.device.mailbox
+    server = mailbox.protocols.get(MailboxType.FOE) if mailbox else None
+    if isinstance(server, FoeServer):
+        server.packet_time_ns = 1000 * spec.delay_us if on else 0
+        server.refuses = spec.code if on else 0
+
+
+def _sdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    del now_ns
+    dictionary = slave.device.dictionary
+    if isinstance(dictionary, FaultyDictionary):
+        index, _ = ObjectId.parse(spec.object)
+        dictionary.aborts.pop(index, None)
+        if on:
+            dictionary.aborts[index] = spec.code or AbortCode.GENERAL
+
+
+def _emergency(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Report an error code, and with the end of the fault that there is none any more.
+
+    The axis of a drive fails besides, until it is reset.
+    """
+    del now_ns
+    device = slave.device
+    code = spec.code & 0xFFFF if on else 0
+    drives = device.behaviour.drives if isinstance(device.behaviour, Axes) else ()
+    if code and spec.axis < len(drives):
+        drives[spec.axis].fail(code)
+    else:
+        device.report_error(code, axis=spec.axis)
+
+
+def _tx_pdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Send a TxPDO through the mailbox that nobody asked for."""
+    del now_ns
+    mailbox = slave.device.mailbox
+    server = mailbox.protocols.get(MailboxType.COE) if mailbox else None
+    index, _ = ObjectId.parse(spec.object)
+    data = slave.device.process_data.read_pdo(index)
+    if on and isinstance(server, CoeServer) and data is not None:
+        server.send_tx_pdo(index - TX_PDO, data)
+
+
+def _eeprom(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Slow the EEPROM down; without a delay it acknowledges nothing."""
+    del now_ns
+    eeprom = slave.esc.eeprom
+    eeprom.extra_ns = 1000 * spec.delay_us if on else 0
+    eeprom.is_broken = on and not spec.delay_us
+
+
+def _al_error(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    del now_ns
+    if on:
+        slave.fail(spec.code or AlStatusCode.UNSPECIFIED)
+
+
+def _refuse(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    del now_ns
+    state = AlState[spec.state]
+    slave.refuses.pop(state, None)
+    if on:
+        slave.refuses[state] = spec.code or AlStatusCode.UNSPECIFIED
+
+
+def _drift(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    drift_ppm = spec.drift_ppm if on else slave.esc.settings.drift_ppm
+    slave.esc.clock.set_drift(drift_ppm, now_ns)
+
+
+SLAVE_FAULTS: dict[FaultKind, Callable[[Slave, FaultSpec, int, bool], None]] = {
+    FaultKind.MAILBOX: _mailbox,
+    FaultKind.FOE: _foe,
+    FaultKind.SDO: _sdo,
+    FaultKind.EEPROM: _eeprom,
+    FaultKind.EMERGENCY: _emergency,
+    FaultKind.TX_PDO: _tx_pdo,
+    FaultKind.AL_ERROR: _al_error,
+    FaultKind.REFUSE: _refuse,
+    FaultKind.DRIFT: _drift,
+}
+
+
+def find_entry(device: Device, text: str) -> tuple[int, int]:
+    """Return index and subindex of an entry.
+
+    Args:
+        device: Whose entry it is.
+        text: The name of an input or output, that of any other entry, or index and subindex such
+            as ``0x6000:01``; of an index that begins with a letter, 0x or the subindex too.
+
+    Raises:
+        ValueError: there is none, or several of that name.
+    """
+    if text in device.channels:
+        return device.channels[text]
+    named = [
+        ObjectId(item.index, subindex)
+        for item in device.dictionary
+        for subindex, entry in item.entries.items()
+        if entry.name == text
+    ]
+    if not named and (text[:1].isdigit() or ":" in text):
+        index, subindex = entry = ObjectId.parse(text)
+        if index in device.dictionary and subindex in device.dictionary[index].entries:
+            return entry
+        raise ValueError(f"{device.name} has no entry {entry}")
+    if not named:
+        known = ", ".join(device.channels) or "none"
+        raise ValueError(f"{device.name} has no entry {text!r} (inputs and outputs: {known})")
+    if len(named) > 1:
+        places = ", ".join(map(str, named))
+        raise ValueError(f"{device.name} has several entries {text!r}: {places}")
+    return named[0]
+
 
 _MS = 1_000_000
 _ON_FRAMES = frozenset((FaultKind.LOSS, FaultKind.DELAY, FaultKind.CORRUPT, FaultKind.WKC))
@@ -201,3 +331,67 @@ def spoil_working_counters(frame: bytearray) -> None:
         offset += OVERHEAD + header.length
         if not header.more:
             break
+
+
+class EntryValue(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An entry of a slave and the value that it is to keep."""
+
+    slave: str
+    entry: str
+    value: Value
+
+
+class EntryName(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An entry of a slave that may change again."""
+
+    slave: str
+    entry: str
+
+
+class _SetCommand(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    set: EntryValue
+
+
+class _ReleaseCommand(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    release: EntryName
+
+
+class FaultCommand(FaultSpec, frozen=True, forbid_unknown_fields=True):
+    """A fault; with *end* it is over."""
+
+    end: bool = False
+
+
+def obey(segment: FaultySegment, command: object, now_ns: int) -> None:
+    """Do what *command* says, a JSON object that is decoded.
+
+    Raises:
+        ValueError: it says nothing that can be done; the text says why.
+    """
+    if not isinstance(command, dict):
+        raise ValueError("a command is a JSON object")  # noqa: TRY004  the person's, not ours
+    try:
+        if "set" in command:
+            entry = msgspec.convert(command, _SetCommand).set
+            segment.set_value(entry.slave, entry.entry, entry.value, now_ns)
+        elif "release" in command:
+            name = msgspec.convert(command, _ReleaseCommand).release
+            segment.release(name.slave, name.entry, now_ns)
+        else:
+            _check_keys(command)
+            _switch(segment, msgspec.convert(command, FaultCommand), now_ns)
+    except msgspec.MsgspecError as exc:
+        raise ValueError(str(exc)) from None
+
+
+def _check_keys(command: dict[str, object]) -> None:
+    known = (*FaultSpec.__struct_fields__, "end")
+    for key in command:
+        if key not in known:
+            raise ValueError(f"a fault has no key {key!r} (one of {', '.join(known)})")
+
+
+def _switch(segment: FaultySegment, command: FaultCommand, now_ns: int) -> None:
+    given = msgspec.structs.asdict(command)
+    is_end = given.pop("end")
+    (segment.end if is_end else segment.begin)(FaultSpec(**given), now_ns)

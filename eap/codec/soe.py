@@ -105,6 +105,11 @@ class DataState(IntFlag):
     FAILED = SET | ENABLED | EXECUTING | ERROR
 
 
+COMMAND_START = DataState.SET | DataState.ENABLED
+COMMAND_CLEAR = 0
+"""Values that start a procedure command and clear it, written to element 7 of its IDN."""
+
+
 class ListHead(WireStruct, frozen=True):
     """IEC 61800-7-300: in front of a list and of every text, in octets."""
 

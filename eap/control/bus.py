@@ -14,8 +14,7 @@ from msgspec import Meta
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, MailboxRequest
-from devicebus.master.access import DatagramReply, DatagramRequest
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
 from eap.control.protocol import ErrorCode, Method, Parameters
 from eap.errors import ControlError

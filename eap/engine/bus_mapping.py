@@ -10,8 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeAlias
 
-from devicebus.master.image import BusImage
-from devicebus.master.layout import Layout, Variable
+from devicebus.master.image import BusImage, Layout, Variable
 from devicebus.master.master import Master
 from eap.codec import datatypes
 from eap.codec.pd import PdHeader

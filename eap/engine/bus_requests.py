@@ -18,16 +18,14 @@ from msgspec.structs import replace
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.master.access import AS_SET, DatagramReply, DatagramRequest
 from devicebus.master.bus import Unit
 from devicebus.master.findings import join_errors
 from devicebus.master.link import MAX_DATA
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
-from devicebus.master.procedure import Procedure
-from devicebus.master.task import Task
+from devicebus.master.procedure import Procedure, Task
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import AS_SET, Command, DatagramReply, DatagramRequest
 from eap.engine.bus_report import BusPublisher, report_bus
 from eap.engine.engine_bus import EngineBus
 from eap.errors import EapError, EngineRefusedError

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from devicebus.errors import BusError, FrameLostError
-from devicebus.master.bus import MasterSettings
-from devicebus.master.event import (
+from devicebus.master.bus import (
     BusBack,
     BusLost,
     Event,
+    MasterSettings,
     SlaveBack,
     SlaveFailed,
     SlaveLeft,
@@ -23,7 +23,7 @@ from devicebus.master.event import (
 from devicebus.master.findings import NO_ANSWER
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
-from devicebus.master.task import Task
+from devicebus.master.procedure import Task
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from eap.engine.bus_mapping import BusMapping
 from eap.errors import EnvironmentalError

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from devicebus.master.bus import MasterSettings
-from devicebus.master.expected import ExpectedSlave
+from devicebus.master.scan import ExpectedSlave
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.engine_bus import EngineBus
 from eap.engine.successor import EngineStation

@@ -11,14 +11,7 @@ from types import TracebackType
 from typing import Self, TypeVar, cast
 
 from devicebus.drive import drive_async
-from devicebus.mailbox import (
-    coe_client,
-    coeinfo_client,
-    foe_client,
-    soe_browse,
-    soe_client,
-    voe_client,
-)
+from devicebus.mailbox import coe_client, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import (
     Conversation,
     MailboxMessage,
@@ -26,7 +19,7 @@ from devicebus.mailbox.conversation import (
     Progress,
 )
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.mailbox.soe_browse import IdnDescription
+from devicebus.mailbox.soe_client import IdnDescription
 from eap.codec.sdo import EXPEDITED_SIZE
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
@@ -118,15 +111,15 @@ class AsyncGatewayClient:
 
     async def od_list(self, address: int) -> list[int]:
         """Read the indexes of all objects."""
-        return await self.converse(address, coeinfo_client.object_list())
+        return await self.converse(address, coe_client.object_list())
 
     async def od_object(self, address: int, index: int) -> ObjectDescription:
         """Read what is said of an object."""
-        return await self.converse(address, coeinfo_client.object_description(index))
+        return await self.converse(address, coe_client.object_description(index))
 
     async def od_entry(self, address: int, index: int, subindex: int) -> EntryDescription:
         """Read what is said of an entry."""
-        return await self.converse(address, coeinfo_client.entry_description(index, subindex))
+        return await self.converse(address, coe_client.entry_description(index, subindex))
 
     async def foe_read(
         self, address: int, name: str, *, password: int = 0, progress: Progress | None = None
@@ -161,7 +154,7 @@ class AsyncGatewayClient:
 
     async def idn_describe(self, address: int, idn: Idn, *, drive: int = 0) -> IdnDescription:
         """Read all elements of an IDN in one view."""
-        return await self.converse(address, soe_browse.describe(idn, drive=drive))
+        return await self.converse(address, soe_client.describe(idn, drive=drive))
 
     async def idn_write(
         self,
@@ -179,7 +172,7 @@ class AsyncGatewayClient:
 
     async def voe(self, address: int, vendor_id: int, vendor_type: int, data: bytes) -> bytes:
         """Send data of a vendor's protocol; return the data of its answer."""
-        return await self.converse(address, voe_client.exchange(vendor_id, vendor_type, data))
+        return await self.converse(address, voe.exchange(vendor_id, vendor_type, data))
 
     async def slaves(self) -> list[MasterSlave]:
         """Return the slaves that the master knows."""

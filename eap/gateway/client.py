@@ -23,14 +23,7 @@ from typing import TypeVar
 
 from devicebus.drive import drive
 from devicebus.errors import BusError
-from devicebus.mailbox import (
-    coe_client,
-    coeinfo_client,
-    foe_client,
-    soe_browse,
-    soe_client,
-    voe_client,
-)
+from devicebus.mailbox import coe_client, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import (
     Conversation,
     MailboxMessage,
@@ -38,7 +31,7 @@ from devicebus.mailbox.conversation import (
     Progress,
 )
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.mailbox.soe_browse import IdnDescription
+from devicebus.mailbox.soe_client import IdnDescription
 from eap.closeable import Closeable
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.sdo import EXPEDITED_SIZE
@@ -143,15 +136,15 @@ class GatewayClient(Closeable):
 
     def od_list(self, address: int) -> list[int]:
         """Read the indexes of all objects."""
-        return self.converse(address, coeinfo_client.object_list())
+        return self.converse(address, coe_client.object_list())
 
     def od_object(self, address: int, index: int) -> ObjectDescription:
         """Read what is said of an object."""
-        return self.converse(address, coeinfo_client.object_description(index))
+        return self.converse(address, coe_client.object_description(index))
 
     def od_entry(self, address: int, index: int, subindex: int) -> EntryDescription:
         """Read what is said of an entry."""
-        return self.converse(address, coeinfo_client.entry_description(index, subindex))
+        return self.converse(address, coe_client.entry_description(index, subindex))
 
     def idn_read(
         self, address: int, idn: Idn, elements: int = Element.VALUE, *, drive: int = 0
@@ -161,7 +154,7 @@ class GatewayClient(Closeable):
 
     def idn_describe(self, address: int, idn: Idn, *, drive: int = 0) -> IdnDescription:
         """Read all elements of an IDN in one view."""
-        return self.converse(address, soe_browse.describe(idn, drive=drive))
+        return self.converse(address, soe_client.describe(idn, drive=drive))
 
     def idn_write(
         self,
@@ -204,7 +197,7 @@ class GatewayClient(Closeable):
 
     def voe(self, address: int, vendor_id: int, vendor_type: int, data: bytes) -> bytes:
         """Send data of a vendor's protocol; return the data of its answer."""
-        return self.converse(address, voe_client.exchange(vendor_id, vendor_type, data))
+        return self.converse(address, voe.exchange(vendor_id, vendor_type, data))
 
     def slaves(self) -> list[MasterSlave]:
         """Return the slaves that the master knows."""

@@ -18,7 +18,7 @@ from typing import BinaryIO, TypeAlias
 from msgspec import Struct
 
 from devicebus.errors import BusError, MailboxSizeError
-from devicebus.mailbox import foe_client, voe_client
+from devicebus.mailbox import foe_client, voe
 from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.errors import ConfigError, EapError, EnvironmentalError
@@ -254,7 +254,5 @@ def exchange(
         BusError: there is no such slave, or it does not answer.
     """
     unit = bus.find(slave)
-    answer = bus.converse(
-        unit, lambda _: voe_client.exchange(vendor_id, vendor_type, data), "VoE request"
-    )
+    answer = bus.converse(unit, lambda _: voe.exchange(vendor_id, vendor_type, data), "VoE request")
     return VendorReply(unit.station, vendor_id, vendor_type, answer.hex())

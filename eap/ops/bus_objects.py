@@ -11,7 +11,7 @@ from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
 from devicebus.errors import MailboxProtocolError, MailboxRefusedError, SoeError
-from devicebus.mailbox import coe_client, coeinfo_client, soe_browse, soe_client
+from devicebus.mailbox import coe_client, soe_client
 from devicebus.mailbox.conversation import Conversation, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec import datatypes
@@ -186,7 +186,7 @@ def write_entry(
 def list_objects(bus: SlaveBus, slave: str) -> Iterator[SlaveObject]:
     """Yield the description of each object of a slave; raises as read_entry() does."""
     unit = bus.find(slave)
-    indexes = bus.converse(unit, lambda _: coeinfo_client.object_list(), "object list")
+    indexes = bus.converse(unit, lambda _: coe_client.object_list(), "object list")
     for index in indexes:
         yield _described(bus, unit, index)
 
@@ -202,7 +202,7 @@ def dump_entries(bus: SlaveBus, slave: str) -> Iterator[SdoDumpEntry]:
 
 
 def _described(bus: SlaveBus, unit: Slave, index: int) -> SlaveObject:
-    found = bus.converse(unit, lambda _: coeinfo_client.object_description(index), _name(index))
+    found = bus.converse(unit, lambda _: coe_client.object_description(index), _name(index))
     codes = ObjectCode._value2member_map_
     return SlaveObject(
         index=index,
@@ -218,9 +218,7 @@ def _dumped(bus: SlaveBus, unit: Slave, found: SlaveObject, subindex: int) -> Sd
     index, name = found.index, _name(found.index, subindex)
     row = SdoDumpEntry(index=index, subindex=subindex, object=found.name, name="")
     try:
-        entry = bus.converse(
-            unit, lambda _: coeinfo_client.entry_description(index, subindex), name
-        )
+        entry = bus.converse(unit, lambda _: coe_client.entry_description(index, subindex), name)
     except SdoAbortError as exc:
         return None if cause_of(exc) is Cause.NOT_FOUND else replace(row, error=str(exc))
     except MailboxProtocolError as exc:  # one bad description is no reason to lose all others
@@ -250,7 +248,7 @@ def _access(entry: EntryDescription) -> str:
 def _kind_of_entry(index: int, subindex: int) -> Conversation[DataType | None]:
     """Ask the slave for an entry's type; None if it does not tell."""
     try:
-        entry = yield from coeinfo_client.entry_description(index, subindex)
+        entry = yield from coe_client.entry_description(index, subindex)
     except (SdoAbortError, MailboxRefusedError, MailboxProtocolError):
         return None
     return kind_of(entry)
@@ -307,7 +305,7 @@ def read_idn(bus: SlaveBus, slave: str, idn: Idn, *, drive: int) -> IdnElements:
         BusError: there is no such slave, or it does not answer.
     """
     unit = bus.find(slave)
-    found = bus.converse(unit, lambda _: soe_browse.describe(idn, drive=drive), str(idn))
+    found = bus.converse(unit, lambda _: soe_client.describe(idn, drive=drive), str(idn))
     attribute = found.attribute
     display = attribute.display
     protected = {
@@ -361,7 +359,7 @@ def write_idn(bus: SlaveBus, slave: str, idn: Idn, text: str, *, drive: int) -> 
 def list_idns(bus: SlaveBus, slave: str, *, drive: int) -> Iterator[NamedIdn]:
     """Yield every IDN of a drive with its name; raises as read_idn() does."""
     unit = bus.find(slave)
-    for idn in bus.converse(unit, lambda _: soe_browse.idn_list(drive=drive), "list of IDNs"):
+    for idn in bus.converse(unit, lambda _: soe_client.idn_list(drive=drive), "list of IDNs"):
         yield NamedIdn(str(idn), idn.number, _name_of_idn(bus, unit, idn, drive))
 
 

@@ -18,11 +18,11 @@ from devicebus.drive import drive
 from devicebus.errors import FrameLostError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.master.access import DatagramReply, fprd
 from devicebus.master.findings import History
 from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
-from devicebus.master.topology import find_joints
+from devicebus.master.scan import find_joints
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import DatagramReply, fprd
 from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.control import bus as words
 from eap.control.protocol import AnswerT, Method, ParametersT

@@ -20,10 +20,9 @@ from devicebus.master.attach import attach
 from devicebus.master.bring import bring, read_process_data
 from devicebus.master.bus import Bus, MasterSettings, Unit
 from devicebus.master.findings import join_errors
-from devicebus.master.procedure import Procedure, together
+from devicebus.master.procedure import Procedure, Task, together
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import set_up_cycle
-from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
 from eap.errors import EapError
 from eap.ids import InterfaceUri

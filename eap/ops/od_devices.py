@@ -15,7 +15,7 @@ from typing import NamedTuple, Self
 from msgspec.structs import replace
 
 from devicebus.errors import MailboxProtocolError, MailboxRefusedError
-from devicebus.mailbox import coe_client, coeinfo_client
+from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.operation import Read, Write
@@ -192,7 +192,7 @@ class SlaveOd:
 
     def objects(self) -> list[ObjectInfo]:
         """Return all objects that the slave describes, without their entries."""
-        begin = coeinfo_client.object_list
+        begin = coe_client.object_list
         indexes = self._bus.converse(self._slave, lambda _: begin(), "object list")
         return [self._object(index) for index in indexes]
 
@@ -205,7 +205,7 @@ class SlaveOd:
         name = str(ObjectId(index, subindex))
         try:
             found = self._bus.converse(
-                self._slave, lambda _: coeinfo_client.entry_description(index, subindex), name
+                self._slave, lambda _: coe_client.entry_description(index, subindex), name
             )
         except (MailboxProtocolError, MailboxRefusedError):
             return None
@@ -238,7 +238,7 @@ class SlaveOd:
     def _object(self, index: int) -> ObjectInfo:
         found = self._bus.converse(
             self._slave,
-            lambda _: coeinfo_client.object_description(index),
+            lambda _: coe_client.object_description(index),
             f"0x{index:04X}",
         )
         return object_info(index, found)

@@ -12,9 +12,9 @@ import msgspec
 
 from devicebus.errors import NoMailboxError
 from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
-from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.errors import EapError
 from eap.runtime.bus_errors import ErrorRecord, to_error
 from eap.runtime.station_request import StationRequest

@@ -14,8 +14,8 @@ import msgspec
 from devicebus.master.pdo import PdoEntry, channels_from_sii
 from devicebus.sim.devices.build import build_segment, build_slave
 from devicebus.sim.fault import FaultySegment
+from devicebus.sim.segment import Side, find_way
 from devicebus.sim.spec import BusSpec, SlaveSpec
-from devicebus.sim.wiring import Side, find_way
 from devicebus.wire import sii
 from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus
 from eap.config.convert import convert_to

@@ -20,9 +20,8 @@ from typing import Any, Protocol
 
 import msgspec
 
-from devicebus.sim.command import obey
-from devicebus.sim.fault import FaultySegment
-from devicebus.sim.wiring import Side
+from devicebus.sim.fault import FaultySegment, obey
+from devicebus.sim.segment import Side
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net import realtime

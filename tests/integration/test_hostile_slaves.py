@@ -18,19 +18,11 @@ from devicebus.errors import (
     MailboxTimeoutError,
     SoeError,
 )
-from devicebus.mailbox import (
-    aoe_client,
-    coe_client,
-    coeinfo_client,
-    eoe_client,
-    foe_client,
-    soe_client,
-    voe_client,
-)
+from devicebus.mailbox import aoe_client, coe_client, eoe, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
-from devicebus.master.event import SlaveBack, SlaveFailed
+from devicebus.master.bus import SlaveBack, SlaveFailed
 from devicebus.master.master import Master
 from devicebus.sim.spec import MailboxSpec
 from eap.codec.ams import AmsHeader, encode_packet
@@ -113,7 +105,7 @@ def download(sizes: MailboxSizes) -> Conversation:
 
 
 def listed(_: MailboxSizes) -> Conversation:
-    return coeinfo_client.object_list()
+    return coe_client.object_list()
 
 
 def get(sizes: MailboxSizes) -> Conversation:
@@ -133,11 +125,11 @@ def command(sizes: MailboxSizes) -> Conversation:
 
 
 def ip(_: MailboxSizes) -> Conversation:
-    return eoe_client.get_ip()
+    return eoe.get_ip()
 
 
-def voe(_: MailboxSizes) -> Conversation:
-    return voe_client.exchange(1, 2, b"x")
+def other_vendor(_: MailboxSizes) -> Conversation:
+    return voe.exchange(1, 2, b"x")
 
 
 def ams(sizes: MailboxSizes) -> Conversation:
@@ -284,8 +276,8 @@ CASES = {
         EOE, ip, ["0700 0000 3f000000 0102"], MailboxProtocolError, "not all there"
     ),
     "unknown EoE type": Case(EOE, ip, ["0f00 0000"], MailboxTimeoutError, "no EOE reply"),
-    "other vendor": Case(VOE, voe, ["090000000200"], MailboxTimeoutError, "no VOE reply"),
-    "no vendor": Case(VOE, voe, ["01"], MailboxTimeoutError, "no VOE reply"),
+    "other vendor": Case(VOE, other_vendor, ["090000000200"], MailboxTimeoutError, "no VOE reply"),
+    "no vendor": Case(VOE, other_vendor, ["01"], MailboxTimeoutError, "no VOE reply"),
     "cut AMS header": Case(AOE, ams, ["0102"], MailboxProtocolError, "AoE answer of"),
     "AMS length": Case(
         AOE, ams, [packet(4, 5, b"ab", length=3)], MailboxProtocolError, "but 2 octets follow"

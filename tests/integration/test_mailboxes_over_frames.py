@@ -13,20 +13,11 @@ from random import Random
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from devicebus.mailbox import (
-    aoe_client,
-    coe_client,
-    coeinfo_client,
-    eoe_client,
-    foe_client,
-    soe_client,
-    voe_client,
-)
+from devicebus.mailbox import aoe_client, coe_client, eoe, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import Conversation
-from devicebus.master.task import Task
-from devicebus.sim.segment import Segment
+from devicebus.master.procedure import Task
+from devicebus.sim.segment import Segment, Side
 from devicebus.sim.spec import FileSpec, MailboxSpec, ObjectSpec
-from devicebus.sim.wiring import Side
 from eap.codec.ads import AdsRange, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.codec.eoe import IpSettings
@@ -134,7 +125,7 @@ class MailboxMachine(RuleBasedStateMachine):
     @rule()
     def coe_list(self) -> None:
         """In fragments, and the same each time."""
-        self.start(then(coeinfo_client.object_list(), lambda found: BLOCK in found), True)
+        self.start(then(coe_client.object_list(), lambda found: BLOCK in found), True)
 
     @rule(data=st.binary(max_size=200))
     def foe_write(self, data: bytes) -> None:
@@ -161,15 +152,15 @@ class MailboxMachine(RuleBasedStateMachine):
     @rule(address=st.integers(0, 0xFFFFFFFF))
     def eoe_write(self, address: int) -> None:
         self.ip = IpSettings(ip=IPv4Address(address))
-        self.start(eoe_client.set_ip(self.ip), None)
+        self.start(eoe.set_ip(self.ip), None)
 
     @rule()
     def eoe_read(self) -> None:
-        self.start(eoe_client.get_ip(), self.ip)
+        self.start(eoe.get_ip(), self.ip)
 
     @rule(data=st.binary(max_size=36), kind=st.integers(0, 3))
     def voe(self, data: bytes, kind: int) -> None:
-        self.start(voe_client.exchange(0xE5A, kind, data), data)
+        self.start(voe.exchange(0xE5A, kind, data), data)
 
     @rule(data=st.binary(min_size=4, max_size=4))
     def aoe_write(self, data: bytes) -> None:
@@ -186,7 +177,7 @@ class MailboxMachine(RuleBasedStateMachine):
 
     @rule(milliseconds=st.integers(0, 20))
     def cancel_a_read(self, milliseconds: int) -> None:
-        talks = [coe_client.upload(BLOCK, 0), coeinfo_client.object_list(), soe_client.read(LIST)]
+        talks = [coe_client.upload(BLOCK, 0), coe_client.object_list(), soe_client.read(LIST)]
         tasks = [self.box.converse(talk, self.line.now_ns, requester="hasty") for talk in talks]
         self.line.elapse(milliseconds * MS)
         for task in tasks:

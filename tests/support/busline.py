@@ -8,21 +8,23 @@ from typing import Protocol
 
 import devicebus.drive
 from devicebus.mailbox.server import MailboxServer
-from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.esm import change_state
 from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea, configure
-from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
-from devicebus.master.runner import Runner
+from devicebus.master.procedure import Procedure, Runner, Sleep, Step, StepReplies, Task
 from devicebus.master.scan import scan
-from devicebus.master.task import Task
 from devicebus.sim.devices.build import build_segment
-from devicebus.sim.segment import POLL_NS, Segment
+from devicebus.sim.segment import POLL_NS, Segment, Side
 from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec
-from devicebus.sim.wiring import Side
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Datagram, encode_frame, iter_datagrams
+from devicebus.wire.datagram import (
+    Datagram,
+    DatagramReply,
+    DatagramRequest,
+    encode_frame,
+    iter_datagrams,
+)
 
 US = 1_000
 MS = 1_000_000

@@ -14,12 +14,12 @@ from typing import Any
 import msgspec
 
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.master.access import DatagramRequest
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master, why_closed
 from devicebus.master.procedure import Procedure
-from devicebus.sim.command import obey
+from devicebus.sim.fault import obey
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import DatagramRequest
 from eap.engine.bus_requests import bring_all, bring_one
 from eap.errors import EapError
 from eap.runtime.bus_errors import ErrorRecord, to_record

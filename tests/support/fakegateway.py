@@ -7,13 +7,11 @@ import threading
 from typing import Self
 
 from devicebus.mailbox.coe_server import CoeServer
-from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
-from devicebus.mailbox.soe_parameter import SoeParameter
-from devicebus.mailbox.soe_server import SoeServer
-from devicebus.mailbox.voe_server import VoeServer
+from devicebus.mailbox.soe_server import SoeParameter, SoeServer
+from devicebus.mailbox.voe import VoeServer
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import (
     MailboxError,

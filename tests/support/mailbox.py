@@ -16,9 +16,8 @@ import pytest
 from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.mailbox.counter import CounterWatch, next_counter
 from devicebus.mailbox.match import answers
-from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
+from devicebus.mailbox.protocol import CounterWatch, MailboxSizes, ProtocolServer, next_counter
 from devicebus.mailbox.server import MailboxServer
 from eap.codec.mailbox import (
     MailboxErrorReply,

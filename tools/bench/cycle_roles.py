@@ -13,7 +13,7 @@ from devicebus.mailbox.coe_client import upload
 from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master
-from devicebus.master.task import Task
+from devicebus.master.procedure import Task
 from eap.ids import InterfaceUri
 from eap.net import realtime
 from eap.net.busport import BusPort, open_bus_port

@@ -8,9 +8,8 @@ import msgspec
 
 from devicebus.master.master import Master
 from devicebus.sim.devices.build import build_segment
-from devicebus.sim.segment import Segment
+from devicebus.sim.segment import Segment, Side
 from devicebus.sim.spec import BusSpec
-from devicebus.sim.wiring import Side
 from tools.bench.buses import bus
 from tools.bench.figures import Figure, report
 from tools.bench.settings import Settings

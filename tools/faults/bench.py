@@ -12,10 +12,9 @@ from typing import TypeVar
 
 import msgspec
 
-from devicebus.master.bus import MasterSettings
-from devicebus.master.event import Event
+from devicebus.master.bus import Event, MasterSettings
 from devicebus.master.master import Master
-from devicebus.master.task import Task
+from devicebus.master.procedure import Task
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.spec import BusSpec, FaultSpec

@@ -9,7 +9,7 @@ import msgspec
 from devicebus.master.clocks import read_difference
 from devicebus.master.diagnosis import clear_counters, diagnose
 from devicebus.master.link import LINGER_NS
-from devicebus.master.task import Task
+from devicebus.master.procedure import Task
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.spec import BusSpec, FaultKind
 from eap.errors import EapError

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 
-from devicebus.master.diagnosis import BusDiagnosis, SlaveDiagnosis
-from devicebus.master.event import (
+from devicebus.master.bus import (
     BusBack,
     BusLost,
     Event,
@@ -15,6 +14,7 @@ from devicebus.master.event import (
     SlaveLeft,
     SlaveLost,
 )
+from devicebus.master.diagnosis import BusDiagnosis, SlaveDiagnosis
 from devicebus.master.findings import SlaveView, find_causes, find_silence
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import MasterStats

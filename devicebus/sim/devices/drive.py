@@ -7,15 +7,113 @@ was told to (cyclic velocity, mode 9).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from enum import Enum, IntEnum, auto
 
 import msgspec
 
-from devicebus.sim.devices.cia402 import DriveCommand, DriveState, DriveStateMachine
+from devicebus.errors import SoeError
+from devicebus.mailbox.soe_server import ProcedureCommand, SoeParameter
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
+from eap.codec.soe import Display, Idn, SoeAttribute
+from eap.codec.soeerror import SoeErrorCode, name_of
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Entry
+
+FAULT_RESET_BIT = 0x80
+_REMOTE = 0x0200
+_VOLTAGE = 0x0010
+
+
+class DriveState(IntEnum):
+    """The states, as the status word shows them in bits 0 to 3, 5 and 6."""
+
+    SWITCH_ON_DISABLED = 0x40
+    READY_TO_SWITCH_ON = 0x21
+    SWITCHED_ON = 0x23
+    OPERATION_ENABLED = 0x27
+    QUICK_STOP_ACTIVE = 0x07
+    FAULT = 0x08
+
+
+class DriveCommand(Enum):
+    """What a control word asks for."""
+
+    SHUTDOWN = auto()
+    SWITCH_ON = auto()
+    ENABLE = auto()
+    DISABLE_VOLTAGE = auto()
+    QUICK_STOP = auto()
+    FAULT_RESET = auto()
+    FAULT = auto()
+    """From inside the drive."""
+
+
+_S, _C = DriveState, DriveCommand
+TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
+    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,
+    (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): _S.SWITCHED_ON,
+    (_S.READY_TO_SWITCH_ON, _C.ENABLE): _S.OPERATION_ENABLED,
+    (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+    (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): _S.SWITCH_ON_DISABLED,
+    (_S.SWITCHED_ON, _C.ENABLE): _S.OPERATION_ENABLED,
+    (_S.SWITCHED_ON, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,
+    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+    (_S.SWITCHED_ON, _C.QUICK_STOP): _S.SWITCH_ON_DISABLED,
+    (_S.OPERATION_ENABLED, _C.SWITCH_ON): _S.SWITCHED_ON,
+    (_S.OPERATION_ENABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,
+    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+    (_S.OPERATION_ENABLED, _C.QUICK_STOP): _S.QUICK_STOP_ACTIVE,
+    (_S.QUICK_STOP_ACTIVE, _C.ENABLE): _S.OPERATION_ENABLED,
+    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+    (_S.FAULT, _C.FAULT_RESET): _S.SWITCH_ON_DISABLED,
+    **{(state, _C.FAULT): _S.FAULT for state in _S},
+}
+
+
+class DriveStateMachine:
+    """One axis.
+
+    Attributes:
+        state: Where it stands.
+    """
+
+    def __init__(self) -> None:
+        self.state = DriveState.SWITCH_ON_DISABLED
+        self._control_word = 0
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether it follows its set points."""
+        return self.state is DriveState.OPERATION_ENABLED
+
+    @property
+    def status_word(self) -> int:
+        """The status word."""
+        return self.state | _REMOTE | _VOLTAGE
+
+    def control(self, word: int) -> None:
+        """Act on a control word."""
+        rising = word & ~self._control_word & FAULT_RESET_BIT
+        self._control_word = word
+        self.process(DriveCommand.FAULT_RESET if rising else command_of(word))
+
+    def process(self, command: DriveCommand) -> None:
+        """Change the state if *command* means anything in it."""
+        self.state = TRANSITIONS.get((self.state, command), self.state)
+
+
+def command_of(word: int) -> DriveCommand:
+    """Return what the bits 0 to 3 of a control word ask for."""
+    if not word & 0x02:
+        return DriveCommand.DISABLE_VOLTAGE
+    if not word & 0x04:
+        return DriveCommand.QUICK_STOP
+    if not word & 0x01:
+        return DriveCommand.SHUTDOWN
+    return DriveCommand.ENABLE if word & 0x08 else DriveCommand.SWITCH_ON
+
 
 CYCLIC_POSITION, CYCLIC_VELOCITY = 8, 9
 DEVICE_TYPE = 0x0002_0192
@@ -189,3 +287,122 @@ class Drive:
 
     def _show(self) -> None:
         self.entry(0x6041).value = self.machine.status_word
+
+
+_SWITCH_ON = 0xE000
+_SHUTDOWN, _ENABLE = 0x0006, 0x000F
+_RESET_NS = 10_000_000
+_HOMING_NS = 50_000_000
+_WORD = SoeAttribute(length=1, display=Display.HEXADECIMAL)
+_WORD_READ_ONLY = SoeAttribute(
+    length=1, display=Display.HEXADECIMAL, protected_preop=1, protected_safeop=1, protected_op=1
+)
+_DOUBLE = SoeAttribute(display=Display.UNSIGNED)
+_SIGNED = SoeAttribute(display=Display.SIGNED)
+_SIGNED_READ_ONLY = SoeAttribute(
+    display=Display.SIGNED, protected_preop=1, protected_safeop=1, protected_op=1
+)
+_TEXT = SoeAttribute(
+    length=0, is_list=1, display=Display.TEXT, protected_preop=1, protected_safeop=1, protected_op=1
+)
+_IDNS = SoeAttribute(length=1, is_list=1, display=Display.IDN, protected_safeop=1, protected_op=1)
+_COMMAND = SoeAttribute(length=1, is_command=1, display=Display.BINARY)
+_IN_AT = ("S-0-0135", "S-0-0051")
+_IN_MDT = ("S-0-0134", "S-0-0047")
+
+
+def parameters(drive: Drive, version: str) -> list[SoeParameter]:
+    """Return the IDNs of *drive*, whose software has *version*."""
+    return [*_lists(version), *_words(drive), *_set_points(drive)]
+
+
+def _lists(version: str) -> Iterator[SoeParameter]:
+    yield SoeParameter("S-0-0016", "Configuration list of AT", _IDNS, _numbers(_IN_AT),
+                       max_length=32)  # fmt: skip
+    yield SoeParameter("S-0-0024", "Configuration list of MDT", _IDNS, _numbers(_IN_MDT),
+                       max_length=32)  # fmt: skip
+    yield SoeParameter("S-0-0030", "Manufacturer version", _TEXT, version)
+    yield SoeParameter("S-0-0032", "Primary operation mode", _DOUBLE, 2)
+
+
+def _words(drive: Drive) -> Iterator[SoeParameter]:
+    yield SoeParameter("S-0-0134", "Master control word", _WORD, write=_control(drive))
+    yield SoeParameter(
+        "S-0-0135", "Drive status word", _WORD_READ_ONLY, read=lambda: _status(drive)
+    )
+    reset = ProcedureCommand(duration_ns=_RESET_NS, finish=lambda: _reset(drive))
+    yield SoeParameter("S-0-0099", "Reset class 1 diagnostic", _COMMAND, procedure=reset)
+    home = ProcedureCommand(
+        duration_ns=_HOMING_NS,
+        start=lambda: _check_enabled(drive),
+        finish=lambda: _home(drive),
+    )
+    yield SoeParameter("S-0-0148", "Drive controlled homing", _COMMAND, procedure=home)
+
+
+def _set_points(drive: Drive) -> Iterator[SoeParameter]:
+    for idn, name, index in (
+        ("S-0-0036", "Velocity command value", 0x60FF),
+        ("S-0-0047", "Position command value", 0x607A),
+    ):
+        yield SoeParameter(idn, name, _SIGNED, unit="inc", read=_reader(drive, index),
+                           write=_writer(drive, index))  # fmt: skip
+    for idn, name, index in (
+        ("S-0-0040", "Velocity feedback value", 0x606C),
+        ("S-0-0051", "Position feedback value", 0x6064),
+    ):
+        yield SoeParameter(idn, name, _SIGNED_READ_ONLY, unit="inc", read=_reader(drive, index))
+
+
+def _numbers(idns: tuple[str, ...]) -> list[int]:
+    return [Idn.parse(idn).number for idn in idns]
+
+
+def _reader(drive: Drive, index: int) -> Callable[[], bytes]:
+    return lambda: drive.entry(index).octets
+
+
+def _writer(drive: Drive, index: int) -> Callable[[bytes], None]:
+    def write(octets: bytes) -> None:
+        drive.entry(index).octets = octets
+
+    return write
+
+
+def _control(drive: Drive) -> Callable[[bytes], None]:
+    def write(octets: bytes) -> None:
+        on = int.from_bytes(octets, "little") & _SWITCH_ON == _SWITCH_ON
+        drive.command(_SHUTDOWN)
+        if on:
+            drive.command(_ENABLE)
+
+    return write
+
+
+def _status(drive: Drive) -> bytes:
+    state = drive.machine.state
+    if state is DriveState.FAULT:
+        word = 0x2000
+    elif state is DriveState.OPERATION_ENABLED:
+        word = 0xC000
+    else:
+        word = 0x4000 if state is not DriveState.SWITCH_ON_DISABLED else 0
+    return word.to_bytes(2, "little")
+
+
+def _reset(drive: Drive) -> bool:
+    drive.reset()
+    return True
+
+
+def _check_enabled(drive: Drive) -> None:
+    if not drive.machine.is_enabled:
+        code = SoeErrorCode.COMMAND_NOT_NOW
+        raise SoeError(name_of(code), code=code)
+
+
+def _home(drive: Drive) -> bool:
+    """Call the place where the axis is 0; an axis that was switched off meanwhile fails."""
+    if drive.machine.is_enabled:
+        drive.entry(0x607A).value = drive.entry(0x6064).value = 0
+    return drive.machine.is_enabled

@@ -7,16 +7,181 @@ simulated controller has its own.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 from defusedxml import ElementTree
 
-from devicebus.sim.devices.esidictionary import number, objects, text_at, type_of
-from devicebus.sim.spec import ChannelSpec, MailboxSpec, SlaveSpec
+from devicebus.sim.spec import (
+    AccessKind,
+    ChannelSpec,
+    EntrySpec,
+    MailboxSpec,
+    ObjectSpec,
+    SlaveSpec,
+    Value,
+)
+from eap.codec import datatypes
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
+
+
+_BY_BITS = {1: "BOOL", 8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
+_ACCESS = {"ro": AccessKind.READ, "wo": AccessKind.WRITE, "rw": AccessKind.READ_WRITE}
+_STANDARD = frozenset(
+    (0x1000, 0x1001, 0x1008, 0x1009, 0x100A, 0x1018, 0x1C00, *range(0x1600, 0x1800),
+     *range(0x1A00, 0x1C00), *range(0x1C10, 0x1C20))
+)  # fmt: skip
+_MAX_SUBINDEX = 0xFF
+
+
+class _Part(NamedTuple):
+    """One subindex of a data type."""
+
+    subindex: int
+    name: str
+    kind: str
+    bits: int
+    access: AccessKind
+
+
+def number(text: str) -> int:
+    """Read ``#x1A00`` or ``6656``, as ESI files write numbers; raise ValueError otherwise."""
+    stripped = text.strip().lower()
+    digits = stripped.removeprefix("#x")
+    return int(digits, 10 if digits == stripped else 16)
+
+
+def text_at(element: Element, path: str, default: str) -> str:
+    """Return the text at *path*, or *default* where there is none."""
+    return (element.findtext(path) or default).strip()
+
+
+def type_of(name: str, bits: int) -> str:
+    """Return the type of that name if it has so many bits, else one that has room for them."""
+    try:
+        kind = datatypes.parse(name)
+    except ValueError:
+        kind = None
+    if kind is not None and kind.bit_length == bits:
+        return name
+    if bits in _BY_BITS:
+        return _BY_BITS[bits]
+    if bits < 8:
+        return f"BIT{bits}"
+    if bits % 8 == 0:
+        return f"BLOCK({bits // 8})"
+    whole = f"BLOCK({bits // 8 + 1})"
+    return next((kind for size, kind in _BY_BITS.items() if size > bits), whole)
+
+
+def objects(device: Element) -> Iterator[ObjectSpec]:
+    """Yield the objects that a device describes.
+
+    Raises:
+        ValueError: a number is none.
+    """
+    types = {
+        text_at(each, "Name", ""): each
+        for each in device.iterfind("Profile/Dictionary/DataTypes/DataType")
+    }
+    for item in device.iterfind("Profile/Dictionary/Objects/Object"):
+        index = number(text_at(item, "Index", "0"))
+        bits = number(text_at(item, "BitSize", "0"))
+        if index in _STANDARD or not bits:
+            continue
+        kind = text_at(item, "Type", "")
+        parts = list(_parts(types.get(kind), types))
+        name = text_at(item, "Name", f"0x{index:04X}")
+        if parts:
+            yield ObjectSpec(index=index, name=name, entries=tuple(_entries(item, parts)))
+        elif kind in types or not kind.startswith("DT"):
+            simple = type_of(_base(kind, types), bits)
+            value = _value(item.find("Info"), simple)
+            yield ObjectSpec(index=index, name=name, type=simple, value=value, access=_access(item))
+
+
+def _parts(kind: Element | None, types: dict[str, Element]) -> Iterator[_Part]:
+    """Yield the subindexes from 1 on of a data type; nothing if it has none."""
+    for item in () if kind is None else kind.iterfind("SubItem"):
+        name = text_at(item, "Type", "")
+        bits = number(text_at(item, "BitSize", "0"))
+        access = _access(item)
+        if item.find("SubIdx") is None:
+            yield from _elements(types.get(name), types, access)
+            continue
+        subindex = number(text_at(item, "SubIdx", "0"))
+        if 0 < subindex <= _MAX_SUBINDEX and bits:
+            label = text_at(item, "Name", f"SubIndex {subindex:03}")
+            yield _Part(subindex, label, type_of(_base(name, types), bits), bits, access)
+
+
+def _elements(
+    array: Element | None, types: dict[str, Element], access: AccessKind
+) -> Iterator[_Part]:
+    """Yield the elements of an array."""
+    if array is None:
+        return
+    count = number(text_at(array, "ArrayInfo/Elements", "0"))
+    first = number(text_at(array, "ArrayInfo/LBound", "1"))
+    bits = number(text_at(array, "BitSize", "0")) // count if count else 0
+    if not bits:
+        return
+    kind = type_of(_base(text_at(array, "BaseType", ""), types), bits)
+    for subindex in range(max(first, 1), min(first + count, _MAX_SUBINDEX + 1)):
+        yield _Part(subindex, f"SubIndex {subindex:03}", kind, bits, access)
+
+
+def _entries(item: Element, parts: list[_Part]) -> Iterator[EntrySpec]:
+    told = {text_at(each, "Name", ""): each.find("Info") for each in item.iterfind("Info/SubItem")}
+    for part in {each.subindex: each for each in parts}.values():
+        yield EntrySpec(
+            subindex=part.subindex,
+            name=part.name,
+            type=part.kind,
+            value=_value(told.get(part.name), part.kind),
+            access=part.access,
+        )
+
+
+def _base(name: str, types: dict[str, Element]) -> str:
+    """Return the type behind a name that the file gives it, such as an enumeration's."""
+    found = types.get(name)
+    return name if found is None else text_at(found, "BaseType", name)
+
+
+def _access(item: Element) -> AccessKind:
+    flags = item.find("Flags/Access")
+    if flags is None:
+        return AccessKind.READ_WRITE
+    access = _ACCESS.get((flags.text or "").strip().lower(), AccessKind.READ_WRITE)
+    restricted = flags.get("WriteRestrictions", "").lower() == "preop"
+    if access is AccessKind.READ_WRITE and restricted:
+        return AccessKind.CONFIGURATION
+    return access
+
+
+def _value(info: Element | None, kind_name: str) -> Value | None:
+    """Return what an entry starts with; None where nothing is told that fits its type."""
+    if info is None:
+        return None
+    kind = datatypes.parse(kind_name)
+    try:
+        if (data := text_at(info, "DefaultData", "")) != "":
+            octets = bytes.fromhex(data).ljust(kind.size, b"\0")
+            plain = kind.to_plain(kind.decode(octets, 0))
+        elif (told := text_at(info, "DefaultString", "")) != "":
+            plain = told
+        elif (told := text_at(info, "DefaultValue", "")) != "":
+            plain = number(told)
+        else:
+            return None
+        kind.encode(plain)
+    except ValueError:
+        return None
+    return None if isinstance(plain, list) else plain
+
 
 _MAX_ENTRY_BITS = 255
 _MINIMUM_MAILBOX = 32

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from devicebus.sim.devices.pdoobjects import (
+from devicebus.sim.devices.objects import (
     MIN_ROOM,
     PDOS,
     RX_ASSIGN,
@@ -17,13 +17,15 @@ from devicebus.sim.devices.pdoobjects import (
 )
 from devicebus.sim.spec import DeviceKind, MailboxSpec, SlaveSpec
 from devicebus.wire import sii
-from devicebus.wire.sii import Sii, SiiPdo, SiiProtocol
-from devicebus.wire.siirecord import (
+from devicebus.wire.sii import (
+    Sii,
     SiiDc,
     SiiFixed,
     SiiGeneral,
+    SiiPdo,
     SiiPdoEntry,
     SiiPdoHeader,
+    SiiProtocol,
     SiiSyncManager,
 )
 from eap.od.dictionary import ObjectDictionary

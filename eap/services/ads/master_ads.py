@@ -13,9 +13,15 @@ from collections.abc import Awaitable, Callable, Sequence
 from time import monotonic_ns, time_ns
 from typing import TypeAlias
 
-from devicebus.master.access import DatagramReply, DatagramRequest, brd
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command, DatagramHeader, WorkingCounter
+from devicebus.wire.datagram import (
+    Command,
+    DatagramHeader,
+    DatagramReply,
+    DatagramRequest,
+    WorkingCounter,
+    brd,
+)
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
 from eap.ads.master import MasterSpace, SlaveState

@@ -12,7 +12,6 @@ from itertools import count
 from typing import NamedTuple
 
 from devicebus.errors import MailboxTimeoutError, SoeError
-from devicebus.mailbox.soe_procedure import CLEAR, START
 from devicebus.wire.sii import SiiProtocol
 from eap.ads.notifications import Client
 from eap.ads.operation import (
@@ -31,7 +30,7 @@ from eap.ads.state import DeviceDataSpace, al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoPlace, SoePlace, device_name
 from eap.codec.ams import AmsHeader, decode_packet
 from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
-from eap.codec.soe import DataState, Element, Idn
+from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Element, Idn
 from eap.codec.soeerror import SoeErrorCode
 from eap.codec.voe import VoeHeader
 from eap.errors import TruncatedError
@@ -52,8 +51,8 @@ KEEP_S = 30.0
 MAX_COMMANDS = 64
 """Procedure commands that go on or are kept at a time, of all drives."""
 _POLL_S = 0.02
-_START = START.to_bytes(2, "little")
-_CLEAR = CLEAR.to_bytes(2, "little")
+_START = COMMAND_START.to_bytes(2, "little")
+_CLEAR = COMMAND_CLEAR.to_bytes(2, "little")
 _OCTET = 0xFF
 _NET_ID_OFFSET = 3
 _OTHER_ADDRESS = frozenset((AdsError.TARGET_MACHINE, AdsError.TARGET_PORT))

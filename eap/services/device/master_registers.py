@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from devicebus.master.access import DatagramRequest, fprd
 from devicebus.master.procedure import Procedure
-from devicebus.master.scan import Identity, count_slaves, read_identity, read_stations
-from devicebus.master.topology import find_joints
+from devicebus.master.scan import Identity, count_slaves, find_joints, read_identity, read_stations
+from devicebus.wire.datagram import DatagramRequest, fprd
 from devicebus.wire.register import AlStatus, DlStatus, Register
 
 PORTS = 4

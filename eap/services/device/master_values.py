@@ -19,8 +19,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from devicebus.errors import AlStatusError
 from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
-from devicebus.master.access import fpwr
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import fpwr
 from devicebus.wire.register import DlStatus
 from devicebus.wire.sii import SiiProtocol
 from eap.device.eap_objects import DeviceIdentity

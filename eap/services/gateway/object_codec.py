@@ -8,13 +8,13 @@ client that pauses in the middle of one would keep the slave from all others).
 
 from __future__ import annotations
 
-from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.mailbox.sdo_server import (
+from devicebus.mailbox.coe_server import (
     SEGMENTS,
     SegmentedTransfer,
     size_of_download,
     transfer_of,
 )
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.coe import CoeHeader, CoeService, encode_message
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import (

@@ -14,10 +14,10 @@ from typing import TypeVar
 from devicebus.drive import drive_async
 from devicebus.errors import BusError, MailboxBusyError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
 from eap.control.bus import BRING_S, PATIENCE_S, TRANSFER_S
 from eap.errors import EapError, EngineGoneError

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TypeVar
 
 from devicebus.drive import drive_async
-from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client, voe_client
+from devicebus.mailbox import aoe_client, coe_client, soe_client, voe
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet
@@ -98,7 +98,7 @@ class LocalSlave:
 
     async def read_info(self, opcode: SdoInfoOpcode, request: bytes) -> bytes:
         """Return the body of an SDO information answer, its fragments joined."""
-        return await self._converse(coeinfo_client.read(opcode, request))
+        return await self._converse(coe_client.read(opcode, request))
 
     async def read_elements(self, idn: int, elements: int, *, drive: int) -> bytes:
         """Read elements of an IDN, one behind the other; lists and texts with their heads."""
@@ -127,7 +127,7 @@ class LocalSlave:
         """Send a VoE message that is not answered."""
         head = VoeHeader.decode(message)
         data = message[VoeHeader.SIZE :]
-        await self._converse(voe_client.send(head.vendor_id, head.vendor_type, data))
+        await self._converse(voe.send(head.vendor_id, head.vendor_type, data))
 
     async def exchange_ads(self, header: AmsHeader, data: bytes) -> bytes:
         """Return the AMS packet that answers an AoE request; nothing if it wants no answer."""

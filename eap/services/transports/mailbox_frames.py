@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns
 from typing import Protocol
 
-from devicebus.mailbox.counter import next_counter
+from devicebus.mailbox.protocol import next_counter
 from eap.codec.ams import AmsHeader
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.mailbox import (

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from devicebus import errors
 from devicebus.errors import BusError, WorkingCounterError
-from devicebus.master.access import DatagramReply
 from devicebus.master.procedure import not_answered
+from devicebus.wire.datagram import DatagramReply
 from eap.errors import EapError
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 from devicebus.errors import BusError, MailboxRefusedError
-from devicebus.mailbox import coe_client, coeinfo_client
+from devicebus.mailbox import coe_client
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
@@ -38,9 +38,9 @@ def fuzz_one(data: bytes) -> None:
     talks: list[Conversation[object]] = [
         coe_client.upload(0x1018, 0),
         coe_client.download(0x1018, 0, bytes(50), SIZES),
-        coeinfo_client.object_list(ListType.ALL),
-        coeinfo_client.object_description(0x1018),
-        coeinfo_client.entry_description(0x1018, 0),
+        coe_client.object_list(ListType.ALL),
+        coe_client.object_description(0x1018),
+        coe_client.entry_description(0x1018, 0),
     ]
     for talk in talks:
         with suppress(BusError, SdoAbortError):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from devicebus.master.access import fprd, logical
 from devicebus.master.link import Link
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec
-from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
+from devicebus.wire.datagram import Command, encode_frame, fprd, iter_datagrams, logical
 from eap.errors import CodecError
 
 _BIT = (ChannelSpec(name="bit"),)

@@ -6,8 +6,7 @@ from contextlib import suppress
 
 from devicebus.errors import BusError, MailboxRefusedError
 from devicebus.mailbox import foe_client
-from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxType
 from tools.fuzz.messages import answer_with, cut

@@ -12,11 +12,10 @@ from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
-from devicebus.mailbox.voe_server import VoeServer
+from devicebus.mailbox.voe import VoeServer
 from devicebus.master.mailboxes import Unsolicited
 from eap.ads.answer import AmsAnswer
 from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite

@@ -9,15 +9,7 @@ from typing import Any
 
 from devicebus.drive import drive
 from devicebus.errors import BusError
-from devicebus.mailbox import (
-    coe_client,
-    coeinfo_client,
-    eoe_client,
-    foe_client,
-    soe_browse,
-    soe_client,
-    voe_client,
-)
+from devicebus.mailbox import coe_client, eoe, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
@@ -36,13 +28,13 @@ def _talks() -> list[tuple[MailboxType, Conversation[Any]]]:
     return [
         (MailboxType.COE, coe_client.upload(0x1018, 1)),
         (MailboxType.COE, coe_client.download(0x2000, 0, bytes(60), _SIZES)),
-        (MailboxType.COE, coeinfo_client.object_list()),
+        (MailboxType.COE, coe_client.object_list()),
         (MailboxType.COE, read_slaves()),
-        (MailboxType.SOE, soe_browse.describe(_MODE)),
+        (MailboxType.SOE, soe_client.describe(_MODE)),
         (MailboxType.SOE, soe_client.write(_MODE, bytes(50), _SIZES)),
         (MailboxType.FOE, foe_client.read("f", lambda data: None, _SIZES)),
-        (MailboxType.VOE, voe_client.exchange(1, 2, b"a")),
-        (MailboxType.EOE, eoe_client.get_ip()),
+        (MailboxType.VOE, voe.exchange(1, 2, b"a")),
+        (MailboxType.EOE, eoe.get_ip()),
     ]
 
 

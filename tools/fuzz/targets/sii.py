@@ -8,14 +8,13 @@ from contextlib import suppress
 from devicebus.drive import drive
 from devicebus.errors import BusError
 from devicebus.master import eeprom
-from devicebus.master.access import DatagramReply, DatagramRequest
-from devicebus.master.layout import SlaveShape, lay_out
+from devicebus.master.image import SlaveShape, lay_out
 from devicebus.master.pdo import channels_from_sii
 from devicebus.master.procedure import Sleep, Step, StepReplies
 from devicebus.wire import sii
+from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from devicebus.wire.register import Register
-from devicebus.wire.sii import CategoryHeader, SiiCategory
-from devicebus.wire.siirecord import SiiFixed
+from devicebus.wire.sii import CategoryHeader, SiiCategory, SiiFixed
 from eap.errors import CodecError
 from tools.fuzz.messages import cut
 

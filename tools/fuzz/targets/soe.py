@@ -8,9 +8,7 @@ from devicebus.errors import BusError, MailboxRefusedError
 from devicebus.mailbox import soe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.mailbox.soe_parameter import SoeParameter
-from devicebus.mailbox.soe_procedure import Procedure
-from devicebus.mailbox.soe_server import SoeServer
+from devicebus.mailbox.soe_server import ProcedureCommand, SoeParameter, SoeServer
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Display, Idn, SoeAttribute
 from eap.codec.soevalue import decode_value
@@ -33,7 +31,9 @@ def fuzz_one(data: bytes) -> None:
     parameters = [
         SoeParameter(str(MODE), "Mode", _ATTRIBUTES[0], 1, limits=(0, 9)),
         SoeParameter(str(LIST), "List", _ATTRIBUTES[1], range(30)),
-        SoeParameter(str(RESET), "Reset", _ATTRIBUTES[2], procedure=Procedure(duration_ns=3)),
+        SoeParameter(
+            str(RESET), "Reset", _ATTRIBUTES[2], procedure=ProcedureCommand(duration_ns=3)
+        ),
     ]
     server = SoeServer({0: parameters, 1: parameters}, lambda: OdState.OP, SIZES)
     for now_ns, message in enumerate(messages):

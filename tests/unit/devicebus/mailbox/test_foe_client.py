@@ -21,8 +21,7 @@ from devicebus.errors import (
 )
 from devicebus.mailbox import foe_client
 from devicebus.mailbox.conversation import MailboxMessage, Progress
-from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxType

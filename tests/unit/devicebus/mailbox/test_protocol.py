@@ -1,9 +1,17 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from devicebus.errors import MailboxRefusedError
-from devicebus.mailbox.protocol import MINIMUM_SIZE, MailboxSizes, refuse
+from devicebus.mailbox.protocol import (
+    MINIMUM_SIZE,
+    CounterWatch,
+    MailboxSizes,
+    next_counter,
+    refuse,
+)
 from eap.codec.mailbox import MailboxError
 
 
@@ -24,3 +32,47 @@ def test_refusal_carries_the_detail_of_the_standard() -> None:
     with pytest.raises(MailboxRefusedError, match="INVALID_HEADER: no length") as caught:
         refuse(MailboxError.INVALID_HEADER, "no length")
     assert caught.value.detail == 5
+
+
+def test_counter_goes_from_1_to_7_and_never_to_0() -> None:
+    seen = [0]
+    for _ in range(9):
+        seen.append(next_counter(seen[-1]))
+    assert seen == [0, 1, 2, 3, 4, 5, 6, 7, 1, 2]
+
+
+def test_same_counter_is_a_repeat() -> None:
+    watch = CounterWatch()
+    assert [watch.is_new(counter) for counter in (3, 3, 3, 4)] == [True, False, False, True]
+    assert (watch.repeated, watch.gaps) == (2, 0)
+
+
+def test_counter_0_is_always_new_and_starts_again() -> None:
+    watch = CounterWatch()
+    assert all(watch.is_new(counter) for counter in (0, 0, 5, 0, 5))
+    assert (watch.repeated, watch.gaps) == (0, 0)
+
+
+def test_missing_counters_are_gaps() -> None:
+    watch = CounterWatch()
+    assert all(watch.is_new(counter) for counter in (6, 7, 1, 3, 1, 2))
+    assert watch.gaps == 2
+
+
+def test_restart_takes_any_counter_and_keeps_the_counts() -> None:
+    watch = CounterWatch()
+    assert watch.is_new(1)
+    assert not watch.is_new(1)
+    watch.restart()
+    assert watch.is_new(1)
+    assert (watch.repeated, watch.gaps) == (1, 0)
+
+
+@given(st.lists(st.integers(1, 3)))
+def test_own_sequence_with_repeats_has_no_gaps(repeats: list[int]) -> None:
+    watch = CounterWatch()
+    counter = 0
+    for times in repeats:
+        counter = next_counter(counter)
+        assert [watch.is_new(counter) for _ in range(times)] == [True] + [False] * (times - 1)
+    assert (watch.gaps, watch.repeated) == (0, sum(repeats) - len(repeats))

@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from devicebus.errors import MailboxRefusedError
-from devicebus.mailbox import coe_client, eoe_client, foe_client, voe_client
+from devicebus.mailbox import coe_client, eoe, foe_client, voe
 from devicebus.mailbox.coe_server import CoeServer
-from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MAX_QUEUED, MailboxServer
-from devicebus.mailbox.voe_server import VoeServer
+from devicebus.mailbox.voe import VoeServer
 from eap.codec.coe import Emergency
 from eap.codec.mailbox import (
     MailboxError,
@@ -295,12 +294,12 @@ class MailboxMachine(RuleBasedStateMachine):
 
     @rule(data=st.binary(max_size=16))
     def echo(self, data: bytes) -> None:
-        assert self.line.run(voe_client.exchange(1, 2, data)) == data
+        assert self.line.run(voe.exchange(1, 2, data)) == data
 
     @rule()
     def refused(self) -> None:
         with pytest.raises(MailboxRefusedError) as caught:
-            self.line.run(eoe_client.get_ip())
+            self.line.run(eoe.get_ip())
         assert caught.value.detail == MailboxError.UNSUPPORTED_PROTOCOL
 
     def teardown(self) -> None:

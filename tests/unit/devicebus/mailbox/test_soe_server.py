@@ -6,17 +6,256 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devicebus.errors import MailboxRefusedError
+from devicebus.errors import MailboxRefusedError, SoeError
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.mailbox.soe_parameter import SoeParameter
-from devicebus.mailbox.soe_procedure import Procedure
-from devicebus.mailbox.soe_server import FRAGMENT_TIMEOUT_NS, MAX_PENDING, SoeServer
+from devicebus.mailbox.soe_server import (
+    FRAGMENT_TIMEOUT_NS,
+    MAX_PENDING,
+    ProcedureCommand,
+    SoeParameter,
+    SoeServer,
+)
 from eap.codec.mailbox import MailboxError
-from eap.codec.soe import Display, SoeAttribute
+from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Display, Element, SoeAttribute
+from eap.codec.soeerror import SoeErrorCode
 from eap.od.model import OdState
 
-NUMBER = SoeAttribute(length=2, protected_op=1)
+
+def code_of(procedure: ProcedureCommand, value: int, now_ns: int) -> SoeErrorCode:
+    with pytest.raises(SoeError) as caught:
+        procedure.command(value, now_ns)
+    return SoeErrorCode(caught.value.code)
+
+
+def test_life_of_a_command() -> None:
+    procedure = ProcedureCommand(duration_ns=100)
+    assert procedure.state(0) == 0
+    procedure.command(COMMAND_START, 10)
+    assert procedure.state(109) == DataState.BUSY == 0x0007
+    assert code_of(procedure, COMMAND_START, 109) is SoeErrorCode.COMMAND_ACTIVE
+    assert procedure.state(110) == DataState.DONE == 0x0003
+    assert code_of(procedure, COMMAND_START, 111) is SoeErrorCode.COMMAND_ACTIVE
+    procedure.command(COMMAND_CLEAR, 112)
+    assert procedure.state(112) == 0
+    procedure.command(COMMAND_START, 113)
+    assert procedure.state(113) == DataState.BUSY
+
+
+def test_hooks_run_once_at_start_and_end() -> None:
+    seen: list[str] = []
+    procedure = ProcedureCommand(
+        duration_ns=5,
+        start=lambda: seen.append("start"),
+        finish=lambda: bool(seen.append("finish")) or True,
+    )
+    procedure.command(COMMAND_START, 0)
+    for now_ns in (0, 4, 5, 6):
+        procedure.state(now_ns)
+    assert seen == ["start", "finish"]
+
+
+def test_command_that_does_not_succeed_has_failed() -> None:
+    procedure = ProcedureCommand(finish=lambda: False)
+    procedure.command(COMMAND_START, 0)
+    assert procedure.state(0) == DataState.FAILED == 0x000F
+    procedure.command(COMMAND_CLEAR, 0)
+    assert procedure.state(0) == 0
+
+
+def test_start_may_be_refused() -> None:
+    def refuse() -> None:
+        raise SoeError("no power", code=SoeErrorCode.COMMAND_NOT_NOW)
+
+    procedure = ProcedureCommand(start=refuse)
+    assert code_of(procedure, COMMAND_START, 0) is SoeErrorCode.COMMAND_NOT_NOW
+    assert procedure.state(0) == 0
+
+
+@pytest.mark.parametrize("is_interruptible", [True, False])
+def test_clearing_what_runs(is_interruptible: bool) -> None:
+    procedure = ProcedureCommand(duration_ns=9, is_interruptible=is_interruptible)
+    procedure.command(COMMAND_START, 0)
+    if is_interruptible:
+        procedure.command(COMMAND_CLEAR, 1)
+        assert procedure.state(99) == 0
+    else:
+        assert code_of(procedure, COMMAND_CLEAR, 1) is SoeErrorCode.COMMAND_NOT_INTERRUPTIBLE
+        assert procedure.state(9) == DataState.DONE
+
+
+@pytest.mark.parametrize("value", [1, 2, 7, 0xFFFF])
+def test_other_values_are_invalid(value: int) -> None:
+    assert code_of(ProcedureCommand(), value, 0) is SoeErrorCode.INVALID_VALUE
+
+
+PREOP, SAFEOP, OP = OdState.PREOP, OdState.SAFEOP, OdState.OP
+SIGNED = SoeAttribute(length=2, display=Display.SIGNED)
 LIST = SoeAttribute(length=1, is_list=1, display=Display.IDN)
+
+
+def speed(**options: object) -> SoeParameter:
+    return SoeParameter(
+        "S-0-0036", "Velocity", SIGNED, -5, unit="rpm", limits=(-100, 200), **options
+    )
+
+
+def refusal_of(call: object, *arguments: object) -> SoeErrorCode:
+    with pytest.raises(SoeError) as caught:
+        call(*arguments)  # type: ignore[operator]
+    return SoeErrorCode(caught.value.code)
+
+
+def number(value: int) -> bytes:
+    return value.to_bytes(4, "little", signed=True)
+
+
+@pytest.mark.parametrize(
+    ("element", "octets"),
+    [
+        (Element.NAME, "0800 0800 56656c6f63697479"),
+        (Element.ATTRIBUTE, "0100 2200"),
+        (Element.UNIT, "0300 0300 72706d"),
+        (Element.MINIMUM, "9cffffff"),
+        (Element.MAXIMUM, "c8000000"),
+        (Element.VALUE, "fbffffff"),
+        (Element.DEFAULT, "fbffffff"),
+        (Element.VALUE | Element.UNIT | Element.MINIMUM, "0300 0300 72706d 9cffffff fbffffff"),
+    ],
+)
+def test_elements(element: int, octets: str) -> None:
+    assert speed().read(element, 0) == bytes.fromhex(octets)
+
+
+@pytest.mark.parametrize(
+    ("element", "code"),
+    [
+        (0, "NO_ELEMENT"),
+        (Element.DATA_STATE, "NO_DATA_STATE"),
+        (Element.NAME, "NO_NAME"),
+        (Element.UNIT, "NO_UNIT"),
+        (Element.MINIMUM, "NO_MINIMUM"),
+        (Element.MAXIMUM, "NO_MAXIMUM"),
+        (Element.VALUE | Element.MAXIMUM, "NO_MAXIMUM"),
+    ],
+)
+def test_element_that_is_not_there(element: int, code: str) -> None:
+    assert refusal_of(SoeParameter("P-0-0001", "", SIGNED).read, element, 0).name == code
+
+
+def test_value_is_written_and_default_stays() -> None:
+    parameter = speed()
+    parameter.write(Element.VALUE, number(200), PREOP, 0)
+    assert parameter.read(Element.VALUE, 0) == number(200)
+    assert parameter.read(Element.DEFAULT, 0) == number(-5)
+
+
+@pytest.mark.parametrize(
+    ("element", "data", "code"),
+    [
+        (0, bytes(4), "NO_ELEMENT"),
+        (Element.DATA_STATE, bytes(2), "ELEMENT_1_ACCESS"),
+        (Element.NAME, b"x", "NAME_READ_ONLY"),
+        (Element.ATTRIBUTE, bytes(4), "ATTRIBUTE_READ_ONLY"),
+        (Element.UNIT, b"x", "UNIT_READ_ONLY"),
+        (Element.MINIMUM, bytes(4), "MINIMUM_READ_ONLY"),
+        (Element.MAXIMUM, bytes(4), "MAXIMUM_READ_ONLY"),
+        (Element.DEFAULT, bytes(4), "DEFAULT_READ_ONLY"),
+        (Element.VALUE | Element.UNIT, bytes(4), "UNIT_READ_ONLY"),
+        (Element.VALUE, bytes(3), "VALUE_TOO_SHORT"),
+        (Element.VALUE, bytes(5), "VALUE_TOO_LONG"),
+        (Element.VALUE, number(-101), "BELOW_MINIMUM"),
+        (Element.VALUE, number(201), "ABOVE_MAXIMUM"),
+    ],
+)
+def test_write_that_is_refused(element: int, data: bytes, code: str) -> None:
+    parameter = speed()
+    assert refusal_of(parameter.write, element, data, PREOP, 0).name == code
+    assert parameter.read(Element.VALUE, 0) == number(-5)
+
+
+def test_protection_depends_on_the_state() -> None:
+    attribute = SoeAttribute(protected_safeop=1, protected_op=1)
+    parameter = SoeParameter("S-0-0001", "Cycle time", attribute)
+    parameter.write(Element.VALUE, number(7), PREOP, 0)
+    for state in (SAFEOP, OP):
+        code = refusal_of(parameter.write, Element.VALUE, number(8), state, 0)
+        assert code is SoeErrorCode.VALUE_PROTECTED
+    attribute = SoeAttribute(protected_preop=1, protected_safeop=1, protected_op=1)
+    parameter = SoeParameter("S-0-0030", "Version", attribute)
+    code = refusal_of(parameter.write, Element.VALUE, number(8), PREOP, 0)
+    assert code is SoeErrorCode.VALUE_READ_ONLY
+
+
+def test_list_has_a_head() -> None:
+    parameter = SoeParameter("S-0-0016", "AT list", LIST, [40, 51], max_length=8)
+    assert parameter.read(Element.VALUE, 0) == bytes.fromhex("0400 0800 2800 3300")
+    parameter.write(Element.VALUE, bytes.fromhex("0600 0600 010002000300"), PREOP, 0)
+    assert parameter.read(Element.VALUE, 0) == bytes.fromhex("0600 0800 010002000300")
+    assert parameter.read(Element.DEFAULT, 0) == bytes.fromhex("0400 0800 2800 3300")
+
+
+@pytest.mark.parametrize(
+    ("octets", "code"),
+    [
+        ("0400", "VALUE_TOO_SHORT"),
+        ("0400 0400 0100", "VALUE_TOO_SHORT"),
+        ("0a00 0a00 01000200030004000500", "VALUE_TOO_LONG"),
+        ("0200 0200 01000200", "VALUE_TOO_LONG"),
+        ("0300 0300 010002", "INVALID_VALUE"),
+        ("0400 0400 01006400", "ABOVE_MAXIMUM"),
+    ],
+)
+def test_list_that_is_refused(octets: str, code: str) -> None:
+    parameter = SoeParameter("S-0-0016", "", LIST, [1], max_length=8, limits=(None, 99))
+    write = (Element.VALUE, bytes.fromhex(octets), PREOP, 0)
+    assert refusal_of(parameter.write, *write).name == code
+
+
+def test_text_is_a_list_of_octets() -> None:
+    text = SoeAttribute(length=0, is_list=1, display=Display.TEXT)
+    parameter = SoeParameter("S-0-0140", "Type", text, "AX", max_length=4)
+    assert parameter.read(Element.VALUE, 0) == bytes.fromhex("0200 0400 4158")
+    parameter.write(Element.VALUE, bytes.fromhex("0300 0300 414241"), OP, 0)
+    assert parameter.octets == b"ABA"
+
+
+def test_empty_list() -> None:
+    parameter = SoeParameter("S-0-0016", "", LIST, max_length=4)
+    assert parameter.read(Element.VALUE, 0) == bytes.fromhex("0000 0400")
+
+
+def test_hooks_read_and_check_the_octets() -> None:
+    def check(octets: bytes) -> None:
+        if octets == number(3):
+            raise SoeError("not 3", code=SoeErrorCode.OTHER_SETTINGS)
+
+    parameter = speed(read=lambda: number(77), write=check)
+    assert parameter.read(Element.VALUE, 0) == number(77)
+    assert refusal_of(parameter.write, Element.VALUE, number(3), OP, 0).name == "OTHER_SETTINGS"
+    parameter.write(Element.VALUE, number(4), OP, 0)
+    assert parameter.octets == number(4)
+
+
+def test_procedure_command_has_a_data_state() -> None:
+    attribute = SoeAttribute(length=1, is_command=1, display=Display.BINARY)
+    parameter = SoeParameter(
+        "S-0-0099", "Reset", attribute, procedure=ProcedureCommand(duration_ns=9)
+    )
+    assert parameter.read(Element.DATA_STATE, 0) == bytes(2)
+    parameter.write(Element.VALUE, b"\3\0", OP, 0)
+    assert parameter.read(Element.DATA_STATE, 8) == b"\7\0"
+    assert parameter.read(Element.DATA_STATE, 9) == b"\3\0"
+    code = refusal_of(parameter.write, Element.VALUE, b"\3\0", OP, 9)
+    assert code is SoeErrorCode.COMMAND_ACTIVE
+    assert parameter.read(Element.VALUE, 9) == b"\3\0"
+
+
+def test_refusal_names_the_idn() -> None:
+    with pytest.raises(SoeError, match=r"P-0-0001: no unit \(0x4001\)"):
+        SoeParameter("P-0-0001", "", SIGNED).read(Element.UNIT, 0)
+
+
+NUMBER = SoeAttribute(length=2, protected_op=1)
 COMMAND = SoeAttribute(length=1, is_command=1, display=Display.BINARY)
 
 
@@ -24,7 +263,9 @@ class Drive:
     def __init__(self) -> None:
         self.list = SoeParameter("S-0-0016", "AT list", LIST, max_length=40)
         self.number = SoeParameter("S-0-0032", "Mode", NUMBER, 11)
-        reset = SoeParameter("S-0-0099", "Reset", COMMAND, procedure=Procedure(duration_ns=9))
+        reset = SoeParameter(
+            "S-0-0099", "Reset", COMMAND, procedure=ProcedureCommand(duration_ns=9)
+        )
         self.state = OdState.PREOP
         self.server = SoeServer(
             {0: [self.list, self.number, reset], 3: [SoeParameter("P-0-0001", "x", NUMBER, 3)]},

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError
-from devicebus.mailbox import coe_client, foe_client, soe_client, voe_client
-from devicebus.mailbox.sdo_server import SdoServer
+from devicebus.mailbox import coe_client, foe_client, soe_client, voe
+from devicebus.mailbox.coe_server import SdoServer
 from devicebus.wire.alstatus import AlState
 from eap.codec.sdo import SdoRequest
 from eap.codec.soe import Idn
@@ -31,7 +31,7 @@ REQUESTS = {
     "coe": lambda sizes: coe_client.upload(0x1018, 1),
     "foe": read_file,
     "soe": lambda sizes: soe_client.read(Idn.parse("S-0-0032")),
-    "voe": lambda sizes: voe_client.exchange(1, 2, b"x"),
+    "voe": lambda sizes: voe.exchange(1, 2, b"x"),
 }
 
 

@@ -1,15 +1,30 @@
 from __future__ import annotations
 
+from typing import get_args
+
+import pytest
+
 from devicebus.mailbox.conversation import MailboxRequest
-from devicebus.master.access import frmw
-from devicebus.master.bus import MAX_EVENTS, Bus, MasterSettings, Unit
+from devicebus.master import bus
+from devicebus.master.bus import MAX_EVENTS, Bus, BusLost, MasterSettings, Unit
 from devicebus.master.cycle import Presence
-from devicebus.master.event import BusLost
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.scan import scan
 from devicebus.master.startup import set_up_cycle
+from devicebus.wire.datagram import frmw
 from eap.codec.mailbox import MailboxType
 from tests.support.busline import Bench, Line, run, segment, slave
+
+KINDS = [each for each in get_args(bus.Event) if each.__module__ == bus.__name__]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_event_tells_when_and_cannot_be_changed(kind):
+    made = kind(*range(len(kind.__struct_fields__)))
+    assert kind.__struct_fields__[-1] == "at_ns"
+    with pytest.raises(AttributeError):
+        made.at_ns = 5
+
 
 AREA = MailboxArea(0x1000, 128, 0x1080, 128)
 

@@ -12,10 +12,9 @@ from devicebus.master.clocks import (
     start_sync0,
     synchronize,
 )
-from devicebus.master.scan import scan
-from devicebus.master.topology import Joint
+from devicebus.master.scan import Joint, scan
+from devicebus.sim.segment import CABLE_NS, FORWARD_NS
 from devicebus.sim.spec import ClockSpec
-from devicebus.sim.wiring import CABLE_NS, FORWARD_NS
 from devicebus.wire.register import Register
 from tests.support.busline import MS, Bench, Line, run, segment, slave
 

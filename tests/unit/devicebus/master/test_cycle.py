@@ -2,15 +2,12 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.master.access import DatagramRequest, frmw
 from devicebus.master.cycle import MAX_UNDER_WAY, Cycle, Presence
-from devicebus.master.image import BusImage
-from devicebus.master.layout import BASE, lay_out
-from devicebus.master.link import LINGER_NS, Link
-from devicebus.master.roundtrip import BACKOFF_LIMIT_NS
-from devicebus.wire.datagram import Command
+from devicebus.master.image import BASE, BusImage, lay_out
+from devicebus.master.link import BACKOFF_LIMIT_NS, LINGER_NS, Link
+from devicebus.wire.datagram import Command, DatagramRequest, frmw
 from tests.support.busline import MS, accesses_of, answer
-from tests.unit.devicebus.master.test_layout import shape
+from tests.unit.devicebus.master.test_image import shape
 
 SHAPES = (shape(1, (8, 8), (16,)), shape(2, (8,), (8,)), shape(3, (), (8,)))
 

@@ -4,15 +4,13 @@ import pytest
 
 from devicebus.errors import SiiError, WorkingCounterError
 from devicebus.master import eeprom
-from devicebus.master.access import DatagramReply
 from devicebus.master.procedure import Sleep
 from devicebus.master.scan import assign_stations
 from devicebus.sim.eeprom import Eeprom
 from devicebus.wire import sii
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply
 from devicebus.wire.register import EepromControl, Register
-from devicebus.wire.sii import Sii
-from devicebus.wire.siirecord import SiiFixed
+from devicebus.wire.sii import Sii, SiiFixed
 from tests.support.busline import Bench, Line, drive, run, segment, slave
 
 

@@ -3,12 +3,11 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import AlStatusError, BusError, StateTimeoutError, WorkingCounterError
-from devicebus.master.access import DatagramReply
 from devicebus.master.esm import TIMEOUT_NS, acknowledge, change_state, path, read_status
 from devicebus.master.scan import assign_stations
-from devicebus.sim.smcheck import ALLOWED
+from devicebus.sim.slave import ALLOWED
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply
 from devicebus.wire.register import AlStatus
 from tests.support.busline import MS, Bench, Line, drive, run, segment, slave
 

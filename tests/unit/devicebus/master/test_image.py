@@ -1,11 +1,94 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from devicebus.errors import BusError
-from devicebus.master.image import BusImage, kind_of
-from devicebus.master.layout import SlaveShape, lay_out
+from devicebus.master.image import BASE, BusImage, Group, SlaveShape, kind_of, lay_out
+from devicebus.master.link import MAX_DATA
 from devicebus.master.pdo import Channel, Pdo, PdoEntry
+
+
+def channel(number, *bits, is_output, start=0x1100, name=""):
+    entries = tuple(PdoEntry(0x7000, sub, size, name) for sub, size in enumerate(bits, 1))
+    control = 0x64 if is_output else 0x20
+    return Channel(number, start, control, is_output, (Pdo(0x1600, entries),))
+
+
+def shape(station, outputs=(), inputs=(), **options):
+    channels = (channel(2, *outputs, is_output=True), channel(3, *inputs, is_output=False))
+    return SlaveShape(station, channels, **options)
+
+
+def test_outputs_come_first_then_inputs():
+    layout = lay_out([shape(1, (8, 8), (16,)), shape(2, (1, 1), (32,))])
+    assert layout.groups == (Group(BASE, 0, 3, 0, 6),)
+    one, two = layout.places.values()
+    assert (one.outputs, one.outputs_size, one.inputs, one.inputs_size) == (0, 2, 0, 2)
+    assert (two.outputs, two.outputs_size, two.inputs, two.inputs_size) == (2, 1, 2, 4)
+    assert [(f.logical_start - BASE, f.length, f.type) for f in one.fmmus + two.fmmus] == [
+        (0, 2, 2), (3, 2, 1), (2, 1, 2), (5, 4, 1),
+    ]  # fmt: skip
+    assert (layout.outputs_size, layout.inputs_size) == (3, 6)
+
+
+def test_sync_managers_have_the_length_of_their_pdos_and_are_off_without_any():
+    (place,) = lay_out([shape(1, (8, 3), ())]).places.values()
+    (_, outputs), (_, inputs) = place.sync_managers
+    assert (outputs.length, outputs.enable, outputs.watchdog, outputs.direction) == (2, 1, 1, 1)
+    assert (inputs.length, inputs.enable) == (0, 0)
+    assert len(place.fmmus) == 1
+
+
+def test_entries_have_names_and_bits():
+    padded = Pdo(0x1A00, (PdoEntry(0x6000, 1, 1, "a"), PdoEntry(0, 0, 7), PdoEntry(0x6000, 2, 16)))
+    twice = Pdo(0x1A01, (PdoEntry(0x6010, 1, 8, "a"),))
+    channels = (Channel(3, 0x1180, 0x20, False, (padded, twice)),)
+    layout = lay_out([shape(1, (), (8,)), SlaveShape(2, channels)])
+    assert [(v.station, v.name, v.bit_offset, v.bit_length) for v in layout.variables] == [
+        (1, "7000:01", 0, 8), (2, "a", 8, 1), (2, "6000:02", 16, 16), (2, "a 6010:01", 32, 8),
+    ]  # fmt: skip
+
+
+def test_more_than_a_frame_holds_goes_in_several():
+    layout = lay_out([shape(at, (8,) * 200, (8,) * 300) for at in range(1, 7)])
+    assert [group.outputs_size + group.inputs_size for group in layout.groups] == [1000] * 3
+    assert [group.address for group in layout.groups] == [BASE, BASE + 0x800, BASE + 0x1000]
+    assert (layout.groups[1].outputs, layout.groups[1].inputs) == (400, 600)
+    assert layout.places[3].fmmus[1].logical_start == BASE + 0x800 + 400
+
+
+@given(st.lists(st.tuples(st.integers(0, 700), st.integers(0, 700)), max_size=12))
+def test_no_octet_is_used_twice_and_no_slave_is_split(sizes):
+    slaves = [shape(n, (8,) * out, (8,) * into) for n, (out, into) in enumerate(sizes)]
+    layout = lay_out(slaves)
+    used = []
+    for place in layout.places.values():
+        group = layout.groups[place.group]
+        end = group.address + group.outputs_size + group.inputs_size
+        for fmmu in place.fmmus:
+            used += range(fmmu.logical_start, fmmu.logical_start + fmmu.length)
+            assert group.address <= fmmu.logical_start
+            assert fmmu.logical_start + fmmu.length <= end <= group.address + MAX_DATA
+    assert len(used) == len(set(used)) == sum(map(sum, sizes))
+
+
+def test_a_bus_without_process_data_has_none():
+    layout = lay_out([shape(1), SlaveShape(2, ())])
+    assert layout == ({}, (), ())
+
+
+def test_what_cannot_be_laid_out_is_refused():
+    with pytest.raises(BusError, match="slave 5: 1500 octets of process data, expected at most"):
+        lay_out([shape(5, (8,) * 1500)])
+    with pytest.raises(BusError, match="slave 5: 2 sync managers with process data, but 1 FMMUs"):
+        lay_out([shape(5, (8,), (8,), fmmus=1)])
+    one = Pdo(0x1A00, (PdoEntry(0x6000, 1, 8, "a"),))
+    channels = tuple(Channel(n, 0x1100, 0x20, False, (one,)) for n in range(17))
+    with pytest.raises(BusError, match="slave 5: 17 sync managers with process data, but 16"):
+        lay_out([SlaveShape(5, channels, 255)])
+
 
 OUT = (
     PdoEntry(0x7000, 1, 1, "lamp", 0x01),

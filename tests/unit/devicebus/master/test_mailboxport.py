@@ -3,10 +3,9 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError, FrameLostError, WorkingCounterError
-from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted, configure
 from devicebus.master.scan import assign_stations
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from devicebus.wire.register import Register, SyncManager
 from tests.support.busline import Bench, Line, drive, run, segment, slave
 

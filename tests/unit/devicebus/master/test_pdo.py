@@ -14,10 +14,11 @@ from devicebus.master.pdo import (
     read_channels,
     write_choice,
 )
-from devicebus.wire.sii import Sii, SiiPdo
-from devicebus.wire.siirecord import (
+from devicebus.wire.sii import (
+    Sii,
     SiiFixed,
     SiiGeneral,
+    SiiPdo,
     SiiPdoEntry,
     SiiPdoHeader,
     SiiSyncManager,

@@ -4,18 +4,139 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.master.bus import MasterSettings
-from devicebus.master.event import (
+from devicebus.master.bus import (
     BusBack,
     BusLost,
+    MasterSettings,
     SlaveBack,
     SlaveFailed,
     SlaveLeft,
 )
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
+from devicebus.master.procedure import StepReplies
+from devicebus.master.watch import Growth, PortErrorLog, look_around
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command
-from tests.support.busline import MS, Paced, accesses_of, segment, slave
+from devicebus.wire.datagram import Command, DatagramReply
+from eap.codec.mailbox import MailboxType
+from tests.support.busline import MS, Line, Paced, accesses_of, segment, slave
+
+
+class Teller:
+    """A protocol of a slave that has something to say."""
+
+    def __init__(self):
+        self.news = []
+
+    def receive_message(self, data, now_ns):
+        del now_ns
+        return [data]
+
+    def messages_to_send(self, now_ns):
+        del now_ns
+        news, self.news = self.news, []
+        return news
+
+    def reset(self):
+        pass
+
+
+@pytest.fixture
+def paced():
+    paced = Line(Master(), segment(*(slave(f"s{n}") for n in range(17)), slave("x", mailbox=None)))
+    paced.wait(paced.core.bring_up(paced.now_ns, AlState.PREOP))
+    paced.tellers = []
+    for device in paced.segment.slaves[:17]:
+        paced.tellers.append(Teller())
+        device.device.mailbox.protocols[MailboxType.VOE] = paced.tellers[-1]
+    paced.elapse(30 * MS)
+    return paced
+
+
+def heard(paced):
+    events = iter(paced.core.next_event, None)
+    return [(each.station, each.data) for each in events if isinstance(each, Unsolicited)]
+
+
+def test_all_that_is_said_is_heard(paced):
+    for number in (0, 3, 16):
+        paced.tellers[number].news = [b"first", b"second"]
+    paced.elapse(30 * MS)
+    assert sorted(heard(paced)) == [
+        (1001 + number, text) for number in (0, 3, 16) for text in (b"first", b"second")
+    ]
+
+
+def test_a_look_at_seventeen_takes_two_frames(paced):
+    looking = look_around(paced.core._bus)
+    assert len(next(looking)) == 15
+    assert len(looking.send(StepReplies([DatagramReply(b"\0", 1)] * 15, 0))) == 2
+
+
+def test_a_look_that_is_lost_is_made_again(paced):
+    paced.tellers[0].news = [b"here"]
+    first = paced.frames
+    paced.lose_back = lambda number: number < first + 6
+    paced.elapse(400 * MS)
+    assert heard(paced) == [(1001, b"here")]
+
+
+def counters(**at):
+    octets = bytearray(0x14)
+    for name, count in at.items():
+        octets[{"crc0": 0, "rx1": 3, "forwarded2": 10, "lost3": 19}[name]] = count
+    return bytes(octets)
+
+
+def test_port_error_log_first_look_says_nothing_about_times():
+    log = PortErrorLog()
+    log.take(1001, counters(crc0=7), 5)
+    assert log.of(1001) == {}
+
+
+def test_port_error_log_notes_first_and_last_growth_of_each_port():
+    log = PortErrorLog()
+    for now_ns, octets in (
+        (5, counters()),
+        (6, counters(crc0=1)),
+        (7, counters(crc0=1, lost3=1)),
+        (8, counters(crc0=3, lost3=1, forwarded2=9)),
+        (9, counters(crc0=3, lost3=1, forwarded2=9)),
+    ):
+        log.take(1001, octets, now_ns)
+    assert log.of(1001) == {0: Growth(6, 8), 3: Growth(7, 7)}
+
+
+def test_port_error_log_counters_that_were_cleared_end_older_times():
+    log = PortErrorLog()
+    for now_ns, octets in ((5, counters()), (6, counters(crc0=1)), (7, counters())):
+        log.take(1001, octets, now_ns)
+    assert log.of(1001) == {}
+    log.take(1001, counters(rx1=2), 8)
+    assert log.of(1001) == {1: Growth(8, 8)}
+
+
+def test_port_error_log_forgets():
+    log = PortErrorLog()
+    for now_ns in (5, 6):
+        log.take(1001, counters(crc0=now_ns), now_ns)
+    log.clear()
+    assert log.of(1001) == {}
+    log.take(1001, counters(crc0=6), 7)
+    assert log.of(1001) == {}
+
+
+def test_master_reads_error_counters_once_a_second_while_cycles_run():
+    line = Paced(Master(), segment(slave("a"), slave("b")))
+    line.wait(line.core.bring_up(line.now_ns))
+    line.elapse(1_100 * MS)
+    line.segment.slaves[1].esc.memory[0x0300] = 4
+    begun_ns = line.now_ns
+    line.elapse(1_100 * MS)
+    (seen,) = line.core.port_errors.of(1002).values()
+    assert seen.since_ns == seen.until_ns
+    assert 0 < seen.until_ns - begun_ns < 1_010 * MS
+    assert line.core.port_errors.of(1001) == {}
 
 
 @pytest.fixture

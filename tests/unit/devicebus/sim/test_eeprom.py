@@ -7,8 +7,7 @@ import pytest
 from devicebus.sim.eeprom import READ_NS, RELOAD_NS, WRITE_NS, Eeprom
 from devicebus.wire import sii
 from devicebus.wire.register import EepromCommand, EepromControl, Register
-from devicebus.wire.sii import Sii
-from devicebus.wire.siirecord import SiiFixed
+from devicebus.wire.sii import Sii, SiiFixed
 
 IMAGE = sii.encode(
     Sii(fixed=SiiFixed(pdi_control=0x0E08, alias=0x1234, vendor=0xABCDEF01, product=7))

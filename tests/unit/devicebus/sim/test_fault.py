@@ -2,16 +2,217 @@
 
 from __future__ import annotations
 
-import pytest
+import json
+from contextlib import suppress
 
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devicebus.sim import fault as commands
 from devicebus.sim.devices.build import build_slave
-from devicebus.sim.fault import FaultySegment
+from devicebus.sim.fault import SLAVE_FAULTS, FaultySegment, find_entry
 from devicebus.sim.segment import Segment
-from devicebus.sim.spec import FaultKind, FaultSpec
-from devicebus.wire.alstatus import AlState
+from devicebus.sim.spec import (
+    ChannelSpec,
+    DeviceKind,
+    EntrySpec,
+    FaultKind,
+    FaultSpec,
+    ObjectSpec,
+    SlaveSpec,
+)
+from devicebus.wire.alstatus import ERROR, AlState, AlStatusCode
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
-from devicebus.wire.register import Register
-from tests.support.bus import datagram, generic
+from devicebus.wire.register import EepromControl, Register
+from eap.codec.mailbox import MailboxType
+from tests.support.bus import Bench, datagram, generic
+
+UPLOAD = bytes.fromhex("0a00 0000 00 03 0020 40 1810 01 00000000")
+ABORTED = bytes.fromhex("0a00 0000 00 13 0020 80 1810 01 00000006")
+
+
+@pytest.fixture
+def bench():
+    bench = Bench()
+    bench.bring(AlState.PREOP)
+    return bench
+
+
+def switch(bench, kind, *, on=True, **more):
+    spec = FaultSpec(kind=FaultKind(kind), slave="slave", **more)
+    SLAVE_FAULTS[spec.kind](bench.slaves[0], spec, bench.now_ns, on)
+
+
+def test_stuck_mailbox(bench):
+    switch(bench, "mailbox")
+    assert (bench.post(UPLOAD), bench.fetch().wkc, bench.post(UPLOAD)) == (1, 0, 0)
+    switch(bench, "mailbox", on=False)
+    bench.now_ns = 2_000_000
+    bench.status()
+    assert bench.fetch().wkc == 1
+
+
+def test_aborted_object(bench):
+    switch(bench, "sdo", object="0x1018", code=0x06000000)
+    bench.post(UPLOAD)
+    assert bench.fetch().data[:16] == ABORTED
+    switch(bench, "sdo", object="0x1018", on=False)
+    bench.post(UPLOAD)
+    assert bench.fetch().data[8] == 0x43
+
+
+def test_slow_files(bench):
+    server = bench.slaves[0].device.mailbox.protocols[MailboxType.FOE]
+    switch(bench, "foe", delay_us=1500)
+    assert server.packet_time_ns == 1_500_000
+    switch(bench, "foe", on=False)
+    assert server.packet_time_ns == 0
+
+
+def test_refused_files(bench):
+    server = bench.slaves[0].device.mailbox.protocols[MailboxType.FOE]
+    switch(bench, "foe", code=0x8007)
+    (answer,) = server.receive_message(b"\1\0\0\0\0\0firmware.bin", 0)
+    assert answer[:6] == bytes.fromhex("0500 07800000")
+    switch(bench, "foe", on=False)
+    (answer,) = server.receive_message(b"\1\0\0\0\0\0firmware.bin", 0)
+    assert answer[0] == 3
+
+
+def test_files_of_a_slave_without_mailbox_are_not_slow():
+    bench = Bench()
+    bench.slaves[0].device.mailbox = None
+    switch(bench, "foe", delay_us=1500)
+    assert bench.status() == (AlState.INIT, 0)
+
+
+def test_error_of_its_own(bench):
+    switch(bench, "al-error", code=0x8001)
+    assert bench.status() == (AlState.PREOP | ERROR, 0x8001)
+    switch(bench, "al-error", on=False)
+    assert bench.status() == (AlState.PREOP | ERROR, 0x8001)
+
+
+def test_emergency_and_its_end(bench):
+    for on, body in ((True, "1050 01"), (False, "0000 00")):
+        switch(bench, "emergency", on=on, code=0x5010)
+        bench.now_ns += 2_000_000
+        bench.status()
+        assert bench.fetch().data[6:16] == bytes.fromhex("0010") + bytes.fromhex(body) + bytes(5)
+
+
+def test_emergency_needs_coe():
+    bench = Bench()
+    bench.slaves[0].device.mailbox = None
+    switch(bench, "emergency", code=0x5010)
+    assert bench.status() == (AlState.INIT, 0)
+
+
+def test_refused_state(bench):
+    switch(bench, "refuse", state="INIT")
+    bench.ask(AlState.INIT)
+    assert bench.status() == (AlState.PREOP | ERROR, AlStatusCode.UNSPECIFIED)
+    switch(bench, "refuse", state="INIT", on=False)
+    bench.ask(AlState.INIT)
+    assert bench.status() == (AlState.INIT, 0)
+
+
+def test_drift(bench):
+    clock = bench.slaves[0].esc.clock
+    clock.local_time(0)
+    switch(bench, "drift", drift_ppm=100.0)
+    assert clock.local_time(10**9) == 10**9 + 10**5
+    bench.now_ns = 10**9
+    switch(bench, "drift", on=False)
+    assert clock.local_time(2 * 10**9) == 2 * 10**9 + 10**5
+
+
+def test_emergency_of_an_axis_is_a_fault_of_it():
+    bench = Bench(SlaveSpec(name="slave", kind=DeviceKind.DRIVE, axes=2))
+    switch(bench, "emergency", code=0x7500, axis=1)
+    dictionary = bench.slaves[0].device.dictionary
+    assert [dictionary.entry(index, 0).value for index in (0x603F, 0x683F)] == [0, 0x7500]
+    switch(bench, "emergency", code=0x7500, axis=1, on=False)
+    assert dictionary.entry(0x6841, 0).value & 0x6F == 8
+
+
+def test_pdo_that_nobody_asked_for(bench):
+    bench.slaves[0].device.dictionary.entry(0x6000, 1).value = 0x1234
+    switch(bench, "tx-pdo", object="0x1A00")
+    bench.now_ns += 2_000_000
+    bench.status()
+    assert bench.fetch().data[6:11] == bytes.fromhex("0040 3412 00")
+    for object_, on in (("0x1A07", True), ("0x1A00", False)):
+        switch(bench, "tx-pdo", object=object_, on=on)
+        bench.now_ns += 2_000_000
+        bench.status()
+        assert bench.fetch().wkc == 0
+
+
+def test_slow_and_broken_eeprom(bench):
+    def take_ns():
+        bench.write(0x0502, bytes.fromhex("0001 08000000"))
+        for wait_us in range(0, 5000, 50):
+            bench.now_ns += 50_000
+            status = EepromControl.decode(bench.read(0x0502, 2).data)
+            if not status.busy:
+                return wait_us, status.command_error
+        return None
+
+    assert take_ns() == (0, 0)
+    switch(bench, "eeprom", delay_us=1000)
+    assert take_ns() == (1000, 0)
+    switch(bench, "eeprom")
+    assert take_ns() == (0, 1)
+    switch(bench, "eeprom", on=False)
+    assert take_ns() == (0, 0)
+
+
+@pytest.fixture
+def device():
+    entries = (EntrySpec(subindex=2, name="gain", type="UINT"),
+               EntrySpec(subindex=3, name="twice", type="UINT"))  # fmt: skip
+    return build_slave(
+        generic(
+            objects=(
+                ObjectSpec(index=0x8000, name="settings", entries=entries),
+                ObjectSpec(index=0x8001, name="twice", type="UINT"),
+            )
+        )
+    ).device
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("level", (0x6000, 1)),
+        ("valve", (0x7000, 2)),
+        ("gain", (0x8000, 2)),
+        ("0x8000:3", (0x8000, 3)),
+        ("8001", (0x8001, 0)),
+        ("8000:03", (0x8000, 3)),
+    ],
+)
+def test_entry_is_found(device, text, place):
+    assert find_entry(device, text) == place
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("speeed", "no entry 'speeed' .inputs and outputs: level, limit, speed, valve"),
+        ("twice", "several entries 'twice': 0x8000:03, 0x8001:00"),
+        ("0x8000:9", "no entry 0x8000:09"),
+        ("0x9000", "no entry 0x9000:00"),
+        ("0xZZ", "is not INDEX.:SUB. in hexadecimal"),
+        ("", "no entry ''"),
+    ],
+)
+def test_entry_is_not_found(device, text, reason):
+    with pytest.raises(ValueError, match=reason):
+        find_entry(device, text)
+
 
 MS = 1_000_000
 
@@ -151,3 +352,104 @@ def test_fault_that_cannot_be(spec, message):
         make(spec)
     with pytest.raises(ValueError, match=message):
         make().begin(spec, 0)
+
+
+SET = b'{"set": {"slave": "slave", "entry": "limit", "value": true}}'
+RELEASE = b'{"release": {"slave": "slave", "entry": "limit"}}'
+
+
+def obey(faulty, octets, now_ns):
+    commands.obey(faulty, json.loads(octets), now_ns)
+
+
+@pytest.fixture
+def commanded():
+    inputs = (ChannelSpec(name="limit", values=(0,)), ChannelSpec(name="echo", follows="valve"))
+    return Bench(generic(inputs=inputs, outputs=(ChannelSpec(name="valve"),)))
+
+
+def inputs(commanded):
+    return commanded.cycle().data[1]
+
+
+def test_input_is_what_it_was_set_to_until_it_is_released(commanded):
+    faulty = FaultySegment(commanded.segment)
+    commanded.bring(AlState.OP)
+    assert inputs(commanded) == 0
+    obey(faulty, SET, commanded.now_ns)
+    assert [inputs(commanded) for _ in range(3)] == [1, 1, 1]
+    obey(faulty, RELEASE, commanded.now_ns)
+    assert inputs(commanded) == 0
+
+
+def test_slave_that_does_not_run_yet_has_the_value_when_it_does(commanded):
+    faulty = FaultySegment(commanded.segment)
+    obey(faulty, SET, 0)
+    commanded.bring(AlState.OP)
+    assert inputs(commanded) == 1
+
+
+def test_output_is_set_for_the_device_too(commanded):
+    faulty = FaultySegment(commanded.segment)
+    commanded.bring(AlState.OP)
+    obey(faulty, SET.replace(b"limit", b"valve"), 0)
+    assert inputs(commanded) == 2
+    assert inputs(commanded) == 2
+
+
+def test_faults_begin_and_end(commanded):
+    faulty = FaultySegment(commanded.segment)
+    obey(faulty, b'{"kind": "power", "slave": "slave"}', 0)
+    assert not commanded.slaves[0].is_powered
+    obey(faulty, b'{"kind": "power", "slave": "slave", "end": true}', 0)
+    assert commanded.slaves[0].is_powered
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (b"[]", "a JSON object"),
+        (b"3", "a JSON object"),
+        (b"{}", "kind"),
+        (b'{"kind": "loss", "evry": 2}', "no key 'evry' .one of kind, .*every.*, end"),
+        (b'{"kind": "power", "slave": "x"}', "no slave 'x'"),
+        (SET.replace(b'"slave": "slave"', b'"slave": "x"'), "no slave 'x' .one of slave"),
+        (SET.replace(b"limit", b"limt"), "no entry 'limt'"),
+        (SET.replace(b"true", b'"on"'), "is not a value of BOOL"),
+        (SET.replace(b"true", b"null"), "value"),
+        (RELEASE, "limit was not set"),
+        (b'{"set": {}}', "slave"),
+        (b'{"tx": 1, "kind": "tx-pdo"}', "tx"),
+        (b'{"kind": "tx-pdo", "slave": "slave", "object": "0x1600"}', "is no TxPDO"),
+    ],
+)
+def test_refusals(commanded, command, reason):
+    with pytest.raises(ValueError, match=reason):
+        obey(FaultySegment(commanded.segment), command, 0)
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3),
+    max_leaves=3,
+)
+
+
+@given(
+    st.sampled_from(("limit", "valve", "0x1008", "0x1018:1", "0x1A00:0", "0x7000:0")),
+    VALUES,
+    st.sampled_from(FaultKind),
+)
+def test_nothing_but_value_errors(entry, value, kind):
+    commanded = Bench(generic())
+    faulty = FaultySegment(commanded.segment)
+    commands = (
+        {"set": {"slave": "slave", "entry": entry, "value": value}},
+        {"release": {"slave": "slave", "entry": value}},
+        {"kind": kind.value, "slave": "slave", "object": entry, "code": value},
+        value,
+    )
+    for command in commands:
+        with suppress(ValueError):
+            obey(faulty, json.dumps(command).encode(), 0)
+    faulty.receive_frame(bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")])), 10**9)

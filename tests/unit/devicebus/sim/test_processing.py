@@ -12,8 +12,7 @@ from devicebus.sim.processing import Chain
 from devicebus.wire import sii
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
 from devicebus.wire.register import Fmmu
-from devicebus.wire.sii import Sii
-from devicebus.wire.siirecord import SiiFixed
+from devicebus.wire.sii import Sii, SiiFixed
 from tests.support.bus import datagram, send
 from tests.support.vectors import load_datagrams
 

@@ -4,11 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from devicebus.wire import datagram
 from devicebus.wire.datagram import (
     OVERHEAD,
     Command,
     Datagram,
     DatagramHeader,
+    DatagramRequest,
     encode_frame,
     iter_datagrams,
 )
@@ -98,3 +100,26 @@ def test_other_frame_type_is_malformed() -> None:
 def test_frame_that_cannot_be_is_refused(items: list[Datagram]) -> None:
     with pytest.raises(CodecError):
         encode_frame(items)
+
+
+def test_positions_count_down_on_their_way():
+    assert datagram.aprd(0, 0x10, 2) == DatagramRequest(Command.APRD, 0, 0x10, b"\0\0")
+    assert datagram.apwr(2, 0x10, b"ab") == DatagramRequest(Command.APWR, 0xFFFE, 0x10, b"ab")
+
+
+def test_stations_and_broadcasts():
+    assert datagram.fprd(1001, 0x130, 2, tries=1) == DatagramRequest(
+        Command.FPRD, 1001, 0x130, b"\0\0", 1
+    )
+    assert datagram.fpwr(1001, 0x120, b"\1\0") == DatagramRequest(
+        Command.FPWR, 1001, 0x120, b"\1\0", 0
+    )
+    assert datagram.brd(0, 1) == DatagramRequest(Command.BRD, 0, 0, b"\0")
+    assert datagram.bwr(0x120, b"\1") == DatagramRequest(Command.BWR, 0, 0x120, b"\1")
+
+
+def test_what_ages_is_sent_once():
+    assert datagram.frmw(1001, 0x910, 8) == DatagramRequest(Command.FRMW, 1001, 0x910, bytes(8), 1)
+    assert datagram.logical(Command.LRW, 0x12345678, b"x") == DatagramRequest(
+        Command.LRW, 0x5678, 0x1234, b"x", 1
+    )

@@ -6,8 +6,7 @@ import pytest
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import MailboxRequest
-from devicebus.master.access import DatagramReply, DatagramRequest, fprd
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, fprd
 from eap.codec.mailbox import MailboxType
 from eap.control.bus import (
     BUS_TRANSFER,

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.master.event import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
+from devicebus.master.bus import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
 from devicebus.master.mailboxes import Unsolicited
 from eap.codec.mailbox import MailboxType
 from eap.engine.engine_bus import FaultCounts, SlaveFaults

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from devicebus.master.layout import Layout, Variable
+from devicebus.master.image import Layout, Variable
 from eap.engine.bus_mapping import BusPlanner
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (

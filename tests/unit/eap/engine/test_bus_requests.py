@@ -10,10 +10,9 @@ import pytest
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import MailboxRequest
-from devicebus.master.access import AS_SET, DatagramRequest
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import AS_SET, Command, DatagramRequest
 from devicebus.wire.register import Register
 from eap.codec.mailbox import MailboxType
 from eap.engine.bus_requests import (

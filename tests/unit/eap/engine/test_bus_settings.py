@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.master.expected import ExpectedSlave
-from devicebus.master.link import RETRIES
-from devicebus.master.roundtrip import CEILING_NS
+from devicebus.master.link import CEILING_NS, RETRIES
+from devicebus.master.scan import ExpectedSlave
 from eap.engine.engine_buses import master_settings
 from eap.pd.spec import BusPortSpec, BusSlaveSpec, PortKind, PortSpec
 from tests.support.cyclic import MS

@@ -6,7 +6,7 @@ import pytest
 
 from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox import coe_client, foe_client, soe_client, voe_client
+from devicebus.mailbox import coe_client, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
@@ -18,7 +18,7 @@ REQUEST = bytes.fromhex("10 50 0a00 e903 00 13 0020 40 1810 01 00000000")
 REPLY = bytes.fromhex("10 50 0a00 e903 00 23 0030 43 1810 01 02000000")
 REFUSED = bytes.fromhex("0a50 0400 e903 00 00 0100 0200")
 UPLOAD = next(coe_client.upload(0x1018, 1))
-VENDOR = next(voe_client.exchange(1, 2, b"a"))
+VENDOR = next(voe.exchange(1, 2, b"a"))
 READ = next(foe_client.read("f", bytes, MailboxSizes()))
 TIMEOUT_NS, TRIES = 100, 3
 
@@ -101,7 +101,7 @@ def test_request_without_a_reply_is_sent_again_and_ends_with_a_timeout(core) -> 
 
 
 def test_request_that_expects_no_reply_ends_when_it_is_sent(core) -> None:
-    request = begin(core, next(voe_client.send(1, 2, b"x")))
+    request = begin(core, next(voe.send(1, 2, b"x")))
     assert len(core.frames_to_send(0)) == 1
     assert request.result().data == b""
 

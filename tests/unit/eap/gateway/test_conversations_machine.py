@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox import coe_client, foe_client, voe_client
+from devicebus.mailbox import coe_client, foe_client, voe
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import (
@@ -135,7 +135,7 @@ class Run:
             "missing": lambda: coe_client.upload(MISSING, 0),
             "write": lambda: coe_client.download(SHORT, 0, self.data, SIZES),
             "file": lambda: foe_client.read("f", self.file.extend, SIZES),
-            "vendor": lambda: voe_client.exchange(5, 1, self.data),
+            "vendor": lambda: voe.exchange(5, 1, self.data),
         }[kind]()
 
     def check(self) -> None:

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from devicebus.errors import MailboxProtocolError
-from devicebus.mailbox.coeinfo_client import entry_description
+from devicebus.mailbox.coe_client import entry_description
 from eap.codec import datatypes
 from eap.errors import ConfigError
 from eap.od.abort import AbortCode, SdoAbortError
@@ -127,7 +127,7 @@ def test_dump_goes_on_behind_a_description_that_makes_no_sense(bus, monkeypatch)
             raise MailboxProtocolError("InfoError at offset 6: needs 4 octets, but 0 follow")
         return (yield from entry_description(index, subindex))
 
-    monkeypatch.setattr("devicebus.mailbox.coeinfo_client.entry_description", short_answer)
+    monkeypatch.setattr("devicebus.mailbox.coe_client.entry_description", short_answer)
     rows = {(row.index, row.subindex): row for row in dump_entries(bus, "sensor")}
     assert "needs 4 octets" in rows[0x8000, 1].error
     assert rows[0x8000, 2].value == 1000

@@ -6,9 +6,8 @@ import msgspec
 import pytest
 
 from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
-from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
 from eap.runtime.bus_errors import ErrorRecord
 from eap.runtime.bus_request import (

@@ -17,9 +17,8 @@ import pytest
 
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.fault import FaultySegment
-from devicebus.sim.segment import Segment
+from devicebus.sim.segment import Segment, Side
 from devicebus.sim.spec import BusSpec
-from devicebus.sim.wiring import Side
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
 from eap.ids import InterfaceUri
 from eap.runtime.busfile import Bus

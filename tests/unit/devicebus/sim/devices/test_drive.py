@@ -3,12 +3,85 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from devicebus.sim.devices.drive import FOLLOWING_ERROR, Axes, Drive, complete
+from devicebus.errors import SoeError
+from devicebus.sim.devices.drive import (
+    FOLLOWING_ERROR,
+    TRANSITIONS,
+    Axes,
+    Drive,
+    DriveCommand,
+    DriveState,
+    DriveStateMachine,
+    command_of,
+    complete,
+    parameters,
+)
 from devicebus.sim.devices.objects import build_dictionary
 from devicebus.sim.spec import ChannelSpec, DeviceKind, ObjectSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
+from eap.codec.soe import Element
 from eap.od.model import OdState
+
+
+@pytest.mark.parametrize(
+    ("word", "command"),
+    [
+        (0x0000, DriveCommand.DISABLE_VOLTAGE), (0x000D, DriveCommand.DISABLE_VOLTAGE),
+        (0x0002, DriveCommand.QUICK_STOP), (0x000B, DriveCommand.QUICK_STOP),
+        (0x0006, DriveCommand.SHUTDOWN), (0x000E, DriveCommand.SHUTDOWN),
+        (0x0007, DriveCommand.SWITCH_ON), (0x000F, DriveCommand.ENABLE),
+        (0x010F, DriveCommand.ENABLE),
+    ],
+)  # fmt: skip
+def test_control_word(word, command):
+    assert command_of(word) is command
+
+
+def test_way_to_enabled_and_its_status_words():
+    machine = DriveStateMachine()
+    seen = [machine.status_word & 0x6F]
+    for word in (0x06, 0x07, 0x0F):
+        machine.control(word)
+        seen.append(machine.status_word & 0x6F)
+    assert seen == [0x40, 0x21, 0x23, 0x27]
+    assert machine.is_enabled
+    machine.control(0x02)
+    assert machine.state is DriveState.QUICK_STOP_ACTIVE
+    machine.control(0x0F)
+    assert machine.is_enabled
+    machine.control(0x00)
+    assert machine.state is DriveState.SWITCH_ON_DISABLED
+
+
+def test_enable_alone_does_not_switch_on():
+    machine = DriveStateMachine()
+    machine.control(0x0F)
+    assert machine.state is DriveState.SWITCH_ON_DISABLED
+
+
+def test_fault_is_left_by_the_edge_only():
+    machine = DriveStateMachine()
+    machine.control(0x80)
+    machine.process(DriveCommand.FAULT)
+    for word in (0x80, 0x06, 0x0F):
+        machine.control(word)
+        assert machine.state is DriveState.FAULT
+    machine.control(0x8F)
+    assert machine.state is DriveState.SWITCH_ON_DISABLED
+
+
+@given(st.lists(st.integers(0, 0xFFFF), max_size=20))
+def test_any_words_lead_to_a_known_state(words):
+    machine = DriveStateMachine()
+    for word in words:
+        before = machine.state
+        machine.control(word)
+        assert machine.state is before or machine.state in TRANSITIONS.values()
+        assert machine.status_word & 0x0210 == 0x0210
+
 
 MS = 1_000_000
 
@@ -150,3 +223,83 @@ def test_axes_have_objects_and_pdos_of_their_own():
         axes.step(AlState.OP, number)
     assert [status(drive) for drive in axes.drives] == [0x40, 0x27]
     assert dictionary.entry(0x6841, 0).value & 0x6F == 0x27
+
+
+@pytest.fixture
+def idn_drive():
+    return Drive(build_dictionary(complete(SlaveSpec(name="d", kind=DeviceKind.DRIVE)), 0x20192))
+
+
+@pytest.fixture
+def idns(idn_drive):
+    return {str(each.idn): each for each in parameters(idn_drive, "1.2")}
+
+
+def read(idns, idn):
+    return idns[idn].read(Element.VALUE, 0)
+
+
+def write(idns, idn, data, now_ns=0, state=OdState.PREOP):
+    idns[idn].write(Element.VALUE, data, state, now_ns)
+
+
+def test_operation_mode_has_four_octets(idns):
+    assert read(idns, "S-0-0032") == b"\2\0\0\0"
+    write(idns, "S-0-0032", b"\1\0\0\0")
+    assert read(idns, "S-0-0032") == b"\1\0\0\0"
+
+
+def test_lists(idns):
+    assert read(idns, "S-0-0016") == bytes.fromhex("0400 2000 8700 3300")
+    assert read(idns, "S-0-0024") == bytes.fromhex("0400 2000 8600 2f00")
+    assert read(idns, "S-0-0030").endswith(b"1.2")
+
+
+def test_master_control_word_switches_the_axis(idn_drive, idns):
+    assert read(idns, "S-0-0135") == b"\0\0"
+    write(idns, "S-0-0134", b"\0\0")
+    assert read(idns, "S-0-0135") == b"\0\x40"
+    write(idns, "S-0-0134", b"\0\xe0")
+    assert read(idns, "S-0-0135") == b"\0\xc0"
+    assert idn_drive.machine.is_enabled
+    write(idns, "S-0-0134", b"\0\x60")
+    assert not idn_drive.machine.is_enabled
+
+
+def test_set_points_and_feedback_are_those_of_coe(idn_drive, idns):
+    write(idns, "S-0-0047", (77).to_bytes(4, "little"))
+    write(idns, "S-0-0134", b"\0\xe0")
+    idn_drive.step(AlState.OP, 0)
+    assert read(idns, "S-0-0051") == (77).to_bytes(4, "little")
+    assert idn_drive.entry(0x607A).value == 77
+    with pytest.raises(SoeError) as caught:
+        write(idns, "S-0-0051", bytes(4))
+    assert caught.value.code == 0x7004
+
+
+def test_fault_is_reset_by_a_procedure(idn_drive, idns):
+    idn_drive.fail(0x7500)
+    assert read(idns, "S-0-0135") == b"\0\x20"
+    write(idns, "S-0-0099", b"\3\0")
+    assert idns["S-0-0099"].read(Element.DATA_STATE, 1000) == b"\7\0"
+    assert idns["S-0-0099"].read(Element.DATA_STATE, 10_000_000) == b"\3\0"
+    assert read(idns, "S-0-0135") == b"\0\0"
+
+
+def test_homing_takes_its_time_and_an_axis_that_is_on(idn_drive, idns):
+    with pytest.raises(SoeError) as caught:
+        write(idns, "S-0-0148", b"\3\0")
+    assert caught.value.code == 0x7012
+    write(idns, "S-0-0134", b"\0\xe0")
+    idn_drive.entry(0x6064).value = idn_drive.entry(0x607A).value = 900
+    write(idns, "S-0-0148", b"\3\0")
+    assert idns["S-0-0148"].read(Element.DATA_STATE, 49_999_999) == b"\7\0"
+    assert idns["S-0-0148"].read(Element.DATA_STATE, 50_000_000) == b"\3\0"
+    assert read(idns, "S-0-0051") == bytes(4)
+
+
+def test_homing_of_an_axis_that_is_switched_off_fails(idn_drive, idns):
+    write(idns, "S-0-0134", b"\0\xe0")
+    write(idns, "S-0-0148", b"\3\0")
+    write(idns, "S-0-0134", b"\0\0")
+    assert idns["S-0-0148"].read(Element.DATA_STATE, 50_000_000) == b"\x0f\0"

@@ -3,12 +3,105 @@
 from __future__ import annotations
 
 import pytest
+from defusedxml import ElementTree
 
 from devicebus.sim.devices.build import build_slave
-from devicebus.sim.devices.esi import complete
-from devicebus.sim.spec import DeviceKind, SlaveSpec
+from devicebus.sim.devices.esi import complete, number, objects, type_of
+from devicebus.sim.spec import AccessKind, DeviceKind, SlaveSpec
 from devicebus.wire import sii
 from tests.support.terminals import DI4, DI8, DO8, esi
+
+DICTIONARY_XML = """
+<Device><Profile><Dictionary>
+  <DataTypes>
+    <DataType><Name>DT8000</Name><BitSize>88</BitSize>
+      <SubItem><SubIdx>0</SubIdx><Name>SubIndex 000</Name><Type>USINT</Type>
+        <BitSize>8</BitSize></SubItem>
+      <SubItem><SubIdx>1</SubIdx><Name>Filter</Name><Type>DT0800EN16</Type><BitSize>16</BitSize>
+        <Flags><Access WriteRestrictions="PreOP">rw</Access></Flags></SubItem>
+      <SubItem><SubIdx>17</SubIdx><Name>Scale</Name><Type>REAL</Type><BitSize>32</BitSize>
+        <Flags><Access>ro</Access></Flags></SubItem>
+      <SubItem><SubIdx>18</SubIdx><Name>Flags</Name><Type>BITARR4</Type><BitSize>4</BitSize></SubItem>
+    </DataType>
+    <DataType><Name>DT0800EN16</Name><BaseType>UINT</BaseType><BitSize>16</BitSize></DataType>
+    <DataType><Name>DT8010ARR</Name><BaseType>INT</BaseType><BitSize>48</BitSize>
+      <ArrayInfo><LBound>1</LBound><Elements>3</Elements></ArrayInfo></DataType>
+    <DataType><Name>DT8010</Name><BitSize>64</BitSize>
+      <SubItem><SubIdx>0</SubIdx><Name>SubIndex 000</Name><Type>USINT</Type>
+        <BitSize>8</BitSize></SubItem>
+      <SubItem><Name>Elements</Name><Type>DT8010ARR</Type><BitSize>48</BitSize>
+        <Flags><Access>ro</Access></Flags></SubItem>
+    </DataType>
+    <DataType><Name>DT8011</Name><BitSize>64</BitSize>
+      <SubItem><Name>Elements</Name><Type>DTmissing</Type><BitSize>48</BitSize></SubItem></DataType>
+  </DataTypes>
+  <Objects>
+    <Object><Index>#x1018</Index><Name>Identity</Name><Type>DT1018</Type><BitSize>144</BitSize></Object>
+    <Object><Index>#x8000</Index><Name>Settings</Name><Type>DT8000</Type><BitSize>88</BitSize>
+      <Info>
+        <SubItem><Name>Filter</Name><Info><DefaultData>3412</DefaultData></Info></SubItem>
+        <SubItem><Name>Scale</Name><Info><DefaultData>0000803f</DefaultData></Info></SubItem>
+        <SubItem><Name>Flags</Name><Info><DefaultValue>99</DefaultValue></Info></SubItem>
+      </Info></Object>
+    <Object><Index>#x8010</Index><Name>Table</Name><Type>DT8010</Type><BitSize>64</BitSize></Object>
+    <Object><Index>#x8012</Index><Name>Text</Name><Type>STRING(4)</Type><BitSize>32</BitSize>
+      <Info><DefaultString>abc</DefaultString></Info></Object>
+    <Object><Index>#x8013</Index><Name>Count</Name><Type>UDINT</Type><BitSize>32</BitSize>
+      <Info><DefaultValue>#x10</DefaultValue></Info><Flags><Access>wo</Access></Flags></Object>
+    <Object><Index>#x8014</Index><Name>Mode</Name><Type>DT0800EN16</Type><BitSize>16</BitSize>
+      <Info><DefaultData>zz</DefaultData></Info></Object>
+    <Object><Index>#x8015</Index><Name>Unknown</Name><Type>DT9999</Type><BitSize>16</BitSize></Object>
+  </Objects>
+</Dictionary></Profile></Device>
+"""
+
+
+@pytest.fixture(scope="module")
+def found():
+    return {each.index: each for each in objects(ElementTree.fromstring(DICTIONARY_XML))}
+
+
+def test_what_every_slave_makes_itself_and_unknown_types_are_left_out(found):
+    assert sorted(found) == [0x8000, 0x8010, 0x8012, 0x8013, 0x8014]
+
+
+def test_record(found):
+    assert [
+        (each.subindex, each.name, each.type, each.value, each.access)
+        for each in found[0x8000].entries
+    ] == [
+        (1, "Filter", "UINT", 0x1234, AccessKind.CONFIGURATION),
+        (17, "Scale", "REAL", 1.0, AccessKind.READ),
+        (18, "Flags", "BIT4", None, AccessKind.READ_WRITE),
+    ]
+
+
+def test_array(found):
+    assert [(each.subindex, each.type, each.access) for each in found[0x8010].entries] == [
+        (sub, "INT", AccessKind.READ) for sub in (1, 2, 3)
+    ]
+
+
+def test_variables(found):
+    assert [(found[i].type, found[i].value, found[i].access) for i in (0x8012, 0x8013, 0x8014)] == [
+        ("STRING(4)", "abc", AccessKind.READ_WRITE),
+        ("UDINT", 16, AccessKind.WRITE),
+        ("UINT", None, AccessKind.READ_WRITE),
+    ]
+
+
+@pytest.mark.parametrize(("text", "value"), [("#x1A00", 0x1A00), (" 12 ", 12), ("#X0f", 15)])
+def test_numbers(text, value):
+    assert number(text) == value
+
+
+@pytest.mark.parametrize(
+    ("name", "bits", "kind"),
+    [("INT", 16, "INT"), ("INT", 32, "UDINT"), ("", 3, "BIT3"), ("DT1", 24, "BLOCK(3)")],
+)
+def test_types(name, bits, kind):
+    assert type_of(name, bits) == kind
+
 
 XML = b"""<?xml version="1.0"?>
 <EtherCATInfo>

@@ -6,8 +6,7 @@ import logging
 
 import pytest
 
-from devicebus.master.access import DatagramReply, DatagramRequest, brd
-from devicebus.wire.datagram import Command
+from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, brd
 from eap.ads.master import SlaveState
 from eap.ads.operation import AdsRefusedError, DeleteNotification, WriteControl
 from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup

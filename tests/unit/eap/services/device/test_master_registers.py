@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.services.device.master_registers import (
     LOOPS,
     SlaveRegisters,

@@ -14,8 +14,7 @@ from devicebus.errors import (
     MailboxTimeoutError,
     SoeError,
 )
-from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write

@@ -11,8 +11,7 @@ from devicebus.errors import SoeError
 from devicebus.mailbox import soe_client
 from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.mailbox.soe_parameter import SoeParameter
-from devicebus.mailbox.soe_server import SoeServer
+from devicebus.mailbox.soe_server import SoeParameter, SoeServer
 from eap.ads.answer import AmsAnswer
 from eap.ads.operation import Read, ReadWrite, Write
 from eap.ads.query import encode_query

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from devicebus.mailbox import coe_client, coeinfo_client
+from devicebus.mailbox import coe_client
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.operation import Write
@@ -152,14 +152,14 @@ def test_object_codec_is_given_up_by_an_abort() -> None:
 def test_object_codec_describes_objects_without_a_transfer() -> None:
     async def scene(codec: ObjectCodec, mailbox: MemoryMailbox) -> None:
         running: list[bool] = []
-        assert await lead(codec, coeinfo_client.object_list(), running) == [TEXT, NUMBER]
-        found = await lead(codec, coeinfo_client.object_description(TEXT), running)
+        assert await lead(codec, coe_client.object_list(), running) == [TEXT, NUMBER]
+        found = await lead(codec, coe_client.object_description(TEXT), running)
         assert found.name == "Text"
-        entry = await lead(codec, coeinfo_client.entry_description(NUMBER, 0), running)
+        entry = await lead(codec, coe_client.entry_description(NUMBER, 0), running)
         assert entry.bit_length == 32
         assert not any(running)
         with pytest.raises(SdoAbortError) as refused:
-            await lead(codec, coeinfo_client.object_description(0x5555))
+            await lead(codec, coe_client.object_description(0x5555))
         assert refused.value.code == AbortCode.NO_OBJECT
 
     play(scene)

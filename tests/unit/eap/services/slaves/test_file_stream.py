@@ -9,8 +9,7 @@ import pytest
 
 from devicebus.errors import BusError, FoeError, MailboxClosedError
 from devicebus.mailbox.conversation import MailboxMessage
-from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
