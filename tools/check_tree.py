@@ -3,7 +3,7 @@
 Rules: the top level holds only what ``docs/architecture.md`` allows; modules stay under 700 lines;
 ``tests/unit`` and ``tests/tools`` hold test files, in folders named after what they test;
 nothing that is true of one machine only is committed; unfinished work names its issue; tasks have
-an owner that keeps and reports them; the files that pages in ``docs/`` name exist.
+an owner that keeps and reports them; the files and modules that pages name exist.
 
     python tools/check_tree.py [ROOT]
 
@@ -60,6 +60,9 @@ FORBIDDEN = (
 )
 UNFINISHED = re.compile(r"\b(?:TO[D]O|FIX[M]E)\b(?!\W{0,3}#\d)")
 NAMED = re.compile(r"`((?:tests|config|eap|devicebus|docs|tools)/[\w./-]*\w)/?`")
+MODULE = re.compile(r"`((?:eap|devicebus)(?:\.[A-Za-z_]\w*)+)`")
+PAGES = ("CONTRIBUTING.md", "README.md")
+"""Pages beside those in ``docs/``."""
 LOOSE_TASK = re.compile(r"(?<!group)\.create_task\(|\bensure_future\(")
 TASKS = ("services", "tasks.py")
 """The module that may start tasks, whatever package services is in."""
@@ -123,7 +126,7 @@ def check(root: Path) -> list[Violation]:
         if b"\0" not in data:
             text = data.decode(errors="replace")
             found += check_text(name, text)
-            if name.suffix == ".md" and name.parts[0] == "docs":
+            if name.suffix == ".md" and name.parts[0] in {"docs", *PAGES}:
                 found += check_named(root, name, text)
     return sorted(found)
 
@@ -167,11 +170,24 @@ def check_text(name: PurePosixPath, text: str) -> Iterator[Violation]:
 
 
 def check_named(root: Path, page: PurePosixPath, text: str) -> Iterator[Violation]:
-    """Yield the files and folders of the tree that a page names and that do not exist."""
+    """Yield the files, folders and modules that a page names and that do not exist."""
     for number, line in enumerate(text.splitlines(), 1):
         for match in NAMED.finditer(line):
             if not (root / match[1]).exists():
                 yield Violation(page, number, f"{match[1]} does not exist", "where it is now")
+        for match in MODULE.finditer(line):
+            if not _is_module(root, match[1]):
+                yield Violation(page, number, f"no module {match[1]}", "where it is now")
+
+
+def _is_module(root: Path, name: str) -> bool:
+    """Return whether *name* is a module, a package, or a name in one of them."""
+    path = root / name.replace(".", "/")
+    if path.is_dir() or path.with_suffix(".py").is_file():
+        return True
+    definition = re.compile(rf"^(?:def|class) {path.name}\b|^{path.name}\b *[:=]", re.MULTILINE)
+    owners = (path.parent.with_suffix(".py"), path.parent / "__init__.py")
+    return any(each.is_file() and definition.search(each.read_text()) for each in owners)
 
 
 def main(arguments: list[str]) -> int:

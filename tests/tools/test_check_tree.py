@@ -58,6 +58,19 @@ def test_pages_name_files_that_exist(tmp_path):
     ]
 
 
+def test_pages_name_modules_that_exist(tmp_path):
+    grow(tmp_path, "eap/pd/image.py", text="LIMIT = 1\n\nclass Image: ...\n\ndef open_it(): ...\n")
+    grow(tmp_path, "eap/__init__.py", text="def attach(): ...\n")
+    text = "`eap.pd`, `eap.pd.image`, `eap.pd.image.Image`, `eap.pd.image.LIMIT`, `eap.attach`\n"
+    grow(
+        tmp_path, "CONTRIBUTING.md", text=text + "`eap.pd.gone`, `eap.pd.image.Gone`, `devicebus.x`"
+    )
+    assert found(tmp_path) == [
+        f"CONTRIBUTING.md:2: no module {name}, expected where it is now"
+        for name in ("devicebus.x", "eap.pd.gone", "eap.pd.image.Gone")
+    ]
+
+
 def test_unit_test_in_a_folder_of_no_package_is_reported(tmp_path):
     grow(
         tmp_path, "eap/pd/a.py", "tests/unit/eap/pd/test_several.py", "tests/unit/eap/od/test_a.py"
