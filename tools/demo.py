@@ -24,8 +24,7 @@ from typing import Any, NamedTuple
 from rich.console import Group, RenderableType
 
 import eap
-from eap.cli.output import repaint
-from eap.cli.table import Column, Styled, TextTable, duration
+from eap.cli.output import Column, Styled, TextTable, duration, repaint
 from eap.errors import EapError
 from eap.runtime.attach import AttachedStation
 

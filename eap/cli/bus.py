@@ -9,14 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.bus_place import BusCommand, Place, StationBus, bus_options, open_session
 from eap.cli.group import LazyGroup
 from eap.cli.output import Renderer
 from eap.cli.params import (
+    BusCommand,
     CommandT,
+    Place,
+    StationBus,
+    bus_options,
     examples,
     json_option,
     number_up_to,
+    open_session,
     parse_entry,
     parse_octets,
     parse_type,

@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import UNSET
 
-from eap.cli.table import Column, Styled, TextTable, count, duration
+from eap.cli.output import Column, Styled, TextTable, count, duration
 from eap.ids import ObjectId
 from eap.ops.bus_info import (
     BusScan,

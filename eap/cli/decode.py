@@ -17,8 +17,7 @@ from eap.cli.params import json_option
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from eap.ops.capture import Packet
-    from eap.ops.decode import DecodedAms, DecodedDatagram, DecodedFrame
+    from eap.ops.decode import DecodedAms, DecodedDatagram, DecodedFrame, Packet
 
 _NAMES = {
     1: "datagrams",
@@ -68,8 +67,7 @@ def _frames(source: str) -> Iterator[DecodedFrame]:
 
 def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
     from eap.errors import CodecError
-    from eap.ops.capture import iter_capture
-    from eap.ops.decode import decode_frame
+    from eap.ops.decode import decode_frame, iter_capture
 
     try:
         for captured in iter_capture(Path(name)):
@@ -83,8 +81,7 @@ def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
 
 
 def _frames_of_octets(octets: bytes) -> Iterator[DecodedFrame]:
-    from eap.ops.capture import cut_frames, unwrap
-    from eap.ops.decode import decode_frame
+    from eap.ops.decode import cut_frames, decode_frame, unwrap
 
     packet = unwrap(octets)
     if packet is None:

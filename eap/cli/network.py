@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer
+from eap.cli.output import Column, Renderer, Styled, TextTable, count, duration
 from eap.cli.params import examples, json_option, plant_option
 
 if TYPE_CHECKING:
-    from eap.cli.table import Styled, TextTable
     from eap.control.routes import (
         HopRow,
         PlantScan,
@@ -42,9 +41,9 @@ def scan(via: str | None, plant: str | None, output: Renderer) -> None:
     the reason on stderr.
     """
     from eap.control.routes import MergedScan
-    from eap.ops import ams
+    from eap.ops import routing
 
-    answers = ams.scan(plant, via)
+    answers = routing.scan(plant, via)
     stations = [station for answer in answers for station in answer.stations]
     merged = MergedScan(stations, [answer.via for answer in answers])
     output.show(merged, lambda _: map(scan_table, answers))
@@ -77,11 +76,11 @@ def trace(
 
     Exits with 1 when a target is not reached; the last line says at which hop, and why.
     """
-    from eap.ops import ams
+    from eap.ops import routing
 
     is_ok = True
     for target in targets:
-        found = ams.trace(target, plant, via)
+        found = routing.trace(target, plant, via)
         is_ok = is_ok and found.ok
         output.show(found, trace_view)
     if not is_ok:
@@ -102,8 +101,6 @@ def scan_table(answer: PlantScan) -> TextTable:
     On a terminal without room for the lines of pyads these are left out: a line that wraps could
     not be pasted.
     """
-    from eap.cli.table import Column, TextTable
-
     table = TextTable(
         "Name", Column("What", rank=1), "State", "AMS address", Column("To paste", rank=2)
     )
@@ -155,8 +152,6 @@ def _lines(station: StationEntry, via: ScanVia) -> Iterator[_Line]:
 
 def trace_view(found: TracedPath) -> Iterator[TextTable | Styled | str]:
     """Yield the path, the answer of the target, and faults on the way."""
-    from eap.cli.table import Column, Styled, TextTable, count, duration
-
     name = f" ({found.name})" if found.name not in {"", found.target} else ""
     yield f"{found.target}{name} is {found.address}"
     table = TextTable(

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer
+from eap.cli.output import Renderer, TextTable
 from eap.cli.params import json_option, parse_entry, parse_octets, parse_type, plant_option
 from eap.errors import ControlError
 
 if TYPE_CHECKING:
-    from eap.cli.table import TextTable
     from eap.codec.datatypes import DataType
     from eap.control.device import StateAnswer
     from eap.ids import ObjectId
@@ -251,7 +250,7 @@ def _state_of(target: Target, wanted: str | None) -> StateAnswer:
 
 
 def _state_by_ads(target: Target, wanted: str | None) -> StateAnswer:
-    from eap.ops.ams import open_ams, read_state, request_state
+    from eap.ops.routing import open_ams, read_state, request_state
 
     with open_ams(str(target), target.plant) as device:
         return request_state(device, wanted) if wanted else read_state(device)

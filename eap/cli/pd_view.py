@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from eap.cli.table import Column, TextTable, quality
+from eap.cli.output import Column, TextTable, quality
 from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
 from eap.ops.client import connect_station

@@ -92,7 +92,7 @@ def _run_view(plant: str | None) -> None:
 def list_all(station: str | None, match: str, plant: str | None, output: Renderer) -> None:
     """List the routes and connections of STATION, or of all running stations."""
     from eap.cli.routes_view import routes_view
-    from eap.ops.route_lists import RouterList, list_routes
+    from eap.ops.routing import RouterList, list_routes
 
     found = list_routes(plant, station, match, requests=50 if output.is_json else 0)
     output.show(RouterList([row for each in found for row in each.stations]), routes_view)
@@ -231,7 +231,7 @@ def test(
     failure.
     """
     from eap.cli.routes_view import result_table
-    from eap.ops.route_lists import TestedTarget, list_routes
+    from eap.ops.routing import TestedTarget, list_routes
 
     chosen = [(station, target) for target in targets if station]
     clients: set[tuple[str, str]] = set()
@@ -328,7 +328,7 @@ def export(station: str, file: Path | None, plant: str | None) -> None:
 
 
 def _read(file: Path) -> str:
-    from eap.ops.route_lists import text_of_xml
+    from eap.ops.routing import text_of_xml
 
     octets = sys.stdin.buffer.read() if str(file) == "-" else file.read_bytes()
     try:

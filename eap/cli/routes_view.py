@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 
 from eap.ads.endpoint import Endpoint
-from eap.cli.table import Column, Styled, TextTable, count, duration
+from eap.cli.output import Column, Styled, TextTable, count, duration
 from eap.control.routes import (
     ConnectionRow,
     EndpointRow,
@@ -17,7 +17,7 @@ from eap.control.routes import (
     RouterRow,
     interruption_text,
 )
-from eap.ops.route_lists import RouterList, TestedTarget
+from eap.ops.routing import RouterList, TestedTarget
 
 _UNITS = ("", "k", "M", "G", "T", "P", "E")
 _STYLES = {"up": "green", "down": "bold red", "unknown": "dim", "client": "dim"}

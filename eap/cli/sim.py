@@ -8,10 +8,9 @@ from typing import Any
 
 import click
 
-from eap.cli.bus_place import StationBus, parse_port
 from eap.cli.group import LazyGroup
 from eap.cli.output import Renderer, write_json
-from eap.cli.params import CommandT, examples, json_option, plant_option
+from eap.cli.params import CommandT, StationBus, examples, json_option, parse_port, plant_option
 from eap.ids import InterfaceUri
 
 _EXAMPLE = "such as power slave=drive for_ms=500"

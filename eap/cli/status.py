@@ -1,21 +1,48 @@
-"""``eapctl status``: the state of the running appliances, once or again and again."""
+"""``eapctl status``: the state of the running appliances, once or periodically.
+
+The screen shows the number of errors, findings, stations and processes.  On a terminal it takes no
+more lines than there are: the parts in order give way first, and a line names the omitted ones.
+The full view has each process, port, bus and PD, and below the tables the remarks since the start.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from threading import Event
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from eap.cli.output import Renderer, repaint, write_json
+from eap.cli.output import (
+    Column,
+    ItemLine,
+    Renderer,
+    Styled,
+    TextTable,
+    count,
+    duration,
+    quality,
+    repaint,
+    times,
+    write_json,
+)
 from eap.cli.params import json_option, plant_option, station_option
+from eap.cli.status_findings import (
+    LISTENER_COUNTS,
+    REASONS,
+    STATES,
+    Severity,
+    StatusFinding,
+    is_special,
+)
 from eap.errors import ControlError
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+
 
 _LEAST_INTERVAL_S = 0.1
 
@@ -126,7 +153,6 @@ def _write_object(found: Look | str) -> None:
 def _page(
     found: Look | str, view: Callable[[Look], Iterable[RenderableType]], interval_s: float
 ) -> Iterator[RenderableType]:
-    from eap.cli.table import Styled
 
     yield Styled(f"{time.strftime('%H:%M:%S')}, every {interval_s:g} s", style="dim")
     if isinstance(found, Look):
@@ -136,12 +162,438 @@ def _page(
 
 
 def _screen(look: Look) -> Iterator[RenderableType]:
-    from eap.cli.status_view import StatusScreen
-
     yield StatusScreen(look.document, look.now_s, look.earlier, look.seconds)
 
 
 def _full(look: Look) -> Iterator[RenderableType]:
-    from eap.cli.status_view import full_view
-
     return full_view(look.document, look.now_s)
+
+
+Row = Mapping[str, Any]
+
+_STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: ""}
+_GOOD, _BAD, _DIM = "green", "bold red", "dim"
+_STATE_STYLES = {"OP": _GOOD, "INIT": _BAD, "PREOP": "yellow", "SAFEOP": "yellow"}
+_OFF = "off"
+_FULL_STYLES = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
+_FULL_STYLES |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM, _OFF: _DIM}
+_SPARE_LINES = 2
+"""Lines of the screen that stay free: for the heading of ``--watch``, and for the shell."""
+_LEAST_ROWS = 1
+"""Number of findings and stations that the smallest screen shows."""
+
+
+class StatusScreen:
+    """One status document, fitted to the screen.
+
+    With the document of *seconds* ago as *earlier* it shows rates in place of counts.
+    """
+
+    def __init__(
+        self, document: Row, now_s: float, earlier: Row | None = None, seconds: float = 0.0
+    ) -> None:
+        findings = [StatusFinding.from_plain(row) for row in document["findings"]]
+        self._document = document
+        self._findings = [each for each in findings if each.severity is not Severity.INFO]
+        self._remarks = len(findings) - len(self._findings)
+        self._now_s = now_s
+        self._earlier = earlier
+        self._seconds = seconds
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        def excess(findings: int, stations: int) -> int:
+            """Return the number of lines for which the screen has no room."""
+            lines = console.render_lines(self._layout(findings, stations), options, pad=False)
+            return len(lines) + _SPARE_LINES - console.height
+
+        stations, findings = len(self._document["stations"]), len(self._findings)
+        if console.is_terminal:
+            while findings > _LEAST_ROWS and (lines := excess(findings, _LEAST_ROWS)) > 0:
+                findings = max(_LEAST_ROWS, findings - lines)
+            while stations > _LEAST_ROWS and (lines := excess(findings, stations)) > 0:
+                stations = max(_LEAST_ROWS, stations - lines)
+        yield self._layout(findings, stations)
+
+    def _layout(self, findings: int, stations: int) -> RenderableType:
+        from rich.console import Group
+
+        parts: list[RenderableType] = [*verdicts(self._document)]
+        if self._findings:
+            parts.append(finding_grid(self._findings[:findings], self._now_s))
+        if rest := len(self._findings) - findings:
+            parts.append(Styled(f"{rest} more: eapctl status --full", style="dim"))
+        parts += [Styled(), self._stations(stations)]
+        if others := self._document["stations"][stations:]:
+            parts.append(Styled(f"{count(len(others), 'more station')}, {_states(others)}"))
+        parts.append(Styled())
+        parts += (
+            _processes(each, appliance_label(self._document, each))
+            for each in self._document["appliances"]
+        )
+        remarks = f", and {count(self._remarks, 'remark')}" if self._remarks else ""
+        parts.append(Styled(f"eapctl status --full: each PD, port and bus{remarks}", style="dim"))
+        return Group(*parts)
+
+    def _stations(self, shown: int) -> RenderableType:
+        rate = "/s" if self._earlier else ""
+        table = TextTable(
+            "Station",
+            "State",
+            Column("Links", rank=3, wraps=True),
+            Column(f"Tx{rate}", is_number=True),
+            Column(f"Rx{rate}", is_number=True),
+            Column("Lost", is_number=True),
+            Column("Late", is_number=True),
+            Column("Dropped", rank=2, is_number=True),
+            Column("Buses", rank=1, wraps=True),
+        )
+        for row in self._document["stations"][:shown]:
+            rx = row["pd"]["rx"]
+            dropped = sum(row["discarded"].values())
+            dropped += sum(number for each in rx for number in each["discarded"].values())
+            table.add_row(
+                row["name"],
+                Styled(row["state"], style=_STATE_STYLES.get(row["state"], "")),
+                _links(row["ports"]),
+                self._figure(row, "tx", "sent"),
+                self._figure(row, "rx", "received"),
+                _bad_count(sum(each["lost"] or 0 for each in rx)),
+                str(sum(each["late"] for each in rx)),
+                str(dropped),
+                _buses(row["ports"]),
+            )
+        return table
+
+    def _figure(self, station: Row, direction: str, key: str) -> str:
+        """Return a sum over all PDs: since the start, or a second where there is a look before."""
+        total = _total(station, direction, key)
+        if self._earlier is None:
+            return str(total)
+        before = [
+            row
+            for row in self._earlier["stations"]
+            if (row["plant"], row["name"]) == (station["plant"], station["name"])
+        ]
+        if not before or total < (total_before := _total(before[0], direction, key)):
+            return ""  # it was not there, or its counters started anew
+        # Not the time between the looks: counters are of a moment that the look does not know.
+        seconds = _station_s(station) - _station_s(before[0])
+        return f"{(total - total_before) / (seconds if seconds > 0 else self._seconds):.0f}"
+
+
+def appliance_label(document: Row, appliance: Row) -> str:
+    """Return the plant of an appliance, with its stations where others run parts of that plant."""
+    plants = [each["plant"] for each in document["appliances"]]
+    plant: str = appliance["plant"]
+    if plants.count(plant) == 1:
+        return plant
+    return f"{plant} ({', '.join(appliance['stations'])})"
+
+
+def verdicts(document: Row) -> list[Styled]:
+    """Return a line for each plant: the number of errors and warnings, and its parts."""
+    plants = dict.fromkeys(appliance["plant"] for appliance in document["appliances"])
+    return [_verdict(document, plant) for plant in plants]
+
+
+def _verdict(document: Row, plant: str) -> Styled:
+    stations = [row for row in document["stations"] if row["plant"] == plant]
+    pds = sum(len(row["pd"]["tx"]) + len(row["pd"]["rx"]) for row in stations)
+    counts = Counter(row["severity"] for row in document["findings"] if row["plant"] == plant)
+    text = Styled(f"{plant}: ", style="bold")
+    if errors := counts[Severity.ERROR]:
+        text.append(count(errors, "error"), _BAD)
+    else:
+        text.append("no errors", _GOOD)
+    if warnings := counts[Severity.WARNING]:
+        text.append(f", {count(warnings, 'warning')}", _STYLES[Severity.WARNING])
+    scope = f" ({count(len(stations), 'station')}, {count(pds, 'PD')})"
+    return text.append(scope, "not bold")
+
+
+def finding_grid(found: Iterable[StatusFinding], now_s: float) -> RenderableType:
+    """Return a line for each finding, or more where it is long."""
+    from rich.table import Table
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(no_wrap=True)
+    grid.add_column()
+    for each in found:
+        grid.add_row(Styled(each.severity, style=_STYLES[each.severity]), Styled(each.text(now_s)))
+    return grid
+
+
+def _total(station: Row, direction: str, key: str) -> int:
+    return sum(row[key] for row in station["pd"][direction])
+
+
+def _station_s(station: Row) -> float:
+    """Return the time of a station's counters: its cycles since the first, also those left out."""
+    cycles: int = station.get("cycle", 0) + station.get("overruns", 0)
+    cycle_us: int = station.get("cycle_us", 0)
+    return cycles * cycle_us / 1e6
+
+
+def _states(stations: Iterable[Row]) -> str:
+    states = Counter(row["state"] for row in stations)
+    return ", ".join(f"{number} in {state}" for state, number in states.items())
+
+
+def _links(ports: Sequence[Row]) -> Styled:
+    down = [port["name"] for port in ports if port.get("link") == "down"]
+    if down:
+        return Styled(f"{', '.join(down)} down", style=_BAD)
+    return (
+        Styled("up", style=_GOOD) if any(port.get("link") == "up" for port in ports) else Styled()
+    )
+
+
+def _buses(ports: Sequence[Row]) -> Styled:
+    """Return each bus with the states of its slaves."""
+    text = Styled()
+    for port in ports:
+        if (bus := port.get("bus")) is None:
+            continue
+        text.append(f"{', ' if text.plain else ''}{port['name']}: ")
+        states = Counter(slave["state"] or "no answer" for slave in bus["slaves"])
+        if not bus["is_up"]:
+            text.append("down", _BAD)
+        for at, (state, number) in enumerate(states.items() if bus["is_up"] else ()):
+            style = _GOOD if state == "OP" else _BAD
+            text.append(", " if at else "").append(f"{number} {state}", style)
+    return text
+
+
+def _bad_count(number: int) -> Styled:
+    return Styled(str(number), style=_BAD if number else "")
+
+
+def _processes(appliance: Row, label: str) -> RenderableType:
+    processes = dict(appliance["processes"])
+    segments = list(processes.pop("segments", {}).values())
+    items = [_process(name, [process]) for name, process in processes.items()]
+    if segments:
+        items.append(_process(count(len(segments), "segment"), segments))
+    return ItemLine(f"{label}:", items)
+
+
+def _process(name: str, processes: Sequence[Row]) -> Styled:
+    """Return name, share of a core and memory of processes of one kind."""
+    text = Styled(name)
+    if not all(process["pid"] for process in processes):
+        return text.append(" restarting", _BAD)
+    if any(process.get("step") for process in processes):
+        return text.append(" starting", _STYLES[Severity.WARNING])
+    if all(process.get("cpu") is not None for process in processes):
+        text.append(f" {sum(process['cpu'] for process in processes):.0f} %")
+    if all(process.get("rss") is not None for process in processes):
+        text.append(f" {sum(process['rss'] for process in processes) / 1e6:.0f} MB")
+    if restarts := sum(process.get("restarts") or 0 for process in processes):
+        text.append(f" restarted {times(restarts)}", _STYLES[Severity.WARNING])
+    return text
+
+
+def full_view(document: Row, now_s: float) -> Iterator[RenderableType]:
+    """Yield everything in a status *document* of *now_s*, as tables."""
+    stations = document["stations"]
+    yield from verdicts(document)
+    found = [StatusFinding.from_plain(row) for row in document["findings"]]
+    if faults := [each for each in found if each.severity is not Severity.INFO]:
+        yield finding_grid(faults, now_s)
+    for appliance in document["appliances"]:
+        yield ""
+        yield _processes_table(appliance, appliance_label(document, appliance))
+        if listeners := appliance.get("listeners"):
+            yield ""
+            yield _listeners(listeners)
+    yield ""
+    yield _stations_table(stations)
+    if any("bus" in port for station in stations for port in station["ports"]):
+        yield ""
+        yield _buses_table(stations)
+    yield ""
+    yield _process_data(stations)
+    if any(is_special(row) for station in stations for row in station.get("frames", ())):
+        yield ""
+        yield _frames(stations)
+    if remarks := [each for each in found if each.severity is Severity.INFO]:
+        yield Styled("\nSince the start", style="bold")
+        yield from (Styled(each.text(now_s)) for each in remarks)
+
+
+def _processes_table(appliance: Row, label: str) -> TextTable:
+    table = TextTable(
+        f"Process of {label}",
+        Column("PID", rank=1, is_number=True),
+        Column("CPU", is_number=True),
+        Column("Memory", is_number=True),
+        Column("Files", rank=1, is_number=True),
+        Column("Restarts", is_number=True),
+    )
+    processes = dict(appliance["processes"])
+    segments = processes.pop("segments", {})
+    processes |= {f"segment {name}": process for name, process in segments.items()}
+    for name, process in processes.items():
+        if not process["pid"]:
+            table.add_row(name, "", Styled("restarting", style=_BAD))
+            continue
+        if process.get("step"):
+            table.add_row(name, str(process["pid"]), Styled("starting", style=_BAD))
+            continue
+        cpu, rss = process.get("cpu"), process.get("rss")
+        table.add_row(
+            name,
+            str(process["pid"]),
+            "" if cpu is None else f"{cpu:.1f} %",
+            "" if rss is None else f"{rss / 1e6:.0f} MB",
+            _descriptors(process.get("descriptors")),
+            str(process.get("restarts", "")),
+        )
+    return table
+
+
+def _descriptors(descriptors: Row | None) -> str:
+    return "" if descriptors is None else f"{descriptors['used']} of {descriptors['limit']}"
+
+
+def _listeners(listeners: Sequence[Row]) -> TextTable:
+    table = TextTable(
+        "Listener",
+        Column("Open", is_number=True),
+        Column("Refused", is_number=True),
+        Column("Evicted", is_number=True),
+        Column("Too slow", is_number=True),
+    )
+    for row in listeners:
+        opened = f"{row['open']} of {row['limit']}"
+        counts = (str(row[key]) for key in LISTENER_COUNTS)
+        table.add_row(row["name"], opened, *counts)
+    return table
+
+
+def _stations_table(stations: Sequence[Row]) -> TextTable:
+    table = TextTable(
+        "Station",
+        "State",
+        Column("Cycle", rank=2),
+        "Port",
+        Column("Interface", rank=1),
+        Column("NetID", rank=3),
+        "Link",
+    )
+    for station in stations:
+        own = (
+            station["name"],
+            _state(station["state"]),
+            duration(station["cycle_us"]) if "cycle_us" in station else "",
+        )
+        for port in station["ports"] or [{}]:
+            where, net_id = _interface(port.get("interface", "")), port.get("net_id", "")
+            link = _state(port.get("link") or "")
+            table.add_row(*own, port.get("name", ""), where, net_id, link)
+            own = ("", Styled(), "")
+    return table
+
+
+def _interface(uri: str) -> str:
+    """Return where a port is; of a simulated bus only the name of its file."""
+    scheme, _, path = uri.partition("://")
+    return f"{scheme}://{path.rpartition('/')[2]}" if scheme == "sim" else uri
+
+
+def _buses_table(stations: Sequence[Row]) -> TextTable:
+    table = TextTable(
+        "Bus",
+        Column("Slaves", rank=3, is_number=True),
+        Column("State", wraps=True),
+        Column("Cycles", rank=1, is_number=True),
+        Column("Lost", is_number=True),
+        Column("Counters", is_number=True),
+        Column("Trip", rank=2, is_number=True),
+    )
+    for station in stations:
+        for port in station["ports"]:
+            if (bus := port.get("bus")) is None:
+                continue
+            states = Counter(slave["state"] or "no answer" for slave in bus["slaves"])
+            shown = ", ".join(
+                state if len(states) == 1 else f"{number} {state}"
+                for state, number in states.items()
+            )
+            table.add_row(
+                f"{station['name']}/{port['name']}",
+                str(len(bus["slaves"])),
+                _state(shown if bus["is_up"] else "down"),
+                str(bus["cycles"]),
+                str(bus["lost"]),
+                f"{bus['received_wkc']} of {bus['expected_wkc']}",
+                duration(bus["trip_us"]),
+            )
+    return table
+
+
+def _process_data(stations: Sequence[Row]) -> TextTable:
+    table = TextTable(
+        "",
+        "Process data",
+        "State",
+        Column("Frames", is_number=True),
+        Column("Lost", is_number=True),
+        Column("Quality", rank=2, is_number=True),
+        Column("Age", rank=1, is_number=True),
+        Column("Jitter or\nresponse µs\np50 / p99 / max", rank=3, is_number=True),
+    )
+    for station in stations:
+        pd = station["pd"]
+        if pd["tx"] or pd["rx"]:
+            table.add_row("", Styled(station["name"], style="bold"))
+        for row in pd["tx"]:
+            why = row.get("last_reason") or next(reversed(row["reason"]), "silent")
+            shown = _OFF if station["state"] == "PREOP" else REASONS.get(why, why)
+            table.add_row("→", row["name"], _state(shown), str(row["sent"]))
+        for row in pd["rx"]:
+            table.add_row(*_received(row, _OFF if station["state"] in STATES else row["state"]))
+    return table
+
+
+def _received(row: Row, state: str) -> tuple[str | Styled, ...]:
+    lost, age = row["lost"], row["age_us"]
+    times = row.get("response_us") or row["jitter_us"]
+    spread = [times[key] for key in ("p50", "p99", "max")]
+    return (
+        "←",
+        row["name"],
+        _state(state),
+        str(row["received"]),
+        Styled("unknown", style=_DIM)
+        if lost is None
+        else Styled(str(lost), style=_BAD * bool(lost)),
+        quality(row["quality"]),
+        "" if age is None else duration(age),
+        "" if None in spread else " / ".join(map(str, spread)),
+    )
+
+
+def _frames(stations: Sequence[Row]) -> TextTable:
+    table = TextTable(
+        "Frame",
+        Column("Goes to", wraps=True),
+        "Subscriber",
+        Column("Frames", rank=1, is_number=True),
+        Column("Skipped", is_number=True),
+    )
+    for station in stations:
+        for row in filter(is_special, station.get("frames", ())):
+            name, address = row["destination"], row["address"]
+            table.add_row(
+                f"{station['name']}/{row['name']}",
+                name if name == address else f"{name} at {address or 'an unknown address'}",
+                _state(row["subscriber"] if row["monitor_interval_ms"] else ""),
+                str(row["sent"]),
+                str(row["skipped"]),
+            )
+    return table
+
+
+def _state(state: str) -> Styled:
+    return Styled(state, style=_FULL_STYLES.get(state, ""))

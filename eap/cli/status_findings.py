@@ -18,8 +18,8 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from eap.cli.table import count, duration
-from eap.cli.table import times as times_of
+from eap.cli.output import count, duration
+from eap.cli.output import times as times_of
 
 Row = Mapping[str, Any]
 

@@ -22,7 +22,7 @@ from devicebus.mailbox import foe_client, voe
 from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.errors import ConfigError, EapError, EnvironmentalError
-from eap.ops.bus_slave import Begin, Slave, SlaveBus
+from eap.ops.bus_session import Begin, Slave, SlaveBus
 from eap.runtime.durable import whole_file
 from eap.runtime.foe_restart import PAUSE_S, Restarts
 

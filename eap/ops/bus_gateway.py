@@ -23,7 +23,7 @@ from eap.gateway.address import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.client import GatewayClient
 from eap.gateway.slaves import NOT_TOLD, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.ops.bus_slave import Begin, Slave, choose, no_mailbox
+from eap.ops.bus_session import Begin, Slave, choose, no_mailbox
 from eap.runtime.bus_status import FrameCounts
 
 T = TypeVar("T")
@@ -34,7 +34,7 @@ _HINT_S = 0.3
 
 
 class GatewayBus:
-    """A bus behind a gateway; fits :class:`eap.ops.bus_slave.SlaveBus`.
+    """A bus behind a gateway; fits :class:`eap.ops.bus_session.SlaveBus`.
 
     Slave 0 is the master itself, with its dictionary.
 

@@ -21,7 +21,7 @@ from devicebus.master.procedure import Procedure, Sleep
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from devicebus.wire.sii import SiiProtocol
-from eap.ops.bus_slave import Slave, SlaveBus, choose
+from eap.ops.bus_session import Slave, SlaveBus, choose
 from eap.runtime.bus_status import FindingRow, FrameCounts, finding_row
 
 _TRIES = 3

@@ -24,7 +24,7 @@ from eap.gateway.error_table import Cause, cause_of
 from eap.ids import ObjectId
 from eap.od.abort import SdoAbortError
 from eap.od.model import Access, ObjectCode
-from eap.ops.bus_slave import Slave, SlaveBus
+from eap.ops.bus_session import Slave, SlaveBus
 
 _TEXT, _OCTETS = 0x09, 0x0A
 _NUMBERS = (

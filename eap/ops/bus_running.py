@@ -27,7 +27,7 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.control import bus as words
 from eap.control.protocol import AnswerT, Method, ParametersT
 from eap.errors import ControlError
-from eap.ops.bus_slave import Begin, Slave, choose
+from eap.ops.bus_session import Begin, Slave, choose
 from eap.ops.client import ControlClient, connect_station
 from eap.runtime.bus_request import BusReport, SlaveReport, no_mailbox
 from eap.runtime.bus_status import (
@@ -50,7 +50,7 @@ _PER_STEP = 60
 
 
 class RunningBus:
-    """One bus port of a running station; fits :class:`eap.ops.bus_slave.SlaveBus`.
+    """One bus port of a running station; fits :class:`eap.ops.bus_session.SlaveBus`.
 
     Args:
         client: Connected to the appliance, for this bus alone.

@@ -40,11 +40,11 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, ValueInfo
 from eap.od.model import Access, ObjectCode
 from eap.od.profiles.eap1000 import CONTROL
-from eap.ops.ams import AmsDevice, AmsRefusedError, open_ams
 from eap.ops.bus_objects import kind_of
-from eap.ops.bus_slave import SlaveBus
+from eap.ops.bus_session import SlaveBus
 from eap.ops.client import ControlClient, connect_station
 from eap.ops.od import Content, EntryInfo, ObjectInfo, OdDevice
+from eap.ops.routing import AmsDevice, AmsRefusedError, open_ams
 from eap.runtime.folder import find_running
 
 _ROOM = 0x20002

@@ -15,7 +15,7 @@ import pytest
 
 from eap.config.new_plant import Shape, plant_text
 from eap.device.rollout import without_alternates
-from eap.ops.plant_change import load_or_raise
+from eap.ops.plant import load_or_raise
 from eap.pd.spec import StationSpec
 from tests.support.appliance import EAPCTL, Appliance, Plants, run_eapctl, troubles, wait_until
 

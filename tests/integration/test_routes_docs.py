@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from eap.cli.routes_tui.app import RoutesApp
-from eap.cli.routes_tui.link import RouteLink
-from eap.ops.route_lists import list_routes
+from eap.cli.routes_tui.table import RouteLink
+from eap.ops.routing import list_routes
 from tests.support.appliance import wait_until
 from tests.support.pages import ROOT, Shell, commands, shell
 from tests.support.screens import Screen, play

@@ -1,5 +1,5 @@
 """The live view of ``eapctl routes``: a client of running appliances, in a terminal.
 
-``link`` asks them, ``table`` says what a table shows, ``app`` and ``forms`` put it on the screen.
-Needs Textual, which only the extra ``tui`` brings along.
+``table`` makes the rows of the table and is its widget; ``app`` has the screen, its forms, and the
+requests to the appliances.  Needs Textual, which only the extra ``tui`` installs.
 """

@@ -1,17 +1,86 @@
-"""What the tables of the live view show: rows, columns, and how wide a screen has room for.
+"""Rows and columns of the live view's table, and its widget, which keeps the cursor.
 
-Pure: records in, texts out.
+The functions that make rows are pure: records in, texts out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from rich.text import Text
+from textual.widgets import DataTable
 
 from eap.cli import routes_view
-from eap.cli.routes_tui.link import PlantRouter
-from eap.control.routes import ConnectionRow, RouteRow
+from eap.control.protocol import AnswerT, Method, ParametersT
+from eap.control.routes import (
+    ROUTES_ADD,
+    ROUTES_REMOVE,
+    ROUTES_TEST,
+    ConnectionRow,
+    RouteRow,
+    RouterRow,
+    TestResult,
+)
+from eap.errors import EapError
+from eap.ops.client import connect_station
+from eap.ops.routing import list_routes
+
+MOST = 500
+"""Routes of a station that are shown; a filter finds the others."""
+_REQUESTS = 256
+_TEST_MS = 5000
+_TEST_S = 10.0
+
+
+class PlantRouter(NamedTuple):
+    """The router of one station, and the plant of its appliance."""
+
+    plant: str
+    routes: RouterRow
+
+
+class Picture(NamedTuple):
+    """Content of the view; *problem* says why there is nothing new."""
+
+    routers: list[PlantRouter]
+    problem: str = ""
+
+
+class RouteLink:
+    """The running appliances, or the one that runs *plant*."""
+
+    def __init__(self, plant: str | None) -> None:
+        self._plant = plant
+
+    def look(self, match: str) -> Picture:
+        """Return all routers, with those of their routes that *match*; never raises EapError."""
+        try:
+            found = list_routes(self._plant, None, match, requests=_REQUESTS, most=MOST)
+        except EapError as exc:
+            return Picture([], str(exc))
+        return Picture([PlantRouter(each.plant, row) for each in found for row in each.stations])
+
+    def add(self, router: PlantRouter, params: dict[str, Any]) -> list[str]:
+        """Add a route, and return the warnings; raise EapError if refused."""
+        return self._call(router, ROUTES_ADD, **params).warnings
+
+    def remove(self, router: PlantRouter, route: str, transport: str, address: str) -> None:
+        """Remove a route; raise EapError if refused."""
+        self._call(router, ROUTES_REMOVE, route=route, transport=transport, address=address)
+
+    def test(self, router: PlantRouter, target: str) -> TestResult:
+        """Test the way to *target*, which may take some seconds; raise EapError if refused."""
+        return self._call(router, ROUTES_TEST, target=target, timeout_ms=_TEST_MS)
+
+    def _call(
+        self, router: PlantRouter, method: Method[ParametersT, AnswerT], **params: Any
+    ) -> AnswerT:
+        station = router.routes.station
+        with connect_station(station, router.plant) as client:
+            return client.call(method, within_s=_TEST_S, station=station, **params)
+
 
 _GAP = 1
 _EXTRA = 6
@@ -212,3 +281,65 @@ def detail(line: Line | None) -> list[tuple[str, str]]:
         for each in reversed(requests)
     ]
     return texts
+
+
+STYLES = {
+    "up": "green",
+    "down": "bold red",
+    "unknown": "dim",
+    "client": "dim",
+    "bold": "bold",
+    "": "",
+}
+"""How texts are coloured, by what they say."""
+
+
+class Grid(DataTable[Text]):
+    """Lines of a view, one of them chosen."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(id=name, cursor_type="row", cell_padding=0)
+        self._lines: Sequence[Line] = ()
+        self._fitted: list[tuple[int, GridColumn, int]] = []
+
+    @property
+    def chosen(self) -> Line | None:
+        """The line that the cursor is on."""
+        at = self.cursor_row
+        return self._lines[at] if 0 <= at < len(self._lines) else None
+
+    def show_lines(
+        self, view: View, found: Sequence[Line], width: int, *, has_station: bool
+    ) -> None:
+        """Show *found* in *width* characters; the cursor stays on its line if that is there."""
+        fitted = fit(view, found, width, has_station=has_station)
+        before, chosen = [line.key for line in self._lines], self.chosen
+        self._lines = found
+        cells = [
+            [
+                Text(cut(line.cells[number], size, is_number=column.is_number),
+                     style=STYLES[line.state] if column.heading == "State" else "")
+                for number, column, size in fitted
+            ]
+            for line in found
+        ]  # fmt: skip
+        if (fitted, [line.key for line in found]) != (self._fitted, before):
+            self._fitted = fitted
+            self._lay_out(cells, chosen)
+            return
+        for number, row in enumerate(cells):
+            for place, cell in enumerate(row):
+                if self.get_cell_at((number, place)) != cell:  # type: ignore[arg-type]
+                    self.update_cell_at((number, place), cell)  # type: ignore[arg-type]
+
+    def _lay_out(self, cells: list[list[Text]], chosen: Line | None) -> None:
+        at = max(self.cursor_row, 0)
+        self.clear(columns=True)
+        for _, column, size in self._fitted:
+            heading = cut(column.heading, size, is_number=column.is_number)
+            self.add_column(Text(heading, style="bold"), width=size + 1)
+        self.add_rows(cells)
+        keys = [line.key for line in self._lines]
+        if chosen is not None and chosen.key in keys:
+            at = keys.index(chosen.key)
+        self.move_cursor(row=max(min(at, len(keys) - 1), 0))

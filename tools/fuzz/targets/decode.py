@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.ops.capture import unwrap
-from eap.ops.decode import decode_frame
+from eap.ops.decode import decode_frame, unwrap
 
 
 def fuzz_one(data: bytes) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.ops.capture import Stream, TcpSegment
+from eap.ops.decode import Stream, TcpSegment
 
 
 def fuzz_one(data: bytes) -> None:

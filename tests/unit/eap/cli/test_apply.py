@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from eap.cli import main
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ControlError
-from eap.ops.plant_change import load_or_raise
+from eap.ops.plant import load_or_raise
 from tests.support.plantstub import PlantStub
 
 CHANGE = "~ 0xF800:08 Configured objects: Device cycle time"

@@ -6,15 +6,16 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from eap.cli.bus_place import (
+from eap.cli.params import (
     BusCommand,
     StationBus,
     bus_options,
+    json_option,
     open_session,
     parse_port,
     parse_uri,
+    slave_argument,
 )
-from eap.cli.params import json_option, slave_argument
 
 UDP = "udp://127.0.4.1"
 

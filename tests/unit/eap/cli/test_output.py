@@ -8,8 +8,7 @@ import pytest
 from rich.console import Console
 from rich.text import Text
 
-from eap.cli.output import repaint, write_json, write_text, write_view
-from eap.cli.table import Column, TextTable
+from eap.cli.output import Column, TextTable, repaint, write_json, write_text, write_view
 from eap.errors import EnvironmentalError
 
 

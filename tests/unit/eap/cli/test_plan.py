@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from eap.cli import main
 from eap.config.new_plant import Shape, plant_text
-from eap.ops.plant_change import load_or_raise
+from eap.ops.plant import load_or_raise
 from tests.support.plantstub import PlantStub
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from eap.cli.plan import change_text, plan_lines
+from eap.cli.plant import change_text, plan_lines
 from eap.control.device import ObjectChange
 from eap.device.rollout import Step
-from eap.ops.plant_change import PlanReport, StationPlan
+from eap.ops.plant import PlanReport, StationPlan
 from tests.support.fakeappliance import station
 
 

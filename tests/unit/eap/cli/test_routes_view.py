@@ -18,7 +18,7 @@ from eap.control.routes import (
     NeighbourRow,
     TestResult,
 )
-from eap.ops.route_lists import RouterList, TestedTarget
+from eap.ops.routing import RouterList, TestedTarget
 from tests.support.fakeroutes import FakeRoutes
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from eap.cli.status_view import StatusScreen
+from eap.cli.status import StatusScreen
 from tests.support.statusdocument import NOW_S, bus_port, document, rx, tx, with_findings
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from eap.cli.status_view import full_view
+from eap.cli.status import full_view
 from tests.support.statusdocument import (
     NOW_S,
     bus_port,

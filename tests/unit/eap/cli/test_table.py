@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from eap.cli.table import Column, TextTable
+from eap.cli.output import Column, TextTable
 
 
 def lines(table: TextTable, width: int) -> list[str]:

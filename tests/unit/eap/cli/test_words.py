@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.cli import table
+from eap.cli import output as table
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from eap.control.protocol import ErrorCode
 from eap.control.routes import PlantScan, ScanVia, StationEntry, TracedPath
 from eap.errors import ControlError
-from eap.ops import ams
+from eap.ops import routing
 from tests.support.controlstub import ControlStub
 
 
@@ -42,14 +42,14 @@ def plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Pla
 
 
 def test_the_appliance_that_knows_a_target_is_asked(plants: list[Plant]) -> None:
-    assert ams.trace("press-2").target == "press-2"
-    assert ams.trace("line-2", "line", "line-1").target == "line-2"
+    assert routing.trace("press-2").target == "press-2"
+    assert routing.trace("line-2", "line", "line-1").target == "line-2"
     with pytest.raises(ControlError, match="does not know it"):
-        ams.trace("x")
+        routing.trace("x")
     with pytest.raises(ControlError, match="broken"):
-        ams.trace("broken")
+        routing.trace("broken")
 
 
 def test_each_plant_is_scanned_once(plants: list[Plant]) -> None:
-    assert [each.stations[0].name for each in ams.scan()] == ["line", "press"]
-    assert [each.via.station for each in ams.scan(via="press-1")] == ["press-1"]
+    assert [each.stations[0].name for each in routing.scan()] == ["line", "press"]
+    assert [each.via.station for each in routing.scan(via="press-1")] == ["press-1"]

@@ -6,7 +6,7 @@ import pytest
 
 from eap.ads.operation import ReadState
 from eap.errors import ControlError
-from eap.ops.ams import AmsRefusedError, open_ams
+from eap.ops.routing import AmsRefusedError, open_ams
 from tests.support.adstarget import TARGET, AdsTarget
 from tests.support.oddevice import mixer
 

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 import pytest
 
 from eap.control.device import StateAnswer, StateError
-from eap.ops.ams import (
+from eap.ops.routing import (
     STATE_S,
     AmsRefusedError,
     open_ams,

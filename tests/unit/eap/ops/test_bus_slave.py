@@ -6,7 +6,7 @@ import pytest
 
 from devicebus.errors import BusError
 from devicebus.wire.register import AlStatus
-from eap.ops.bus_slave import Slave, choose, no_mailbox
+from eap.ops.bus_session import Slave, choose, no_mailbox
 
 
 def slave(station, name):

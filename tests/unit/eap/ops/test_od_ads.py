@@ -7,8 +7,8 @@ from contextlib import ExitStack
 import pytest
 
 from eap.errors import ControlError
-from eap.ops.ams import AmsDevice, AmsRefusedError, open_ams
 from eap.ops.od_devices import AdsOd
+from eap.ops.routing import AmsDevice, AmsRefusedError, open_ams
 from tests.support.adstarget import TARGET, AdsTarget
 from tests.support.oddevice import mixer
 

@@ -11,7 +11,7 @@ from eap.ams.spec import AccessRule
 from eap.config.load import Plant
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ConfigError
-from eap.ops.plant_change import (
+from eap.ops.plant import (
     apply_steps,
     choose,
     link_to,

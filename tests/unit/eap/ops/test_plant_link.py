@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from eap.config.load import Plant
 from eap.errors import ControlError
-from eap.ops.plant_change import StationPlan, link_to
+from eap.ops.plant import StationPlan, link_to
 from tests.support.fakeappliance import station
 from tests.support.plantstub import PlantStub
 

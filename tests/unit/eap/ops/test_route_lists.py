@@ -5,7 +5,7 @@ from contextlib import ExitStack
 import pytest
 
 from eap.errors import ControlError
-from eap.ops.route_lists import list_routes, text_of_xml
+from eap.ops.routing import list_routes, text_of_xml
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import FakeRoutes
 

@@ -6,7 +6,7 @@ import msgspec
 
 from eap.ams.spec import AccessRule, RoutingSpec
 from eap.control.device import RoutingDifference, RunningRouting
-from eap.ops.plant_change import PlantLink
+from eap.ops.plant import PlantLink
 
 TOLD = RoutingSpec(access=(AccessRule("a"),))
 DIFFERENCE = {"changes": ["access rule a: added"], "refused": []}

@@ -10,7 +10,7 @@ import pytest
 
 from eap.cli.routes_tui import app
 from eap.cli.routes_tui.app import RoutesApp
-from eap.cli.routes_tui.link import RouteLink
+from eap.cli.routes_tui.table import RouteLink
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
 from tests.support.screens import Screen, play
@@ -284,7 +284,7 @@ def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
         assert goes_on.wait(20)
         return answer(params)
 
-    monkeypatch.setattr(app, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(app, "STALE_AFTER_S", 0.0)
 
     async def script(screen):
         stub._methods["routes_list"] = hang

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.cli.routes_tui.app import RoutesApp
-from eap.cli.routes_tui.forms import Message, Question, RouteForm, values_of
-from eap.cli.routes_tui.link import RouteLink
+from eap.cli.routes_tui.app import Message, Question, RouteForm, RoutesApp, values_of
+from eap.cli.routes_tui.table import RouteLink
 from eap.errors import ControlError
 from tests.support.fakeroutes import ISLAND, PRESS
 from tests.support.screens import play

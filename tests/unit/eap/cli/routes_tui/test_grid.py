@@ -4,9 +4,7 @@ import asyncio
 
 from textual.app import App, ComposeResult
 
-from eap.cli.routes_tui.grid import Grid
-from eap.cli.routes_tui.link import PlantRouter
-from eap.cli.routes_tui.table import View, lines
+from eap.cli.routes_tui.table import Grid, PlantRouter, View, lines
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
 
 

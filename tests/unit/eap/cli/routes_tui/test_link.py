@@ -4,7 +4,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.cli.routes_tui.link import Picture, RouteLink
+from eap.cli.routes_tui.table import Picture, RouteLink
 from eap.errors import ControlError
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import FakeRoutes

@@ -3,8 +3,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from eap.cli.routes_tui.link import PlantRouter
-from eap.cli.routes_tui.table import View, cut, detail, fit, lines
+from eap.cli.routes_tui.table import PlantRouter, View, cut, detail, fit, lines
 from tests.support.fakeroutes import ISLAND, FakeRoutes
 
 ROUTER = PlantRouter("line", FakeRoutes().stations["island-01"])

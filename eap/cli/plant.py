@@ -1,0 +1,499 @@
+"""Commands of a plant file: ``check``, ``new``, ``run``, ``plan``, ``apply`` and ``rollback``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from eap.cli.group import ExitCode
+from eap.cli.output import Renderer, count, write_text
+from eap.cli.params import PLANT_FILE, CommandT, json_option, parse_cycle
+from eap.errors import ConfigError, ControlError
+from eap.ids import ObjectId
+
+if TYPE_CHECKING:
+    from eap.config.load import Plant
+    from eap.control.device import ObjectChange
+    from eap.ops.plant import ChangeReport, PlanReport, PlantLink, StepOutcome
+    from eap.pd.spec import StationSpec
+
+
+SHAPES = ("ring", "star")
+
+
+@click.command(short_help="Report all errors of a plant file at once.")
+@click.argument("plant", type=PLANT_FILE)
+@json_option("Print one object: ok, all findings, and warnings.")
+@click.pass_context
+def check(ctx: click.Context, plant: Path, output: Renderer) -> None:
+    """Check the plant file PLANT, and report all errors at once.
+
+    Exits with 2 when there is an error.  What works, but not with all commands, is a warning.
+    """
+    from eap.ops.plant import check_plant  # yaml; --help must not wait
+
+    found, checked = check_plant(plant)
+    for warning in found.warnings:
+        output.remark(f"warning: {warning}")
+    for finding in found.findings:
+        output.remark(str(finding))
+    if len(found.findings) > 1:
+        output.remark(f"{plant}: {len(found.findings)} findings, not a plant yet")
+    output.show(found, lambda _: _summary(plant, checked))
+    if found.findings:
+        ctx.exit(ExitCode.UNUSABLE)
+
+
+def _summary(file: Path, plant: Plant | None) -> Iterator[str]:
+    """Yield the numbers of stations and PDs of a plant without errors."""
+    if plant is None:
+        return
+    sent = sum(len(frame.pds) for station in plant.stations for frame in station.frames)
+    received = sum(len(station.subscriptions) for station in plant.stations)
+    yield (
+        f"{file}: no errors (plant {plant.name}: {count(len(plant.stations), 'station')},"
+        f" {count(sent, 'PD')} sent, {count(received, 'PD')} received)"
+    )
+
+
+@click.command(short_help="Write a plant file to start from.")
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
+@click.option(
+    "--stations",
+    "count",
+    type=click.IntRange(2, 250),
+    default=3,
+    show_default=True,
+    metavar="N",
+    help="How many stations.",
+)
+@click.option("--ring", "shape", flag_value="ring", default="ring", help="Each sends to the next.")
+@click.option(
+    "--star", "shape", flag_value="star", help="The first sends to the others, they send to it."
+)
+@click.option("--name", metavar="NAME", help="Name of the plant; the file's unless given.")
+@click.option(
+    "--address",
+    default="127.0.1.{n}",
+    show_default=True,
+    metavar="PATTERN",
+    help="Addresses of the stations: {n} is a station's number; 10.0.0.11 is that of the first, the"
+    " others follow; ethernet://eth0 is the interface of each on its host.",
+)
+@click.option(
+    "--cycle",
+    "cycle_us",
+    callback=parse_cycle,
+    default="10",
+    show_default=True,
+    metavar="MS",
+    help="Device cycle in milliseconds.",
+)
+@click.option("--force", is_flag=True, help="Write over a file that is there.")
+@json_option("Print one object: file, plant and stations.")
+def new(
+    file: Path,
+    count: int,
+    shape: str,
+    name: str | None,
+    address: str,
+    cycle_us: int,
+    force: bool,
+    output: Renderer,
+) -> None:
+    """Write the plant file FILE, or stdout for -, with N stations in a ring or a star.
+
+    Names, NetIDs, addresses and PD ids are allocated; the file explains itself, passes 'eapctl
+    check' and runs.
+    """
+    from eap.config.new_plant import NewPlant, Shape, plant_text
+
+    is_stdout = str(file) == "-"
+    plant = name or ("plant" if is_stdout else file.stem)
+    text = plant_text(
+        plant,
+        count,
+        Shape(shape),
+        address=address,
+        cycle_us=cycle_us,
+        file="FILE" if is_stdout else str(file),
+    )
+    if is_stdout:
+        if output.is_json:
+            raise click.UsageError("--json tells of a file: name one in place of -")
+        write_text(text, end="")
+        return
+    _write(file, text, force=force)
+    created = NewPlant(str(file), plant, shape, count)
+    output.show(
+        created,
+        lambda _: f"{file}: plant {plant}, {count} stations in a {shape}; eapctl run {file}",
+    )
+
+
+def _write(file: Path, text: str, *, force: bool) -> None:
+    from eap.runtime.durable import whole_file
+
+    if file.exists() and not force:
+        raise click.ClickException(f"{file} exists: write over it with --force")
+    with whole_file(file) as target:
+        target.write(text.encode())
+
+
+_SIGNS = {"added": "+", "removed": "-", "changed": "~"}
+_EMPTY = '""'
+
+
+def plant_arguments(command: CommandT) -> CommandT:
+    """Add PLANT and ``--station``."""
+    stations = click.option(
+        "--station",
+        "stations",
+        multiple=True,
+        metavar="NAME",
+        help="Only this station; may be given several times.",
+    )
+    return click.argument("plant", type=PLANT_FILE)(stations(command))
+
+
+keep_going_option = click.option(
+    "--keep-going", is_flag=True, help="Go on with the other stations when one refuses."
+)
+_RESULT = json_option("Print one object: ok, the steps with their results, and refusals.")
+
+
+@contextmanager
+def running_plant(
+    file: Path, wanted: tuple[str, ...]
+) -> Iterator[tuple[PlantLink, dict[str, StationSpec]]]:
+    """Connect to the running part of the plant in *file*, for the length of a block.
+
+    Yields:
+        The connections, and the specifications of the *wanted* stations: of all that run here
+        unless some are named.
+    """
+    from eap.ops.plant import choose, link_to, load_or_raise
+
+    plant = load_or_raise(file)
+    with link_to(plant, file) as link:
+        yield link, choose(plant, link, wanted)
+
+
+@click.command(short_help="Show the differences between a plant file and the running plant.")
+@plant_arguments
+@json_option("Print one object: ok, stations with changes, the steps of 'apply', absent stations.")
+@click.pass_context
+def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Renderer) -> None:
+    """Show the differences, object by object, between PLANT and its stations that run here.
+
+    Nothing is changed.  Exits with 1 when a station cannot become what the file says while it runs.
+    """
+    from eap.ops.plant import PlanReport, plan_all, start_command, steps_to
+
+    with running_plant(plant, stations) as (link, wanted):
+        plans = plan_all(link, wanted)
+        is_possible = not any(each.refused for each in plans)
+        order = steps_to(link, wanted) if is_possible else []
+        report = PlanReport.of(plans, order, () if stations else link.absent)
+    command = start_command(plant, report.absent)
+    output.show(report, lambda each: plan_lines(each, command))
+    if not is_possible:
+        ctx.exit(ExitCode.FAILED)
+
+
+@click.command(short_help="Apply a plant file to the running plant.")
+@plant_arguments
+@keep_going_option
+@_RESULT
+@click.pass_context
+def apply(
+    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Renderer
+) -> None:
+    """Apply PLANT to its stations that run here, without a restart.
+
+    Everything without a change goes on undisturbed.  Each station changes between two of its
+    cycles, and keeps the change over a restart.  A receiver takes a new layout beside the old one
+    before anything sends it.  The first refusal of a station ends it; 'eapctl rollback' brings back
+    the state before.
+
+    Exits with 1 when a station refused.
+    """
+    from eap.ops.plant import apply_steps, plan_all, steps_to
+
+    with running_plant(plant, stations) as (link, wanted):
+        refusing = {each.station: each.refused for each in plan_all(link, wanted) if each.refused}
+        is_on = keep_going or not refusing
+        chosen = {name: spec for name, spec in wanted.items() if is_on and name not in refusing}
+        order = steps_to(link, chosen)
+        steps = apply_steps(link, order, keep_going=keep_going, routed=chosen)
+        _run_steps(ctx, steps, link, refusing, output)
+
+
+@click.command(short_help="Take back the last change of a running plant.")
+@plant_arguments
+@keep_going_option
+@_RESULT
+@click.pass_context
+def rollback(
+    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Renderer
+) -> None:
+    """Take back the last change of the stations of PLANT that run here.
+
+    Stations that it did not change stay as they are.  A second rollback undoes the first one.
+
+    Exits with 1 when a station refused.
+    """
+    from eap.ops.plant import roll_back
+
+    with running_plant(plant, stations) as (link, wanted):
+        _run_steps(ctx, roll_back(link, tuple(wanted), keep_going=keep_going), link, {}, output)
+
+
+def _run_steps(
+    ctx: click.Context,
+    steps: Iterable[StepOutcome],
+    link: PlantLink,
+    refusing: Mapping[str, list[str]],
+    output: Renderer,
+) -> None:
+    """Take all steps, print the text of each when it is done, and then the whole result."""
+    from eap.ops.plant import ChangeReport
+
+    taken: list[StepOutcome] = []
+    error: ControlError | None = None
+    try:
+        for step in steps:
+            taken.append(step)
+            if not output.is_json:
+                for line in _step_lines(step):
+                    write_text(line)
+    except ControlError as exc:
+        error = exc
+    report = ChangeReport.of(taken, refusing, error)
+    output.show(report, lambda each: _end_lines(each, len(link.stations)))
+    if error is not None:
+        raise error
+    if not report.ok:
+        ctx.exit(ExitCode.FAILED)
+
+
+def plan_lines(report: PlanReport, command: str) -> Iterator[str]:
+    """Yield the differences of each station, the steps, and the *command* for absent stations."""
+    plans = report.stations
+    differing = [each for each in plans if each.differs]
+    for each in differing:
+        yield each.station
+        yield from (f"  {line}" for line in _change_lines(each.changes))
+        yield from (f"  * {note}" for note in each.notes)
+        yield from (f"  ! {reason}" for reason in each.refused)
+    if differing:
+        yield from _plan_summary(report)
+    else:
+        names = [each.station for each in plans]
+        all_of = f"{names[0]} is" if len(names) == 1 else f"all {len(names)} stations are"
+        yield f"nothing differs: {all_of} as the file says"
+    if report.absent:
+        yield f"not running here: {', '.join(report.absent)}; start them with:"
+        yield f"  {command}"
+
+
+def _plan_summary(report: PlanReport) -> Iterator[str]:
+
+    differing = [each for each in report.stations if each.differs]
+    refusing = [each.station for each in differing if each.refused]
+    kinds = [change.change for each in differing for change in each.changes]
+    numbers = ", ".join(
+        f"{kinds.count(kind)} {kind}" for kind in ("added", "removed", "changed") if kind in kinds
+    )
+    others = len(report.stations) - len(differing)
+    yield (
+        f"{count(len(differing), 'station')} of {len(report.stations)} to change"
+        + (f" ({numbers})" if numbers else "")
+        + (f", {others} as the file says" if others else "")
+    )
+    if refusing:
+        yield f"cannot be applied: {', '.join(refusing)} refused"
+    elif len(report.steps) > 1:
+        yield "'eapctl apply' goes these steps:"
+        for number, step in enumerate(report.steps, 1):
+            yield f"  {number}. {step.station} {step.why}"
+
+
+def change_text(change: ObjectChange, name: str) -> str:
+    """Return one change, such as ``~ 0xD000:07 TxPD 0 (state): Cycle time  10000 -> 20000 us``."""
+    old, new = change.old, change.new
+    values = f"{old or _EMPTY} -> {new or _EMPTY}" if change.change == "changed" else new
+    unit = f" {change.unit}" if values and change.unit else ""
+    entry = ObjectId(change.index, change.subindex)
+    return f"{_SIGNS[change.change]} {entry} {name}  {values}{unit}".rstrip()
+
+
+def _change_lines(changes: Sequence[ObjectChange]) -> Iterator[str]:
+    """Yield a line for each change, with its port if there is more than one port."""
+    several = len({change.port for change in changes}) > 1
+    for change in changes:
+        yield change_text(change, f"{change.port}: {change.name}" if several else change.name)
+
+
+def _step_lines(step: StepOutcome) -> Iterator[str]:
+    """Yield the result of one step."""
+    outcome = step.outcome
+    yield f"{step.station} {step.why}: {'ok' if outcome.ok else 'refused'}"
+    for line, result in zip(_change_lines(outcome.results), outcome.results, strict=True):
+        yield f"  {line}  {'ok' if result.ok else result.reason}"
+    yield from (f"  ! {reason}" for reason in outcome.refused)
+
+
+def _end_lines(report: ChangeReport, stations: int) -> Iterator[str]:
+    """Yield the result of all steps, and the remedy if these were not all.
+
+    Args:
+        report: The result.
+        stations: Number of stations that run here.
+    """
+    for each in report.refused:
+        yield f"{each.station} cannot change while it runs"
+        yield from (f"  ! {reason}" for reason in each.refused)
+    refused = [step.station for step in report.steps if not step.ok]
+    changed = list(dict.fromkeys(step.station for step in report.steps if step.ok))
+    if not changed:
+        yield "nothing was changed"
+        return
+    others = stations - len(changed)
+    rest = f", {others} as before" if others else ""
+    yield f"{count(len(changed), 'station')} changed{rest}"
+    if refused or report.error is not None:
+        what = f"{', '.join(refused)} refused" if refused else "broken off"
+        are = "is" if len(changed) == 1 else "are"
+        yield f"{what}: changed until then {are} {', '.join(changed)}"
+        yield "'eapctl apply' goes on with it, 'eapctl rollback' brings back the state before"
+
+
+DEFAULT_CYCLE_US = 10_000
+_OF_A_BLANK = "interface", "net_id", "cycle_us"
+
+
+def _blank_options(command: CommandT) -> CommandT:
+    blank = click.option(
+        "--blank", metavar="NAME", help="In place of PLANT: a station without any configuration."
+    )
+    interface = click.option(
+        "--interface",
+        metavar="URI",
+        help="Of the blank station's port eap0, such as udp://10.0.0.1 or ethernet://eth0.",
+    )
+    net_id = click.option(
+        "--net-id",
+        metavar="N",
+        help="AMS NetID of that port: publisher ID of its frames, address of its dictionary.",
+    )
+    cycle = click.option(
+        "--cycle",
+        "cycle_us",
+        callback=parse_cycle,
+        metavar="MS",
+        help="Device cycle of the blank station in milliseconds; 10 unless given.",
+    )
+    resume = click.option(
+        "--resume",
+        is_flag=True,
+        help="Let the blank station go on with what it was configured to be when it last ran.",
+    )
+    return blank(interface(net_id(cycle(resume(command)))))
+
+
+@click.command(short_help="Run a plant, or some of its stations.")
+@click.argument("plant", type=PLANT_FILE, required=False)
+@click.option(
+    "--station",
+    "stations",
+    multiple=True,
+    metavar="NAME",
+    help="Run only this station; may be given several times.",
+)
+@_blank_options
+@click.option(
+    "--realtime/--no-realtime",
+    default=True,
+    show_default=True,
+    help="Ask for SCHED_FIFO, locked memory and PM QoS; without permission the plant runs all the"
+    " same, and status says so.",
+)
+@click.option(
+    "--priority",
+    type=click.IntRange(1, 99),
+    default=50,
+    show_default=True,
+    metavar="N",
+    help="SCHED_FIFO priority of the engine.",
+)
+@click.option("--cpu", type=click.IntRange(0), metavar="N", help="Run the engine on this CPU only.")
+@click.pass_context
+def run(
+    ctx: click.Context,
+    plant: Path | None,
+    stations: tuple[str, ...],
+    realtime: bool,
+    priority: int,
+    cpu: int | None,
+    blank: str | None,
+    interface: str | None,
+    net_id: str | None,
+    cycle_us: int | None,
+    resume: bool,
+) -> None:
+    """Run the stations of the plant file PLANT until Ctrl-C or SIGTERM.
+
+    With --blank, run one station that has an EAP port and nothing else, in PREOP: 'eapctl od
+    write', 'eapctl apply' or another tool configures it.
+
+    When each has run its first cycle, one line {"ready": true, "stations": [...]} appears on
+    stdout; messages go to stderr.  Exits with 2, and starts nothing, when the file or this machine
+    is not fit.
+    """
+    _check_form(ctx)
+    from eap.runtime.handover import EngineOptions
+
+    # Processes and sockets: --help must not wait for them.
+    from eap.supervisor import process as supervisor
+
+    options = EngineOptions(realtime=realtime, priority=priority, cpu=-1 if cpu is None else cpu)
+    if plant is not None:
+        ctx.exit(supervisor.run(plant, stations, options=options))
+    station = _blank_plant(blank or "", interface or "", net_id or "", cycle_us or DEFAULT_CYCLE_US)
+    ctx.exit(supervisor.run_blank(station, options=options, resume=resume))
+
+
+def _check_form(ctx: click.Context) -> None:
+    """Raise UsageError unless the command line has one of the two forms."""
+    given = {name for name in _OF_A_BLANK if ctx.params[name] is not None}
+    has_plant = ctx.params["plant"] is not None
+    if ctx.params["blank"] is None:
+        if given or ctx.params["resume"]:
+            names = "--interface, --net-id, --cycle and --resume"
+            raise click.UsageError(f"{names} go with --blank NAME", ctx)
+        if not has_plant:
+            raise click.UsageError("say what to run: PLANT, or --blank NAME", ctx)
+    elif has_plant or ctx.params["stations"]:
+        raise click.UsageError("--blank NAME takes the place of PLANT and --station", ctx)
+    elif not {"interface", "net_id"} <= given:
+        raise click.UsageError("--blank NAME needs --interface URI and --net-id N", ctx)
+
+
+def _blank_plant(name: str, interface: str, net_id: str, cycle_us: int) -> Plant:
+    """Return a plant of one blank station; raise ConfigError that names the wrong options."""
+    from eap.config.load import INTERFACE_PATH, NET_ID_PATHS, blank
+
+    result = blank(name, interface, net_id, cycle_us)
+    if result.plant is not None:
+        return result.plant
+    options = {INTERFACE_PATH: "--interface"} | dict.fromkeys(NET_ID_PATHS, "--net-id")
+    lines = {
+        f"{options.get(each.path, '--blank')}: {each.message}; expected {each.expected}": None
+        for each in result.findings
+    }
+    raise ConfigError("\n".join(lines))
