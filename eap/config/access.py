@@ -16,9 +16,9 @@ from eap.ams.spec import (
     TransportKind,
 )
 from eap.config.brokers import brokers_of, check_file
-from eap.config.check_ports import check_names
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
+from eap.config.ports import check_names
 from eap.config.routes import WHOLE, MisfitError, net_ids_of, without_prefix
 from eap.config.structs import AccessSection, PortSection, StationSection
 from eap.ids import STATION_OCTETS, MacAddr, ObjectId

@@ -1,158 +1,24 @@
-"""Bus of a plant file as it is expected: its slaves, and the variables of a station on it.
-
-A plant file names a bus file; the caller of ``load`` brings the function that reads it, because
-this package knows plants and not devices.
-"""
+"""Bus ports of a plant file: bus files, mailbox gateways, and checks of both."""
 
 from __future__ import annotations
 
-import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from ipaddress import IPv4Address
-from itertools import count
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
-import msgspec
-
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ethercat import EAP_PORT
 from eap.config.finding import FindingReport, PlantFinding
-from eap.config.structs import PlantFile, PortSection, StationSection
-from eap.ids import InterfaceUri, ObjectId
-from eap.pd.spec import BusEntrySpec, BusSlaveSpec, PortKind
-
-FIRST_STATION = 1001
-"""Station address of the first slave in the line; the others follow."""
-STATE = "state"
-WKC_OK = "wkc_ok"
-_STATES = "1 INIT, 2 PREOP, 4 SAFEOP, 8 OP, 0 without an answer"
-_OTHER = re.compile(r"[^\w-]")
-
-
-class DescribedEntry(msgspec.Struct, frozen=True):
-    """One entry of process data; *type* as ``datatypes.parse`` reads it, empty for padding."""
-
-    name: str
-    type: str
-    index: int
-    subindex: int
-    bit_length: int
-
-
-class DescribedSlave(msgspec.Struct, frozen=True, kw_only=True):
-    """One slave as its description has it; what is None may be anything."""
-
-    name: str
-    vendor: int
-    product: int
-    revision: int | None = None
-    serial: int | None = None
-    alias: int | None = None
-    outputs: tuple[DescribedEntry, ...] = ()
-    """In the order of the PDOs."""
-    inputs: tuple[DescribedEntry, ...] = ()
-
-
-class ExpectedBus(msgspec.Struct, frozen=True):
-    """A bus, in the order of the line."""
-
-    slaves: tuple[DescribedSlave, ...] = ()
-
+from eap.config.index import ExpectedBus, Index
+from eap.config.routes import MisfitError
+from eap.config.structs import Plain, PlantFile, PortSection, StationSection
+from eap.ids import InterfaceUri
+from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
+from eap.suggest import suggest
 
 DescribeBus: TypeAlias = Callable[[Path], ExpectedBus | tuple[PlantFinding, ...]]
 """Reads a bus file; returns its findings if it has any, and never raises for what it holds."""
-
-
-class BusVariable(NamedTuple):
-    """A variable that a station has because of a bus; *type* is canonical."""
-
-    type: str
-    is_output: bool
-    comment: str
-
-
-class NamedBus(NamedTuple):
-    """The slaves of one bus port, and all variables that it brings, in order."""
-
-    slaves: tuple[BusSlaveSpec, ...]
-    variables: dict[str, BusVariable]
-
-
-def name_bus(port: str, description: ExpectedBus) -> NamedBus:
-    """Give the process data of the bus at *port* its names.
-
-    ``PORT.SLAVE.ENTRY``, and beside these the states of bus and slaves.
-    """
-    variables = {
-        f"{port}.{STATE}": BusVariable("BYTE", False, f"lowest AL state of the slaves: {_STATES}"),
-        f"{port}.{WKC_OK}": BusVariable("BOOL", False, "the last exchange reached every slave"),
-    }
-    slaves = []
-    for number, slave in enumerate(description.slaves):
-        prefix = f"{port}.{slave.name}"
-        variables[f"{prefix}.{STATE}"] = BusVariable("BYTE", False, f"AL state: {_STATES}")
-        names = iter(_unique_names([*slave.outputs, *slave.inputs]))
-        outputs = tuple(_name(entry, prefix, next(names)) for entry in slave.outputs)
-        inputs = tuple(_name(entry, prefix, next(names)) for entry in slave.inputs)
-        for entries, specs in ((slave.outputs, outputs), (slave.inputs, inputs)):
-            variables.update(_variables(entries, specs, is_output=entries is slave.outputs))
-        slaves.append(
-            BusSlaveSpec(
-                name=slave.name,
-                station=FIRST_STATION + number,
-                vendor=slave.vendor,
-                product=slave.product,
-                revision=slave.revision,
-                serial=slave.serial,
-                alias=slave.alias,
-                outputs=outputs,
-                inputs=inputs,
-            )
-        )
-    return NamedBus(tuple(slaves), variables)
-
-
-def _name(entry: DescribedEntry, prefix: str, name: str) -> BusEntrySpec:
-    variable = f"{prefix}.{name}" if entry.type else ""
-    return BusEntrySpec(variable, entry.index, entry.subindex, entry.bit_length)
-
-
-def _variables(
-    entries: Sequence[DescribedEntry], specs: Sequence[BusEntrySpec], *, is_output: bool
-) -> Iterator[tuple[str, BusVariable]]:
-    for entry, spec in zip(entries, specs, strict=True):
-        if spec.variable:
-            comment = f"{'output' if is_output else 'input'} {ObjectId(spec.index, spec.subindex)}"
-            yield spec.variable, BusVariable(entry.type, is_output, comment)
-
-
-def _unique_names(entries: Sequence[DescribedEntry]) -> list[str]:
-    """Return the last part of each entry's name; one that is there twice gets its object."""
-    plain = [_plain(entry) for entry in entries]
-    counts = Counter([STATE, *(name for name, e in zip(plain, entries, strict=True) if e.type)])
-    taken = {name for name, times in counts.items() if times == 1} | {STATE}
-    names = []
-    for entry, name in zip(entries, plain, strict=True):
-        if counts[name] > 1 and entry.type:
-            names.append(_free(f"{name}_{_place(entry)}", taken))
-            taken.add(names[-1])
-        else:
-            names.append(name)
-    return names
-
-
-def _plain(entry: DescribedEntry) -> str:
-    return _OTHER.sub("_", entry.name) or _place(entry)
-
-
-def _place(entry: DescribedEntry) -> str:
-    return f"{entry.index:04X}_{entry.subindex:02X}"
-
-
-def _free(name: str, taken: set[str]) -> str:
-    if name not in taken:
-        return name
-    return next(each for n in count(2) if (each := f"{name}_{n}") not in taken)
 
 
 SCHEMES = ("sim", "ethernet", "udp")
@@ -252,3 +118,223 @@ def _has_names(
     for name in wrong:
         report.add(path, f"port {port.name} has a slave {name!r}", _SLAVE_NAME)
     return not wrong
+
+
+MASTER_PORT = 0xFFFF
+ADDRESS = "a mailbox address from 1 to 0xFFFE"
+TARGET = (
+    "a station address or the name of a slave, STATION/PORT/SLAVE, or a list of these addresses"
+)
+_MEMBER = "station addresses, names of slaves of this bus, and virtual addresses"
+_LAST = 0xFFFE
+
+
+def gateway_spec(index: Index, station: StationSection, port: PortSection) -> GatewaySpec:
+    """Return the specification of the gateway of a bus port; the checks have passed it."""
+    said = port.gateway
+    return GatewaySpec(
+        enabled=said.enabled,
+        port=gateway_port(station, port),
+        answer_ms=said.answer_ms,
+        silent=said.silent,
+        full=said.full,
+        padded=said.padded,
+        addresses=tuple(
+            resolve(index, station, port, parse_address(text), target)
+            for text, target in said.addresses.items()
+        ),
+        in_flight=said.limits.in_flight,
+        rate=said.limits.rate,
+        clients=said.limits.clients,
+    )
+
+
+def gateway_port(station: StationSection, port: PortSection) -> int:
+    """Return the port number that a gateway has to itself, 0 for none.
+
+    The one to the first bus is served where the station takes all frames.
+    """
+    buses = [each.name for each in station.ports if each.kind is PortKind.BUS]
+    number = buses.index(port.name)
+    return port.gateway.port or (EAP_PORT + number if number else 0)
+
+
+def hosts_of(index: Index, station: StationSection) -> Iterator[str]:
+    """Yield the IP addresses of a station, each once."""
+    uris = (index.uris.get((station.name, each.name)) for each in _eap_ports(station))
+    found = (uri.host for uri in uris if uri is not None and uri.scheme in {"udp", "tcp"})
+    yield from dict.fromkeys(found)
+
+
+def parse_address(text: str) -> int:
+    """Return a virtual address as a plant file has it; raise MisfitError if it is none."""
+    try:
+        address = int(text, 0)
+    except ValueError:
+        address = 0
+    if not 0 < address <= _LAST:
+        raise MisfitError(text, f"gateway address {text!r}", ADDRESS)
+    return address
+
+
+def resolve(
+    index: Index, station: StationSection, port: PortSection, address: int, target: Plain
+) -> GatewayAddress:
+    """Return the target of *address*; raise MisfitError if there is no such one."""
+    if isinstance(target, list):
+        known = _virtual(port)
+        members = tuple(_member(index, station, port, each, known) for each in target)
+        if not members:
+            raise MisfitError("", "a group of nobody", _MEMBER)
+        return GatewayAddress(address, members=members)
+    names = str(target).split("/")
+    if len(names) == 1:
+        return GatewayAddress(address, station=_slave(index, station, port, target))
+    other = index.stations.get(names[0])
+    there = index.ports.get((names[0], names[1]))
+    if other is None or there is None or there.kind is not PortKind.BUS or len(names) > 3:
+        buses = [f"{at}/{name}" for (at, name), each in index.ports.items() if _is_bus(each)]
+        hint = suggest("/".join(names[:2]), buses)
+        raise MisfitError("", f"there is no bus port for {target!r}{hint}", TARGET)
+    number = _slave(index, other, there, names[2]) if len(names) == 3 else MASTER_PORT
+    if there is port and number != MASTER_PORT:
+        return GatewayAddress(address, station=number)
+    return GatewayAddress(address, net_id=str(there.net_id), port=number)
+
+
+def _member(
+    index: Index,
+    station: StationSection,
+    port: PortSection,
+    member: object,
+    known: dict[int, Plain],
+) -> int:
+    text = str(member)
+    if text.lower().startswith("0x") or isinstance(member, int):
+        number = int(text, 0)
+        if number in known:
+            if isinstance(known[number], list):
+                raise MisfitError("", f"0x{number:04X} is a group itself", _MEMBER)
+            return number
+    return _slave(index, station, port, member)
+
+
+def _slave(index: Index, station: StationSection, port: PortSection, slave: object) -> int:
+    """Return the station address of a slave that is named by it, or by its name."""
+    slaves = slaves_of(index, station, port)
+    for each in slaves:
+        if slave in {each.name, each.station} or str(slave) == str(each.station):
+            return each.station
+    name = f"{station.name}/{port.name}"
+    text = str(slave)
+    if text.isdecimal() or isinstance(slave, int):
+        number = int(text, 0)
+        if not slaves and 0 < number <= _LAST:
+            return number  # nothing describes the bus: any slave may be there
+        last = f"; its last one is {slaves[-1].station}" if slaves else ""
+        raise MisfitError("", f"{name} has no slave {number}{last}", TARGET)
+    hint = suggest(text, [each.name for each in slaves])
+    raise MisfitError("", f"{name} has no slave {text!r}{hint}", TARGET)
+
+
+def slaves_of(index: Index, station: StationSection, port: PortSection) -> tuple[BusSlaveSpec, ...]:
+    """Return the slaves that a bus is known to have, none where nothing describes it."""
+    bus = index.buses.get((station.name, port.name))
+    return bus.slaves if bus else ()
+
+
+def _virtual(port: PortSection) -> dict[int, Plain]:
+    found: dict[int, Plain] = {}
+    for text, target in port.gateway.addresses.items():
+        try:
+            found[parse_address(text)] = target
+        except MisfitError:
+            continue  # a finding of its own
+    return found
+
+
+def _eap_ports(station: StationSection) -> Iterator[PortSection]:
+    return (port for port in station.ports if port.kind is PortKind.EAP)
+
+
+def _is_bus(port: PortSection) -> bool:
+    return port.kind is PortKind.BUS
+
+
+_ANY = "0.0.0.0"  # noqa: S104  what a plant file may say
+_BIT_15 = 0x8000
+
+
+def check_gateways(index: Index, report: FindingReport) -> None:
+    """Report every gateway that cannot be as it is."""
+    taken = list(_taken(index))
+    for station in index.plant.stations:
+        for port in station.ports:
+            if port.kind is PortKind.BUS:
+                _check_addresses(index, station, port, report)
+                _check_place(index, station, port, taken, report)
+
+
+def _check_addresses(
+    index: Index, station: StationSection, port: PortSection, report: FindingReport
+) -> None:
+    path = f"{port.at}.gateway.addresses"
+    first: dict[int, str] = {}
+    stations = {slave.station for slave in slaves_of(index, station, port)}
+    is_unread = port.name in index.unread_buses(station)
+    for text, target in port.gateway.addresses.items():
+        try:
+            address = parse_address(text)
+            if address in first:
+                message = f"gateway address {text} is {first[address]} once more"
+                report.add(f"{path}.{text}", message, "each address once")
+                continue
+            first[address] = text
+            if address & _BIT_15 and address & ~_BIT_15 in stations:
+                slave = address & ~_BIT_15
+                message = f"gateway address {text} is that of slave {slave} with bit 15 set"
+                report.add(f"{path}.{text}", message, f"{ADDRESS} that stands for nobody yet")
+            resolve(index, station, port, address, target)
+        except MisfitError as exc:
+            if not is_unread:
+                report.add(f"{path}.{text}", str(exc), exc.expected)
+        except ValueError:
+            continue  # a NetID that is a finding of its own
+
+
+def _check_place(
+    index: Index,
+    station: StationSection,
+    port: PortSection,
+    taken: list[tuple[str, int, str, str]],
+    report: FindingReport,
+) -> None:
+    number = gateway_port(station, port)
+    if not number:
+        return
+    path = f"{port.at}.gateway.port"
+    if path not in report.lines:
+        path = port.at
+    for host in hosts_of(index, station):
+        for other_host, other_number, what, at in taken:
+            if other_number == number and (host == other_host or _ANY in {host, other_host}):
+                line = report.line_of(at)
+                message = (
+                    f"the gateway to {port.name} is served at {host}, port {number}, which"
+                    f" belongs to {what} (line {line})"
+                )
+                report.add(path, message, f"gateway: {{port: NUMBER}} that is free at {host}")
+                return
+        taken.append((host, number, f"the gateway to {station.name}/{port.name}", path))
+
+
+def _taken(index: Index) -> Iterator[tuple[str, int, str, str]]:
+    """Yield what the ports of the plant have: address, port number, whose, and its path."""
+    for (station, name), uri in index.uris.items():
+        port = index.ports[station, name]
+        path = f"{port.at}.interface"
+        if uri.scheme in {"udp", "tcp"}:
+            yield uri.host, uri.port or EAP_PORT, f"{station}/{name}", path
+            if port.kind is PortKind.EAP and port.ams:
+                yield uri.host, AMS_TCP_PORT, f"AMS at {station}/{name}", path
+                yield uri.host, AMS_TCP_PORT + 1, f"AMS at {station}/{name}", path

@@ -12,7 +12,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from eap.ams.spec import RoutingSpec
 from eap.control.protocol import Document, Method, Parameters
-from eap.device.difference import EntryChange
+from eap.device.configuration import EntryChange
 from eap.device.eap_state import StateResult
 from eap.device.rollout import without_alternates
 from eap.od.model import Access, Entry, OdObject

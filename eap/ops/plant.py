@@ -33,7 +33,7 @@ from eap.control.device import (
 )
 from eap.control.protocol import AnswerT, ErrorCode, Method, ParametersT
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_fill import fill
+from eap.device.eap_spec import fill
 from eap.device.rollout import Step, steps, without_alternates
 from eap.errors import ConfigError, ControlError
 from eap.ids import InterfaceUri

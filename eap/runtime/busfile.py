@@ -17,10 +17,9 @@ from devicebus.sim.fault import FaultySegment
 from devicebus.sim.segment import Side, find_way
 from devicebus.sim.spec import BusSpec, SlaveSpec
 from devicebus.wire import sii
-from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus
-from eap.config.convert import convert_to
-from eap.config.document import read
+from eap.config.document import convert_to, read
 from eap.config.finding import FindingReport, PlantFinding, one_of
+from eap.config.index import DescribedEntry, DescribedSlave, ExpectedBus
 from eap.errors import ConfigError
 from eap.od.dictionary import ObjectDictionary
 from eap.suggest import suggest

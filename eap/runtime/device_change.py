@@ -8,14 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from eap.device import stored
-from eap.device.difference import EntryChange, compare
+from eap.device.configuration import (
+    EntryChange,
+    StoredError,
+    compare,
+    dump_configuration,
+    load_configuration,
+)
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_fill import fill
-from eap.device.eap_records import read_back
-from eap.device.pdlayout import bus_variables, kept_versions
-from eap.device.rollout import without_alternates
-from eap.device.stored import StoredError
+from eap.device.eap_spec import fill, read_back
+from eap.device.rollout import bus_variables, kept_versions, without_alternates
 from eap.pd.device import DeviceFault
 from eap.pd.handover import needs_new_start
 from eap.pd.spec import LinkSpec, PortKind, Source, StationSpec, VariableSpec
@@ -52,7 +54,7 @@ def eap_ports(spec: StationSpec) -> list[str]:
 
 def dump_all(dictionaries: Mapping[str, EapDictionary]) -> dict[str, Any]:
     """Return what *dictionaries* hold, for the store."""
-    return {name: stored.dump(each) for name, each in dictionaries.items()}
+    return {name: dump_configuration(each) for name, each in dictionaries.items()}
 
 
 def fill_all(
@@ -73,7 +75,7 @@ def fill_all(
     for name, dictionary in dictionaries.items():
         if name in objects:
             try:
-                stored.load(dictionary, objects[name])
+                load_configuration(dictionary, objects[name])
             except StoredError:
                 pass
             else:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from eap.config.bus import ExpectedBus
 from eap.config.finding import PlantFinding
+from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri

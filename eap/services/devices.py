@@ -10,7 +10,7 @@ from functools import partial
 from time import monotonic_ns
 
 from eap.ams.spec import RoutingSpec
-from eap.device.eap_objects import DeviceIdentity
+from eap.device.eap_dictionary import DeviceIdentity
 from eap.errors import ImageError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec

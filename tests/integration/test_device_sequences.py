@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from msgspec.structs import replace
 
-from eap.device.eap_records import read_back
+from eap.device.eap_spec import read_back
 from eap.errors import EngineGoneError, EngineRefusedError
 from eap.od.abort import SdoAbortError
 from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var

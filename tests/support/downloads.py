@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from eap.device.configuration import adopt_configuration
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.stored import adopt
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.eap1000 import AddressMode, FrameSub, Rx, RxFlag, Tx, Var, row_of
@@ -29,7 +29,7 @@ def write(
 def copy(dictionary: EapDictionary) -> EapDictionary:
     """Return another dictionary with the same configuration, for which nothing runs."""
     other = dictionary.blank()
-    adopt(other, dictionary)
+    adopt_configuration(other, dictionary)
     return other
 
 

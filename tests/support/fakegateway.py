@@ -22,8 +22,8 @@ from eap.codec.mailbox import (
     encode_message,
 )
 from eap.codec.soe import SoeAttribute
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.master_dictionary import MasterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import MasterDictionary
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import refuse
 from eap.od.dictionary import ObjectDictionary

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.device.eap_objects import DeviceIdentity, NothingRuns
+from eap.device.eap_dictionary import DeviceIdentity, NothingRuns
 from eap.errors import EapError, EngineGoneError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from eap.codec import datatypes, pdo
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_fill import fill
+from eap.device.eap_spec import fill
 from eap.ids import InterfaceUri
 from eap.pd.spec import (
     REQUESTER,

@@ -9,8 +9,7 @@ from tempfile import TemporaryDirectory
 from time import monotonic_ns, perf_counter_ns
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_fill import fill
-from eap.device.eap_records import read_back
+from eap.device.eap_spec import fill, read_back
 from eap.ids import InterfaceUri
 from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines

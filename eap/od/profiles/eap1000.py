@@ -8,7 +8,7 @@ To add a field of the plant file: its section (``eap.config.structs``) and its r
 (``eap.pd.spec``) get it, a row here names both, and docs/plant-file.md explains it; dictionaries,
 checks of entries, plans and docs/objects.md follow.  A TxFrame ends with the list of its PDs: a new
 entry takes the first sub-index of that list.  Stored objects are then those of another version
-(``eap.device.stored.VERSION``), and are made anew from the stored specification.
+(``eap.device.configuration.VERSION``), and are made anew from the stored specification.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from eap.ads.objects import ObjectSpace
 from eap.ads.operation import Operation, OperationOutcome
 from eap.codec.ads import AdsDeviceInfo
 from eap.codec.ams import DEVICE_PORT, IO_PORT
-from eap.device.router_dictionary import RouterDictionary
+from eap.device.live_dictionaries import RouterDictionary
 from eap.gateway.error_table import ads_result
 from eap.ids import NetId
 from eap.od.model import OdState

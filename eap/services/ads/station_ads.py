@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.router_dictionary import RouterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import RouterDictionary
 from eap.ids import NetId
 from eap.pd.spec import StationSpec
 from eap.runtime.station_image import StationImage

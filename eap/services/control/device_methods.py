@@ -11,7 +11,7 @@ from eap.control import device as words
 from eap.control.bus import to_octets
 from eap.control.protocol import ErrorCode, of_station
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.router_dictionary import RouterDictionary
+from eap.device.live_dictionaries import RouterDictionary
 from eap.errors import ControlError
 from eap.od.model import Access, OdObject
 from eap.od.profiles import eap1000 as profile

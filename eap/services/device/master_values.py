@@ -23,8 +23,8 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import fpwr
 from devicebus.wire.register import DlStatus
 from devicebus.wire.sii import SiiProtocol
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.master_dictionary import MasterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import MasterDictionary
 from eap.errors import EapError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.master1100 import CONFIGURED, DIAGNOSIS, MasterLive

@@ -13,10 +13,9 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from eap.device import stored
-from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_objects import DeviceIdentity, LiveValues
-from eap.device.eap_records import read_back
+from eap.device.configuration import adopt_configuration, read_configuration, restore_configuration
+from eap.device.eap_dictionary import DeviceIdentity, EapDictionary, LiveValues
+from eap.device.eap_spec import read_back
 from eap.device.eap_state import EapStateMachine, StateResult
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
@@ -195,7 +194,7 @@ class StationDevice:
         except DeviceFault as exc:
             return plan, exc
         for name, dictionary in self.dictionaries.items():
-            stored.adopt(dictionary, plan.dictionaries[name])
+            adopt_configuration(dictionary, plan.dictionaries[name])
         self._incomplete = None
         return plan, None
 
@@ -207,7 +206,7 @@ class StationDevice:
         """
         self._requested = self._changed = None
         runs = self._machine.status.state is not DeviceState.PREOP
-        before = stored.configuration(dictionary) if runs else {}
+        before = read_configuration(dictionary) if runs else {}
         result = write()
         self._is_written = self._is_written or self._requested is None
         if self._requested is not None:
@@ -218,7 +217,7 @@ class StationDevice:
             try:
                 await self._keeper.change(self._changed, dump_all(self.dictionaries))
             except DeviceFault as exc:
-                stored.restore(dictionary, before)
+                restore_configuration(dictionary, before)
                 raise SdoAbortError(AbortCode.PARAMETER, exc.index, exc.subindex, exc.text) from exc
         return result
 

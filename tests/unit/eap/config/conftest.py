@@ -2,11 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus, describe_buses
-from eap.config.convert import convert
-from eap.config.document import read
+from eap.config.bus import describe_buses
+from eap.config.document import convert, read
 from eap.config.finding import FindingReport, PlantFinding
-from eap.config.index import Index
+from eap.config.index import DescribedEntry, DescribedSlave, ExpectedBus, Index
 from eap.config.load import load
 
 PLANT = """\

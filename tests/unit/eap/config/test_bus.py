@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus, name_bus
+from eap.config.index import DescribedEntry, DescribedSlave, ExpectedBus, name_bus
 
 
 def slave(*inputs, outputs=(), name="a", **identity):

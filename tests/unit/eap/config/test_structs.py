@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from eap.config import structs
-from eap.config.bus import ExpectedBus
+from eap.config.index import ExpectedBus
 from eap.config.load import load
 from eap.pd import spec
 

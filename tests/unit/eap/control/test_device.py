@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec import to_builtins
 
 from eap.control import device as words
-from eap.device.difference import ChangeKind, EntryChange
+from eap.device.configuration import ChangeKind, EntryChange
 from eap.device.eap_state import StateResult
 from eap.od.model import WO, Entry, record
 from eap.pd.device import DeviceFault, DeviceState, FaultCode

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from msgspec.structs import replace
 
+from eap.device.configuration import read_configuration
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_fill import fill
-from eap.device.stored import configuration
+from eap.device.eap_spec import fill
 from eap.od.profiles.eap1000 import RX_PD, RX_VARIABLE, TX_FRAME, TX_PD, TX_VARIABLE, Tx, Var
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import (
@@ -81,7 +81,7 @@ def test_what_has_the_same_name_keeps_its_index(forwarding):
 def test_filling_like_itself_changes_nothing(station: StationSpec):
     before = filled(station)
     for name, each in filled(station, before).items():
-        assert configuration(each) == configuration(before[name])
+        assert read_configuration(each) == read_configuration(before[name])
 
 
 def test_mappings_that_others_share_are_not_taken_over(forwarding):

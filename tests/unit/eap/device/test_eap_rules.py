@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from eap.codec import datatypes, pdo
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_objects import EapObjects
 from eap.device.eap_rules import (
     MappingEntry,
     check_mapped,
@@ -165,7 +164,7 @@ def test_a_received_variable_is_sent_on_but_a_sent_one_is_not_received(udp):
         check_mapped(udp, 0x6000_0110, Access.RX_MAPPABLE, 0x1600, 1)
 
 
-def test_a_mapping_that_no_longer_holds_counts_what_is_left(udp: EapObjects):
+def test_a_mapping_that_no_longer_holds_counts_what_is_left(udp: EapDictionary):
     variable(udp, 0x6000, "level")
     write(udp, 0x1A00, 1, 0x6000_0110)
     write(udp, 0x1A00, 0, 1)

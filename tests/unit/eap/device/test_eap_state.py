@@ -7,10 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from eap.device.difference import compare
-from eap.device.eap_records import read_back
+from eap.device.configuration import (
+    compare,
+    dump_configuration,
+    load_configuration,
+    read_configuration,
+)
+from eap.device.eap_spec import read_back
 from eap.device.eap_state import EapStateMachine
-from eap.device.stored import configuration, dump, load
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var
@@ -239,26 +243,26 @@ class DeviceMachine(RuleBasedStateMachine):
     @rule(port=st.sampled_from(["eap0", "eap1"]), where=_downloads())
     def download(self, port: str, where: tuple[int, int, object]) -> None:
         dictionary = self.ports[port]
-        before = configuration(dictionary)
+        before = read_configuration(dictionary)
         try:
             write(dictionary, *where, self.machine.od_state)
         except (SdoAbortError, OverflowError, KeyError):
-            assert configuration(dictionary) == before
+            assert read_configuration(dictionary) == before
 
     @rule(wanted=st.sampled_from([PRE, SAFE, OPER, 1]))
     def request(self, wanted: int) -> None:
-        before = {name: configuration(each) for name, each in self.ports.items()}
+        before = {name: read_configuration(each) for name, each in self.ports.items()}
         result = self.machine.request(wanted)
         assert (result.fault is None) == (result.state == wanted)
-        assert before == {name: configuration(each) for name, each in self.ports.items()}
+        assert before == {name: read_configuration(each) for name, each in self.ports.items()}
 
     @rule()
     def restart(self) -> None:
-        kept = {name: dump(each) for name, each in self.ports.items()}
+        kept = {name: dump_configuration(each) for name, each in self.ports.items()}
         self.ports = empty()
         for name, each in self.ports.items():
-            load(each, kept[name])
-            assert dump(each) == kept[name]
+            load_configuration(each, kept[name])
+            assert dump_configuration(each) == kept[name]
         before = self.engine
         self.engine = Actions()
         self.start(self.machine.status.state)

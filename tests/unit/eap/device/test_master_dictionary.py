@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.master_dictionary import MasterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import MasterDictionary
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, object_list
 from eap.od.model import OdState

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.router_dictionary import RouterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import RouterDictionary
 from eap.ids import NetId
 from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError

@@ -8,8 +8,7 @@ import pytest
 
 from eap.config.load import blank
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_fill import fill
-from eap.device.eap_records import read_back
+from eap.device.eap_spec import fill, read_back
 from eap.errors import ControlError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, Entry, OdState, record

@@ -8,7 +8,7 @@ import pytest
 
 from devicebus.master.pdo import channels_from_sii
 from devicebus.master.scan import scan
-from eap.config.bus import DescribedEntry
+from eap.config.index import DescribedEntry
 from eap.errors import ConfigError
 from eap.runtime import busfile
 from tests.support.busline import Bench, Line, run

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
+from eap.device.configuration import dump_configuration
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.stored import dump
 from eap.pd.spec import (
     BusPortSpec,
     CounterSource,
@@ -69,7 +69,7 @@ def test_plan_tells_all_kinds_of_changes(spec, dictionaries):
     assert plan.station == ["source of ticks: changed"]
     assert plan.refused == []
     assert not plan.is_empty
-    assert plan.objects() == {"eap0": dump(plan.dictionaries["eap0"])}
+    assert plan.objects() == {"eap0": dump_configuration(plan.dictionaries["eap0"])}
     assert make_plan(spec, dictionaries, spec, {}).is_empty
 
 

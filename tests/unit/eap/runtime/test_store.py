@@ -16,9 +16,9 @@ from msgspec.structs import replace
 
 from eap.ams.spec import HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.config.load import load
+from eap.device.configuration import load_configuration as load_objects
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_records import read_back
-from eap.device.stored import load as load_objects
+from eap.device.eap_spec import read_back
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.device import DeviceState
 from eap.pd.spec import RxAlternateSpec, TakenVariableSpec

@@ -13,8 +13,8 @@ from eap.ads.endpoint import Endpoint
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import AmsCommand, AmsHeader
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.router_dictionary import RouterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import RouterDictionary
 from eap.ids import NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortKind, PortSpec

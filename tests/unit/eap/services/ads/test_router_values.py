@@ -10,8 +10,8 @@ from msgspec.structs import replace
 from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
 from eap.ams.transport_table import Transport
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.router_dictionary import RouterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import RouterDictionary
 from eap.ids import NetId
 from eap.net.image_file import create_image
 from eap.od.profiles.router9000 import RouterLive

@@ -12,7 +12,7 @@ from eap.ams.transport_table import Transport
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode, decode_notification
 from eap.codec.ams import AmsCommand
-from eap.device.eap_objects import DeviceIdentity
+from eap.device.eap_dictionary import DeviceIdentity
 from eap.ids import NetId
 from eap.pd.image import Inputs
 from eap.pd.samples import Sampler

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from eap.control import device as control_device
 from eap.control.protocol import ErrorCode
-from eap.device.eap_objects import DeviceIdentity
-from eap.device.router_dictionary import RouterDictionary
+from eap.device.eap_dictionary import DeviceIdentity
+from eap.device.live_dictionaries import RouterDictionary
 from eap.errors import ControlError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000 import FrameSub, Tx

@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_fill import fill
+from eap.device.eap_spec import fill
 from eap.net.image_file import create_image
 from eap.od.model import OdState
 from eap.od.profiles import eap1000 as profile

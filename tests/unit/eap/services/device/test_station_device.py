@@ -8,7 +8,7 @@ import errno
 import pytest
 from msgspec.structs import replace
 
-from eap.device.stored import dump
+from eap.device.configuration import dump_configuration
 from eap.errors import EngineGoneError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000 import Tx
@@ -98,7 +98,9 @@ def test_next_services_find_the_same_dictionary(spec):
     asyncio.run(script())
     assert 0x6010 in device.dictionaries["eap0"]
     again, _ = make_device(engine.spec, DeviceState.SAFEOP)
-    assert dump(again.dictionaries["eap0"]) == dump(device.dictionaries["eap0"])
+    assert dump_configuration(again.dictionaries["eap0"]) == dump_configuration(
+        device.dictionaries["eap0"]
+    )
 
 
 def test_refused_state_says_why_and_by_which_object(spec):
@@ -240,7 +242,7 @@ def test_apply_of_what_cannot_be_is_refused_whole(spec):
 
 def test_apply_that_the_engine_refuses_changes_nothing(spec):
     device, engine = make_device(spec)
-    before = dump(device.dictionaries["eap0"])
+    before = dump_configuration(device.dictionaries["eap0"])
 
     async def script():
         engine.failure = EngineRefusedError("no memory")
@@ -250,7 +252,7 @@ def test_apply_that_the_engine_refuses_changes_nothing(spec):
 
     asyncio.run(script())
     assert device.spec == engine.spec == spec
-    assert dump(device.dictionaries["eap0"]) == before
+    assert dump_configuration(device.dictionaries["eap0"]) == before
     assert effective("demo", (spec,)) == ((spec, DeviceState.OP),)
 
 
@@ -261,17 +263,17 @@ def test_rollback_goes_back_and_forth(spec):
     async def script():
         plan, _ = await device.roll_back()
         assert plan.refused == ["there is nothing to go back to: it has run nothing else"]
-        before = dump(device.dictionaries["eap0"])
+        before = dump_configuration(device.dictionaries["eap0"])
         await device.apply(wanted)
-        after = dump(device.dictionaries["eap0"])
+        after = dump_configuration(device.dictionaries["eap0"])
         plan, fault = await device.roll_back()
         assert plan.changes
         assert fault is None
         assert device.spec == engine.spec == spec
-        assert dump(device.dictionaries["eap0"]) == before
+        assert dump_configuration(device.dictionaries["eap0"]) == before
         await device.roll_back()
         assert device.spec == engine.spec == wanted
-        assert dump(device.dictionaries["eap0"]) == after
+        assert dump_configuration(device.dictionaries["eap0"]) == after
 
     asyncio.run(script())
     again, engine = make_device(wanted)

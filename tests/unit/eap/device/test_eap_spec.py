@@ -7,7 +7,7 @@ from hypothesis import given
 from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_records import PortReader, read_back
+from eap.device.eap_spec import PortReader, read_back
 from eap.od.abort import SdoAbortError
 from eap.od.profiles.eap1000 import (
     AddressMode,
