@@ -1,7 +1,8 @@
-"""The network side of services: what the supervisor opened, with the takers of what arrives."""
+"""Network side of services: sockets that the supervisor opened, and the transports on them."""
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -15,7 +16,7 @@ from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, NetId
 from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
-from eap.net.interface import interface_of
+from eap.net.interface import interface_of, link_is_up
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.pd.link import FrameOrigin
@@ -23,28 +24,68 @@ from eap.pd.spec import StationSpec
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
 from eap.services.gateway.gateway_transport import GatewayTransport
-from eap.services.routing.ams_requests import AmsQuestions
-from eap.services.routing.route_admin import RouteAdmin
+from eap.services.routing.neighbours import AmsQuestions
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.accepting import Listeners
-from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
-from eap.services.transports.ams_transport import AmsClients, AmsTransport
-from eap.services.transports.ams_uplink import AmsUplinks
+from eap.services.transports.ams_discovery import AmsDiscovery, RouteAdmin, RouterName
+from eap.services.transports.ams_tcp import AmsClients, AmsTransport, AmsUplinks
 from eap.services.transports.demultiplexer import Demultiplexer
-from eap.services.transports.intake import FrameIntake, watch_channel
-from eap.services.transports.link_watch import LinkWatch
 from eap.services.transports.mailbox_frames import (
     FRAME_OVERHEAD,
     ChannelSender,
+    FrameIntake,
     MailboxIntake,
+    Segment,
+    SegmentSender,
+    watch_channel,
 )
-from eap.services.transports.mailbox_stream import LARGEST_FRAME, MailboxStreams
-from eap.services.transports.segment import Segment, SegmentSender
-from eap.services.transports.tcp_transport import TcpTransport
+from eap.services.transports.mailbox_stream import LARGEST_FRAME, MailboxStreams, TcpTransport
 
 if TYPE_CHECKING:
     from eap.services.gateway.gateway import MailboxGateway
+
+
+LOOK_S = 0.2
+"""Between two looks."""
+
+
+class LinkWatch:
+    """Looks after the links of interfaces.
+
+    Args:
+        transports: By interface, which stations use it and by which of their doors.
+        is_up: Says of an interface whether its link is up.
+    """
+
+    def __init__(
+        self,
+        transports: Mapping[str, Sequence[tuple[StationRouter, str]]],
+        is_up: Callable[[str], bool] = link_is_up,
+    ) -> None:
+        self._transports = transports
+        self._is_up = is_up
+        self._down: set[str] = set()
+
+    async def serve(self) -> None:
+        """Look until cancelled; at once if there is nothing to look after."""
+        while self._transports:
+            self.look()
+            await asyncio.sleep(LOOK_S)
+
+    def look(self) -> None:
+        """Tell the stations what has changed."""
+        for interface, transports in self._transports.items():
+            is_up, was_up = self._is_up(interface), interface not in self._down
+            if is_up and not was_up:
+                self._down.discard(interface)
+                for station, transport in transports:
+                    station.hop_up(transport, None)
+            elif was_up and not is_up:
+                self._down.add(interface)
+                for station, transport in transports:
+                    station.hop_down(transport, None, f"interface {interface} has no link")
+
 
 AMS_TRANSPORT = TransportKind.AMS_TCP
 """By which clients come in that connect to AMS/TCP."""

@@ -1,16 +1,20 @@
 """Tasks owned by an object that lives longer than one block: kept, reported, ended together.
 
-A TaskGroup ends with its block and with the first failure of a task; requests of clients, and
-transfers that go on when their client has gone, need neither.  This is the only other place that
-starts tasks (house rule, ``tools/check_tree.py``): a bare task can be collected, or lose its error.
+A TaskGroup ends with its block and with the first failure of a task.  Requests of clients, and
+transfers that continue after their client has disconnected, need neither.  This is the only other
+place that starts tasks (house rule, ``tools/check_tree.py``): the event loop keeps weak references
+only, so a bare task can be collected, or its exception lost.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
+
+from eap.control.protocol import ErrorCode
+from eap.errors import ControlError
 
 T = TypeVar("T")
 
@@ -61,3 +65,46 @@ class TaskSet:
     def _report(self, task: asyncio.Task[Any]) -> None:
         if not task.cancelled() and (exc := task.exception()) is not None:
             logger.error("%s: a task failed", self._name, exc_info=exc)
+
+
+MAX_WAITING = 256
+
+ResultT = TypeVar("ResultT")
+
+
+class Jobs:
+    """A row of jobs; *what* they are about is for the refusal when it is full."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._lock = asyncio.Lock()
+        self._tasks = TaskSet(what)
+        self._waiting = 0
+
+    async def do(self, job: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
+        """Wait for the turn and the end of *job*; return and raise what it does.
+
+        Who leaves before its turn wants it no more.
+
+        Raises:
+            ControlError: too many wait already.
+        """
+        if self._waiting >= MAX_WAITING:
+            reason = f"{self._what}: {MAX_WAITING} requests wait already"
+            raise ControlError(reason, code=ErrorCode.BUSY)
+        self._waiting += 1
+        try:
+            await self._lock.acquire()
+        finally:
+            self._waiting -= 1
+        task = self._tasks.start_awaited(job())
+        task.add_done_callback(lambda _: self._lock.release())
+        try:
+            return await asyncio.shield(task)
+        except asyncio.CancelledError:
+            task.add_done_callback(self._tell_nobody)
+            raise
+
+    def _tell_nobody(self, task: asyncio.Task[Any]) -> None:
+        if not task.cancelled() and (exc := task.exception()) is not None:
+            logger.warning("%s: a change nobody waits for failed: %s", self._what, exc)

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from eap.services.transports.ams_transport import LIMITS
+from eap.services.transports.ams_tcp import LIMITS
 from tests.support import aoe
 from tests.support.amsclient import AmsClient
 from tests.support.appliance import Appliance, Plants, wait_until

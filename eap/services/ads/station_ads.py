@@ -15,8 +15,8 @@ from eap.services.ads.router_ads import RouterAds
 from eap.services.ads.router_values import LiveRouter
 from eap.services.ads.system_ads import SystemAds
 from eap.services.device.station_device import StationDevice
-from eap.services.routing.route_query import RouteQuery
 from eap.services.routing.station_router import StationRouter
+from eap.services.routing.tracing import RouteQuery
 
 
 class StationAds:

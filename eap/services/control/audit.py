@@ -26,7 +26,7 @@ from eap.ams.directory import Directory
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import ObjectId
 from eap.services.control.audit_file import AuditFile
-from eap.services.rate_limiter import Rate, SourceRateLimiter, SourceRates
+from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates
 
 BURST, PER_S = 500, 50
 """Lines that a client may cause at once, and in each second for long."""

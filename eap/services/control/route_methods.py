@@ -25,8 +25,8 @@ from eap.services.routing.neighbours import (
     find_neighbours,
     introduce,
 )
-from eap.services.routing.route_probe import find_target, probe_target
 from eap.services.routing.route_rows import RouterView, route_row
+from eap.services.routing.tracing import find_target, probe_target
 from eap.suggest import suggest
 
 _ANY = NetId(bytes(6))

@@ -32,7 +32,7 @@ from eap.runtime.device_change import (
 from eap.runtime.device_change import plan_rollback as make_rollback
 from eap.runtime.store import Configuration
 from eap.services.device.station_keeper import StationKeeper
-from eap.services.jobs import Jobs
+from eap.services.tasks import Jobs
 
 _CONTROL = 0xF200
 _STATES = frozenset((DeviceState.PREOP, DeviceState.SAFEOP, DeviceState.OP))

@@ -16,7 +16,7 @@ from eap.gateway import dialect
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker, Ticket
 from eap.services.gateway.client_session import GatewayReply, refusals
-from eap.services.log_limits import caused_by
+from eap.services.rate_limits import caused_by
 
 Send: TypeAlias = Callable[[bytes], None]
 """Sends a frame back to the client of a request, now or later."""

@@ -37,9 +37,10 @@ from eap.ams.subscription_restorer import Interruption
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
-from eap.services.log_limits import caused_by
-from eap.services.routing.local_client import LOCAL_TRANSPORT, LocalClient
+from eap.services.rate_limits import caused_by
 from eap.services.routing.service import (
+    LOCAL_TRANSPORT,
+    LocalClient,
     LocalRequest,
     SerialQueues,
     Service,

@@ -18,8 +18,8 @@ from eap.ams.routing_change import describe_routing, routing_needs_new_start
 from eap.ams.spec import RoutingSpec
 from eap.errors import ControlError, EnvironmentalError
 from eap.runtime.store import AppliedRouting, StationFile, digest_of
-from eap.services.jobs import Jobs
 from eap.services.routing.station_routes import StationRoutes
+from eap.services.tasks import Jobs
 
 logger = logging.getLogger(__name__)
 

@@ -1,12 +1,14 @@
-"""The way to an AMS address, hop by hop: each router is asked where it passes requests on to.
+"""The path to an AMS address, hop by hop: each router reports where it forwards requests.
 
-A question for a router further on is handed on by those before it, so nobody needs routes to the
-routers between.  What is not one of ours answers with an error, and what is behind it is not seen.
+A query for a router further on is forwarded by those before it, so no routes to the routers between
+are needed (own format, see :class:`~eap.ams.hop_report.HopQuestion`).  A router of another make
+answers it with an error; the hops behind that one stay unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+from collections.abc import Awaitable, Callable, Container
 from time import monotonic_ns
 from typing import NamedTuple, Protocol
 
@@ -14,22 +16,30 @@ from msgspec.structs import replace
 
 from eap.ads.answer import AmsAnswer
 from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation, OperationOutcome, ReadState, ReadWrite
+from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome, ReadState, ReadWrite
 from eap.ads.query import decode_outcome, encode_query
+from eap.ads.request import encode_outcome, parse_request
+from eap.ams.advice import Advice, advise
+from eap.ams.directory import AmsAddress, Directory
 from eap.ams.hop_report import (
     MAX_FURTHER,
     MAX_REPORT,
     HopQuestion,
     HopReport,
     decode_report,
+    encode_report,
     report_of,
 )
-from eap.ams.report import Location
+from eap.ams.report import Location, RouteReport, RouteState
 from eap.ams.spec import TransportKind
-from eap.codec.ads import AdsError, AdsStates, IndexGroup
-from eap.codec.ams import SYSTEM_PORT, AmsHeader
-from eap.errors import CodecError
+from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
+from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
+from eap.control.protocol import ErrorCode
+from eap.control.routes import TestResult
+from eap.errors import CodecError, ControlError
 from eap.ids import NetId
+from eap.services.routing.service import LocalRequest, Service
+from eap.services.routing.station_router import StationRouter
 
 HERE = Endpoint(TransportKind.LOCAL, "trace")
 TARGET_PATIENCE_S = 5.0
@@ -231,3 +241,132 @@ def _explain(report: HopReport) -> str:
 def _next_name(report: HopReport) -> str:
     """Return the name of the next router; an older router tells that of its route only."""
     return report.next_name or report.route
+
+
+class RouteQuery:
+    """Stands before the system service of *station*, and answers questions of traces.
+
+    Args:
+        station: Whose router it is.
+        rest: Answers everything else.
+    """
+
+    def __init__(self, station: TracedStation, rest: Service) -> None:
+        self._station = station
+        self._rest = rest
+
+    @property
+    def ports(self) -> Container[int]:
+        """Those of the system service."""
+        return self._rest.ports
+
+    def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
+        """Answer a request."""
+        asked = _asked(request)
+        return self._rest.answer(request) if asked is None else self._tell(request, asked)
+
+    def client_gone(self, endpoint: Endpoint) -> None:
+        """Pass it on."""
+        self._rest.client_gone(endpoint)
+
+    async def _tell(self, request: LocalRequest, asked: ReadWrite) -> AmsAnswer:
+        try:
+            question = HopQuestion.decode(asked.data)
+        except CodecError:
+            outcome = OperationOutcome(AdsError.SIZE)
+        else:
+            source = request.header.source
+            report = await answer_question(self._station, question, request.came_by, source)
+            data = encode_report(report)
+            fits = len(data) <= asked.length
+            outcome = OperationOutcome(data=data) if fits else OperationOutcome(AdsError.SIZE)
+        return AmsAnswer(encode_outcome(AmsCommand.READ_WRITE, outcome))
+
+
+def _asked(request: LocalRequest) -> ReadWrite | None:
+    """Return the operation of a trace, None for any other request."""
+    if request.header.command != AmsCommand.READ_WRITE:
+        return None
+    try:
+        operation, *others = parse_request(request.header.command, request.body).operations
+    except (AdsRefusedError, ValueError):
+        return None
+    if others or not isinstance(operation, ReadWrite):
+        return None
+    return operation if operation.group == IndexGroup.WHEREABOUTS else None
+
+
+BLAME_S = 3.0
+"""Limit for finding the router at which the way ends."""
+_NO_FURTHER = frozenset((RouteState.DOWN, RouteState.CLIENT))
+"""States of a route whose own next hop is at fault."""
+_TRACE_HINT = "'eapctl trace' shows the routers before it"
+_RESULT_SIZE = 4
+"""Octets of an ADS answer before its data."""
+
+
+def find_target(router: StationRouter, directory: Directory, text: str) -> AmsAddress:
+    """Return whom *text* names: a route, a NetID with or without a port, or a name of the plant.
+
+    Raises:
+        ControlError: nobody.
+    """
+    for route in router.table:
+        if text == route.name and route.octets:
+            return AmsAddress(route.net_id, SYSTEM_PORT)
+    try:
+        if text.count(".") == 5 and ":" not in text and "/" not in text:
+            return AmsAddress(NetId.parse(text), SYSTEM_PORT)
+        return directory.find(text)
+    except ValueError as exc:
+        reason = f"{exc}; nor is there a route of that name"
+        raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
+
+
+async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: float) -> TestResult:
+    """Ask *target* for its ADS state by way of *router*, and say what came of it."""
+    found = router.table.find(target.net_id)
+    is_own = target.net_id in router.net_ids
+    route = None if found is None or is_own else found[0]
+    began_ns = monotonic_ns()
+    answer = await router.ask(*target, AmsCommand.READ_STATE, timeout_s=timeout_s)
+    took_us = (monotonic_ns() - began_ns) // 1000
+    report = None if route is None else router.report(route)
+    advice = advise(answer.error_code, target.net_id, report, router.net_id, is_own=is_own)
+    if not advice.is_reached and report is not None and _leads_further(report):
+        advice = await _blame(router, target, advice)
+    state = _state(answer.data) if not answer.error_code else ""
+    return TestResult(
+        target=str(target),
+        name="" if route is None else route.name,
+        ok=advice.is_reached,
+        rtt_us=took_us if advice.is_reached else None,
+        state=state,
+        error=answer.error_code,
+        text=f"{advice.text}: {state}" if state else advice.text,
+        hint=advice.hint,
+    )
+
+
+def _leads_further(report: RouteReport) -> bool:
+    """Say whether a router behind the next hop of a route may be at fault."""
+    return report.next_name != report.route.name and report.state not in _NO_FURTHER
+
+
+async def _blame(router: StationRouter, target: AmsAddress, advice: Advice) -> Advice:
+    """Return *advice* about the router at which the way to *target* ends, if one is found."""
+    try:
+        async with asyncio.timeout(BLAME_S):
+            why = await find_fault(router, *target)
+    except TimeoutError:
+        return advice
+    return Advice(is_reached=False, text=why, hint=_TRACE_HINT) if why else advice
+
+
+def _state(data: bytes) -> str:
+    """Return the ADS state in the answer to ReadState; empty if it tells none."""
+    try:
+        state = AdsStates.decode(data, _RESULT_SIZE).ads_state
+    except CodecError:
+        return ""
+    return AdsState(state).name if state in AdsState._value2member_map_ else f"state {state}"

@@ -26,7 +26,7 @@ from eap.net.connections import (
     host_of,
 )
 from eap.net.descriptors import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
-from eap.services.log_limits import caused_by
+from eap.services.rate_limits import caused_by
 
 _TURN_NS, _LOCAL_TURN_NS = 5_000_000, 20_000_000
 """Time for accepting connections before others have their turn: a crowd that is refused has to go

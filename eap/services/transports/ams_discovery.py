@@ -1,44 +1,233 @@
-"""UDP 48899: tools that have an address ask which AMS routers are there, and for routes to them.
+"""UDP 48899: answers to tools that look for AMS routers or request routes.
 
-Rule: an answer is hardly longer than its question, so nobody is flooded by way of us.  Hence who
-asks for routers is told name and version; what routers of others tell beside that (the operating
-system, a fingerprint) is ten times as long, and no tool we know needs it.
+Rule: an answer is hardly longer than its request, so it cannot be used to flood a third host.
+Hence server info has name and version only; the other fields that routers of others send (operating
+system, fingerprint) are ten times as long, and no known tool needs them.
+
+A requested route leads to the tool: its NetID, and the host where it serves AMS/TCP if it does.
+A tool that only sends requests needs no such route, because answers return on its connection.
 """
 
 from __future__ import annotations
 
 import asyncio
+import hmac
 import logging
 import socket
 from collections.abc import AsyncIterator, Callable, Sequence
 from ipaddress import IPv4Address
+from pathlib import Path
+from time import monotonic
 from typing import NamedTuple
 
-from eap.codec.ams import SYSTEM_PORT
+from eap.ads.endpoint import Endpoint
+from eap.ams.access import Decision
+from eap.ams.authorized_request import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.routes import Origin, RouteTable
+from eap.ams.spec import AccessService, AmsUser, HopSpec, RouteSpec, TransportKind
+from eap.codec.ads import AdsError
+from eap.codec.ams import SYSTEM_PORT, AmsHeader
 from eap.codec.amsdiscovery import (
     RESPONSE,
+    TEMPORARY,
     Discovery,
     DiscoveryHeader,
     DiscoveryService,
     Tag,
     decode_discovery,
+    decode_text,
     encode_discovery,
     encode_text,
     encode_version,
 )
-from eap.errors import CodecError
-from eap.ids import NetId
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.errors import CodecError, ControlError, EnvironmentalError
+from eap.ids import STATION_OCTETS, NetId, parse_host
+from eap.net.password import read_password
 from eap.release import RELEASE
 from eap.runtime.discards import Refusal
-from eap.services.routing.ams_requests import AmsQuestions
-from eap.services.routing.route_admin import RouteAdmin
+from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates, caused_by
+from eap.services.routing.neighbours import AmsQuestions
+from eap.services.routing.station_routes import StationRoutes
 from eap.services.tasks import TaskSet
+
+RATES = SourceRates(
+    source=Rate(10, 1.0),
+    known=Rate(50, 5.0),
+    new=Rate(10, 1.0),
+    local=Rate(50, 10.0),
+)
+"""Requests that are decided; the others get no answer.  Passwords take time to guess."""
+MAX_SOURCES = 1024
+_SHOWN = 80
+
+logger = logging.getLogger(__name__)
+
+
+class _Request(NamedTuple):
+    name: str
+    net_id: NetId
+    host: str
+    port: int
+    is_kept: bool
+
+
+class RouteAdmin:
+    """Takes the requests that come to one address.
+
+    Args:
+        stations: The routes of each station there; all of them get a route.
+        clock: In seconds.
+    """
+
+    def __init__(
+        self, stations: Sequence[StationRoutes], *, clock: Callable[[], float] = monotonic
+    ) -> None:
+        self._stations = stations
+        self._clock = clock
+        self._limiter = SourceRateLimiter(RATES, MAX_SOURCES, clock())
+
+    async def take(
+        self, question: Discovery, sender: str, *, is_this_host: bool
+    ) -> AdsError | None:
+        """Add the route that *question* asks for, and return the result for its sender.
+
+        None stands for no answer: the sender, or all together, ask too often.
+
+        Args:
+            question: The datagram.
+            sender: IPv4 address that it came from.
+            is_this_host: Whether a program of this host sent it.
+        """
+        now_s = self._clock()
+        is_allowed = (
+            self._limiter.take_local(now_s) if is_this_host else self._limiter.take(sender, now_s)
+        )
+        if not is_allowed:
+            return None
+        name = decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN]
+        results = []
+        for station in self._stations:
+            wanted = _audited(station.router.net_id, question, sender, AdsError.NONE, "")
+            if why := station.router.why_not_recorded(wanted):
+                result = AdsError.ACCESS
+            else:
+                result, why = await _decide(station, question, sender, is_this_host=is_this_host)
+            level = logging.INFO if result == AdsError.NONE else logging.WARNING
+            cause = caused_by((station.router.net_id, name, sender, why), sender)
+            logger.log(level, "route %r asked for by %s: %s", name, sender, why, extra=cause)
+            entry = _audited(station.router.net_id, question, sender, result, why)
+            for write in station.router.on_audit:
+                write(entry)
+            results.append(result)
+        return next((each for each in results if each != AdsError.NONE), AdsError.NONE)
+
+
+def _audited(
+    router: NetId, question: Discovery, sender: str, result: AdsError, why: str
+) -> AuditEntry:
+    """Return what the audit says of a request."""
+    octets = (question.find(Tag.NET_ID) or b"")[:6].ljust(6, b"\0")
+    wanted = AddRoute(
+        decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN],
+        str(NetId(octets)),
+        decode_text(question.find(Tag.HOST) or b"")[:_SHOWN],
+        decode_text(question.find(Tag.USER) or b"")[:_SHOWN],
+    )
+    decision = Decision(AccessService.CONTROL, result != AdsError.ACCESS, why)
+    header = AmsHeader(router, SYSTEM_PORT, NetId(octets), 0, 0)
+    done = AuditedOperation(wanted, decision, result)
+    return AuditEntry(Endpoint("ams-udp", sender), header, "", (done,))
+
+
+async def _decide(
+    station: StationRoutes, question: Discovery, sender: str, *, is_this_host: bool
+) -> tuple[AdsError, str]:
+    """Return the result for the sender, and what was done in words."""
+    if refused := _why_not(station.spec.users, question, is_this_host=is_this_host):
+        return AdsError.ACCESS, f"refused: {refused}"
+    try:
+        wanted = _read(question, sender)
+        written = _written(station.router.table, wanted.net_id)
+        if written:
+            return AdsError.NONE, f"route {written!r} of the plant file leads there"
+        await _add(station, wanted)
+    except (ValueError, ControlError) as exc:
+        return AdsError.VALUE, f"refused: {exc}"
+    except EnvironmentalError as exc:
+        return AdsError.INTERNAL, f"not added: {exc}"
+    return AdsError.NONE, f"added, to {wanted.net_id} at {wanted.host}:{wanted.port}"
+
+
+def _why_not(users: Sequence[AmsUser], question: Discovery, *, is_this_host: bool) -> str:
+    """Return why the sender may have no route, empty if it may."""
+    if users:
+        user = decode_text(question.find(Tag.USER) or b"")[:_SHOWN]
+        return "" if _is_known(users, question) else f"user {user!r} or the password is wrong"
+    return "" if is_this_host else "the station has no users, so only this host may"
+
+
+def _is_known(users: Sequence[AmsUser], question: Discovery) -> bool:
+    name = decode_text(question.find(Tag.USER) or b"")
+    given = (question.find(Tag.PASSWORD) or b"").partition(b"\0")[0]
+    is_known = False
+    for user in users:  # all of them: how long it takes tells nobody whether a name is right
+        password = _password(user)
+        is_right = password is not None and hmac.compare_digest(password, given)
+        is_known |= is_right and hmac.compare_digest(user.name.encode(), name.encode())
+    return is_known
+
+
+def _password(user: AmsUser) -> bytes | None:
+    """Return the password of *user*, None if there is none, with a warning."""
+    try:
+        password = read_password(Path(user.password_file))
+        reason = "" if password else f"{user.password_file}: its first line is empty"
+    except EnvironmentalError as exc:
+        password, reason = b"", str(exc)
+    if reason:
+        cause = caused_by((user.name, reason), f"user {user.name}")
+        logger.warning("password of user %s: %s", user.name, reason, extra=cause)
+    return password or None
+
+
+def _read(question: Discovery, sender: str) -> _Request:
+    """Return what is wanted; raise ValueError if that can be nothing."""
+    octets = question.find(Tag.NET_ID) or b""
+    if len(octets) != 6 or not any(octets):
+        raise ValueError("it names no NetID")
+    where = decode_text(question.find(Tag.HOST) or b"").strip() or sender
+    host, port = parse_host(where, AMS_TCP_PORT)
+    name = decode_text(question.find(Tag.ROUTE_NAME) or b"").strip() or where
+    options = int.from_bytes((question.find(Tag.OPTIONS) or b"")[:4], "little")
+    return _Request(name, NetId(octets), host, port, not options & TEMPORARY)
+
+
+def _written(table: RouteTable, net_id: NetId) -> str:
+    """Return the route of the plant file that *net_id* takes, empty if there is none."""
+    found = table.find(net_id)
+    is_written = found is not None and found[1] and found[0].origin is Origin.STATIC
+    return found[0].name if found is not None and is_written else ""
+
+
+async def _add(station: StationRoutes, wanted: _Request) -> None:
+    """Add a route for all NetIDs that begin as the wanted one, or for that alone."""
+    hop = HopSpec(TransportKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
+    is_here = station.has(wanted.net_id.station)
+    spec = RouteSpec(
+        name=wanted.name,
+        net_id=str(wanted.net_id),
+        hop=hop,
+        octets=len(wanted.net_id) if is_here else STATION_OCTETS,
+        is_probed=False,  # most tools answer nobody
+        is_client=True,
+    )
+    await station.add(spec, is_kept=wanted.is_kept)
+
 
 _VERSION = encode_version(RELEASE)
 _LONGEST = 2048
 _DATAGRAMS_PER_TURN = 64
-
-logger = logging.getLogger(__name__)
 
 
 class RouterName(NamedTuple):

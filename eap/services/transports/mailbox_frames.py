@@ -1,19 +1,26 @@
-"""AMS packets in frames of type 5: framing, datagrams and Ethernet; TCP is in mailbox_stream.
+"""Frames of type 5 on UDP and Ethernet: intake, framing, and MAC addresses of NetIDs.
 
 AoE to address 0 is for the router of a station; every other mailbox belongs to a bus, whose gateway
-passes it on.
+forwards it.  A frame that nothing accepts is counted under its reason.  A frame that waited in a
+socket since before this process started is stale: the request of its sender has timed out.
+
+A NetID on an Ethernet segment is resolved to a MAC address as ARP does it, with AoE (own format):
+a ReadState goes to the multicast address of EAP, only the port with that NetID answers, and the
+answer carries its address.  The query is repeated from time to time, because devices are exchanged.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from time import monotonic_ns
-from typing import Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 from devicebus.mailbox.protocol import next_counter
-from eap.codec.ams import AmsHeader
-from eap.codec.ethercat import EtherCatHeader
+from eap.ams.hop_prober import PROBE_PORT
+from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
+from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import (
     MailboxHeader,
     MailboxType,
@@ -23,8 +30,140 @@ from eap.codec.mailbox import (
 )
 from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
+from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
 from eap.pd.link import FrameChannel, FrameOrigin, OutFrame
-from eap.runtime.discards import Refusal
+from eap.runtime.discards import DiscardCounters, Refusal
+from eap.services.transports.demultiplexer import Demultiplexer
+
+_MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
+
+
+QUICK_NS = 120_000
+"""Frames that come within this time after the last was answered are quick."""
+PATIENCE_NS = 60_000
+"""How long is watched for the next of them."""
+MOST_FRAMES = 32
+"""That are taken so before others have their turn."""
+TRUST = 2
+"""How often in a row that may be in vain: who was quick may have been interrupted."""
+MOST_REST = 1024
+"""Frames that are not waited for, once many were waited for in vain."""
+
+
+class DrainedChannel(Protocol):
+    """What services needs of a UDP or an Ethernet channel."""
+
+    def drain(self, now_ns: int) -> int:
+        """Hand what waits to the takers; return how many frames there were."""
+
+    def fileno(self) -> int:
+        """Return the descriptor to watch."""
+
+
+MailboxTaker: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], Refusal | None]
+"""Takes a frame of type 5 as a Taker does; returns why not if it does not."""
+
+
+class FrameIntake:
+    """Takes the frames of one socket for the *stations* that listen there.
+
+    Args:
+        stations: At which is counted what is not taken.
+        counters: Where.
+        from_ns: Since when this process runs, on the monotonic clock.
+        mailbox: Takes type 5.
+    """
+
+    def __init__(
+        self,
+        stations: Sequence[str],
+        counters: DiscardCounters,
+        from_ns: int,
+        mailbox: MailboxTaker,
+    ) -> None:
+        self._stations = stations
+        self._counters = counters
+        self._from_ns = from_ns
+        self.mailbox = mailbox
+
+    def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
+        """Take, or count, one frame that arrived at *at_ns* on the monotonic clock."""
+        if at_ns < self._from_ns:
+            reason: Refusal | None = Refusal.STALE
+        elif size < EtherCatHeader.SIZE:
+            reason = Refusal.TRUNCATED
+        elif data[1] >> 4 == _MAILBOX:  # the four upper bits of the header
+            reason = self.mailbox(data, size, at_ns, origin)
+        else:
+            reason = Refusal.WRONG_TYPE
+        if reason is not None:
+            for station in self._stations:
+                self._counters.count(station, reason)
+
+
+def watch_channel(channel: DrainedChannel) -> None:
+    """Drain *channel* now and whenever something arrives, as long as the running loop lives."""
+    patient = PatientDrain(channel)
+    asyncio.get_running_loop().add_reader(channel.fileno(), patient.drain)
+    patient.drain()
+
+
+class PatientDrain:
+    """Drains a channel, and looks again for a while where the next frame is likely to be near.
+
+    Who waits for each answer before asking again does so at once: the next frame is there sooner
+    than a process falls asleep, is woken and finds its way through an event loop, which takes as
+    long as to answer.  So while frames come that quickly the channel is watched, for some
+    microseconds after each and for some frames in all, because others wait for the loop.
+
+    Where the sender shares the processor he cannot go on before this gives up.  So each time in
+    vain the channel is not watched for twice as many frames.
+
+    Args:
+        channel: What is drained.
+        clock: The monotonic clock, in nanoseconds.
+    """
+
+    def __init__(self, channel: DrainedChannel, clock: Callable[[], int] = monotonic_ns) -> None:
+        self._channel = channel
+        self._clock = clock
+        self._answered_ns = clock() - QUICK_NS
+        self._trust = 0
+        self._resting = 0
+        self._rest = 1
+
+    def drain(self) -> None:
+        """Take what waits; and what comes, if this came quickly after what was taken last."""
+        channel, clock = self._channel, self._clock
+        now_ns = clock()
+        is_quick = now_ns - self._answered_ns < QUICK_NS
+        taken = channel.drain(now_ns)
+        self._answered_ns = now_ns = clock()
+        if self._resting:
+            self._resting -= 1
+        elif is_quick or self._trust:
+            self._watch(taken, now_ns)
+
+    def _watch(self, taken: int, now_ns: int) -> None:
+        """Look for more, after *taken* frames."""
+        channel, clock = self._channel, self._clock
+        while taken < MOST_FRAMES:
+            if now_ns - self._answered_ns > PATIENCE_NS:
+                self._note_vain()
+                return
+            found = channel.drain(now_ns)
+            now_ns = clock()
+            if found:
+                taken += found
+                self._answered_ns, self._trust, self._rest = now_ns, TRUST, 1
+
+    def _note_vain(self) -> None:
+        """Remember that nothing came; of somebody who was quick until now that says little."""
+        if self._trust:
+            self._trust -= 1
+        else:
+            self._resting, self._rest = self._rest, min(2 * self._rest, MOST_REST)
+
 
 FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
 _MAX_PEERS = 1024
@@ -173,3 +312,100 @@ class ChannelSender:
             sent.append(OutFrame(buffer, len(header), connection))
         failed = self._channel.send(sent, monotonic_ns())
         return "the network took no frame" if failed else None
+
+
+ASK_NS = 1_000_000_000
+"""Between two questions for a NetID that nobody answered."""
+ASK_AGAIN_NS = 30_000_000_000
+"""Between two questions for one whose address is known."""
+
+
+class _Place(NamedTuple):
+    mac: str
+    """Empty while it is not known."""
+    asked_at_ns: int | None
+
+
+class Segment:
+    """The way in from one interface and VLAN, and the addresses of its stations.
+
+    Args:
+        entrance: To the stations of this host that are on it.
+        mac: Own address.
+    """
+
+    def __init__(self, demultiplexer: Demultiplexer, mac: MacAddr) -> None:
+        self.mac = str(mac)
+        self._demultiplexer = demultiplexer
+        self._places: dict[NetId, _Place] = {}
+
+    def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
+        """Act on a packet; the arguments are those of :meth:`Demultiplexer.receive`."""
+        self._learn(data, connection)
+        self._demultiplexer.receive(data, connection, for_all=for_all)
+
+    def find(self, net_id: NetId, now_ns: int, ask: Callable[[], object]) -> str:
+        """Return the MAC address of a port, empty while it is not known; *ask* when it is time."""
+        if self._demultiplexer.has(net_id):
+            self._demultiplexer.hop_is_at(str(net_id), self.mac)
+            return self.mac
+        place = self._places.get(net_id, _Place("", None))
+        pause_ns = ASK_AGAIN_NS if place.mac else ASK_NS
+        if place.asked_at_ns is None or now_ns - place.asked_at_ns >= pause_ns:
+            self._places[net_id] = place._replace(asked_at_ns=now_ns)
+            ask()
+        return place.mac
+
+    def _learn(self, data: bytes, mac: str) -> None:
+        if not self._places:
+            return
+        try:
+            header = AmsHeader.decode(data)
+        except CodecError:
+            return
+        place = self._places.get(header.source)
+        if place is None or header.target_port != PROBE_PORT or not _is_response(header):
+            return
+        if place.mac != mac and self._demultiplexer.has(header.target):
+            self._places[header.source] = place._replace(mac=mac)
+            self._demultiplexer.hop_is_at(str(header.source), mac)
+
+
+class SegmentSender:
+    """Sends packets of one station to MAC addresses, and to NetIDs of ports.
+
+    Args:
+        segment: Where they are.
+        channel: Of the station's port.
+        net_id: Of the station's router, in whose name is asked.
+    """
+
+    def __init__(self, segment: Segment, channel: FrameChannel, net_id: NetId) -> None:
+        self._segment = segment
+        self._sender = ChannelSender(channel)
+        self._net_id = net_id
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send packets to an address; return why not if that cannot be done."""
+        mac = connection
+        if ":" not in connection:
+            net_id = NetId.parse(connection)
+            mac = self._segment.find(net_id, monotonic_ns(), lambda: self._ask(net_id))
+        if not mac:
+            return "nobody has said yet which MAC address it has"
+        if mac != self._segment.mac:
+            return self._sender.send(mac, packets)
+        loop = asyncio.get_running_loop()
+        for packet in packets:  # a packet socket does not get what its own host sends
+            loop.call_soon(self._segment.receive, packet, mac)
+        return None
+
+    def _ask(self, net_id: NetId) -> None:
+        question = AmsHeader(
+            net_id, DEVICE_PORT, self._net_id, PROBE_PORT, AmsCommand.READ_STATE
+        ).encode()
+        self._sender.send(str(EAP_MULTICAST_MAC), (question,))
+
+
+def _is_response(header: AmsHeader) -> bool:
+    return bool(header.state_flags & StateFlags.RESPONSE)

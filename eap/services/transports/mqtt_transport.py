@@ -24,8 +24,8 @@ from eap.ams.spec import MqttSpec, RoutingSpec
 from eap.ams.transport_table import Transport
 from eap.net.mqtt import Handlers, MqttLink
 from eap.runtime.discards import DiscardCounters, Refusal
-from eap.services.routing.planned import mqtt_door
 from eap.services.routing.station_router import StationRouter
+from eap.services.routing.station_routes import mqtt_door
 
 _REFUSALS = {
     Drop.TOPIC: Refusal.MQTT_TOPIC,

@@ -23,8 +23,8 @@ from eap.errors import CodecError
 from eap.ids import NetId
 from eap.runtime.discards import Refusal
 from eap.runtime.store import StationFile
-from eap.services.routing.ams_requests import AmsQuestions
-from eap.services.routing.route_admin import RouteAdmin
+from eap.services.routing.neighbours import AmsQuestions
+from eap.services.transports.ams_discovery import RouteAdmin
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
 

@@ -16,7 +16,7 @@ from eap.pd.device import DeviceState
 from eap.pd.layout import plan_layout
 from eap.pd.spec import HostSource, Measure, VariableSpec
 from eap.pd.words import StationWord
-from eap.services.devices import Devices
+from eap.services.process import Devices
 from tests.support import aoe
 from tests.support.eventually import eventually
 from tests.support.stationengine import StationEngine

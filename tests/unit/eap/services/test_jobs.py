@@ -8,8 +8,8 @@ import pytest
 
 from eap.control.protocol import ErrorCode
 from eap.errors import ControlError
-from eap.services import jobs as module
-from eap.services.jobs import Jobs
+from eap.services import tasks as module
+from eap.services.tasks import Jobs
 
 
 def play(script):

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 import pytest
 
-from eap.services import log_limits
-from eap.services.log_limits import (
+from eap.services import rate_limits
+from eap.services.rate_limits import (
     MAX_CAUSES,
     PERIOD_S,
     RATES,
@@ -90,7 +90,7 @@ def test_log_many_sources_are_limited_together() -> None:
 def test_log_causes_are_bounded_and_a_forgotten_one_is_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(log_limits, "MAX_CAUSES", 2)
+    monkeypatch.setattr(rate_limits, "MAX_CAUSES", 2)
     log = Log()
     for cause in "abbc":
         log.write(cause, cause)
@@ -109,7 +109,7 @@ def test_log_end_of_the_process_writes_what_was_counted() -> None:
 
 
 def test_log_serve_writes_what_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_limits, "_FLUSH_S", 0.001)
+    monkeypatch.setattr(rate_limits, "_FLUSH_S", 0.001)
     log = Log()
     log.write("a", "a")
     log.write("a", "a")

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.services.rate_limiter import Allowance, Rate, SourceRateLimiter, SourceRates
+from eap.services.rate_limits import Allowance, Rate, SourceRateLimiter, SourceRates
 
 
 def takes(allowance: Allowance, now_s: float) -> int:

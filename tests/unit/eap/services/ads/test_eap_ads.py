@@ -20,8 +20,8 @@ from eap.pd.device import DeviceState, FaultCode
 from eap.pd.words import StationWord
 from eap.services.ads.eap_ads import EapAds, device_info
 from eap.services.ads.image_variables import StationSymbols
-from eap.services.jobs import MAX_WAITING
 from eap.services.routing.service import LocalRequest
+from eap.services.tasks import MAX_WAITING
 from tests.support import aoe
 from tests.support.stationengine import make_device
 

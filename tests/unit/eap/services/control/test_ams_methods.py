@@ -14,8 +14,8 @@ from eap.ams.spec import DirectoryStation
 from eap.errors import ControlError
 from eap.ids import NetId
 from eap.services.control.ams_methods import AmsMethods
-from eap.services.routing.route_query import RouteQuery
 from eap.services.routing.station_router import StationRouter
+from eap.services.routing.tracing import RouteQuery
 from tests.support.routing import StubService
 
 NET_ID = NetId.parse("5.1.1.1.1.1")

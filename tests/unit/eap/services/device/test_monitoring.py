@@ -24,8 +24,7 @@ from eap.pd.image import Image
 from eap.pd.spec import TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord
 from eap.runtime.handover import PortName
-from eap.services.device.monitoring import LOOK_NS, SubscriberWatch
-from eap.services.routing.monitor_addresses import UdpWay, Ways
+from eap.services.device.monitoring import LOOK_NS, SubscriberWatch, UdpWay, Ways
 from tests.support.cyclic import image_of, station, written
 from tests.support.eventually import eventually, settle
 from tests.unit.eap.net.conftest import cable as _cable

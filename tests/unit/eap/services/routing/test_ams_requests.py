@@ -16,9 +16,8 @@ from eap.codec.amsdiscovery import (
 )
 from eap.errors import EnvironmentalError
 from eap.ids import NetId
-from eap.services.routing import ams_requests as module
-from eap.services.routing.ams_requests import AmsQuestions, network_of
-from eap.services.routing.neighbours import Introduction, Neighbour
+from eap.services.routing import neighbours as module
+from eap.services.routing.neighbours import AmsQuestions, Introduction, Neighbour, network_of
 
 pytestmark = pytest.mark.net
 

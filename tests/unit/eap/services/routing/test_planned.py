@@ -8,8 +8,8 @@ from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.ids import NetId
-from eap.services.routing import planned
-from eap.services.routing.planned import access_of, make_router, to_route, to_way
+from eap.services.routing import station_routes
+from eap.services.routing.station_routes import access_of, make_router, to_route, to_way
 from tests.unit.eap.conftest import eap_port, left
 
 UDP = HopSpec(TransportKind.UDP, "eap0", "127.0.1.2:34980")
@@ -104,7 +104,7 @@ def test_router_knows_its_net_ids():
 
 
 def test_all_addresses_of_the_machine_are_those_of_a_port_at_any(monkeypatch):
-    monkeypatch.setattr(planned, "own_addresses", lambda: [("eth7", "10.0.0.7")])
+    monkeypatch.setattr(station_routes, "own_addresses", lambda: [("eth7", "10.0.0.7")])
     access = access_of(left(eap_port(1, interface="udp://0.0.0.0")), RoutingSpec())
     assert access.is_this_host(Endpoint("ams-tcp", "10.0.0.7:4711#1"))
     assert not access.is_this_host(Endpoint("ams-tcp", "10.0.0.8:4711#1"))

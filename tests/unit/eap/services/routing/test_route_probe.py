@@ -9,8 +9,8 @@ from eap.ams.directory import AmsAddress
 from eap.ams.routes import Route
 from eap.errors import ControlError
 from eap.ids import NetId
-from eap.services.routing import route_probe
-from eap.services.routing.route_probe import find_target, probe_target
+from eap.services.routing import tracing
+from eap.services.routing.tracing import find_target, probe_target
 from tests.support.ams import Ams
 from tests.support.eventually import settle
 from tests.support.routeviews import DIRECTORY, Left
@@ -118,7 +118,7 @@ def test_request_beyond_a_router_that_finds_a_fault_names_it(monkeypatch) -> Non
         assert (router.name, str(AmsAddress(*address))) == ("left", "127.0.9.3.1.1:10000")
         return why
 
-    monkeypatch.setattr(route_probe, "find_fault", find)
+    monkeypatch.setattr(tracing, "find_fault", find)
     target = AmsAddress(NetId.parse("127.0.9.3.1.1"), 10000)
     why = "right: third (127.0.9.3:34980 by udp:eap1) is down: it does not answer"
     assert probe(target, data=b"", error=0x1B, more=BEYOND).text == why
@@ -131,8 +131,8 @@ def test_search_for_a_fault_that_takes_too_long_is_given_up(monkeypatch) -> None
     async def find(router, *address):
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(route_probe, "find_fault", find)
-    monkeypatch.setattr(route_probe, "BLAME_S", 0.01)
+    monkeypatch.setattr(tracing, "find_fault", find)
+    monkeypatch.setattr(tracing, "BLAME_S", 0.01)
     target = AmsAddress(NetId.parse("127.0.9.3.1.1"), 10000)
     assert "no answer from right" in probe(target, more=BEYOND).text
 

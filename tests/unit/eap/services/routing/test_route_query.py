@@ -13,8 +13,8 @@ from eap.ams.hop_report import HopQuestion, decode_report
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
-from eap.services.routing.route_query import RouteQuery
 from eap.services.routing.service import LocalRequest
+from eap.services.routing.tracing import RouteQuery
 from tests.support.tracedplant import Line, to
 
 WAY = Endpoint("link", "island-09")

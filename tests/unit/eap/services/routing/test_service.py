@@ -7,9 +7,8 @@ from inspect import signature
 import pytest
 
 from eap.services.ads.ads_service import AdsService
-from eap.services.routing.local_client import LocalClient
-from eap.services.routing.service import Service, TransportSender
-from eap.services.transports.ams_transport import AmsClients
+from eap.services.routing.service import LocalClient, Service, TransportSender
+from eap.services.transports.ams_tcp import AmsClients
 from eap.services.transports.mailbox_frames import ChannelSender
 from eap.services.transports.mailbox_stream import MailboxStreams
 from tests.support.routing import KeepingCarrier, StubService

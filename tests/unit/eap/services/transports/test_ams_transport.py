@@ -12,9 +12,9 @@ import pytest
 from eap.net.connections import Limits
 from eap.runtime.discards import Refusal
 from eap.services.transports import accepting
-from eap.services.transports import ams_transport as ams_door
+from eap.services.transports import ams_tcp as ams_door
 from eap.services.transports.accepting import Listeners
-from eap.services.transports.ams_transport import AmsClients, AmsTransport
+from eap.services.transports.ams_tcp import AmsClients, AmsTransport
 from eap.services.transports.demultiplexer import Demultiplexer
 from tests.support import aoe
 from tests.support.amsstation import EchoStation

@@ -10,8 +10,8 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from eap.services.transports import ams_uplink
-from eap.services.transports.ams_uplink import AmsUplink, Peer, source_for
+from eap.services.transports import ams_tcp
+from eap.services.transports.ams_tcp import AmsUplink, Peer, source_for
 from tests.support import aoe
 from tests.support.eventually import eventually
 
@@ -128,7 +128,7 @@ def free_port() -> int:
 
 @pytest.fixture(autouse=True)
 def short_waits(monkeypatch):
-    monkeypatch.setattr(ams_uplink, "FIRST_WAIT_S", 0.05)
+    monkeypatch.setattr(ams_tcp, "FIRST_WAIT_S", 0.05)
 
 
 def test_what_is_sent_before_it_is_connected_goes_out_then():
@@ -159,7 +159,7 @@ def test_answers_and_requests_of_the_peer_are_handed_on_and_answered():
 
 
 def test_too_much_does_not_wait_for_a_connection(monkeypatch):
-    monkeypatch.setattr(ams_uplink, "MAX_EARLY", 2)
+    monkeypatch.setattr(ams_tcp, "MAX_EARLY", 2)
 
     async def run():
         async with listening() as (plc, port), serving(port) as (uplink, _, _):
@@ -324,7 +324,7 @@ def test_two_names_of_one_peer_are_not_two_connections():
 
 
 def test_peer_that_does_not_answer_is_given_up(monkeypatch):
-    monkeypatch.setattr(ams_uplink, "CONNECT_S", 0.1)
+    monkeypatch.setattr(ams_tcp, "CONNECT_S", 0.1)
 
     async def run():
         with socket.create_server(("127.0.0.1", 0), backlog=0) as full:

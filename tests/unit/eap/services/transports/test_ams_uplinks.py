@@ -13,7 +13,7 @@ from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
 from eap.ids import NetId
-from eap.services.transports.ams_uplink import AmsUplinks
+from eap.services.transports.ams_tcp import AmsUplinks
 from tests.support.eventually import eventually
 
 pytestmark = pytest.mark.net

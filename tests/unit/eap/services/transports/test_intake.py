@@ -16,7 +16,7 @@ from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.net.udpsocket import prepare_receiver
 from eap.runtime.discards import DiscardCounters, Refusal
-from eap.services.transports.intake import (
+from eap.services.transports.mailbox_frames import (
     MOST_FRAMES,
     MOST_REST,
     PATIENCE_NS,

@@ -6,7 +6,7 @@ import asyncio
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.transport_table import Transport
-from eap.services.transports.link_watch import LinkWatch
+from eap.services.sockets import LinkWatch
 from tests.support.eventually import eventually
 from tests.support.routing import KeepingCarrier, station, while_serving
 

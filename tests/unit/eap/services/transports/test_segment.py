@@ -12,8 +12,8 @@ from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
-from eap.services.transports import segment as segment_module
-from eap.services.transports.segment import Segment, SegmentSender
+from eap.services.transports import mailbox_frames as segment_module
+from eap.services.transports.mailbox_frames import Segment, SegmentSender
 from tests.support import aoe
 from tests.support.ams import Ams, parse
 from tests.support.routing import demultiplexer, station

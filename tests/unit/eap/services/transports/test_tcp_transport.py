@@ -18,10 +18,9 @@ from eap.runtime.handover import PortName
 from eap.runtime.passing import take_connection
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import accepting
-from eap.services.transports import tcp_transport as tcp_door
+from eap.services.transports import mailbox_stream as tcp_door
 from eap.services.transports.accepting import Listeners
-from eap.services.transports.mailbox_stream import MailboxStreams, StreamConnection
-from eap.services.transports.tcp_transport import TcpTransport
+from eap.services.transports.mailbox_stream import MailboxStreams, StreamConnection, TcpTransport
 from tests.support import aoe
 from tests.support.eventually import eventually, settle
 from tests.support.routing import demultiplexer, station

@@ -1,8 +1,8 @@
-"""AMS/TCP as a client: the connections of a station to its peers, one for each that a route names.
+"""AMS/TCP: the listener of an address with its clients, and the connections to other routers.
 
 Rule 1: there is one connection for each peer, however many NetIDs are behind it: routers close the
 older one of two.
-Rule 2: the peer may ask on it too, and is answered on it.
+Rule 2: the peer may send requests on it too, and gets its answers on it.
 """
 
 from __future__ import annotations
@@ -11,6 +11,10 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
+from ipaddress import IPv4Address
+from secrets import randbelow
+from threading import Thread
 from time import monotonic_ns
 from typing import NamedTuple, Protocol
 
@@ -19,13 +23,163 @@ from eap.ams.routes import Route
 from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.amstcp import AMS_TCP_PORT
-from eap.ids import parse_host
-from eap.net.connections import OVERDUE_NS, CloseReason
+from eap.ids import NetId, parse_host
+from eap.net.connections import OVERDUE_NS, CloseReason, Limits
 from eap.net.reconnecting import Pauses, ReconnectingLink, connect_tcp
+from eap.net.tcp import set_stream_options
 from eap.runtime.discards import Refusal
-from eap.services.routing.resolving import resolve
 from eap.services.routing.service import TransportSender
-from eap.services.transports.ams_connection import AmsConnection
+from eap.services.transports.accepting import Listeners, ListeningSocket, connection_name
+from eap.services.transports.ams_connection import AmsConnection, ClientAddresses
+from eap.services.transports.demultiplexer import Demultiplexer
+
+LIMITS = Limits()
+
+logger = logging.getLogger(__name__)
+
+
+class AmsClients:
+    """Connections to all AMS/TCP listeners of this process, by name; the carrier of their door.
+
+    Attributes:
+        addresses: For clients that ask for an AMS address.
+    """
+
+    def __init__(self) -> None:
+        self.addresses = ClientAddresses(randbelow(1 << 16))
+        self._connections: dict[str, AmsConnection] = {}
+
+    def __len__(self) -> int:
+        return len(self._connections)
+
+    def add(self, connection: AmsConnection) -> None:
+        """Take one more."""
+        self._connections[connection.name] = connection
+
+    def remove(self, connection: AmsConnection) -> None:
+        """Forget one that has ended."""
+        del self._connections[connection.name]
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send packets by a connection; return why not if there is none of that name."""
+        found = self._connections.get(connection)
+        return "the connection was closed" if found is None else found.send(packets)
+
+
+class AmsTransport:
+    """One listening socket and the stations behind it.
+
+    A peer that has vanished without a word is found out by the kernel within a minute.
+
+    Args:
+        listener: Opened by the supervisor; it stays open.
+        entrance: To the stations that are reached by it.
+        clients: Where those who have connected are found when an answer is there.
+        refuse: Counts what is not answered as it was wanted.
+        listeners: Of this process.
+    """
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        demultiplexer: Demultiplexer,
+        clients: AmsClients,
+        refuse: Callable[[Refusal], None],
+        listeners: Listeners,
+    ) -> None:
+        self.refuse = refuse
+        self._demultiplexer = demultiplexer
+        self._clients = clients
+        name = "ams-tcp {}:{}".format(*listener.getsockname())
+        self._listening = ListeningSocket(listener, name, self, listeners, LIMITS)
+
+    async def serve(self) -> None:
+        """Accept until cancelled; then close all connections."""
+        await self._listening.serve()
+
+    def connection_from(self, sock: socket.socket, host: str) -> AmsConnection:
+        """Return the connection on a socket that was accepted (ConnectionServer)."""
+        set_stream_options(sock)
+        return AmsConnection(
+            connection_name(sock),
+            sock.getpeername()[0],
+            self,
+            host=host,
+            give_address=self._give_address,
+        )
+
+    async def serve_connection(self, connection: AmsConnection, sock: socket.socket) -> None:
+        """Serve a connection until its end (ConnectionServer)."""
+        loop = asyncio.get_running_loop()
+        await loop.connect_accepted_socket(lambda: connection, sock)
+        try:
+            await connection.closed
+        finally:
+            connection.close(CloseReason.ENDED)
+
+    def refuse_connection(self, sock: socket.socket, why: str) -> None:
+        """Count a connection that gets no place (ConnectionServer)."""
+        del sock, why
+        self.refuse(Refusal.AMS_FULL)
+
+    def connection_opened(self, connection: AmsConnection) -> None:
+        """Keep it (PacketTaker)."""
+        self._clients.add(connection)
+
+    def connection_closed(self, connection: AmsConnection, why: str) -> None:
+        """Let others have its place (PacketTaker)."""
+        logger.debug("AMS/TCP connection %s: %s", connection.name, why)
+        self._clients.remove(connection)
+        self._demultiplexer.connection_closed(connection.name)
+
+    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+        """Hand a request to the stations (PacketTaker)."""
+        self._demultiplexer.receive(packet, connection.name)
+
+    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        """Count a response: nothing is asked by connections that others opened (PacketTaker)."""
+        del packet, connection
+        self.refuse(Refusal.AMS_UNASKED)
+
+    def _give_address(self, host: str) -> tuple[NetId, int]:
+        return self._clients.addresses.next(host, self._demultiplexer.has)
+
+
+async def resolve(host: str) -> str:
+    """Return the address of *host*, which may be one already.
+
+    Raises:
+        OSError: there is no such name, or nobody says whose it is.
+    """
+    try:
+        return str(IPv4Address(host))
+    except ValueError:
+        pass
+    loop = asyncio.get_running_loop()
+    found: asyncio.Future[str] = loop.create_future()
+
+    def take(result: str | OSError) -> None:
+        if found.done():
+            return
+        if isinstance(result, str):
+            found.set_result(result)
+        else:
+            found.set_exception(result)
+
+    def look_up() -> None:
+        result: str | OSError
+        try:
+            result = socket.gethostbyname(host)
+        except OSError as exc:
+            result = exc
+        except UnicodeError:
+            result = OSError(f"{host!r} is not a host name")
+        with suppress(RuntimeError):  # the loop has ended meanwhile
+            loop.call_soon_threadsafe(take, result)
+
+    Thread(target=look_up, name=f"resolve {host}", daemon=True).start()
+    return await found
+
 
 CONNECT_S = 3.0
 """How long a peer may take to accept a connection."""
@@ -41,8 +195,6 @@ _STABLE_S = 10.0
 
 DOOR = f"{TransportKind.AMS_TCP}:"
 """Begin of the names of doors to peers; the address of the peer follows."""
-
-logger = logging.getLogger(__name__)
 
 
 class Hops(Protocol):

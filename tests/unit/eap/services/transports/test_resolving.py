@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from eap.services.routing import resolving
-from eap.services.routing.resolving import resolve
+from eap.services.transports import ams_tcp
+from eap.services.transports.ams_tcp import resolve
 
 pytestmark = pytest.mark.net
 
@@ -29,7 +29,7 @@ def test_unknown_name_is_an_error(host: str, monkeypatch: pytest.MonkeyPatch) ->
             raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
         return original(name)
 
-    monkeypatch.setattr(resolving.socket, "gethostbyname", look_up)
+    monkeypatch.setattr(ams_tcp.socket, "gethostbyname", look_up)
     with pytest.raises(OSError, match=r"not known|not a host name"):
         asyncio.run(resolve(host))
 
@@ -43,7 +43,7 @@ def test_slow_name_server_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> No
         leave.wait(10)
         return "10.0.0.1"
 
-    monkeypatch.setattr(resolving.socket, "gethostbyname", look_up)
+    monkeypatch.setattr(ams_tcp.socket, "gethostbyname", look_up)
 
     async def run() -> None:
         with pytest.raises(TimeoutError):

@@ -12,8 +12,8 @@ from eap.ids import Destination
 from eap.net.neighbour import NeighbourTable
 from eap.pd.monitor import Evidence
 from eap.runtime.handover import Handover, PortName
-from eap.services.routing import monitor_addresses as monitor_ways
-from eap.services.routing.monitor_addresses import REFUSAL_NS, UdpWay, key_of, open_ways
+from eap.services.device import monitoring as monitor_ways
+from eap.services.device.monitoring import REFUSAL_NS, UdpWay, key_of, open_ways
 from eap.supervisor.sockets import SharedSockets
 from tests.unit.eap.conftest import left, right
 

@@ -20,8 +20,8 @@ from eap.codec.amsdiscovery import (
 )
 from eap.ids import NetId
 from eap.runtime.store import StationStore
-from eap.services.routing.route_admin import RATES, RouteAdmin
 from eap.services.routing.station_routes import StationRoutes
+from eap.services.transports.ams_discovery import RATES, RouteAdmin
 from tests.support.routing import station
 from tests.support.vectors import load
 
