@@ -24,9 +24,8 @@ from eap.ids import NetId
 from eap.runtime.discards import Refusal
 from eap.runtime.store import StationFile
 from eap.services.routing.neighbours import AmsQuestions
-from eap.services.transports.ams_discovery import RouteAdmin
 from eap.services.routing.station_routes import StationRoutes
-from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
+from eap.services.transports.ams_discovery import AmsDiscovery, RouteAdmin, RouterName
 
 OWN = NetId.parse("10.0.0.1.1.1")
 _MAX_ANSWER = 64
