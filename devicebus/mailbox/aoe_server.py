@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from devicebus.mailbox.protocol import MailboxSizes, refuse
+from devicebus.mailbox.protocol import MailboxSizes, raise_mailbox_error
 from eap.ads.answer import AmsAnswer, response_to
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
@@ -121,15 +121,17 @@ class AoeServer:
         try:
             header, body = decode_packet(data)
         except CodecError as exc:
-            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
+            raise_mailbox_error(MailboxError.SIZE_TOO_SHORT, str(exc))
         if header.state_flags & StateFlags.RESPONSE:
-            refuse(MailboxError.SERVICE_NOT_SUPPORTED, "a response, but nothing was asked")
+            raise_mailbox_error(
+                MailboxError.SERVICE_NOT_SUPPORTED, "a response, but nothing was asked"
+            )
         if header.command != AmsCommand.FRAGMENT:
             return self._answer(header, bytes(body))
         try:
             packet, acknowledgement = self.assembler.receive(header, bytes(body), now_ns)
         except CodecError as exc:
-            refuse(MailboxError.INVALID_SIZE, str(exc))
+            raise_mailbox_error(MailboxError.INVALID_SIZE, str(exc))
         if packet is None:
             return [] if acknowledgement is None else [acknowledgement]
         header, body = decode_packet(packet)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from devicebus.mailbox.protocol import MailboxSizes, readable, refuse
+from devicebus.mailbox.protocol import MailboxSizes, decode_or_error, raise_mailbox_error
 from eap.codec.coe import CoeHeader, CoeService, Emergency, encode_message
 from eap.codec.mailbox import MailboxError
 from eap.codec.sdo import (
@@ -139,7 +139,9 @@ class SdoServer:
     def receive_request(self, body: bytes) -> list[bytes]:
         """Act on an SDO request behind its CoE header; return the answer, if it has one."""
         if len(body) < SdoHeader.SIZE:
-            refuse(MailboxError.SIZE_TOO_SHORT, f"an SDO of {len(body)} octets, expected 8")
+            raise_mailbox_error(
+                MailboxError.SIZE_TOO_SHORT, f"an SDO of {len(body)} octets, expected 8"
+            )
         specifier = body[0] >> 5
         if specifier == _ABORT:
             self._transfer = None
@@ -327,7 +329,7 @@ class CoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answers."""
         del now_ns
-        header = readable(CoeHeader.decode, data)
+        header = decode_or_error(CoeHeader.decode, data)
         body = data[CoeHeader.SIZE :]
         if header.service is CoeService.SDO_REQUEST:
             return self._sdo.receive_request(body)
@@ -366,6 +368,6 @@ class CoeServer:
         write = self._write_pdo if header.service is CoeService.RX_PDO else None
         if write is not None and write(header.number, body):
             return []
-        return refuse(
+        return raise_mailbox_error(
             MailboxError.SERVICE_NOT_SUPPORTED, f"{header.service.name}, number {header.number}"
         )

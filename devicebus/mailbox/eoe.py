@@ -9,7 +9,7 @@ import msgspec
 
 from devicebus.errors import EoeError
 from devicebus.mailbox.conversation import Conversation, MailboxRequest, reading
-from devicebus.mailbox.protocol import MailboxSizes, readable, refuse
+from devicebus.mailbox.protocol import MailboxSizes, decode_or_error, raise_mailbox_error
 from eap.codec.eoe import (
     DATA_OVERHEAD,
     FRAGMENT_UNIT,
@@ -58,7 +58,7 @@ def iter_fragments(frame: bytes, number: int, room: int, *, port: int = 0) -> It
         yield EoeHeader(EoeType.FRAGMENT, port, last).encode() + word.encode() + piece
 
 
-class Assembler:
+class FrameAssembler:
     """Puts fragments together again, one frame at a time.
 
     Attributes:
@@ -177,7 +177,7 @@ class EoeServer:
         receive_frame: Callable[[bytes], list[bytes]] | None = None,
     ) -> None:
         self.settings = settings or IpSettings()
-        self.assembler = Assembler()
+        self.assembler = FrameAssembler()
         self.dropped = 0
         """Frames lost because the master did not fetch those before, or too long to be sent."""
         self._sizes = sizes
@@ -194,12 +194,12 @@ class EoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer, if it has one."""
         del now_ns
-        header, _, body = readable(decode_message, data)
+        header, _, body = decode_or_error(decode_message, data)
         if header.type is EoeType.FRAGMENT:
-            readable(self._take_fragment, data)
+            decode_or_error(self._take_fragment, data)
             return []
         if header.type not in _RESPONSE:
-            refuse(MailboxError.SERVICE_NOT_SUPPORTED, f"type {header.type.name}")
+            raise_mailbox_error(MailboxError.SERVICE_NOT_SUPPORTED, f"type {header.type.name}")
         return [self._answer(header, bytes(body))]
 
     def messages_to_send(self, now_ns: int) -> list[bytes]:

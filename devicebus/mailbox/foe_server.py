@@ -11,7 +11,7 @@ from enum import Enum, auto
 from typing import Protocol
 
 from devicebus.errors import FoeError
-from devicebus.mailbox.protocol import MailboxSizes, refuse
+from devicebus.mailbox.protocol import MailboxSizes, raise_mailbox_error
 from eap.codec.foe import (
     DATA_OVERHEAD,
     Busy,
@@ -106,7 +106,7 @@ class FoeServer:
             header = FoeHeader.decode(data)
             return self._answer(header, data[FoeHeader.SIZE :], now_ns)
         except TruncatedError as exc:
-            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
+            raise_mailbox_error(MailboxError.SIZE_TOO_SHORT, str(exc))
         except MalformedError:
             self.reset()
             return [encode_message(FoeOpcode.ERROR, FoeErrorCode.ILLEGAL)]

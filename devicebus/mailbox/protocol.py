@@ -62,19 +62,19 @@ class ProtocolServer(Protocol):
         """Forget every transfer: the mailbox starts again."""
 
 
-def refuse(detail: MailboxError, reason: str) -> NoReturn:
+def raise_mailbox_error(detail: MailboxError, reason: str) -> NoReturn:
     """Raise the MailboxRefusedError that answers a request with a mailbox error."""
     raise MailboxRefusedError(f"{detail.name}: {reason}", detail=detail)
 
 
-def readable(decode: Callable[[bytes], T], data: bytes) -> T:
+def decode_or_error(decode: Callable[[bytes], T], data: bytes) -> T:
     """Return what *decode* makes of a message; what it cannot read gets a mailbox error."""
     try:
         return decode(data)
     except TruncatedError as exc:
-        refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
+        raise_mailbox_error(MailboxError.SIZE_TOO_SHORT, str(exc))
     except MalformedError as exc:
-        refuse(MailboxError.SERVICE_NOT_SUPPORTED, str(exc))
+        raise_mailbox_error(MailboxError.SERVICE_NOT_SUPPORTED, str(exc))
 
 
 def next_counter(counter: int) -> int:
@@ -82,7 +82,7 @@ def next_counter(counter: int) -> int:
     return counter % 7 + 1
 
 
-class CounterWatch:
+class CounterCheck:
     """Judges the counters of one sender's messages.
 
     Attributes:

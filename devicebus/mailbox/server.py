@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.protocol import (
-    CounterWatch,
+    CounterCheck,
     MailboxSizes,
     ProtocolServer,
     next_counter,
-    refuse,
+    raise_mailbox_error,
 )
 from eap.codec.mailbox import (
     MailboxError,
@@ -31,7 +31,7 @@ MAX_QUEUED = 8
 """Messages waiting for the master from which on no further request is taken."""
 
 
-class MailboxStats(NamedTuple):
+class MailboxServerStats(NamedTuple):
     """Counters of one mailbox since it was made."""
 
     received: int
@@ -60,7 +60,7 @@ class MailboxServer:
     ) -> None:
         self.protocols = dict(protocols)
         self.sizes = sizes
-        self._watch = CounterWatch()
+        self._watch = CounterCheck()
         self._queue: deque[bytes] = deque()
         self._counter = 0
         self._posted: bytes | None = None
@@ -129,9 +129,9 @@ class MailboxServer:
         self._repeated += 1
         return self._posted
 
-    def stats(self) -> MailboxStats:
+    def stats(self) -> MailboxServerStats:
         """Return the counters."""
-        return MailboxStats(
+        return MailboxServerStats(
             self._received,
             self._sent,
             self._watch.repeated,
@@ -145,17 +145,21 @@ class MailboxServer:
         length = int.from_bytes(message[:2], "little")
         room = min(len(message), self.sizes.to_slave) - MailboxHeader.SIZE
         if not 0 < length <= room:
-            refuse(MailboxError.INVALID_HEADER, f"length {length}, expected 1 to {room}")
+            raise_mailbox_error(
+                MailboxError.INVALID_HEADER, f"length {length}, expected 1 to {room}"
+            )
         if message[4] & 0x3F:
-            refuse(MailboxError.INVALID_CHANNEL, f"channel {message[4] & 0x3F}, expected 0")
+            raise_mailbox_error(
+                MailboxError.INVALID_CHANNEL, f"channel {message[4] & 0x3F}, expected 0"
+            )
         number = message[5] & 0x0F
         if number == MailboxType.ERR:
-            refuse(MailboxError.INVALID_HEADER, "type 0 is no request")
+            raise_mailbox_error(MailboxError.INVALID_HEADER, "type 0 is no request")
         try:
             kind = MailboxType(number)
             protocol = self.protocols[kind]
         except (KeyError, ValueError):
-            refuse(MailboxError.UNSUPPORTED_PROTOCOL, f"type {number}")
+            raise_mailbox_error(MailboxError.UNSUPPORTED_PROTOCOL, f"type {number}")
         data = bytes(message[MailboxHeader.SIZE : MailboxHeader.SIZE + length])
         return kind, protocol.receive_message(data, now_ns)
 

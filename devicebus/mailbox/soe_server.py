@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from devicebus.errors import SoeError
-from devicebus.mailbox.protocol import MailboxSizes, readable, refuse
+from devicebus.mailbox.protocol import MailboxSizes, decode_or_error, raise_mailbox_error
 from eap.codec.coe import Emergency
 from eap.codec.mailbox import MailboxError
 from eap.codec.soe import (
@@ -259,7 +259,7 @@ _RESPONSE = {
 }
 
 
-class _Partial:
+class _PendingWrite:
     """The fragments of a write so far."""
 
     __slots__ = ("content", "deadline_ns", "drive", "elements", "left")
@@ -299,7 +299,7 @@ class SoeServer:
         self.drives = {drive: _with_list(items) for drive, items in drives.items()}
         self._state = state
         self._sizes = sizes
-        self._partial: _Partial | None = None
+        self._partial: _PendingWrite | None = None
         self._running: dict[tuple[int, int], SoeParameter] = {}
         self._pending: deque[bytes] = deque()
         self.dropped = 0
@@ -313,9 +313,9 @@ class SoeServer:
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer in its fragments."""
-        header = readable(SoeHeader.decode, data)
+        header = decode_or_error(SoeHeader.decode, data)
         if header.opcode not in _RESPONSE:
-            refuse(MailboxError.SERVICE_NOT_SUPPORTED, f"opcode {header.opcode.name}")
+            raise_mailbox_error(MailboxError.SERVICE_NOT_SUPPORTED, f"opcode {header.opcode.name}")
         body = data[SoeHeader.SIZE :]
         if header.opcode is SoeOpcode.WRITE_REQUEST:
             joined = self._join(header, body, now_ns)
@@ -372,7 +372,7 @@ class SoeServer:
         if partial is not None and not self._continues(partial, header, body, now_ns):
             partial = None
         if header.incomplete:
-            self._partial = partial or _Partial(header)
+            self._partial = partial or _PendingWrite(header)
             self._partial.take(header, body, now_ns)
             return None
         self._partial = None
@@ -381,7 +381,9 @@ class SoeServer:
         partial.take(header, body, now_ns)
         return bytes(partial.content)
 
-    def _continues(self, partial: _Partial, header: SoeHeader, body: bytes, now_ns: int) -> bool:
+    def _continues(
+        self, partial: _PendingWrite, header: SoeHeader, body: bytes, now_ns: int
+    ) -> bool:
         if now_ns > partial.deadline_ns:
             return False
         if (header.drive, header.elements) != (partial.drive, partial.elements):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Conversation, MailboxRequest
-from devicebus.mailbox.protocol import readable
+from devicebus.mailbox.protocol import decode_or_error
 from eap.codec.mailbox import MailboxType
 from eap.codec.voe import VoeHeader
 
@@ -39,7 +39,7 @@ class VoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer, if it has one."""
         del now_ns
-        header = readable(VoeHeader.decode, data)
+        header = decode_or_error(VoeHeader.decode, data)
         if self._handler is None:
             return [data]
         answer = self._handler(header.vendor_id, header.vendor_type, data[VoeHeader.SIZE :])

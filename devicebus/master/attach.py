@@ -12,7 +12,7 @@ from __future__ import annotations
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation, MailboxRequest
 from devicebus.master.bring import bring, wait_for
-from devicebus.master.bus import Bus, Unit
+from devicebus.master.bus import BusSlave, BusState
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.procedure import Procedure, Sleep, read
@@ -31,7 +31,7 @@ _MAILBOX_MODE = 2
 _DEVICE_TYPE = 0x1000
 
 
-def attach(bus: Bus, unit: Unit) -> Procedure[Mailbox]:
+def attach(bus: BusState, slave: BusSlave) -> Procedure[Mailbox]:
     """Return the open mailbox of a slave, which is brought to PREOP if it is in INIT.
 
     Raises:
@@ -39,44 +39,44 @@ def attach(bus: Bus, unit: Unit) -> Procedure[Mailbox]:
         AlStatusError: it refuses PREOP.
         WorkingCounterError: it does not answer.
     """
-    if unit.state is AlState.INIT:
-        yield from bring(bus, unit, AlState.PREOP)
-        return _opened(unit)
+    if slave.state is AlState.INIT:
+        yield from bring(bus, slave, AlState.PREOP)
+        return _opened(slave)
     octets = yield from read(
-        unit.station, Register.SYNC_MANAGER, 2 * SyncManager.SIZE, "sync managers"
+        slave.station, Register.SYNC_MANAGER, 2 * SyncManager.SIZE, "sync managers"
     )
     out, back = SyncManager.decode(octets), SyncManager.decode(octets, SyncManager.SIZE)
     if out.mode == back.mode == _MAILBOX_MODE and out.enable and back.enable:
         area = MailboxArea(out.start, out.length, back.start, back.length)
         if area.is_there:
-            area.check(unit.station)
-            bus.open_mailbox(unit, area)
-            yield from _settle(bus, unit)
-    return _opened(unit)
+            area.check(slave.station)
+            bus.open_mailbox(slave, area)
+            yield from _synchronize_counter(bus, slave)
+    return _opened(slave)
 
 
-def _opened(unit: Unit) -> Mailbox:
-    if unit.mailbox is None:
+def _opened(slave: BusSlave) -> Mailbox:
+    if slave.mailbox is None:
         raise BusError(
-            f"slave {unit.station} ({unit.name}) has no mailbox in {state_name(unit.al_state)}:"
+            f"slave {slave.station} ({slave.name}) has no mailbox in {state_name(slave.al_state)}:"
             " nothing but its state, its EEPROM and its registers can be reached"
         )
-    return unit.mailbox
+    return slave.mailbox
 
 
-def _settle(bus: Bus, unit: Unit) -> Procedure[None]:
+def _synchronize_counter(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Throw away what waits in the mailbox, and use up one counter."""
-    mailbox = _opened(unit)
+    mailbox = _opened(slave)
     _, now_ns = yield Sleep(0)
     mailbox.look(now_ns)
-    greeting = _greet(SiiProtocol(unit.found.sii.fixed.protocols), unit.state)
+    greeting = _send_first_message(SiiProtocol(slave.found.sii.fixed.protocols), slave.state)
     yield from wait_for(mailbox.converse(greeting, now_ns, name="greeting", requester=bus))
     for _ in range(2):
         _, now_ns = yield Sleep(SETTLE_NS // 2)
         mailbox.look(now_ns)
 
 
-def _greet(protocols: SiiProtocol, state: AlState | None) -> Conversation[None]:
+def _send_first_message(protocols: SiiProtocol, state: AlState | None) -> Conversation[None]:
     """Send what changes nothing, in a protocol that the slave knows; an answer is thrown away."""
     if protocols & SiiProtocol.COE and state is not AlState.BOOT:
         body = encode_plain(SdoRequest.UPLOAD, _DEVICE_TYPE, 0)

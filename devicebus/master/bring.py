@@ -6,14 +6,14 @@ from typing import TypeVar
 
 from devicebus.errors import BusError, SiiError
 from devicebus.mailbox.conversation import Conversation
-from devicebus.master.bus import Bus, Unit
+from devicebus.master.bus import BusSlave, BusState
 from devicebus.master.clocks import start_sync0, synchronize
-from devicebus.master.cycle import Presence
+from devicebus.master.cycle import Participation
 from devicebus.master.esm import acknowledge, change_state, path
-from devicebus.master.image import MAX_FMMUS, Place
+from devicebus.master.image import MAX_FMMUS, SlaveLayout
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea, configure
-from devicebus.master.pdo import channels_from_sii, read_channels, write_choice
+from devicebus.master.pdo import channels_from_sii, read_channels, write_configuration
 from devicebus.master.procedure import Procedure, Sleep, Task, write
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Fmmu, Register, SyncManager
@@ -53,17 +53,17 @@ def clear(station: int, *, fmmus: int, sync_managers: int) -> Procedure[None]:
         yield from write(station, Register.FMMU, bytes(Fmmu.SIZE * min(fmmus, MAX_FMMUS)), "FMMUs")
 
 
-def set_process_data(place: Place) -> Procedure[None]:
+def set_process_data(layout: SlaveLayout) -> Procedure[None]:
     """Write the sync managers and FMMUs of a slave in PREOP.
 
     Raises WorkingCounterError if it does not answer.
     """
-    for number, manager in place.sync_managers:
+    for number, manager in layout.sync_managers:
         at = Register.SYNC_MANAGER + SyncManager.SIZE * number
-        yield from write(place.station, at, manager.encode(), f"sync manager {number}")
-    if place.fmmus:
-        octets = b"".join(fmmu.encode() for fmmu in place.fmmus)
-        yield from write(place.station, Register.FMMU, octets, "FMMUs")
+        yield from write(layout.station, at, manager.encode(), f"sync manager {number}")
+    if layout.fmmus:
+        octets = b"".join(fmmu.encode() for fmmu in layout.fmmus)
+        yield from write(layout.station, Register.FMMU, octets, "FMMUs")
 
 
 def set_watchdog(station: int, timeout_ms: int) -> Procedure[None]:
@@ -87,7 +87,7 @@ _POLL_NS = 100_000
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
-def bring(bus: Bus, unit: Unit, target: AlState) -> Procedure[None]:
+def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
     """Bring a slave to *target*, step by step.
 
     Raises:
@@ -95,43 +95,43 @@ def bring(bus: Bus, unit: Unit, target: AlState) -> Procedure[None]:
         SiiError: nothing is known of it, for its EEPROM cannot be read.
         WorkingCounterError: it does not answer.
     """
-    if unit.found.fault:
-        raise SiiError(unit.found.fault)
-    unit.state = current = yield from acknowledge(unit.station)
+    if slave.found.fault:
+        raise SiiError(slave.found.fault)
+    slave.state = current = yield from acknowledge(slave.station)
     if current is AlState.INIT:
-        bus.close_mailbox(unit)
+        bus.close_mailbox(slave)
     for step in path(current, target):
-        yield from _prepare(bus, unit, current, step)
-        yield from change_state(unit.station, step)
-        before, unit.state, current = current, step, step
+        yield from _prepare(bus, slave, current, step)
+        yield from change_state(slave.station, step)
+        before, slave.state, current = current, step, step
         if step is AlState.INIT:
-            bus.close_mailbox(unit)  # not before: the slave may have stayed where it has one
+            bus.close_mailbox(slave)  # not before: the slave may have stayed where it has one
         if before in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
-            yield from _end_process_data(bus, unit)
-        unit.is_set_up = step in _WITH_PROCESS_DATA
+            yield from _end_process_data(bus, slave)
+        slave.is_set_up = step in _WITH_PROCESS_DATA
         if step in _WITH_PROCESS_DATA:
-            bus.set_presence(unit, Presence.PRESENT)
+            bus.set_participation(slave, Participation.ACTIVE)
         elif step is AlState.BOOT:
-            bus.open_mailbox(unit, boot_mailbox(unit.found.sii.fixed))
-        elif step is AlState.PREOP and unit.mailbox is None:
-            yield from _begin_preop(bus, unit)
-    unit.state = target
+            bus.open_mailbox(slave, boot_mailbox(slave.found.sii.fixed))
+        elif step is AlState.PREOP and slave.mailbox is None:
+            yield from _begin_preop(bus, slave)
+    slave.state = target
 
 
-def read_process_data(bus: Bus, unit: Unit) -> Procedure[None]:
+def read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Find out what a slave in PREOP exchanges."""
-    sii = unit.found.sii
-    if unit.mailbox is not None and sii.fixed.protocols & SiiProtocol.COE:
+    sii = slave.found.sii
+    if slave.mailbox is not None and sii.fixed.protocols & SiiProtocol.COE:
         reading = read_channels(sii)
-        unit.channels = yield from _ask(bus, unit.mailbox, reading, "reading PDOs")
+        slave.channels = yield from _ask(bus, slave.mailbox, reading, "reading PDOs")
     else:
-        unit.channels = channels_from_sii(sii)
+        slave.channels = channels_from_sii(sii)
 
 
-def set_clocks(bus: Bus, *, only: frozenset[int] | None = None) -> Procedure[None]:
+def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedure[None]:
     """Set the clocks of all slaves, or *only* of those that came back."""
     _, now_ns = yield Sleep(0)
-    present = [unit.found for unit in bus.units.values() if not unit.is_lost]
+    present = [slave.found for slave in bus.slaves.values() if not slave.is_lost]
     states = yield from synchronize(present, now_ns + bus.settings.epoch_offset_ns, only=only)
     bus.follow(states[0].station if states else None)
 
@@ -143,60 +143,62 @@ def wait_for(task: Task[T]) -> Procedure[T]:
     return task.result()
 
 
-def _prepare(bus: Bus, unit: Unit, current: AlState, step: AlState) -> Procedure[None]:
+def _prepare(bus: BusState, slave: BusSlave, current: AlState, step: AlState) -> Procedure[None]:
     """Set up what the slave checks on its way to *step*."""
     if current in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
-        bus.set_presence(unit, Presence.UNSURE)
+        bus.set_participation(slave, Participation.UNCERTAIN)
     if current is AlState.INIT:
-        yield from _prepare_mailbox(bus, unit, step)
+        yield from _prepare_mailbox(bus, slave, step)
     elif current is AlState.PREOP and step is AlState.SAFEOP:
-        yield from _prepare_process_data(bus, unit)
+        yield from _prepare_process_data(bus, slave)
 
 
-def _prepare_mailbox(bus: Bus, unit: Unit, step: AlState) -> Procedure[None]:
-    bus.close_mailbox(unit)
-    esc, fixed = unit.found.esc, unit.found.sii.fixed
-    yield from clear(unit.station, fmmus=esc.fmmus, sync_managers=esc.sync_managers)
+def _prepare_mailbox(bus: BusState, slave: BusSlave, step: AlState) -> Procedure[None]:
+    bus.close_mailbox(slave)
+    esc, fixed = slave.found.esc, slave.found.sii.fixed
+    yield from clear(slave.station, fmmus=esc.fmmus, sync_managers=esc.sync_managers)
     area = boot_mailbox(fixed) if step is AlState.BOOT else standard_mailbox(fixed)
     if area.is_there:
-        area.check(unit.station)
-        yield from configure(unit.station, area)
+        area.check(slave.station)
+        yield from configure(slave.station, area)
     elif step is AlState.BOOT:
-        raise BusError(f"slave {unit.station}: its EEPROM names no mailbox for BOOT")
+        raise BusError(f"slave {slave.station}: its EEPROM names no mailbox for BOOT")
 
 
-def _end_process_data(bus: Bus, unit: Unit) -> Procedure[None]:
+def _end_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Take the slave out of the cycle: a controller would go on counting in any state."""
-    yield from clear(unit.station, fmmus=unit.found.esc.fmmus, sync_managers=0)
-    bus.set_presence(unit, Presence.AWAY)
+    yield from clear(slave.station, fmmus=slave.found.esc.fmmus, sync_managers=0)
+    bus.set_participation(slave, Participation.ABSENT)
 
 
-def _begin_preop(bus: Bus, unit: Unit) -> Procedure[None]:
+def _begin_preop(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Open the mailbox and tell the slave what to exchange."""
-    area = standard_mailbox(unit.found.sii.fixed)
+    area = standard_mailbox(slave.found.sii.fixed)
     if not area.is_there:
         return
-    bus.open_mailbox(unit, area)
-    choice = bus.settings.choices.get(unit.station)
-    mailbox = unit.mailbox
-    if choice is not None and mailbox is not None:
-        yield from _ask(bus, mailbox, write_choice(choice, mailbox.sizes), "setting PDOs")
+    bus.open_mailbox(slave, area)
+    configuration = bus.settings.pdo_configurations.get(slave.station)
+    mailbox = slave.mailbox
+    if configuration is not None and mailbox is not None:
+        yield from _ask(
+            bus, mailbox, write_configuration(configuration, mailbox.sizes), "setting PDOs"
+        )
 
 
-def _ask(bus: Bus, mailbox: Mailbox, conversation: Conversation[T], name: str) -> Procedure[T]:
+def _ask(bus: BusState, mailbox: Mailbox, conversation: Conversation[T], name: str) -> Procedure[T]:
     _, now_ns = yield Sleep(0)
     task = mailbox.converse(conversation, now_ns, name=name, requester=bus)
     return (yield from wait_for(task))
 
 
-def _prepare_process_data(bus: Bus, unit: Unit) -> Procedure[None]:
-    place = bus.image.layout.places.get(unit.station) if bus.image is not None else None
-    if place is None:
+def _prepare_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
+    layout = bus.image.layout.slaves.get(slave.station) if bus.image is not None else None
+    if layout is None:
         return
     if bus.settings.watchdog_ms is not None:
-        yield from set_watchdog(unit.station, bus.settings.watchdog_ms)
-    sync0 = bus.settings.sync0.get(unit.station)
+        yield from set_watchdog(slave.station, bus.settings.watchdog_ms)
+    sync0 = bus.settings.sync0.get(slave.station)
     if sync0 is not None and bus.reference is not None:
-        yield from start_sync0(unit.station, sync0)
-    bus.set_presence(unit, Presence.UNSURE)
-    yield from set_process_data(place)
+        yield from start_sync0(slave.station, sync0)
+    bus.set_participation(slave, Participation.UNCERTAIN)
+    yield from set_process_data(layout)

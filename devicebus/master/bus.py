@@ -8,13 +8,13 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from devicebus.master.clocks import Sync0, drift_access
-from devicebus.master.cycle import Cycle, Presence
+from devicebus.master.clocks import Sync0, drift_datagram
+from devicebus.master.cycle import Cycle, Participation
 from devicebus.master.image import BusImage
 from devicebus.master.link import CEILING_NS, RETRIES, Link
 from devicebus.master.mailboxes import Mailbox, Unsolicited
 from devicebus.master.mailboxport import MailboxArea
-from devicebus.master.pdo import Channel, PdoChoice
+from devicebus.master.pdo import PdoConfiguration, ProcessDataChannel
 from devicebus.master.procedure import Runner, Task
 from devicebus.master.scan import FIRST_STATION, ExpectedSlave, FoundSlave
 from devicebus.wire.alstatus import AlState
@@ -76,7 +76,7 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     expected: Sequence[ExpectedSlave] = ()
     """Slaves in the order of the line; nothing is compared without any."""
-    choices: Mapping[int, PdoChoice] = {}
+    pdo_configurations: Mapping[int, PdoConfiguration] = {}
     """PDOs by station address; other slaves keep what they come with."""
     first_station: int = FIRST_STATION
     frame_timeout_ns: int = CEILING_NS
@@ -97,7 +97,7 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     """False exchanges process data by LWR and LRD even where slaves know LRW."""
 
 
-class Changes:
+class ChangeCount:
     """Number of changes on a bus that matter to its users: states, mailboxes, slaves, faults."""
 
     def __init__(self) -> None:
@@ -114,7 +114,7 @@ _NOTED = frozenset(("state", "target", "is_lost", "mailbox", "work"))
 _UNSET = object()
 
 
-class Unit:
+class BusSlave:
     """One slave that the master drives.
 
     Attributes:
@@ -130,8 +130,8 @@ class Unit:
         retry_ns: Not tried again before then.
     """
 
-    def __init__(self, found: FoundSlave, name: str, changes: Changes | None = None) -> None:
-        self._changes = changes or Changes()
+    def __init__(self, found: FoundSlave, name: str, changes: ChangeCount | None = None) -> None:
+        self._changes = changes or ChangeCount()
         self.revision = 0
         self.found = found
         self.name = name
@@ -139,7 +139,7 @@ class Unit:
         self.state: AlState | None = None
         self.target = AlState.INIT
         self.is_set_up = False
-        self.channels: tuple[Channel, ...] = ()
+        self.channels: tuple[ProcessDataChannel, ...] = ()
         self.mailbox: Mailbox | None = None
         self.missed_ns: int | None = None
         self.is_lost = False
@@ -178,12 +178,12 @@ class Unit:
         self.is_set_up = False
 
 
-class Bus:
+class BusState:
     """All slaves, their process data, and the wire to them.
 
     Attributes:
         changes: Noted by units, and here with each event and each new list of units.
-        units: By station address, in the order of the line.
+        slaves: By station address, in the order of the line.
         image, cycle: None until process data is laid out.
         reference: Station address of the slave whose clock the others follow.
         is_lost: No frame comes back, so that nothing is known about any slave.
@@ -198,8 +198,8 @@ class Bus:
             acyclic_octets=settings.acyclic_octets,
         )
         self.runner = Runner(self.link)
-        self.changes = Changes()
-        self.units: dict[int, Unit] = {}
+        self.changes = ChangeCount()
+        self.slaves: dict[int, BusSlave] = {}
         self.image: BusImage | None = None
         self.cycle: Cycle | None = None
         self.reference: int | None = None
@@ -214,42 +214,42 @@ class Bus:
             return
         if isinstance(event, BusLost | BusBack):
             self.changes.note()
-        elif (unit := self.units.get(event.station)) is not None:
-            unit.note_change()
+        elif (slave := self.slaves.get(event.station)) is not None:
+            slave.note_change()
 
     def next_event(self) -> Event | None:
         """Take the oldest event."""
         return self._events.popleft() if self._events else None
 
-    def open_mailbox(self, unit: Unit, area: MailboxArea) -> None:
+    def open_mailbox(self, slave: BusSlave, area: MailboxArea) -> None:
         """The slave's mailbox works from now on."""
-        self.close_mailbox(unit)
-        unit.mailbox = Mailbox(unit.station, area, self.runner, self.emit)
+        self.close_mailbox(slave)
+        slave.mailbox = Mailbox(slave.station, area, self.runner, self.emit)
 
-    def close_mailbox(self, unit: Unit) -> None:
+    def close_mailbox(self, slave: BusSlave) -> None:
         """The slave's mailbox works no longer: whoever waits for it is told."""
-        mailbox, unit.mailbox = unit.mailbox, None
+        mailbox, slave.mailbox = slave.mailbox, None
         if mailbox is not None:
             mailbox.close()
 
-    def set_presence(self, unit: Unit, presence: Presence) -> None:
+    def set_participation(self, slave: BusSlave, participation: Participation) -> None:
         """The slave takes part in the cycle, or no longer."""
         if self.cycle is not None:
-            self.cycle.set_presence(unit.station, presence)
+            self.cycle.set_participation(slave.station, participation)
 
     def follow(self, reference: int | None) -> None:
         """Hand this slave's time to the others in every cycle, or nobody's."""
         self.reference = reference
         if self.cycle is not None:
-            self.cycle.extra = [] if reference is None else [drift_access(reference)]
+            self.cycle.extra = [] if reference is None else [drift_datagram(reference)]
 
     def forget(self) -> None:
         """Begin anew: no slave is known."""
-        for unit in self.units.values():
-            if unit.work is not None:
-                unit.work.cancel()
-            self.close_mailbox(unit)
-        self.units = {}
+        for slave in self.slaves.values():
+            if slave.work is not None:
+                slave.work.cancel()
+            self.close_mailbox(slave)
+        self.slaves = {}
         self.changes.note()
         self.image = self.cycle = self.reference = None
         self.link.stop_cycles()

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 
 from devicebus.master.procedure import Procedure, not_answered, read, write
-from devicebus.master.scan import FoundSlave, Joint
+from devicebus.master.scan import FoundSlave, TopologyNode
 from devicebus.wire.datagram import DatagramRequest, bwr, fprd, frmw
 from devicebus.wire.register import Register
 
@@ -76,7 +76,7 @@ def synchronize(
     latched: dict[int, Latched] = {}
     for slave in clocks:
         latched[slave.position] = yield from _read_latched(slave.station)
-    delays = find_delays({each.position: each.joint for each in slaves}, latched)
+    delays = find_delays({each.position: each.node for each in slaves}, latched)
     start_ns = time_ns
     running = [slave for slave in clocks if only is not None and slave.station not in only]
     if running:
@@ -92,31 +92,33 @@ def synchronize(
         if only is None or slave.station in only:
             yield from _write_state(state)
     for _ in range(_DRIFT_FRAMES):
-        yield [drift_access(clocks[0].station)] * _DRIFT_PER_FRAME
+        yield [drift_datagram(clocks[0].station)] * _DRIFT_PER_FRAME
     return tuple(states)
 
 
-def find_delays(joints: Mapping[int, Joint], latched: Mapping[int, Latched]) -> dict[int, int]:
+def find_delays(
+    nodes: Mapping[int, TopologyNode], latched: Mapping[int, Latched]
+) -> dict[int, int]:
     """Return the delay to each slave with a clock, by position; the first one's is 0.
 
     Slaves without a clock count as a part of the cable.
     """
     delays: dict[int, int] = {}
     for position in sorted(latched):
-        parent, port = _clocked_parent(position, joints, latched)
+        parent, port = _clocked_parent(position, nodes, latched)
         if parent is None:
             delays[position] = 0
             continue
-        above, times = joints[parent], latched[parent].ports
+        above, times = nodes[parent], latched[parent].ports
         before = _port_before(above, port)
         round_trip = times[port] - times[before] & _U32
-        inside = _inside(joints[position], latched[position].ports)
+        inside = _inside(nodes[position], latched[position].ports)
         earlier = times[before] - times[above.entry_port] & _U32
         delays[position] = delays[parent] + earlier + max(0, round_trip - inside) // 2
     return delays
 
 
-def drift_access(reference: int) -> DatagramRequest:
+def drift_datagram(reference: int) -> DatagramRequest:
     """Return the datagram that hands the reference's time to all; one belongs in every cycle."""
     return frmw(reference, Register.DC_SYSTEM_TIME, 8)
 
@@ -171,28 +173,28 @@ def _write_state(state: ClockState) -> Procedure[None]:
 
 
 def _clocked_parent(
-    position: int, joints: Mapping[int, Joint], latched: Mapping[int, Latched]
+    position: int, nodes: Mapping[int, TopologyNode], latched: Mapping[int, Latched]
 ) -> tuple[int | None, int]:
     """Return the nearest slave with a clock towards the master, and its port that leads here."""
-    joint = joints[position]
-    while joint.parent is not None and joint.parent not in latched:
-        if joint.parent not in joints:
+    node = nodes[position]
+    while node.parent is not None and node.parent not in latched:
+        if node.parent not in nodes:
             return None, 0
-        joint = joints[joint.parent]
-    return joint.parent, joint.parent_port
+        node = nodes[node.parent]
+    return node.parent, node.parent_port
 
 
-def _way(joint: Joint) -> list[int]:
+def _port_order(node: TopologyNode) -> list[int]:
     """Return the open ports in the order in which a frame comes in at them."""
-    turn = _ORDER.index(joint.entry_port)
-    return [port for port in _ORDER[turn:] + _ORDER[:turn] if port in joint.ports]
+    turn = _ORDER.index(node.entry_port)
+    return [port for port in _ORDER[turn:] + _ORDER[:turn] if port in node.ports]
 
 
-def _port_before(joint: Joint, port: int) -> int:
-    way = _way(joint)
+def _port_before(node: TopologyNode, port: int) -> int:
+    way = _port_order(node)
     return way[way.index(port) - 1]
 
 
-def _inside(joint: Joint, times: Sequence[int]) -> int:
+def _inside(node: TopologyNode, times: Sequence[int]) -> int:
     """Return how long a frame is behind a slave, from coming in to its last return."""
-    return times[_way(joint)[-1]] - times[joint.entry_port] & _U32
+    return times[_port_order(node)[-1]] - times[node.entry_port] & _U32

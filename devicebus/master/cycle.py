@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 
 from devicebus.errors import FrameLostError
-from devicebus.master.image import BusImage, Group, Place
+from devicebus.master.image import BusImage, DatagramGroup, SlaveLayout
 from devicebus.master.link import Exchange, Link
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, logical
 
@@ -22,14 +22,14 @@ MAX_UNDER_WAY = 2
 """Cycles under way at once: more would only make those behind them late, acyclic frames too."""
 
 
-class Presence(Enum):
+class Participation(Enum):
     """Whether a slave takes part."""
 
-    AWAY = auto()
+    ABSENT = auto()
     """It is not set up and does not count."""
-    UNSURE = auto()
+    UNCERTAIN = auto()
     """It may count or not: it is being set up, or lost and might come back as it was."""
-    PRESENT = auto()
+    ACTIVE = auto()
 
 
 class CycleStats(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,7 +53,7 @@ class CycleStats(msgspec.Struct, frozen=True, kw_only=True):
     max_trip_ns: int
 
 
-class _Part(NamedTuple):
+class _CyclicDatagram(NamedTuple):
     """One datagram of a cycle."""
 
     command: Command
@@ -68,36 +68,36 @@ class Cycle:
         link: Takes the datagrams.
         image: Outputs and inputs.
         knows_lrw: Whether all slaves let one datagram read and write.
-        trouble: Called with the time when a cycle does not come back as expected.
+        on_fault: Called with the time when a cycle does not come back as expected.
 
     Attributes:
         is_good: Whether the last cycle has come back with the expected working counters.
     """
 
     def __init__(
-        self, link: Link, image: BusImage, trouble: Callable[[int], None], *, knows_lrw: bool
+        self, link: Link, image: BusImage, on_fault: Callable[[int], None], *, knows_lrw: bool
     ) -> None:
         self._link = link
         self._image = image
-        self._trouble = trouble
+        self._on_fault = on_fault
         self.extra: Sequence[DatagramRequest] = ()
-        """More datagrams of each cycle; their replies go to *take_extra*."""
-        self.take_extra: Callable[[Sequence[DatagramReply]], None] = lambda replies: None
-        self._presence = dict.fromkeys(image.layout.places, Presence.AWAY)
-        self._parts = tuple(
-            part
+        """More datagrams of each cycle; their replies go to *handle_extra*."""
+        self.handle_extra: Callable[[Sequence[DatagramReply]], None] = lambda replies: None
+        self._participation = dict.fromkeys(image.layout.slaves, Participation.ABSENT)
+        self._datagrams = tuple(
+            datagram
             for number, group in enumerate(image.layout.groups)
-            for part in _parts(number, group, knows_lrw=knows_lrw)
+            for datagram in _datagrams_of(number, group, knows_lrw=knows_lrw)
         )
         self._members = [
-            [place for place in image.layout.places.values() if place.group == number]
+            [slave for slave in image.layout.slaves.values() if slave.group == number]
             for number in range(len(image.layout.groups))
         ]
-        self._is_whole = [False] * len(self._members)
-        self._allowed = (0,) * len(self._parts)
+        self._all_active = [False] * len(self._members)
+        self._allowed = (0,) * len(self._datagrams)
         self._expected = 0
         for number in range(len(self._members)):
-            self._judge(number)
+            self._update_expected(number)
         self.is_good = False
         self._under_way: deque[Exchange] = deque()
         self._newest = 0
@@ -105,15 +105,15 @@ class Cycle:
         self._late = self._lost = self._skipped = 0
         self._received = self._trip_ns = self._max_trip_ns = 0
 
-    def set_presence(self, station: int, presence: Presence) -> None:
+    def set_participation(self, station: int, participation: Participation) -> None:
         """A slave comes or goes."""
-        if station in self._presence and self._presence[station] is not presence:
-            self._presence[station] = presence
-            self._judge(self._image.layout.places[station].group)
+        if station in self._participation and self._participation[station] is not participation:
+            self._participation[station] = participation
+            self._update_expected(self._image.layout.slaves[station].group)
 
-    def presence(self, station: int) -> Presence:
+    def participation(self, station: int) -> Participation:
         """Whether a slave takes part."""
-        return self._presence.get(station, Presence.AWAY)
+        return self._participation.get(station, Participation.ABSENT)
 
     @property
     def is_full(self) -> bool:
@@ -129,9 +129,9 @@ class Cycle:
         if len(under_way) >= MAX_UNDER_WAY:
             self._skipped += 1
             return
-        accesses = [self._access(part) for part in self._parts]
-        accesses += self.extra
-        if not accesses:
+        datagrams = [self._request(datagram) for datagram in self._datagrams]
+        datagrams += self.extra
+        if not datagrams:
             return
         self._cycles += 1
         number = self._cycles
@@ -147,9 +147,9 @@ class Cycle:
             self._max_trip_ns = max(self._max_trip_ns, self._trip_ns)
             if number > self._newest:  # an overdue frame may be overtaken
                 self._newest = number
-                self._take(outcome, allowed, done_ns)
+                self._handle_replies(outcome, allowed, done_ns)
 
-        exchange = self._link.submit(accesses, done, cyclic=True)
+        exchange = self._link.submit(datagrams, done, cyclic=True)
         under_way.append(exchange)
 
     def stats(self) -> CycleStats:
@@ -167,82 +167,84 @@ class Cycle:
             max_trip_ns=self._max_trip_ns,
         )
 
-    def _access(self, part: _Part) -> DatagramRequest:
-        group = self._image.layout.groups[part.group]
+    def _request(self, datagram: _CyclicDatagram) -> DatagramRequest:
+        group = self._image.layout.groups[datagram.group]
         data = b""
-        if part.command is not Command.LRD:
+        if datagram.command is not Command.LRD:
             data = bytes(self._image.outputs[group.outputs : group.outputs + group.outputs_size])
-        if part.command is not Command.LWR:
+        if datagram.command is not Command.LWR:
             data += bytes(group.inputs_size)
-        return logical(part.command, part.address, data)
+        return logical(datagram.command, datagram.address, data)
 
-    def _take(self, replies: list[DatagramReply], allowed: tuple[int, ...], now_ns: int) -> None:
+    def _handle_replies(
+        self, replies: list[DatagramReply], allowed: tuple[int, ...], now_ns: int
+    ) -> None:
         is_good = True
-        for part, reply, counts in zip(self._parts, replies, allowed, strict=False):
+        for datagram, reply, counts in zip(self._datagrams, replies, allowed, strict=False):
             if counts >> reply.wkc & 1:
-                self._take_inputs(part, reply.data)
+                self._copy_inputs(datagram, reply.data)
             else:
                 is_good = False
-        count = len(self._parts)
+        count = len(self._datagrams)
         self._received = sum(reply.wkc for reply in replies[:count])
-        self.take_extra(replies[count:])
+        self.handle_extra(replies[count:])
         self.is_good = is_good
         if is_good:
             self._good += 1
         else:
             self._wkc_errors += 1
-            self._trouble(now_ns)
+            self._on_fault(now_ns)
 
-    def _take_inputs(self, part: _Part, data: bytes) -> None:
-        if part.command is Command.LWR:
+    def _copy_inputs(self, datagram: _CyclicDatagram, data: bytes) -> None:
+        if datagram.command is Command.LWR:
             return
-        group = self._image.layout.groups[part.group]
-        begin = group.outputs_size if part.command is Command.LRW else 0
+        group = self._image.layout.groups[datagram.group]
+        begin = group.outputs_size if datagram.command is Command.LRW else 0
         inputs = self._image.inputs
-        if self._is_whole[part.group]:
+        if self._all_active[datagram.group]:
             inputs[group.inputs : group.inputs + group.inputs_size] = data[begin:]
             return
-        for place in self._members[part.group]:
-            if self._presence[place.station] is Presence.PRESENT:
-                start = begin + place.inputs - group.inputs
-                end = start + place.inputs_size
-                inputs[place.inputs : place.inputs + place.inputs_size] = data[start:end]
+        for slave in self._members[datagram.group]:
+            if self._participation[slave.station] is Participation.ACTIVE:
+                start = begin + slave.inputs - group.inputs
+                end = start + slave.inputs_size
+                inputs[slave.inputs : slave.inputs + slave.inputs_size] = data[start:end]
 
-    def _judge(self, number: int) -> None:
+    def _update_expected(self, number: int) -> None:
         """Work out anew which working counters the datagrams of a group may have, as bits."""
         members = self._members[number]
-        presences = [self._presence[place.station] for place in members]
-        self._is_whole[number] = all(each is Presence.PRESENT for each in presences)
+        participations = [self._participation[slave.station] for slave in members]
+        self._all_active[number] = all(each is Participation.ACTIVE for each in participations)
         allowed = list(self._allowed)
-        for at, part in enumerate(self._parts):
-            if part.group != number:
+        for at, datagram in enumerate(self._datagrams):
+            if datagram.group != number:
                 continue
             counts = 1
-            for place, presence in zip(members, presences, strict=True):
-                if presence is Presence.PRESENT:
-                    counts <<= _count(part.command, place)
-                elif presence is Presence.UNSURE:
-                    counts |= counts << _count(part.command, place)
+            for slave, participation in zip(members, participations, strict=True):
+                if participation is Participation.ACTIVE:
+                    counts <<= _count(datagram.command, slave)
+                elif participation is Participation.UNCERTAIN:
+                    counts |= counts << _count(datagram.command, slave)
             allowed[at] = counts
         self._allowed = tuple(allowed)
         self._expected = sum(counts.bit_length() - 1 for counts in allowed)
 
 
-def _parts(number: int, group: Group, *, knows_lrw: bool) -> list[_Part]:
+def _datagrams_of(number: int, group: DatagramGroup, *, knows_lrw: bool) -> list[_CyclicDatagram]:
     if knows_lrw and group.outputs_size and group.inputs_size:
-        return [_Part(Command.LRW, group.address, number)]
-    parts = []
+        return [_CyclicDatagram(Command.LRW, group.address, number)]
+    datagrams = []
     if group.outputs_size:
-        parts.append(_Part(Command.LWR, group.address, number))
+        datagrams.append(_CyclicDatagram(Command.LWR, group.address, number))
     if group.inputs_size:
-        parts.append(_Part(Command.LRD, group.address + group.outputs_size, number))
-    return parts
+        datagrams.append(_CyclicDatagram(Command.LRD, group.address + group.outputs_size, number))
+    return datagrams
 
 
-def _count(command: Command, place: Place) -> int:
+def _count(command: Command, slave: SlaveLayout) -> int:
     """What a slave adds to the working counter (ETG.1000.4)."""
-    reads = int(place.inputs_size > 0)
-    writes = int(place.outputs_size > 0)
+    reads = int(slave.inputs_size > 0)
+    writes = int(slave.outputs_size > 0)
     match command:
         case Command.LRD:
             return reads

@@ -12,7 +12,7 @@ import msgspec
 
 from devicebus.errors import FrameLostError
 from devicebus.master.procedure import Procedure
-from devicebus.master.scan import find_joints
+from devicebus.master.scan import find_topology
 from devicebus.wire.alstatus import ERROR, name_of, state_name
 from devicebus.wire.datagram import DatagramReply, fprd, fpwr
 from devicebus.wire.register import AlStatus, DlStatus, Register
@@ -123,7 +123,7 @@ def _slave(station: int, replies: Sequence[DatagramReply]) -> tuple[SlaveDiagnos
         return SlaveDiagnosis(station, answers=False), DlStatus()
     status = AlStatus.decode(al.data)
     dl_status = DlStatus.decode(dl.data)
-    open_ports = find_joints([dl_status])[0].ports
+    open_ports = find_topology([dl_status])[0].ports
     octets = counters.data
     ports = tuple(
         PortErrors(
@@ -142,20 +142,20 @@ def _slave(station: int, replies: Sequence[DatagramReply]) -> tuple[SlaveDiagnos
 
 
 def _faults(slaves: Sequence[SlaveDiagnosis], statuses: Sequence[DlStatus]) -> Iterator[Fault]:
-    joints = find_joints(statuses)
+    nodes = find_topology(statuses)
     for position, slave in enumerate(slaves):
-        joint = joints[position]
+        node = nodes[position]
         for port in slave.ports:
             if not port.total:
                 continue
-            if port.port == joint.entry_port:
-                parent = joint.parent
-                far = None if parent is None else slaves[parent].station
+            if port.port == node.entry_port:
+                parent = node.parent
+                neighbour = None if parent is None else slaves[parent].station
             else:
                 children = (
                     slaves[number].station
-                    for number, each in enumerate(joints)
+                    for number, each in enumerate(nodes)
                     if (each.parent, each.parent_port) == (position, port.port)
                 )
-                far = next(children, None)
-            yield Fault(slave.station, port.port, far)
+                neighbour = next(children, None)
+            yield Fault(slave.station, port.port, neighbour)

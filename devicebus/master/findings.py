@@ -103,7 +103,7 @@ def find_causes(
     for trouble, group in _by_trouble([each for each in slaves if each.answers]):
         found.append(
             BusFinding(
-                what=_says(group, trouble), slaves=_stations(group), since_ns=_since_ns(group)
+                what=_describe(group, trouble), slaves=_stations(group), since_ns=_since_ns(group)
             )
         )
     if diagnosis is not None:
@@ -183,7 +183,7 @@ def _past(slaves: Sequence[SlaveView], history: History) -> list[BusFinding]:
         )
     return found + [
         BusFinding(
-            what=_said([slave for slave, _ in group], group[0][0].trouble),
+            what=_describe_past([slave for slave, _ in group], group[0][0].trouble),
             slaves=_stations([slave for slave, _ in group]),
             is_over=True,
             since_ns=max(times.since_ns for _, times in group),
@@ -343,15 +343,15 @@ def _by_trouble(slaves: Sequence[SlaveView]) -> list[tuple[str, list[SlaveView]]
     return list(groups.items())
 
 
-def _says(slaves: Sequence[SlaveView], trouble: str) -> str:
+def _describe(slaves: Sequence[SlaveView], trouble: str) -> str:
     return describe_trouble([str(each) for each in slaves], trouble)
 
 
-def _said(slaves: Sequence[SlaveView], trouble: str) -> str:
+def _describe_past(slaves: Sequence[SlaveView], trouble: str) -> str:
     """Return what was wrong with slaves, in the past."""
     if trouble == NO_ANSWER:
         return f"{_listed([str(each) for each in slaves])} did not answer"
-    return _says(slaves, trouble)
+    return _describe(slaves, trouble)
 
 
 def _listed(names: Sequence[str]) -> str:

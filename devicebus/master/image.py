@@ -9,7 +9,7 @@ import msgspec
 
 from devicebus.errors import BusError
 from devicebus.master.link import MAX_DATA
-from devicebus.master.pdo import Channel
+from devicebus.master.pdo import ProcessDataChannel
 from devicebus.wire.register import FMMU_READ, FMMU_WRITE, Fmmu, SyncManager
 from eap.codec import datatypes
 from eap.codec.values import DataType, Value
@@ -22,15 +22,15 @@ _STRIDE = 0x0800
 """Between the addresses of two datagrams; more than the octets of one."""
 
 
-class SlaveShape(NamedTuple):
+class SlaveProcessData(NamedTuple):
     """What a slave needs: its process data, and how many FMMUs it has for that."""
 
     station: int
-    channels: tuple[Channel, ...]
+    channels: tuple[ProcessDataChannel, ...]
     fmmus: int = 16
 
 
-class Place(NamedTuple):
+class SlaveLayout(NamedTuple):
     """A slave's part of the image, outputs and inputs each from an octet on."""
 
     station: int
@@ -44,7 +44,7 @@ class Place(NamedTuple):
     sync_managers: tuple[tuple[int, SyncManager], ...]
 
 
-class Group(NamedTuple):
+class DatagramGroup(NamedTuple):
     """What one LRW, or one LWR and one LRD, exchange."""
 
     address: int
@@ -54,7 +54,7 @@ class Group(NamedTuple):
     inputs_size: int
 
 
-class Variable(msgspec.Struct, frozen=True):
+class ProcessVariable(msgspec.Struct, frozen=True):
     """An entry of a PDO in the image."""
 
     station: int
@@ -68,13 +68,13 @@ class Variable(msgspec.Struct, frozen=True):
     subindex: int
 
 
-class Layout(NamedTuple):
+class ProcessDataLayout(NamedTuple):
     """All of it."""
 
-    places: dict[int, Place]
+    slaves: dict[int, SlaveLayout]
     """By station address."""
-    groups: tuple[Group, ...]
-    variables: tuple[Variable, ...]
+    groups: tuple[DatagramGroup, ...]
+    variables: tuple[ProcessVariable, ...]
 
     @property
     def outputs_size(self) -> int:
@@ -87,15 +87,15 @@ class Layout(NamedTuple):
         return sum(group.inputs_size for group in self.groups)
 
 
-def lay_out(slaves: Sequence[SlaveShape]) -> Layout:
+def plan_image(slaves: Sequence[SlaveProcessData]) -> ProcessDataLayout:
     """Give every slave its place.
 
     Raises:
         BusError: a slave has more process data than a frame holds, or too few FMMUs.
     """
-    places: dict[int, Place] = {}
-    groups: list[Group] = []
-    variables: list[Variable] = []
+    layouts: dict[int, SlaveLayout] = {}
+    groups: list[DatagramGroup] = []
+    variables: list[ProcessVariable] = []
     outputs = inputs = 0
     for number, members in enumerate(_group(slaves)):
         address = BASE + number * _STRIDE
@@ -103,18 +103,20 @@ def lay_out(slaves: Sequence[SlaveShape]) -> Layout:
         start = outputs, inputs
         for slave in members:
             shift = (address - start[0], address + group_outputs - start[1])
-            place = _place(slave, number, (outputs, inputs), shift)
-            places[slave.station] = place
-            variables += _variables(slave, place)
-            outputs += place.outputs_size
-            inputs += place.inputs_size
-        groups.append(Group(address, start[0], outputs - start[0], start[1], inputs - start[1]))
-    return Layout(places, tuple(groups), tuple(variables))
+            layout = _plan_slave(slave, number, (outputs, inputs), shift)
+            layouts[slave.station] = layout
+            variables += _variables(slave, layout)
+            outputs += layout.outputs_size
+            inputs += layout.inputs_size
+        groups.append(
+            DatagramGroup(address, start[0], outputs - start[0], start[1], inputs - start[1])
+        )
+    return ProcessDataLayout(layouts, tuple(groups), tuple(variables))
 
 
-def _group(slaves: Sequence[SlaveShape]) -> Iterator[list[SlaveShape]]:
+def _group(slaves: Sequence[SlaveProcessData]) -> Iterator[list[SlaveProcessData]]:
     """Divide the slaves with process data into as few datagrams as their order allows."""
-    members: list[SlaveShape] = []
+    members: list[SlaveProcessData] = []
     total = 0
     for slave in slaves:
         size = sum(channel.size for channel in slave.channels)
@@ -131,11 +133,13 @@ def _group(slaves: Sequence[SlaveShape]) -> Iterator[list[SlaveShape]]:
         yield members
 
 
-def _size(slave: SlaveShape, *, is_output: bool) -> int:
+def _size(slave: SlaveProcessData, *, is_output: bool) -> int:
     return sum(each.size for each in slave.channels if each.is_output is is_output)
 
 
-def _place(slave: SlaveShape, group: int, start: tuple[int, int], shift: tuple[int, int]) -> Place:
+def _plan_slave(
+    slave: SlaveProcessData, group: int, start: tuple[int, int], shift: tuple[int, int]
+) -> SlaveLayout:
     """Place one slave; *shift* leads from offsets in the image to logical addresses."""
     ends = list(start)
     fmmus = []
@@ -161,12 +165,12 @@ def _place(slave: SlaveShape, group: int, start: tuple[int, int], shift: tuple[i
             f" {min(slave.fmmus, MAX_FMMUS)} FMMUs"
         )
     sizes = [end - begin for begin, end in zip(start, ends, strict=True)]
-    return Place(
+    return SlaveLayout(
         slave.station, start[0], sizes[0], start[1], sizes[1], group, tuple(fmmus), tuple(managers)
     )
 
 
-def _sync_manager(channel: Channel) -> SyncManager:
+def _sync_manager(channel: ProcessDataChannel) -> SyncManager:
     control = channel.control
     return SyncManager(
         channel.start,
@@ -180,8 +184,8 @@ def _sync_manager(channel: Channel) -> SyncManager:
     )
 
 
-def _variables(slave: SlaveShape, place: Place) -> Iterator[Variable]:
-    ends = [place.outputs * 8, place.inputs * 8]
+def _variables(slave: SlaveProcessData, layout: SlaveLayout) -> Iterator[ProcessVariable]:
+    ends = [layout.outputs * 8, layout.inputs * 8]
     names: set[tuple[bool, str]] = set()
     for channel in slave.channels:
         side = 0 if channel.is_output else 1
@@ -193,7 +197,7 @@ def _variables(slave: SlaveShape, place: Place) -> Iterator[Variable]:
                 if (channel.is_output, name) in names:
                     name = f"{name} {plain}"
                 names.add((channel.is_output, name))
-                yield Variable(
+                yield ProcessVariable(
                     slave.station, name, channel.is_output, offset, entry.bit_length,
                     entry.data_type, entry.index, entry.subindex,
                 )  # fmt: skip
@@ -217,13 +221,13 @@ class BusImage:
         inputs: What came with the last one; a slave that is away keeps its last inputs.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: ProcessDataLayout) -> None:
         self.layout = layout
         self.outputs = bytearray(layout.outputs_size)
         self.inputs = bytearray(layout.inputs_size)
         self._variables = {(each.station, each.name): each for each in layout.variables}
 
-    def variable(self, station: int, name: str) -> Variable:
+    def variable(self, station: int, name: str) -> ProcessVariable:
         """Return an entry by its slave and name; raise BusError naming those that exist."""
         try:
             return self._variables[station, name]
@@ -237,7 +241,7 @@ class BusImage:
         """Return a value; raise BusError if there is no such entry."""
         variable = self.variable(station, name)
         octets = self.read_octets(variable)
-        kind = kind_of(variable)
+        kind = data_type_of(variable)
         return kind.decode(octets, 0) if kind else octets
 
     def write(self, station: int, name: str, value: Value) -> None:
@@ -250,12 +254,12 @@ class BusImage:
         variable = self.variable(station, name)
         if not variable.is_output:
             raise BusError(f"slave {station}: {name!r} is an input, expected an output")
-        kind = kind_of(variable)
+        kind = data_type_of(variable)
         if kind is None and not isinstance(value, bytes):
             raise ValueError(f"{value!r} for {name!r}, expected octets")
         self.write_octets(variable, kind.encode(value) if kind else bytes(value))  # type: ignore[arg-type]
 
-    def read_octets(self, variable: Variable) -> bytes:
+    def read_octets(self, variable: ProcessVariable) -> bytes:
         """Return the bits of an entry, from bit 0 of the first octet on."""
         block = self.outputs if variable.is_output else self.inputs
         first, shift = divmod(variable.bit_offset, 8)
@@ -264,7 +268,7 @@ class BusImage:
         word = int.from_bytes(block[first:end], "little") >> shift & (1 << bits) - 1
         return word.to_bytes((bits + 7) // 8, "little")
 
-    def write_octets(self, variable: Variable, octets: bytes) -> None:
+    def write_octets(self, variable: ProcessVariable, octets: bytes) -> None:
         """Set the bits of an output; what lies beside them stays."""
         first, shift = divmod(variable.bit_offset, 8)
         mask = (1 << variable.bit_length) - 1
@@ -274,7 +278,7 @@ class BusImage:
         self.outputs[first:end] = word.to_bytes(end - first, "little")
 
 
-def kind_of(variable: Variable) -> DataType | None:
+def data_type_of(variable: ProcessVariable) -> DataType | None:
     """Return the data type of an entry; one that nobody told is a number of that many bits."""
     kind = _KINDS.get(variable.data_type)
     if kind is not None and kind.bit_length == variable.bit_length:

@@ -112,7 +112,7 @@ MAX_DATA = MAX_BODY - OVERHEAD
 """Octets of one access."""
 MIN_COST = 64
 """What a datagram takes of the budget at least: a short one costs as much time as this many."""
-MAX_RIDE = 256
+MAX_PIGGYBACK = 256
 """Octets of acyclic datagrams in a cyclic frame: 20 µs of it at 100 Mbit/s."""
 MAX_ACYCLIC_FRAMES = 8
 """Acyclic frames under way at once; more would only wait in somebody's buffer."""
@@ -181,15 +181,15 @@ class Exchange:
             self.done(error, now_ns)
 
 
-class _Item:
+class _QueuedDatagram:
     """One access on its way."""
 
-    __slots__ = ("access", "exchange", "is_answered", "limit", "number", "tries")
+    __slots__ = ("datagram", "exchange", "is_answered", "limit", "number", "tries")
 
     def __init__(
-        self, access: DatagramRequest, exchange: Exchange, number: int, limit: int
+        self, datagram: DatagramRequest, exchange: Exchange, number: int, limit: int
     ) -> None:
-        self.access = access
+        self.datagram = datagram
         self.exchange = exchange
         self.number = number
         self.limit = limit
@@ -201,12 +201,14 @@ class _Item:
         return self.is_answered or self.exchange.cancelled
 
 
-class _Flight:
+class _SentFrame:
     """A frame that is under way, or overdue."""
 
     __slots__ = ("cyclic", "deadline_ns", "items", "sent_ns")
 
-    def __init__(self, items: list[_Item], sent_ns: int, deadline_ns: int, *, cyclic: bool) -> None:
+    def __init__(
+        self, items: list[_QueuedDatagram], sent_ns: int, deadline_ns: int, *, cyclic: bool
+    ) -> None:
         self.items = items
         self.sent_ns = sent_ns
         self.deadline_ns = deadline_ns
@@ -233,18 +235,18 @@ class Link:
         self._tries = 1 + retries
         self._budget = acyclic_octets
         self._credit: int | None = None  # None while no cycles run
-        self._cyclic: deque[_Item] = deque()
-        self._acyclic: deque[_Item] = deque()
-        self._flights: dict[int, _Flight] = {}
-        self._overdue: dict[int, _Flight] = {}  # the oldest first
-        self._acyclic_flights = 0
+        self._cyclic: deque[_QueuedDatagram] = deque()
+        self._acyclic: deque[_QueuedDatagram] = deque()
+        self._in_flight: dict[int, _SentFrame] = {}
+        self._overdue: dict[int, _SentFrame] = {}  # the oldest first
+        self._acyclic_in_flight = 0
         self._index = 0
         self._spent = self._max_spent = 0
         self._sent = self._received = self._late = self._lost = self._retried = 0
         self._unexpected = self._malformed = 0
 
     def submit(
-        self, accesses: Sequence[DatagramRequest], done: Done, *, cyclic: bool = False
+        self, datagrams: Sequence[DatagramRequest], done: Done, *, cyclic: bool = False
     ) -> Exchange:
         """Queue accesses; *done* is called once with all replies, or with what went wrong.
 
@@ -255,14 +257,14 @@ class Link:
         Raises:
             ValueError: there is none, or one does not fit a frame.
         """
-        if not accesses or max(len(access.data) for access in accesses) > MAX_DATA:
+        if not datagrams or max(len(datagram.data) for datagram in datagrams) > MAX_DATA:
             raise ValueError(f"accesses of at most {MAX_DATA} octets are needed, at least one")
-        exchange = Exchange(len(accesses), done, is_cyclic=cyclic)
+        exchange = Exchange(len(datagrams), done, is_cyclic=cyclic)
         queue = self._cyclic if cyclic else self._acyclic
         tries = self._tries
         queue.extend(
-            _Item(access, exchange, number, access.tries or tries)
-            for number, access in enumerate(accesses)
+            _QueuedDatagram(datagram, exchange, number, datagram.tries or tries)
+            for number, datagram in enumerate(datagrams)
         )
         return exchange
 
@@ -281,7 +283,7 @@ class Link:
     def frames_to_send(self, now_ns: int) -> list[bytes]:
         """Take the frames that are ready to go out."""
         frames: list[bytes] = []
-        while self._cyclic and len(self._flights) < INDEXES:
+        while self._cyclic and len(self._in_flight) < INDEXES:
             self._send(self._cyclic, frames, now_ns, cyclic=True)
         while self._may_send_acyclic():
             self._send(self._acyclic, frames, now_ns, cyclic=False)
@@ -290,14 +292,14 @@ class Link:
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
         """Take a frame that came back; one that answers nothing is counted."""
         index = data[3] if len(data) > EtherCatHeader.SIZE + DatagramHeader.SIZE else -1
-        flight = self._flights.get(index)
-        is_late = flight is None
-        if flight is None:
-            flight = self._overdue.get(index)
-            if flight is None:
+        sent = self._in_flight.get(index)
+        is_late = sent is None
+        if sent is None:
+            sent = self._overdue.get(index)
+            if sent is None:
                 self._unexpected += 1
                 return
-        results = _match(data, index, flight.items)
+        results = _match(data, index, sent.items)
         if results is None:
             self._malformed += 1
             return
@@ -306,9 +308,9 @@ class Link:
             del self._overdue[index]
             self._late += 1
         else:
-            self._land(index)
-        self._round_trip.measure(now_ns - flight.sent_ns)
-        for item, (reply, wkc) in zip(flight.items, results, strict=True):
+            self._end_flight(index)
+        self._round_trip.measure(now_ns - sent.sent_ns)
+        for item, (reply, wkc) in zip(sent.items, results, strict=True):
             if item.is_over:
                 continue
             item.is_answered = True
@@ -321,11 +323,11 @@ class Link:
     @property
     def is_waiting(self) -> bool:
         """Whether a frame may come back."""
-        return bool(self._flights or self._overdue)
+        return bool(self._in_flight or self._overdue)
 
     def next_timeout(self) -> int | None:
         """When the next frame under way is overdue."""
-        return min([flight.deadline_ns for flight in self._flights.values()], default=None)
+        return min([sent.deadline_ns for sent in self._in_flight.values()], default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
         """Send again what overdue frames held, or give it up."""
@@ -334,11 +336,11 @@ class Link:
             if now_ns - oldest.deadline_ns < LINGER_NS:
                 break
             self._lose(index, now_ns)
-        due = [index for index, each in self._flights.items() if each.deadline_ns <= now_ns]
-        again: list[_Item] = []
+        due = [index for index, each in self._in_flight.items() if each.deadline_ns <= now_ns]
+        again: list[_QueuedDatagram] = []
         for index in due:
-            flight = self._overdue[index] = self._land(index)
-            for item in flight.items:
+            sent = self._overdue[index] = self._end_flight(index)
+            for item in sent.items:
                 if item.is_over:
                     continue
                 if item.exchange.is_cyclic:
@@ -367,12 +369,14 @@ class Link:
     def _may_send_acyclic(self) -> bool:
         return (
             bool(self._acyclic)
-            and self._acyclic_flights < MAX_ACYCLIC_FRAMES
+            and self._acyclic_in_flight < MAX_ACYCLIC_FRAMES
             and (self._credit is None or self._credit > 0)
-            and len(self._flights) < INDEXES
+            and len(self._in_flight) < INDEXES
         )
 
-    def _send(self, queue: deque[_Item], frames: list[bytes], now_ns: int, *, cyclic: bool) -> None:
+    def _send(
+        self, queue: deque[_QueuedDatagram], frames: list[bytes], now_ns: int, *, cyclic: bool
+    ) -> None:
         items = self._take(queue, cyclic=cyclic)
         if not items:
             return
@@ -383,43 +387,50 @@ class Link:
             if tries > 1:
                 self._retried += 1
                 timeout_ns = self._round_trip.timeout_of(tries, limit)
-        self._flights[index] = _Flight(items, now_ns, now_ns + timeout_ns, cyclic=cyclic)
-        self._acyclic_flights += not cyclic
+        self._in_flight[index] = _SentFrame(items, now_ns, now_ns + timeout_ns, cyclic=cyclic)
+        self._acyclic_in_flight += not cyclic
         self._sent += 1
         frames.append(_encode(items, index))
 
     def _free_index(self, now_ns: int) -> int:
         """Return an index that no frame has; the oldest overdue frame may have to give its own."""
-        flights, overdue = self._flights, self._overdue
-        if len(flights) + len(overdue) >= INDEXES:
+        in_flight, overdue = self._in_flight, self._overdue
+        if len(in_flight) + len(overdue) >= INDEXES:
             self._lose(next(iter(overdue)), now_ns)
         index = self._index
-        while index in flights or index in overdue:
+        while index in in_flight or index in overdue:
             index = (index + 1) % INDEXES
         self._index = (index + 1) % INDEXES
         return index
 
     def _lose(self, index: int, now_ns: int) -> None:
         """Count an overdue frame as lost."""
-        flight = self._overdue.pop(index)
+        sent = self._overdue.pop(index)
         self._lost += 1
-        for item in flight.items:
+        for item in sent.items:
             if item.exchange.is_cyclic and not item.is_answered:
                 item.exchange.fail(_lost(item), now_ns)
 
-    def _take(self, queue: deque[_Item], *, cyclic: bool) -> list[_Item]:
-        items: list[_Item] = []
+    def _take(self, queue: deque[_QueuedDatagram], *, cyclic: bool) -> list[_QueuedDatagram]:
+        items: list[_QueuedDatagram] = []
         self._fill(items, queue, MAX_BODY, cyclic=cyclic)
         if cyclic and not queue and self._credit is not None and self._credit > 0:
-            room = MAX_BODY - sum(OVERHEAD + len(item.access.data) for item in items)
-            self._fill(items, self._acyclic, min(room, MAX_RIDE), cyclic=False)
+            room = MAX_BODY - sum(OVERHEAD + len(item.datagram.data) for item in items)
+            self._fill(items, self._acyclic, min(room, MAX_PIGGYBACK), cyclic=False)
         return items
 
-    def _fill(self, items: list[_Item], queue: deque[_Item], room: int, *, cyclic: bool) -> None:
+    def _fill(
+        self,
+        items: list[_QueuedDatagram],
+        queue: deque[_QueuedDatagram],
+        room: int,
+        *,
+        cyclic: bool,
+    ) -> None:
         """Add what *room* octets hold."""
         size = 0
         while queue and len(items) < MAX_DATAGRAMS:
-            octets = OVERHEAD + len(queue[0].access.data)
+            octets = OVERHEAD + len(queue[0].datagram.data)
             if size + octets > room:
                 break
             item = queue.popleft()
@@ -434,22 +445,22 @@ class Link:
                 if self._credit <= 0:
                     break
 
-    def _land(self, index: int) -> _Flight:
-        flight = self._flights.pop(index)
-        self._acyclic_flights -= not flight.cyclic
-        return flight
+    def _end_flight(self, index: int) -> _SentFrame:
+        sent = self._in_flight.pop(index)
+        self._acyclic_in_flight -= not sent.cyclic
+        return sent
 
 
-def _encode(items: list[_Item], index: int) -> bytes:
+def _encode(items: list[_QueuedDatagram], index: int) -> bytes:
     parts = [b""]
     length = 0
     last = len(items) - 1
     for number, item in enumerate(items):
-        access = item.access
-        data = access.data
+        datagram = item.datagram
+        data = datagram.data
         word = len(data) | (_MORE if number < last else 0)
         parts += (
-            _LAYOUT.pack(access.command, index, access.adp, access.ado, word, 0),
+            _LAYOUT.pack(datagram.command, index, datagram.adp, datagram.ado, word, 0),
             data,
             b"\0\0",
         )
@@ -458,19 +469,21 @@ def _encode(items: list[_Item], index: int) -> bytes:
     return b"".join(parts)
 
 
-def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, int]] | None:
+def _match(
+    data: Buffer, index: int, items: list[_QueuedDatagram]
+) -> list[tuple[bytes, int]] | None:
     """Return data and working counter of each item, or None if this is not the frame."""
     results = []
     offset = EtherCatHeader.SIZE
-    need = offset + sum(OVERHEAD + len(item.access.data) for item in items)
+    need = offset + sum(OVERHEAD + len(item.datagram.data) for item in items)
     if len(data) < need or data[1] >> 4 != FrameType.DATAGRAM:
         return None
     for item in items:
-        access = item.access
-        command, size = access.command, len(access.data)
+        datagram = item.datagram
+        command, size = datagram.command, len(datagram.data)
         there = _LAYOUT.unpack_from(data, offset)
-        same = (command, index, access.ado, size) == (*there[:2], there[3], there[4] & _LENGTH)
-        if not same or (command in _FIXED_ADP and access.adp != there[2]):
+        same = (command, index, datagram.ado, size) == (*there[:2], there[3], there[4] & _LENGTH)
+        if not same or (command in _FIXED_ADP and datagram.adp != there[2]):
             return None
         start = offset + DatagramHeader.SIZE
         offset = start + size
@@ -480,12 +493,12 @@ def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, in
     return results
 
 
-def _lost(item: _Item) -> FrameLostError:
-    access = item.access
+def _lost(item: _QueuedDatagram) -> FrameLostError:
+    datagram = item.datagram
     # A frame to one slave that is lost says nothing about the others; a broadcast goes to any.
-    is_broadcast = access.command in _BROADCAST
+    is_broadcast = datagram.command in _BROADCAST
     advice = "; check the cable to the first slave and its power" if is_broadcast else ""
     return FrameLostError(
-        f"{access.command.name} 0x{access.adp:04X}:0x{access.ado:04X}: no frame came back, sent"
-        f" {item.tries} times{advice}"
+        f"{datagram.command.name} 0x{datagram.adp:04X}:0x{datagram.ado:04X}: no frame came back,"
+        f" sent {item.tries} times{advice}"
     )

@@ -23,13 +23,13 @@ from devicebus.errors import (
     MailboxTimeoutError,
 )
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.mailbox.protocol import CounterWatch, MailboxSizes, next_counter
+from devicebus.mailbox.protocol import CounterCheck, MailboxSizes, next_counter
 from devicebus.master.conversation_queue import (
     ConversationQueue,
     QueuedConversation,
     is_unsolicited,
 )
-from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted
+from devicebus.master.mailboxport import MailboxArea, MailboxPort, WriteResult
 from devicebus.master.procedure import Procedure, Runner, Sleep, Task
 from eap.codec.mailbox import (
     MailboxError,
@@ -87,7 +87,7 @@ class MailboxStats(msgspec.Struct, frozen=True, kw_only=True):
     max_latency_ns: int
 
 
-class MailboxCounters:
+class RequestCounters:
     """Counters of a mailbox, without those of the wire."""
 
     __slots__ = (
@@ -163,12 +163,12 @@ class Mailbox:
         self._runner = runner
         self._report = report
         self._queue = ConversationQueue()
-        self._watch = CounterWatch()
+        self._watch = CounterCheck()
         self._counter = 0
         self._work: Task[None] | None = None
         self._is_busy = False
         self._is_open = True
-        self._counters = MailboxCounters()
+        self._counters = RequestCounters()
 
     def converse(
         self,
@@ -338,7 +338,7 @@ class Mailbox:
                     " messages"
                 )
 
-    def _post(self, message: bytes, deadline_ns: int) -> Procedure[Posted]:
+    def _post(self, message: bytes, deadline_ns: int) -> Procedure[WriteResult]:
         """Write a request, also after the bus was silent for a while."""
         was_silent = False
         while True:

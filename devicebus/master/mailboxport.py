@@ -57,7 +57,7 @@ class MailboxArea(NamedTuple):
         )
 
 
-class Posted(NamedTuple):
+class WriteResult(NamedTuple):
     """What became of a message on its way to the slave."""
 
     is_taken: bool
@@ -80,7 +80,7 @@ class MailboxPort:
         self._repeat = 0
         self._has_to_repeat = False
 
-    def post(self, message: bytes) -> Procedure[Posted]:
+    def post(self, message: bytes) -> Procedure[WriteResult]:
         """Write a message, once its mailbox is empty.
 
         Raises:
@@ -88,7 +88,7 @@ class MailboxPort:
         """
         padded = message.ljust(self.area.to_slave_size, b"\0")
         (reply,), _ = yield [fpwr(self.station, self.area.to_slave, padded)]
-        return Posted(reply.wkc == 1, reply.tries > 1)
+        return WriteResult(reply.wkc == 1, reply.tries > 1)
 
     def is_full(self) -> Procedure[bool]:
         """Return whether the slave has a message, which it repeats first if one was lost.

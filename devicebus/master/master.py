@@ -10,7 +10,7 @@ import msgspec
 from devicebus.errors import BusError, MailboxClosedError, NoMailboxError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.master.bring import bring, standard_mailbox
-from devicebus.master.bus import Bus, Event, MasterSettings, Unit
+from devicebus.master.bus import BusSlave, BusState, Event, MasterSettings
 from devicebus.master.cycle import Cycle, CycleStats
 from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
@@ -21,8 +21,8 @@ from devicebus.master.startup import shut_down, start_up
 from devicebus.master.watch import (
     ERRORS_PERIOD_NS,
     PortErrorLog,
-    look_around,
-    look_at_errors,
+    poll_error_counters,
+    poll_mailboxes,
     watch,
 )
 from devicebus.wire.alstatus import AlState
@@ -55,7 +55,7 @@ class Master:
     """
 
     def __init__(self, settings: MasterSettings | None = None) -> None:
-        self._bus = Bus(settings or MasterSettings())
+        self._bus = BusState(settings or MasterSettings())
         self._running: Task[None] | None = None
         self._look_ns = 0
         self._look: Task[None] | None = None
@@ -63,9 +63,9 @@ class Master:
         self._errors_ns = 0
 
     @property
-    def units(self) -> dict[int, Unit]:
+    def slaves(self) -> dict[int, BusSlave]:
         """The slaves by station address, in the order of the line; for reading."""
-        return self._bus.units
+        return self._bus.slaves
 
     @property
     def changes(self) -> int:
@@ -119,12 +119,12 @@ class Master:
 
         Raises BusError if there is no such slave, or it is being brought somewhere.
         """
-        unit = self._unit(station)
-        if unit.is_busy:
-            raise BusError(f"slave {station} is on its way to {unit.target.name} already")
-        unit.target = target
-        work = self.run(bring(self._bus, unit, target), now_ns, f"slave {station}: state")
-        unit.begin(work)
+        slave = self._slave(station)
+        if slave.is_busy:
+            raise BusError(f"slave {station} is on its way to {slave.target.name} already")
+        slave.target = target
+        work = self.run(bring(self._bus, slave, target), now_ns, f"slave {station}: state")
+        slave.begin(work)
         return work
 
     def converse(
@@ -140,11 +140,11 @@ class Master:
 
         Raises BusError if there is no such slave, or its mailbox is closed.
         """
-        unit = self._unit(station)
-        if unit.mailbox is None:
+        slave = self._slave(station)
+        if slave.mailbox is None:
             conversation.close()
-            raise why_closed(unit)
-        return unit.mailbox.converse(conversation, now_ns, name=name, requester=requester)
+            raise why_closed(slave)
+        return slave.mailbox.converse(conversation, now_ns, name=name, requester=requester)
 
     def run(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
         """Run any procedure beside everything else."""
@@ -181,10 +181,12 @@ class Master:
         if now_ns >= self._look_ns and self._has_mailbox():
             self._look_ns = now_ns + LOOK_NS
             if self._look is None or self._look.is_done:
-                self._look = self.run(look_around(self._bus), now_ns, "looking into mailboxes")
+                self._look = self.run(poll_mailboxes(self._bus), now_ns, "looking into mailboxes")
         if now_ns >= self._errors_ns and self._bus.cycle is not None:
             self._errors_ns = now_ns + ERRORS_PERIOD_NS
-            self.run(look_at_errors(self._bus, self.port_errors), now_ns, "reading error counters")
+            self.run(
+                poll_error_counters(self._bus, self.port_errors), now_ns, "reading error counters"
+            )
 
     def next_event(self) -> Event | None:
         """Take the oldest event."""
@@ -197,9 +199,9 @@ class Master:
             bus.link.stats(),
             bus.cycle.stats() if bus.cycle is not None else None,
             {
-                station: unit.mailbox.stats()
-                for station, unit in bus.units.items()
-                if unit.mailbox is not None
+                station: slave.mailbox.stats()
+                for station, slave in bus.slaves.items()
+                if slave.mailbox is not None
             },
         )
 
@@ -209,33 +211,33 @@ class Master:
             running.cancel()
 
     def _has_mailbox(self) -> bool:
-        return any(unit.mailbox is not None for unit in self._bus.units.values())
+        return any(slave.mailbox is not None for slave in self._bus.slaves.values())
 
     @property
     def is_lost(self) -> bool:
         """Whether no frame comes back, so that nothing is known about any slave."""
         return self._bus.is_lost
 
-    def _unit(self, station: int) -> Unit:
+    def _slave(self, station: int) -> BusSlave:
         try:
-            return self._bus.units[station]
+            return self._bus.slaves[station]
         except KeyError:
-            known = ", ".join(map(str, self._bus.units)) or "none"
+            known = ", ".join(map(str, self._bus.slaves)) or "none"
             raise BusError(f"there is no slave {station}; known are {known}") from None
 
 
-def why_closed(unit: Unit) -> NoMailboxError | MailboxClosedError:
+def why_closed(slave: BusSlave) -> NoMailboxError | MailboxClosedError:
     """Return why a slave has no open mailbox: never, not in its state, or not yet again."""
-    who = f"slave {unit.station} ({unit.name})"
-    if unit.is_lost:
+    who = f"slave {slave.station} ({slave.name})"
+    if slave.is_lost:
         return MailboxClosedError(f"{who} does not answer")
-    if unit.found.fault or not standard_mailbox(unit.found.sii.fixed).is_there:
+    if slave.found.fault or not standard_mailbox(slave.found.sii.fixed).is_there:
         return NoMailboxError(f"{who} has no mailbox: its EEPROM names none")
-    if unit.state is None:
+    if slave.state is None:
         return MailboxClosedError(f"{who} is being identified: its mailbox is not open yet")
-    if unit.target in _WITH_MAILBOX:
+    if slave.target in _WITH_MAILBOX:
         return MailboxClosedError(
-            f"{who} is in {unit.state.name} and being brought to {unit.target.name}: its mailbox"
+            f"{who} is in {slave.state.name} and being brought to {slave.target.name}: its mailbox"
             " is closed until PREOP"
         )
-    return NoMailboxError(f"{who} has no mailbox in {unit.state.name}")
+    return NoMailboxError(f"{who} has no mailbox in {slave.state.name}")

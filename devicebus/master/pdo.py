@@ -44,7 +44,7 @@ class Pdo(msgspec.Struct, frozen=True):
     entries: tuple[PdoEntry, ...]
 
 
-class Channel(NamedTuple):
+class ProcessDataChannel(NamedTuple):
     """A sync manager that carries process data."""
 
     number: int
@@ -62,7 +62,7 @@ class Channel(NamedTuple):
         return (bits + 7) // 8 if self.pdos else self.fixed_size
 
 
-class PdoChoice(msgspec.Struct, frozen=True, kw_only=True):
+class PdoConfiguration(msgspec.Struct, frozen=True, kw_only=True):
     """What a slave is told to exchange."""
 
     assignment: Mapping[int, Sequence[int]] = {}
@@ -71,10 +71,10 @@ class PdoChoice(msgspec.Struct, frozen=True, kw_only=True):
     """Index, subindex and bits of each entry, by PDO."""
 
 
-def channels_from_sii(sii: Sii) -> tuple[Channel, ...]:
+def channels_from_sii(sii: Sii) -> tuple[ProcessDataChannel, ...]:
     """Return the sync managers for process data with the PDOs that the EEPROM assigns."""
     return tuple(
-        Channel(
+        ProcessDataChannel(
             number,
             manager.start,
             manager.control,
@@ -91,7 +91,7 @@ def channels_from_sii(sii: Sii) -> tuple[Channel, ...]:
     )
 
 
-def read_channels(sii: Sii) -> Conversation[tuple[Channel, ...]]:
+def read_channels(sii: Sii) -> Conversation[tuple[ProcessDataChannel, ...]]:
     """Ask a slave with CoE what its sync managers carry.
 
     What the slave does not know by SDO is as its EEPROM says.
@@ -125,7 +125,7 @@ def read_channels(sii: Sii) -> Conversation[tuple[Channel, ...]]:
     return tuple(channels)
 
 
-def write_choice(choice: PdoChoice, sizes: MailboxSizes) -> Conversation[None]:
+def write_configuration(choice: PdoConfiguration, sizes: MailboxSizes) -> Conversation[None]:
     """Tell a slave in PREOP what to map and to assign.
 
     Raises:

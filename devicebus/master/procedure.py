@@ -25,7 +25,7 @@ from eap.errors import EapError
 T = TypeVar("T")
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     """There is nothing to stop any more."""
 
 
@@ -85,7 +85,7 @@ class Task(Generic[T]):
         self._tell()
 
     def _tell(self) -> None:
-        self._stop = _nothing  # whoever is behind it knows the task: this would be a circle
+        self._stop = _do_nothing  # whoever is behind it knows the task: this would be a circle
         watchers, self._watchers = self._watchers, []
         for callback in watchers:
             callback(self)
@@ -150,14 +150,14 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
     children = [_Child(procedure, now_ns) for procedure in procedures]
     try:
         while running := [child for child in children if child.is_running]:
-            asking = [child for child in running if child.accesses]
+            asking = [child for child in running if child.datagrams]
             if asking:
-                now_ns = yield from _ask_for(asking)
+                now_ns = yield from _exchange_step(asking)
             else:
                 pause_ns = min(child.wake_ns for child in running) - now_ns
                 _, now_ns = yield Sleep(pause_ns)
             for child in running:
-                if not child.accesses and child.is_running and child.wake_ns <= now_ns:
+                if not child.datagrams and child.is_running and child.wake_ns <= now_ns:
                     child.resume(StepReplies((), now_ns))
     finally:
         for child in children:
@@ -172,7 +172,7 @@ class _Child(Generic[T]):
         self.procedure = procedure
         self.is_running = True
         self.result: T | EapError
-        self.accesses: Sequence[DatagramRequest] = ()
+        self.datagrams: Sequence[DatagramRequest] = ()
         self.wake_ns = 0
         self._advance(lambda: next(procedure), now_ns)
 
@@ -180,7 +180,7 @@ class _Child(Generic[T]):
         self._advance(lambda: self.procedure.send(answer), answer.now_ns)
 
     def _advance(self, action: Callable[[], Step], now_ns: int) -> None:
-        self.accesses = ()
+        self.datagrams = ()
         try:
             step = action()
         except StopIteration as end:
@@ -194,15 +194,15 @@ class _Child(Generic[T]):
             if isinstance(step, Sleep):
                 self.wake_ns = now_ns + step.duration_ns
             else:
-                self.accesses = step
+                self.datagrams = step
 
 
-def _ask_for(asking: Sequence[_Child[T]]) -> Procedure[int]:
+def _exchange_step(asking: Sequence[_Child[T]]) -> Procedure[int]:
     """Send what the children want and tell them what came back; return the time."""
-    replies, now_ns = yield [access for child in asking for access in child.accesses]
+    replies, now_ns = yield [datagram for child in asking for datagram in child.datagrams]
     start = 0
     for child in asking:
-        end = start + len(child.accesses)
+        end = start + len(child.datagrams)
         child.resume(StepReplies(replies[start:end], now_ns))
         start = end
     return now_ns

@@ -21,7 +21,7 @@ from eap.errors import EapError
 _ORDER = (3, 1, 2)
 
 
-class Joint(NamedTuple):
+class TopologyNode(NamedTuple):
     """How a slave hangs on the bus."""
 
     ports: tuple[int, ...]
@@ -43,12 +43,12 @@ def open_ports(status: DlStatus) -> tuple[int, ...]:
     return tuple(port for port, (loop, alive) in enumerate(pairs) if alive and not loop)
 
 
-def find_joints(statuses: Sequence[DlStatus]) -> tuple[Joint, ...]:
+def find_topology(statuses: Sequence[DlStatus]) -> tuple[TopologyNode, ...]:
     """Return where each slave hangs, in the order of positions.
 
     Open ports that lead nowhere are tolerated: a slave behind them may be gone by now.
     """
-    joints: list[Joint] = []
+    nodes: list[TopologyNode] = []
     exits: list[tuple[int, list[int]]] = []  # slaves with ports that no slave was found at yet
     for position, status in enumerate(statuses):
         ports = open_ports(status)
@@ -56,9 +56,9 @@ def find_joints(statuses: Sequence[DlStatus]) -> tuple[Joint, ...]:
             exits.pop()
         parent, port = (exits[-1][0], exits[-1][1].pop(0)) if exits else (None, 0)
         entry = 0 if 0 in ports or not ports else ports[0]
-        joints.append(Joint(ports, parent, port, entry))
+        nodes.append(TopologyNode(ports, parent, port, entry))
         exits.append((position, [each for each in _ORDER if each in ports and each != entry]))
-    return tuple(joints)
+    return tuple(nodes)
 
 
 FIRST_STATION = 1001
@@ -116,7 +116,7 @@ class FoundSlave(NamedTuple):
     alias: int
     esc: EscInfo
     al_status: AlStatus
-    joint: Joint
+    node: TopologyNode
     identity: Identity
     sii: Sii
     fault: str = ""
@@ -156,10 +156,10 @@ def scan(first_station: int = FIRST_STATION) -> Procedure[tuple[FoundSlave, ...]
     stations = range(first_station, first_station + count)
     yield from assign_stations(list(enumerate(stations)))
     registers = yield from _read_registers(stations)
-    joints = find_joints([each.dl_status for each in registers])
+    nodes = find_topology([each.dl_status for each in registers])
     images = yield from together([read_image(station) for station in stations])
     return tuple(
-        _found(position, stations[position], registers[position], joints[position], image)
+        _found(position, stations[position], registers[position], nodes[position], image)
         for position, image in enumerate(images)
     )
 
@@ -169,7 +169,7 @@ def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
 
     Raises WorkingCounterError if nobody is at a position.
     """
-    replies = yield from _in_pieces(
+    replies = yield from _in_frames(
         [apwr(at, Register.STATION_ADDRESS, to.to_bytes(2, "little")) for at, to in places]
     )
     for (position, _), reply in zip(places, replies, strict=True):
@@ -179,7 +179,7 @@ def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
 
 def read_stations(count: int) -> Procedure[list[int]]:
     """Return the station addresses at the first *count* positions; 0 where there is none."""
-    replies = yield from _in_pieces([aprd(at, Register.STATION_ADDRESS, 2) for at in range(count)])
+    replies = yield from _in_frames([aprd(at, Register.STATION_ADDRESS, 2) for at in range(count)])
     return [int.from_bytes(reply.data, "little") if reply.wkc else 0 for reply in replies]
 
 
@@ -198,11 +198,11 @@ def read_identity(station: int) -> Procedure[Identity]:
 
 
 def _read_registers(stations: Sequence[int]) -> Procedure[list[_Registers]]:
-    replies = yield from _in_pieces(
+    replies = yield from _in_frames(
         [
-            access
+            datagram
             for station in stations
-            for access in (
+            for datagram in (
                 fprd(station, Register.TYPE, EscInfo.SIZE),
                 fprd(station, Register.STATION_ALIAS, 2),
                 fprd(station, Register.DL_STATUS, DlStatus.SIZE),
@@ -228,7 +228,7 @@ def _read_registers(stations: Sequence[int]) -> Procedure[list[_Registers]]:
 
 
 def _found(
-    position: int, station: int, registers: _Registers, joint: Joint, image: bytes | EapError
+    position: int, station: int, registers: _Registers, node: TopologyNode, image: bytes | EapError
 ) -> FoundSlave:
     fault = ""
     content = Sii(fixed=SiiFixed())
@@ -241,13 +241,13 @@ def _found(
     fixed = content.fixed
     identity = Identity(fixed.vendor, fixed.product, fixed.revision, fixed.serial)
     esc, alias, _, al_status = registers
-    return FoundSlave(position, station, alias, esc, al_status, joint, identity, content, fault)
+    return FoundSlave(position, station, alias, esc, al_status, node, identity, content, fault)
 
 
-def _in_pieces(accesses: Sequence[DatagramRequest]) -> Procedure[list[DatagramReply]]:
+def _in_frames(datagrams: Sequence[DatagramRequest]) -> Procedure[list[DatagramReply]]:
     replies: list[DatagramReply] = []
-    for start in range(0, len(accesses), _PER_STEP):
-        answers, _ = yield accesses[start : start + _PER_STEP]
+    for start in range(0, len(datagrams), _PER_STEP):
+        answers, _ = yield datagrams[start : start + _PER_STEP]
         replies += answers
     return replies
 
@@ -261,7 +261,7 @@ class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
     revision: int | None = None
     serial: int | None = None
     alias: int | None = None
-    """With one, other than 0, it may be anywhere in the line (:func:`arrange`)."""
+    """With one, other than 0, it may be anywhere in the line (:func:`match_aliases`)."""
 
 
 def fits(expected: ExpectedSlave, identity: Identity) -> bool:
@@ -284,7 +284,7 @@ def check_bus(expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]) ->
         )
 
 
-def arrange(expected: Sequence[ExpectedSlave], aliases: Sequence[int]) -> tuple[int, ...]:
+def match_aliases(expected: Sequence[ExpectedSlave], aliases: Sequence[int]) -> tuple[int, ...]:
     """Return which of the expected slaves is to stand at each position, by their numbers.
 
     A slave that is expected with an alias is looked for wherever in the line it is, and those
@@ -333,26 +333,26 @@ def iter_differences(
             before = f"after {found[there - 1 + pairs].name}" if there + pairs else "at the start"
             yield f"{missing.name} is missing {before}, expected {_describe(missing)}"
         for slave in found[there + pairs : there_end]:
-            yield f"{_place(slave)}: {slave.fault or slave.identity}, expected no slave here"
+            yield f"{_name_of(slave)}: {slave.fault or slave.identity}, expected no slave here"
 
 
 def _compare(expected: ExpectedSlave, slave: FoundSlave) -> Iterator[str]:
     if slave.fault:
-        yield f"{_place(slave)}: {slave.fault}, expected {expected.name}"
+        yield f"{_name_of(slave)}: {slave.fault}, expected {expected.name}"
     elif not fits(expected, slave.identity):
         serial = f", serial {slave.identity.serial}" if expected.serial is not None else ""
         yield (
-            f"{_place(slave)}: {slave.identity}{serial},"
+            f"{_name_of(slave)}: {slave.identity}{serial},"
             f" expected {expected.name} with {_describe(expected)}"
         )
     elif expected.alias not in {None, slave.alias}:
         yield (
-            f"{_place(slave)}: alias {slave.alias}, expected {expected.name} with alias"
+            f"{_name_of(slave)}: alias {slave.alias}, expected {expected.name} with alias"
             f" {expected.alias}"
         )
 
 
-def _place(slave: FoundSlave) -> str:
+def _name_of(slave: FoundSlave) -> str:
     return f"position {slave.position} (station {slave.station})"
 
 

@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 
 from devicebus.errors import BusError, StateTimeoutError
 from devicebus.master.bring import bring, read_process_data, set_clocks
-from devicebus.master.bus import Bus, Unit
+from devicebus.master.bus import BusSlave, BusState
 from devicebus.master.cycle import Cycle
 from devicebus.master.esm import POLL_NS, TIMEOUT_NS
 from devicebus.master.findings import join_errors
-from devicebus.master.image import BusImage, SlaveShape, lay_out
-from devicebus.master.pdo import Channel, channels_from_sii
+from devicebus.master.image import BusImage, SlaveProcessData, plan_image
+from devicebus.master.pdo import ProcessDataChannel, channels_from_sii
 from devicebus.master.procedure import Procedure, Sleep, together
-from devicebus.master.scan import FoundSlave, arrange, assign_stations, check_bus, scan
+from devicebus.master.scan import FoundSlave, assign_stations, check_bus, match_aliases, scan
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import brd, bwr
 from devicebus.wire.register import AlControl, AlStatus, Register
@@ -22,7 +22,7 @@ from eap.errors import EapError
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
-def start_up(bus: Bus, target: AlState) -> Procedure[None]:
+def start_up(bus: BusState, target: AlState) -> Procedure[None]:
     """Find all slaves and bring them to *target*, INIT to OP, together.
 
     For OP cycles have to run as soon as the bus has one.  Slaves that fail are left behind and the
@@ -35,22 +35,22 @@ def start_up(bus: Bus, target: AlState) -> Procedure[None]:
     bus.forget()
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
     found = yield from scan(bus.settings.first_station)
-    units = yield from _identify(bus, found)
-    bus.units = {unit.station: unit for unit in units}
-    for unit in units:
-        unit.target = target
-    crew = _Crew(units)
-    yield from crew.do(lambda unit: bring(bus, unit, AlState.INIT))
+    slaves = yield from _identify(bus, found)
+    bus.slaves = {slave.station: slave for slave in slaves}
+    for slave in slaves:
+        slave.target = target
+    crew = _StartingSlaves(slaves)
+    yield from crew.do(lambda slave: bring(bus, slave, AlState.INIT))
     if target is not AlState.INIT:
-        yield from crew.do(lambda unit: bring(bus, unit, AlState.PREOP))
+        yield from crew.do(lambda slave: bring(bus, slave, AlState.PREOP))
     if target in _WITH_PROCESS_DATA:
-        yield from crew.do(lambda unit: _plan(bus, unit))
+        yield from crew.do(lambda slave: _plan(bus, slave))
         if crew.fit:
             yield from _run_process_data(bus, crew, target)
     crew.check()
 
 
-def shut_down(bus: Bus) -> Procedure[None]:
+def shut_down(bus: BusState) -> Procedure[None]:
     """Bring all slaves to INIT, and keep nobody anywhere any more.
 
     Raises:
@@ -69,11 +69,11 @@ def shut_down(bus: Bus) -> Procedure[None]:
     raise StateTimeoutError("some slaves are not in INIT within 5 s")
 
 
-def set_up_cycle(bus: Bus) -> None:
+def set_up_cycle(bus: BusState) -> None:
     """Lay out the process data of all slaves, so that cycles can run."""
-    units = bus.units.values()
-    layout = lay_out([_shape(unit) for unit in units])
-    knows_lrw = bus.settings.allow_lrw and all(unit.found.esc.knows_lrw for unit in units)
+    slaves = bus.slaves.values()
+    layout = plan_image([_process_data_of(slave) for slave in slaves])
+    knows_lrw = bus.settings.allow_lrw and all(slave.found.esc.knows_lrw for slave in slaves)
 
     def trouble(now_ns: int) -> None:
         del now_ns
@@ -84,12 +84,12 @@ def set_up_cycle(bus: Bus) -> None:
     bus.follow(bus.reference)
 
 
-def _identify(bus: Bus, found: Sequence[FoundSlave]) -> Procedure[list[Unit]]:
+def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusSlave]]:
     """Return the slaves in the order of the line, with the names and stations they are to have."""
     expected = bus.settings.expected
     if not expected:
-        return [Unit(slave, slave.name, bus.changes) for slave in found]
-    order = arrange(expected, [slave.alias for slave in found])
+        return [BusSlave(slave, slave.name, bus.changes) for slave in found]
+    order = match_aliases(expected, [slave.alias for slave in found])
     check_bus([expected[number] for number in order], found)
     stations = [bus.settings.first_station + number for number in order]
     moved = [
@@ -100,44 +100,44 @@ def _identify(bus: Bus, found: Sequence[FoundSlave]) -> Procedure[list[Unit]]:
     if moved:
         yield from assign_stations(moved)
     return [
-        Unit(slave._replace(station=station), expected[number].name, bus.changes)
+        BusSlave(slave._replace(station=station), expected[number].name, bus.changes)
         for slave, station, number in zip(found, stations, order, strict=True)
     ]
 
 
-def _run_process_data(bus: Bus, crew: _Crew, target: AlState) -> Procedure[None]:
+def _run_process_data(bus: BusState, crew: _StartingSlaves, target: AlState) -> Procedure[None]:
     """Lay out process data and bring those that are left to SAFEOP or OP."""
-    for unit, _ in crew.errors:
-        unit.channels = _believed(unit)
+    for slave, _ in crew.errors:
+        slave.channels = _channels_by_eeprom(slave)
     if bus.settings.clocks:
         yield from set_clocks(bus)
     set_up_cycle(bus)
-    yield from crew.do(lambda unit: bring(bus, unit, AlState.SAFEOP))
+    yield from crew.do(lambda slave: bring(bus, slave, AlState.SAFEOP))
     if target is AlState.OP:
-        yield from crew.do(lambda unit: bring(bus, unit, AlState.OP))
+        yield from crew.do(lambda slave: bring(bus, slave, AlState.OP))
 
 
-def _plan(bus: Bus, unit: Unit) -> Procedure[None]:
+def _plan(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Find out what a slave exchanges, and that it fits the bus."""
-    yield from read_process_data(bus, unit)
-    lay_out([_shape(unit)])
+    yield from read_process_data(bus, slave)
+    plan_image([_process_data_of(slave)])
 
 
-def _believed(unit: Unit) -> tuple[Channel, ...]:
+def _channels_by_eeprom(slave: BusSlave) -> tuple[ProcessDataChannel, ...]:
     """Return what a slave that has failed may exchange once it comes back, by its EEPROM."""
-    channels = channels_from_sii(unit.found.sii)
+    channels = channels_from_sii(slave.found.sii)
     try:
-        lay_out([SlaveShape(unit.station, channels, unit.found.esc.fmmus)])
+        plan_image([SlaveProcessData(slave.station, channels, slave.found.esc.fmmus)])
     except BusError:
         return ()
     return channels
 
 
-def _shape(unit: Unit) -> SlaveShape:
-    return SlaveShape(unit.station, unit.channels, unit.found.esc.fmmus)
+def _process_data_of(slave: BusSlave) -> SlaveProcessData:
+    return SlaveProcessData(slave.station, slave.channels, slave.found.esc.fmmus)
 
 
-class _Crew:
+class _StartingSlaves:
     """The slaves that go from step to step together.
 
     Attributes:
@@ -145,20 +145,20 @@ class _Crew:
         errors: What went wrong with the others.
     """
 
-    def __init__(self, units: Sequence[Unit]) -> None:
-        self.fit = list(units)
-        self.errors: list[tuple[Unit, EapError]] = []
+    def __init__(self, slaves: Sequence[BusSlave]) -> None:
+        self.fit = list(slaves)
+        self.errors: list[tuple[BusSlave, EapError]] = []
 
-    def do(self, work: Callable[[Unit], Procedure[None]]) -> Procedure[None]:
+    def do(self, work: Callable[[BusSlave], Procedure[None]]) -> Procedure[None]:
         """Let all that are left do something together; raises FrameLostError."""
-        results = yield from together([work(unit) for unit in self.fit])
+        results = yield from together([work(slave) for slave in self.fit])
         done = list(zip(self.fit, results, strict=True))
-        self.errors += [(unit, error) for unit, error in done if isinstance(error, EapError)]
-        self.fit = [unit for unit, error in done if not isinstance(error, EapError)]
+        self.errors += [(slave, error) for slave, error in done if isinstance(error, EapError)]
+        self.fit = [slave for slave, error in done if not isinstance(error, EapError)]
 
     def check(self) -> None:
         """Raise what went wrong: one error as it is, several as one with a line for each cause."""
         if self.errors:
             raise join_errors(
-                [(f"{unit.name} ({unit.station})", error) for unit, error in self.errors]
+                [(f"{slave.name} ({slave.station})", error) for slave, error in self.errors]
             )

@@ -11,16 +11,16 @@ from typing import NamedTuple
 from devicebus.errors import FrameLostError, IdentityError, WorkingCounterError
 from devicebus.master.bring import bring, set_clocks
 from devicebus.master.bus import (
-    Bus,
     BusBack,
     BusLost,
+    BusSlave,
+    BusState,
     SlaveBack,
     SlaveFailed,
     SlaveLeft,
     SlaveLost,
-    Unit,
 )
-from devicebus.master.cycle import Presence
+from devicebus.master.cycle import Participation
 from devicebus.master.diagnosis import COUNTERS, port_counters
 from devicebus.master.mailboxport import STATUS
 from devicebus.master.procedure import Procedure, Sleep, Task
@@ -34,9 +34,9 @@ _PER_STEP = 15
 """As many as share one frame."""
 
 
-def look_around(bus: Bus) -> Procedure[None]:
+def poll_mailboxes(bus: BusState) -> Procedure[None]:
     """Have the mailboxes read that are full and that nobody is busy with."""
-    idle = [unit.mailbox for unit in bus.units.values() if unit.mailbox is not None]
+    idle = [slave.mailbox for slave in bus.slaves.values() if slave.mailbox is not None]
     idle = [mailbox for mailbox in idle if not mailbox.is_busy]
     for start in range(0, len(idle), _PER_STEP):
         part = idle[start : start + _PER_STEP]
@@ -52,7 +52,7 @@ def look_around(bus: Bus) -> Procedure[None]:
 ERRORS_PERIOD_NS = 1_000_000_000
 
 
-class Growth(NamedTuple):
+class ErrorPeriod(NamedTuple):
     """First and last time at which more errors were seen at a port."""
 
     since_ns: int
@@ -64,9 +64,9 @@ class PortErrorLog:
 
     def __init__(self) -> None:
         self._counters: dict[int, tuple[int, ...]] = {}
-        self._growth: dict[int, dict[int, Growth]] = {}
+        self._growth: dict[int, dict[int, ErrorPeriod]] = {}
 
-    def of(self, station: int) -> dict[int, Growth]:
+    def of(self, station: int) -> dict[int, ErrorPeriod]:
         """Return by port when errors were seen; a port that was quiet is not there."""
         return self._growth.get(station, {})
 
@@ -90,12 +90,12 @@ class PortErrorLog:
             if now > old:
                 ports = self._growth.setdefault(station, {})
                 first = ports[port].since_ns if port in ports else now_ns
-                ports[port] = Growth(first, now_ns)
+                ports[port] = ErrorPeriod(first, now_ns)
 
 
-def look_at_errors(bus: Bus, log: PortErrorLog) -> Procedure[None]:
+def poll_error_counters(bus: BusState, log: PortErrorLog) -> Procedure[None]:
     """Read the error counters of all slaves that answer."""
-    stations = [unit.station for unit in bus.units.values() if not unit.is_lost]
+    stations = [slave.station for slave in bus.slaves.values() if not slave.is_lost]
     for start in range(0, len(stations), _PER_STEP):
         part = stations[start : start + _PER_STEP]
         try:
@@ -119,34 +119,34 @@ _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 _STATES = {int(state): state for state in AlState}
 
 
-def watch(bus: Bus) -> Procedure[None]:
+def watch(bus: BusState) -> Procedure[None]:
     """Look at the slaves for ever."""
     while True:
-        now_ns = yield from _pause(bus)
+        now_ns = yield from _wait_for_period(bus)
         try:
             count = yield from count_slaves()
-            replies = yield from _read_states(list(bus.units))
+            replies = yield from _read_states(list(bus.slaves))
         except FrameLostError:
             if not bus.is_lost:
                 bus.is_lost = True
-                for unit in bus.units.values():
-                    unit.state = None
+                for slave in bus.slaves.values():
+                    slave.state = None
                 bus.emit(BusLost(now_ns))
             continue
         if bus.is_lost:
             bus.is_lost = False
             bus.emit(BusBack(now_ns))
-        for unit, reply in zip(list(bus.units.values()), replies, strict=True):
+        for slave, reply in zip(list(bus.slaves.values()), replies, strict=True):
             if reply.wkc:
-                _judge(bus, unit, AlStatus.decode(reply.data), now_ns)
+                _check_slave(bus, slave, AlStatus.decode(reply.data), now_ns)
             else:
-                _lose(bus, unit, now_ns)
-        lost = [unit for unit in bus.units.values() if unit.is_lost]
-        if lost and count > len(bus.units) - len(lost):
-            yield from _seek(bus, count, now_ns)
+                _mark_lost(bus, slave, now_ns)
+        lost = [slave for slave in bus.slaves.values() if slave.is_lost]
+        if lost and count > len(bus.slaves) - len(lost):
+            yield from _readdress(bus, count, now_ns)
 
 
-def _pause(bus: Bus) -> Procedure[int]:
+def _wait_for_period(bus: BusState) -> Procedure[int]:
     """Wait for the next look; return the time."""
     _, now_ns = yield Sleep(SLICE_NS)
     end_ns = now_ns + PERIOD_NS - SLICE_NS
@@ -165,102 +165,102 @@ def _read_states(stations: Sequence[int]) -> Procedure[list[DatagramReply]]:
     return replies
 
 
-def _lose(bus: Bus, unit: Unit, now_ns: int) -> None:
+def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     """A slave does not answer although the frame came back: leave it out."""
-    if unit.is_lost:
+    if slave.is_lost:
         return
-    unit.lose()
-    unit.retry_ns = 0
-    unit.missed_ns = unit.missed_ns or now_ns
-    work, unit.work = unit.work, None
+    slave.lose()
+    slave.retry_ns = 0
+    slave.missed_ns = slave.missed_ns or now_ns
+    work, slave.work = slave.work, None
     if work is not None:
         work.cancel()
-    bus.close_mailbox(unit)
-    bus.set_presence(unit, Presence.UNSURE)
-    if unit.station == bus.reference:
+    bus.close_mailbox(slave)
+    bus.set_participation(slave, Participation.UNCERTAIN)
+    if slave.station == bus.reference:
         bus.follow(None)  # without it the others would be handed the empty datagram's time
-    bus.emit(SlaveLost(unit.station, now_ns))
+    bus.emit(SlaveLost(slave.station, now_ns))
 
 
-def _judge(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
+def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> None:
     """A slave answers: bring it back if it is not where it belongs."""
-    if unit.is_busy:
+    if slave.is_busy:
         return
-    if not unit.is_lost:  # of one that was, the identity is compared before its state counts
-        unit.state = _STATES.get(status.state)
-    if now_ns < unit.retry_ns:
+    if not slave.is_lost:  # of one that was, the identity is compared before its state counts
+        slave.state = _STATES.get(status.state)
+    if now_ns < slave.retry_ns:
         return
-    is_set_up = unit.is_set_up or unit.target not in _WITH_PROCESS_DATA
-    if status.state == unit.target and not status.error and is_set_up and not unit.is_lost:
-        _take_back(bus, unit, now_ns)
+    is_set_up = slave.is_set_up or slave.target not in _WITH_PROCESS_DATA
+    if status.state == slave.target and not status.error and is_set_up and not slave.is_lost:
+        _report_back(bus, slave, now_ns)
         return
-    if unit.missed_ns is None:
-        unit.missed_ns = now_ns
+    if slave.missed_ns is None:
+        slave.missed_ns = now_ns
         shown = status.state | (ERROR if status.error else 0)
-        bus.emit(SlaveLeft(unit.station, shown, status.code, now_ns))
-    _begin(bus, unit, status, now_ns)
+        bus.emit(SlaveLeft(slave.station, shown, status.code, now_ns))
+    _begin(bus, slave, status, now_ns)
 
 
-def _take_back(bus: Bus, unit: Unit, now_ns: int) -> None:
+def _report_back(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     """A slave is where it belongs: report it if it was missed."""
-    missed_ns, unit.missed_ns = unit.missed_ns, None
+    missed_ns, slave.missed_ns = slave.missed_ns, None
     if missed_ns is not None:
-        bus.emit(SlaveBack(unit.station, now_ns - missed_ns, now_ns))
+        bus.emit(SlaveBack(slave.station, now_ns - missed_ns, now_ns))
 
 
-def _begin(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
+def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> None:
     stays = (
-        not unit.is_lost
+        not slave.is_lost
         and status.state in _WITH_PROCESS_DATA
-        and unit.target in _WITH_PROCESS_DATA
-        and unit.is_set_up
+        and slave.target in _WITH_PROCESS_DATA
+        and slave.is_set_up
     )
     bus.is_troubled = True
 
     def done(task: Task[int]) -> None:
         error = task.error
-        if unit.work is not task or isinstance(error, FrameLostError):
+        if slave.work is not task or isinstance(error, FrameLostError):
             return  # the slave is lost meanwhile, or nobody knows: the next look begins again
         if error is None:
-            _take_back(bus, unit, task.result())
-        elif not (unit.is_lost and isinstance(error, WorkingCounterError)):
-            unit.retry_ns = now_ns + RETRY_NS
+            _report_back(bus, slave, task.result())
+        elif not (slave.is_lost and isinstance(error, WorkingCounterError)):
+            slave.retry_ns = now_ns + RETRY_NS
             if isinstance(error, IdentityError):
-                unit.lose()
-                bus.close_mailbox(unit)
-            bus.emit(SlaveFailed(unit.station, str(error), now_ns))
+                slave.lose()
+                bus.close_mailbox(slave)
+            bus.emit(SlaveFailed(slave.station, str(error), now_ns))
 
-    work = _revive(bus, unit, stays=stays)
-    task = bus.runner.start(work, now_ns, f"bringing back slave {unit.station}")
-    unit.begin(task)
+    work = _bring_back(bus, slave, stays=stays)
+    task = bus.runner.start(work, now_ns, f"bringing back slave {slave.station}")
+    slave.begin(task)
     task.watch(done)
 
 
-def _revive(bus: Bus, unit: Unit, *, stays: bool) -> Procedure[int]:
+def _bring_back(bus: BusState, slave: BusSlave, *, stays: bool) -> Procedure[int]:
     """Bring a slave back; return the time.  Unless it *stays* set up it begins in INIT."""
     if not stays:
-        found = unit.found.identity
-        identity = yield from read_identity(unit.station)
+        found = slave.found.identity
+        identity = yield from read_identity(slave.station)
         if identity != found:
-            yield [fpwr(unit.station, Register.STATION_ADDRESS, bytes(2))]
+            yield [fpwr(slave.station, Register.STATION_ADDRESS, bytes(2))]
             raise IdentityError(
-                f"in place of {unit.name} (station {unit.station}) there is {identity}, serial"
+                f"in place of {slave.name} (station {slave.station}) there is {identity}, serial"
                 f" {identity.serial}, expected {found}, serial {found.serial}"
             )
-        yield from bring(bus, unit, AlState.INIT)
-        unit.is_lost = False
+        yield from bring(bus, slave, AlState.INIT)
+        slave.is_lost = False
         if bus.settings.clocks:
-            yield from set_clocks(bus, only=frozenset((unit.station,)))
-    yield from bring(bus, unit, unit.target)
+            yield from set_clocks(bus, only=frozenset((slave.station,)))
+    yield from bring(bus, slave, slave.target)
     _, now_ns = yield Sleep(0)
     return now_ns
 
 
-def _seek(bus: Bus, count: int, now_ns: int) -> Procedure[None]:
+def _readdress(bus: BusState, count: int, now_ns: int) -> Procedure[None]:
     """Give slaves that came without an address that of the lost one whose place they have."""
     try:
         stations = yield from read_stations(count)
-        places = _places(bus, stations, now_ns)
+        places = _missing_addresses(bus, stations, now_ns)
         if places:
             yield from assign_stations(places)
             bus.is_troubled = True
@@ -268,10 +268,12 @@ def _seek(bus: Bus, count: int, now_ns: int) -> Procedure[None]:
         bus.is_troubled = True  # the line has changed meanwhile: look again
 
 
-def _places(bus: Bus, stations: Sequence[int], now_ns: int) -> list[tuple[int, int]]:
+def _missing_addresses(
+    bus: BusState, stations: Sequence[int], now_ns: int
+) -> list[tuple[int, int]]:
     """Return positions and station addresses; a lost slave comes behind those before it."""
-    order = {station: number for number, station in enumerate(bus.units)}
-    lost = [at for at, unit in bus.units.items() if unit.is_lost and unit.retry_ns <= now_ns]
+    order = {station: number for number, station in enumerate(bus.slaves)}
+    lost = [at for at, slave in bus.slaves.items() if slave.is_lost and slave.retry_ns <= now_ns]
     places = []
     last = -1
     for position, station in enumerate(stations):

@@ -14,7 +14,7 @@ import msgspec
 
 from devicebus.sim.clock import Clock
 from devicebus.sim.eeprom import Eeprom
-from devicebus.sim.fmmu import Window, active_windows
+from devicebus.sim.fmmu import FmmuWindow, active_windows
 from devicebus.sim.syncmanager import SyncChannel, Watchdog
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlEvent, Register
@@ -152,7 +152,7 @@ class Esc:
         self.channels = tuple(SyncChannel(self.memory, n) for n in range(given.sync_managers))
         self._guards: tuple[SyncChannel, ...] = ()
         self._areas: dict[tuple[int, int], SyncChannel] = {}
-        self.windows: tuple[Window, ...] = ()
+        self.windows: tuple[FmmuWindow, ...] = ()
         self.set_al_status(AlState.INIT, 0)
         self.ecat_event = 0
 

@@ -18,8 +18,8 @@ from devicebus.mailbox.foe_server import FoeServer
 from devicebus.sim.device import Device, FaultyDictionary
 from devicebus.sim.devices.drive import Axes
 from devicebus.sim.devices.objects import TX_PDO
-from devicebus.sim.segment import Segment, Side
-from devicebus.sim.slave import Slave
+from devicebus.sim.segment import SegmentEnd, SimulatedSegment
+from devicebus.sim.slave import SimulatedSlave
 from devicebus.sim.spec import FaultKind, FaultSpec, Value
 from devicebus.wire.alstatus import AlState, AlStatusCode
 from devicebus.wire.datagram import OVERHEAD, DatagramHeader
@@ -29,12 +29,12 @@ from eap.ids import ObjectId
 from eap.od.abort import AbortCode
 
 
-def _mailbox(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _mailbox(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del spec, now_ns
     slave.esc.channels[0].is_stuck = on
 
 
-def _foe(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _foe(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     """Be busy with every message, or refuse every request with a code."""
     del now_ns
     mailbox = slave.device.mailbox
@@ -44,7 +44,7 @@ def _foe(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
         server.refuses = spec.code if on else 0
 
 
-def _sdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _sdo(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del now_ns
     dictionary = slave.device.dictionary
     if isinstance(dictionary, FaultyDictionary):
@@ -54,7 +54,7 @@ def _sdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
             dictionary.aborts[index] = spec.code or AbortCode.GENERAL
 
 
-def _emergency(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _emergency(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     """Report an error code, and with the end of the fault that there is none any more.
 
     The axis of a drive fails besides, until it is reset.
@@ -69,7 +69,7 @@ def _emergency(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
         device.report_error(code, axis=spec.axis)
 
 
-def _tx_pdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _tx_pdo(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     """Send a TxPDO through the mailbox that nobody asked for."""
     del now_ns
     mailbox = slave.device.mailbox
@@ -80,7 +80,7 @@ def _tx_pdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
         server.send_tx_pdo(index - TX_PDO, data)
 
 
-def _eeprom(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _eeprom(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     """Slow the EEPROM down; without a delay it acknowledges nothing."""
     del now_ns
     eeprom = slave.esc.eeprom
@@ -88,13 +88,13 @@ def _eeprom(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     eeprom.is_broken = on and not spec.delay_us
 
 
-def _al_error(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _al_error(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del now_ns
     if on:
         slave.fail(spec.code or AlStatusCode.UNSPECIFIED)
 
 
-def _refuse(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _refuse(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del now_ns
     state = AlState[spec.state]
     slave.refuses.pop(state, None)
@@ -102,12 +102,12 @@ def _refuse(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
         slave.refuses[state] = spec.code or AlStatusCode.UNSPECIFIED
 
 
-def _drift(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+def _drift(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     drift_ppm = spec.drift_ppm if on else slave.esc.settings.drift_ppm
     slave.esc.clock.set_drift(drift_ppm, now_ns)
 
 
-SLAVE_FAULTS: dict[FaultKind, Callable[[Slave, FaultSpec, int, bool], None]] = {
+SLAVE_FAULTS: dict[FaultKind, Callable[[SimulatedSlave, FaultSpec, int, bool], None]] = {
     FaultKind.MAILBOX: _mailbox,
     FaultKind.FOE: _foe,
     FaultKind.SDO: _sdo,
@@ -161,7 +161,7 @@ class Outgoing(NamedTuple):
     """A frame on its way back; *origin* is what it was received with."""
 
     frame: bytearray
-    side: Side
+    side: SegmentEnd
     origin: Any
 
 
@@ -173,7 +173,7 @@ class FaultySegment:
         script: Faults with their times, counted from the first call that has a time.
     """
 
-    def __init__(self, segment: Segment, script: Iterable[FaultSpec] = ()) -> None:
+    def __init__(self, segment: SimulatedSegment, script: Iterable[FaultSpec] = ()) -> None:
         self.segment = segment
         self._numbers = {slave.device.name: n for n, slave in enumerate(segment.slaves)}
         self._script = list(script)
@@ -242,13 +242,18 @@ class FaultySegment:
             raise ValueError(f"{slave}: {entry} was not set")
         found.offer_inputs(now_ns)
 
-    def _slave(self, name: str) -> Slave:
+    def _slave(self, name: str) -> SimulatedSlave:
         if name not in self._numbers:
             raise ValueError(f"no slave {name!r} (one of {', '.join(self._numbers)})")
         return self.segment.slaves[self._numbers[name]]
 
     def receive_frame(
-        self, frame: bytearray, now_ns: int, *, side: Side = Side.PRIMARY, origin: Any = None
+        self,
+        frame: bytearray,
+        now_ns: int,
+        *,
+        side: SegmentEnd = SegmentEnd.PRIMARY,
+        origin: Any = None,
     ) -> None:
         """Let a frame enter; what comes back is in :meth:`frames_to_send`."""
         self.handle_timeout(now_ns)
@@ -362,7 +367,7 @@ class FaultCommand(FaultSpec, frozen=True, forbid_unknown_fields=True):
     end: bool = False
 
 
-def obey(segment: FaultySegment, command: object, now_ns: int) -> None:
+def execute_command(segment: FaultySegment, command: object, now_ns: int) -> None:
     """Do what *command* says, a JSON object that is decoded.
 
     Raises:

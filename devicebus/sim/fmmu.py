@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 from devicebus.wire.register import FMMU_READ, FMMU_WRITE, Fmmu, Register
 
 
-class Memory(Protocol):
+class EscMemory(Protocol):
     """What FMMUs map to: a slave controller, or whatever stands for one."""
 
     def read(self, address: int, length: int, now_ns: int) -> bytes | None:
@@ -24,7 +24,7 @@ class Memory(Protocol):
         """Read with no effect."""
 
 
-class Window(NamedTuple):
+class FmmuWindow(NamedTuple):
     """One active FMMU; *first* and *last* are octets of the logical memory."""
 
     first: int
@@ -42,17 +42,17 @@ class Window(NamedTuple):
         return not self.first_bit and not self.physical_bit and not self.bits % 8
 
 
-def active_windows(memory: bytearray, count: int) -> tuple[Window, ...]:
+def active_windows(memory: bytearray, count: int) -> tuple[FmmuWindow, ...]:
     """Read the registers of *count* FMMUs and return the active ones."""
     units = (Fmmu.decode(memory, Register.FMMU + 16 * number) for number in range(count))
     windows = (_window(unit) for unit in units if unit.activate & 1 and unit.length)
     return tuple(window for window in windows if window.bits > 0)
 
 
-def _window(unit: Fmmu) -> Window:
+def _window(unit: Fmmu) -> FmmuWindow:
     first_bit = unit.logical_start_bit & 7
     bits = 8 * (unit.length - 1) + (unit.logical_end_bit & 7) - first_bit + 1
-    return Window(
+    return FmmuWindow(
         unit.logical_start,
         unit.logical_start + unit.length - 1,
         unit.physical_start,
@@ -64,7 +64,7 @@ def _window(unit: Fmmu) -> Window:
     )
 
 
-class Piece(NamedTuple):
+class FmmuSlice(NamedTuple):
     """What a window shares with a datagram."""
 
     first: int
@@ -81,7 +81,7 @@ class Piece(NamedTuple):
     """Bits in front of it in the memory."""
 
 
-def find_pieces(windows: Iterable[Window], address: int, size: int) -> tuple[Piece, ...]:
+def find_slices(windows: Iterable[FmmuWindow], address: int, size: int) -> tuple[FmmuSlice, ...]:
     """Return what *windows* map of ``address`` to ``address + size``."""
     pieces = []
     for window in windows:
@@ -93,7 +93,7 @@ def find_pieces(windows: Iterable[Window], address: int, size: int) -> tuple[Pie
         first, shift = divmod(start, 8)
         offset, physical_shift = divmod(window.physical_bit + start - begin, 8)
         pieces.append(
-            Piece(
+            FmmuSlice(
                 first,
                 first + (shift + bits + 7) // 8,
                 window.physical + offset,
@@ -106,7 +106,9 @@ def find_pieces(windows: Iterable[Window], address: int, size: int) -> tuple[Pie
     return tuple(pieces)
 
 
-def read_pieces(memory: Memory, pieces: Iterable[Piece], now_ns: int) -> list[tuple[Piece, bytes]]:
+def read_slices(
+    memory: EscMemory, pieces: Iterable[FmmuSlice], now_ns: int
+) -> list[tuple[FmmuSlice, bytes]]:
     """Read what can be read, to be inserted later: a datagram's own data is written first."""
     found = []
     for piece in pieces:
@@ -116,8 +118,8 @@ def read_pieces(memory: Memory, pieces: Iterable[Piece], now_ns: int) -> list[tu
     return found
 
 
-def insert_pieces(frame: bytearray, start: int, found: Iterable[tuple[Piece, bytes]]) -> None:
-    """Put what :func:`read_pieces` found into the data at *start* of *frame*."""
+def insert_slices(frame: bytearray, start: int, found: Iterable[tuple[FmmuSlice, bytes]]) -> None:
+    """Put what :func:`read_slices` found into the data at *start* of *frame*."""
     for piece, octets in found:
         first, end = start + piece.first, start + piece.end
         if not piece.mask:
@@ -128,8 +130,8 @@ def insert_pieces(frame: bytearray, start: int, found: Iterable[tuple[Piece, byt
         frame[first:end] = (old | value << piece.shift).to_bytes(end - first, "little")
 
 
-def write_pieces(
-    memory: Memory, pieces: Iterable[Piece], frame: bytearray, start: int, now_ns: int
+def write_slices(
+    memory: EscMemory, pieces: Iterable[FmmuSlice], frame: bytearray, start: int, now_ns: int
 ) -> bool:
     """Write from the data at *start* of *frame*; return whether anything was written."""
     written = False

@@ -17,7 +17,7 @@ INPUTS = 0x1C13
 _OCTETS = tuple(bytes((value,)) for value in range(0x100))
 
 
-class Mapped(NamedTuple):
+class MappedEntry(NamedTuple):
     """An entry and the bits of the process data that it has; None is padding."""
 
     entry: Entry | None
@@ -25,7 +25,7 @@ class Mapped(NamedTuple):
     bits: int
 
 
-class _Whole(NamedTuple):
+class _ByteRun(NamedTuple):
     """An entry on whole octets, *first* to *end*."""
 
     entry: Entry
@@ -33,7 +33,7 @@ class _Whole(NamedTuple):
     end: int
 
 
-class _Bits(NamedTuple):
+class _BitRun(NamedTuple):
     """What shares the octets from *first* to *end*: entries, and the shift and mask of each."""
 
     places: tuple[tuple[Entry, int, int], ...]
@@ -43,7 +43,7 @@ class _Bits(NamedTuple):
     """Whether every entry is one octet, as those of digital inputs and outputs are."""
 
 
-class Side:
+class PdoMapping:
     """All outputs or all inputs, or one PDO.
 
     Attributes:
@@ -51,7 +51,7 @@ class Side:
         size: Octets.
     """
 
-    def __init__(self, parts: Iterable[Mapped] = ()) -> None:
+    def __init__(self, parts: Iterable[MappedEntry] = ()) -> None:
         self.parts = tuple(parts)
         self.size = (sum(part.bits for part in self.parts) + 7) // 8
         self._runs = tuple(_runs(self.parts))
@@ -59,7 +59,7 @@ class Side:
     def unpack(self, data: bytes) -> None:
         """Give the octets of *data* to the entries."""
         for run in self._runs:
-            if isinstance(run, _Whole):
+            if isinstance(run, _ByteRun):
                 run.entry.octets = data[run.first : run.end]
                 continue
             word = int.from_bytes(data[run.first : run.end], "little")
@@ -75,7 +75,7 @@ class Side:
         pieces = []
         for run in self._runs:
             size = run.end - run.first
-            if isinstance(run, _Whole):
+            if isinstance(run, _ByteRun):
                 octets = run.entry.octets
                 pieces.append(octets if len(octets) == size else octets[:size].ljust(size, b"\0"))
                 continue
@@ -99,8 +99,8 @@ class ProcessData:
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self._dictionary = dictionary
-        self.outputs = Side()
-        self.inputs = Side()
+        self.outputs = PdoMapping()
+        self.inputs = PdoMapping()
 
     def configure(self) -> None:
         """Read assignment and mapping; what maps an entry that does not exist counts as padding."""
@@ -119,15 +119,17 @@ class ProcessData:
         plan.unpack(data)
         return True
 
-    def _plan(self, pdos: Iterable[int]) -> Side:
+    def _plan(self, pdos: Iterable[int]) -> PdoMapping:
         parts = []
         end = 0
         for pdo in pdos:
             for mapping in self._numbers(pdo):
                 bits = mapping & 0xFF
-                parts.append(Mapped(self._entry(mapping >> 16, mapping >> 8 & 0xFF), end, bits))
+                parts.append(
+                    MappedEntry(self._entry(mapping >> 16, mapping >> 8 & 0xFF), end, bits)
+                )
                 end += bits
-        return Side(parts)
+        return PdoMapping(parts)
 
     def _numbers(self, index: int) -> list[int]:
         if index not in self._dictionary:
@@ -145,7 +147,7 @@ class ProcessData:
         return self._dictionary[index].entries.get(subindex)
 
 
-def _runs(parts: Iterable[Mapped]) -> Iterator[_Whole | _Bits]:
+def _runs(parts: Iterable[MappedEntry]) -> Iterator[_ByteRun | _BitRun]:
     """Take together what shares octets; what has octets of its own is copied as a whole."""
     places: list[tuple[Entry, int, int]] = []
     first = end = 0
@@ -153,7 +155,7 @@ def _runs(parts: Iterable[Mapped]) -> Iterator[_Whole | _Bits]:
         aligned = end == 8 * first
         end = part.start + part.bits
         if aligned and part.entry is not None and part.bits == 8 * part.entry.kind.size:
-            yield _Whole(part.entry, first, end // 8)
+            yield _ByteRun(part.entry, first, end // 8)
             first = end // 8
             continue
         if part.entry is not None:
@@ -166,6 +168,6 @@ def _runs(parts: Iterable[Mapped]) -> Iterator[_Whole | _Bits]:
         yield _bits(places, first, (end + 7) // 8)
 
 
-def _bits(places: list[tuple[Entry, int, int]], first: int, end: int) -> _Bits:
+def _bits(places: list[tuple[Entry, int, int]], first: int, end: int) -> _BitRun:
     is_small = all(entry.kind.size == 1 and not entry.is_text for entry, _, _ in places)
-    return _Bits(tuple(places), first, end, is_small)
+    return _BitRun(tuple(places), first, end, is_small)

@@ -12,7 +12,14 @@ from operator import attrgetter
 from typing import NamedTuple
 
 from devicebus.sim.esc import Esc
-from devicebus.sim.fmmu import Piece, Window, find_pieces, insert_pieces, read_pieces, write_pieces
+from devicebus.sim.fmmu import (
+    FmmuSlice,
+    FmmuWindow,
+    find_slices,
+    insert_slices,
+    read_slices,
+    write_slices,
+)
 from devicebus.wire.datagram import OVERHEAD, Command
 from devicebus.wire.register import Register
 from eap.codec.ethercat import EtherCatHeader, FrameType
@@ -38,12 +45,12 @@ _MAX_PLANS = 64
 """A master that sends other logical addresses in every frame gains nothing by plans."""
 
 
-class _Share(NamedTuple):
+class _LogicalAccess(NamedTuple):
     """What of a logical datagram concerns one controller."""
 
     esc: Esc
-    reads: tuple[Piece, ...]
-    writes: tuple[Piece, ...]
+    reads: tuple[FmmuSlice, ...]
+    writes: tuple[FmmuSlice, ...]
 
 
 class Chain:
@@ -60,8 +67,8 @@ class Chain:
         self._closed_at = closed_at
         self._stations: dict[int, list[Esc]] | None = None
         self._masked: list[Esc] | None = None
-        self._plans: dict[tuple[int, int], tuple[_Share, ...]] = {}
-        self._planned: list[tuple[Window, ...]] = []
+        self._plans: dict[tuple[int, int], tuple[_LogicalAccess, ...]] = {}
+        self._planned: list[tuple[FmmuWindow, ...]] = []
 
     def process(self, frame: bytearray, now_ns: int) -> bool:
         """Work on *frame* in place; return False if a controller takes it out of the ring."""
@@ -171,15 +178,15 @@ class Chain:
         writing = _LOGICAL_WRITES.get(command, 0)
         reading = command != _LWR
         for esc, reads, writes in self._plan(where):
-            found = read_pieces(esc, reads, now_ns) if reading and reads else None
-            if writing and writes and write_pieces(esc, writes, frame, start, now_ns):
+            found = read_slices(esc, reads, now_ns) if reading and reads else None
+            if writing and writes and write_slices(esc, writes, frame, start, now_ns):
                 count += writing
             if found:
                 count += 1
-                insert_pieces(frame, start, found)
+                insert_slices(frame, start, found)
         return count
 
-    def _plan(self, where: tuple[int, int]) -> tuple[_Share, ...]:
+    def _plan(self, where: tuple[int, int]) -> tuple[_LogicalAccess, ...]:
         """Return who takes part in datagrams of this address and length; kept for the next one."""
         windows = [esc.windows for esc in self._escs]
         if windows != self._planned or len(self._plans) >= _MAX_PLANS:
@@ -187,7 +194,7 @@ class Chain:
             self._planned = windows
         plan = self._plans.get(where)
         if plan is None:
-            shares = (_share(esc, *where) for esc in self._escs if esc.windows)
+            shares = (_logical_access(esc, *where) for esc in self._escs if esc.windows)
             plan = self._plans[where] = tuple(each for each in shares if each is not None)
         return plan
 
@@ -202,9 +209,9 @@ class Chain:
             frame[at + 1] |= irq >> 8
 
 
-def _share(esc: Esc, address: int, size: int) -> _Share | None:
+def _logical_access(esc: Esc, address: int, size: int) -> _LogicalAccess | None:
     reads, writes = (
-        find_pieces((window for window in esc.windows if chosen(window)), address, size)
+        find_slices((window for window in esc.windows if chosen(window)), address, size)
         for chosen in (_CAN_READ, _CAN_WRITE)
     )
-    return _Share(esc, reads, writes) if reads or writes else None
+    return _LogicalAccess(esc, reads, writes) if reads or writes else None

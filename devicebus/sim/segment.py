@@ -11,7 +11,7 @@ from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
 from devicebus.sim.processing import Chain
-from devicebus.sim.slave import Slave
+from devicebus.sim.slave import SimulatedSlave
 from devicebus.wire.register import Register
 
 FORWARD_NS = 300
@@ -23,30 +23,30 @@ PortAt: TypeAlias = "tuple[int, int]"
 """Number of a slave and one of its ports."""
 
 
-class Side(IntEnum):
+class SegmentEnd(IntEnum):
     """An end of the segment at the master; the secondary exists in a ring only."""
 
     PRIMARY = 0
     SECONDARY = 1
 
 
-class Way(NamedTuple):
+class FramePath(NamedTuple):
     """What happens to a frame that enters at one side."""
 
     order: tuple[int, ...]
     """The slaves that work on it."""
     arrivals: dict[PortAt, int]
     """Nanoseconds from its entering to its arrival at each port that it comes through."""
-    comes_out: Side
+    exit: SegmentEnd
     closed_at: int | None
     """Index in *order* of the first slave that has no link at port 0."""
 
 
-Links: TypeAlias = Mapping[PortAt, "PortAt | Side"]
+Links: TypeAlias = Mapping[PortAt, "PortAt | SegmentEnd"]
 """What each port is joined to; ports without a link are missing."""
 
 
-def find_way(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> Way:
+def trace_path(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> FramePath:
     """Follow a frame from the port where it enters until it leaves the segment."""
     order: list[int] = []
     arrivals: dict[PortAt, int] = {}
@@ -63,8 +63,8 @@ def find_way(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> Way:
             order.append(slave)
         port = _NEXT_PORT[port]
         target = links.get((slave, port))
-        if isinstance(target, Side):
-            return Way(tuple(order), arrivals, target, closed_at)
+        if isinstance(target, SegmentEnd):
+            return FramePath(tuple(order), arrivals, target, closed_at)
         is_loop = target is None
         if target is not None:
             slave, port = target
@@ -97,7 +97,7 @@ class Cable(NamedTuple):
     parent_port: int = 1
 
 
-class Segment:
+class SimulatedSegment:
     """Slaves in a tree; the first one's port 0 is the master's.
 
     Args:
@@ -109,7 +109,7 @@ class Segment:
 
     def __init__(
         self,
-        slaves: Sequence[Slave],
+        slaves: Sequence[SimulatedSlave],
         cables: Sequence[Cable] | None = None,
         *,
         ring_end: PortAt | None = None,
@@ -142,8 +142,8 @@ class Segment:
         self._rewire()
 
     def process_frame(
-        self, frame: bytearray, now_ns: int, side: Side = Side.PRIMARY
-    ) -> Side | None:
+        self, frame: bytearray, now_ns: int, side: SegmentEnd = SegmentEnd.PRIMARY
+    ) -> SegmentEnd | None:
         """Let *frame* pass; what the slaves write is in it afterwards.
 
         Returns:
@@ -155,20 +155,20 @@ class Segment:
             return None
         survives = chain.process(frame, now_ns)
         self._let_run(side, now_ns)
-        way = self._ways[side]
-        return way.comes_out if survives and way is not None else None
+        path = self._paths[side]
+        return path.exit if survives and path is not None else None
 
-    def break_frame(self, frame: bytearray, now_ns: int, side: Side, number: int) -> None:
+    def break_frame(self, frame: bytearray, now_ns: int, side: SegmentEnd, number: int) -> None:
         """Let a frame break on the cable in front of slave *number*, as the others see it.
 
         Those in front have taken it as it was; the slave counts an error, those behind a forwarded
         one, and none of these takes it.
         """
         self.handle_timeout(now_ns)
-        way = self._ways[side]
-        if way is None or number not in way.order:
+        path = self._paths[side]
+        if path is None or number not in path.order:
             return
-        place = way.order.index(number)
+        place = path.order.index(number)
         reached = self._reached[side]
         Chain([slave.esc for slave in reached[:place]]).process(frame, now_ns)
         self._let_run(side, now_ns)
@@ -203,7 +203,7 @@ class Segment:
         """
         self._poll_at_ns = now_ns + CATCH_UP_NS
 
-    def _let_run(self, side: Side, now_ns: int) -> None:
+    def _let_run(self, side: SegmentEnd, now_ns: int) -> None:
         rewire = False
         for slave in self._reached[side]:
             esc = slave.esc
@@ -215,19 +215,19 @@ class Segment:
 
     def _rewire(self) -> None:
         links = self._links()
-        self._ways: list[Way | None] = [None, None]
+        self._paths: list[FramePath | None] = [None, None]
         self._chains: list[Chain | None] = [None, None]
-        self._reached: list[tuple[Slave, ...]] = [(), ()]
+        self._reached: list[tuple[SimulatedSlave, ...]] = [(), ()]
         for end, side in [(place, side) for place, side in links.items() if side in _SIDES]:
-            assert isinstance(side, Side)  # noqa: S101  chosen so
-            way = find_way(links, end, self._cable_ns)
-            reached = tuple(self.slaves[number] for number in way.order)
-            self._ways[side] = way
+            assert isinstance(side, SegmentEnd)  # noqa: S101  chosen so
+            path = trace_path(links, end, self._cable_ns)
+            reached = tuple(self.slaves[number] for number in path.order)
+            self._paths[side] = path
             self._reached[side] = reached
-            self._chains[side] = Chain([each.esc for each in reached], closed_at=way.closed_at)
-            for number in way.order:
+            self._chains[side] = Chain([each.esc for each in reached], closed_at=path.closed_at)
+            for number in path.order:
                 self.slaves[number].esc.port_delays = tuple(
-                    way.arrivals.get((number, port)) for port in range(4)
+                    path.arrivals.get((number, port)) for port in range(4)
                 )
         joined: list[set[int]] = [set() for _ in self.slaves]
         for number, port in links:
@@ -236,17 +236,17 @@ class Segment:
             slave.esc.loops_changed = False
             slave.esc.set_dl_status(dl_status(frozenset(ports)))
 
-    def _links(self) -> dict[PortAt, PortAt | Side]:
-        links: dict[PortAt, PortAt | Side] = {}
+    def _links(self) -> dict[PortAt, PortAt | SegmentEnd]:
+        links: dict[PortAt, PortAt | SegmentEnd] = {}
         if self.slaves and 0 not in self._cut and self._is_open(0, 0):
-            links[0, 0] = Side.PRIMARY
+            links[0, 0] = SegmentEnd.PRIMARY
         for child, parent, port in self._cables:
             whole = child not in self._cut
             if whole and self._is_open(child, 0) and self._is_open(parent, port):
                 links[child, 0] = (parent, port)
                 links[parent, port] = (child, 0)
         if self._ring_end is not None and self._is_open(*self._ring_end):
-            links[self._ring_end] = Side.SECONDARY
+            links[self._ring_end] = SegmentEnd.SECONDARY
         return links
 
     def _is_open(self, number: int, port: int) -> bool:
@@ -254,4 +254,4 @@ class Segment:
         return slave.is_powered and slave.esc.loop_control(port) != 3
 
 
-_SIDES = frozenset(Side)
+_SIDES = frozenset(SegmentEnd)

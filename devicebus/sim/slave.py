@@ -84,7 +84,7 @@ _WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BO
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
-class Slave:
+class SimulatedSlave:
     """One slave of a segment.
 
     Attributes:

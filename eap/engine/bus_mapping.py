@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeAlias
 
-from devicebus.master.image import BusImage, Layout, Variable
+from devicebus.master.image import BusImage, ProcessDataLayout, ProcessVariable
 from devicebus.master.master import Master
 from eap.codec import datatypes
 from eap.codec.pd import PdHeader
@@ -109,7 +109,7 @@ class BusPlanner:
         ]
         self._used += [(8 * place.offset, 8 * PdHeader.SIZE) for place in layout.rx]
 
-    def plan(self, bus: Layout) -> BusPlan:
+    def plan(self, bus: ProcessDataLayout) -> BusPlan:
         """Find every described entry in *bus*, the process data as the slaves have it."""
         there = _by_entry(bus.variables)
         missing: list[str] = []
@@ -142,16 +142,16 @@ class BusPlanner:
                         yield slave, entry, is_output
 
 
-def _by_entry(variables: Iterable[Variable]) -> dict[_Entry, list[Variable]]:
+def _by_entry(variables: Iterable[ProcessVariable]) -> dict[_Entry, list[ProcessVariable]]:
     """Return the variables of each entry, the first one last."""
-    there: dict[_Entry, list[Variable]] = defaultdict(list)
+    there: dict[_Entry, list[ProcessVariable]] = defaultdict(list)
     for each in variables:
         there[each.station, each.is_output, each.index, each.subindex].insert(0, each)
     return there
 
 
 def _missing(
-    slave: BusSlaveSpec, entry: BusEntrySpec, known: Sequence[Variable], *, is_output: bool
+    slave: BusSlaveSpec, entry: BusEntrySpec, known: Sequence[ProcessVariable], *, is_output: bool
 ) -> str:
     what = "output" if is_output else "input"
     has = f"one of {known[-1].bit_length} bits" if known else "none"
@@ -183,10 +183,10 @@ class BusStateVariables:
         if seen == self._seen:
             return
         self._seen = seen
-        units = master.units
-        lowest = min([unit.al_state for unit in units.values()], default=0)
+        slaves = master.slaves
+        lowest = min([slave.al_state for slave in slaves.values()], default=0)
         values = [lowest, int(seen[2])]
-        values += [units[at].al_state if at in units else 0 for at in self._stations]
+        values += [slaves[at].al_state if at in slaves else 0 for at in self._stations]
         for name, value, shown in zip(self._names, values, self._shown, strict=True):
             if value != shown and name in self._image.slots:
                 self._image.store(name, bytes((value,)))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 
 from msgspec.structs import asdict
 
-from devicebus.master.bus import Unit
+from devicebus.master.bus import BusSlave
 from devicebus.master.findings import NO_ANSWER
 from devicebus.master.master import why_closed
 from eap.engine.engine_bus import WHOLE_BUS, EngineBus
@@ -23,11 +23,11 @@ from eap.runtime.bus_request import (
 def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
     """Return what *bus* knows now; before its slaves are known, those that are expected."""
     stats = bus.master.stats()
-    units = bus.master.units.values()
-    presets = link_presets(units)
+    bus_slaves = bus.master.slaves.values()
+    presets = link_presets(bus_slaves)
     slaves = (
-        [_report(bus, unit, presets, now_ns) for unit in units]
-        if units
+        [_report(bus, bus_slave, presets, now_ns) for bus_slave in bus_slaves]
+        if bus_slaves
         else [SlaveReport(**asdict(each)) for each in expected_slaves(bus)]
     )
     cycle = stats.cycle
@@ -58,70 +58,72 @@ def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
     )
 
 
-def link_presets(units: Collection[Unit]) -> dict[int, int]:
+def link_presets(slaves: Collection[BusSlave]) -> dict[int, int]:
     """Return by position which ports led to other slaves when these were found (ETG.1510)."""
     presets: dict[int, int] = {}
-    for unit in units:
-        joint = unit.found.joint
-        ends = [(unit.found.position, joint.entry_port)]
-        if joint.parent is not None:
-            ends.append((joint.parent, joint.parent_port))
+    for slave in slaves:
+        node = slave.found.node
+        ends = [(slave.found.position, node.entry_port)]
+        if node.parent is not None:
+            ends.append((node.parent, node.parent_port))
         for position, port in ends:
             if port:  # the standard has no bits for port 0
                 presets[position] = presets.get(position, 0) | 0x11 << port - 1
     return presets
 
 
-def describe_slave(bus: EngineBus, unit: Unit, presets: Mapping[int, int]) -> SlaveDescription:
+def describe_slave(bus: EngineBus, slave: BusSlave, presets: Mapping[int, int]) -> SlaveDescription:
     """Return the description of a slave that was found; *presets* as link_presets returns them."""
-    identity, sii = unit.found.identity, unit.found.sii
-    counts = bus.faults.counts(unit.station)
-    sizes = unit.mailbox.sizes if unit.mailbox is not None else None
+    identity, sii = slave.found.identity, slave.found.sii
+    counts = bus.faults.counts(slave.station)
+    sizes = slave.mailbox.sizes if slave.mailbox is not None else None
     return SlaveDescription(
-        station=unit.station,
-        name=unit.name,
+        station=slave.station,
+        name=slave.name,
         vendor=identity.vendor,
         product=identity.product,
         revision=identity.revision,
         serial=identity.serial,
-        alias=unit.found.alias,
-        state=unit.al_state,
-        target=int(unit.target),
+        alias=slave.found.alias,
+        state=slave.al_state,
+        target=int(slave.target),
         to_slave=sizes.to_slave if sizes else 0,
         to_master=sizes.to_master if sizes else 0,
-        mailbox_fault=None if sizes else to_record(why_closed(unit)),
+        mailbox_fault=None if sizes else to_record(why_closed(slave)),
         protocols=int(sii.fixed.protocols),
         order=sii.string(sii.general.order) if sii.general else "",
         usual_to_slave=sii.fixed.receive_size,
         usual_to_master=sii.fixed.send_size,
         port_physics=sii.general.port_physics if sii.general else 0,
-        link_preset=presets.get(unit.found.position, 0),
+        link_preset=presets.get(slave.found.position, 0),
         losses=counts.losses,
         departures=counts.departures,
         al_code=counts.al_code,
-        fault=_fault(bus, unit),
+        fault=_fault(bus, slave),
     )
 
 
-def _report(bus: EngineBus, unit: Unit, presets: Mapping[int, int], now_ns: int) -> SlaveReport:
-    last = bus.faults.last(unit.station)
+def _report(
+    bus: EngineBus, slave: BusSlave, presets: Mapping[int, int], now_ns: int
+) -> SlaveReport:
+    last = bus.faults.last(slave.station)
     return SlaveReport(
-        **asdict(describe_slave(bus, unit, presets)),
+        **asdict(describe_slave(bus, slave, presets)),
         past_fault=last.text if last.until_ns is not None else "",
         since_ns=now_ns - last.since_ns if last.text else None,
         until_ns=None if last.until_ns is None else now_ns - last.until_ns,
         port_errors=tuple(
             PortErrorReport(port, now_ns - seen.since_ns, now_ns - seen.until_ns)
-            for port, seen in bus.master.port_errors.of(unit.station).items()
+            for port, seen in bus.master.port_errors.of(slave.station).items()
         ),
     )
 
 
-def _fault(bus: EngineBus, unit: Unit) -> str:
+def _fault(bus: EngineBus, slave: BusSlave) -> str:
     """Return the reason why a slave is not in its target state at this moment."""
-    fault = bus.faults.of(unit.station)
-    if fault == NO_ANSWER and unit.is_busy and unit.state is not None:
-        return f"it answers again and is on its way to {unit.target.name}"
+    fault = bus.faults.of(slave.station)
+    if fault == NO_ANSWER and slave.is_busy and slave.state is not None:
+        return f"it answers again and is on its way to {slave.target.name}"
     return fault
 
 
@@ -160,13 +162,13 @@ class BusPublisher:
         self._bus = bus
         self._send = send
         self._sent: tuple[object, ...] = ()
-        self._units: Mapping[int, Unit] | None = None
+        self._bus_slaves: Mapping[int, BusSlave] | None = None
         self._presets: Mapping[int, int] = {}
         self._changes = 0
 
     def reset(self) -> None:
         """Send all slaves next: the receiver is another one."""
-        self._sent, self._units = (), None
+        self._sent, self._bus_slaves = (), None
 
     def flush(self) -> None:
         """Send what has changed, if anything has."""
@@ -175,23 +177,25 @@ class BusPublisher:
         if revision == self._sent:
             return
         bus.faults.take_events(master)  # a change that they bring is counted already
-        units = master.units
-        if units is self._units:
+        bus_slaves = master.slaves
+        if bus_slaves is self._bus_slaves:
             presets = self._presets
-            changed = [unit for unit in units.values() if unit.revision > self._changes]
+            changed = [
+                bus_slave for bus_slave in bus_slaves.values() if bus_slave.revision > self._changes
+            ]
         else:
-            presets = link_presets(units.values())
-            changed = list(units.values())
-        slaves = [describe_slave(bus, unit, presets) for unit in changed]
-        if not units:
+            presets = link_presets(bus_slaves.values())
+            changed = list(bus_slaves.values())
+        slaves = [describe_slave(bus, bus_slave, presets) for bus_slave in changed]
+        if not bus_slaves:
             slaves = expected_slaves(bus)
         message = BusChange(
             bus=self._number,
             is_up=bus.is_up,
             fault=bus.fault,
-            stations=tuple(units) or tuple(slave.station for slave in slaves),
+            stations=tuple(bus_slaves) or tuple(slave.station for slave in slaves),
             slaves=tuple(slaves),
         )
         if self._send(message):
-            self._sent, self._units = revision, units
+            self._sent, self._bus_slaves = revision, bus_slaves
             self._presets, self._changes = presets, master.changes

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.master.bus import Unit
+from devicebus.master.bus import BusSlave
 from devicebus.master.findings import join_errors
 from devicebus.master.link import MAX_DATA
 from devicebus.master.mailboxes import Unsolicited
@@ -356,7 +356,7 @@ def bring_one(master: Master, station: int, target: AlState, now_ns: int) -> Tas
         BusError: there is no such slave, it is on its way somewhere, or the bus has no process
             data yet.
     """
-    if target in _WITH_PROCESS_DATA and master.cycle is None and station in master.units:
+    if target in _WITH_PROCESS_DATA and master.cycle is None and station in master.slaves:
         raise BusError(
             f"slave {station}: the process data of this bus is not laid out, for its slaves never"
             f" were beyond PREOP: bring all of them to {target.name} at once"
@@ -369,30 +369,32 @@ def bring_all(master: Master, target: AlState, now_ns: int) -> Task[None]:
 
     Raises BusError if no slaves are known.
     """
-    units = list(master.units.values())
-    if not units:
+    slaves = list(master.slaves.values())
+    if not slaves:
         raise BusError("the bus is not up: no slave is known")
     if target in _WITH_PROCESS_DATA and master.cycle is None:
         return master.bring_up(now_ns, target)
-    return _AllSlaves(master, units, target, now_ns).task
+    return _AllSlaves(master, slaves, target, now_ns).task
 
 
 class _AllSlaves:
     """Task that is done when all slaves of a bus are in a state."""
 
-    def __init__(self, master: Master, units: Sequence[Unit], target: AlState, now_ns: int) -> None:
+    def __init__(
+        self, master: Master, slaves: Sequence[BusSlave], target: AlState, now_ns: int
+    ) -> None:
         self.task: Task[None] = Task(f"bringing all slaves to {target.name}", self._stop)
-        self._missing = len(units)
+        self._missing = len(slaves)
         self._errors: list[tuple[str, EapError]] = []
         self._tasks: list[Task[None]] = []
-        for unit in units:
+        for slave in slaves:
             try:
-                task = master.request_state(unit.station, target, now_ns)
+                task = master.request_state(slave.station, target, now_ns)
             except BusError as exc:
-                self._end(f"{unit.name} ({unit.station})", exc)
+                self._end(f"{slave.name} ({slave.station})", exc)
             else:
                 self._tasks.append(task)
-                task.watch(partial(self._take, f"{unit.name} ({unit.station})"))
+                task.watch(partial(self._take, f"{slave.name} ({slave.station})"))
 
     def _take(self, name: str, task: Task[None]) -> None:
         self._end(name, task.error)

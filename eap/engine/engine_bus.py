@@ -349,4 +349,4 @@ class EngineBus:
         """Return whether something is under way that should not wait for the next cycle."""
         if self._is_slow or self._starting is not None or self.tasks:
             return True
-        return any(unit.is_busy for unit in self.master.units.values())
+        return any(slave.is_busy for slave in self.master.slaves.values())

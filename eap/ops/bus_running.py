@@ -20,7 +20,7 @@ from devicebus.mailbox.conversation import Conversation, MailboxMessage, Mailbox
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.findings import History
 from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
-from devicebus.master.scan import find_joints
+from devicebus.master.scan import find_topology
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramReply, fprd
 from devicebus.wire.register import AlStatus, DlStatus, Register
@@ -71,10 +71,10 @@ class RunningBus:
             finding, *_ = report_findings(self._report)
             raise FrameLostError(f"{finding.what}; {finding.advice}")
         registers = self.run(_look([slave.station for slave in slaves]))
-        joints = find_joints([dl_status for _, dl_status in registers])
+        nodes = find_topology([dl_status for _, dl_status in registers])
         return [
-            msgspec.structs.replace(slave, status=al_status, parent=joint.parent, ports=joint.ports)
-            for slave, (al_status, _), joint in zip(slaves, registers, joints, strict=True)
+            msgspec.structs.replace(slave, status=al_status, parent=node.parent, ports=node.ports)
+            for slave, (al_status, _), node in zip(slaves, registers, nodes, strict=True)
         ]
 
     def known(self) -> Sequence[Slave]:

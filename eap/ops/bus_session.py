@@ -24,7 +24,7 @@ from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.attach import attach
 from devicebus.master.bring import bring, read_process_data
-from devicebus.master.bus import Bus, MasterSettings, Unit
+from devicebus.master.bus import BusSlave, BusState, MasterSettings
 from devicebus.master.findings import History, join_errors
 from devicebus.master.procedure import Procedure, Task, together
 from devicebus.master.scan import FoundSlave, scan
@@ -59,17 +59,19 @@ class BusSession:
     def __init__(self, port: BusPort, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._port = port
         self._clock = clock
-        self._bus = Bus(MasterSettings())
+        self._bus = BusState(MasterSettings())
         self._cycle_ns = 0
         self._slaves: Sequence[Slave] = ()
 
     def scan(self) -> Sequence[Slave]:
         """Find all slaves and give them their station addresses; raises as the scan does."""
         found = self.run(scan(), "scanning the bus")
-        self._bus.units = {each.station: Unit(each, each.name) for each in found}
-        for unit in self._bus.units.values():
-            status = unit.found.al_status
-            unit.state = AlState(status.state) if status.state in set(AlState) else AlState.INIT
+        self._bus.slaves = {each.station: BusSlave(each, each.name) for each in found}
+        for bus_slave in self._bus.slaves.values():
+            status = bus_slave.found.al_status
+            bus_slave.state = (
+                AlState(status.state) if status.state in set(AlState) else AlState.INIT
+            )
         self._slaves = [_slave(each) for each in found]
         return self._slaves
 
@@ -97,8 +99,10 @@ class BusSession:
             BusError: the slave has no mailbox, or does not answer.
             SdoAbortError, SoeError, FoeError: it refuses.
         """
-        unit = self._bus.units[slave.station]
-        mailbox = unit.mailbox or self.run(attach(self._bus, unit), f"slave {unit.station}")
+        bus_slave = self._bus.slaves[slave.station]
+        mailbox = bus_slave.mailbox or self.run(
+            attach(self._bus, bus_slave), f"slave {bus_slave.station}"
+        )
         task = mailbox.converse(begin(mailbox.sizes), self._clock(), name=name)
         return self._finish(task, meanwhile)
 
@@ -111,16 +115,18 @@ class BusSession:
             AlStatusError, StateTimeoutError: one refuses, or takes too long.
             BusError: several do; the message has a line for each.
         """
-        units = [self._bus.units[slave.station] for slave in slaves]
+        bus_slaves = [self._bus.slaves[slave.station] for slave in slaves]
         if target in _WITH_PROCESS_DATA:
-            for unit in units:
-                if unit.state in _WITH_MAILBOX and unit.found.sii.fixed.protocols:
-                    self.run(attach(self._bus, unit))
-            self._bring_all(units, AlState.PREOP)
-            self._run_all(units, [read_process_data(self._bus, unit) for unit in units])
+            for bus_slave in bus_slaves:
+                if bus_slave.state in _WITH_MAILBOX and bus_slave.found.sii.fixed.protocols:
+                    self.run(attach(self._bus, bus_slave))
+            self._bring_all(bus_slaves, AlState.PREOP)
+            self._run_all(
+                bus_slaves, [read_process_data(self._bus, bus_slave) for bus_slave in bus_slaves]
+            )
             set_up_cycle(self._bus)
         try:
-            self._bring_all(units, target)
+            self._bring_all(bus_slaves, target)
         finally:
             self._bus.cycle = None
             self._bus.link.stop_cycles()
@@ -144,14 +150,16 @@ class BusSession:
     def forget(self) -> None:
         """Do nothing: this master remembers nothing."""
 
-    def _bring_all(self, units: Sequence[Unit], target: AlState) -> None:
-        self._run_all(units, [bring(self._bus, unit, target) for unit in units])
+    def _bring_all(self, bus_slaves: Sequence[BusSlave], target: AlState) -> None:
+        self._run_all(bus_slaves, [bring(self._bus, bus_slave, target) for bus_slave in bus_slaves])
 
-    def _run_all(self, units: Sequence[Unit], procedures: Sequence[Procedure[None]]) -> None:
+    def _run_all(
+        self, bus_slaves: Sequence[BusSlave], procedures: Sequence[Procedure[None]]
+    ) -> None:
         results = self.run(together(procedures))
         errors = [
-            (f"{unit.name} ({unit.station})", result)
-            for unit, result in zip(units, results, strict=True)
+            (f"{bus_slave.name} ({bus_slave.station})", result)
+            for bus_slave, result in zip(bus_slaves, results, strict=True)
             if isinstance(result, EapError)
         ]
         if errors:
@@ -217,8 +225,8 @@ def _slave(found: FoundSlave) -> Slave:
         alias=found.alias,
         status=found.al_status,
         protocols=found.sii.fixed.protocols,
-        parent=found.joint.parent,
-        ports=found.joint.ports,
+        parent=found.node.parent,
+        ports=found.node.ports,
         fault=found.fault,
     )
 

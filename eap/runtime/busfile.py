@@ -14,7 +14,7 @@ import msgspec
 from devicebus.master.pdo import PdoEntry, channels_from_sii
 from devicebus.sim.devices.build import build_segment, build_slave
 from devicebus.sim.fault import FaultySegment
-from devicebus.sim.segment import Side, find_way
+from devicebus.sim.segment import SegmentEnd, trace_path
 from devicebus.sim.spec import BusSpec, SlaveSpec
 from devicebus.wire import sii
 from eap.config.document import convert_to, read
@@ -96,13 +96,13 @@ def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
 
 def _line(spec: BusSpec) -> tuple[int, ...]:
     """Return the slaves in the order in which a frame comes to them: branches change it."""
-    links: dict[tuple[int, int], tuple[int, int] | Side] = {(0, 0): Side.PRIMARY}
+    links: dict[tuple[int, int], tuple[int, int] | SegmentEnd] = {(0, 0): SegmentEnd.PRIMARY}
     numbers = {slave.name: number for number, slave in enumerate(spec.slaves)}
     for number, slave in enumerate(spec.slaves[1:], 1):
         parent = numbers[slave.after] if slave.after else number - 1
         links[number, 0] = parent, slave.port
         links[parent, slave.port] = number, 0
-    return find_way(links, (0, 0)).order
+    return trace_path(links, (0, 0)).order
 
 
 def _describe(bus: Bus, number: int) -> DescribedSlave:

@@ -20,8 +20,8 @@ from typing import Any, Protocol
 
 import msgspec
 
-from devicebus.sim.fault import FaultySegment, obey
-from devicebus.sim.segment import Side
+from devicebus.sim.fault import FaultySegment, execute_command
+from devicebus.sim.segment import SegmentEnd
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net import realtime
@@ -122,8 +122,8 @@ def run(
     """
     segment = bus.build()
     with catch_end_signals() as end_fd, ExitStack() as stack:
-        sockets: dict[Side, SegmentSocket] = {}
-        for side, uri in zip(Side, (interface, second), strict=True):
+        sockets: dict[SegmentEnd, SegmentSocket] = {}
+        for side, uri in zip(SegmentEnd, (interface, second), strict=True):
             if uri is not None:
                 sockets[side] = open_segment(uri)
                 stack.callback(sockets[side].close)
@@ -151,14 +151,14 @@ def run_for_appliance(handover: SegmentHandover, startup: Startup) -> None:
         gc.collect()
         gc.freeze()
         startup.finish({"slaves": len(bus.spec.slaves)})
-        _Loop(segment, {Side.PRIMARY: frames}, CommandMessages(commands)).run(end_fd)
+        _Loop(segment, {SegmentEnd.PRIMARY: frames}, CommandMessages(commands)).run(end_fd)
 
 
 class _Loop:
     def __init__(
         self,
         segment: FaultySegment,
-        sockets: Mapping[Side, SegmentSocket],
+        sockets: Mapping[SegmentEnd, SegmentSocket],
         commands: Commands | None,
     ) -> None:
         self._segment = segment
@@ -187,7 +187,7 @@ class _Loop:
         self._late_ns = _NEVER_NS if due is None else max(due, now_ns) + _STALL_NS
         return None if due is None else max(0.0, (due - now_ns) / _MS)
 
-    def _pass_frames(self, side: Side, sock: SegmentSocket) -> None:
+    def _pass_frames(self, side: SegmentEnd, sock: SegmentSocket) -> None:
         segment = self._segment
         for _ in range(_BATCH):
             arrival = sock.receive()
@@ -218,7 +218,7 @@ class _Loop:
             command = msgspec.json.decode(text)
             if isinstance(command, dict) and "id" in command:
                 outcome["id"] = command.pop("id")
-            obey(self._segment, command, time.monotonic_ns())
+            execute_command(self._segment, command, time.monotonic_ns())
         except (msgspec.MsgspecError, ValueError) as exc:
             outcome |= {"ok": False, "error": str(exc)}
         return outcome

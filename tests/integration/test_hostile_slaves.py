@@ -308,7 +308,7 @@ def test_lies_end_in_named_errors_in_time_and_the_bus_runs_on(
     before = master.cycle.stats()
     line.evil.kind, line.evil.script = case.kind, iter(case.said)
     started_ns = line.now_ns
-    talk = case.ask(master.units[EVIL].mailbox.sizes)
+    talk = case.ask(master.slaves[EVIL].mailbox.sizes)
     task = master.converse(EVIL, talk, line.now_ns, name=name)
     with pytest.raises(case.error, match=case.text):
         line.wait(task, 200 * SECOND)

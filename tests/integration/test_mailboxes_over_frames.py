@@ -16,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from devicebus.mailbox import aoe_client, coe_client, eoe, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import Conversation
 from devicebus.master.procedure import Task
-from devicebus.sim.segment import Segment, Side
+from devicebus.sim.segment import SegmentEnd, SimulatedSegment
 from devicebus.sim.spec import FileSpec, MailboxSpec, ObjectSpec
 from eap.codec.ads import AdsRange, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader
@@ -36,7 +36,7 @@ BLOCK, COUNT = 0x8000, 0x8001
 class RoughLine(Line):
     """A line that loses frames, brings answers twice, and lets frames overtake each other."""
 
-    def __init__(self, core: Bench, line_segment: Segment, dice: Random) -> None:
+    def __init__(self, core: Bench, line_segment: SimulatedSegment, dice: Random) -> None:
         super().__init__(core, line_segment)
         self.dice = dice
         self.is_rough = False
@@ -55,7 +55,7 @@ class RoughLine(Line):
                 self.core.receive_frame(octets, self.now_ns)
                 continue
             passing = bytearray(octets)
-            if self.segment.process_frame(passing, self.now_ns) is Side.PRIMARY:
+            if self.segment.process_frame(passing, self.now_ns) is SegmentEnd.PRIMARY:
                 self._send(bytes(passing), is_back=True)
                 if self.is_rough and self.dice.random() < 0.1:
                     self._send(bytes(passing), is_back=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from devicebus.sim.devices.build import build_slave
-from devicebus.sim.segment import Segment
+from devicebus.sim.segment import SimulatedSegment
 from devicebus.sim.spec import ChannelSpec, DeviceKind, FileSpec, MailboxSpec, SlaveSpec
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState
@@ -31,7 +31,7 @@ def datagram(command: Command, adp: int, ado: int, data: bytes, **more: int) -> 
 def send(chain, command: Command, adp: int, ado: int, data: bytes, now_ns: int = 0) -> Answer:
     """Send one datagram through *chain* (a Segment or a Chain)."""
     frame = bytearray(encode_frame([datagram(command, adp, ado, data)]))
-    if isinstance(chain, Segment):
+    if isinstance(chain, SimulatedSegment):
         assert chain.process_frame(frame, now_ns) is not None, "the frame is lost"
     else:
         assert chain.process(frame, now_ns)
@@ -55,7 +55,9 @@ class Bench:
     """A segment with slaves at stations from 0x3E9 on, and what a master does with them."""
 
     def __init__(self, *specs: SlaveSpec, **more) -> None:
-        self.segment = Segment([build_slave(spec) for spec in specs or (generic(),)], **more)
+        self.segment = SimulatedSegment(
+            [build_slave(spec) for spec in specs or (generic(),)], **more
+        )
         self.slaves = self.segment.slaves
         self.now_ns = 0
         for position in range(len(self.slaves)):

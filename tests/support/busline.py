@@ -15,7 +15,7 @@ from devicebus.master.mailboxport import MailboxArea, configure
 from devicebus.master.procedure import Procedure, Runner, Sleep, Step, StepReplies, Task
 from devicebus.master.scan import scan
 from devicebus.sim.devices.build import build_segment
-from devicebus.sim.segment import POLL_NS, Segment, Side
+from devicebus.sim.segment import POLL_NS, SegmentEnd, SimulatedSegment
 from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import (
@@ -70,7 +70,7 @@ class Line:
         lose_out, lose_back: Say which frames are lost, by their number from 0.
     """
 
-    def __init__(self, core: Core, segment: Segment) -> None:
+    def __init__(self, core: Core, segment: SimulatedSegment) -> None:
         self.core = core
         self.segment = segment
         self.now_ns = 1_000 * MS
@@ -96,7 +96,7 @@ class Line:
             octets = bytearray(frame)
             if self.lose_out(number):
                 continue
-            if self.segment.process_frame(octets, self.now_ns) is not Side.PRIMARY:
+            if self.segment.process_frame(octets, self.now_ns) is not SegmentEnd.PRIMARY:
                 continue
             if not self.lose_back(number):
                 self.core.receive_frame(bytes(octets), self.now_ns)
@@ -165,7 +165,7 @@ def slave(name: str, kind: str = "digital", **options) -> SlaveSpec:
     return SlaveSpec(name=name, kind=DeviceKind(kind), **({"product": 7} | options))
 
 
-def segment(*slaves: SlaveSpec) -> Segment:
+def segment(*slaves: SlaveSpec) -> SimulatedSegment:
     """A simulated bus of these slaves."""
     return build_segment(BusSpec(bus="test", slaves=slaves))
 
@@ -228,7 +228,7 @@ class Paced(Line):
 class Slow(Paced):
     """A line on which each frame takes *trip_ns()*, and none overtakes another."""
 
-    def __init__(self, core: Core, segment: Segment, trip_ns: Callable[[], int]) -> None:
+    def __init__(self, core: Core, segment: SimulatedSegment, trip_ns: Callable[[], int]) -> None:
         super().__init__(core, segment)
         self.trip_ns = trip_ns
         self._under_way: deque[tuple[int, bytes]] = deque()
@@ -248,6 +248,6 @@ class Slow(Paced):
         self.segment.handle_timeout(self.now_ns)
         while self._under_way and self._under_way[0][0] <= self.now_ns:
             frame = bytearray(self._under_way.popleft()[1])
-            if self.segment.process_frame(frame, self.now_ns) is Side.PRIMARY:
+            if self.segment.process_frame(frame, self.now_ns) is SegmentEnd.PRIMARY:
                 self.core.receive_frame(bytes(frame), self.now_ns)
         self.core.handle_timeout(self.now_ns)

@@ -17,7 +17,7 @@ from devicebus.mailbox.conversation import Conversation, MailboxMessage, Mailbox
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master, why_closed
 from devicebus.master.procedure import Procedure
-from devicebus.sim.fault import obey
+from devicebus.sim.fault import execute_command
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramRequest
 from eap.engine.bus_requests import bring_all, bring_one
@@ -117,7 +117,7 @@ class FakeBus:
         return BusReport(
             is_up=self.is_up,
             fault="" if self.is_up else "no frame comes back",
-            slaves=tuple(_slave(unit) for unit in self.master.units.values()),
+            slaves=tuple(_slave(unit) for unit in self.master.slaves.values()),
             frames_sent=link.sent,
             frames_received=link.received,
             timeout_ns=link.timeout_ns,
@@ -299,7 +299,7 @@ class FakeSegment:
             return
         answer = {"id": command.pop("id"), "ok": True}
         try:
-            obey(self._line.segment, command, self._line.now_ns)
+            execute_command(self._line.segment, command, self._line.now_ns)
         except ValueError as exc:
             answer |= {"ok": False, "error": str(exc)}
         self.say(answer)

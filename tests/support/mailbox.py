@@ -17,7 +17,7 @@ from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.match import answers
-from devicebus.mailbox.protocol import CounterWatch, MailboxSizes, ProtocolServer, next_counter
+from devicebus.mailbox.protocol import CounterCheck, MailboxSizes, ProtocolServer, next_counter
 from devicebus.mailbox.server import MailboxServer
 from eap.codec.mailbox import (
     MailboxErrorReply,
@@ -63,7 +63,7 @@ class Line:
         """Messages that no conversation waited for."""
         self.sent: list[bytes] = []
         self._counter = 0
-        self._watch = CounterWatch()
+        self._watch = CounterCheck()
 
     def run(self, talk: Conversation[T]) -> T:
         """Run a conversation to its end."""

@@ -49,7 +49,7 @@ def run(job: dict[str, Any]) -> None:
         loop.run_for(_SETTLE_NS)
         busy = loop.observe(int(job["seconds"] * 1e9))
         counts = {
-            "slaves": len(loop.master.units),
+            "slaves": len(loop.master.slaves),
             "reads": traffic.reads,
             "octets": traffic.octets,
             "errors": traffic.errors,
@@ -67,7 +67,7 @@ class Traffic:
         self._octets = 0
         self._master = master
         self._content = content
-        for station in master.units:
+        for station in master.slaves:
             self._read(station)
         self._write()
 
@@ -85,7 +85,7 @@ class Traffic:
         self._start(station, upload(0x1018, 1)).watch(done)
 
     def _write(self) -> None:
-        mailbox = self._master.units[_FIRST_STATION].mailbox
+        mailbox = self._master.slaves[_FIRST_STATION].mailbox
         assert mailbox is not None  # noqa: S101  all slaves are in OP
 
         def done(task: Task[int]) -> None:

@@ -8,7 +8,7 @@ import msgspec
 
 from devicebus.master.master import Master
 from devicebus.sim.devices.build import build_segment
-from devicebus.sim.segment import Segment, Side
+from devicebus.sim.segment import SegmentEnd, SimulatedSegment
 from devicebus.sim.spec import BusSpec
 from tools.bench.buses import bus
 from tools.bench.figures import Figure, report
@@ -48,7 +48,7 @@ def _measure(slaves: int, repeats: int) -> float:
     return best
 
 
-def _operate(segment: Segment) -> tuple[bytes, int]:
+def _operate(segment: SimulatedSegment) -> tuple[bytes, int]:
     """Bring *segment* to OP on a virtual clock; return the frame of a cycle, and the time.
 
     Raises:
@@ -72,12 +72,12 @@ def _operate(segment: Segment) -> tuple[bytes, int]:
     return frames[0], now_ns  # process data goes first
 
 
-def _exchange(master: Master, segment: Segment, frames: list[bytes], now_ns: int) -> int:
+def _exchange(master: Master, segment: SimulatedSegment, frames: list[bytes], now_ns: int) -> int:
     """Let *frames* go round; return the time."""
     now_ns += _TRIP_NS
     for frame in frames:
         octets = bytearray(frame)
-        if segment.process_frame(octets, now_ns) is Side.PRIMARY:
+        if segment.process_frame(octets, now_ns) is SegmentEnd.PRIMARY:
             master.receive_frame(octets, now_ns)
     master.handle_timeout(now_ns)
     return now_ns

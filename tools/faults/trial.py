@@ -48,7 +48,7 @@ class Trial:
     def __init__(self, case: Case) -> None:
         self._case = case
         self._bench = Bench()
-        self._names = {at: unit.name for at, unit in self._bench.master.units.items()}
+        self._names = {at: unit.name for at, unit in self._bench.master.slaves.items()}
         self._start_ns = 0
         self._unwell_ns: int | None = None
         self._task: Task[object] | None = None
@@ -135,7 +135,7 @@ class Trial:
         request, bench = self._case.request, self._bench
         if request is None:
             return
-        mailbox = bench.master.units[request.station].mailbox
+        mailbox = bench.master.slaves[request.station].mailbox
         if mailbox is None:
             raise RuntimeError(f"{self._names[request.station]} has no mailbox")
         begin_ns = bench.now_ns

@@ -12,13 +12,13 @@ from devicebus.mailbox.soe_server import SoeParameter
 from devicebus.sim.device import Behaviour, Device
 from devicebus.sim.devices import drive, esi
 from devicebus.sim.devices.drive import Axes
-from devicebus.sim.devices.objects import INPUTS, OUTPUTS, build_dictionary, places
+from devicebus.sim.devices.objects import INPUTS, OUTPUTS, build_dictionary, object_ids_of
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.devices.signal import Signals
 from devicebus.sim.devices.siibuild import RAM, build_image, plan_channels
 from devicebus.sim.esc import Esc, EscSettings
-from devicebus.sim.segment import Cable, Segment
-from devicebus.sim.slave import Slave
+from devicebus.sim.segment import Cable, SimulatedSegment
+from devicebus.sim.slave import SimulatedSlave
 from devicebus.sim.spec import BusSpec, ChannelSpec, ClockSpec, DeviceKind, SlaveSpec
 from eap.codec import datatypes
 from eap.od.dictionary import ObjectDictionary
@@ -93,7 +93,7 @@ _NONE: Mapping[str, bytes] = {}
 
 def build_slave(
     spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE, *, ports: Iterable[int] = (0, 1)
-) -> Slave:
+) -> SimulatedSlave:
     """Make one slave.
 
     Args:
@@ -129,10 +129,10 @@ def build_slave(
             drive.report = partial(device.report_error, axis=axis)
     emulates = spec.mailbox is None and not layout.channels[0].length + layout.channels[1].length
     image = build_image(spec, dictionary, layout, emulates=emulates, ports=ports)
-    return Slave(Esc(image, _settings(spec, ports)), device)
+    return SimulatedSlave(Esc(image, _settings(spec, ports)), device)
 
 
-def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Segment:
+def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> SimulatedSegment:
     """Make all slaves of *bus* and wire them.
 
     Raises:
@@ -153,13 +153,13 @@ def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Segme
         for spec, there in zip(bus.slaves, ports, strict=True)
     ]
     ring_end = (len(slaves) - 1, 1) if bus.ring else None
-    return Segment(slaves, cables, ring_end=ring_end, cable_ns=bus.cable_ns)
+    return SimulatedSegment(slaves, cables, ring_end=ring_end, cable_ns=bus.cable_ns)
 
 
 def _channels(spec: SlaveSpec) -> dict[str, tuple[int, int]]:
     """Return the entries of inputs and outputs by those names that only one of them has."""
     channels = (*spec.inputs, *spec.outputs)
-    found = (*places(spec.inputs, INPUTS), *places(spec.outputs, OUTPUTS))
+    found = (*object_ids_of(spec.inputs, INPUTS), *object_ids_of(spec.outputs, OUTPUTS))
     counts = Counter(channel.name for channel in channels)
     return {
         channel.name: place

@@ -36,7 +36,7 @@ _STANDARD = frozenset(
 _MAX_SUBINDEX = 0xFF
 
 
-class _Part(NamedTuple):
+class _SubItem(NamedTuple):
     """One subindex of a data type."""
 
     subindex: int
@@ -92,7 +92,7 @@ def objects(device: Element) -> Iterator[ObjectSpec]:
         if index in _STANDARD or not bits:
             continue
         kind = text_at(item, "Type", "")
-        parts = list(_parts(types.get(kind), types))
+        parts = list(_sub_items(types.get(kind), types))
         name = text_at(item, "Name", f"0x{index:04X}")
         if parts:
             yield ObjectSpec(index=index, name=name, entries=tuple(_entries(item, parts)))
@@ -102,7 +102,7 @@ def objects(device: Element) -> Iterator[ObjectSpec]:
             yield ObjectSpec(index=index, name=name, type=simple, value=value, access=_access(item))
 
 
-def _parts(kind: Element | None, types: dict[str, Element]) -> Iterator[_Part]:
+def _sub_items(kind: Element | None, types: dict[str, Element]) -> Iterator[_SubItem]:
     """Yield the subindexes from 1 on of a data type; nothing if it has none."""
     for item in () if kind is None else kind.iterfind("SubItem"):
         name = text_at(item, "Type", "")
@@ -114,12 +114,12 @@ def _parts(kind: Element | None, types: dict[str, Element]) -> Iterator[_Part]:
         subindex = number(text_at(item, "SubIdx", "0"))
         if 0 < subindex <= _MAX_SUBINDEX and bits:
             label = text_at(item, "Name", f"SubIndex {subindex:03}")
-            yield _Part(subindex, label, type_of(_base(name, types), bits), bits, access)
+            yield _SubItem(subindex, label, type_of(_base(name, types), bits), bits, access)
 
 
 def _elements(
     array: Element | None, types: dict[str, Element], access: AccessKind
-) -> Iterator[_Part]:
+) -> Iterator[_SubItem]:
     """Yield the elements of an array."""
     if array is None:
         return
@@ -130,10 +130,10 @@ def _elements(
         return
     kind = type_of(_base(text_at(array, "BaseType", ""), types), bits)
     for subindex in range(max(first, 1), min(first + count, _MAX_SUBINDEX + 1)):
-        yield _Part(subindex, f"SubIndex {subindex:03}", kind, bits, access)
+        yield _SubItem(subindex, f"SubIndex {subindex:03}", kind, bits, access)
 
 
-def _entries(item: Element, parts: list[_Part]) -> Iterator[EntrySpec]:
+def _entries(item: Element, parts: list[_SubItem]) -> Iterator[EntrySpec]:
     told = {text_at(each, "Name", ""): each.find("Info") for each in item.iterfind("Info/SubItem")}
     for part in {each.subindex: each for each in parts}.values():
         yield EntrySpec(

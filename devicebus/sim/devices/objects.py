@@ -66,7 +66,7 @@ def mapping(
     limit = min(len(numbers) + SPARE_ENTRIES, _MAX_ENTRIES)
     count = Entry("SubIndex 000", "USINT", RW_PREOP, len(numbers), maximum=limit)
     entries = {0: count, **_numbered(index, numbers, limit, "UDINT", count)}
-    count.write = _judge_mapping(index, entries, dictionary, room)
+    count.write = _check_mapping(index, entries, dictionary, room)
     return OdObject(index, f"{name} mapping", ObjectCode.RECORD, entries, data_type=_PDO_MAPPING)
 
 
@@ -76,7 +76,7 @@ def assignment(index: int, pdos: Sequence[int], dictionary: ObjectDictionary) ->
     count = Entry("SubIndex 000", "USINT", RW_PREOP, len(pdos), maximum=limit)
     entries = {0: count, **_numbered(index, pdos, limit, "UINT", count)}
     room = max(MIN_ROOM, (sum(_bits(dictionary, pdo) for pdo in pdos) + 7) // 8)
-    count.write = _judge_assignment(index, entries, dictionary, room)
+    count.write = _check_assignment(index, entries, dictionary, room)
     title = "RxPDO assign" if index == RX_ASSIGN else "TxPDO assign"
     return OdObject(index, title, ObjectCode.ARRAY, entries, data_type=0x06)
 
@@ -105,7 +105,7 @@ def _while_empty(index: int, sub: int, count: Entry) -> Callable[[bytes], None]:
     return check
 
 
-def _judge_mapping(
+def _check_mapping(
     index: int, entries: dict[int, Entry], dictionary: ObjectDictionary, room: int
 ) -> Callable[[bytes], None]:
     right = Access.TX_MAPPABLE if index >= TX_PDO else Access.RX_MAPPABLE
@@ -133,7 +133,7 @@ def _judge_mapping(
     return check
 
 
-def _judge_assignment(
+def _check_assignment(
     index: int, entries: dict[int, Entry], dictionary: ObjectDictionary, room: int
 ) -> Callable[[bytes], None]:
     first = RX_PDO if index == RX_ASSIGN else TX_PDO
@@ -167,7 +167,7 @@ _SM_TYPES = (1, 2, 3, 4)
 _IDENTITY_TYPE = 0x23
 
 
-def places(channels: Sequence[ChannelSpec], base: int) -> list[ObjectId]:
+def object_ids_of(channels: Sequence[ChannelSpec], base: int) -> list[ObjectId]:
     """Return the entry of each of *channels*; those that name none count up from *base*:01."""
     found = []
     free = 0
@@ -205,7 +205,7 @@ def _add_side(
     """Add the entries of one direction, the PDOs that map them, and which of these count."""
     pdos: dict[int, list[tuple[int, int, int]]] = {}
     assigned: dict[int, bool] = {}
-    for channel, (index, subindex) in zip(channels, places(channels, base), strict=True):
+    for channel, (index, subindex) in zip(channels, object_ids_of(channels, base), strict=True):
         kind = datatypes.parse(channel.type)
         if index:
             kind = _add_entry(dictionary, index, subindex, channel, access).kind

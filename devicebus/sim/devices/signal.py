@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from zlib import crc32
 
-from devicebus.sim.devices.objects import INPUTS, OUTPUTS, places
+from devicebus.sim.devices.objects import INPUTS, OUTPUTS, object_ids_of
 from devicebus.sim.spec import ChannelSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
 from eap.codec.values import DataType
@@ -29,11 +29,15 @@ class Signals:
         self, spec: SlaveSpec, dictionary: ObjectDictionary, resources: Mapping[str, bytes]
     ) -> None:
         outputs = dict(
-            zip((each.name for each in spec.outputs), places(spec.outputs, OUTPUTS), strict=True)
+            zip(
+                (each.name for each in spec.outputs),
+                object_ids_of(spec.outputs, OUTPUTS),
+                strict=True,
+            )
         )
         self._sources: list[tuple[Entry, Callable[[int], float]]] = []
         self._started_ns: int | None = None
-        for channel, place in zip(spec.inputs, places(spec.inputs, INPUTS), strict=True):
+        for channel, place in zip(spec.inputs, object_ids_of(spec.inputs, INPUTS), strict=True):
             source = _source(channel, dictionary, outputs, resources)
             if source is not None:
                 self._sources.append((dictionary.entry(*place), source))

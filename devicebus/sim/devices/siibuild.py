@@ -65,7 +65,7 @@ class _Strings:
         return len(self.texts)
 
 
-class Layout(NamedTuple):
+class SyncManagerLayout(NamedTuple):
     """Where the sync managers lie, and which of them carry outputs and inputs."""
 
     channels: tuple[SiiSyncManager, ...]
@@ -73,7 +73,9 @@ class Layout(NamedTuple):
     input_channel: int
 
 
-def plan_channels(mailbox: MailboxSpec | None, output_size: int, input_size: int) -> Layout:
+def plan_channels(
+    mailbox: MailboxSpec | None, output_size: int, input_size: int
+) -> SyncManagerLayout:
     """Place mailboxes and process data; each buffered area has room for its three buffers.
 
     There is room as well for what a master may map beside.
@@ -98,13 +100,13 @@ def plan_channels(mailbox: MailboxSpec | None, output_size: int, input_size: int
             f"mailboxes and process data, three times each, take {end - _FIRST} octets,"
             f" expected at most {RAM}"
         )
-    return Layout(tuple(channels), first, first + 1)
+    return SyncManagerLayout(tuple(channels), first, first + 1)
 
 
 def build_image(
     spec: SlaveSpec,
     dictionary: ObjectDictionary,
-    layout: Layout,
+    layout: SyncManagerLayout,
     *,
     emulates: bool,
     ports: Iterable[int] = (0, 1),

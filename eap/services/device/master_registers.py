@@ -6,7 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from devicebus.master.procedure import Procedure
-from devicebus.master.scan import Identity, count_slaves, find_joints, read_identity, read_stations
+from devicebus.master.scan import (
+    Identity,
+    count_slaves,
+    find_topology,
+    read_identity,
+    read_stations,
+)
 from devicebus.wire.datagram import DatagramRequest, fprd
 from devicebus.wire.register import AlStatus, DlStatus, Register
 
@@ -58,12 +64,12 @@ def neighbour(
         port: Of that slave.
     """
     stations = [each for each in order if each in registers]
-    joints = find_joints([registers[each].dl for each in stations])
-    for position, joint in enumerate(joints):
-        there = None if joint.parent is None else stations[joint.parent]
-        if stations[position] == station and joint.entry_port == port:
+    nodes = find_topology([registers[each].dl for each in stations])
+    for position, node in enumerate(nodes):
+        there = None if node.parent is None else stations[node.parent]
+        if stations[position] == station and node.entry_port == port:
             return there or 0
-        if there == station and joint.parent_port == port:
+        if there == station and node.parent_port == port:
             return stations[position]
     return 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from devicebus.sim.devices.build import build_segment
-from devicebus.sim.slave import Slave
+from devicebus.sim.slave import SimulatedSlave
 from devicebus.sim.spec import (
     BusSpec,
     ChannelSpec,
@@ -78,14 +78,14 @@ def _with_header(octets: bytes, number: int) -> bytes:
                           body)  # fmt: skip
 
 
-def _open_mailbox(slave: Slave) -> None:
+def _open_mailbox(slave: SimulatedSlave) -> None:
     for number, channel in enumerate(_CHANNELS):
         slave.esc.write(Register.SYNC_MANAGER + 8 * number, channel.encode(), 0)
     slave.esc.write(Register.AL_CONTROL, AlState.PREOP.to_bytes(2, "little"), 0)
     slave.run(0)
 
 
-def _fetch(slave: Slave, now_ns: int) -> None:
+def _fetch(slave: SimulatedSlave, now_ns: int) -> None:
     """Read what a slave has to say; it must come to an end."""
     for _ in range(_MAX_ANSWERS):
         slave.run(now_ns)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from devicebus.drive import drive
 from devicebus.errors import BusError
 from devicebus.master import eeprom
-from devicebus.master.image import SlaveShape, lay_out
+from devicebus.master.image import SlaveProcessData, plan_image
 from devicebus.master.pdo import channels_from_sii
 from devicebus.master.procedure import Sleep, Step, StepReplies
 from devicebus.wire import sii
@@ -54,7 +54,7 @@ def _decode(image: bytes) -> None:
     ):  # fmt: skip
         raise AssertionError("the image encodes to another device")
     with suppress(BusError, CodecError):
-        lay_out([SlaveShape(1001, channels_from_sii(content))])
+        plan_image([SlaveProcessData(1001, channels_from_sii(content))])
 
 
 def _read(image: bytes) -> bytes:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from devicebus.errors import BusError, EoeError, MailboxProtocolError, MailboxRefusedError
 from devicebus.mailbox import eoe
-from devicebus.mailbox.eoe import MAX_FRAME, MAX_PENDING, Assembler, EoeServer, iter_fragments
+from devicebus.mailbox.eoe import MAX_FRAME, MAX_PENDING, EoeServer, FrameAssembler, iter_fragments
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.eoe import EoeHeader, EoeResult, FragmentWord, IpSettings
 from eap.codec.mailbox import MailboxError, MailboxType
@@ -26,14 +26,14 @@ def fragments(frame: bytes = FRAME, number: int = 0, room: int = 40) -> list[byt
     return list(iter_fragments(frame, number, room))
 
 
-def receive(assembler: Assembler, *messages: bytes) -> list[bytes]:
+def receive(assembler: FrameAssembler, *messages: bytes) -> list[bytes]:
     found = [assembler.receive(message) for message in messages]
     return [frame for frame in found if frame is not None]
 
 
 @pytest.mark.parametrize("number", range(4))
 def test_captured_frame_is_read_and_written_again(number: int) -> None:
-    (frame,) = receive(Assembler(), CAPTURED[number])
+    (frame,) = receive(FrameAssembler(), CAPTURED[number])
     assert frame == CAPTURED[number][4:]
     assert fragments(frame, number, 1014) == [CAPTURED[number]]
 
@@ -48,11 +48,11 @@ def test_fragments_lie_as_on_the_wire() -> None:
 def test_round_trip(frame: bytes, room: int, number: int) -> None:
     messages = fragments(frame, number, room)
     assert all(len(message) <= room + 4 for message in messages)
-    assert receive(Assembler(), *messages) == [frame]
+    assert receive(FrameAssembler(), *messages) == [frame]
 
 
 def test_short_frame_fits_a_small_mailbox() -> None:
-    assert receive(Assembler(), *fragments(b"short", room=6)) == [b"short"]
+    assert receive(FrameAssembler(), *fragments(b"short", room=6)) == [b"short"]
 
 
 @pytest.mark.parametrize(
@@ -70,14 +70,14 @@ def test_frame_that_cannot_be_sent(frame: bytes, room: int, reason: str) -> None
 
 def test_time_behind_a_frame_is_no_part_of_it() -> None:
     header = EoeHeader(0, last=1, time_appended=1).encode() + FragmentWord(0, 1, 0).encode()
-    assert receive(Assembler(), header + b"frame" + b"time") == [b"frame"]
+    assert receive(FrameAssembler(), header + b"frame" + b"time") == [b"frame"]
     with pytest.raises(CodecError, match="no room for the time"):
-        Assembler().receive(header + b"tim")
+        FrameAssembler().receive(header + b"tim")
 
 
 @pytest.mark.parametrize("missing", range(4))
 def test_frame_with_a_missing_fragment_is_dropped(missing: int) -> None:
-    assembler = Assembler()
+    assembler = FrameAssembler()
     messages = fragments()
     del messages[missing]
     assert receive(assembler, *messages, *fragments(number=1)) == [FRAME]
@@ -85,13 +85,13 @@ def test_frame_with_a_missing_fragment_is_dropped(missing: int) -> None:
 
 
 def test_fragments_of_two_frames_do_not_mix() -> None:
-    assembler = Assembler()
+    assembler = FrameAssembler()
     assert receive(assembler, *fragments()[:2], *fragments(number=1)[2:]) == []
     assert assembler.dropped == 2
 
 
 def test_offset_that_does_not_fit_drops_the_frame() -> None:
-    assembler = Assembler()
+    assembler = FrameAssembler()
     first, second = fragments(bytes(64), room=32)
     wrong = second[:2] + FragmentWord(1, 2, 0).encode() + second[4:]
     assert receive(assembler, first, wrong) == []
@@ -99,7 +99,7 @@ def test_offset_that_does_not_fit_drops_the_frame() -> None:
 
 
 def test_reset_forgets_the_frame_under_way() -> None:
-    assembler = Assembler()
+    assembler = FrameAssembler()
     first, last = fragments(bytes(64), room=32)
     assembler.receive(first)
     assembler.reset()
@@ -108,7 +108,7 @@ def test_reset_forgets_the_frame_under_way() -> None:
 
 @given(st.lists(st.binary(min_size=4, max_size=700), max_size=20))
 def test_any_fragments_give_frames_or_codec_error(noise: list[bytes]) -> None:
-    assembler = Assembler()
+    assembler = FrameAssembler()
     for octets in noise:
         message = bytes((0, octets[1])) + octets[2:]
         try:
@@ -165,7 +165,7 @@ def ask(server: EoeServer, octets: str) -> list[str]:
 
 
 def drain(server: EoeServer) -> list[bytes]:
-    assembler = Assembler()
+    assembler = FrameAssembler()
     found = []
     while messages := server.messages_to_send(0):
         assert len(messages) == 1

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.protocol import (
     MINIMUM_SIZE,
-    CounterWatch,
+    CounterCheck,
     MailboxSizes,
     next_counter,
-    refuse,
+    raise_mailbox_error,
 )
 from eap.codec.mailbox import MailboxError
 
@@ -30,7 +30,7 @@ def test_mailbox_that_is_too_small_is_refused(sizes: tuple[int, int]) -> None:
 
 def test_refusal_carries_the_detail_of_the_standard() -> None:
     with pytest.raises(MailboxRefusedError, match="INVALID_HEADER: no length") as caught:
-        refuse(MailboxError.INVALID_HEADER, "no length")
+        raise_mailbox_error(MailboxError.INVALID_HEADER, "no length")
     assert caught.value.detail == 5
 
 
@@ -42,25 +42,25 @@ def test_counter_goes_from_1_to_7_and_never_to_0() -> None:
 
 
 def test_same_counter_is_a_repeat() -> None:
-    watch = CounterWatch()
+    watch = CounterCheck()
     assert [watch.is_new(counter) for counter in (3, 3, 3, 4)] == [True, False, False, True]
     assert (watch.repeated, watch.gaps) == (2, 0)
 
 
 def test_counter_0_is_always_new_and_starts_again() -> None:
-    watch = CounterWatch()
+    watch = CounterCheck()
     assert all(watch.is_new(counter) for counter in (0, 0, 5, 0, 5))
     assert (watch.repeated, watch.gaps) == (0, 0)
 
 
 def test_missing_counters_are_gaps() -> None:
-    watch = CounterWatch()
+    watch = CounterCheck()
     assert all(watch.is_new(counter) for counter in (6, 7, 1, 3, 1, 2))
     assert watch.gaps == 2
 
 
 def test_restart_takes_any_counter_and_keeps_the_counts() -> None:
-    watch = CounterWatch()
+    watch = CounterCheck()
     assert watch.is_new(1)
     assert not watch.is_new(1)
     watch.restart()
@@ -70,7 +70,7 @@ def test_restart_takes_any_counter_and_keeps_the_counts() -> None:
 
 @given(st.lists(st.integers(1, 3)))
 def test_own_sequence_with_repeats_has_no_gaps(repeats: list[int]) -> None:
-    watch = CounterWatch()
+    watch = CounterCheck()
     counter = 0
     for times in repeats:
         counter = next_counter(counter)

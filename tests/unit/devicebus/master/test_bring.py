@@ -13,10 +13,10 @@ from devicebus.master.bring import (
     wait_for,
 )
 from devicebus.master.bus import MasterSettings
-from devicebus.master.image import lay_out
+from devicebus.master.image import plan_image
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.master import Master
-from devicebus.master.pdo import PdoChoice
+from devicebus.master.pdo import PdoConfiguration
 from devicebus.master.scan import assign_stations
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Fmmu, Register, SyncManager
@@ -45,7 +45,7 @@ def test_mailboxes_by_state():
 
 
 def test_process_data_is_set_up_and_cleared(line):
-    (place,) = lay_out([shape(1001, (8,), (16,))]).places.values()
+    (place,) = plan_image([shape(1001, (8,), (16,))]).slaves.values()
     run(line, set_process_data(place))
     memory = line.segment.slaves[0].esc.memory
     managers = [SyncManager.decode(memory, Register.SYNC_MANAGER + 8 * n) for n in (2, 3)]
@@ -73,7 +73,7 @@ def test_the_watchdog_is_set_in_milliseconds(line):
 
 
 def test_a_slave_that_is_gone(line):
-    (place,) = lay_out([shape(1005, (8,))]).places.values()
+    (place,) = plan_image([shape(1005, (8,))]).slaves.values()
     with pytest.raises(WorkingCounterError, match="slave 1005: writing sync manager 2"):
         run(line, set_process_data(place))
 
@@ -91,7 +91,7 @@ def request(line, target, station=1001):
 
 def test_mailboxes_open_and_close_with_the_states():
     line = line_of(slave("a"))
-    unit = line.core.units[1001]
+    unit = line.core.slaves[1001]
     preop = unit.mailbox
     assert preop is not None
     request(line, AlState.INIT)
@@ -103,8 +103,8 @@ def test_mailboxes_open_and_close_with_the_states():
 
 
 def test_a_choice_of_pdos_is_written_before_they_are_read():
-    choice = PdoChoice(assignment={2: (), 3: (0x1A00,)})
-    line = Paced(Master(MasterSettings(choices={1001: choice})), segment(slave("a")))
+    choice = PdoConfiguration(assignment={2: (), 3: (0x1A00,)})
+    line = Paced(Master(MasterSettings(pdo_configurations={1001: choice})), segment(slave("a")))
     line.wait(line.core.bring_up(line.now_ns))
     assert [each.name for each in line.core.image.layout.variables] == ["in"]
     assert line.segment.slaves[0].state is AlState.OP
@@ -130,12 +130,12 @@ def test_refusals_are_told():
     line.segment.slaves[0].refuses[AlState.SAFEOP] = 0x1E
     with pytest.raises(AlStatusError, match="0x001E, invalid input configuration"):
         request(line, AlState.SAFEOP)
-    assert line.core.units[1001].state is AlState.PREOP
+    assert line.core.slaves[1001].state is AlState.PREOP
 
 
 def test_a_slave_nobody_knows_anything_of_is_not_touched():
     line = line_of(slave("a"))
-    unit = line.core.units[1001]
+    unit = line.core.slaves[1001]
     unit.found = unit.found._replace(fault="its EEPROM is empty")
     frames = line.frames
     with pytest.raises(SiiError, match="its EEPROM is empty"):

@@ -6,8 +6,8 @@ import pytest
 
 from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master import bus
-from devicebus.master.bus import MAX_EVENTS, Bus, BusLost, MasterSettings, Unit
-from devicebus.master.cycle import Presence
+from devicebus.master.bus import MAX_EVENTS, BusLost, BusSlave, BusState, MasterSettings
+from devicebus.master.cycle import Participation
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.scan import scan
 from devicebus.master.startup import set_up_cycle
@@ -31,8 +31,8 @@ AREA = MailboxArea(0x1000, 128, 0x1080, 128)
 
 def made():
     (found,) = run(Line(Bench(), segment(slave("a"))), scan())
-    bus = Bus(MasterSettings(acyclic_octets=100))
-    unit = bus.units[1001] = Unit(found, "first")
+    bus = BusState(MasterSettings(acyclic_octets=100))
+    unit = bus.slaves[1001] = BusSlave(found, "first")
     return bus, unit
 
 
@@ -64,7 +64,7 @@ def talk():
 
 def test_forgetting_ends_what_runs():
     bus, unit = made()
-    bus.set_presence(unit, Presence.PRESENT)
+    bus.set_participation(unit, Participation.ACTIVE)
     set_up_cycle(bus)
     bus.open_mailbox(unit, AREA)
     unit.work = bus.runner.start(scan(), 0)
@@ -72,7 +72,7 @@ def test_forgetting_ends_what_runs():
     bus.is_lost = bus.is_troubled = True
     bus.forget()
     assert not unit.is_busy
-    assert (bus.units, bus.image, bus.cycle, unit.mailbox) == ({}, None, None, None)
+    assert (bus.slaves, bus.image, bus.cycle, unit.mailbox) == ({}, None, None, None)
     assert not bus.is_lost
     assert not bus.is_troubled
 

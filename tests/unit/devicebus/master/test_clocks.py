@@ -6,13 +6,13 @@ from devicebus.errors import WorkingCounterError
 from devicebus.master.clocks import (
     Latched,
     Sync0,
-    drift_access,
+    drift_datagram,
     find_delays,
     read_difference,
     start_sync0,
     synchronize,
 )
-from devicebus.master.scan import Joint, scan
+from devicebus.master.scan import TopologyNode, scan
 from devicebus.sim.segment import CABLE_NS, FORWARD_NS
 from devicebus.sim.spec import ClockSpec
 from devicebus.wire.register import Register
@@ -70,16 +70,16 @@ def test_delays_along_a_line_with_branches():
 
 
 def test_times_of_32_bits_that_wrap():
-    joints = {
-        0: Joint((0, 1), None, 0, 0),
-        1: Joint((0,), 0, 1, 0),
+    nodes = {
+        0: TopologyNode((0, 1), None, 0, 0),
+        1: TopologyNode((0,), 0, 1, 0),
     }
     start = 0xFFFF_FF00
     latched = {
         0: Latched((start, start + 700 & 0xFFFF_FFFF, 0, 0), start),
         1: Latched((50, 0, 0, 0), 50),
     }
-    assert find_delays(joints, latched) == {0: 0, 1: 350}
+    assert find_delays(nodes, latched) == {0: 0, 1: 350}
 
 
 def test_a_bus_without_clocks_has_nothing_to_do():
@@ -102,8 +102,8 @@ def test_one_that_came_back_is_set_and_the_others_left_alone(back):
 
 
 def test_a_slave_behind_one_that_is_not_known_begins_anew():
-    joints = {2: Joint((0,), 1, 1, 0)}
-    assert find_delays(joints, {2: Latched((5, 0, 0, 0), 5)}) == {2: 0}
+    nodes = {2: TopologyNode((0,), 1, 1, 0)}
+    assert find_delays(nodes, {2: Latched((5, 0, 0, 0), 5)}) == {2: 0}
 
 
 def test_drift_is_taken_out_by_the_datagram_of_every_cycle():
@@ -111,7 +111,7 @@ def test_drift_is_taken_out_by_the_datagram_of_every_cycle():
     run(line, synchronize(found, TIME))
 
     def steer():
-        yield [drift_access(1001)]
+        yield [drift_datagram(1001)]
 
     for _ in range(3000):
         run(line, steer())

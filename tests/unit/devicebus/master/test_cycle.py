@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.master.cycle import MAX_UNDER_WAY, Cycle, Presence
-from devicebus.master.image import BASE, BusImage, lay_out
+from devicebus.master.cycle import MAX_UNDER_WAY, Cycle, Participation
+from devicebus.master.image import BASE, BusImage, plan_image
 from devicebus.master.link import BACKOFF_LIMIT_NS, LINGER_NS, Link
 from devicebus.wire.datagram import Command, DatagramRequest, frmw
 from tests.support.busline import MS, accesses_of, answer
@@ -15,11 +15,11 @@ SHAPES = (shape(1, (8, 8), (16,)), shape(2, (8,), (8,)), shape(3, (), (8,)))
 class Fixture:
     def __init__(self, *, knows_lrw=True, present=(1, 2, 3)):
         self.link = Link()
-        self.image = BusImage(lay_out(SHAPES))
+        self.image = BusImage(plan_image(SHAPES))
         self.troubles = []
         self.cycle = Cycle(self.link, self.image, self.troubles.append, knows_lrw=knows_lrw)
         for station in present:
-            self.cycle.set_presence(station, Presence.PRESENT)
+            self.cycle.set_participation(station, Participation.ACTIVE)
 
     def round(self, wkc, data=b"", now_ns=0):
         self.cycle.start(now_ns)
@@ -63,18 +63,18 @@ def test_a_wrong_working_counter_leaves_the_inputs_alone():
 def test_inputs_of_those_who_are_there_go_on_while_one_is_away():
     f = Fixture()
     f.round(7, b"...WXYZ")
-    f.cycle.set_presence(1, Presence.AWAY)
+    f.cycle.set_participation(1, Participation.ABSENT)
     f.round(4, b"...\0\0yz")
     assert f.image.inputs == b"WXyz"
     assert f.cycle.stats().wkc_errors == 0
-    assert f.cycle.presence(1) is Presence.AWAY
-    assert f.cycle.presence(99) is Presence.AWAY
+    assert f.cycle.participation(1) is Participation.ABSENT
+    assert f.cycle.participation(99) is Participation.ABSENT
 
 
 @pytest.mark.parametrize(("wkc", "errors"), [(4, 0), (6, 1), (7, 0), (3, 1), (8, 1)])
 def test_a_slave_nobody_is_sure_of_counts_wholly_or_not_at_all(wkc, errors):
     f = Fixture()
-    f.cycle.set_presence(1, Presence.UNSURE)
+    f.cycle.set_participation(1, Participation.UNCERTAIN)
     f.round(wkc, b"...WXYZ")
     assert f.cycle.stats().wkc_errors == errors
     assert f.image.inputs == (b"\0\0\0\0" if errors else b"\0\0YZ")
@@ -84,7 +84,7 @@ def test_what_is_expected_holds_from_the_next_cycle_on():
     f = Fixture()
     f.cycle.start(0)
     (frame,) = f.link.frames_to_send(0)
-    f.cycle.set_presence(1, Presence.AWAY)
+    f.cycle.set_participation(1, Participation.ABSENT)
     f.link.receive_frame(answer(frame, wkc=7), 1)
     assert f.cycle.stats().good == 1
 
@@ -144,14 +144,14 @@ def test_more_datagrams_go_with_a_cycle():
     f = Fixture()
     taken = []
     f.cycle.extra = [frmw(1, 0x910, 8)]
-    f.cycle.take_extra = taken.extend
+    f.cycle.handle_extra = taken.extend
     accesses = f.round(7, b"...WXYZ")
     assert [each.command for each in accesses] == [Command.LRW, Command.FRMW]
     assert taken[0].data == b"...WXYZ\0"
 
 
 def test_a_bus_without_process_data_sends_nothing():
-    cycle = Cycle(link := Link(), BusImage(lay_out([])), lambda now: None, knows_lrw=True)
+    cycle = Cycle(link := Link(), BusImage(plan_image([])), lambda now: None, knows_lrw=True)
     cycle.start(0)
     assert (link.frames_to_send(0), cycle.stats().cycles) == ([], 0)
 
@@ -169,7 +169,7 @@ def test_whether_the_last_cycle_came_back_well_is_known_at_any_time():
 
 def test_a_cycle_without_one_who_should_take_part_is_good_but_not_full():
     f = Fixture()
-    f.cycle.set_presence(3, Presence.UNSURE)
+    f.cycle.set_participation(3, Participation.UNCERTAIN)
     f.round(6)
     assert f.cycle.is_good
     assert not f.cycle.is_full

@@ -5,26 +5,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devicebus.errors import BusError
-from devicebus.master.image import BASE, BusImage, Group, SlaveShape, kind_of, lay_out
+from devicebus.master.image import (
+    BASE,
+    BusImage,
+    DatagramGroup,
+    SlaveProcessData,
+    data_type_of,
+    plan_image,
+)
 from devicebus.master.link import MAX_DATA
-from devicebus.master.pdo import Channel, Pdo, PdoEntry
+from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel
 
 
 def channel(number, *bits, is_output, start=0x1100, name=""):
     entries = tuple(PdoEntry(0x7000, sub, size, name) for sub, size in enumerate(bits, 1))
     control = 0x64 if is_output else 0x20
-    return Channel(number, start, control, is_output, (Pdo(0x1600, entries),))
+    return ProcessDataChannel(number, start, control, is_output, (Pdo(0x1600, entries),))
 
 
 def shape(station, outputs=(), inputs=(), **options):
     channels = (channel(2, *outputs, is_output=True), channel(3, *inputs, is_output=False))
-    return SlaveShape(station, channels, **options)
+    return SlaveProcessData(station, channels, **options)
 
 
 def test_outputs_come_first_then_inputs():
-    layout = lay_out([shape(1, (8, 8), (16,)), shape(2, (1, 1), (32,))])
-    assert layout.groups == (Group(BASE, 0, 3, 0, 6),)
-    one, two = layout.places.values()
+    layout = plan_image([shape(1, (8, 8), (16,)), shape(2, (1, 1), (32,))])
+    assert layout.groups == (DatagramGroup(BASE, 0, 3, 0, 6),)
+    one, two = layout.slaves.values()
     assert (one.outputs, one.outputs_size, one.inputs, one.inputs_size) == (0, 2, 0, 2)
     assert (two.outputs, two.outputs_size, two.inputs, two.inputs_size) == (2, 1, 2, 4)
     assert [(f.logical_start - BASE, f.length, f.type) for f in one.fmmus + two.fmmus] == [
@@ -34,7 +41,7 @@ def test_outputs_come_first_then_inputs():
 
 
 def test_sync_managers_have_the_length_of_their_pdos_and_are_off_without_any():
-    (place,) = lay_out([shape(1, (8, 3), ())]).places.values()
+    (place,) = plan_image([shape(1, (8, 3), ())]).slaves.values()
     (_, outputs), (_, inputs) = place.sync_managers
     assert (outputs.length, outputs.enable, outputs.watchdog, outputs.direction) == (2, 1, 1, 1)
     assert (inputs.length, inputs.enable) == (0, 0)
@@ -44,27 +51,27 @@ def test_sync_managers_have_the_length_of_their_pdos_and_are_off_without_any():
 def test_entries_have_names_and_bits():
     padded = Pdo(0x1A00, (PdoEntry(0x6000, 1, 1, "a"), PdoEntry(0, 0, 7), PdoEntry(0x6000, 2, 16)))
     twice = Pdo(0x1A01, (PdoEntry(0x6010, 1, 8, "a"),))
-    channels = (Channel(3, 0x1180, 0x20, False, (padded, twice)),)
-    layout = lay_out([shape(1, (), (8,)), SlaveShape(2, channels)])
+    channels = (ProcessDataChannel(3, 0x1180, 0x20, False, (padded, twice)),)
+    layout = plan_image([shape(1, (), (8,)), SlaveProcessData(2, channels)])
     assert [(v.station, v.name, v.bit_offset, v.bit_length) for v in layout.variables] == [
         (1, "7000:01", 0, 8), (2, "a", 8, 1), (2, "6000:02", 16, 16), (2, "a 6010:01", 32, 8),
     ]  # fmt: skip
 
 
 def test_more_than_a_frame_holds_goes_in_several():
-    layout = lay_out([shape(at, (8,) * 200, (8,) * 300) for at in range(1, 7)])
+    layout = plan_image([shape(at, (8,) * 200, (8,) * 300) for at in range(1, 7)])
     assert [group.outputs_size + group.inputs_size for group in layout.groups] == [1000] * 3
     assert [group.address for group in layout.groups] == [BASE, BASE + 0x800, BASE + 0x1000]
     assert (layout.groups[1].outputs, layout.groups[1].inputs) == (400, 600)
-    assert layout.places[3].fmmus[1].logical_start == BASE + 0x800 + 400
+    assert layout.slaves[3].fmmus[1].logical_start == BASE + 0x800 + 400
 
 
 @given(st.lists(st.tuples(st.integers(0, 700), st.integers(0, 700)), max_size=12))
 def test_no_octet_is_used_twice_and_no_slave_is_split(sizes):
     slaves = [shape(n, (8,) * out, (8,) * into) for n, (out, into) in enumerate(sizes)]
-    layout = lay_out(slaves)
+    layout = plan_image(slaves)
     used = []
-    for place in layout.places.values():
+    for place in layout.slaves.values():
         group = layout.groups[place.group]
         end = group.address + group.outputs_size + group.inputs_size
         for fmmu in place.fmmus:
@@ -75,19 +82,19 @@ def test_no_octet_is_used_twice_and_no_slave_is_split(sizes):
 
 
 def test_a_bus_without_process_data_has_none():
-    layout = lay_out([shape(1), SlaveShape(2, ())])
+    layout = plan_image([shape(1), SlaveProcessData(2, ())])
     assert layout == ({}, (), ())
 
 
 def test_what_cannot_be_laid_out_is_refused():
     with pytest.raises(BusError, match="slave 5: 1500 octets of process data, expected at most"):
-        lay_out([shape(5, (8,) * 1500)])
+        plan_image([shape(5, (8,) * 1500)])
     with pytest.raises(BusError, match="slave 5: 2 sync managers with process data, but 1 FMMUs"):
-        lay_out([shape(5, (8,), (8,), fmmus=1)])
+        plan_image([shape(5, (8,), (8,), fmmus=1)])
     one = Pdo(0x1A00, (PdoEntry(0x6000, 1, 8, "a"),))
-    channels = tuple(Channel(n, 0x1100, 0x20, False, (one,)) for n in range(17))
+    channels = tuple(ProcessDataChannel(n, 0x1100, 0x20, False, (one,)) for n in range(17))
     with pytest.raises(BusError, match="slave 5: 17 sync managers with process data, but 16"):
-        lay_out([SlaveShape(5, channels, 255)])
+        plan_image([SlaveProcessData(5, channels, 255)])
 
 
 OUT = (
@@ -104,10 +111,12 @@ IN = (PdoEntry(0x6000, 1, 8, "count", 0x05), PdoEntry(0x6010, 1, 80, "raw"))
 @pytest.fixture
 def image():
     channels = (
-        Channel(2, 0x1100, 0x64, True, (Pdo(0x1600, OUT),)),
-        Channel(3, 0x1180, 0x20, False, (Pdo(0x1A00, IN),)),
+        ProcessDataChannel(2, 0x1100, 0x64, True, (Pdo(0x1600, OUT),)),
+        ProcessDataChannel(3, 0x1180, 0x20, False, (Pdo(0x1A00, IN),)),
     )
-    return BusImage(lay_out([SlaveShape(1001, channels), SlaveShape(1002, channels)]))
+    return BusImage(
+        plan_image([SlaveProcessData(1001, channels), SlaveProcessData(1002, channels)])
+    )
 
 
 def test_values_lie_side_by_side(image):
@@ -153,6 +162,6 @@ def test_what_is_not_there_names_what_is(image):
 
 def test_a_type_of_another_width_is_a_number_of_those_bits(image):
     variable = image.variable(1001, "mode")
-    assert kind_of(variable).text == "BIT3"
-    assert kind_of(image.variable(1001, "lamp")).text == "BOOL"
-    assert kind_of(image.variable(1001, "odd")) is None
+    assert data_type_of(variable).text == "BIT3"
+    assert data_type_of(image.variable(1001, "lamp")).text == "BOOL"
+    assert data_type_of(image.variable(1001, "odd")) is None

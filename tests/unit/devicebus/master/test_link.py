@@ -17,7 +17,7 @@ from devicebus.master.link import (
     MAX_BODY,
     MAX_DATA,
     MAX_DATAGRAMS,
-    MAX_RIDE,
+    MAX_PIGGYBACK,
     Link,
     RoundTrip,
 )
@@ -332,7 +332,7 @@ def test_indexes_go_round_and_pass_by_those_that_are_awaited(link):
 def test_cyclic_frames_go_first_and_take_a_little_along():
     link = Link(acyclic_octets=3000)
     client = Client(link)
-    long = fprd(1001, 0x1000, MAX_RIDE)
+    long = fprd(1001, 0x1000, MAX_PIGGYBACK)
     client.ask(READ, READ, long, READ)
     link.start_cycle()
     cyclic = replace(logical(Command.LRW, 0x10000, bytes(20)), tries=1)

@@ -16,7 +16,7 @@ from devicebus.errors import (
 )
 from devicebus.mailbox import coe_client, foe_client
 from devicebus.mailbox.conversation import MailboxRequest
-from devicebus.master.mailboxes import MailboxCounters, Unsolicited
+from devicebus.master.mailboxes import RequestCounters, Unsolicited
 from devicebus.sim.spec import EntrySpec, FileSpec, MailboxSpec, ObjectSpec
 from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxHeader, MailboxType
@@ -397,7 +397,7 @@ def test_hostile_answers_end_in_named_errors(line, box, octets, error, text):
 
 
 def test_mailbox_counters_have_latencies_and_errors():
-    counters = MailboxCounters()
+    counters = RequestCounters()
     nothing = counters.stats(repeats=0, duplicates=0, gaps=0)
     assert (nothing.mean_latency_ns, nothing.last_error) == (0, "")
     for latency in (30, 10, 20):

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError, FrameLostError, WorkingCounterError
-from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted, configure
+from devicebus.master.mailboxport import MailboxArea, MailboxPort, WriteResult, configure
 from devicebus.master.scan import assign_stations
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from devicebus.wire.register import Register, SyncManager
@@ -67,13 +67,15 @@ class Wire:
 
 def test_a_message_fills_its_mailbox():
     wire = Wire()
-    assert drive(MailboxPort(7, AREA).post(b"abc"), wire) == Posted(True, False)
+    assert drive(MailboxPort(7, AREA).post(b"abc"), wire) == WriteResult(True, False)
     assert wire.accesses == [DatagramRequest(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 0)]
 
 
 def test_a_full_mailbox_takes_nothing():
-    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0)) == Posted(False, False)
-    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0, tries=2)) == Posted(False, True)
+    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0)) == WriteResult(False, False)
+    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0, tries=2)) == WriteResult(
+        False, True
+    )
 
 
 def test_messages_are_fetched_whole_and_never_read_twice():

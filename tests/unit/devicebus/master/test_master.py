@@ -50,7 +50,7 @@ def test_mailboxes_never_delay_a_cycle():
     line = line_of(*names(8))
     master = line.core
     content = bytes(range(256)) * 64
-    sizes = master.units[1001].mailbox.sizes
+    sizes = master.slaves[1001].mailbox.sizes
     at = 0
 
     def give(size):

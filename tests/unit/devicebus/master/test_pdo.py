@@ -6,13 +6,13 @@ from devicebus.errors import MailboxProtocolError
 from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.pdo import (
-    Channel,
     Pdo,
-    PdoChoice,
+    PdoConfiguration,
     PdoEntry,
+    ProcessDataChannel,
     channels_from_sii,
     read_channels,
-    write_choice,
+    write_configuration,
 )
 from devicebus.wire.sii import (
     Sii,
@@ -52,7 +52,7 @@ SII = Sii(
 def test_the_eeprom_tells_what_sync_managers_carry():
     outputs, inputs = channels_from_sii(SII)
     entries = (PdoEntry(0x7000, 1, 1, "lamp", 1), PdoEntry(0, 0, 7))
-    assert outputs == Channel(2, 0x1100, 0x64, True, (Pdo(0x1600, entries),))
+    assert outputs == ProcessDataChannel(2, 0x1100, 0x64, True, (Pdo(0x1600, entries),))
     assert (outputs.size, inputs.size, inputs.pdos, inputs.is_output) == (1, 4, (), False)
 
 
@@ -93,18 +93,20 @@ def test_what_it_does_not_know_is_as_the_eeprom_says():
 def test_a_choice_is_written_in_the_order_that_slaves_want():
     line = Line(Bench(), segment(slave("a")))
     box = open_mailbox(line)
-    empty = PdoChoice(assignment={2: (), 3: (0x1A00,)})
-    line.wait(box.converse(write_choice(empty, box.sizes), line.now_ns))
+    empty = PdoConfiguration(assignment={2: (), 3: (0x1A00,)})
+    line.wait(box.converse(write_configuration(empty, box.sizes), line.now_ns))
     dictionary = line.segment.slaves[0].device.dictionary
     assert dictionary.entry(0x1C12, 0).value == 0
     assert dictionary.entry(0x1C13, 1).value == 0x1A00
-    wrong = PdoChoice(mapping={0x1600: ((0x7000, 1, 8),)})
+    wrong = PdoConfiguration(mapping={0x1600: ((0x7000, 1, 8),)})
     with pytest.raises(SdoAbortError, match="0x1600:0"):
-        line.wait(box.converse(write_choice(wrong, box.sizes), line.now_ns))
+        line.wait(box.converse(write_configuration(wrong, box.sizes), line.now_ns))
 
 
 def test_a_mapping_is_written_as_index_subindex_and_bits():
-    writing = write_choice(PdoChoice(mapping={0x1600: ((0x7010, 2, 16),)}), MailboxSizes())
+    writing = write_configuration(
+        PdoConfiguration(mapping={0x1600: ((0x7010, 2, 16),)}), MailboxSizes()
+    )
     first = next(writing)
     assert first.request[3:6] == b"\x00\x16\x00"
     answer = encode_message(CoeService.SDO_RESPONSE, b"\x60\x00\x16\x00" + bytes(4))

@@ -6,13 +6,13 @@ from devicebus.errors import BusError, FrameLostError, IdentityError, WorkingCou
 from devicebus.master.scan import (
     ExpectedSlave,
     Identity,
-    arrange,
     assign_stations,
     check_bus,
     count_slaves,
-    find_joints,
+    find_topology,
     fits,
     iter_differences,
+    match_aliases,
     open_ports,
     read_identity,
     read_stations,
@@ -34,7 +34,7 @@ def test_open_ports(ports):
 
 
 def parents(*ports):
-    return [(joint.parent, joint.parent_port) for joint in find_joints([status(*p) for p in ports])]
+    return [(node.parent, node.parent_port) for node in find_topology([status(*p) for p in ports])]
 
 
 def test_a_line():
@@ -54,8 +54,8 @@ def test_branches_are_left_at_port_3_first_and_then_1_and_2():
 def test_ports_that_lead_nowhere_and_slaves_without_any_are_tolerated():
     assert parents((0, 1), (0, 1)) == [(None, 0), (0, 1)]
     assert parents((0,), ()) == [(None, 0), (None, 0)]
-    assert find_joints([status(1, 2)])[0].entry_port == 1
-    assert find_joints([]) == ()
+    assert find_topology([status(1, 2)])[0].entry_port == 1
+    assert find_topology([]) == ()
 
 
 def bench_line(*slaves):
@@ -77,7 +77,7 @@ def test_a_scan_tells_who_is_there_and_how_they_are_wired():
     assert [each.alias for each in found] == [77, 0, 0]
     assert [each.esc.has_clock for each in found] == [True, True, False]
     assert found[0].esc.knows_lrw
-    assert [each.joint.parent for each in found] == [None, 0, 0]
+    assert [each.node.parent for each in found] == [None, 0, 0]
     assert [each.al_status.state for each in found] == [1, 1, 1]
     assert found[0].sii.sync_managers
     assert [each.esc.station for each in line.segment.slaves] == [1001, 1003, 1002]
@@ -243,4 +243,4 @@ def test_whether_a_slave_fits():
 )
 def test_slaves_with_an_alias_are_found_wherever_they_are(expected, there, order):
     slaves = [ExpectedSlave(name="s", vendor=1, product=1, alias=alias) for alias in expected]
-    assert arrange(slaves, there) == order
+    assert match_aliases(slaves, there) == order

@@ -43,7 +43,7 @@ def test_all_slaves_get_to_the_state_together(target):
     line = line_of(*SLAVES)
     line.wait(line.core.bring_up(line.now_ns, target))
     assert set(states(line)) == {target}
-    assert {unit.state for unit in line.core.units.values()} == {target}
+    assert {unit.state for unit in line.core.slaves.values()} == {target}
 
 
 def test_sixteen_slaves_are_in_op_in_less_than_a_tenth_of_a_second():
@@ -62,7 +62,7 @@ def test_slaves_with_an_alias_keep_name_and_station_wherever_they_are_wired():
     ]
     line = line_of(*there, expected=expected)
     line.wait(line.core.bring_up(line.now_ns))
-    units = line.core.units
+    units = line.core.slaves
     assert [(at, unit.name) for at, unit in units.items()] == [
         (1002, "right"), (1003, "behind"), (1001, "left")
     ]  # fmt: skip
@@ -98,7 +98,7 @@ def test_names_are_those_that_were_expected():
     expected = [ExpectedSlave(name=f"n{n}", vendor=0xE5A, product=7) for n in range(2)]
     line = line_of(slave("a"), slave("b"), expected=expected)
     line.wait(line.core.bring_up(line.now_ns, AlState.PREOP))
-    assert [unit.name for unit in line.core.units.values()] == ["n0", "n1"]
+    assert [unit.name for unit in line.core.slaves.values()] == ["n0", "n1"]
 
 
 def test_another_bus_is_left_in_init():
@@ -239,7 +239,7 @@ def test_a_bus_that_is_shut_down_stays_in_init():
     assert line.core.cycle is not None
     line.wait(line.core.shut_down(line.now_ns))
     assert set(states(line)) == {AlState.INIT}
-    assert (line.core.units, line.core.cycle) == ({}, None)
+    assert (line.core.slaves, line.core.cycle) == ({}, None)
     line.elapse(500 * MS)
     assert set(states(line)) == {AlState.INIT}
 
@@ -272,7 +272,7 @@ def test_200_slaves_come_to_op_while_the_round_trip_jumps():
     assert stats.cycle.wkc_errors == 0
     line.elapse(200 * MS)
     assert line.events() == []
-    assert {unit.state for unit in line.core.units.values()} == {AlState.OP}
+    assert {unit.state for unit in line.core.slaves.values()} == {AlState.OP}
 
 
 def test_bring_up_with_one_frame_lost_fails_no_slave():
@@ -283,7 +283,7 @@ def test_bring_up_with_one_frame_lost_fails_no_slave():
         line.wait(line.core.bring_up(line.now_ns))
         line.elapse(200 * MS)
         assert line.events() == []
-        assert {unit.state for unit in line.core.units.values()} == {AlState.OP}
+        assert {unit.state for unit in line.core.slaves.values()} == {AlState.OP}
 
 
 def test_bring_up_on_a_bus_that_falls_silent_blames_no_slave():

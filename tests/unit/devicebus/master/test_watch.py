@@ -15,7 +15,7 @@ from devicebus.master.bus import (
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
 from devicebus.master.procedure import StepReplies
-from devicebus.master.watch import Growth, PortErrorLog, look_around
+from devicebus.master.watch import ErrorPeriod, PortErrorLog, poll_mailboxes
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command, DatagramReply
 from eap.codec.mailbox import MailboxType
@@ -68,7 +68,7 @@ def test_all_that_is_said_is_heard(paced):
 
 
 def test_a_look_at_seventeen_takes_two_frames(paced):
-    looking = look_around(paced.core._bus)
+    looking = poll_mailboxes(paced.core._bus)
     assert len(next(looking)) == 15
     assert len(looking.send(StepReplies([DatagramReply(b"\0", 1)] * 15, 0))) == 2
 
@@ -104,7 +104,7 @@ def test_port_error_log_notes_first_and_last_growth_of_each_port():
         (9, counters(crc0=3, lost3=1, forwarded2=9)),
     ):
         log.take(1001, octets, now_ns)
-    assert log.of(1001) == {0: Growth(6, 8), 3: Growth(7, 7)}
+    assert log.of(1001) == {0: ErrorPeriod(6, 8), 3: ErrorPeriod(7, 7)}
 
 
 def test_port_error_log_counters_that_were_cleared_end_older_times():
@@ -113,7 +113,7 @@ def test_port_error_log_counters_that_were_cleared_end_older_times():
         log.take(1001, octets, now_ns)
     assert log.of(1001) == {}
     log.take(1001, counters(rx1=2), 8)
-    assert log.of(1001) == {1: Growth(8, 8)}
+    assert log.of(1001) == {1: ErrorPeriod(8, 8)}
 
 
 def test_port_error_log_forgets():
@@ -180,7 +180,7 @@ def test_a_slave_that_was_switched_off_comes_back_with_its_address(line):
     line.segment.switch(1, on=False)
     line.elapse(30 * MS)
     assert kinds(line.events()) == [("SlaveLost", 1002)]
-    assert line.core.units[1002].mailbox is None
+    assert line.core.slaves[1002].mailbox is None
     errors = line.core.stats().cycle.wkc_errors
     assert 1 <= errors <= 10
     cycles = line.core.stats().cycle.good
@@ -194,7 +194,7 @@ def test_a_slave_that_was_switched_off_comes_back_with_its_address(line):
     assert back.at_ns - begun < 130 * MS
     assert {each.state for each in line.segment.slaves} == {AlState.OP}
     assert line.core.stats().cycle.wkc_errors == errors
-    assert line.core.units[1002].mailbox is not None
+    assert line.core.slaves[1002].mailbox is not None
 
 
 def test_all_behind_a_cut_come_back_when_it_is_mended(line):
@@ -274,19 +274,19 @@ def test_watch_with_a_cut_first_cable_reports_the_bus_and_no_slave(line):
 
 def test_watch_with_a_short_silence_changes_nothing(line):
     line.period_ns = 4 * MS
-    mailboxes = [unit.mailbox for unit in line.core.units.values()]
+    mailboxes = [unit.mailbox for unit in line.core.slaves.values()]
     for _ in range(10):
         line.lose_back = lambda _: True
         line.elapse(60 * MS)
         line.lose_back = lambda _: False
         line.elapse(240 * MS)
     assert line.events() == []
-    assert [unit.mailbox for unit in line.core.units.values()] == mailboxes
+    assert [unit.mailbox for unit in line.core.slaves.values()] == mailboxes
     assert {each.state for each in line.segment.slaves} == {AlState.OP}
 
 
 def test_slave_is_shown_lost_until_it_is_set_up_anew(line):
-    unit = line.core.units[1003]
+    unit = line.core.slaves[1003]
     line.segment.switch(2, on=False)
     line.elapse(50 * MS)
     line.segment.switch(2, on=True)
@@ -303,7 +303,7 @@ def test_slave_is_shown_lost_until_it_is_set_up_anew(line):
 @pytest.mark.parametrize("silent_ms", [12, 400])
 def test_slave_whose_return_was_interrupted_by_a_silent_bus_gets_its_mailbox_back(line, silent_ms):
     line.period_ns = 4 * MS
-    unit = line.core.units[1003]
+    unit = line.core.slaves[1003]
     slave_b = by_name(line)["b"]
     for frames in range(1, 40, 9):  # the bus falls silent at another step each time
         line.segment.switch(2, on=False)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from devicebus.sim import fault as commands
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.fault import SLAVE_FAULTS, FaultySegment, find_entry
-from devicebus.sim.segment import Segment
+from devicebus.sim.segment import SimulatedSegment
 from devicebus.sim.spec import (
     ChannelSpec,
     DeviceKind,
@@ -223,7 +223,7 @@ def fault(kind, **more) -> FaultSpec:
 
 def make(*script) -> FaultySegment:
     slaves = [build_slave(generic(name)) for name in ("a", "b", "c")]
-    return FaultySegment(Segment(slaves), script)
+    return FaultySegment(SimulatedSegment(slaves), script)
 
 
 def exchange(faulty, now_ns=0, command=Command.BRD, ado=0, size=1, adp=0):
@@ -359,7 +359,7 @@ RELEASE = b'{"release": {"slave": "slave", "entry": "limit"}}'
 
 
 def obey(faulty, octets, now_ns):
-    commands.obey(faulty, json.loads(octets), now_ns)
+    commands.execute_command(faulty, json.loads(octets), now_ns)
 
 
 @pytest.fixture

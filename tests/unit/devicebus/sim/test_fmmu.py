@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devicebus.sim.fmmu import active_windows, find_pieces, insert_pieces, read_pieces, write_pieces
+from devicebus.sim.fmmu import active_windows, find_slices, insert_slices, read_slices, write_slices
 from devicebus.wire.register import Fmmu
 
 
@@ -40,18 +40,18 @@ def unit(logical, length, physical, kind=3, *, bits=(0, 7, 0)):
 
 def read(memory, units, address, size):
     chosen = [each for each in units if each.can_read]
-    return read_pieces(memory, find_pieces(chosen, address, size), 0)
+    return read_slices(memory, find_slices(chosen, address, size), 0)
 
 
 def write(memory, units, address, data):
     chosen = [each for each in units if each.can_write]
-    pieces = find_pieces(chosen, address, len(data))
-    return write_pieces(memory, pieces, bytearray(b"?" + data), 1, 0)
+    pieces = find_slices(chosen, address, len(data))
+    return write_slices(memory, pieces, bytearray(b"?" + data), 1, 0)
 
 
 def insert(data, found):
     frame = bytearray(b"??") + data
-    insert_pieces(frame, 2, found)
+    insert_slices(frame, 2, found)
     data[:] = frame[2:]
 
 

@@ -7,7 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devicebus.sim.devices.build import build_slave
-from devicebus.sim.segment import CABLE_NS, FORWARD_NS, Cable, Segment, Side, dl_status, find_way
+from devicebus.sim.segment import (
+    CABLE_NS,
+    FORWARD_NS,
+    Cable,
+    SegmentEnd,
+    SimulatedSegment,
+    dl_status,
+    trace_path,
+)
 from devicebus.sim.spec import ClockSpec
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
@@ -18,52 +26,52 @@ HOP = FORWARD_NS + CABLE_NS
 
 
 def links(*cables, ring_end=None, master=True):
-    found = {(0, 0): Side.PRIMARY} if master else {}
+    found = {(0, 0): SegmentEnd.PRIMARY} if master else {}
     for child, parent, port in cables:
         found[child, 0] = parent, port
         found[parent, port] = child, 0
     if ring_end is not None:
-        found[ring_end] = Side.SECONDARY
+        found[ring_end] = SegmentEnd.SECONDARY
     return found
 
 
 def test_line_is_worked_off_in_its_order():
-    way = find_way(links((1, 0, 1), (2, 1, 1)), (0, 0))
-    assert (way.order, way.comes_out, way.closed_at) == ((0, 1, 2), Side.PRIMARY, None)
-    assert way.arrivals == {
+    path = trace_path(links((1, 0, 1), (2, 1, 1)), (0, 0))
+    assert (path.order, path.exit, path.closed_at) == ((0, 1, 2), SegmentEnd.PRIMARY, None)
+    assert path.arrivals == {
         (0, 0): 0, (1, 0): HOP, (2, 0): 2 * HOP, (1, 1): 3 * HOP, (0, 1): 4 * HOP,
     }  # fmt: skip
 
 
 def test_branches_go_in_the_order_3_1_2():
-    way = find_way(links((1, 0, 1), (2, 0, 2), (3, 0, 3), (4, 3, 1)), (0, 0))
-    assert way.order == (0, 3, 4, 1, 2)
+    path = trace_path(links((1, 0, 1), (2, 0, 2), (3, 0, 3), (4, 3, 1)), (0, 0))
+    assert path.order == (0, 3, 4, 1, 2)
 
 
 def test_single_slave():
-    way = find_way(links(), (0, 0))
-    assert (way.order, way.arrivals) == ((0,), {(0, 0): 0})
+    path = trace_path(links(), (0, 0))
+    assert (path.order, path.arrivals) == ((0,), {(0, 0): 0})
 
 
 def test_whole_ring_is_worked_off_from_one_side_only():
     ring = links((1, 0, 1), (2, 1, 1), ring_end=(2, 1))
-    assert find_way(ring, (0, 0)).order == (0, 1, 2)
-    assert find_way(ring, (0, 0)).comes_out is Side.SECONDARY
-    back = find_way(ring, (2, 1))
-    assert (back.order, back.comes_out) == ((), Side.PRIMARY)
+    assert trace_path(ring, (0, 0)).order == (0, 1, 2)
+    assert trace_path(ring, (0, 0)).exit is SegmentEnd.SECONDARY
+    back = trace_path(ring, (2, 1))
+    assert (back.order, back.exit) == ((), SegmentEnd.PRIMARY)
 
 
 def test_broken_ring_is_worked_off_from_both_sides():
     ring = links((1, 0, 1), (3, 2, 1), ring_end=(3, 1))
-    first = find_way(ring, (0, 0))
-    assert (first.order, first.comes_out, first.closed_at) == ((0, 1), Side.PRIMARY, None)
-    second = find_way(ring, (3, 1))
-    assert (second.order, second.comes_out, second.closed_at) == ((2, 3), Side.SECONDARY, 0)
+    first = trace_path(ring, (0, 0))
+    assert (first.order, first.exit, first.closed_at) == ((0, 1), SegmentEnd.PRIMARY, None)
+    second = trace_path(ring, (3, 1))
+    assert (second.order, second.exit, second.closed_at) == ((2, 3), SegmentEnd.SECONDARY, 0)
 
 
 def test_long_line_needs_no_deep_stack():
     cables = [(n, n - 1, 1) for n in range(1, 3000)]
-    assert find_way(links(*cables), (0, 0)).order == tuple(range(3000))
+    assert trace_path(links(*cables), (0, 0)).order == tuple(range(3000))
 
 
 def test_dl_status_of_a_captured_controller():
@@ -87,7 +95,7 @@ def test_every_slave_answers():
 
 def test_segment_without_slaves_answers_nothing():
     frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
-    assert Segment([]).process_frame(frame, 0) is None
+    assert SimulatedSegment([]).process_frame(frame, 0) is None
 
 
 def test_cut_cable_hides_what_is_behind_it():
@@ -159,28 +167,28 @@ def test_receive_times_follow_the_wiring():
 
 def test_ring_works_from_both_ends_when_it_is_broken():
     slaves = [build_slave(generic(f"slave {n}")) for n in range(4)]
-    segment = Segment(slaves, ring_end=(3, 1))
+    segment = SimulatedSegment(slaves, ring_end=(3, 1))
 
     def send_at(side):
         frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
         out = segment.process_frame(frame, 0, side)
         return out, next(iter_datagrams(frame)).wkc
 
-    assert send_at(Side.PRIMARY) == (Side.SECONDARY, 4)
-    assert send_at(Side.SECONDARY) == (Side.PRIMARY, 0)
+    assert send_at(SegmentEnd.PRIMARY) == (SegmentEnd.SECONDARY, 4)
+    assert send_at(SegmentEnd.SECONDARY) == (SegmentEnd.PRIMARY, 0)
     segment.cut(1)
-    assert send_at(Side.PRIMARY) == (Side.PRIMARY, 1)
-    assert send_at(Side.SECONDARY) == (Side.SECONDARY, 3)
+    assert send_at(SegmentEnd.PRIMARY) == (SegmentEnd.PRIMARY, 1)
+    assert send_at(SegmentEnd.SECONDARY) == (SegmentEnd.SECONDARY, 3)
     segment.cut(0)
-    assert send_at(Side.PRIMARY) == (None, 0)
+    assert send_at(SegmentEnd.PRIMARY) == (None, 0)
 
 
 def test_circulating_frame_is_taken_out_of_a_broken_ring():
     slaves = [build_slave(generic(f"slave {n}")) for n in range(2)]
-    segment = Segment(slaves, ring_end=(1, 1))
+    segment = SimulatedSegment(slaves, ring_end=(1, 1))
     segment.cut(1)
     frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0", circulating=1)]))
-    assert segment.process_frame(frame, 0, Side.SECONDARY) is None
+    assert segment.process_frame(frame, 0, SegmentEnd.SECONDARY) is None
 
 
 def test_slaves_look_at_the_time_between_frames():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from devicebus.master.image import Layout, Variable
+from devicebus.master.image import ProcessDataLayout, ProcessVariable
 from eap.engine.bus_mapping import BusPlanner
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
@@ -50,7 +50,7 @@ def variables(entries, *, is_output, station=1001, first_bit=0):
     for entry in entries:
         if entry.index:
             found.append(
-                Variable(
+                ProcessVariable(
                     station, "", is_output, first_bit, entry.bit_length, 0, entry.index,
                     entry.subindex,
                 )
@@ -60,7 +60,7 @@ def variables(entries, *, is_output, station=1001, first_bit=0):
 
 
 def layout(*found):
-    return Layout({}, (), tuple(found))
+    return ProcessDataLayout({}, (), tuple(found))
 
 
 def plan(*found):
@@ -108,7 +108,7 @@ def test_slaves_may_lie_elsewhere_than_described():
 
 def test_what_slaves_do_not_have_is_told_once_each():
     there = [each for each in ALL if each.index not in {0x6001, 0x7001}]
-    other = Variable(1001, "", False, 8, 32, 0, 0x6001, 0)
+    other = ProcessVariable(1001, "", False, 8, 32, 0, 0x6001, 0)
     made = plan(*there, other)
     assert made.missing == (
         "io (station 1001) has no output 0x7001:00 of 16 bits, but none: r stays as it is",

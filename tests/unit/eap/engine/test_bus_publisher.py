@@ -135,7 +135,7 @@ def test_publisher_forgets_no_change_whatever_happens_on_the_bus(tmp_path, seed)
                 rig.fault(kind="al-error", slave=pick.choice(names), code=0x1B, for_ms=50)
             case 2:
                 rig.wire.is_deaf = not rig.wire.is_deaf
-            case 3 if units := list(rig.bus.master.units.values()):
+            case 3 if units := list(rig.bus.master.slaves.values()):
                 unit = pick.choice(units)
                 if not unit.is_busy:
                     state = pick.choice((AlState.INIT, AlState.PREOP))

@@ -129,7 +129,7 @@ def test_changes_come_before_the_answer_to_what_made_them(office):
     (first,) = office.changes
     assert first.stations == (1001, 1002, 1003) == tuple(each.station for each in first.slaves)
     office.post(BringSlaves(id=2, bus=0, station=1002, target=AlState.PREOP))
-    office.rig.wait(lambda: office.rig.bus.master.units[1002].al_state == AlState.PREOP)
+    office.rig.wait(lambda: office.rig.bus.master.slaves[1002].al_state == AlState.PREOP)
     office.rig.run(MS)
     messages = []
     while not messages or "id" not in messages[-1]:

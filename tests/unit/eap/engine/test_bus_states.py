@@ -22,7 +22,7 @@ class Cycle:
 
 class Master:
     def __init__(self, *units):
-        self.units = {1001 + number: unit for number, unit in enumerate(units)}
+        self.slaves = {1001 + number: unit for number, unit in enumerate(units)}
         self.cycle = None
         self.changes = 0
 
@@ -44,7 +44,7 @@ def test_the_lowest_state_is_that_of_the_bus(image):
     master.cycle = Cycle()
     states.show(master)
     assert read(image) == [4, 8, 4, True]
-    master.units[1002].al_state = 0
+    master.slaves[1002].al_state = 0
     master.changes += 1
     master.cycle.is_full = False
     states.show(master)

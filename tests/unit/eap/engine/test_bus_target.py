@@ -69,4 +69,4 @@ def test_cancelling_stops_all_of_them():
     task.cancel()
     line.elapse(5 * MS)
     assert "cancelled" in str(task.error)
-    assert not any(unit.is_busy for unit in line.core.units.values())
+    assert not any(unit.is_busy for unit in line.core.slaves.values())

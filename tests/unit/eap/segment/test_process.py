@@ -17,7 +17,7 @@ import pytest
 
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.fault import FaultySegment
-from devicebus.sim.segment import Segment, Side
+from devicebus.sim.segment import SegmentEnd, SimulatedSegment
 from devicebus.sim.spec import BusSpec
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
 from eap.ids import InterfaceUri
@@ -275,12 +275,14 @@ def test_frames_that_waited_for_a_late_process_come_before_watchdogs(
 ):
     clock = SimpleNamespace(now_ns=10**9)
     monkeypatch.setattr(segment_process.time, "monotonic_ns", lambda: clock.now_ns)
-    segment = FaultySegment(Segment([build_slave(generic())]))
+    segment = FaultySegment(SimulatedSegment([build_slave(generic())]))
     calls = []
-    monkeypatch.setattr(Segment, "postpone_timeouts", lambda _, now_ns: calls.append(now_ns))
+    monkeypatch.setattr(
+        SimulatedSegment, "postpone_timeouts", lambda _, now_ns: calls.append(now_ns)
+    )
     sock = StalledSocket(clock, stall_ms * 1_000_000)
-    loop = segment_process._Loop(segment, {Side.PRIMARY: sock}, None)
+    loop = segment_process._Loop(segment, {SegmentEnd.PRIMARY: sock}, None)
     monkeypatch.setattr(FaultySegment, "next_timeout", lambda _: 10**9 + 100_000_000)
     loop._patience_ms()
-    loop._pass_frames(Side.PRIMARY, sock)
+    loop._pass_frames(SegmentEnd.PRIMARY, sock)
     assert len(calls) == postponed

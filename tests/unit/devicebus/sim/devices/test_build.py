@@ -7,7 +7,7 @@ import pytest
 from devicebus.sim.devices.build import build_segment, build_slave, complete, device_type
 from devicebus.sim.devices.drive import Axes
 from devicebus.sim.devices.signal import Signals
-from devicebus.sim.segment import Side
+from devicebus.sim.segment import SegmentEnd
 from devicebus.sim.spec import BusSpec, ChannelSpec, ClockSpec, DeviceKind, MailboxSpec, SlaveSpec
 from devicebus.wire.datagram import Command, encode_frame
 from eap.codec.mailbox import MailboxType
@@ -89,7 +89,7 @@ def test_slave_before_must_come_before():
 def test_ring_has_a_second_end():
     segment = build_segment(bus(generic("a"), generic("b"), ring=True))
     frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
-    assert segment.process_frame(frame, 0) is Side.SECONDARY
+    assert segment.process_frame(frame, 0) is SegmentEnd.SECONDARY
 
 
 def test_clock_as_described():

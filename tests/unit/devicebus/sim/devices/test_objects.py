@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.sim.devices.objects import assignment, build_dictionary, mapping, places
+from devicebus.sim.devices.objects import assignment, build_dictionary, mapping, object_ids_of
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
@@ -133,8 +133,8 @@ def test_channels_without_an_entry_count_up():
         ChannelSpec(name="b", object="0x6041"),
         ChannelSpec(name="c"),
     ]
-    assert places(channels, 0x6000) == [(0x6000, 1), (0x6041, 0), (0x6000, 2)]
-    many = places([ChannelSpec(name=str(n)) for n in range(201)], 0x7000)
+    assert object_ids_of(channels, 0x6000) == [(0x6000, 1), (0x6041, 0), (0x6000, 2)]
+    many = object_ids_of([ChannelSpec(name=str(n)) for n in range(201)], 0x7000)
     assert many[199:] == [(0x7000, 200), (0x7010, 1)]
 
 

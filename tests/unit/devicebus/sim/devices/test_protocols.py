@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scapy.layers.inet import ICMP, IP, UDP
 from scapy.layers.l2 import ARP, Ether
 
-from devicebus.mailbox.eoe import Assembler, iter_fragments
+from devicebus.mailbox.eoe import FrameAssembler, iter_fragments
 from devicebus.sim.device import Device
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.devices.protocols import DEFAULT_MAC, EthernetHost, build_mailbox
@@ -242,7 +242,7 @@ def test_device_with_eoe_answers_a_ping_in_fragments():
     for piece in iter_fragments(frame, 0, 96):
         message = encode_message(MailboxHeader(0, type=MailboxType.EOE), piece)
         mailbox.receive_message(message, 0)
-    assembler = Assembler()
+    assembler = FrameAssembler()
     answers = []
     while (message := mailbox.next_message(0)) is not None:
         answers.append(assembler.receive(bytes(decode_message(message)[1])))
