@@ -10,7 +10,7 @@ def main() -> None:
     is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_default:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from eap.cli import main as eapctl
+    from eap.cli.group import main as eapctl
 
     if is_default:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.group import LazyGroup
+from eap.cli.group import CommandGroup, LazyGroup
 from eap.cli.output import Renderer
 from eap.cli.params import (
     BusCommand,
@@ -129,7 +129,7 @@ def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Rendere
     output.show(found, lambda each: diagnosis_view(each, time(), is_full=full))
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def sii() -> None:
     """Read and write the EEPROM of a slave."""
 
@@ -213,7 +213,7 @@ def _value_options(command: CommandT) -> CommandT:
     return complete(kind(command))
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def sdo() -> None:
     """Read, write and list the objects of a slave (CoE)."""
 
@@ -321,7 +321,7 @@ def _drive_option(command: CommandT) -> CommandT:
     )(command)
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def idn() -> None:
     """Read, write and list the IDNs of a drive (SoE)."""
 
@@ -387,7 +387,7 @@ def _password_option(command: CommandT) -> CommandT:
     )(command)
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def foe() -> None:
     """Read and write files of a slave (FoE)."""
 

@@ -30,7 +30,7 @@ _SHOWN_OCTETS = 32
 _SEPARATORS = str.maketrans("", "", ":-, \t\r\n")
 
 
-@click.command(short_help="Decode a frame, or the frames of a capture.")
+@click.command()
 @click.argument("source", metavar="HEX|FILE", nargs=-1, required=True)
 @json_option("Print one object a frame, on one line.")
 @click.pass_context

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from eap.cli.group import LazyGroup
+from eap.cli.group import CommandGroup, LazyGroup
 from eap.cli.output import Column, Renderer, TextTable, count
 from eap.cli.params import (
     BusCommand,
@@ -40,7 +40,7 @@ _SHOWN_CLIENTS = 10
 
 
 @click.group(
-    short_help="Start, stop and show the ETG.8200 gateways of a station.",
+    cls=CommandGroup,
     epilog=examples(
         "eapctl gateway status island-01",
         "eapctl gateway stop island-01/bus0",
@@ -260,7 +260,7 @@ class GatewayGroup(LazyGroup):
 def _behind_gateway(command: click.Command) -> click.Command:
     if isinstance(command, click.Group):
         found = {name: _behind_gateway(each) for name, each in command.commands.items()}
-        return click.Group(command.name, found, help=command.help, epilog=None)
+        return CommandGroup(command.name, found, help=command.help, epilog=None)
     left_out = place_parameters()
     params = [each for each in command.params if each.name not in left_out]
     if len(params) == len(command.params):

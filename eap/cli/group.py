@@ -1,7 +1,8 @@
-"""The group behind ``eapctl``: subcommands by name, and one way out for every error.
+"""Command groups of ``eapctl``, the main one, and the single exit for every error.
 
-Rule: whatever goes wrong ends as one line on stderr (the findings of a plant file as one each) and
-an exit code, never as a traceback; ``EAP_DEBUG=1`` shows the traceback above that line.
+Each error ends as one line on stderr (a plant file: one line for each finding) and an exit code,
+never as a traceback; ``EAP_DEBUG=1`` prints the traceback above that line.  The module of a command
+is imported when the command is used: the front end owns no plant, and starts within milliseconds.
 """
 
 from __future__ import annotations
@@ -32,11 +33,26 @@ class ExitCode(IntEnum):
     """Usage, configuration or environment."""
 
 
-class LazyGroup(click.Group):
+class CommandGroup(click.Group):
+    """Group that suggests the nearest subcommand for an unknown one."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the subcommand that *args* start with; raise UsageError with a suggestion."""
+        if self.get_command(ctx, args[0]) is None and not ctx.resilient_parsing:
+            names = self.list_commands(ctx)
+            hint = suggest(args[0], names) or f"; known commands: {', '.join(names)}"
+            raise click.UsageError(f"unknown command {args[0]!r}{hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+class LazyGroup(CommandGroup):
     """Group that imports a subcommand's module when it is used.
 
     Args:
         commands_at: ``module:attribute`` of each subcommand.
+        summaries: Lines of the group's help page, so that it imports no subcommand.
         former_names: Hidden former names of subcommands, with the present ones.
         **settings: As ``click.Group`` takes them.
     """
@@ -45,11 +61,13 @@ class LazyGroup(click.Group):
         self,
         *,
         commands_at: Mapping[str, str],
+        summaries: Mapping[str, str] = MappingProxyType({}),
         former_names: Mapping[str, str] = MappingProxyType({}),
         **settings: Any,
     ) -> None:
         super().__init__(**settings)
         self._commands_at = commands_at
+        self._summaries = summaries
         self._former_names = former_names
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -65,16 +83,13 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(import_module(module), attribute)
         return command
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the subcommand that *args* start with; raise UsageError with one that comes near."""
-        is_known = args[0] in self._commands_at or args[0] in self._former_names
-        if not is_known and not ctx.resilient_parsing:
-            known = ", ".join(self.list_commands(ctx))
-            hint = suggest(args[0], self._commands_at) or f": there are {known}"
-            raise click.UsageError(f"no command {args[0]!r}{hint}", ctx)
-        return super().resolve_command(ctx, args)
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the subcommands with their summaries."""
+        if not self._summaries:
+            super().format_commands(ctx, formatter)
+            return
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, self._summaries[name]) for name in sorted(self._summaries)])
 
     def main(self, *args: Any, **extra: Any) -> NoReturn:
         """Run one command line and end the process; takes what ``click.Command.main`` takes."""
@@ -144,3 +159,40 @@ def _report(error: Exception) -> None:
 
         traceback.print_exception(error)
     click.echo(describe(error), err=True)
+
+
+_COMMANDS = {
+    "apply": ("plant:apply", "Apply a plant file to the running plant."),
+    "bus": ("bus:bus", "Scan, diagnose and access the slaves of a bus."),
+    "check": ("plant:check", "Check a plant file and report all errors."),
+    "decode": ("decode:decode", "Decode a frame, or the frames of a capture."),
+    "gateway": ("gateway:gateway", "Start, stop and show the mailbox gateways of a station."),
+    "gw": ("gateway:gw", "Access a master and its slaves through any mailbox gateway."),
+    "new": ("plant:new", "Write a plant file to start from."),
+    "od": ("od:od", "Read and write the object dictionary of a device."),
+    "pd": ("pd:pd", "List, watch and set the process data of running stations."),
+    "plan": ("plant:plan", "Show the differences between a plant file and the running plant."),
+    "rollback": ("plant:rollback", "Undo the last change of a running plant."),
+    "routes": ("routes:routes", "Show, add, remove and test AMS routes; live without a command."),
+    "run": ("plant:run", "Run a plant, or some of its stations."),
+    "scan": ("network:scan", "List stations, ports and slaves of the whole plant."),
+    "sim": ("sim:sim", "Run simulated slaves, and inject faults."),
+    "state": ("od:state", "Show or request the state of a station or slave."),
+    "status": ("status:status", "Show errors, stations, ports, process data and processes."),
+    "trace": ("network:trace", "Show the path to a device, and the hop that failed."),
+}
+"""Place of each command below ``eap.cli``, and its line in the help."""
+
+
+@click.group(
+    cls=LazyGroup,
+    commands_at={name: f"eap.cli.{place}" for name, (place, _) in _COMMANDS.items()},
+    summaries={name: summary for name, (_, summary) in _COMMANDS.items()},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(package_name="eap-appliance", message="eapctl %(version)s")
+def main() -> None:
+    """Run, configure and diagnose stations of the EtherCAT Automation Protocol (EAP).
+
+    Exit codes: 0 done, 1 refused or failed, 2 usage, configuration or environment.
+    """

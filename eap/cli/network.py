@@ -27,7 +27,6 @@ _VIA = click.option(
 
 
 @click.command(
-    short_help="List stations, ports and slaves of the whole plant.",
     epilog=examples("eapctl scan", "eapctl scan --via island-02 --json"),
 )
 @_VIA
@@ -52,7 +51,6 @@ def scan(via: str | None, plant: str | None, output: Renderer) -> None:
 
 
 @click.command(
-    short_help="Show the path to a device, hop by hop, and where it ends.",
     epilog=examples(
         "eapctl trace island-03/bus0/1001",
         "eapctl trace 5.1.2.3.1.1:851 --via island-02",

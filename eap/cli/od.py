@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from eap.cli.group import ExitCode
+from eap.cli.group import CommandGroup, ExitCode
 from eap.cli.output import Renderer, TextTable
 from eap.cli.params import json_option, parse_entry, parse_octets, parse_type, plant_option
 from eap.errors import ControlError
@@ -52,7 +52,7 @@ def _target(text: str, plant: str | None) -> Target:
         raise click.UsageError(str(exc)) from None
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def od() -> None:
     """Read and write the object dictionary of a station.
 
@@ -204,7 +204,7 @@ def _entry_to_write(
     return parse_entry(entry)
 
 
-@click.command(short_help="Show or request the state of a station.")
+@click.command()
 @target_argument
 @click.argument(
     "wanted",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from eap.cli.group import CommandGroup
 from eap.cli.output import Renderer
 from eap.cli.params import (
     json_option,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from eap.codec.values import DataType
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def pd() -> None:
     """List, watch and set the process data of running stations."""
 

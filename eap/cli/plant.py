@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SHAPES = ("ring", "star")
 
 
-@click.command(short_help="Report all errors of a plant file at once.")
+@click.command()
 @click.argument("plant", type=PLANT_FILE)
 @json_option("Print one object: ok, all findings, and warnings.")
 @click.pass_context
@@ -60,7 +60,7 @@ def _summary(file: Path, plant: Plant | None) -> Iterator[str]:
     )
 
 
-@click.command(short_help="Write a plant file to start from.")
+@click.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
 @click.option(
     "--stations",
@@ -183,7 +183,7 @@ def running_plant(
         yield link, choose(plant, link, wanted)
 
 
-@click.command(short_help="Show the differences between a plant file and the running plant.")
+@click.command()
 @plant_arguments
 @json_option("Print one object: ok, stations with changes, the steps of 'apply', absent stations.")
 @click.pass_context
@@ -205,7 +205,7 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Ren
         ctx.exit(ExitCode.FAILED)
 
 
-@click.command(short_help="Apply a plant file to the running plant.")
+@click.command()
 @plant_arguments
 @keep_going_option
 @_RESULT
@@ -233,7 +233,7 @@ def apply(
         _run_steps(ctx, steps, link, refusing, output)
 
 
-@click.command(short_help="Take back the last change of a running plant.")
+@click.command()
 @plant_arguments
 @keep_going_option
 @_RESULT
@@ -406,7 +406,7 @@ def _blank_options(command: CommandT) -> CommandT:
     return blank(interface(net_id(cycle(resume(command)))))
 
 
-@click.command(short_help="Run a plant, or some of its stations.")
+@click.command()
 @click.argument("plant", type=PLANT_FILE, required=False)
 @click.option(
     "--station",

@@ -34,7 +34,6 @@ _FILE = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
         "test": "eap.cli.routes:test",
     },
     former_names={"introduce": "add-remote"},
-    short_help="Show, add, remove and test routes; without a command: a live view.",
     invoke_without_command=True,
     epilog=examples(
         "eapctl routes",

@@ -63,7 +63,7 @@ class Look(NamedTuple):
     seconds: float = 0.0
 
 
-@click.command(short_help="Show errors, stations, ports, process data and processes.")
+@click.command()
 @click.option("--full", is_flag=True, help="Show every process, port, bus and PD.")
 @click.option("--watch", is_flag=True, help="Show it again and again, with rates; Ctrl-C ends it.")
 @click.option(

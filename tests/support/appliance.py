@@ -20,7 +20,7 @@ from unittest import mock
 
 from click.testing import CliRunner
 
-from eap.cli import main as eapctl
+from eap.cli.group import main as eapctl
 from eap.errors import ControlError
 from eap.ops.client import connect_those
 from eap.runtime.folder import VARIABLE

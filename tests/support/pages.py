@@ -15,7 +15,7 @@ from unittest import mock
 
 from click.testing import CliRunner
 
-from eap.cli import main as eapctl
+from eap.cli.group import main as eapctl
 
 ROOT = Path(__file__).parents[2]
 _EAPCTL = re.compile(r"eapctl( [^|&;<>$*'\"\\]+)+")

@@ -16,7 +16,8 @@ def test_module_is_the_command() -> None:
         [sys.executable, "-m", "eap", "chek"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
-    assert done.stderr == "eapctl: no command 'chek', did you mean check? (see 'eapctl --help')\n"
+    hint = "did you mean check? (see 'eapctl --help')"
+    assert done.stderr == f"eapctl: unknown command 'chek', {hint}\n"
 
 
 def test_eapctl_interrupted_while_it_imports_ends_without_a_traceback(tmp_path: Path) -> None:

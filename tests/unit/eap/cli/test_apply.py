@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
 
-from eap.cli import main
+from eap.cli.group import main
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ControlError
 from eap.ops.plant import load_or_raise

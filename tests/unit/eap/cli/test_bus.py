@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from eap.cli import main
+from eap.cli.group import main
 from tests.support.loopbus import LoopBus
 
 WHERE = ["--interface", "udp://127.0.4.1"]

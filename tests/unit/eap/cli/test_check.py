@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from eap.cli import main
+from eap.cli.group import main
 
 PLANT = """\
 plant: line

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from eap.cli import main
+from eap.cli.group import main
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import NetId
 from tests.support.packets import ethernet, tcp_segment, tcp_stream, udp

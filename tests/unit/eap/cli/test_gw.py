@@ -7,7 +7,7 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from eap.cli import main
+from eap.cli.group import main
 from eap.gateway.client import GatewayClient
 from tests.support.fakegateway import FILE, FakeGateway
 

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
-from eap.cli import main
+from eap.cli.group import main
 from eap.od.model import OdState
 from tests.support.controlstub import ControlStub
 from tests.support.oddevice import MemoryDevice, methods, mixer

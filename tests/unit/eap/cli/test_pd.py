@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from eap.cli import main
+from eap.cli.group import main
 from tests.unit.eap.cli.conftest import Appliance
 
 pytestmark = pytest.mark.net

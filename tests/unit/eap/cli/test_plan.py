@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
-from eap.cli import main
+from eap.cli.group import main
 from eap.config.new_plant import Shape, plant_text
 from eap.ops.plant import load_or_raise
 from tests.support.plantstub import PlantStub

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
-from eap.cli import main
+from eap.cli.group import main
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import FakeRoutes
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from eap.cli import main
+from eap.cli.group import main
 
 pytestmark = pytest.mark.net  # the runtime directory is claimed
 

@@ -8,7 +8,7 @@ import click
 import pytest
 
 from devicebus.sim.spec import FaultKind
-from eap.cli import main
+from eap.cli.group import main
 from eap.cli.sim import parse_fault, parse_value
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from eap.cli import main
+from eap.cli.group import main
 from tests.unit.eap.cli.conftest import Appliance
 
 pytestmark = pytest.mark.net
