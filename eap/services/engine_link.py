@@ -28,7 +28,7 @@ from eap.runtime.bus_request import (
     UnsolicitedMessage,
 )
 
-LOOK_S = 1.0
+SILENCE_LIMIT_S = 1.0
 """An engine that says nothing at all for this long, though it was asked, is gone."""
 
 _MAX_MESSAGE = 1 << 20
@@ -42,7 +42,7 @@ class EngineLink:
 
     Args:
         sock: This end of the pair; closed by :meth:`close`.
-        look_s: As LOOK_S.
+        silence_limit_s: As SILENCE_LIMIT_S.
 
     Attributes:
         on_restart: Called when another engine has taken its end of the pair.
@@ -51,10 +51,10 @@ class EngineLink:
         received_s: Time of the loop at which the engine has sent something last.
     """
 
-    def __init__(self, sock: socket.socket, *, look_s: float = LOOK_S) -> None:
+    def __init__(self, sock: socket.socket, *, silence_limit_s: float = SILENCE_LIMIT_S) -> None:
         self._socket = sock
         self._socket.setblocking(False)
-        self._look_s = look_s
+        self._silence_limit_s = silence_limit_s
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(sock, self._receive)
         self._encoder = msgspec.msgpack.Encoder()
@@ -70,7 +70,7 @@ class EngineLink:
     @property
     def is_alive(self) -> bool:
         """True if the engine has sent something in the time after which it counts as gone."""
-        return self._loop.time() < self.received_s + self._look_s
+        return self._loop.time() < self.received_s + self._silence_limit_s
 
     async def request(self, make: Callable[[int], EngineRequest], timeout_s: float) -> EngineReply:
         """Send the request that *make* returns for its number, and wait for the reply.
@@ -119,16 +119,16 @@ class EngineLink:
         self._socket.close()
 
     async def _wait(self, future: asyncio.Future[EngineReply], end_s: float) -> EngineReply:
-        looked_s: float | None = None
+        pinged_s: float | None = None
         while True:
-            rest_s = min(self._look_s, end_s - self._loop.time())
+            rest_s = min(self._silence_limit_s, end_s - self._loop.time())
             await asyncio.wait({future}, timeout=max(0.0, rest_s))
             now_s = self._loop.time()
             if future.done():
                 return future.result()
-            if now_s >= end_s or (looked_s is not None and self.received_s < looked_s):
+            if now_s >= end_s or (pinged_s is not None and self.received_s < pinged_s):
                 raise EngineGoneError("the engine does not answer")
-            looked_s = now_s
+            pinged_s = now_s
             self.send(lambda number: Ping(id=number))
 
     def _next_id(self) -> int:

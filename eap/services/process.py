@@ -60,7 +60,7 @@ from eap.services.control.status import (
 )
 from eap.services.device.engine_client import EngineClient
 from eap.services.device.image_values import ImageValues
-from eap.services.device.monitoring import SubscriberWatch, open_ways
+from eap.services.device.monitoring import SubscriberWatch, open_subscriber_probes
 from eap.services.device.sources import SourcePlayer
 from eap.services.device.station_device import StationDevice
 from eap.services.device.station_keeper import StationEngine, StationKeeper
@@ -72,7 +72,7 @@ from eap.services.routing.station_routes import StationRoutes, access_of, make_r
 from eap.services.routing.station_routing import StationRouting
 from eap.services.slaves.bus_client import BusClient, open_buses
 from eap.services.slaves.segment_link import SegmentLink
-from eap.services.sockets import open_doors
+from eap.services.sockets import Network, open_transports
 from eap.services.transports.accepting import Listeners
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def _runs(image: StationImage) -> bool:
     return bool(ran_at_ns) and monotonic_ns() - ran_at_ns < _LATELY_NS
 
 
-STATUS_PATIENCE_S = 0.3
+STATUS_TIMEOUT_S = 0.3
 """How long ``status`` waits for what the engine says of its buses."""
 _IMAGE_PAUSE_S = 0.01
 _AGAIN_S = 1.0
@@ -246,16 +246,16 @@ class Services:
         self._startup.step("opening gateways and sockets")
         clients = open_buses(link, [bus.owner for bus in self._handover.buses])
         providers, gateways = self._gateways(clients, devices.routers)
-        transports = open_doors(
+        network = Network(
             self._handover,
             devices.routers,
             {name: each.routes for name, each in devices.routing.items()},
             gateways,
             self._counters,
-            self._link,
             self._listeners,
             self._resources,
         )
+        transports = open_transports(network, self._link)
         brokers = self._brokers(devices.routers)
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(clients, devices, providers)
@@ -270,7 +270,7 @@ class Services:
             tasks.append(group.create_task(devices.serve()))
             tasks.append(group.create_task(audit.serve()))
             tasks.append(group.create_task(self._log.serve()))
-            watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
+            watch = SubscriberWatch(images, open_subscriber_probes(self._handover, self._resources))
             tasks.append(group.create_task(_keep_serving(watch.run)))
             self._startup.finish({})
             await self._stopping.wait()
@@ -325,9 +325,11 @@ class Services:
         routing = self._handover.routing
         if not any(told.mqtt for told in routing.values()):
             return ()
-        from eap.services.transports.mqtt_transport import open_mqtt_doors  # few plants have any
+        from eap.services.transports.mqtt_transport import (
+            open_mqtt_transports,  # few plants have any
+        )
 
-        return open_mqtt_doors(routing, routers, self._counters)
+        return open_mqtt_transports(routing, routers, self._counters)
 
     def _methods(
         self,
@@ -344,7 +346,7 @@ class Services:
         identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
 
         async def status() -> dict[str, Any]:
-            reports = await buses.reports(STATUS_PATIENCE_S)
+            reports = await buses.reports(STATUS_TIMEOUT_S)
             return appliance_status(
                 self._folder.read_info(),
                 [await take_snapshot(each.image) for each in images.values()],

@@ -16,7 +16,7 @@ from time import monotonic
 from typing import Any, NamedTuple, TextIO
 
 
-class Allowance:
+class RateLimiter:
     """Room for *burst* at once, which comes back at *per_s* a second."""
 
     def __init__(self, burst: int, per_s: float, now_s: float) -> None:
@@ -71,10 +71,10 @@ class SourceRateLimiter:
     def __init__(self, rates: SourceRates, max_sources: int, now_s: float) -> None:
         self._rate = rates.source
         self._max_sources = max_sources
-        self._known = Allowance(*rates.known, now_s)
-        self._new = Allowance(*rates.new, now_s)
-        self._local = Allowance(*rates.local, now_s)
-        self._sources: OrderedDict[str, Allowance] = OrderedDict()
+        self._known = RateLimiter(*rates.known, now_s)
+        self._new = RateLimiter(*rates.new, now_s)
+        self._local = RateLimiter(*rates.local, now_s)
+        self._sources: OrderedDict[str, RateLimiter] = OrderedDict()
 
     def take_local(self, now_s: float) -> bool:
         """Take one for this host; return whether its rate allows it."""
@@ -90,7 +90,7 @@ class SourceRateLimiter:
             return False
         if len(self._sources) >= self._max_sources:
             self._sources.popitem(last=False)
-        own = self._sources[source] = Allowance(*self._rate, now_s)
+        own = self._sources[source] = RateLimiter(*self._rate, now_s)
         return own.take(now_s)
 
 

@@ -1,4 +1,9 @@
-"""Network side of services: sockets that the supervisor opened, and the transports on them."""
+"""Network side of services: the transports on the sockets that the supervisor opened.
+
+:class:`MailboxTransports` opens frames of type 4 and 5 (EtherType 0x88A4, UDP and TCP 34980, ports
+of gateways), :class:`AmsTransports` AMS/TCP 48898 and UDP 48899.  :func:`open_transports` gives
+each socket to one of them by its kind.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address
 from time import monotonic_ns
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
@@ -24,7 +29,7 @@ from eap.pd.spec import StationSpec
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
 from eap.services.gateway.gateway_transport import GatewayTransport
-from eap.services.routing.neighbours import AmsQuestions
+from eap.services.routing.neighbours import RouterRequests
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.accepting import Listeners
@@ -34,9 +39,9 @@ from eap.services.transports.demultiplexer import Demultiplexer
 from eap.services.transports.mailbox_frames import (
     FRAME_OVERHEAD,
     ChannelSender,
+    EthernetSegment,
     FrameIntake,
     MailboxIntake,
-    Segment,
     SegmentSender,
     watch_channel,
 )
@@ -45,36 +50,134 @@ from eap.services.transports.mailbox_stream import LARGEST_FRAME, MailboxStreams
 if TYPE_CHECKING:
     from eap.services.gateway.gateway import MailboxGateway
 
+AMS_TRANSPORT = TransportKind.AMS_TCP
+"""Name of the transport of all clients that connect to AMS/TCP."""
+LINK_POLL_S = 0.2
+"""Interval between two polls of the links."""
 
-LOOK_S = 0.2
-"""Between two looks."""
+
+class ServedTransport(Protocol):
+    """Transport with a task of its own, such as a listener."""
+
+    async def serve(self) -> None:
+        """Serve until cancelled."""
+
+
+class Network(NamedTuple):
+    """Routers, gateways and resources that all transports of the process are opened with."""
+
+    handover: Handover
+    routers: Mapping[str, StationRouter]
+    """Of the stations, by name."""
+    routes: Mapping[str, StationRoutes]
+    """Of these routers; tools may add some."""
+    gateways: Mapping[PortName, MailboxGateway]
+    """To the buses, in their order."""
+    counters: DiscardCounters
+    """Of dropped frames and closed connections."""
+    listeners: Listeners
+    """Of this process."""
+    resources: ExitStack
+    """Closes the sockets."""
+
+    def open_socket(self, shared: SharedSocket) -> socket.socket:
+        """Return the socket of services; *resources* closes it."""
+        return self.resources.enter_context(socket.socket(fileno=shared.services_fd))
+
+    def demultiplexer(self, kind: str, owners: Sequence[PortName]) -> Demultiplexer:
+        """Return the demultiplexer to the stations of *owners*."""
+        names = _transport_names(kind, owners)
+        return Demultiplexer([(self.routers[station], name) for station, name in names.items()])
+
+    def first_gateways(self, kind: str, owners: Sequence[PortName]) -> GatewayTransport:
+        """Return the gateways of the first bus of each station of *owners*."""
+        first: dict[str, MailboxGateway] = {}
+        for owner, gateway in self.gateways.items():
+            first.setdefault(owner.station, gateway)
+        names = _transport_names(kind, owners)
+        return GatewayTransport(
+            [(first[station], name) for station, name in names.items() if station in first]
+        )
+
+    def own_gateway(self, kind: str, shared: SharedSocket) -> GatewayTransport:
+        """Return the gateway that has a port number to itself."""
+        (owner,) = shared.owners
+        spec = next(each for each in self.handover.stations if each.name == owner.station)
+        name = next(
+            port.name
+            for port in spec.ports
+            if InterfaceUri.parse(port.interface).host == shared.address
+        )
+        return GatewayTransport([(self.gateways[owner], f"{kind}:{name}")])
+
+    def drop_counter(self, stations: Sequence[str]) -> Callable[[Refusal], None]:
+        """Return the function that counts a reason at each of *stations*."""
+
+        def count_dropped(reason: Refusal) -> None:
+            for station in stations:
+                self.counters.count(station, reason)
+
+        return count_dropped
+
+
+def open_transports(network: Network, engine: socket.socket) -> list[ServedTransport]:
+    """Open all transports on the sockets of the handover, as long as the running loop lives.
+
+    Args:
+        network: What they are opened with.
+        engine: Link to the engine, for connections that belong there.
+
+    Returns:
+        The listeners, the connections to other routers and the link watch, to be served.
+    """
+    links = LinkWatch()
+    mailbox = MailboxTransports(network, links, engine)
+    ams = AmsTransports(network)
+    openers: dict[SocketKind, Callable[[SharedSocket], ServedTransport | None]] = {
+        # Unicast first: answers to frames of a group go out by the socket of the unicast address.
+        SocketKind.UDP: mailbox.open_unicast,
+        SocketKind.GROUP: mailbox.open_group,
+        SocketKind.PACKET: mailbox.open_interface,
+        SocketKind.AMS_UDP: ams.open_discovery,
+        SocketKind.GATEWAY_UDP: mailbox.open_gateway_datagrams,
+        SocketKind.TCP: mailbox.open_listener,
+        SocketKind.GATEWAY_TCP: mailbox.open_gateway_listener,
+        SocketKind.AMS_TCP: ams.open_listener,
+    }
+    opened = [
+        opener(shared)
+        for kind, opener in openers.items()
+        for shared in network.handover.sockets
+        if shared.kind is kind
+    ]
+    uplinks = [ams.open_uplinks(station) for station in network.handover.stations]
+    return [*(each for each in opened if each is not None), *uplinks, links]
 
 
 class LinkWatch:
-    """Looks after the links of interfaces.
+    """Link state of the interfaces: a pulled cable takes the hops of their transports down.
 
     Args:
-        transports: By interface, which stations use it and by which of their doors.
-        is_up: Says of an interface whether its link is up.
+        is_up: Returns whether the link of an interface is up.
     """
 
-    def __init__(
-        self,
-        transports: Mapping[str, Sequence[tuple[StationRouter, str]]],
-        is_up: Callable[[str], bool] = link_is_up,
-    ) -> None:
-        self._transports = transports
+    def __init__(self, is_up: Callable[[str], bool] = link_is_up) -> None:
+        self._transports: dict[str, list[tuple[StationRouter, str]]] = {}
         self._is_up = is_up
         self._down: set[str] = set()
 
-    async def serve(self) -> None:
-        """Look until cancelled; at once if there is nothing to look after."""
-        while self._transports:
-            self.look()
-            await asyncio.sleep(LOOK_S)
+    def add(self, interface: str, router: StationRouter, transport: str) -> None:
+        """Watch *interface* for one transport of *router*."""
+        self._transports.setdefault(interface, []).append((router, transport))
 
-    def look(self) -> None:
-        """Tell the stations what has changed."""
+    async def serve(self) -> None:
+        """Poll until cancelled; return at once without any interface."""
+        while self._transports:
+            self.poll()
+            await asyncio.sleep(LINK_POLL_S)
+
+    def poll(self) -> None:
+        """Notify the routers of changed links."""
         for interface, transports in self._transports.items():
             is_up, was_up = self._is_up(interface), interface not in self._down
             if is_up and not was_up:
@@ -87,313 +190,243 @@ class LinkWatch:
                     station.hop_down(transport, None, f"interface {interface} has no link")
 
 
-AMS_TRANSPORT = TransportKind.AMS_TCP
-"""By which clients come in that connect to AMS/TCP."""
-
-
-def open_doors(
-    handover: Handover,
-    routers: Mapping[str, StationRouter],
-    routes: Mapping[str, StationRoutes],
-    gateways: Mapping[PortName, MailboxGateway],
-    counters: DiscardCounters,
-    link: socket.socket,
-    listeners: Listeners,
-    resources: ExitStack,
-) -> list[TcpTransport | AmsTransport | AmsUplinks | LinkWatch]:
-    """Take frames from all sockets of *handover*, as long as the running loop lives.
+class MailboxTransports:
+    """Transports of frames of type 5, and of TCP connections with type 4 to the engine.
 
     Args:
-        handover: What the supervisor opened.
-        routers: Of the stations, by name; they get their doors.
-        routes: Of these routers; tools may add some.
-        gateways: To the buses, in their order.
-        counters: Of what is not taken.
-        link: To the engine, for connections that belong there.
-        listeners: Of this process.
-        resources: Closes what is opened here.
-
-    Returns:
-        The listeners for TCP, the connections to others and the watch over links, to be served.
+        network: What they are opened with.
+        links: Watches the interfaces.
+        engine: Link to the engine.
     """
-    transports = _Sockets(handover, routers, routes, gateways, counters, listeners, resources)
-    return transports.open(link)
 
-
-class _Sockets:
-    def __init__(
-        self,
-        handover: Handover,
-        routers: Mapping[str, StationRouter],
-        routes: Mapping[str, StationRoutes],
-        gateways: Mapping[PortName, MailboxGateway],
-        counters: DiscardCounters,
-        listeners: Listeners,
-        resources: ExitStack,
-    ) -> None:
-        self._handover = handover
-        self._listeners = listeners
-        self._routers = routers
-        self._routes = routes
-        self._gateways = gateways
-        self._first_gateways: dict[str, MailboxGateway] = {}
-        for owner, gateway in gateways.items():
-            self._first_gateways.setdefault(owner.station, gateway)
-        self._counters = counters
-        self._resources = resources
+    def __init__(self, network: Network, links: LinkWatch, engine: socket.socket) -> None:
+        self._network = network
+        self._links = links
+        self._engine = engine
         self._batch = ReceiveBatch()
-        self._now_ns = monotonic_ns()
-        self._ams_clients = AmsClients()
-        self._ams_stations: set[str] = set()
-        self._links: dict[str, list[tuple[StationRouter, str]]] = {}
+        self._from_ns = monotonic_ns()
 
-    def open(
-        self, link: socket.socket
-    ) -> list[TcpTransport | AmsTransport | AmsUplinks | LinkWatch]:
-        by_kind: dict[SocketKind, list[SharedSocket]] = {kind: [] for kind in SocketKind}
-        for shared in self._handover.sockets:
-            by_kind[shared.kind].append(shared)
-        for shared in by_kind[SocketKind.UDP]:
-            self._watch_unicast(shared)
-        for shared in by_kind[SocketKind.GROUP]:  # what comes there is answered by the others
-            self._watch_group(shared)
-        for shared in by_kind[SocketKind.PACKET]:
-            self._watch_interface(shared)
-        for shared in by_kind[SocketKind.AMS_UDP]:
-            self._watch_discovery(shared)
-        for shared in by_kind[SocketKind.GATEWAY_UDP]:
-            self._watch_gateway(shared)
-        transports: list[TcpTransport | AmsTransport | AmsUplinks | LinkWatch] = []
-        transports += [self._transport(shared, link) for shared in by_kind[SocketKind.TCP]]
-        transports += [
-            self._gateway_door(shared, link) for shared in by_kind[SocketKind.GATEWAY_TCP]
-        ]
-        transports += [self._ams_door(shared) for shared in by_kind[SocketKind.AMS_TCP]]
-        transports += [self._uplinks(station) for station in self._handover.stations]
-        transports.append(LinkWatch(self._links))
-        return transports
-
-    def _channel(self, shared: SharedSocket) -> UdpChannel:
-        channel = UdpChannel(socket.socket(fileno=shared.services_fd), self._batch)
-        self._resources.callback(channel.close)
-        return channel
-
-    def _demultiplexer(self, kind: str, owners: Sequence[PortName]) -> Demultiplexer:
-        """Return the way in to the stations of *owners*, by the doors of their ports."""
-        transports = _transports(kind, owners)
-        return Demultiplexer(
-            [(self._routers[station], transport) for station, transport in transports.items()]
-        )
-
-    def _gateway(self, kind: str, owners: Sequence[PortName]) -> GatewayTransport:
-        """Return the way in to the gateways of their stations' first buses."""
-        transports = _transports(kind, owners)
-        gateways = self._first_gateways
-        return GatewayTransport(
-            [
-                (gateways[station], transport)
-                for station, transport in transports.items()
-                if station in gateways
-            ]
-        )
-
-    def _own_gateway(self, kind: str, shared: SharedSocket) -> GatewayTransport:
-        """Return the way in to the gateway that has a port number to itself."""
-        (owner,) = shared.owners
-        spec = next(each for each in self._handover.stations if each.name == owner.station)
-        at = next(
-            port.name
-            for port in spec.ports
-            if InterfaceUri.parse(port.interface).host == shared.address
-        )
-        return GatewayTransport([(self._gateways[owner], f"{kind}:{at}")])
-
-    def _watch_gateway(self, shared: SharedSocket) -> None:
-        channel = self._channel(shared)
-        mailbox = MailboxIntake(
-            Demultiplexer([]),
-            self._own_gateway("udp", shared),
-            ChannelSender(channel),
-            lambda data: False,
-            is_aoe_here=False,
-        )
-        stations = _stations_of(shared)
-        channel.takers.append(
-            FrameIntake(stations, self._counters, self._now_ns, mailbox.take).take
-        )
-        watch_channel(channel)
-
-    def _gateway_door(self, shared: SharedSocket, link: socket.socket) -> TcpTransport:
-        refuse = self._error_replier(_stations_of(shared))
-        gateway = self._own_gateway("tcp", shared)
-        streams = MailboxStreams(Demultiplexer([]), gateway, refuse, is_aoe_here=False)
-        return TcpTransport(self._socket(shared), (), link, refuse, streams, self._listeners)
-
-    def _watch_unicast(self, shared: SharedSocket) -> None:
+    def open_unicast(self, shared: SharedSocket) -> None:
+        """Open the UDP socket of an address."""
         channel = self._channel(shared)
         sender = ChannelSender(channel)
+        max_size = MAX_UDP_FRAME - FRAME_OVERHEAD
         for owner in shared.owners:
-            transport = Transport(f"udp:{owner.port}", MAX_UDP_FRAME - FRAME_OVERHEAD, is_hub=True)
-            self._routers[owner.station].add_transport(transport, sender)
+            transport = Transport(f"udp:{owner.port}", max_size, is_hub=True)
+            self._network.routers[owner.station].add_transport(transport, sender)
             self._watch_link(shared.address, owner, transport)
-        self._take_datagrams(shared.owners, channel, sender, lambda data: False)
+        self._add_intake(shared.owners, channel, sender, lambda data: False)
         watch_channel(channel)
 
-    def _watch_group(self, shared: SharedSocket) -> None:
+    def open_group(self, shared: SharedSocket) -> None:
+        """Open a multicast group; each owner gets all of its frames."""
         channel = self._channel(shared)
         sender = ChannelSender(channel)
         for owner in shared.owners:
-            self._take_datagrams([owner], channel, sender, lambda data: True)
+            self._add_intake([owner], channel, sender, lambda data: True)
         watch_channel(channel)
 
-    def _take_datagrams(
-        self,
-        owners: Sequence[PortName],
-        channel: UdpChannel,
-        sender: ChannelSender,
-        is_for_many: Callable[[memoryview], bool],
-    ) -> None:
-        demultiplexer, gateway = self._demultiplexer("udp", owners), self._gateway("udp", owners)
-        mailbox = MailboxIntake(demultiplexer, gateway, sender, is_for_many)
-        stations = list(dict.fromkeys(owner.station for owner in owners))
-        intake = FrameIntake(stations, self._counters, self._now_ns, mailbox.take)
-        channel.takers.append(intake.take)
+    def open_interface(self, shared: SharedSocket) -> None:
+        """Open an Ethernet interface: one segment for each VLAN, with all ports in it.
 
-    def _watch_interface(self, shared: SharedSocket) -> None:
-        """One way in for each VLAN: its ports have one MAC address, and all get what comes there.
-
-        Of two ports of a station in one VLAN the first one has the door.
+        The ports of a VLAN have one MAC address, so each of them gets every frame.  Of two ports of
+        a station in one VLAN the first one has the transport.
         """
+        network = self._network
         interface = EthernetInterface(socket.socket(fileno=shared.services_fd), packet_batch())
-        self._resources.callback(interface.close)
+        network.resources.callback(interface.close)
         intakes: dict[int, list[FrameIntake]] = {}
         ports: dict[int, dict[PortName, EthernetPort]] = {}
         for owner in shared.owners:
-            spec = self._handover.port(owner)
-            intake = FrameIntake([owner.station], self._counters, self._now_ns, _not_yet)
+            spec = network.handover.port(owner)
+            intake = FrameIntake([owner.station], network.counters, self._from_ns, _drop_mailbox)
             port = interface.port(
-                intake.take, vlan_id=spec.vlan_id, priority=spec.vlan_priority, join=spec.join
+                intake.receive, vlan_id=spec.vlan_id, priority=spec.vlan_priority, join=spec.join
             )
             intakes.setdefault(spec.vlan_id, []).append(intake)
             in_vlan = ports.setdefault(spec.vlan_id, {})
             if owner.station not in {each.station for each in in_vlan}:
                 in_vlan[owner] = port
         for vlan_id, (first, *others) in intakes.items():
-            there = [*ports[vlan_id]]
-            segment = Segment(self._demultiplexer("ethernet", there), interface.address)
-            sender = ChannelSender(ports[vlan_id][there[0]])
-            gateway = self._gateway("ethernet", there)
+            owners = [*ports[vlan_id]]
+            segment = EthernetSegment(network.demultiplexer("ethernet", owners), interface.address)
+            sender = ChannelSender(ports[vlan_id][owners[0]])
+            gateway = network.first_gateways("ethernet", owners)
             mailbox = MailboxIntake(segment, gateway, sender, interface.is_for_many)
-            first.mailbox = mailbox.take
+            first.mailbox = mailbox.receive
             for each in others:
-                each.mailbox = mailbox.admission
+                each.mailbox = mailbox.drop_reason
             for owner, port in ports[vlan_id].items():
-                router = self._routers[owner.station]
+                router = network.routers[owner.station]
                 transport = Transport(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
                 router.add_transport(transport, SegmentSender(segment, port, router.net_id))
-                self._links.setdefault(shared.address, []).append((router, transport.name))
+                self._links.add(shared.address, router, transport.name)
         watch_channel(port)
 
-    def _watch_discovery(self, shared: SharedSocket) -> None:
-        names = _stations_of(shared)
+    def open_listener(self, shared: SharedSocket) -> TcpTransport:
+        """Open the TCP listener of an address."""
+        network, owners = self._network, shared.owners
+        count_dropped = network.drop_counter(_stations_of(shared))
+        streams = MailboxStreams(
+            network.demultiplexer("tcp", owners),
+            network.first_gateways("tcp", owners),
+            count_dropped,
+            shared.address,
+        )
+        max_size = LARGEST_FRAME - FRAME_OVERHEAD
+        for owner in owners:
+            transport = Transport(f"tcp:{owner.port}", max_size, is_stream=True, is_hub=True)
+            network.routers[owner.station].add_transport(transport, streams)
+            self._watch_link(shared.address, owner, transport)
+        accepting = tuple(owner for owner in owners if self._accepts_process_data(owner))
+        return self._tcp_transport(shared, accepting, count_dropped, streams)
+
+    def open_gateway_datagrams(self, shared: SharedSocket) -> None:
+        """Open the UDP port of one gateway."""
+        channel = self._channel(shared)
+        mailbox = MailboxIntake(
+            Demultiplexer([]),
+            self._network.own_gateway("udp", shared),
+            ChannelSender(channel),
+            lambda data: False,
+            is_aoe_here=False,
+        )
+        stations = _stations_of(shared)
+        intake = FrameIntake(stations, self._network.counters, self._from_ns, mailbox.receive)
+        channel.takers.append(intake.receive)
+        watch_channel(channel)
+
+    def open_gateway_listener(self, shared: SharedSocket) -> TcpTransport:
+        """Open the TCP port of one gateway."""
+        count_dropped = self._network.drop_counter(_stations_of(shared))
+        gateway = self._network.own_gateway("tcp", shared)
+        streams = MailboxStreams(Demultiplexer([]), gateway, count_dropped, is_aoe_here=False)
+        return self._tcp_transport(shared, (), count_dropped, streams)
+
+    def _tcp_transport(
+        self,
+        shared: SharedSocket,
+        accepting: tuple[PortName, ...],
+        count_dropped: Callable[[Refusal], None],
+        streams: MailboxStreams,
+    ) -> TcpTransport:
+        listener, listeners = self._network.open_socket(shared), self._network.listeners
+        return TcpTransport(listener, accepting, self._engine, count_dropped, streams, listeners)
+
+    def _channel(self, shared: SharedSocket) -> UdpChannel:
+        channel = UdpChannel(socket.socket(fileno=shared.services_fd), self._batch)
+        self._network.resources.callback(channel.close)
+        return channel
+
+    def _add_intake(
+        self,
+        owners: Sequence[PortName],
+        channel: UdpChannel,
+        sender: ChannelSender,
+        is_for_many: Callable[[memoryview], bool],
+    ) -> None:
+        network = self._network
+        mailbox = MailboxIntake(
+            network.demultiplexer("udp", owners),
+            network.first_gateways("udp", owners),
+            sender,
+            is_for_many,
+        )
+        stations = list(dict.fromkeys(owner.station for owner in owners))
+        intake = FrameIntake(stations, network.counters, self._from_ns, mailbox.receive)
+        channel.takers.append(intake.receive)
+
+    def _watch_link(self, address: str, owner: PortName, transport: Transport) -> None:
+        """Watch the link of the interface with *address*, which a loopback address has not."""
+        if IPv4Address(address).is_loopback or IPv4Address(address).is_unspecified:
+            return
+        with suppress(EnvironmentalError):  # the address was removed from this host
+            router = self._network.routers[owner.station]
+            self._links.add(interface_of(address), router, transport.name)
+
+    def _accepts_process_data(self, name: PortName) -> bool:
+        port = self._network.handover.port(name)
+        return port.tcp or InterfaceUri.parse(port.interface).scheme == "tcp"
+
+
+class AmsTransports:
+    """Transports of AMS/TCP, and discovery by UDP 48899.
+
+    Args:
+        network: What they are opened with.
+    """
+
+    def __init__(self, network: Network) -> None:
+        self._network = network
+        self._clients = AmsClients()
+        self._stations: set[str] = set()
+
+    def open_discovery(self, shared: SharedSocket) -> None:
+        """Open the UDP 48899 socket of an address, and that for broadcasts to its network."""
+        network, names = self._network, _stations_of(shared)
         routers = [
             RouterName(station.name, NetId.parse(station.net_id))
-            for station in self._handover.stations
+            for station in network.handover.stations
             if station.name in names
         ]
-        desk = RouteAdmin([self._routes[name] for name in names])
-        sock = self._socket(shared)
-        questions = AmsQuestions(sock, [router.net_id for router in routers])
-        discovery = AmsDiscovery(sock, routers, desk, questions, self._error_replier(names))
+        sock = network.open_socket(shared)
+        requests = RouterRequests(sock, [router.net_id for router in routers])
+        discovery = AmsDiscovery(
+            sock,
+            routers,
+            RouteAdmin([network.routes[name] for name in names]),
+            requests,
+            network.drop_counter(names),
+        )
         discovery.watch()
-        for other in self._handover.sockets:
-            is_for_it = other.kind is SocketKind.AMS_BROADCAST and other.address == shared.address
-            if is_for_it and other.services_fd != NO_DESCRIPTOR:
-                discovery.watch(self._socket(other))
+        for other in network.handover.sockets:
+            is_broadcast = other.kind is SocketKind.AMS_BROADCAST
+            is_same = is_broadcast and other.address == shared.address
+            if is_same and other.services_fd != NO_DESCRIPTOR:
+                discovery.watch(network.open_socket(other))
         for name in names:
-            self._routes[name].scanners.append(questions)
+            network.routes[name].scanners.append(requests)
 
-    def _ams_door(self, shared: SharedSocket) -> AmsTransport:
-        """Return the listener of an address; a station with several has one door for all."""
-        stations = _stations_of(shared)
+    def open_listener(self, shared: SharedSocket) -> AmsTransport:
+        """Open the AMS/TCP listener of an address; all listeners of a station are one transport."""
+        network, stations = self._network, _stations_of(shared)
         for station in stations:
-            if station not in self._ams_stations:
-                self._ams_stations.add(station)
+            if station not in self._stations:
+                self._stations.add(station)
                 transport = Transport(AMS_TRANSPORT, is_stream=True, is_hub=True)
-                self._routers[station].add_transport(transport, self._ams_clients)
-        demultiplexer = Demultiplexer(
-            [(self._routers[station], AMS_TRANSPORT) for station in stations]
-        )
-        refuse = self._error_replier(stations)
+                network.routers[station].add_transport(transport, self._clients)
         return AmsTransport(
-            self._socket(shared), demultiplexer, self._ams_clients, refuse, self._listeners
+            network.open_socket(shared),
+            Demultiplexer([(network.routers[station], AMS_TRANSPORT) for station in stations]),
+            self._clients,
+            network.drop_counter(stations),
+            network.listeners,
         )
 
-    def _uplinks(self, station: StationSpec) -> AmsUplinks:
+    def open_uplinks(self, station: StationSpec) -> AmsUplinks:
+        """Return the AMS/TCP connections of *station* to other routers."""
         sources = [
             uri.host
             for port in station.ports
             if (uri := InterfaceUri.parse(port.interface)).scheme in {"udp", "tcp"}
         ]
-        return AmsUplinks(self._routers[station.name], sources, self._error_replier([station.name]))
-
-    def _transport(self, shared: SharedSocket, link: socket.socket) -> TcpTransport:
-        refuse = self._error_replier(_stations_of(shared))
-        demultiplexer, gateway = (
-            self._demultiplexer("tcp", shared.owners),
-            self._gateway("tcp", shared.owners),
-        )
-        streams = MailboxStreams(demultiplexer, gateway, refuse, shared.address)
-        for owner in shared.owners:
-            room = LARGEST_FRAME - FRAME_OVERHEAD
-            transport = Transport(f"tcp:{owner.port}", room, is_stream=True, is_hub=True)
-            self._routers[owner.station].add_transport(transport, streams)
-            self._watch_link(shared.address, owner, transport)
-        return TcpTransport(
-            self._socket(shared),
-            tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
-            link,
-            refuse,
-            streams,
-            self._listeners,
-        )
-
-    def _watch_link(self, address: str, owner: PortName, transport: Transport) -> None:
-        """Have an eye on the link of the interface with *address*, unless it is this host alone."""
-        if IPv4Address(address).is_loopback or IPv4Address(address).is_unspecified:
-            return
-        with suppress(EnvironmentalError):  # the address has been taken from this machine
-            transports = self._links.setdefault(interface_of(address), [])
-            transports.append((self._routers[owner.station], transport.name))
-
-    def _socket(self, shared: SharedSocket) -> socket.socket:
-        return self._resources.enter_context(socket.socket(fileno=shared.services_fd))
-
-    def _error_replier(self, stations: Sequence[str]) -> Callable[[Refusal], None]:
-        def refuse(reason: Refusal) -> None:
-            for station in stations:
-                self._counters.count(station, reason)
-
-        return refuse
-
-    def _takes_tcp(self, name: PortName) -> bool:
-        port = self._handover.port(name)
-        return port.tcp or InterfaceUri.parse(port.interface).scheme == "tcp"
+        count_dropped = self._network.drop_counter([station.name])
+        return AmsUplinks(self._network.routers[station.name], sources, count_dropped)
 
 
-def _transports(kind: str, owners: Sequence[PortName]) -> dict[str, str]:
-    """Return by what name each station of *owners* knows the door: that of its first port."""
-    transports: dict[str, str] = {}
+def _transport_names(kind: str, owners: Sequence[PortName]) -> dict[str, str]:
+    """Return the transport of each station of *owners*: that of its first port."""
+    names: dict[str, str] = {}
     for owner in owners:
-        transports.setdefault(owner.station, f"{kind}:{owner.port}")
-    return transports
+        names.setdefault(owner.station, f"{kind}:{owner.port}")
+    return names
 
 
 def _stations_of(shared: SharedSocket) -> list[str]:
     return list(dict.fromkeys(owner.station for owner in shared.owners))
 
 
-def _not_yet(data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
-    """Take nothing of an interface whose ports are not all known."""
+def _drop_mailbox(data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
+    """Drop each frame: the ports of the interface are not all known yet."""
     del data, size, at_ns, origin
     return Refusal.MAILBOX

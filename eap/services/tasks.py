@@ -72,7 +72,7 @@ MAX_WAITING = 256
 ResultT = TypeVar("ResultT")
 
 
-class Jobs:
+class JobQueue:
     """A row of jobs; *what* they are about is for the refusal when it is full."""
 
     def __init__(self, what: str) -> None:

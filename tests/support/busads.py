@@ -142,13 +142,13 @@ def play(
     scene: Callable[[Client, FakeEngine], Awaitable[Any]],
     name: str = "drive",
     *,
-    look_s: float = 0.05,
+    silence_limit_s: float = 0.05,
 ) -> Any:
     """Run *scene* with a client and the engine behind the service that it asks."""
 
     async def run() -> Any:
         engine = FakeEngine(FakeBus(_line(name)))
-        link = EngineLink(engine.services, look_s=look_s)
+        link = EngineLink(engine.services, silence_limit_s=silence_limit_s)
         bus = BusClient(link, 0, PORT)
         told: list[tuple[Endpoint, bytes]] = []
         provider = MasterDictionaryProvider(bus, "1.2.3")

@@ -21,7 +21,7 @@ from eap.services.routing.route_rows import RouterView
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
-from tests.support.routing import KeepingCarrier, StubService
+from tests.support.routing import RecordingSender, StubService
 
 DIRECTORY = Directory([
     DirectoryStation(
@@ -55,7 +55,7 @@ class Left:
         net_id = station.net_id
         self.router = StationRouter("left", net_id, net_ids)
         self.router.add_service(net_id, StubService(_run, SYSTEM_PORT))
-        self.sender = KeepingCarrier()
+        self.sender = RecordingSender()
         self.router.add_transport(Transport("udp:eap0", is_hub=True), self.sender)
         self.routes = StationRoutes(
             self.router, RoutingSpec(routes=(RIGHT,)), StationStore("hall", "left").routes,

@@ -38,7 +38,7 @@ class StubService:
         self.gone.append(endpoint)
 
 
-class KeepingCarrier:
+class RecordingSender:
     """Keeps what is sent by it; *error* says why it cannot."""
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ def station(
     return router
 
 
-def demultiplexer(*stations: StationRouter, transport: str = "door") -> Demultiplexer:
+def demultiplexer(*stations: StationRouter, transport: str = "link") -> Demultiplexer:
     return Demultiplexer([(each, transport) for each in stations])
 
 

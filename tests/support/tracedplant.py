@@ -18,7 +18,7 @@ from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError, IndexGroup, encode_result
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId
-from eap.services.routing.tracing import answer_question
+from eap.services.routing.tracing import answer_hop_query
 
 Serve = Callable[[int, int, bytes], AmsAnswer]
 """Answers port, command and body in the place of a station's devices."""
@@ -118,7 +118,7 @@ class Line:
             assert isinstance(asked, ReadWrite)
             assert asked.group == IndexGroup.WHEREABOUTS
             question = HopQuestion.decode(asked.data)
-            report = await answer_question(station, question, endpoint, NetId.parse("9.9.9.9.1.1"))
+            report = await answer_hop_query(station, question, endpoint, NetId.parse("9.9.9.9.1.1"))
             return AmsAnswer(encode_result(0, encode_report(report)))
         return station.serve(port, command, body)
 

@@ -11,9 +11,9 @@ from eap.control import routes as words
 from eap.control.bus import to_octets
 from eap.control.protocol import ErrorCode, of_station
 from eap.errors import ControlError
-from eap.services.routing.scanning import scan, stations_of
+from eap.services.routing.scanning import scan, scan_targets
 from eap.services.routing.station_router import StationRouter
-from eap.services.routing.tracing import Traced, trace
+from eap.services.routing.tracing import TraceResult, trace
 
 _NS_PER_US = 1000
 
@@ -53,7 +53,7 @@ class AmsMethods:
 
     async def _scan(self, wanted: words.ScanParameters) -> words.PlantScan:
         router = self._router(wanted.via)
-        stations = await scan(router, stations_of(self._directory, router.table))
+        stations = await scan(router, scan_targets(self._directory, router.table))
         via = words.ScanVia(router.name, self._addresses.get(router.name, ""))
         return words.PlantScan(stations, via)
 
@@ -89,7 +89,7 @@ def _found(find: Callable[[str], AmsAddress], target: str) -> AmsAddress:
         raise _unknown(str(exc)) from None
 
 
-def _hop_rows(found: Traced) -> list[words.HopRow]:
+def _hop_rows(found: TraceResult) -> list[words.HopRow]:
     rows, before_us = [], 0
     for hop in found.hops:
         took_us = hop.took_ns // _NS_PER_US
@@ -99,7 +99,7 @@ def _hop_rows(found: Traced) -> list[words.HopRow]:
     return rows
 
 
-def _target_answer(found: Traced) -> words.TargetAnswer | None:
+def _target_answer(found: TraceResult) -> words.TargetAnswer | None:
     if found.answer is None:
         return None
     states, result = found.states, found.answer.result

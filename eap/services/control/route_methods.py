@@ -20,10 +20,10 @@ from eap.control.protocol import ErrorCode, of_station, unless_unavailable
 from eap.errors import ControlError
 from eap.ids import NetId
 from eap.services.routing.neighbours import (
-    Found,
-    Introduction,
-    find_neighbours,
-    introduce,
+    FoundRouter,
+    RemoteRouteRequest,
+    add_remote_route,
+    scan_routers,
 )
 from eap.services.routing.route_rows import RouterView, route_row
 from eap.services.routing.tracing import find_target, probe_target
@@ -98,9 +98,9 @@ class RouteMethods:
         name = wanted.name or view.router.name
         if "\0" in name + wanted.user + wanted.password:
             raise ControlError("a NUL in a text", code=ErrorCode.VALUE)
-        route = Introduction(name, view.router.net_id, wanted.user, wanted.password)
+        route = RemoteRouteRequest(name, view.router.net_id, wanted.user, wanted.password)
         with unless_unavailable():
-            result = await introduce(view.routes, route, address, wanted.wait_ms / 1000)
+            result = await add_remote_route(view.routes, route, address, wanted.wait_ms / 1000)
         if result is None:
             return words.RemoteRouteResult(ok=False, result=None, text="no answer by UDP 48899")
         text = "added" if result == AdsError.NONE else AdsError.words_of(result)
@@ -110,7 +110,7 @@ class RouteMethods:
         self, view: RouterView, wanted: words.RoutesScanParameters
     ) -> list[words.NeighbourRow]:
         with unless_unavailable():
-            found = await find_neighbours(view.routes, wanted.address, wanted.wait_ms / 1000)
+            found = await scan_routers(view.routes, wanted.address, wanted.wait_ms / 1000)
         return [_neighbour_row(view, each) for each in found]
 
     async def _import(self, wanted: words.RoutesImportParameters) -> list[words.ImportRow]:
@@ -207,7 +207,7 @@ class RouteMethods:
         return of_station(station, self._views)
 
 
-def _neighbour_row(view: RouterView, found: Found) -> words.NeighbourRow:
+def _neighbour_row(view: RouterView, found: FoundRouter) -> words.NeighbourRow:
     name, net_id, address, version = found.neighbour
     route = view.router.table.find(net_id)
     is_own = route is not None and route[1] > 0  # a default route leads anywhere

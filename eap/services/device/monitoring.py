@@ -42,7 +42,7 @@ REFUSAL_NS = 3_000_000_000
 _CALLS_PER_TURN = 8
 
 
-class UdpWay:
+class UdpSubscriberProbe:
     """What ICMP says of the frames of one UDP port, and what the kernel knows of their targets.
 
     *sockets* are those of the port, the engine's included: which of them gets an error is up to the
@@ -112,20 +112,20 @@ class UdpWay:
             sock.close()
 
 
-class Ways(NamedTuple):
+class SubscriberProbes(NamedTuple):
     """All ways of an appliance, by port."""
 
     arp: dict[PortName, ArpProber]
-    udp: dict[PortName, UdpWay]
+    udp: dict[PortName, UdpSubscriberProbe]
 
 
-def open_ways(handover: Handover, resources: ExitStack) -> Ways:
+def open_subscriber_probes(handover: Handover, resources: ExitStack) -> SubscriberProbes:
     """Return the ways of all EAP ports; *resources* closes what they need."""
-    endpoints = Ways({}, {})
+    endpoints = SubscriberProbes({}, {})
     table = _open_table(resources)
     for shared in handover.sockets:
         if shared.kind is SocketKind.UDP:
-            endpoint = UdpWay(_both(shared), table, shared.address)
+            endpoint = UdpSubscriberProbe(_both(shared), table, shared.address)
             resources.callback(endpoint.close)
             endpoints.udp.update(dict.fromkeys(shared.owners, endpoint))
         elif shared.kind is SocketKind.ARP:
@@ -203,7 +203,7 @@ class _Row:
 class SubscriberWatch:
     """Monitors the subscribers of all frames of the *images*, by station, that say so."""
 
-    def __init__(self, images: Mapping[str, ImageHolder], endpoints: Ways) -> None:
+    def __init__(self, images: Mapping[str, ImageHolder], endpoints: SubscriberProbes) -> None:
         self._holders = images
         self._endpoints = endpoints
         self._images: dict[str, Image] = {}
@@ -284,7 +284,7 @@ class SubscriberWatch:
     def _listen(self) -> None:
         """Have each way listen to what is said of its targets."""
         self._asked = {}
-        targets: dict[UdpWay, list[Destination]] = {}
+        targets: dict[UdpSubscriberProbe, list[Destination]] = {}
         for row in self._rows.values():
             if hop_prober := self._hop_prober(row):
                 key = hop_prober, IPv4Address(row.place.monitor_ip)

@@ -32,7 +32,7 @@ from eap.runtime.device_change import (
 from eap.runtime.device_change import plan_rollback as make_rollback
 from eap.runtime.store import Configuration
 from eap.services.device.station_keeper import StationKeeper
-from eap.services.tasks import Jobs
+from eap.services.tasks import JobQueue
 
 _CONTROL = 0xF200
 _STATES = frozenset((DeviceState.PREOP, DeviceState.SAFEOP, DeviceState.OP))
@@ -58,7 +58,7 @@ class StationDevice:
     def __init__(self, keeper: StationKeeper, values: LiveValues, identity: DeviceIdentity) -> None:
         self.name = keeper.spec.name
         self._keeper = keeper
-        self._jobs = Jobs(f"station {self.name}")
+        self._jobs = JobQueue(f"station {self.name}")
         self.dictionaries = {
             name: EapDictionary(keeper.spec, name, values, identity)
             for name in eap_ports(keeper.spec)

@@ -33,7 +33,7 @@ from eap.ids import NetId
 from eap.net.interface import broadcast_of
 
 
-class Neighbour(NamedTuple):
+class RemoteRouter(NamedTuple):
     """A router of another host that answered."""
 
     name: str
@@ -44,7 +44,7 @@ class Neighbour(NamedTuple):
     """Of its software, empty if it does not tell."""
 
 
-class Introduction(NamedTuple):
+class RemoteRouteRequest(NamedTuple):
     """A route that another router is asked for: to a router here."""
 
     name: str
@@ -54,39 +54,41 @@ class Introduction(NamedTuple):
     """It is sent in clear."""
 
 
-class Scanner(Protocol):
+class NeighbourScanner(Protocol):
     """Asks for the routers of other hosts."""
 
     @property
     def address(self) -> IPv4Address:
         """That it asks from."""
 
-    async def scan(self, address: str = "", *, wait_s: float) -> list[Neighbour]:
+    async def scan(self, address: str = "", *, wait_s: float) -> list[RemoteRouter]:
         """Ask at *address*, or in a network, and return who answered in time."""
 
-    async def introduce(self, wanted: Introduction, address: str, *, wait_s: float) -> int | None:
+    async def add_remote_route(
+        self, wanted: RemoteRouteRequest, address: str, *, wait_s: float
+    ) -> int | None:
         """Ask the router at *address* for a route; return its result, None if it says nothing."""
 
 
-class Learner(Protocol):
+class LearningStation(Protocol):
     """Takes routes to those who answered."""
 
     @property
-    def scanners(self) -> Sequence[Scanner]:
+    def scanners(self) -> Sequence[NeighbourScanner]:
         """One for each address of the station."""
 
     def learn(self, net_id: NetId, name: str, address: str, now_ns: int) -> bool:
         """Take a route; tell whether it was taken."""
 
 
-class Found(NamedTuple):
+class FoundRouter(NamedTuple):
     """Who answered, and whether a route there was learned of it."""
 
-    neighbour: Neighbour
+    neighbour: RemoteRouter
     is_learned: bool
 
 
-async def find_neighbours(station: Learner, address: str, wait_s: float) -> list[Found]:
+async def scan_routers(station: LearningStation, address: str, wait_s: float) -> list[FoundRouter]:
     """Ask who else is there, and learn routes to them.
 
     Args:
@@ -99,19 +101,19 @@ async def find_neighbours(station: Learner, address: str, wait_s: float) -> list
     """
     _check(station.scanners)
     scans = [scanner.scan(address, wait_s=wait_s) for scanner in station.scanners]
-    found: dict[NetId, Neighbour] = {}
+    found: dict[NetId, RemoteRouter] = {}
     for each in await asyncio.gather(*scans):
         for neighbour in each:
             found.setdefault(neighbour.net_id, neighbour)
     now_ns = monotonic_ns()
     return [
-        Found(each, station.learn(each.net_id, each.name, each.address, now_ns))
+        FoundRouter(each, station.learn(each.net_id, each.name, each.address, now_ns))
         for each in found.values()
     ]
 
 
-async def introduce(
-    station: Learner, wanted: Introduction, address: IPv4Address, wait_s: float
+async def add_remote_route(
+    station: LearningStation, wanted: RemoteRouteRequest, address: IPv4Address, wait_s: float
 ) -> int | None:
     """Ask the router at *address* for the route *wanted*, from the station's nearest address.
 
@@ -123,10 +125,10 @@ async def introduce(
     """
     _check(station.scanners)
     nearest = min(station.scanners, key=lambda each: int(each.address) ^ int(address))
-    return await nearest.introduce(wanted, str(address), wait_s=wait_s)
+    return await nearest.add_remote_route(wanted, str(address), wait_s=wait_s)
 
 
-def _check(scanners: Sequence[Scanner]) -> None:
+def _check(scanners: Sequence[NeighbourScanner]) -> None:
     if not scanners:
         raise EnvironmentalError("the station has no IP address at which it serves AMS")
 
@@ -137,7 +139,7 @@ BROADCAST = "255.255.255.255"
 _MAX_NAME = 80
 
 
-class _Question:
+class _PendingRequest:
     """One question on its way; *wanted* is how many answers end the waiting, 0 for none."""
 
     def __init__(self, service: int, take: Callable[[Discovery, str], None], wanted: int) -> None:
@@ -147,7 +149,7 @@ class _Question:
         self.is_answered = asyncio.Event()
 
 
-class AmsQuestions:
+class RouterRequests:
     """Asks from one address.
 
     Args:
@@ -160,11 +162,11 @@ class AmsQuestions:
         self._sock = sock
         self._own: Collection[NetId] = frozenset(own)
         self._net_id = own[0]
-        self._waiting: dict[int, _Question] = {}
+        self._waiting: dict[int, _PendingRequest] = {}
 
     async def scan(
         self, address: str = "", *, wait_s: float, port: int = AMS_UDP_PORT
-    ) -> list[Neighbour]:
+    ) -> list[RemoteRouter]:
         """Ask who is there, and return who answered in time.
 
         Args:
@@ -175,7 +177,7 @@ class AmsQuestions:
         Raises:
             EnvironmentalError: the question cannot be sent.
         """
-        found: dict[NetId, Neighbour] = {}
+        found: dict[NetId, RemoteRouter] = {}
 
         def take(answer: Discovery, sender: str) -> None:
             net_id = answer.header.net_id
@@ -183,13 +185,13 @@ class AmsQuestions:
                 # Who answers for somebody else comes later than that one.
                 found.setdefault(net_id, _neighbour(answer, sender))
 
-        question = _Question(DiscoveryService.SERVER_INFO, take, 0)
+        question = _PendingRequest(DiscoveryService.SERVER_INFO, take, 0)
         target = address or network_of(str(self.address))
         await self._ask(question, [], (target, port), wait_s)
         return list(found.values())
 
-    async def introduce(
-        self, wanted: Introduction, address: str, *, wait_s: float, port: int = AMS_UDP_PORT
+    async def add_remote_route(
+        self, wanted: RemoteRouteRequest, address: str, *, wait_s: float, port: int = AMS_UDP_PORT
     ) -> int | None:
         """Ask the router at *address* for a route to one here.
 
@@ -218,7 +220,7 @@ class AmsQuestions:
             (Tag.PASSWORD, encode_text(wanted.password)),
             (Tag.HOST, encode_text(str(self._seen_from(address)))),
         ]
-        question = _Question(DiscoveryService.ADD_ROUTE, take, 1)
+        question = _PendingRequest(DiscoveryService.ADD_ROUTE, take, 1)
         await self._ask(question, tags, (address, port), wait_s)
         return results[0] if results else None
 
@@ -246,7 +248,7 @@ class AmsQuestions:
 
     async def _ask(
         self,
-        question: _Question,
+        question: _PendingRequest,
         tags: Sequence[tuple[int, bytes]],
         target: tuple[str, int],
         wait_s: float,
@@ -281,7 +283,7 @@ def network_of(address: str) -> str:
     return BROADCAST if is_any else broadcast_of(address) or BROADCAST
 
 
-def _neighbour(answer: Discovery, sender: str) -> Neighbour:
+def _neighbour(answer: Discovery, sender: str) -> RemoteRouter:
     name = "".join(filter(str.isprintable, decode_text(answer.find(Tag.HOST) or b"")))
     version = decode_version(answer.find(Tag.VERSION) or b"")
-    return Neighbour(name[:_MAX_NAME], answer.header.net_id, sender, version)
+    return RemoteRouter(name[:_MAX_NAME], answer.header.net_id, sender, version)

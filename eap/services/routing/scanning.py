@@ -20,23 +20,23 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.control.routes import ScannedPort, SlaveEntry, StationEntry
 from eap.ids import STATION_OCTETS, NetId
-from eap.services.routing.tracing import TracedStation, ask_one, find_fault
+from eap.services.routing.tracing import TracedStation, find_fault, run_operation
 
-PATIENCE_S = 3.0
+ANSWER_TIMEOUT_S = 3.0
 """For one answer."""
-STATION_S = 20.0
+STATION_TIMEOUT_S = 20.0
 """For all answers of a station."""
-_AT_A_TIME = 8
+_MAX_CONCURRENT = 8
 """Stations that are asked."""
 _MAX_PORTS = 64
-_ROOM = 4096
+_MAX_SIZE = 4096
 _NAME = 0x1008_0000
 _INTERFACE = 0x8000_0003
 _INTERFACE_STEP = 0x1_0000
 _KINDS: dict[int, str] = {IoDeviceType.MASTER: "bus", IoDeviceType.EAP: "eap"}
 _STATUS = 0x1F
 """AL state, and the bit of an error."""
-_AT = {"ids": 1, "name": 1, "net_id": 5, "type": 7}
+_LIST_OFFSETS = {"ids": 1, "name": 1, "net_id": 5, "type": 7}
 """Offsets of the list of devices."""
 
 
@@ -44,7 +44,7 @@ class _FailedError(Exception):
     """Why somebody did not say what he was asked; in words."""
 
 
-class Known(NamedTuple):
+class ScanTarget(NamedTuple):
     """A station that a scan asks."""
 
     name: str
@@ -52,40 +52,41 @@ class Known(NamedTuple):
     planned: DirectoryStation | None
 
 
-def stations_of(directory: Directory, routes: Iterable[Route]) -> list[Known]:
+def scan_targets(directory: Directory, routes: Iterable[Route]) -> list[ScanTarget]:
     """Return the stations of the plant, then those that only routes tell of."""
     found = {
-        each.net_id: Known(each.name, each.net_id, each) for each in directory.stations.values()
+        each.net_id: ScanTarget(each.name, each.net_id, each)
+        for each in directory.stations.values()
     }
     for route in routes:
         is_known = route.net_id in found or directory.station_of(route.net_id)
         if route.octets >= STATION_OCTETS and not is_known:
-            found[route.net_id] = Known(route.name, route.net_id, None)
+            found[route.net_id] = ScanTarget(route.name, route.net_id, None)
     return [*found.values()]
 
 
-async def scan(station: TracedStation, known: Sequence[Known]) -> list[StationEntry]:
+async def scan(station: TracedStation, known: Sequence[ScanTarget]) -> list[StationEntry]:
     """Ask all stations; return an entry for each, in their order.
 
     Args:
         station: Whose router asks.
         known: Whom.
     """
-    turns = asyncio.Semaphore(_AT_A_TIME)
+    turns = asyncio.Semaphore(_MAX_CONCURRENT)
 
-    async def look(each: Known) -> StationEntry:
+    async def look(each: ScanTarget) -> StationEntry:
         async with turns:
-            return await _Look(station, each).station()
+            return await _StationScan(station, each).station()
 
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(look(each)) for each in known]
     return [task.result() for task in tasks]
 
 
-class _Look:
+class _StationScan:
     """A look at one station."""
 
-    def __init__(self, asker: TracedStation, known: Known) -> None:
+    def __init__(self, asker: TracedStation, known: ScanTarget) -> None:
         self._asker = asker
         self._known = known
         ports = known.planned.ports if known.planned else ()
@@ -95,12 +96,12 @@ class _Look:
         """Return the station with its ports and slaves."""
         name, net_id = self._known.name, str(self._known.net_id)
         try:
-            async with asyncio.timeout(STATION_S):
+            async with asyncio.timeout(STATION_TIMEOUT_S):
                 ids = await self._read_io(0, "ids")
                 numbers = _numbers(ids)[1 : _MAX_PORTS + 1]
                 ports = [await self._port(place, number) for place, number in enumerate(numbers)]
         except (_FailedError, TimeoutError) as exc:
-            reason = str(exc) or f"not all was said within {STATION_S:g} s"
+            reason = str(exc) or f"not all was said within {STATION_TIMEOUT_S:g} s"
             reason = await find_fault(self._asker, self._known.net_id, IO_PORT) or reason
             planned = [_planned_port(port) for port in self._planned.values()]
             return StationEntry(name, net_id, planned, reason)
@@ -160,16 +161,16 @@ class _Look:
 
     async def _read_io(self, number: int, what: str) -> bytes:
         address = AmsAddress(self._known.net_id, IO_PORT)
-        return await self._read(address, IndexGroup.IO_DEVICES + number, _AT[what])
+        return await self._read(address, IndexGroup.IO_DEVICES + number, _LIST_OFFSETS[what])
 
     async def _read(self, address: AmsAddress, group: int, offset: int) -> bytes:
-        found = await self._ask(address, Read(group, offset, _ROOM))
+        found = await self._ask(address, Read(group, offset, _MAX_SIZE))
         if found.result:
             raise _FailedError(f"{address}: {AdsError.words_of(found.result)}")
         return found.data
 
     async def _ask(self, address: AmsAddress, operation: Read | ReadDeviceInfo) -> OperationOutcome:
-        return await ask_one(self._asker, *address, operation, PATIENCE_S)
+        return await run_operation(self._asker, *address, operation, ANSWER_TIMEOUT_S)
 
 
 def _planned_port(port: DirectoryPort) -> ScannedPort:

@@ -164,7 +164,7 @@ _Key: TypeAlias = tuple[Endpoint, bytes]
 logger = logging.getLogger(__name__)
 
 
-class _Waiting(NamedTuple):
+class _QueuedRequest(NamedTuple):
     ticket: int
     service: Service
     request: LocalRequest
@@ -175,7 +175,7 @@ class SerialQueues:
 
     def __init__(self, finish: Finish) -> None:
         self._finish = finish
-        self._queues: dict[_Key, deque[_Waiting]] = {}
+        self._queues: dict[_Key, deque[_QueuedRequest]] = {}
         self._tasks = TaskSet("AoE requests")
         self._octets = 0
 
@@ -186,7 +186,7 @@ class SerialQueues:
     def put(self, ticket: int, service: Service, request: LocalRequest) -> None:
         """Have *service* answer a request when its turn comes."""
         key = request.came_by, _addresses(request.header)
-        waiting = _Waiting(ticket, service, request)
+        waiting = _QueuedRequest(ticket, service, request)
         queue = self._queues.get(key)
         if queue is None:
             answer = _begin(waiting)
@@ -214,10 +214,14 @@ class SerialQueues:
         await self._tasks.close()
 
     async def _run(
-        self, key: _Key, queue: deque[_Waiting], first: _Waiting, answer: Awaitable[AmsAnswer]
+        self,
+        key: _Key,
+        queue: deque[_QueuedRequest],
+        first: _QueuedRequest,
+        answer: Awaitable[AmsAnswer],
     ) -> None:
         """Answer what is in *queue* until nothing is."""
-        waiting: _Waiting = first
+        waiting: _QueuedRequest = first
         outcome: AmsAnswer | Awaitable[AmsAnswer] = answer
         try:
             while True:
@@ -233,7 +237,7 @@ class SerialQueues:
             del self._queues[key]
 
 
-def _begin(waiting: _Waiting) -> AmsAnswer | Awaitable[AmsAnswer]:
+def _begin(waiting: _QueuedRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
     try:
         return waiting.service.answer(waiting.request)
     except Exception:
@@ -241,7 +245,7 @@ def _begin(waiting: _Waiting) -> AmsAnswer | Awaitable[AmsAnswer]:
         return _FAILED
 
 
-async def _end(waiting: _Waiting, answer: Awaitable[AmsAnswer]) -> AmsAnswer:
+async def _end(waiting: _QueuedRequest, answer: Awaitable[AmsAnswer]) -> AmsAnswer:
     try:
         return await answer
     except Exception:

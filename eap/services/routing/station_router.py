@@ -90,7 +90,7 @@ class RouterTimer:
                 return
             self._timer.cancel()
         at_s = max(at_ns / 1e9, self._loop.time() + _SHORTEST_WAIT_S)
-        self._timer = self._loop.call_at(at_s, self._ring)
+        self._timer = self._loop.call_at(at_s, self._expire)
 
     def set_soon(self) -> None:
         """Call after a moment, as something may be due earlier than it was.
@@ -102,9 +102,9 @@ class RouterTimer:
         self._is_soon = True
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self._loop.call_later(_MOMENT_S, self._ring)
+        self._timer = self._loop.call_later(_MOMENT_S, self._expire)
 
-    def _ring(self) -> None:
+    def _expire(self) -> None:
         self._timer = None
         self._is_soon = False
         self._handle()
@@ -211,7 +211,7 @@ class StationRouter:
         self._queues = SerialQueues(self._finish)
         self._client = LocalClient(self)
         self.add_transport(LOCAL_TRANSPORT, self._client)
-        self._settling: dict[Endpoint, tuple[int, asyncio.Event]] = {}
+        self._below_waiters: dict[Endpoint, tuple[int, asyncio.Event]] = {}
         self._timer = RouterTimer(self._router.next_timeout, self._handle_timeout)
 
     @property
@@ -309,7 +309,7 @@ class StationRouter:
         """Take what comes by *connection* for what comes from the hop that is named *address*."""
         self._router.hop_is_at(transport, address, connection)
 
-    def is_wanted(self, hop: Endpoint) -> bool:
+    def has_route_to(self, hop: Endpoint) -> bool:
         """Say whether a route leads to a hop."""
         return any(route.hop == hop for route in self.table)
 
@@ -393,11 +393,11 @@ class StationRouter:
         if self._router.waiting(endpoint) < count:
             return
         event = asyncio.Event()
-        self._settling[endpoint] = count, event
+        self._below_waiters[endpoint] = count, event
         try:
             await event.wait()
         finally:
-            del self._settling[endpoint]
+            del self._below_waiters[endpoint]
 
     def _act(self, actions: list[Action]) -> None:
         if self._router.has_news:
@@ -410,7 +410,7 @@ class StationRouter:
                 self._forward(*action)
             else:
                 self._deliver(*action)
-        for endpoint, (count, event) in self._settling.items():
+        for endpoint, (count, event) in self._below_waiters.items():
             if self._router.waiting(endpoint) < count:
                 event.set()
         self._timer.set_soon()

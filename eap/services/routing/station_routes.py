@@ -29,9 +29,9 @@ from eap.ids import STATION_OCTETS, Destination, DestinationKind, InterfaceUri, 
 from eap.net.interface import own_addresses
 from eap.pd.spec import StationSpec
 from eap.runtime.store import StationFile
-from eap.services.routing.neighbours import Scanner
+from eap.services.routing.neighbours import NeighbourScanner
 from eap.services.routing.station_router import StationRouter
-from eap.services.tasks import Jobs
+from eap.services.tasks import JobQueue
 
 _IP_SCHEMES = ("udp", "tcp")
 _ADDRESSES = {
@@ -66,7 +66,7 @@ def to_route(spec: RouteSpec, hop: Endpoint, origin: Origin) -> Route:
     )
 
 
-def to_way(hop: HopSpec) -> Endpoint:
+def to_endpoint(hop: HopSpec) -> Endpoint:
     """Return door and address of a hop; each AMS/TCP connection to others is a door of its own.
 
     Raises:
@@ -88,14 +88,18 @@ def to_way(hop: HopSpec) -> Endpoint:
 def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
     """Return the access rules of a station; first those of networks that may ask nothing."""
     closed = tuple(
-        AccessRule(f"unidirectional of {spec.network}", allow=False, transports=(mqtt_door(spec),))
+        AccessRule(
+            f"unidirectional of {spec.network}",
+            allow=False,
+            transports=(mqtt_transport_name(spec),),
+        )
         for spec in routing.mqtt
         if spec.is_unidirectional
     )
     return AccessList((*closed, *routing.access), own=tuple(_own_addresses(station)))
 
 
-def mqtt_door(spec: MqttSpec) -> str:
+def mqtt_transport_name(spec: MqttSpec) -> str:
     """Return the name of the door to a network."""
     return f"{TransportKind.MQTT}:{spec.network}"
 
@@ -169,17 +173,17 @@ class StationRoutes:
         spec: RoutingSpec,
         store: StationFile[tuple[RouteSpec, ...]],
         *,
-        open_hop: Callable[[HopSpec], Endpoint] = to_way,
+        open_hop: Callable[[HopSpec], Endpoint] = to_endpoint,
     ) -> None:
         self.router = router
-        self.scanners: list[Scanner] = []
+        self.scanners: list[NeighbourScanner] = []
         self._spec = spec
         self._store = store
         self._open_hop = open_hop
         self._added: dict[RouteSpec, bool] = {}
         """With whether it is kept over restarts."""
-        self._written: dict[tuple[NetId, Endpoint], RouteSpec] = {}
-        self._jobs = Jobs("routes")
+        self._configured: dict[tuple[NetId, Endpoint], RouteSpec] = {}
+        self._jobs = JobQueue("routes")
 
     @property
     def spec(self) -> RoutingSpec:
@@ -194,7 +198,7 @@ class StationRoutes:
     def start(self, spec: RoutingSpec | None = None) -> None:
         """Take the routes of the plant file, or of *spec*, then those that were added before."""
         self._spec = spec or self._spec
-        self._take_spec()
+        self._apply_spec()
         for added in self._store.read() or ():
             self._take(added)
             self._added[added] = True  # what cannot be today may be one after the next start
@@ -202,13 +206,13 @@ class StationRoutes:
     def replace_spec(self, spec: RoutingSpec) -> None:
         """Go on with what another plant file says; added and learned routes stay."""
         self._spec = spec
-        self._take_spec()
+        self._apply_spec()
         for each in self._added:  # one of them may have been hidden by a route of the same hop
             self._take(each)
 
     def is_derived(self, route: Route) -> bool:
         """Tell whether a route follows from the ports of the plant."""
-        spec = self._written.get(route.key)
+        spec = self._configured.get(route.key)
         return spec is not None and spec.is_derived
 
     def has(self, prefix: bytes) -> bool:
@@ -217,7 +221,7 @@ class StationRoutes:
 
     def check(self, spec: RouteSpec) -> None:
         """Say whether a route could be added; raise ControlError with the reason if not."""
-        self._checked(spec, "")
+        self._validated(spec, "")
 
     async def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> Route:
         """Add a route, in place of the added one of its name, or to its NetID.
@@ -246,7 +250,7 @@ class StationRoutes:
             known, octets = found
             if octets >= STATION_OCTETS and known.origin is not Origin.LEARNED:
                 return False
-        hop = to_way(HopSpec(TransportKind.AMS_TCP, "", f"{address}:{AMS_TCP_PORT}"))
+        hop = to_endpoint(HopSpec(TransportKind.AMS_TCP, "", f"{address}:{AMS_TCP_PORT}"))
         route = Route(
             net_id,
             _plain(name) or address,
@@ -269,10 +273,10 @@ class StationRoutes:
         return await self._jobs.do(partial(self._remove, text, transport, address))
 
     async def _add(self, spec: RouteSpec, replaces: str, *, is_kept: bool) -> Route:
-        spec, old = self._checked(spec, replaces)
+        spec, old = self._validated(spec, replaces)
         route = self._route(spec, Origin.ADDED)
-        if route.key in self._written:
-            raise ControlError(_hidden_by(self._written[route.key].name))
+        if route.key in self._configured:
+            raise ControlError(_hidden_by(self._configured[route.key].name))
         left = {each: kept for each, kept in self._added.items() if each not in old}
         await self._change({**left, spec: is_kept}, gone=old)
         self.router.add_route(route)
@@ -290,7 +294,7 @@ class StationRoutes:
         await self._change(left, gone=found[:1])
         return found[0]
 
-    def _checked(self, spec: RouteSpec, replaces: str) -> tuple[RouteSpec, list[RouteSpec]]:
+    def _validated(self, spec: RouteSpec, replaces: str) -> tuple[RouteSpec, list[RouteSpec]]:
         """Return a route as it is kept, and the added ones that it takes the place of."""
         spec = replace(spec, name=_plain(spec.name), is_derived=False)
         known_as = {spec.name, spec.virtual or spec.net_id, replaces} - {""}
@@ -305,22 +309,22 @@ class StationRoutes:
         for each in gone:
             self._forget(each)
 
-    def _take_spec(self) -> None:
+    def _apply_spec(self) -> None:
         """Have the routes of the plant file; those that are the same as before are not touched.
 
         A connection to the next hop is closed when its last route goes.
         """
-        before, self._written = self._written, {}
+        before, self._configured = self._configured, {}
         for spec in self._spec.routes:
             try:
                 route = self._route(spec, Origin.STATIC)
             except ControlError as exc:
                 logger.warning("route %s of the plant file is left out: %s", spec.name, exc)
                 continue
-            self._written[route.key] = spec
+            self._configured[route.key] = spec
             if before.get(route.key) != spec:
                 self.router.add_route(route)
-        for key in before.keys() - self._written.keys():
+        for key in before.keys() - self._configured.keys():
             self.router.remove_route(*key)
 
     def _take(self, spec: RouteSpec) -> None:

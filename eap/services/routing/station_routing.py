@@ -19,7 +19,7 @@ from eap.ams.spec import RoutingSpec
 from eap.errors import ControlError, EnvironmentalError
 from eap.runtime.store import AppliedRouting, StationFile, digest_of
 from eap.services.routing.station_routes import StationRoutes
-from eap.services.tasks import Jobs
+from eap.services.tasks import JobQueue
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class StationRouting:
         self._set_access = set_access
         self._base = digest_of(routes.spec)
         self._applied = self._usable(store.read())
-        self._jobs = Jobs(f"routing of station {name}")
+        self._jobs = JobQueue(f"routing of station {name}")
 
     @property
     def applied(self) -> AppliedRouting | None:

@@ -42,12 +42,12 @@ from eap.services.routing.service import LocalRequest, Service
 from eap.services.routing.station_router import StationRouter
 
 HERE = Endpoint(TransportKind.LOCAL, "trace")
-TARGET_PATIENCE_S = 5.0
+TARGET_TIMEOUT_S = 5.0
 """For the target itself: a router gives up before."""
-SUSPECT_PATIENCE_S = 2.0
+SUSPECT_TIMEOUT_S = 2.0
 """For a target behind a router that said nothing."""
-_PATIENCE_S = 1.0
-_MORE_S = 0.25
+_HOP_TIMEOUT_S = 1.0
+_TIMEOUT_PER_HOP_S = 0.25
 """For each router that hands a question on: who is nearer waits longer."""
 _ON_THE_WAY = frozenset(
     (
@@ -95,7 +95,7 @@ class Hop(NamedTuple):
     is_opaque: bool = False
 
 
-class Traced(NamedTuple):
+class TraceResult(NamedTuple):
     """A way.
 
     *answer* is what the target says to ReadState, None if nobody asked it, for the way ends before.
@@ -118,7 +118,7 @@ class Traced(NamedTuple):
             return None
 
 
-async def ask_one(
+async def run_operation(
     station: TracedStation,
     target: NetId,
     port: int,
@@ -131,7 +131,7 @@ async def ask_one(
     return decode_outcome(command, answer.error_code, answer.data)
 
 
-async def answer_question(
+async def answer_hop_query(
     station: TracedStation, question: HopQuestion, endpoint: Endpoint, source: NetId
 ) -> HopReport:
     """Return what a router says of an address, or what the routers behind it do.
@@ -151,8 +151,8 @@ async def answer_question(
     onward = HopQuestion(NetId.parse(report.target), question.port, further)
     asked = ReadWrite(IndexGroup.WHEREABOUTS, 0, MAX_REPORT, onward.encode())
     next_router = NetId.parse(report.next_net_id)
-    patience_s = _PATIENCE_S + _MORE_S * further
-    outcome = await ask_one(station, next_router, SYSTEM_PORT, asked, patience_s)
+    timeout_s = _HOP_TIMEOUT_S + _TIMEOUT_PER_HOP_S * further
+    outcome = await run_operation(station, next_router, SYSTEM_PORT, asked, timeout_s)
     if outcome.result:
         return replace(report, error=outcome.result)
     try:
@@ -163,24 +163,24 @@ async def answer_question(
 
 async def trace(
     station: TracedStation, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
-) -> Traced:
+) -> TraceResult:
     """Follow the way from *station* to *target*, and ask that for its state."""
     hops, why = await _follow(station, target, port, clock)
     last = hops[-1]
     if why and not last.is_opaque:
-        return Traced(tuple(hops), None, 0, why)
+        return TraceResult(tuple(hops), None, 0, why)
     # Who does not answer a question that is ours alone may pass requests on all the same.
-    patience_s = SUSPECT_PATIENCE_S if why else TARGET_PATIENCE_S
+    timeout_s = SUSPECT_TIMEOUT_S if why else TARGET_TIMEOUT_S
     began_ns = clock()
-    answer = await ask_one(station, target, port, ReadState(), patience_s)
+    answer = await run_operation(station, target, port, ReadState(), timeout_s)
     took_ns = clock() - began_ns
     if answer.result not in _ON_THE_WAY:
-        return Traced(tuple(hops), answer, took_ns, "")
+        return TraceResult(tuple(hops), answer, took_ns, "")
     if why:
-        return Traced(tuple(hops), None, 0, why)
+        return TraceResult(tuple(hops), None, 0, why)
     where = last.report.station + ("" if last.report.is_here else " or behind it")
     why = f"{where}: {AdsError.words_of(answer.result)}"
-    return Traced(tuple(hops), answer, took_ns, why)
+    return TraceResult(tuple(hops), answer, took_ns, why)
 
 
 async def find_fault(station: TracedStation, target: NetId, port: int) -> str:
@@ -202,7 +202,7 @@ async def _follow(
     while not why and (not hops or _goes_on(hops[-1])):
         began_ns = clock()
         question = HopQuestion(target, port, len(hops))
-        report = await answer_question(station, question, HERE, station.net_id)
+        report = await answer_hop_query(station, question, HERE, station.net_id)
         took_ns = clock() - began_ns
         if report.error:
             why = _explain(report)
@@ -276,7 +276,7 @@ class RouteQuery:
             outcome = OperationOutcome(AdsError.SIZE)
         else:
             source = request.header.source
-            report = await answer_question(self._station, question, request.came_by, source)
+            report = await answer_hop_query(self._station, question, request.came_by, source)
             data = encode_report(report)
             fits = len(data) <= asked.length
             outcome = OperationOutcome(data=data) if fits else OperationOutcome(AdsError.SIZE)
@@ -296,7 +296,7 @@ def _asked(request: LocalRequest) -> ReadWrite | None:
     return operation if operation.group == IndexGroup.WHEREABOUTS else None
 
 
-BLAME_S = 3.0
+FAULT_SEARCH_S = 3.0
 """Limit for finding the router at which the way ends."""
 _NO_FURTHER = frozenset((RouteState.DOWN, RouteState.CLIENT))
 """States of a route whose own next hop is at fault."""
@@ -334,7 +334,7 @@ async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: flo
     report = None if route is None else router.report(route)
     advice = advise(answer.error_code, target.net_id, report, router.net_id, is_own=is_own)
     if not advice.is_reached and report is not None and _leads_further(report):
-        advice = await _blame(router, target, advice)
+        advice = await _with_fault(router, target, advice)
     state = _state(answer.data) if not answer.error_code else ""
     return TestResult(
         target=str(target),
@@ -353,10 +353,10 @@ def _leads_further(report: RouteReport) -> bool:
     return report.next_name != report.route.name and report.state not in _NO_FURTHER
 
 
-async def _blame(router: StationRouter, target: AmsAddress, advice: Advice) -> Advice:
+async def _with_fault(router: StationRouter, target: AmsAddress, advice: Advice) -> Advice:
     """Return *advice* about the router at which the way to *target* ends, if one is found."""
     try:
-        async with asyncio.timeout(BLAME_S):
+        async with asyncio.timeout(FAULT_SEARCH_S):
             why = await find_fault(router, *target)
     except TimeoutError:
         return advice

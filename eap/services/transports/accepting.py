@@ -28,12 +28,12 @@ from eap.net.connections import (
 from eap.net.descriptors import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
 from eap.services.rate_limits import caused_by
 
-_TURN_NS, _LOCAL_TURN_NS = 5_000_000, 20_000_000
+_ACCEPT_SLICE_NS, _LOCAL_ACCEPT_SLICE_NS = 5_000_000, 20_000_000
 """Time for accepting connections before others have their turn: a crowd that is refused has to go
 quickly, for the clients that get a place wait behind it."""
 _PAUSE_S = 1.0
 """After an error of the listener; connections that wait keep waiting."""
-_PEER = struct.Struct("3i")
+_CREDENTIALS = struct.Struct("3i")
 _numbers = count(1)
 
 logger = logging.getLogger(__name__)
@@ -110,12 +110,12 @@ class Listeners:
     """All listeners of one process, with their common table.
 
     Args:
-        patience_ns: Time that a peer has to finish a frame, or to take answers.
+        overdue_ns: Time that a peer has to finish a frame, or to take answers.
     """
 
-    def __init__(self, patience_ns: int = OVERDUE_NS) -> None:
+    def __init__(self, overdue_ns: int = OVERDUE_NS) -> None:
         self.table = ConnectionTable()
-        self._patience_ns = patience_ns
+        self._overdue_ns = overdue_ns
         self._reported: dict[str, int] = {}
 
     def stats(self) -> list[ListenerStats]:
@@ -125,8 +125,8 @@ class Listeners:
     async def serve(self) -> None:
         """Close overdue connections, and report on crowded listeners, until cancelled."""
         while True:
-            await asyncio.sleep(self._patience_ns / 4e9)
-            for connection in self.table.take_overdue(monotonic_ns(), self._patience_ns):
+            await asyncio.sleep(self._overdue_ns / 4e9)
+            for connection in self.table.take_overdue(monotonic_ns(), self._overdue_ns):
                 connection.close(CloseReason.OVERDUE)
             for stats in self.stats():
                 self._report(stats)
@@ -187,14 +187,14 @@ class ListeningSocket(Generic[C]):
 
     def _accept_some(self, group: asyncio.TaskGroup) -> bool:
         """Accept what waits, not too much at a time; return whether to go on at once."""
-        end_ns = monotonic_ns() + (_LOCAL_TURN_NS if self._is_local else _TURN_NS)
+        end_ns = monotonic_ns() + (_LOCAL_ACCEPT_SLICE_NS if self._is_local else _ACCEPT_SLICE_NS)
         while monotonic_ns() < end_ns:
             try:
                 sock, _ = self._socket.accept()
             except (BlockingIOError, ConnectionAbortedError, InterruptedError):
                 return True
             except OSError as exc:
-                return self._make_room(exc)
+                return self._close_unused(exc)
             sock.setblocking(False)
             try:
                 connection = self._server.connection_from(sock, self._host_of(sock))
@@ -237,7 +237,7 @@ class ListeningSocket(Generic[C]):
         sock.close()
         self._table.remove(self._listener, connection)
 
-    def _make_room(self, error: OSError) -> bool:
+    def _close_unused(self, error: OSError) -> bool:
         """Close an unused connection for want of descriptors; return whether there was one."""
         logger.debug("%s: %s", self._listener.name, error)
         if error.errno not in OUT_OF_DESCRIPTORS:
@@ -266,8 +266,8 @@ def _set_once(future: asyncio.Future[None]) -> None:
 
 def process_of(connection: socket.socket) -> tuple[int, int]:
     """Return process id and user id of the other end of a Unix socket."""
-    octets = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
-    pid, uid, _ = _PEER.unpack(octets)
+    octets = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    pid, uid, _ = _CREDENTIALS.unpack(octets)
     return pid, uid
 
 

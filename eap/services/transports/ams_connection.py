@@ -81,13 +81,13 @@ class SubscriptionCounter:
         self._sums: dict[bytes, bytes] = {}
         """Index groups of the sum commands that wait: their answers do not repeat them."""
 
-    def take_request(self, packet: bytes) -> None:
+    def note_request(self, packet: bytes) -> None:
         """Note a request that came in."""
         group = packet[_GROUP]
         if group in _ITEM_SIZES and packet[_COMMAND] == _READ_WRITE and len(self._sums) < _MAX_SUMS:
             self._sums[packet[:16] + packet[_INVOKE_ID]] = group
 
-    def take_answer(self, packet: bytes) -> None:
+    def note_answer(self, packet: bytes) -> None:
         """Note an answer that goes out."""
         command = packet[_COMMAND]
         if command in _ABOUT_NOTIFICATIONS:
@@ -125,7 +125,7 @@ class AmsWindow:
         """True if the next request has to wait."""
         return self.requests >= MAX_REQUESTS or self._octets >= MAX_OCTETS
 
-    def take_in(self, packet: bytes) -> bool:
+    def note_incoming(self, packet: bytes) -> bool:
         """Note a packet that came in; return whether it is an answer."""
         flags, command = packet[_FLAGS], packet[_COMMAND]
         # Those with a group of their own are fragments, of which nothing waits for an answer.
@@ -138,10 +138,10 @@ class AmsWindow:
             (asked,) = _LENGTH.unpack_from(packet, AmsHeader.SIZE)
             self._octets += min(MAX_OCTETS, asked)
             if packet[_GROUP] in _ITEM_SIZES:
-                self.subscriptions.take_request(packet)
+                self.subscriptions.note_request(packet)
         return False
 
-    def take_out(self, packet: bytes) -> bool:
+    def note_outgoing(self, packet: bytes) -> bool:
         """Note a packet that goes out; return whether it is the answer to one that came in."""
         if not packet[_FLAGS] & _RESPONSE or packet[_COMMAND_GROUP] or not self.requests:
             return False
@@ -149,7 +149,7 @@ class AmsWindow:
         # and nothing is left when all have come.
         self._octets -= self._octets // self.requests
         self.requests -= 1
-        self.subscriptions.take_answer(packet)
+        self.subscriptions.note_answer(packet)
         return True
 
 
@@ -180,22 +180,22 @@ _NO_RETURN = StateFlags.NO_RETURN.value  # a plain number: operators of flags ar
 logger = logging.getLogger(__name__)
 
 
-class PacketTaker(Protocol):
+class PacketHandler(Protocol):
     """Who acts on what a connection brings."""
 
     def connection_opened(self, connection: AmsConnection) -> None:
         """Take *connection*, by which can be sent from now on."""
 
-    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+    def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
         """Act on a request whose length is right; its answer goes back by *connection*."""
 
-    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
         """Act on a response."""
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
         """Forget it: nothing comes and nothing can be sent any more; *why* is for people."""
 
-    def refuse(self, reason: Refusal) -> None:
+    def count_dropped(self, reason: Refusal) -> None:
         """Count what is not taken."""
 
 
@@ -229,9 +229,9 @@ class AmsConnection(asyncio.BufferedProtocol):
     Args:
         name: Of this one and no other.
         address: Of the peer.
-        taker: Acts on what it brings.
+        handler: Acts on what it brings.
         is_ours: Whether this side opened it.
-        give_address: Returns NetID and port for a client on a host that asks for an AMS address;
+        assign_address: Returns NetID and port for a client on a host that asks for an AMS address;
             without it no peer may ask for one.
         host: By which the policy counts it (:mod:`eap.net.connections`).
 
@@ -243,17 +243,17 @@ class AmsConnection(asyncio.BufferedProtocol):
         closed: Done, with the reason, when the connection has ended.
     """
 
-    _crowd: ClassVar[int] = 0
+    _busy_count: ClassVar[int] = 0
     """Connections of this process that have more to do."""
 
     def __init__(
         self,
         name: str,
         address: str,
-        taker: PacketTaker,
+        handler: PacketHandler,
         *,
         is_ours: bool = False,
-        give_address: Callable[[str], tuple[NetId, int]] | None = None,
+        assign_address: Callable[[str], tuple[NetId, int]] | None = None,
         host: str = "",
     ) -> None:
         self.name = name
@@ -263,7 +263,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         self.closed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._address = address
         self._is_used = False
-        self._taker = taker
+        self._handler = handler
         self._is_ours = is_ours
         self._window = AmsWindow()
         self._cutter = PacketCutter(LONGEST_ANSWER if is_ours else LONGEST_PACKET)
@@ -274,7 +274,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         self._is_blocked = False
         self._has_ended = False
         self._why = "closed by the peer"
-        self._give_address = give_address
+        self._assign_address = assign_address
         self._net_id: NetId | None = None
         self._is_closed = False
 
@@ -283,7 +283,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         assert isinstance(transport, asyncio.Transport)  # noqa: S101  for the type
         self._transport = transport
         self._is_open = True
-        self._taker.connection_opened(self)
+        self._handler.connection_opened(self)
         if self._is_closed:
             transport.abort()
 
@@ -328,7 +328,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         """End (asyncio)."""
         if isinstance(exc, OSError) and exc.strerror:
             self._why = exc.strerror
-        self._taker.connection_closed(self, self._why)
+        self._handler.connection_closed(self, self._why)
         if not self.closed.done():
             self.closed.set_result(self._why)
 
@@ -343,7 +343,7 @@ class AmsConnection(asyncio.BufferedProtocol):
             return "the peer takes nothing"
         for packet in packets:
             transport.write(encode_with_prefix(packet))
-            if self._window.take_out(packet) and (self._is_held or self._has_ended):
+            if self._window.note_outgoing(packet) and (self._is_held or self._has_ended):
                 self._schedule()
         return None
 
@@ -357,9 +357,9 @@ class AmsConnection(asyncio.BufferedProtocol):
         return Activity.IDLE if self._is_used else Activity.UNUSED
 
     def close(self, why: str) -> None:
-        """Close it at once, even before it is open; the taker is told *why*."""
+        """Close it at once, even before it is open; the handler is told *why*."""
         if why is CloseReason.OVERDUE and not self._has_ended:
-            self._taker.refuse(Refusal.AMS_SLOW)
+            self._handler.count_dropped(Refusal.AMS_SLOW)
         self._why = why
         self._is_closed = True
         if self._is_open:
@@ -368,7 +368,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _schedule(self) -> None:
         if not self._is_scheduled:
             self._is_scheduled = True
-            AmsConnection._crowd += 1
+            AmsConnection._busy_count += 1
             asyncio.get_running_loop().call_soon(self._go_on)
 
     def _hold(self) -> None:
@@ -382,8 +382,8 @@ class AmsConnection(asyncio.BufferedProtocol):
         """Take some of the packets that are here, and read on when there are no more."""
         if self._is_scheduled:
             self._is_scheduled = False
-            AmsConnection._crowd -= 1
-        for _ in range(_PER_TURN if AmsConnection._crowd <= _FEW else 1):
+            AmsConnection._busy_count -= 1
+        for _ in range(_PER_TURN if AmsConnection._busy_count <= _FEW else 1):
             if self._transport.is_closing():
                 return
             if not self._is_ours and (self._is_blocked or self._window.is_full):
@@ -414,7 +414,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _break_off(self, why: str) -> None:
         """Read no more: these are no AMS packets."""
         logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
-        self._taker.refuse(Refusal.AMS_TYPE)
+        self._handler.count_dropped(Refusal.AMS_TYPE)
         self._why = f"no AMS packets: {why}"
         self._cutter = PacketCutter(0)
         self._has_ended = True
@@ -438,17 +438,17 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._answer_client(piece)
         elif int.from_bytes(piece[20:24], "little") != len(piece) - AmsHeader.SIZE:
             self._refuse_length(AmsHeader.decode(piece))
-        elif self._window.take_in(piece):
-            self._taker.take_answer(piece, self)
+        elif self._window.note_incoming(piece):
+            self._handler.handle_answer(piece, self)
         else:
-            self._taker.take_packet(piece, self)
+            self._handler.handle_packet(piece, self)
 
     def _answer_client(self, asked: Asked) -> None:
         port = int.from_bytes(asked.data, "little")
-        if self._give_address is None:
+        if self._assign_address is None:
             self._break_off("a router that asks for an address")
             return
-        net_id, own_port = self._give_address(self._address)
+        net_id, own_port = self._assign_address(self._address)
         self._net_id = net_id = self._net_id or net_id
         if asked.command is RouterCommand.NET_ID:
             self._transport.write(encode_net_id(net_id))
@@ -462,11 +462,11 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._transport.write(encode_opened_port(net_id, own_port))
 
     def _refuse_length(self, header: AmsHeader) -> None:
-        self._taker.refuse(Refusal.AMS_LENGTH)
+        self._handler.count_dropped(Refusal.AMS_LENGTH)
         if header.state_flags & StateFlags.RESPONSE:
             # Whoever waits for this answer need not wait any longer.
             answer = msgspec.structs.replace(header, length=0, error_code=AdsError.AMS_LENGTH)
-            self._taker.take_answer(answer.encode(), self)
+            self._handler.handle_answer(answer.encode(), self)
         elif not header.state_flags & _NO_RETURN and header.command != AmsCommand.NOTIFICATION:
             refusal = response_to(header, AmsAnswer(error_code=AdsError.AMS_LENGTH))
             self._transport.write(encode_with_prefix(refusal))

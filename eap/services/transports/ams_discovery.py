@@ -47,7 +47,7 @@ from eap.net.password import read_password
 from eap.release import RELEASE
 from eap.runtime.discards import Refusal
 from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates, caused_by
-from eap.services.routing.neighbours import AmsQuestions
+from eap.services.routing.neighbours import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.tasks import TaskSet
 
@@ -247,7 +247,7 @@ class AmsDiscovery:
         routers: At that address.
         desk: Decides on routes.
         questions: That were asked by *sock*, for their answers come there too.
-        refuse: Counts a datagram that is not answered.
+        count_dropped: Counts a datagram that is not answered.
     """
 
     def __init__(
@@ -255,15 +255,15 @@ class AmsDiscovery:
         sock: socket.socket,
         routers: Sequence[RouterName],
         desk: RouteAdmin,
-        questions: AmsQuestions,
-        refuse: Callable[[Refusal], None],
+        questions: RouterRequests,
+        count_dropped: Callable[[Refusal], None],
     ) -> None:
         self._sock = sock
         self._own = sock.getsockname()[0]
         self._routers = routers
         self._route_admin = desk
         self._questions = questions
-        self._refuse = refuse
+        self._count_dropped = count_dropped
         self._tasks = TaskSet("AMS discovery")
 
     def watch(self, sock: socket.socket | None = None) -> None:
@@ -312,7 +312,7 @@ class AmsDiscovery:
     async def _answer(self, data: bytes, sender: tuple[str, int]) -> None:
         answers = await self.answers_to(data, sender[0])
         if not answers:
-            self._refuse(Refusal.AMS_DISCOVERY)
+            self._count_dropped(Refusal.AMS_DISCOVERY)
         for answer in answers:
             try:
                 self._sock.sendto(answer, sender)

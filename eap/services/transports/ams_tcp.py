@@ -75,7 +75,7 @@ class AmsTransport:
         listener: Opened by the supervisor; it stays open.
         entrance: To the stations that are reached by it.
         clients: Where those who have connected are found when an answer is there.
-        refuse: Counts what is not answered as it was wanted.
+        count_dropped: Counts what is not answered as it was wanted.
         listeners: Of this process.
     """
 
@@ -84,10 +84,10 @@ class AmsTransport:
         listener: socket.socket,
         demultiplexer: Demultiplexer,
         clients: AmsClients,
-        refuse: Callable[[Refusal], None],
+        count_dropped: Callable[[Refusal], None],
         listeners: Listeners,
     ) -> None:
-        self.refuse = refuse
+        self.count_dropped = count_dropped
         self._demultiplexer = demultiplexer
         self._clients = clients
         name = "ams-tcp {}:{}".format(*listener.getsockname())
@@ -105,7 +105,7 @@ class AmsTransport:
             sock.getpeername()[0],
             self,
             host=host,
-            give_address=self._give_address,
+            assign_address=self._assign_address,
         )
 
     async def serve_connection(self, connection: AmsConnection, sock: socket.socket) -> None:
@@ -120,28 +120,28 @@ class AmsTransport:
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
         """Count a connection that gets no place (ConnectionServer)."""
         del sock, why
-        self.refuse(Refusal.AMS_FULL)
+        self.count_dropped(Refusal.AMS_FULL)
 
     def connection_opened(self, connection: AmsConnection) -> None:
-        """Keep it (PacketTaker)."""
+        """Keep it (PacketHandler)."""
         self._clients.add(connection)
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
-        """Let others have its place (PacketTaker)."""
+        """Let others have its place (PacketHandler)."""
         logger.debug("AMS/TCP connection %s: %s", connection.name, why)
         self._clients.remove(connection)
         self._demultiplexer.connection_closed(connection.name)
 
-    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
-        """Hand a request to the stations (PacketTaker)."""
+    def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
+        """Hand a request to the stations (PacketHandler)."""
         self._demultiplexer.receive(packet, connection.name)
 
-    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Count a response: nothing is asked by connections that others opened (PacketTaker)."""
+    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        """Count a response: nothing is asked by connections that others opened (PacketHandler)."""
         del packet, connection
-        self.refuse(Refusal.AMS_UNASKED)
+        self.count_dropped(Refusal.AMS_UNASKED)
 
-    def _give_address(self, host: str) -> tuple[NetId, int]:
+    def _assign_address(self, host: str) -> tuple[NetId, int]:
         return self._clients.addresses.next(host, self._demultiplexer.has)
 
 
@@ -193,11 +193,11 @@ _STABLE_S = 10.0
 """A connection that lasted so long was a good one: the next is tried soon."""
 
 
-DOOR = f"{TransportKind.AMS_TCP}:"
+PEER_PREFIX = f"{TransportKind.AMS_TCP}:"
 """Begin of the names of doors to peers; the address of the peer follows."""
 
 
-class Hops(Protocol):
+class PacketRouter(Protocol):
     """What a connection to a peer needs of the router of its station."""
 
     @property
@@ -217,7 +217,7 @@ class Hops(Protocol):
         """Pass requests on to it again."""
 
 
-class Peer(NamedTuple):
+class PeerAddress(NamedTuple):
     """Where a peer listens."""
 
     host: str
@@ -239,33 +239,33 @@ class AmsUplink(ReconnectingLink):
         sources: The station's own IPv4 addresses.
         claims: Peers that the station is connected with, by address and port: all its uplinks share
             it.
-        refuse: Counts what is not taken.
+        count_dropped: Counts what is not taken.
         may_be_client: Says whether the peer may be a client that does not listen.
     """
 
     def __init__(
         self,
-        peer: Peer,
+        peer: PeerAddress,
         transport: str,
         address: str,
-        router: Hops,
+        router: PacketRouter,
         *,
         sources: Collection[str],
         claims: dict[tuple[str, int], AmsUplink],
-        refuse: Callable[[Refusal], None],
+        count_dropped: Callable[[Refusal], None],
         may_be_client: Callable[[], bool] = bool,
-        patience_ns: int = OVERDUE_NS,
+        overdue_ns: int = OVERDUE_NS,
     ) -> None:
         super().__init__(Pauses(FIRST_WAIT_S, LONGEST_WAIT_S, _STABLE_S))
         self.peer = peer
         self._may_be_client = may_be_client
         self._was_open = False
-        self.refuse = refuse
+        self.count_dropped = count_dropped
         self._endpoint = transport, address
         self._router = router
         self._sources = sources
         self._claims = claims
-        self._patience_ns = patience_ns
+        self._overdue_ns = overdue_ns
         self._connection: AmsConnection | None = None
         self._closed: asyncio.Future[str]
         self._early: list[bytes] | None = []
@@ -283,7 +283,7 @@ class AmsUplink(ReconnectingLink):
         return None
 
     def connection_opened(self, connection: AmsConnection) -> None:
-        """Send what has waited (PacketTaker)."""
+        """Send what has waited (PacketHandler)."""
         self._connection = connection
         self._was_open = True
         early, self._early = self._early, None
@@ -291,18 +291,18 @@ class AmsUplink(ReconnectingLink):
         if early:
             connection.send(early)
 
-    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
-        """Hand a request of the peer on (PacketTaker)."""
+    def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
+        """Hand a request of the peer on (PacketHandler)."""
         del connection
         self._router.receive(packet, *self._endpoint)
 
-    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Hand an answer of the peer on (PacketTaker)."""
+    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        """Hand an answer of the peer on (PacketHandler)."""
         del connection
         self._router.receive(packet, *self._endpoint)
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
-        """Tell the router (PacketTaker)."""
+        """Tell the router (PacketHandler)."""
         if self._connection is connection:
             self._connection = None
             self._router.connection_closed(*self._endpoint)
@@ -371,9 +371,9 @@ class AmsUplink(ReconnectingLink):
             lambda: AmsConnection(str(self.peer), host, self, is_ours=True), sock=sock
         )
         try:
-            while not (await asyncio.wait([self._closed], timeout=self._patience_ns / 4e9))[0]:
+            while not (await asyncio.wait([self._closed], timeout=self._overdue_ns / 4e9))[0]:
                 late_ns = connection.late_since_ns
-                if late_ns is not None and monotonic_ns() - late_ns >= self._patience_ns:
+                if late_ns is not None and monotonic_ns() - late_ns >= self._overdue_ns:
                     connection.close(CloseReason.OVERDUE)
                 if self.reason:
                     self.reason = ""
@@ -400,7 +400,7 @@ def source_for(host: str, sources: Collection[str]) -> str | None:
     return None
 
 
-class UplinkRouter(Hops, Protocol):
+class UplinkRouter(PacketRouter, Protocol):
     """Router of a station, as its uplinks use it.
 
     Attributes:
@@ -426,15 +426,18 @@ class AmsUplinks:
     Args:
         router: Of the station.
         sources: The station's own IPv4 addresses.
-        refuse: Counts what is not taken.
+        count_dropped: Counts what is not taken.
     """
 
     def __init__(
-        self, router: UplinkRouter, sources: Collection[str], refuse: Callable[[Refusal], None]
+        self,
+        router: UplinkRouter,
+        sources: Collection[str],
+        count_dropped: Callable[[Refusal], None],
     ) -> None:
         self._router = router
         self._sources = sources
-        self._refuse = refuse
+        self._count_dropped = count_dropped
         self._uplinks: dict[Endpoint, AmsUplink] = {}
         self._tasks: dict[Endpoint, asyncio.Task[None]] = {}
         self._claims: dict[tuple[str, int], AmsUplink] = {}
@@ -452,7 +455,7 @@ class AmsUplinks:
 
     def _follow(self, hop: Endpoint) -> None:
         """Open the connection to *hop*, or close it, as there are routes to it or none."""
-        if not hop.transport.startswith(DOOR):
+        if not hop.transport.startswith(PEER_PREFIX):
             return
         is_used = any(route.hop == hop for route in self._router.table)
         if is_used and hop not in self._uplinks:
@@ -462,7 +465,7 @@ class AmsUplinks:
 
     def _open(self, hop: Endpoint) -> None:
         try:
-            peer = Peer(*parse_host(hop.connection, AMS_TCP_PORT))
+            peer = PeerAddress(*parse_host(hop.connection, AMS_TCP_PORT))
         except ValueError as exc:
             logger.warning("a route leads nowhere: %s", exc)
             return
@@ -472,7 +475,7 @@ class AmsUplinks:
             self._router,
             sources=self._sources,
             claims=self._claims,
-            refuse=self._refuse,
+            count_dropped=self._count_dropped,
             may_be_client=lambda: all(
                 route.is_client for route in self._router.table if route.hop == hop
             ),

@@ -69,10 +69,11 @@ class Demultiplexer:
         for station, transport in self._behind:
             station.hop_up(transport, address)
 
-    def is_wanted(self, address: str) -> bool:
+    def has_route_to(self, address: str) -> bool:
         """Say whether a route of a station leads to *address* by this door."""
         return any(
-            station.is_wanted(Endpoint(transport, address)) for station, transport in self._behind
+            station.has_route_to(Endpoint(transport, address))
+            for station, transport in self._behind
         )
 
     def is_awaited(self, address: str) -> bool:

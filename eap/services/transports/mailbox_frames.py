@@ -40,13 +40,13 @@ _MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
 
 QUICK_NS = 120_000
 """Frames that come within this time after the last was answered are quick."""
-PATIENCE_NS = 60_000
+SPIN_LIMIT_NS = 60_000
 """How long is watched for the next of them."""
-MOST_FRAMES = 32
+MAX_SPIN_FRAMES = 32
 """That are taken so before others have their turn."""
-TRUST = 2
+MAX_FRUITLESS = 2
 """How often in a row that may be in vain: who was quick may have been interrupted."""
-MOST_REST = 1024
+MAX_BACKOFF = 1024
 """Frames that are not waited for, once many were waited for in vain."""
 
 
@@ -60,7 +60,7 @@ class DrainedChannel(Protocol):
         """Return the descriptor to watch."""
 
 
-MailboxTaker: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], Refusal | None]
+MailboxHandler: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], Refusal | None]
 """Takes a frame of type 5 as a Taker does; returns why not if it does not."""
 
 
@@ -79,14 +79,14 @@ class FrameIntake:
         stations: Sequence[str],
         counters: DiscardCounters,
         from_ns: int,
-        mailbox: MailboxTaker,
+        mailbox: MailboxHandler,
     ) -> None:
         self._stations = stations
         self._counters = counters
         self._from_ns = from_ns
         self.mailbox = mailbox
 
-    def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
+    def receive(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Take, or count, one frame that arrived at *at_ns* on the monotonic clock."""
         if at_ns < self._from_ns:
             reason: Refusal | None = Refusal.STALE
@@ -103,12 +103,12 @@ class FrameIntake:
 
 def watch_channel(channel: DrainedChannel) -> None:
     """Drain *channel* now and whenever something arrives, as long as the running loop lives."""
-    patient = PatientDrain(channel)
+    patient = BusyPoller(channel)
     asyncio.get_running_loop().add_reader(channel.fileno(), patient.drain)
     patient.drain()
 
 
-class PatientDrain:
+class BusyPoller:
     """Drains a channel, and looks again for a while where the next frame is likely to be near.
 
     Who waits for each answer before asking again does so at once: the next frame is there sooner
@@ -127,49 +127,49 @@ class PatientDrain:
     def __init__(self, channel: DrainedChannel, clock: Callable[[], int] = monotonic_ns) -> None:
         self._channel = channel
         self._clock = clock
-        self._answered_ns = clock() - QUICK_NS
-        self._trust = 0
-        self._resting = 0
-        self._rest = 1
+        self._handled_ns = clock() - QUICK_NS
+        self._retries = 0
+        self._skipped = 0
+        self._backoff = 1
 
     def drain(self) -> None:
         """Take what waits; and what comes, if this came quickly after what was taken last."""
         channel, clock = self._channel, self._clock
         now_ns = clock()
-        is_quick = now_ns - self._answered_ns < QUICK_NS
+        is_quick = now_ns - self._handled_ns < QUICK_NS
         taken = channel.drain(now_ns)
-        self._answered_ns = now_ns = clock()
-        if self._resting:
-            self._resting -= 1
-        elif is_quick or self._trust:
+        self._handled_ns = now_ns = clock()
+        if self._skipped:
+            self._skipped -= 1
+        elif is_quick or self._retries:
             self._watch(taken, now_ns)
 
     def _watch(self, taken: int, now_ns: int) -> None:
         """Look for more, after *taken* frames."""
         channel, clock = self._channel, self._clock
-        while taken < MOST_FRAMES:
-            if now_ns - self._answered_ns > PATIENCE_NS:
-                self._note_vain()
+        while taken < MAX_SPIN_FRAMES:
+            if now_ns - self._handled_ns > SPIN_LIMIT_NS:
+                self._note_fruitless()
                 return
             found = channel.drain(now_ns)
             now_ns = clock()
             if found:
                 taken += found
-                self._answered_ns, self._trust, self._rest = now_ns, TRUST, 1
+                self._handled_ns, self._retries, self._backoff = now_ns, MAX_FRUITLESS, 1
 
-    def _note_vain(self) -> None:
+    def _note_fruitless(self) -> None:
         """Remember that nothing came; of somebody who was quick until now that says little."""
-        if self._trust:
-            self._trust -= 1
+        if self._retries:
+            self._retries -= 1
         else:
-            self._resting, self._rest = self._rest, min(2 * self._rest, MOST_REST)
+            self._skipped, self._backoff = self._backoff, min(2 * self._backoff, MAX_BACKOFF)
 
 
 FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
 _MAX_PEERS = 1024
 
 
-class FrameTaker(Protocol):
+class FrameHandler(Protocol):
     """Takes frames that are no AoE to a station: a gateway, if there is one."""
 
     @property
@@ -208,7 +208,7 @@ def refusal_of(data: Buffer) -> Refusal:
     return Refusal.MAILBOX
 
 
-class MailboxCounters:
+class FrameCounters:
     """Counts the frames to each peer from 1 to 7, so that none is taken for a repeated one.
 
     What comes is not looked at for that: requests are told apart by who asks and by their numbers,
@@ -227,7 +227,7 @@ class MailboxCounters:
         return encode_plain_frame(MailboxType.AOE, 0, counter, packet)
 
 
-class Ingress(Protocol):
+class PacketReceiver(Protocol):
     """Where packets of a channel go."""
 
     def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
@@ -247,8 +247,8 @@ class MailboxIntake:
 
     def __init__(
         self,
-        demultiplexer: Ingress,
-        gateway: FrameTaker,
+        demultiplexer: PacketReceiver,
+        gateway: FrameHandler,
         sender: ChannelSender,
         is_for_many: Callable[[memoryview], bool],
         *,
@@ -260,7 +260,9 @@ class MailboxIntake:
         self._is_for_many = is_for_many
         self._is_aoe_here = is_aoe_here
 
-    def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
+    def receive(
+        self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin
+    ) -> Refusal | None:
         """Act on a frame; return why not if it is not taken."""
         del at_ns
         sender = origin.sender_of(data)
@@ -275,7 +277,7 @@ class MailboxIntake:
             return refusal_of(frame)
         return self._gateway.receive(bytes(frame), sender, self._sender.send_frame)
 
-    def admission(
+    def drop_reason(
         self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin
     ) -> Refusal | None:
         """Return why a frame is not taken that this intake gets too, without acting on it."""
@@ -292,7 +294,7 @@ class ChannelSender:
 
     def __init__(self, channel: FrameChannel) -> None:
         self._channel = channel
-        self._counters = MailboxCounters()
+        self._counters = FrameCounters()
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
         """Send packets to the address *connection*; return why not if that cannot be done."""
@@ -320,13 +322,13 @@ ASK_AGAIN_NS = 30_000_000_000
 """Between two questions for one whose address is known."""
 
 
-class _Place(NamedTuple):
+class _Resolution(NamedTuple):
     mac: str
     """Empty while it is not known."""
     asked_at_ns: int | None
 
 
-class Segment:
+class EthernetSegment:
     """The way in from one interface and VLAN, and the addresses of its stations.
 
     Args:
@@ -337,7 +339,7 @@ class Segment:
     def __init__(self, demultiplexer: Demultiplexer, mac: MacAddr) -> None:
         self.mac = str(mac)
         self._demultiplexer = demultiplexer
-        self._places: dict[NetId, _Place] = {}
+        self._resolutions: dict[NetId, _Resolution] = {}
 
     def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
         """Act on a packet; the arguments are those of :meth:`Demultiplexer.receive`."""
@@ -349,25 +351,25 @@ class Segment:
         if self._demultiplexer.has(net_id):
             self._demultiplexer.hop_is_at(str(net_id), self.mac)
             return self.mac
-        place = self._places.get(net_id, _Place("", None))
+        place = self._resolutions.get(net_id, _Resolution("", None))
         pause_ns = ASK_AGAIN_NS if place.mac else ASK_NS
         if place.asked_at_ns is None or now_ns - place.asked_at_ns >= pause_ns:
-            self._places[net_id] = place._replace(asked_at_ns=now_ns)
+            self._resolutions[net_id] = place._replace(asked_at_ns=now_ns)
             ask()
         return place.mac
 
     def _learn(self, data: bytes, mac: str) -> None:
-        if not self._places:
+        if not self._resolutions:
             return
         try:
             header = AmsHeader.decode(data)
         except CodecError:
             return
-        place = self._places.get(header.source)
+        place = self._resolutions.get(header.source)
         if place is None or header.target_port != PROBE_PORT or not _is_response(header):
             return
         if place.mac != mac and self._demultiplexer.has(header.target):
-            self._places[header.source] = place._replace(mac=mac)
+            self._resolutions[header.source] = place._replace(mac=mac)
             self._demultiplexer.hop_is_at(str(header.source), mac)
 
 
@@ -380,7 +382,7 @@ class SegmentSender:
         net_id: Of the station's router, in whose name is asked.
     """
 
-    def __init__(self, segment: Segment, channel: FrameChannel, net_id: NetId) -> None:
+    def __init__(self, segment: EthernetSegment, channel: FrameChannel, net_id: NetId) -> None:
         self._segment = segment
         self._sender = ChannelSender(channel)
         self._net_id = net_id

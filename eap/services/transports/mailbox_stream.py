@@ -38,7 +38,7 @@ from eap.services.transports.accepting import (
 )
 from eap.services.transports.ams_connection import SubscriptionCounter
 from eap.services.transports.demultiplexer import Demultiplexer
-from eap.services.transports.mailbox_frames import FrameTaker, MailboxCounters, aoe_packet
+from eap.services.transports.mailbox_frames import FrameCounters, FrameHandler, aoe_packet
 
 CONNECT_S = 3.0
 """How long the other side may take to accept."""
@@ -55,7 +55,7 @@ Serve: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter, str], A
 """Takes what comes by a connection, with the address of its other end, until it ends."""
 
 
-class StreamHops(Protocol):
+class HopRouter(Protocol):
     """The routers for which there are connections."""
 
     def hop_down(self, address: str, text: str) -> None:
@@ -64,14 +64,14 @@ class StreamHops(Protocol):
     def hop_up(self, address: str) -> None:
         """Pass requests on again."""
 
-    def is_wanted(self, address: str) -> bool:
+    def has_route_to(self, address: str) -> bool:
         """Say whether a route leads there."""
 
     def is_awaited(self, address: str) -> bool:
         """Say whether an answer from there is waited for."""
 
 
-class Uplinks:
+class StreamUplinks:
     """The connections of one transport to other stations, by ``ADDRESS:PORT``.
 
     Args:
@@ -80,11 +80,11 @@ class Uplinks:
         source: Own address to connect from; empty for any.
     """
 
-    def __init__(self, hops: StreamHops, serve: Serve, source: str = "") -> None:
+    def __init__(self, hops: HopRouter, serve: Serve, source: str = "") -> None:
         self._hops = hops
         self._serve = serve
         self._source = source
-        self._uplinks: dict[str, _Uplink] = {}
+        self._uplinks: dict[str, _StreamUplink] = {}
         self._tasks = TaskSet("connections to other stations")
 
     def send(self, address: str, data: bytes) -> str | None:
@@ -93,7 +93,7 @@ class Uplinks:
         if uplink is None:
             if not _is_address(address):
                 return "the connection is closed"
-            uplink = _Uplink(address, self._source, self._hops, self._serve)
+            uplink = _StreamUplink(address, self._source, self._hops, self._serve)
             self._uplinks[address] = uplink
             self._tasks.start(self._run(address, uplink))
         return uplink.send(data)
@@ -102,7 +102,7 @@ class Uplinks:
         """Close all connections."""
         await self._tasks.close()
 
-    async def _run(self, address: str, uplink: _Uplink) -> None:
+    async def _run(self, address: str, uplink: _StreamUplink) -> None:
         try:
             await uplink.run()
         finally:
@@ -110,10 +110,10 @@ class Uplinks:
             self._hops.hop_up(address)
 
 
-class _Uplink(ReconnectingLink):
+class _StreamUplink(ReconnectingLink):
     """Link to one other station, and the data that waits for its connection."""
 
-    def __init__(self, address: str, source: str, hops: StreamHops, serve: Serve) -> None:
+    def __init__(self, address: str, source: str, hops: HopRouter, serve: Serve) -> None:
         super().__init__(Pauses(FIRST_PAUSE_S, LONGEST_PAUSE_S, _LASTING_S))
         self._address = address
         self._source = source or None
@@ -178,7 +178,7 @@ class _Uplink(ReconnectingLink):
 
     def _is_wanted(self) -> bool:
         """Say whether a route leads there (ReconnectingLink)."""
-        return self._hops.is_wanted(self._address)
+        return self._hops.has_route_to(self._address)
 
     def _forget(self) -> None:
         self._waiting.clear()
@@ -231,7 +231,7 @@ class MailboxStreams:
     Args:
         entrance: To the stations behind the port.
         gateway: For what is no AoE to a station.
-        refuse: Counts a frame that is not taken.
+        count_dropped: Counts a frame that is not taken.
         source: Own address to connect from; empty for any.
         is_aoe_here: Whether AoE is for the stations; otherwise that is for the gateway too.
     """
@@ -239,18 +239,18 @@ class MailboxStreams:
     def __init__(
         self,
         demultiplexer: Demultiplexer,
-        gateway: FrameTaker,
-        refuse: Callable[[Refusal], None],
+        gateway: FrameHandler,
+        count_dropped: Callable[[Refusal], None],
         source: str = "",
         *,
         is_aoe_here: bool = True,
     ) -> None:
         self._demultiplexer = demultiplexer
         self._gateway = gateway
-        self._refuse = refuse
+        self._count_dropped = count_dropped
         self._is_aoe_here = is_aoe_here
-        self._uplinks = Uplinks(demultiplexer, self._serve_uplink, source)
-        self._counters = MailboxCounters()
+        self._uplinks = StreamUplinks(demultiplexer, self._serve_uplink, source)
+        self._counters = FrameCounters()
         self._streams: dict[str, tuple[asyncio.StreamWriter, StreamConnection]] = {}
 
     async def serve(self, connection: StreamConnection, sock: socket.socket) -> None:
@@ -286,7 +286,7 @@ class MailboxStreams:
         if connection not in self._streams:
             return self._uplinks.send(connection, frames)
         if packets[0][_FLAGS] & _RESPONSE:
-            self._streams[connection][1].subscriptions.take_answer(packets[0])
+            self._streams[connection][1].subscriptions.note_answer(packets[0])
         return self.send_frame(connection, frames)
 
     def send_frame(self, connection: str, frame: bytes) -> str | None:
@@ -328,7 +328,7 @@ class MailboxStreams:
                 head += await reader.readexactly(EtherCatHeader.SIZE - 1)
                 header = EtherCatHeader.decode(head)
                 if header.type != FrameType.MAILBOX or header.length < MailboxHeader.SIZE:
-                    self._refuse(Refusal.TCP_TYPE)
+                    self._count_dropped(Refusal.TCP_TYPE)
                     return
                 frame = head + await reader.readexactly(header.length)
             except asyncio.IncompleteReadError:
@@ -336,13 +336,13 @@ class MailboxStreams:
             connection.note_frame()
             packet = aoe_packet(frame) if self._is_aoe_here else None
             if packet is not None:
-                connection.subscriptions.take_request(packet)
+                connection.subscriptions.note_request(packet)
                 self._demultiplexer.receive(packet, name)
                 await self._demultiplexer.wait_below(name, MAX_UNANSWERED)
             else:
                 refusal = self._gateway.receive(frame, name, self.send_frame)
                 if refusal is not None:
-                    self._refuse(refusal)
+                    self._count_dropped(refusal)
                 await self._gateway.wait_below(name, MAX_AT_GATEWAY)
             async with asyncio.timeout(SLOW_READER_S):
                 await writer.drain()
@@ -365,7 +365,7 @@ class TcpTransport:
         listener: Opened by the supervisor; it stays open.
         takers: Ports that take type 4 from TCP; may be empty.
         link: To the engine.
-        refuse: Counts a connection that was closed.
+        count_dropped: Counts a connection that was closed.
         streams: Take the connections of type 5.
         listeners: Of this process.
     """
@@ -375,13 +375,13 @@ class TcpTransport:
         listener: socket.socket,
         takers: tuple[PortName, ...],
         link: socket.socket,
-        refuse: Callable[[Refusal], None],
+        count_dropped: Callable[[Refusal], None],
         streams: MailboxStreams,
         listeners: Listeners,
     ) -> None:
         self._takers = takers
         self._link = link
-        self._refuse = refuse
+        self._count_dropped = count_dropped
         self._mailboxes = streams
         name = "tcp {}:{}".format(*listener.getsockname())
         self._listening = ListeningSocket(listener, name, self, listeners, LIMITS)
@@ -409,12 +409,12 @@ class TcpTransport:
                 self._dispatch(sock, connection.host, frame_type)
         finally:
             if connection.closed_for is CloseReason.OVERDUE:
-                self._refuse(Refusal.TCP_SLOW)
+                self._count_dropped(Refusal.TCP_SLOW)
 
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
         """Count a connection that gets no place (ConnectionServer)."""
         del sock, why
-        self._refuse(Refusal.TCP_FULL)
+        self._count_dropped(Refusal.TCP_FULL)
 
     def _dispatch(self, sock: socket.socket, host: str, frame_type: int) -> None:
         if frame_type != FrameType.PROCESS_DATA:
@@ -426,7 +426,7 @@ class TcpTransport:
         else:
             reason = Refusal.ENGINE_BUSY
         logger.debug("TCP connection from %s closed: %s", host or "this host", reason)
-        self._refuse(reason)
+        self._count_dropped(reason)
 
 
 async def _first_type(connection: StreamConnection, sock: socket.socket) -> int:

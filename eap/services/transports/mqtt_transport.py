@@ -25,7 +25,7 @@ from eap.ams.transport_table import Transport
 from eap.net.mqtt import Handlers, MqttLink
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.services.routing.station_router import StationRouter
-from eap.services.routing.station_routes import mqtt_door
+from eap.services.routing.station_routes import mqtt_transport_name
 
 _REFUSALS = {
     Drop.TOPIC: Refusal.MQTT_TOPIC,
@@ -37,7 +37,7 @@ _REFUSALS = {
 logger = logging.getLogger(__name__)
 
 
-def open_mqtt_doors(
+def open_mqtt_transports(
     routing: Mapping[str, RoutingSpec],
     routers: Mapping[str, StationRouter],
     counters: DiscardCounters,
@@ -72,7 +72,7 @@ class MqttTransport:
     Args:
         spec: The network and its broker.
         router: Of the station.
-        refuse: Counts a message that comes to nothing.
+        count_dropped: Counts a message that comes to nothing.
         learns: Whether routers that tell of themselves become routes.
 
     Raises:
@@ -80,12 +80,12 @@ class MqttTransport:
     """
 
     def __init__(
-        self, spec: MqttSpec, router: StationRouter, refuse: Callable[[Refusal], None], *,
+        self, spec: MqttSpec, router: StationRouter, count_dropped: Callable[[Refusal], None], *,
         learns: bool = True,
     ) -> None:  # fmt: skip
-        self.name = mqtt_door(spec)
+        self.name = mqtt_transport_name(spec)
         self._router = router
-        self._refuse = refuse
+        self._count_dropped = count_dropped
         self._network = MqttNetwork(
             spec, router.net_id, router.name, transport=self.name, table=router.table, learns=learns
         )
@@ -129,7 +129,7 @@ class MqttTransport:
         self._act(self._network.receive_message(topic, payload, now_ns, is_retained=is_retained))
 
     def _overrun(self) -> None:
-        self._refuse(Refusal.MQTT_FULL)
+        self._count_dropped(Refusal.MQTT_FULL)
 
     def _act(self, actions: Iterable[Action]) -> None:
         for action in actions:
@@ -158,7 +158,7 @@ class MqttTransport:
         elif isinstance(action, Closed):
             self._router.connection_closed(self.name, action.connection)
         elif isinstance(action, Dropped):
-            self._refuse(_REFUSALS[action.reason])
+            self._count_dropped(_REFUSALS[action.reason])
         else:
             logger.warning("%s: %s: %s", self._router.name, self.name, action.text)
 

@@ -64,7 +64,7 @@ class _Taker:
     def connection_opened(self, connection: AmsConnection) -> None:
         self.connection = connection
 
-    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+    def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
         header = AmsHeader.decode(packet)
         if header.state_flags & 2 or header.command in {8, 0x0902}:
             return
@@ -74,14 +74,14 @@ class _Taker:
         if not self.is_slow:
             self.answer()
 
-    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
         if not packet[18] & 1:
             raise AssertionError("a request is taken for an answer")
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
         pass
 
-    def refuse(self, reason: Refusal) -> None:
+    def count_dropped(self, reason: Refusal) -> None:
         self.refused += 1
 
     def answer(self) -> None:

@@ -15,12 +15,12 @@ from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
 
-def play(scene, *buses, look_s=1.0):
+def play(scene, *buses, silence_limit_s=1.0):
     """Run *scene* with an engine and the link to it."""
 
     async def run():
         engine = FakeEngine(*buses)
-        link = EngineLink(engine.services, look_s=look_s)
+        link = EngineLink(engine.services, silence_limit_s=silence_limit_s)
         try:
             async with asyncio.timeout(10):
                 return await scene(engine, link)
@@ -70,7 +70,7 @@ def test_silent_engine_is_gone():
         await settle()
         assert engine.of(Cancel)[0].id == engine.requests[0].id
 
-    play(scene, look_s=0.02)
+    play(scene, silence_limit_s=0.02)
 
 
 def test_slow_engine_that_answers_others_is_not_gone():
@@ -86,7 +86,7 @@ def test_slow_engine_that_answers_others_is_not_gone():
         engine.release()
         assert (await asked).report.is_up
 
-    play(scene, FakeBus(LoopBus("drive")), look_s=0.02)
+    play(scene, FakeBus(LoopBus("drive")), silence_limit_s=0.02)
 
 
 def test_time_out_of_its_own():

@@ -1,4 +1,4 @@
-"""Jobs one after the other, to their ends."""
+"""JobQueue one after the other, to their ends."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 from eap.control.protocol import ErrorCode
 from eap.errors import ControlError
 from eap.services import tasks as module
-from eap.services.tasks import Jobs
+from eap.services.tasks import JobQueue
 
 
 def play(script):
     async def run():
-        return await script(Jobs("station a"))
+        return await script(JobQueue("station a"))
 
     return asyncio.run(run())
 

@@ -1,9 +1,9 @@
 from __future__ import annotations
 
-from eap.services.rate_limits import Allowance, Rate, SourceRateLimiter, SourceRates
+from eap.services.rate_limits import Rate, RateLimiter, SourceRateLimiter, SourceRates
 
 
-def takes(allowance: Allowance, now_s: float) -> int:
+def takes(allowance: RateLimiter, now_s: float) -> int:
     count = 0
     while allowance.take(now_s):
         count += 1
@@ -11,7 +11,7 @@ def takes(allowance: Allowance, now_s: float) -> int:
 
 
 def test_a_burst_and_what_comes_back() -> None:
-    allowance = Allowance(10, 2.0, 100.0)
+    allowance = RateLimiter(10, 2.0, 100.0)
     assert takes(allowance, 100.0) == 10
     assert takes(allowance, 100.4) == 0
     assert takes(allowance, 102.0) == 4

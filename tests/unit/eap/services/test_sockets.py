@@ -16,7 +16,7 @@ from eap.runtime.discards import DiscardCounters
 from eap.runtime.handover import Handover
 from eap.runtime.store import StationStore
 from eap.services.routing.station_routes import StationRoutes
-from eap.services.sockets import open_doors
+from eap.services.sockets import Network, open_transports
 from eap.services.transports.accepting import Listeners
 from eap.supervisor.sockets import SharedSockets
 from tests.support import aoe
@@ -52,9 +52,8 @@ def script_on(tmp_path):
                     name: StationRoutes(router, RoutingSpec(), StationStore("plant", name).routes)
                     for name, router in routers.items()
                 }
-                transports = open_doors(
-                    handover, routers, routes, {}, counters, ours, Listeners(), resources
-                )
+                network = Network(handover, routers, routes, {}, counters, Listeners(), resources)
+                transports = open_transports(network, ours)
                 serving = [
                     asyncio.ensure_future(each.serve()) for each in (*routers.values(), *transports)
                 ]

@@ -19,7 +19,7 @@ from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec, VariableSpec, Writer
 from eap.services.ads.router_values import LiveRouter
 from eap.services.routing.station_router import StationRouter
-from tests.support.routing import KeepingCarrier
+from tests.support.routing import RecordingSender
 from tests.support.stationengine import make_device
 
 ROUTE = Route(
@@ -44,7 +44,7 @@ def station(stations):
 @pytest.fixture
 def router(station):
     router = StationRouter("left", NetId.parse(station.net_id))
-    router.add_transport(Transport("udp:eap0"), KeepingCarrier())
+    router.add_transport(Transport("udp:eap0"), RecordingSender())
     router.add_route(ROUTE)
     return router
 

@@ -21,7 +21,7 @@ from eap.services.ads.station_ads import StationAds
 from eap.services.routing.station_router import StationRouter
 from tests.support import aoe
 from tests.support.eventually import eventually
-from tests.support.routing import KeepingCarrier
+from tests.support.routing import RecordingSender
 from tests.support.stationengine import make_device
 
 CONNECTION = "127.0.0.1:9 #1"
@@ -29,7 +29,7 @@ CONNECTION = "127.0.0.1:9 #1"
 
 @pytest.fixture
 def sender():
-    return KeepingCarrier()
+    return RecordingSender()
 
 
 @pytest.fixture

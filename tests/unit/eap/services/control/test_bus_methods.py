@@ -53,7 +53,7 @@ class Scene:
         line = LoopBus("drive")
         self.engine = FakeEngine(FakeBus(line))
         self.segment = FakeSegment(line)
-        self._link = EngineLink(self.engine.services, look_s=0.1)
+        self._link = EngineLink(self.engine.services, silence_limit_s=0.1)
         self._segment_link = SegmentLink(self.segment.services)
         client = open_buses(self._link, [PORT, PortName("left", "bus1")])
         self.buses = Buses(STATIONS, client, {PORT: self._segment_link})

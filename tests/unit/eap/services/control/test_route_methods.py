@@ -13,7 +13,7 @@ from eap.codec.staticroutes import StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
 from eap.ids import NetId
 from eap.services.control.route_methods import RouteMethods
-from eap.services.routing.neighbours import Neighbour
+from eap.services.routing.neighbours import RemoteRouter
 from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 
@@ -178,7 +178,7 @@ def test_export_holds_ams_tcp_and_names_the_rest(ask):
     assert ask("import", station="left", xml=found.xml)[1].reason == ""
 
 
-class Scanner:
+class NeighbourScanner:
     """Finds two routers, one of them is known."""
 
     def __init__(self):
@@ -187,13 +187,13 @@ class Scanner:
     async def scan(self, address="", *, wait_s):
         self.asked.append((address, wait_s))
         return [
-            Neighbour("right", NetId.parse("127.0.9.2.1.1"), "127.0.9.2", "1.2.3"),
-            Neighbour("cx", NetId.parse("5.1.2.3.1.1"), "10.0.0.5", ""),
+            RemoteRouter("right", NetId.parse("127.0.9.2.1.1"), "127.0.9.2", "1.2.3"),
+            RemoteRouter("cx", NetId.parse("5.1.2.3.1.1"), "10.0.0.5", ""),
         ]
 
 
 def test_scan_tells_who_is_there_and_learns(ask, left):
-    left.routes.scanners.append(scanner := Scanner())
+    left.routes.scanners.append(scanner := NeighbourScanner())
     known, new = ask("scan", station="left", address="10.0.0.255", wait_ms=20)
     assert scanner.asked == [("10.0.0.255", 0.02)]
     assert (known.name, known.route, known.is_learned) == ("right", "right", False)
@@ -203,7 +203,7 @@ def test_scan_tells_who_is_there_and_learns(ask, left):
 
 
 def test_scan_from_a_default_route_knows_no_route(ask, left):
-    left.routes.scanners.append(Scanner())
+    left.routes.scanners.append(NeighbourScanner())
     ask("add", station="left", name="others", via="right/eap0", octets=0)
     row = ask("scan")[1]
     assert (row.route, row.is_learned) == ("cx", True)
@@ -229,7 +229,7 @@ class Introducer:
         self.result = result
         self.asked = []
 
-    async def introduce(self, wanted, address, *, wait_s):
+    async def add_remote_route(self, wanted, address, *, wait_s):
         self.asked.append((*wanted, address, wait_s))
         return self.result
 

@@ -13,7 +13,12 @@ from eap.net.neighbour import NeighbourTable
 from eap.pd.monitor import Evidence
 from eap.runtime.handover import Handover, PortName
 from eap.services.device import monitoring as monitor_ways
-from eap.services.device.monitoring import REFUSAL_NS, UdpWay, key_of, open_ways
+from eap.services.device.monitoring import (
+    REFUSAL_NS,
+    UdpSubscriberProbe,
+    key_of,
+    open_subscriber_probes,
+)
 from eap.supervisor.sockets import SharedSockets
 from tests.unit.eap.conftest import left, right
 
@@ -36,7 +41,7 @@ def endpoint():
     table = NeighbourTable()
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind(("127.9.2.8", 0))
-    endpoint = UdpWay([sock], table, "127.9.2.8")
+    endpoint = UdpSubscriberProbe([sock], table, "127.9.2.8")
     yield endpoint
     endpoint.close()
     table.close()
@@ -117,7 +122,7 @@ def handover(tmp_path, sockets):
 
 def test_every_udp_port_has_a_way(tmp_path):
     with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
-        endpoints = open_ways(handover(tmp_path, sockets), opened)
+        endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
         assert set(endpoints.udp) == {PortName("left", "eap0"), PortName("right", "eap0")}
         assert endpoints.arp == {}
         for endpoint in endpoints.udp.values():
@@ -131,7 +136,7 @@ def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog,
 
     monkeypatch.setattr(monitor_ways, "NeighbourTable", refuse)
     with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
-        endpoints = open_ways(handover(tmp_path, sockets), opened)
+        endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
         endpoint = endpoints.udp[PortName("left", "eap0")]
         assert endpoint.look(closed, 0) is Evidence.BLIND
     assert "forbidden; subscribers on UDP are known to be missing by ICMP alone" in caplog.text

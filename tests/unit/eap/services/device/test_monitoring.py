@@ -24,7 +24,12 @@ from eap.pd.image import Image
 from eap.pd.spec import TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord
 from eap.runtime.handover import PortName
-from eap.services.device.monitoring import LOOK_NS, SubscriberWatch, UdpWay, Ways
+from eap.services.device.monitoring import (
+    LOOK_NS,
+    SubscriberProbes,
+    SubscriberWatch,
+    UdpSubscriberProbe,
+)
 from tests.support.cyclic import image_of, station, written
 from tests.support.eventually import eventually, settle
 from tests.unit.eap.net.conftest import cable as _cable
@@ -76,7 +81,7 @@ def endpoint():
     table = NeighbourTable()
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind(("127.9.2.8", 0))
-    endpoint = UdpWay([sock], table, "127.9.2.8")
+    endpoint = UdpSubscriberProbe([sock], table, "127.9.2.8")
     yield endpoint
     endpoint.close()
     table.close()
@@ -97,7 +102,7 @@ def send(endpoint, holder, target, now_ns):
 
 def test_a_refused_frame_has_no_subscriber(endpoint, closed, caplog):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
     assert (holder.status(), holder.state()) == ("unknown", 0)
     send(endpoint, holder, closed, 2 * SECOND)
@@ -109,7 +114,7 @@ def test_a_refused_frame_has_no_subscriber(endpoint, closed, caplog):
 def test_a_listener_on_this_machine_is_unknown_never_present(endpoint, closed, caplog):
     caplog.set_level(logging.INFO)
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
     send(endpoint, holder, closed, 2 * SECOND)
     watch.step(2 * SECOND)
@@ -131,7 +136,7 @@ def test_a_listener_on_this_machine_is_unknown_never_present(endpoint, closed, c
 )
 def test_where_nothing_can_be_told_it_is_unknown(endpoint, destination):
     holder = Holder(frame(destination))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     for second in range(1, 10):
         watch.step(second * SECOND)
     assert holder.status() == "unknown"
@@ -139,7 +144,7 @@ def test_where_nothing_can_be_told_it_is_unknown(endpoint, destination):
 
 def test_frame_that_is_sent_elsewhere_is_judged_anew(endpoint, closed):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
     send(endpoint, holder, closed, 2 * SECOND)
     watch.step(2 * SECOND)
@@ -151,7 +156,7 @@ def test_frame_that_is_sent_elsewhere_is_judged_anew(endpoint, closed):
 
 def test_a_station_may_be_configured_anew(endpoint, closed):
     holder = Holder(frame(closed), frame("127.9.2.7", "g"))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
     holder.current = None
     watch.step(2 * SECOND)
@@ -164,7 +169,7 @@ def test_a_station_may_be_configured_anew(endpoint, closed):
 
 def test_what_is_known_of_a_frame_that_stays_is_kept(endpoint, closed):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
     send(endpoint, holder, closed, 2 * SECOND)
     watch.step(2 * SECOND)
@@ -174,13 +179,13 @@ def test_what_is_known_of_a_frame_that_stays_is_kept(endpoint, closed):
 
 
 def test_nothing_to_monitor_is_looked_for_now_and_then(endpoint):
-    watch = SubscriberWatch({"a": Holder()}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": Holder()}, SubscriberProbes({}, {PORT: endpoint}))
     assert watch.step(SECOND) == SECOND + LOOK_NS
 
 
 def test_errors_are_taken_as_they_come(endpoint, closed):
     holder = Holder(frame(closed))
-    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: endpoint}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
 
     async def scenario() -> float:
         task = asyncio.get_running_loop().create_task(watch.run())
@@ -231,7 +236,7 @@ def ends(cable):
 def test_arp_tells_who_is_there_and_who_is_gone(ends):
     hop_prober, host = ends
     holder = Holder(frame(str(host.mac), monitor_ip="10.77.0.2"))
-    watch = SubscriberWatch({"a": holder}, Ways({PORT: hop_prober}, {}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({PORT: hop_prober}, {}))
     watch.step(SECOND)
     host.answer()
     watch.step(SECOND + LOOK_NS)
@@ -245,7 +250,7 @@ def test_arp_tells_who_is_there_and_who_is_gone(ends):
 def test_another_host_with_the_address_is_not_the_subscriber(ends, caplog):
     hop_prober, host = ends
     holder = Holder(frame(NOBODY, monitor_ip="10.77.0.2"))
-    watch = SubscriberWatch({"a": holder}, Ways({PORT: hop_prober}, {}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({PORT: hop_prober}, {}))
     for half in range(2, 12):
         watch.step(half * SECOND // 2)
         if not half % 2:
@@ -261,7 +266,7 @@ def test_more_addresses_than_one_socket_takes_are_told(ends, caplog):
         frame(NOBODY, f"f{n}", monitor_ip=str(IPv4Address(0x0A4D0000 + n))) for n in range(1001)
     ]
     holder = Holder(*frames)
-    watch = SubscriberWatch({"a": holder}, Ways({PORT: hop_prober}, {}))
+    watch = SubscriberWatch({"a": holder}, SubscriberProbes({PORT: hop_prober}, {}))
     watch.step(SECOND)
     assert "1001 addresses to monitor on one interface" in caplog.text
     holder.replace(msgspec.structs.replace(frames[0], destination=NOBODY))

@@ -17,7 +17,12 @@ from eap.codec.amsdiscovery import (
 from eap.errors import EnvironmentalError
 from eap.ids import NetId
 from eap.services.routing import neighbours as module
-from eap.services.routing.neighbours import AmsQuestions, Introduction, Neighbour, network_of
+from eap.services.routing.neighbours import (
+    RemoteRouter,
+    RemoteRouteRequest,
+    RouterRequests,
+    network_of,
+)
 
 pytestmark = pytest.mark.net
 
@@ -25,14 +30,14 @@ OWN = NetId.parse("1.1.1.1.1.1")
 MILL, SAW = NetId.parse("2.2.2.2.1.1"), NetId.parse("3.3.3.3.1.1")
 INFO, ADD_ROUTE = 0x8000_0001, 0x8000_0006
 THERE = "127.0.0.2"
-WANTED = Introduction("left", OWN, "Administrator", "1")
+WANTED = RemoteRouteRequest("left", OWN, "Administrator", "1")
 
 
 @pytest.fixture
 def questions():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
-        yield AmsQuestions(sock, [OWN])
+        yield RouterRequests(sock, [OWN])
 
 
 def answer(number, net_id, *tags, service=INFO):
@@ -69,9 +74,9 @@ def scan(questions, answers):
     return play(questions, lambda port: questions.scan(THERE, wait_s=0.1, port=port), answers)
 
 
-def introduce(questions, answers, **more):
+def add_remote_route(questions, answers, **more):
     def ask(port):
-        return questions.introduce(WANTED, THERE, wait_s=0.3, port=port)
+        return questions.add_remote_route(WANTED, THERE, wait_s=0.3, port=port)
 
     return play(questions, ask, answers, **more)
 
@@ -86,7 +91,10 @@ def test_who_answers_is_found_once(questions):
         yield answer(0, SAW)  # from who knows no numbers
 
     question, found, taken = scan(questions, answers)
-    assert found == [Neighbour("mill", MILL, THERE, "3.1.4024"), Neighbour("", SAW, THERE, "")]
+    assert found == [
+        RemoteRouter("mill", MILL, THERE, "3.1.4024"),
+        RemoteRouter("", SAW, THERE, ""),
+    ]
     assert (question.header.service, question.header.net_id) == (1, OWN)
     assert all(taken)
 
@@ -112,7 +120,7 @@ def test_there_are_not_more_than_so_many(questions, monkeypatch):
 @pytest.mark.parametrize("result", [0, 0x704])
 def test_a_route_is_asked_for_as_tools_do(questions, result):
     tag = Tag.RESULT, result.to_bytes(4, "little")
-    question, told, _ = introduce(
+    question, told, _ = add_remote_route(
         questions, lambda number: [answer(number, MILL, tag, service=ADD_ROUTE)]
     )
     assert told == result
@@ -130,14 +138,14 @@ def test_only_who_was_asked_says_what_became_of_a_route(questions):
     def answers(number):
         yield answer(number, MILL, (Tag.RESULT, bytes(4)), service=ADD_ROUTE)
 
-    _, told, _ = introduce(questions, answers, sender="127.0.0.3")
+    _, told, _ = add_remote_route(questions, answers, sender="127.0.0.3")
     assert told is None
 
 
 def test_who_listens_at_every_address_says_where_it_is_seen(questions):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("0.0.0.0", 0))
-        question, _, _ = introduce(AmsQuestions(sock, [OWN]), lambda number: [])
+        question, _, _ = add_remote_route(RouterRequests(sock, [OWN]), lambda number: [])
     assert decode_text(question.find(Tag.HOST)) == "127.0.0.1"
 
 

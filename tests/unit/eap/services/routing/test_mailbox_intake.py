@@ -38,11 +38,11 @@ class Wire:
 def tell(wire: Wire, frame: bytes, *, for_many: bool = False, room: int = 0) -> Refusal | None:
     there = station(TARGET)
     sender = ChannelSender(wire)
-    there.add_transport(Transport("door", room), sender)
+    there.add_transport(Transport("link", room), sender)
     intake = MailboxIntake(
         demultiplexer(there), GatewayTransport([]), sender, lambda data: for_many
     )
-    return intake.take(memoryview(frame + bytes(20)), len(frame), 0, wire)
+    return intake.receive(memoryview(frame + bytes(20)), len(frame), 0, wire)
 
 
 def ask(target: str = TARGET, **more) -> bytes:
@@ -110,4 +110,4 @@ def test_frame_that_another_intake_takes_is_only_judged(frame, behind, for_many,
     gateway = GatewayTransport([(object(), name) for name in behind])
     sender = ChannelSender(Wire())
     intake = MailboxIntake(demultiplexer(station(TARGET)), gateway, sender, lambda data: for_many)
-    assert intake.admission(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason
+    assert intake.drop_reason(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason

@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from eap.services.transports import mailbox_stream
-from eap.services.transports.mailbox_stream import Uplinks
+from eap.services.transports.mailbox_stream import StreamUplinks
 from tests.support.eventually import eventually
 
 pytestmark = pytest.mark.net
@@ -21,7 +21,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(mailbox_stream, "CONNECT_S", 0.5)
 
 
-class Hops:
+class PacketRouter:
     """Notes what is said of hops."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Hops:
     def hop_up(self, address):
         self.said.append("up")
 
-    def is_wanted(self, address):
+    def has_route_to(self, address):
         return self.wanted
 
     def is_awaited(self, address):
@@ -43,13 +43,13 @@ class Hops:
 
 
 class Scene:
-    """Uplinks, and the other side."""
+    """StreamUplinks, and the other side."""
 
     def __init__(self) -> None:
-        self.hops = Hops()
+        self.hops = PacketRouter()
         self.heard: list[bytes] = []
         self.connections: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]] = []
-        self.uplinks = Uplinks(self.hops, self._serve, "127.0.0.1")
+        self.uplinks = StreamUplinks(self.hops, self._serve, "127.0.0.1")
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
 

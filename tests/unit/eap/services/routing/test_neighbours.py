@@ -8,24 +8,24 @@ import pytest
 from eap.errors import EnvironmentalError
 from eap.ids import NetId
 from eap.services.routing.neighbours import (
-    Found,
-    Introduction,
-    Neighbour,
-    find_neighbours,
-    introduce,
+    FoundRouter,
+    RemoteRouter,
+    RemoteRouteRequest,
+    add_remote_route,
+    scan_routers,
 )
 
-MILL = Neighbour("mill", NetId.parse("10.0.0.2.1.1"), "10.0.0.2", "1.2.3")
-SAW = Neighbour("saw", NetId.parse("10.0.0.3.1.1"), "10.0.0.3", "")
+MILL = RemoteRouter("mill", NetId.parse("10.0.0.2.1.1"), "10.0.0.2", "1.2.3")
+SAW = RemoteRouter("saw", NetId.parse("10.0.0.3.1.1"), "10.0.0.3", "")
 
 
-class Scanner:
+class NeighbourScanner:
     def __init__(self, *found, address="10.0.0.1"):
         self.address = IPv4Address(address)
         self.found = found
         self.asked = []
 
-    async def introduce(self, wanted, address, *, wait_s):
+    async def add_remote_route(self, wanted, address, *, wait_s):
         self.asked.append((wanted, address, wait_s))
         return 0
 
@@ -46,24 +46,24 @@ class Station:
 
 
 def test_all_networks_are_asked_and_each_router_is_told_once():
-    both = Scanner(MILL), Scanner(MILL._replace(address="10.1.0.2"), SAW)
+    both = NeighbourScanner(MILL), NeighbourScanner(MILL._replace(address="10.1.0.2"), SAW)
     station = Station(*both)
-    found = asyncio.run(find_neighbours(station, "10.0.0.255", 0.5))
-    assert found == [Found(MILL, False), Found(SAW, True)]
+    found = asyncio.run(scan_routers(station, "10.0.0.255", 0.5))
+    assert found == [FoundRouter(MILL, False), FoundRouter(SAW, True)]
     assert station.learned[0] == ("10.0.0.2.1.1", "mill", "10.0.0.2")
     assert [each.asked for each in both] == [[("10.0.0.255", 0.5)]] * 2
 
 
 def test_a_station_without_an_address_cannot_ask():
     with pytest.raises(EnvironmentalError, match="no IP address at which it serves AMS"):
-        asyncio.run(find_neighbours(Station(), "", 0.5))
+        asyncio.run(scan_routers(Station(), "", 0.5))
 
 
 def test_a_router_is_asked_for_a_route_from_the_nearest_address():
-    far, near = Scanner(address="192.168.7.1"), Scanner(address="10.0.0.1")
-    wanted = Introduction("left", NetId.parse("10.0.0.1.1.1"), "me", "secret")
-    told = introduce(Station(far, near), wanted, IPv4Address("10.0.0.9"), 2.0)
+    far, near = NeighbourScanner(address="192.168.7.1"), NeighbourScanner(address="10.0.0.1")
+    wanted = RemoteRouteRequest("left", NetId.parse("10.0.0.1.1.1"), "me", "secret")
+    told = add_remote_route(Station(far, near), wanted, IPv4Address("10.0.0.9"), 2.0)
     assert asyncio.run(told) == 0
     assert (far.asked, near.asked) == ([], [(wanted, "10.0.0.9", 2.0)])
     with pytest.raises(EnvironmentalError, match="no IP address at which it serves AMS"):
-        asyncio.run(introduce(Station(), wanted, IPv4Address("10.0.0.9"), 2.0))
+        asyncio.run(add_remote_route(Station(), wanted, IPv4Address("10.0.0.9"), 2.0))

@@ -9,7 +9,7 @@ from eap.ams.routes import Origin, Route
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.ids import NetId
 from eap.services.routing import station_routes
-from eap.services.routing.station_routes import access_of, make_router, to_route, to_way
+from eap.services.routing.station_routes import access_of, make_router, to_endpoint, to_route
 from tests.unit.eap.conftest import eap_port, left
 
 UDP = HopSpec(TransportKind.UDP, "eap0", "127.0.1.2:34980")
@@ -47,7 +47,7 @@ def test_virtual_net_id_is_the_one_that_is_known_here():
     ],
 )  # fmt: skip
 def test_hops(hop, endpoint):
-    assert to_way(hop) == endpoint
+    assert to_endpoint(hop) == endpoint
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_hops(hop, endpoint):
     ],
 )
 def test_each_address_is_written_in_one_way(kind, text, address):
-    assert to_way(HopSpec(kind, "eap0", text)).connection == address
+    assert to_endpoint(HopSpec(kind, "eap0", text)).connection == address
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_each_address_is_written_in_one_way(kind, text, address):
 )
 def test_what_is_no_address_of_a_station_is_refused(kind, text):
     with pytest.raises(ValueError, match=r"10\.0|0x10|mill|239|01:01|02:00"):
-        to_way(HopSpec(kind, "eap0", text))
+        to_endpoint(HopSpec(kind, "eap0", text))
 
 
 def test_addresses_of_the_station_are_this_host():

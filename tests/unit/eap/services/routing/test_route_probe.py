@@ -132,7 +132,7 @@ def test_search_for_a_fault_that_takes_too_long_is_given_up(monkeypatch) -> None
         await asyncio.Event().wait()
 
     monkeypatch.setattr(tracing, "find_fault", find)
-    monkeypatch.setattr(tracing, "BLAME_S", 0.01)
+    monkeypatch.setattr(tracing, "FAULT_SEARCH_S", 0.01)
     target = AmsAddress(NetId.parse("127.0.9.3.1.1"), 10000)
     assert "no answer from right" in probe(target, more=BEYOND).text
 

@@ -20,7 +20,7 @@ from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_n
 from eap.codec.ams import IO_PORT
 from eap.ids import NetId
 from eap.services.routing import scanning
-from eap.services.routing.scanning import scan, stations_of
+from eap.services.routing.scanning import scan, scan_targets
 from tests.support.eventually import elapse
 from tests.support.tracedplant import Line, Station, to
 
@@ -104,7 +104,7 @@ def plant(*more: Route) -> tuple[Line, Station]:
 
 
 def look(station: Station, directory: Directory = PLANT, *routes: Route) -> list[dict[str, Any]]:
-    return msgspec.to_builtins(asyncio.run(scan(station, stations_of(directory, routes))))
+    return msgspec.to_builtins(asyncio.run(scan(station, scan_targets(directory, routes))))
 
 
 def test_stations_ports_and_slaves_are_listed() -> None:
@@ -185,11 +185,11 @@ def test_scan_station_behind_a_dead_one_names_the_dead_one() -> None:
 
 def test_default_routes_are_no_stations() -> None:
     everything = Route(NetId(bytes(6)), "default", Endpoint("link", "x"), octets=0)
-    assert [each.name for each in stations_of(Directory([]), [everything, to(3)])] == ["island-03"]
+    assert [each.name for each in scan_targets(Directory([]), [everything, to(3)])] == ["island-03"]
 
 
 def test_a_station_that_takes_its_time_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scanning, "STATION_S", 0.05)
+    monkeypatch.setattr(scanning, "STATION_TIMEOUT_S", 0.05)
 
     class Slow(Station):
         async def ask(self, *args: Any, **more: Any) -> AmsAnswer:

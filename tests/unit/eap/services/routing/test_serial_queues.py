@@ -13,7 +13,7 @@ from eap.services.routing.service import LocalRequest, SerialQueues
 from tests.support import aoe
 from tests.support.routing import StubService
 
-ONE, OTHER = Endpoint("door", "1"), Endpoint("door", "2")
+ONE, OTHER = Endpoint("link", "1"), Endpoint("link", "2")
 
 
 def request(body: bytes = b"", endpoint: Endpoint = ONE, port: int = 0xFFFF) -> LocalRequest:

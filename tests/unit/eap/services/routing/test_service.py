@@ -11,7 +11,7 @@ from eap.services.routing.service import LocalClient, Service, TransportSender
 from eap.services.transports.ams_tcp import AmsClients
 from eap.services.transports.mailbox_frames import ChannelSender
 from eap.services.transports.mailbox_stream import MailboxStreams
-from tests.support.routing import KeepingCarrier, StubService
+from tests.support.routing import RecordingSender, StubService
 
 
 @pytest.mark.parametrize("service", [AdsService, StubService])
@@ -22,7 +22,7 @@ def test_services(service):
 
 
 @pytest.mark.parametrize(
-    "sender", [AmsClients, ChannelSender, KeepingCarrier, LocalClient, MailboxStreams]
+    "sender", [AmsClients, ChannelSender, RecordingSender, LocalClient, MailboxStreams]
 )
 def test_carriers(sender):
     assert [*signature(sender.send).parameters] == [*signature(TransportSender.send).parameters]

@@ -20,7 +20,7 @@ from eap.services.routing.station_router import StationRouter
 from tests.support import aoe
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.eventually import eventually, settle
-from tests.support.routing import KeepingCarrier, StubService, while_serving
+from tests.support.routing import RecordingSender, StubService, while_serving
 
 ROUTER, DEVICE = NetId.parse("1.1.1.1.1.1"), NetId.parse("1.1.1.1.2.1")
 CLIENT = "192.168.9.9.1.1:33000"
@@ -39,7 +39,7 @@ class Scene:
     """A station with doors whose packets are kept."""
 
     def __init__(self, **more: object) -> None:
-        self.sender = KeepingCarrier()
+        self.sender = RecordingSender()
         self.service = StubService()
         self.station = StationRouter("island", ROUTER, [DEVICE], **more)
         self.station.add_service(DEVICE, self.service)
@@ -169,7 +169,7 @@ def test_request_goes_on_and_its_answer_comes_back(scene):
 
 def test_what_a_door_cannot_send_is_answered_and_named(scene, caplog):
     scene.add_route()
-    scene.station.add_transport(Transport("dead"), sender := KeepingCarrier())
+    scene.station.add_transport(Transport("dead"), sender := RecordingSender())
     sender.error = "no cable"
     net_id = NetId.parse("8.8.8.8.1.1")
     scene.station.add_route(Route(net_id, "dead end", Endpoint("dead", "hop"), is_probed=False))

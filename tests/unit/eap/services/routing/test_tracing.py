@@ -10,7 +10,7 @@ from eap.ams.spec import AccessService as Service
 from eap.codec.ads import AdsError, AdsStates
 from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
-from eap.services.routing.tracing import Traced, find_fault, trace
+from eap.services.routing.tracing import TraceResult, find_fault, trace
 from tests.support.tracedplant import Line, Station, run_state, to
 
 FAR = NetId.parse("5.1.1.3.3.1")
@@ -25,12 +25,12 @@ def line_of_three() -> tuple[Line, Station]:
     return line, first
 
 
-def follow(station: Station, target: NetId = FAR, port: int = 1001) -> Traced:
+def follow(station: Station, target: NetId = FAR, port: int = 1001) -> TraceResult:
     ticks = count(0, 1000)
     return asyncio.run(trace(station, target, port, clock=lambda: next(ticks)))
 
 
-def names(traced: Traced) -> list[str]:
+def names(traced: TraceResult) -> list[str]:
     return [each.report.station for each in traced.hops]
 
 

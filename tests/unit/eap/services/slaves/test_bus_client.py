@@ -36,7 +36,7 @@ def play(scene, name="coe"):
 
     async def run():
         engine = FakeEngine(FakeBus(LoopBus(name)))
-        link = EngineLink(engine.services, look_s=0.05)
+        link = EngineLink(engine.services, silence_limit_s=0.05)
         try:
             async with asyncio.timeout(20):
                 return await scene(BusClient(link, 0, PORT), engine)

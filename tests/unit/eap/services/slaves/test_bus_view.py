@@ -27,12 +27,12 @@ from tests.support.loopbus import LoopBus
 LOOK_S = 0.05
 
 
-def play(scene, *, look_s=LOOK_S):
+def play(scene, *, silence_limit_s=LOOK_S):
     """Run *scene* with a view and the engine behind it."""
 
     async def run():
         engine = FakeEngine(FakeBus(LoopBus("coe")))
-        link = EngineLink(engine.services, look_s=look_s)
+        link = EngineLink(engine.services, silence_limit_s=silence_limit_s)
         try:
             async with asyncio.timeout(10):
                 return await scene(BusView(link, 0), engine, link)
@@ -63,7 +63,7 @@ def test_view_asks_the_engine_once():
             assert list(bus.slaves) == [1001, 1002, 1003]
         assert [type(each) for each in engine.requests] == [Republish]
 
-    play(scene, look_s=5.0)
+    play(scene, silence_limit_s=5.0)
 
 
 def test_view_has_the_state_that_was_requested_when_the_answer_comes():
@@ -86,7 +86,7 @@ def test_view_confirmed_has_changes_that_nobody_requested():
         assert not (await view.confirm()).is_up
         assert (await view.current()).fault == "no frame comes back"
 
-    play(scene, look_s=5.0)
+    play(scene, silence_limit_s=5.0)
 
 
 def test_view_of_a_silent_engine_is_confirmed_before_it_is_used():
@@ -130,7 +130,7 @@ class Pair:
 
     def __init__(self) -> None:
         self.engine, services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.link = EngineLink(services, look_s=5.0)
+        self.link = EngineLink(services, silence_limit_s=5.0)
         self.view = BusView(self.link, 0)
 
     async def send(self, *messages: object) -> None:

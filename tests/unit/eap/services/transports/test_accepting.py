@@ -52,9 +52,9 @@ class Echo:
         self.refused.append(why)
 
 
-def serve(script, *, limits=LIMITS, patience_ns=10_000_000_000, family=socket.AF_INET, path=""):
+def serve(script, *, limits=LIMITS, overdue_ns=10_000_000_000, family=socket.AF_INET, path=""):
     """Run ``script(connect, echo, listeners)`` while an Echo serves a listener."""
-    echo, listeners = Echo(), Listeners(patience_ns)
+    echo, listeners = Echo(), Listeners(overdue_ns)
 
     async def run():
         with socket.socket(family) as listener, ExitStack() as stack:
@@ -132,7 +132,7 @@ def test_peer_that_leaves_a_frame_unfinished_is_closed(caplog):
         assert is_served(good)
         wait_until(lambda: caplog.messages)
 
-    serve(script, patience_ns=50_000_000)
+    serve(script, overdue_ns=50_000_000)
     (message,) = caplog.messages
     assert message.startswith("test: too many or too slow connections: 1 of 2 places taken;")
     assert message.endswith("0 refused, 0 closed to make room, 1 closed as too slow")

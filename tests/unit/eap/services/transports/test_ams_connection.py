@@ -62,7 +62,7 @@ class Taker:
     def connection_opened(self, connection: AmsConnection) -> None:
         self.connection = connection
 
-    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+    def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
         assert connection is self.connection
         self.seen.append(packet)
         header = AmsHeader.decode(packet)
@@ -72,7 +72,7 @@ class Taker:
             if not self.is_slow:
                 self.answer()
 
-    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
         self.answers.append(packet)
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
@@ -80,7 +80,7 @@ class Taker:
         self.why = why
         self.closed.set()
 
-    def refuse(self, reason: Refusal) -> None:
+    def count_dropped(self, reason: Refusal) -> None:
         self.refused.append(reason)
 
     def answer(self, number: int = 0) -> None:
@@ -112,7 +112,7 @@ def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more
             host,
             taker,
             is_ours=is_ours,
-            give_address=None if is_ours else partial(ADDRESSES.next, taken=is_taken),
+            assign_address=None if is_ours else partial(ADDRESSES.next, taken=is_taken),
         )
         await loop.connect_accepted_socket(lambda: connection, theirs)
         reader, writer = await asyncio.open_connection(sock=ours)

@@ -18,7 +18,7 @@ from eap.codec.amsdiscovery import (
 )
 from eap.ids import NetId
 from eap.runtime.discards import Refusal
-from eap.services.routing.neighbours import AmsQuestions
+from eap.services.routing.neighbours import RouterRequests
 from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
 from tests.support.vectors import load
 
@@ -51,7 +51,7 @@ class Desk:
 
 def discovery(sock, *routers, desk=None, refused=None):
     refuse = [].append if refused is None else refused.append
-    questions = AmsQuestions(sock, [LEFT.net_id])
+    questions = RouterRequests(sock, [LEFT.net_id])
     return AmsDiscovery(sock, routers or [LEFT], desk or Desk(), questions, refuse)
 
 
@@ -156,7 +156,7 @@ def test_answers_to_own_questions_are_none_of_tools(sock):
 
     async def run():
         loop = asyncio.get_running_loop()
-        questions = AmsQuestions(sock, [LEFT.net_id])
+        questions = RouterRequests(sock, [LEFT.net_id])
         AmsDiscovery(sock, [LEFT], Desk(), questions, refused.append).watch()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             other.bind(("127.0.0.2", 0))

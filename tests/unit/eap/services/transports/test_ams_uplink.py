@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from eap.services.transports import ams_tcp
-from eap.services.transports.ams_tcp import AmsUplink, Peer, source_for
+from eap.services.transports.ams_tcp import AmsUplink, PeerAddress, source_for
 from tests.support import aoe
 from tests.support.eventually import eventually
 
@@ -95,12 +95,12 @@ async def serving(port: int, host: str = "127.0.0.1", claims=None, **more):
     """Run an uplink; yield it, its router and what it refused."""
     router, refused = Router(), []
     uplink = AmsUplink(
-        Peer(host, port),
+        PeerAddress(host, port),
         *WAY,
         router,
         sources=["127.9.77.1"],
         claims={} if claims is None else claims,
-        refuse=refused.append,
+        count_dropped=refused.append,
         **more,
     )
     task = asyncio.ensure_future(uplink.run())
@@ -194,7 +194,7 @@ def test_peer_that_refuses_is_tried_again_until_it_is_there():
 def test_log_says_once_why_there_is_no_connection_and_when_there_is(caplog):
     async def run():
         port = free_port()
-        async with serving(port, patience_ns=200_000_000) as (_, router, _):
+        async with serving(port, overdue_ns=200_000_000) as (_, router, _):
             await eventually(lambda: len(router.seen) == 3)
             async with listening(port) as (plc, _):
                 _, writer = await plc.take()
@@ -277,7 +277,7 @@ def test_long_answers_are_taken_and_longer_ones_are_errors_at_once():
 
 def test_peer_that_takes_nothing_is_read_from_and_left_after_a_while():
     async def run():
-        async with listening() as (plc, port), serving(port, patience_ns=400_000_000) as (
+        async with listening() as (plc, port), serving(port, overdue_ns=400_000_000) as (
             uplink, router, refused,
         ):  # fmt: skip
             _, writer = await plc.take()

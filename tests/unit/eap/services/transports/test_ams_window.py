@@ -30,37 +30,37 @@ def test_too_many_requests_fill_it_and_an_answer_makes_room() -> None:
     window = AmsWindow()
     for _ in range(MAX_REQUESTS):
         assert not window.is_full
-        assert not window.take_in(request())
+        assert not window.note_incoming(request())
     assert window.is_full
-    assert window.take_out(answer())
+    assert window.note_outgoing(answer())
     assert not window.is_full
 
 
 def test_long_requests_fill_it_and_so_do_those_for_long_answers() -> None:
     for packet in (request(bytes(MAX_OCTETS)), request(aoe.read_body(0, 1 << 31), aoe.READ)):
         window = AmsWindow()
-        window.take_in(packet)
+        window.note_incoming(packet)
         assert window.is_full
-        window.take_out(answer())
+        window.note_outgoing(answer())
         assert not window.is_full
 
 
 def test_what_is_not_answered_does_not_wait() -> None:
     window = AmsWindow()
-    window.take_in(request(flags=4 | 2))
-    window.take_in(request(command=8))
-    window.take_in(request(command=0x0902))
-    assert window.take_in(answer())
+    window.note_incoming(request(flags=4 | 2))
+    window.note_incoming(request(command=8))
+    window.note_incoming(request(command=0x0902))
+    assert window.note_incoming(answer())
     assert window.requests == 0
-    assert not window.take_out(answer(command=0x0902))
-    assert not window.take_out(request())
-    assert not window.take_out(answer())
+    assert not window.note_outgoing(answer(command=0x0902))
+    assert not window.note_outgoing(request())
+    assert not window.note_outgoing(answer())
     assert window.requests == 0
 
 
 def test_read_without_a_length_is_a_short_one() -> None:
     window = AmsWindow()
-    window.take_in(request(struct.pack("<I", 1), aoe.READ))
+    window.note_incoming(request(struct.pack("<I", 1), aoe.READ))
     assert not window.is_full
 
 
@@ -68,9 +68,9 @@ def test_read_without_a_length_is_a_short_one() -> None:
 def test_nothing_is_left_when_all_have_been_answered(sizes: list[int]) -> None:
     window = AmsWindow()
     for size in sizes:
-        window.take_in(request(bytes(size)))
+        window.note_incoming(request(bytes(size)))
     for _ in sizes:
-        window.take_out(answer())
+        window.note_outgoing(answer())
     assert (window.requests, window._octets) == (0, 0)
 
 
@@ -82,8 +82,8 @@ def test_window_counts_subscriptions_until_they_are_ended() -> None:
     window = AmsWindow()
     seen = []
     for packet in (granted(6), granted(6), granted(6, 0x701), granted(7), granted(7), granted(7)):
-        window.take_in(request(command=packet[16]))
-        window.take_out(packet)
+        window.note_incoming(request(command=packet[16]))
+        window.note_outgoing(packet)
         seen.append(window.subscriptions.count)
     assert seen == [1, 2, 2, 1, 0, 0]
 
@@ -112,8 +112,8 @@ def test_window_counts_subscriptions_of_a_sum_command_until_they_are_ended() -> 
         )
     ):
         request = sum_request(group, 3, invoke_id)
-        window.take_in(request)
-        window.take_out(sum_answer(request, items, result))
+        window.note_incoming(request)
+        window.note_outgoing(sum_answer(request, items, result))
         seen.append(window.subscriptions.count)
     assert seen == [2, 2, 1, 1, 0, 0]
 
@@ -121,17 +121,17 @@ def test_window_counts_subscriptions_of_a_sum_command_until_they_are_ended() -> 
 def test_counter_ignores_answers_to_other_requests() -> None:
     counter = SubscriptionCounter()
     request = sum_request(0xF085, 1)
-    counter.take_request(request)
-    counter.take_request(request[:40])
-    counter.take_answer(sum_answer(sum_request(0xF085, 1, invoke_id=2), bytes(8)))
+    counter.note_request(request)
+    counter.note_request(request[:40])
+    counter.note_answer(sum_answer(sum_request(0xF085, 1, invoke_id=2), bytes(8)))
     assert counter.count == 0
-    counter.take_answer(sum_answer(request, bytes(8)))
-    counter.take_answer(sum_answer(request, bytes(8)))
+    counter.note_answer(sum_answer(request, bytes(8)))
+    counter.note_answer(sum_answer(request, bytes(8)))
     assert counter.count == 1
 
 
 def test_counter_ignores_notifications_that_are_refused() -> None:
     counter = SubscriptionCounter()
     for packet in (granted(6, 0x701), granted(7), answer(command=9)):
-        counter.take_answer(packet)
+        counter.note_answer(packet)
     assert counter.count == 0

@@ -11,7 +11,7 @@ from eap.ams.transport_table import Transport
 from eap.ids import NetId
 from eap.services.transports.demultiplexer import Demultiplexer
 from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams
-from tests.support.routing import KeepingCarrier, demultiplexer, station
+from tests.support.routing import RecordingSender, demultiplexer, station
 
 CLIENT = "192.168.9.9.1.1:33000"
 FAR = "7.7.7.7.1.1:851"
@@ -19,15 +19,15 @@ HOP = Endpoint("out", "hop")
 
 
 @pytest.fixture
-def sender() -> KeepingCarrier:
-    return KeepingCarrier()
+def sender() -> RecordingSender:
+    return RecordingSender()
 
 
 @pytest.fixture
 def stations(sender):
     there = [station(target, name=target) for target in ("1.1.1.1.2.1", "2.2.2.2.2.1")]
     for each in there:
-        each.add_transport(Transport("door"), sender)
+        each.add_transport(Transport("link"), sender)
         each.add_transport(Transport("out"), sender)
     return there
 
@@ -109,9 +109,9 @@ def test_what_was_for_all_is_answered_by_who_is_meant_only(stations, sender):
 
 
 def test_each_station_has_its_own_name_for_a_door(stations, sender):
-    stations[1].remove_transport("door")
+    stations[1].remove_transport("link")
     stations[1].add_transport(Transport("other"), sender)
-    way_in = Demultiplexer([(stations[0], "door"), (stations[1], "other")])
+    way_in = Demultiplexer([(stations[0], "link"), (stations[1], "other")])
     way_in.receive(ask("2.2.2.2.2.1:65535"), "peer")
     assert [endpoint.transport for endpoint in stations[1].record.connections.snapshot()] == [
         "other"
@@ -128,19 +128,19 @@ def test_hops_are_those_of_all_stations(stations, sender):
     _, second = stations
     second.add_route(route("7.7.7.7.1.1"))
     way_in = demultiplexer(*stations, transport="out")
-    assert [way_in.is_wanted(address) for address in ("hop", "other")] == [True, False]
+    assert [way_in.has_route_to(address) for address in ("hop", "other")] == [True, False]
     assert [way_in.has(NetId.parse(each)) for each in ("2.2.2.2.1.1", "7.7.7.7.1.1")] == [
         True,
         False,
     ]
     assert not way_in.is_awaited("hop")
-    second.receive(ask(FAR), "door", "peer")
+    second.receive(ask(FAR), "link", "peer")
     assert way_in.is_awaited("hop")
     way_in.hop_down("hop", "no cable")
     assert [each.is_down(HOP) for each in stations] == [True, True]
     way_in.hop_up("hop")
     assert [each.is_down(HOP) for each in stations] == [False, False]
     way_in.hop_is_at("hop", "place")
-    second.receive(ask(FAR, invoke_id=2), "door", "peer")
+    second.receive(ask(FAR, invoke_id=2), "link", "peer")
     way_in.receive(sender.sent[-1][1].answer(b"far").octets(), "place")
     assert sender.sent[-1][1].body == b"far"

@@ -17,13 +17,13 @@ from eap.net.udp import UdpChannel
 from eap.net.udpsocket import prepare_receiver
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.services.transports.mailbox_frames import (
-    MOST_FRAMES,
-    MOST_REST,
-    PATIENCE_NS,
+    MAX_BACKOFF,
+    MAX_FRUITLESS,
+    MAX_SPIN_FRAMES,
     QUICK_NS,
-    TRUST,
+    SPIN_LIMIT_NS,
+    BusyPoller,
     FrameIntake,
-    PatientDrain,
     watch_channel,
 )
 from tests.support.cyclic import From
@@ -46,11 +46,11 @@ def refuse(data, size, at_ns, origin) -> Refusal | None:
 
 def test_each_frame_is_counted_once_at_every_station(counters):
     intake = FrameIntake(["a", "b"], counters, 100, refuse)
-    intake.take(MAILBOX, 8, 99, NOBODY)
-    intake.take(MAILBOX, 8, 100, NOBODY)
-    intake.take(MAILBOX, 8, 101, NOBODY)
-    intake.take(UNKNOWN, 2, 100, NOBODY)
-    intake.take(UNKNOWN, 1, 100, NOBODY)
+    intake.receive(MAILBOX, 8, 99, NOBODY)
+    intake.receive(MAILBOX, 8, 100, NOBODY)
+    intake.receive(MAILBOX, 8, 101, NOBODY)
+    intake.receive(UNKNOWN, 2, 100, NOBODY)
+    intake.receive(UNKNOWN, 1, 100, NOBODY)
     expected = {"mailbox": 2, "stale": 1, "wrong_type": 1, "truncated": 1}
     assert counters.stats() == {"a": expected, "b": expected}
 
@@ -58,9 +58,9 @@ def test_each_frame_is_counted_once_at_every_station(counters):
 def test_what_is_taken_is_not_counted(counters):
     taken = []
     intake = FrameIntake(["a", "b"], counters, 100, lambda *frame: taken.append(frame))
-    intake.take(MAILBOX, 8, 99, NOBODY)
-    intake.take(MAILBOX, 8, 100, NOBODY)
-    intake.take(UNKNOWN, 2, 100, NOBODY)
+    intake.receive(MAILBOX, 8, 99, NOBODY)
+    intake.receive(MAILBOX, 8, 100, NOBODY)
+    intake.receive(UNKNOWN, 2, 100, NOBODY)
     assert taken == [(MAILBOX, 8, 100, NOBODY)]
     assert counters.stats()["a"] == {"stale": 1, "wrong_type": 1}
 
@@ -86,7 +86,7 @@ class Line:
     def fileno(self) -> int:
         return -1
 
-    def wake(self, drain: PatientDrain, at_ns: int) -> int:
+    def wake(self, drain: BusyPoller, at_ns: int) -> int:
         """Let the channel be drained at a time; return how many looks that took."""
         before, self.now_ns = self.looks, at_ns
         drain.drain()
@@ -95,34 +95,34 @@ class Line:
 
 def test_a_frame_now_and_then_is_taken_by_one_look():
     line = Line(0, 10 * QUICK_NS, 20 * QUICK_NS)
-    drain = PatientDrain(line, line.clock)
+    drain = BusyPoller(line, line.clock)
     assert [line.wake(drain, at_ns) for at_ns in line.arrivals_ns[:]] == [1, 1, 1]
 
 
 def test_the_next_of_quick_frames_is_waited_for():
-    line = Line(0, QUICK_NS // 2, QUICK_NS // 2 + PATIENCE_NS // 2)
-    drain = PatientDrain(line, line.clock)
+    line = Line(0, QUICK_NS // 2, QUICK_NS // 2 + SPIN_LIMIT_NS // 2)
+    drain = BusyPoller(line, line.clock)
     assert line.wake(drain, 0) == 1
     assert line.wake(drain, QUICK_NS // 2) > 2
     assert not line.arrivals_ns
-    late_ns = line.now_ns - PATIENCE_NS - (QUICK_NS // 2 + PATIENCE_NS // 2)
+    late_ns = line.now_ns - SPIN_LIMIT_NS - (QUICK_NS // 2 + SPIN_LIMIT_NS // 2)
     assert 0 <= late_ns < 5000, "given up as long after the last frame as promised"
 
 
 def test_each_time_in_vain_more_frames_are_not_waited_for():
     line = Line()
-    drain = PatientDrain(line, line.clock)
+    drain = BusyPoller(line, line.clock)
     line.wake(drain, 0)
-    looks = [line.wake(drain, line.now_ns + QUICK_NS // 2) for _ in range(4 * MOST_REST)]
+    looks = [line.wake(drain, line.now_ns + QUICK_NS // 2) for _ in range(4 * MAX_BACKOFF)]
     vain = [number for number, count in enumerate(looks) if count > 2]
     rests = [after - before - 1 for before, after in itertools.pairwise(vain)]
     assert rests[:4] == [1, 2, 4, 8]
-    assert max(rests) == MOST_REST
+    assert max(rests) == MAX_BACKOFF
 
 
 def test_a_frame_that_came_is_a_reason_to_wait_for_the_next_again():
     line = Line()
-    drain = PatientDrain(line, line.clock)
+    drain = BusyPoller(line, line.clock)
     line.wake(drain, 0)
     while True:  # until it rests for long
         begin = line.looks
@@ -131,21 +131,21 @@ def test_a_frame_that_came_is_a_reason_to_wait_for_the_next_again():
         if line.looks == begin + 100:
             break
     while line.wake(drain, line.now_ns + QUICK_NS // 2) == 1:
-        line.arrivals_ns = [line.now_ns + QUICK_NS // 2 + PATIENCE_NS // 2]
+        line.arrivals_ns = [line.now_ns + QUICK_NS // 2 + SPIN_LIMIT_NS // 2]
     line.arrivals_ns = []
     # Behind the frame that came, it was watched in vain once already.
-    *trusted, last = (line.wake(drain, line.now_ns + 2 * QUICK_NS) for _ in range(TRUST))
+    *trusted, last = (line.wake(drain, line.now_ns + 2 * QUICK_NS) for _ in range(MAX_FRUITLESS))
     assert min(trusted) > 2, "who was quick is waited for although he was interrupted"
     assert last == 1, "but not for ever"
 
 
 def test_frames_that_never_end_leave_time_for_others():
     line = Line(*range(0, 100_000_000, 2000))
-    drain = PatientDrain(line, line.clock)
+    drain = BusyPoller(line, line.clock)
     line.wake(drain, 0)
     left = len(line.arrivals_ns)
     line.wake(drain, line.now_ns)
-    assert left - len(line.arrivals_ns) <= MOST_FRAMES
+    assert left - len(line.arrivals_ns) <= MAX_SPIN_FRAMES
 
 
 @pytest.mark.net
@@ -165,7 +165,7 @@ def test_a_socket_is_drained_at_once_and_on_arrival(counters):
             # The kernel stamps on another clock, and the two are compared to microseconds only.
             await asyncio.sleep(0.01)
             intake = FrameIntake(["a"], counters, monotonic_ns(), refuse)
-            watch_channel(UdpChannel(receiver, ReceiveBatch(), [intake.take]))
+            watch_channel(UdpChannel(receiver, ReceiveBatch(), [intake.receive]))
             assert counters.stats()["a"] == {"stale": 1}
             sender.send(MAILBOX)
             await eventually(lambda: "mailbox" in counters.stats()["a"])

@@ -7,7 +7,7 @@ import pytest
 from eap.runtime.discards import Refusal
 from eap.services.transports import mailbox_frames
 from eap.services.transports.mailbox_frames import (
-    MailboxCounters,
+    FrameCounters,
     aoe_packet,
     refusal_of,
 )
@@ -39,7 +39,7 @@ def test_others_are_not_taken(frame, reason):
 
 def test_each_peer_gets_its_own_counter(monkeypatch):
     monkeypatch.setattr(mailbox_frames, "_MAX_PEERS", 2)
-    counters = MailboxCounters()
+    counters = FrameCounters()
     peers = ["a"] * 8 + ["b", "a", "c", "a", "b"]
     frames = [counters.frame(peer, PACKET) for peer in peers]
     assert [each[7] >> 4 for each in frames] == [1, 2, 3, 4, 5, 6, 7, 1, 1, 2, 1, 3, 1]

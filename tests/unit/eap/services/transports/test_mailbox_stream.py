@@ -35,7 +35,7 @@ def talk(script, there=None) -> list[Refusal]:
     there = there or station(TARGET)
     refused: list[Refusal] = []
     streams = MailboxStreams(demultiplexer(there), GatewayTransport([]), refused.append)
-    there.add_transport(Transport("door", 2000, is_stream=True), streams)
+    there.add_transport(Transport("link", 2000, is_stream=True), streams)
 
     async def run():
         ours, theirs = socket.socketpair()
@@ -133,15 +133,15 @@ def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
         MailboxStreams(demultiplexer(each), GatewayTransport([]), refused.append)
         for each in (here, there)
     )
-    here.add_transport(Transport("door", 2000, is_stream=True), near)
-    there.add_transport(Transport("door", 2000, is_stream=True), far)
+    here.add_transport(Transport("link", 2000, is_stream=True), near)
+    there.add_transport(Transport("link", 2000, is_stream=True), far)
 
     async def run():
         with socket.create_server(("127.0.0.1", 0)) as listener:
             listener.setblocking(False)
             hop = f"127.0.0.1:{listener.getsockname()[1]}"
             here.add_route(
-                Route(NetId.parse(TARGET), "there", Endpoint("door", hop), is_probed=False)
+                Route(NetId.parse(TARGET), "there", Endpoint("link", hop), is_probed=False)
             )
             asking = asyncio.ensure_future(here.ask(NetId.parse(TARGET), 0xFFFF, 4, timeout_s=5))
             connection, _ = await asyncio.get_running_loop().sock_accept(listener)

@@ -15,13 +15,13 @@ from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand
 from eap.ids import NetId
 from eap.runtime.discards import DiscardCounters, Refusal
-from eap.services.transports.mqtt_transport import MqttTransport, open_mqtt_doors
+from eap.services.transports.mqtt_transport import MqttTransport, open_mqtt_transports
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.busads import until
 from tests.support.eventually import eventually
 from tests.support.mosquitto import broker
 from tests.support.mqttclient import PahoPeer
-from tests.support.routing import KeepingCarrier, station
+from tests.support.routing import RecordingSender, station
 
 pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
 
@@ -117,7 +117,7 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
 
     async def story():
         one, two = Place(ONE), Place(TWO)
-        sender = KeepingCarrier()
+        sender = RecordingSender()
         one.router.add_transport(Transport("ams-tcp", is_stream=True, is_hub=True), sender)
         asked = []
         async with running(two), running(one):
@@ -239,7 +239,7 @@ def test_stations_get_the_doors_of_their_plant_file(tmp_path):
         routers = {"a": station("5.1.1.1.2.1"), "b": station("6.1.1.1.2.1")}
         routing = {"a": RoutingSpec(mqtt=(spec("x"), spec("y"))), "b": RoutingSpec()}
         with DiscardCounters(tmp_path / "counters", [*routers]) as counters:
-            transports = open_mqtt_doors(routing, routers, counters)
+            transports = open_mqtt_transports(routing, routers, counters)
             transports[0]._overrun()
             assert counters.stats() == {"a": {"mqtt_full": 1}, "b": {}}
         assert [transport.name for transport in transports] == ["mqtt:x", "mqtt:y"]
@@ -258,7 +258,7 @@ def test_mqtt_door_learns_in_the_networks_that_the_plant_file_names(tmp_path):
         one, two = station("5.1.1.1.2.1"), Place(TWO, spec("y"), spec("x"))
         told = RoutingSpec(mqtt=(spec("x"), spec("y")), learn=("mqtt:y",))
         with DiscardCounters(tmp_path / "counters", ["a"]) as counters:
-            transports = open_mqtt_doors({"a": told}, {"a": one}, counters)
+            transports = open_mqtt_transports({"a": told}, {"a": one}, counters)
             tasks = [asyncio.ensure_future(transport.serve()) for transport in transports]
             async with running(two):
                 await eventually(lambda: len([*one.table]) == 1)

@@ -13,7 +13,7 @@ from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
 from eap.services.transports import mailbox_frames as segment_module
-from eap.services.transports.mailbox_frames import Segment, SegmentSender
+from eap.services.transports.mailbox_frames import EthernetSegment, SegmentSender
 from tests.support import aoe
 from tests.support.ams import Ams, parse
 from tests.support.routing import demultiplexer, station
@@ -45,7 +45,7 @@ class Scene:
     def __init__(self, *others) -> None:
         self.station = station(HERE)
         self.wire = Wire()
-        self.segment = Segment(
+        self.segment = EthernetSegment(
             demultiplexer(self.station, *others, transport="ethernet:eap0"), MacAddr.parse(OWN)
         )
         for each in (self.station, *others):

@@ -69,7 +69,7 @@ def play(
         with services, engine, socket.create_server(("127.0.0.1", 0)) as listener:
             there = station(TARGET)
             streams = MailboxStreams(demultiplexer(there), GatewayTransport([]), refused.append)
-            there.add_transport(Transport("door", is_stream=True), streams)
+            there.add_transport(Transport("link", is_stream=True), streams)
             listeners = Listeners(int(patience_s * 1e9))
             transport = TcpTransport(listener, takers, services, refused.append, streams, listeners)
             serving = [
@@ -175,10 +175,10 @@ def test_subscribed_connection_is_known_as_such():
     connection.waiting = lambda: 1
     seen.append(connection.activity)
     granted = bytes(4) + struct.pack("<I", 7)
-    connection.subscriptions.take_answer(aoe.packet("1.1.1.1.2.1", 6, granted, flags=5))
+    connection.subscriptions.note_answer(aoe.packet("1.1.1.1.2.1", 6, granted, flags=5))
     seen.append(connection.activity)
     assert seen == list(Activity)
-    connection.subscriptions.take_answer(aoe.packet("1.1.1.1.2.1", 7, bytes(4), flags=5))
+    connection.subscriptions.note_answer(aoe.packet("1.1.1.1.2.1", 7, bytes(4), flags=5))
     assert connection.activity is Activity.BUSY, "the subscription has ended"
 
 

@@ -1,0 +1,54 @@
+"""Links of interfaces that go down and come up."""
+
+from __future__ import annotations
+
+import asyncio
+
+from eap.ads.endpoint import Endpoint
+from eap.ams.transport_table import Transport
+from eap.services.sockets import LinkWatch
+from tests.support.eventually import eventually
+from tests.support.routing import RecordingSender, station, while_serving
+
+HOP = Endpoint("link", "hop")
+
+
+def watch_of(router, is_up):
+    router.add_transport(Transport("link"), RecordingSender())
+    watch = LinkWatch(is_up)
+    watch.add("eth7", router, "link")
+    return watch
+
+
+def test_link_watch_takes_hops_down_and_up_with_the_link():
+    there = station()
+    up = {"eth7": True}
+    watch = watch_of(there, up.__getitem__)
+    seen = []
+    for is_up in (True, False, False, True, True):
+        up["eth7"] = is_up
+        watch.poll()
+        seen.append(there.is_down(HOP))
+    assert seen == [False, True, True, False, False]
+
+
+def test_link_watch_serve_polls_repeatedly():
+    there = station()
+    polls = []
+
+    def is_up(name):
+        polls.append(name)
+        return False
+
+    watch = watch_of(there, is_up)
+
+    async def script():
+        serving = asyncio.ensure_future(watch.serve())
+        await eventually(lambda: len(polls) >= 2)
+        serving.cancel()
+
+    asyncio.run(while_serving(script(), there))
+
+
+def test_link_watch_without_interfaces_ends_at_once():
+    asyncio.run(asyncio.wait_for(LinkWatch().serve(), 1))
