@@ -408,7 +408,7 @@ def add_remote(
 
 def _password(user: str, file: Path | None) -> str:
     if file is not None:
-        from eap.net.password import read_password_text
+        from eap.net.host import read_password_text
 
         return read_password_text(file)
     return click.prompt("Password", hide_input=True, err=True) if user else ""

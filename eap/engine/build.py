@@ -16,11 +16,11 @@ from eap.engine.successor import EngineStation
 from eap.engine.tcp_ports import has_tcp, open_tcp_port
 from eap.ids import InterfaceUri
 from eap.net.connections import CloseReason
-from eap.net.descriptors import descriptor_reserve, spare_descriptors
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines
 from eap.net.mmsg import ReceiveBatch
+from eap.net.realtime import descriptor_reserve, spare_descriptors
 from eap.net.tcp import TcpReceiver
 from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine

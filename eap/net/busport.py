@@ -1,9 +1,10 @@
-"""The socket of a master: frames of type 1 go out to a bus and come back through it.
+"""Sockets of type 1: the master's end of a bus, and the end of a simulated segment.
 
-On Ethernet frames come back with the source address they left with, and are known by it: what
-others say on the same network is not taken.  The first slave controller sets a bit in that address
-(ETG.1000.4); it is not asked for, since emulated controllers leave it as it was.  By UDP a bus
-answers whoever asked it; a simulated segment in another process is at the other end of a pair.
+On Ethernet the master recognizes its frames by the source address that they left with, and ignores
+all others.  The first slave controller sets bit 1 of that address (ETG.1000.4); the master does not
+require it, since emulated controllers leave the address as it was.  The simulated segment sets it.
+By UDP a bus replies to the sender of a frame.  A simulated segment in another process is at the
+other end of a socket pair.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ import errno
 import socket
 import struct
 from contextlib import suppress
+from typing import NamedTuple
 
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, MacAddr
+from eap.net.ipsocket import bind_failure
 from eap.net.packetsocket import join_type1, open_type1
 
 BUS_MULTICAST_MAC = MacAddr.parse("01:01:05:01:00:00")
@@ -129,3 +132,84 @@ def _ethernet_header(sock: socket.socket) -> bytes:
     own = bytearray(sock.getsockname()[4])
     own[0] &= ~_PROCESSED  # the bit by which the first slave marks what it has processed
     return bytes(BUS_MULTICAST_MAC) + own + struct.pack("!H", ETHERTYPE)
+
+
+class Arrival(NamedTuple):
+    """A frame from its EtherCAT header on, and what :meth:`SegmentSocket.send` needs to answer."""
+
+    frame: bytearray
+    origin: bytes | tuple[str, int]
+    """An Ethernet header, an address, or nothing where there is but one other end."""
+
+
+class SegmentSocket:
+    """One open end; ``fileno`` makes it fit for poll and select.
+
+    Args:
+        sock: Of an Ethernet interface, of UDP, or of a pair whose other end is a BusPort.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self._is_ethernet = sock.family == socket.AF_PACKET
+        sock.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._sock.close()
+
+    def receive(self) -> Arrival | None:
+        """Return the next frame, None if there is none now."""
+        try:
+            data, address = self._sock.recvfrom(_LARGEST)
+        except OSError:  # nothing waits, or the interface is down: no reason to end
+            return None
+        if not self._is_ethernet:
+            return Arrival(bytearray(data), address or b"") if data else None
+        if len(data) < _HEADER:
+            return None
+        return Arrival(bytearray(data[_HEADER:]), data[:_HEADER])
+
+    def send(self, frame: bytearray, origin: bytes | tuple[str, int]) -> None:
+        """Send a frame back; one that the network does not take is lost, as frames are."""
+        try:
+            if isinstance(origin, tuple):
+                self._sock.sendto(frame, origin)
+                return
+            if not origin:
+                self._sock.send(frame)
+                return
+            header = bytearray(origin)
+            header[6] |= _PROCESSED
+            self._sock.send((header + frame).ljust(_MINIMUM, b"\0"))
+        except OSError:
+            return
+
+
+def open_segment(interface: InterfaceUri) -> SegmentSocket:
+    """Open ``ethernet://IFACE`` or ``udp://ADDRESS[:PORT]``.
+
+    Raises:
+        EnvironmentalError: it cannot be opened, and why; or it is neither of the two.
+    """
+    if interface.scheme == "udp":
+        return SegmentSocket(_bind_udp(interface.host, interface.port or EAP_PORT))
+    if interface.scheme == "ethernet":
+        return SegmentSocket(open_type1(interface.host))
+    raise EnvironmentalError(
+        f"{interface}: a segment answers on ethernet://INTERFACE or udp://ADDRESS"
+    )
+
+
+def _bind_udp(address: str, port: int) -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.bind((address, port))
+    except OSError as error:
+        sock.close()
+        raise EnvironmentalError(bind_failure("UDP", address, port, error)) from None
+    return sock

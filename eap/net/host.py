@@ -1,8 +1,11 @@
-"""Measurements of this host, read from /proc and /sys: real values for a plant without devices."""
+"""Values and passwords from files of this host: /proc, /sys, CSV recordings, password files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import csv
+import os
+import stat
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from eap.errors import EnvironmentalError
@@ -120,3 +123,63 @@ class Host:
                 raise EnvironmentalError("this host shows no temperature (no thermal zone in /sys)")
             zone = zones[0]
         return int((self._zones / zone / "temp").read_text()) / 1000
+
+
+class CsvReplay:
+    """One column of a file; values are texts, the variable's data type reads them."""
+
+    def __init__(self, values: Sequence[str], period_ns: int) -> None:
+        self._values = values
+        self._period_ns = period_ns
+
+    def value(self, elapsed_ns: int) -> str:
+        """Return the value of the row whose turn it is *elapsed_ns* after the start."""
+        return self._values[elapsed_ns // self._period_ns % len(self._values)]
+
+
+def open_replay(path: Path, column: str, *, period_ms: int) -> CsvReplay:
+    """Read *column* of the file, whose first row names the columns.
+
+    Raises:
+        EnvironmentalError: the file cannot be read, or has no such column or no rows.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.DictReader(file, strict=True)
+            if column not in (rows.fieldnames or ()):
+                raise EnvironmentalError(f"{path}: there is no column {column!r}")
+            values = [row[column] or "" for row in rows]
+    except OSError as exc:
+        raise EnvironmentalError(f"{path}: {exc.strerror}") from None
+    except (csv.Error, UnicodeDecodeError) as exc:
+        raise EnvironmentalError(f"{path} is no CSV file in UTF-8: {exc}") from None
+    if not values:
+        raise EnvironmentalError(f"{path}: there are no rows below the names of the columns")
+    return CsvReplay(values, period_ms * 1_000_000)
+
+
+_MAX_SIZE = 4096
+
+
+def read_password(file: Path) -> bytes:
+    """Return the first line of *file* without its end, as far as 4096 octets.
+
+    Raises:
+        EnvironmentalError: it cannot be read, or is no regular file.
+    """
+    try:
+        # A pipe would keep whoever opens it waiting for somebody who writes.
+        with os.fdopen(os.open(file, os.O_RDONLY | os.O_NONBLOCK), "rb") as opened:
+            if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
+                raise EnvironmentalError(f"{file}: a password is kept in a regular file")
+            return opened.readline(_MAX_SIZE).rstrip(b"\r\n")
+    except OSError as exc:
+        raise EnvironmentalError(f"{file}: {exc.strerror or exc}") from None
+
+
+def read_password_text(file: Path) -> str:
+    """Return the same as text; raises EnvironmentalError also if it is not UTF-8."""
+    try:
+        return read_password(file).decode()
+    except UnicodeDecodeError:
+        raise EnvironmentalError(f"{file}: its first line is not UTF-8") from None

@@ -15,8 +15,21 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic_ns, time_ns
 
-from eap.net.udperrors import ICMP_ERRNOS
 from eap.pd.link import OutFrame
+
+ICMP_ERRNOS = frozenset(
+    {
+        errno.ECONNREFUSED,
+        errno.EHOSTUNREACH,
+        errno.ENETUNREACH,
+        errno.EHOSTDOWN,
+        errno.ENOPROTOOPT,
+        errno.EPROTO,
+        errno.EMSGSIZE,
+        errno.EACCES,
+    }
+)
+"""What a call fails with because of an earlier datagram (and some of them for its own sake)."""
 
 SO_TIMESTAMPNS = 35
 """Missing in the socket module; the same number on every Linux with 64-bit time."""

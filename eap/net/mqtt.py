@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 from eap.ams.mqtt.network import Publish, Subscribe
 from eap.ams.spec import MqttSpec
 from eap.errors import EnvironmentalError
-from eap.net.password import read_password_text
-from eap.net.reconnecting import Pauses, ReconnectingLink
+from eap.net.host import read_password_text
+from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy
 
 if TYPE_CHECKING:
     from eap.net.mqttclient import Client
@@ -72,7 +72,7 @@ class MqttLink(ReconnectingLink):
         self, spec: MqttSpec, client_id: str, *, will: Publish, handlers: Handlers
     ) -> None:
         require_mqtt()
-        super().__init__(Pauses(FIRST_PAUSE_S, LONGEST_PAUSE_S, _STABLE_S))
+        super().__init__(ReconnectPolicy(FIRST_PAUSE_S, LONGEST_PAUSE_S, _STABLE_S))
         self._spec = spec
         self._client_id = client_id
         self._will = will

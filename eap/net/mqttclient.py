@@ -71,7 +71,7 @@ class Inbox(asyncio.Queue[Message]):
         return item
 
 
-class Complaints(logging.Handler):
+class ClientErrorLog(logging.Handler):
     """Keeps the latest error of paho: often the only place that says why a connection broke."""
 
     latest = ""
@@ -84,7 +84,7 @@ class Complaints(logging.Handler):
 class Client(aiomqtt.Client):
     """A client that connects within bounded time and can be closed at any time."""
 
-    complaints: Complaints
+    error_log: ClientErrorLog
 
     @property
     def inbox(self) -> Inbox:
@@ -155,8 +155,8 @@ def make_client(
     user, password = login or (None, None)
     # Of this client alone, and heard by nobody else.
     logger = logging.Logger(__name__, logging.ERROR)  # noqa: LOG001
-    complaints = Complaints()
-    logger.addHandler(complaints)
+    error_log = ClientErrorLog()
+    logger.addHandler(error_log)
     client = Client(
         host,
         port,
@@ -173,7 +173,7 @@ def make_client(
         timeout=ANSWER_S,
         keepalive=keepalive_s,
     )
-    client.complaints = complaints
+    client.error_log = error_log
     client.limit_connect(CONNECT_S)
     return client
 
@@ -193,8 +193,8 @@ def describe(error: MqttError, client: Client, user: str) -> str:
         return f"it refuses user {user!r} or the password: look at 'user' and 'password_file'"
     cause = error.__cause__ or error
     if _code(cause) == _UNSPECIFIED:
-        return client.complaints.latest or "the connection broke"
-    return client.complaints.latest or str(cause) or type(error).__name__
+        return client.error_log.latest or "the connection broke"
+    return client.error_log.latest or str(cause) or type(error).__name__
 
 
 def _code(error: BaseException) -> int | None:

@@ -16,7 +16,7 @@ from eap.codec.ethercat import ETHERTYPE
 from eap.errors import EnvironmentalError
 from eap.net import bpf
 from eap.net.interface import check_interface
-from eap.net.udpsocket import prepare_receiver
+from eap.net.ipsocket import prepare_receiver
 
 SOL_PACKET = 263
 PACKET_ADD_MEMBERSHIP = 1

@@ -1,11 +1,12 @@
-"""Make a process as punctual as this machine lets it be, and say how far that went.
+"""Scheduling and limits of this process, and a report of what the kernel granted.
 
-Nothing here is needed for a plant to run: what is not permitted is left out and reported.
+A plant runs without any of it: what is not permitted is left out and reported.
 """
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import os
 import resource
@@ -136,3 +137,35 @@ def _hold_latency() -> bool | str:
 def _set_timer_slack() -> int:
     _library["prctl"](_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     return int(_library["prctl"](_PR_GET_TIMERSLACK, 0, 0, 0, 0))
+
+
+# The kernel gives out the lowest free number: a descriptor numbered n shows that at least n others
+# are open, so that no bookkeeping is needed to know how near the limit is.
+_MOST_RESERVED = 128
+_UNLIMITED = 1 << 20
+OUT_OF_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
+"""Errors of a call that found nothing left to open a socket with."""
+
+
+def raise_descriptor_limit() -> int:
+    """Raise the soft limit to the hard one, for this process and its children; return it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(OSError, ValueError):  # a sandbox may forbid it
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+        return hard
+    return soft
+
+
+def descriptor_reserve() -> int:
+    """Return how many descriptors are kept for files, buses, routes and the control socket."""
+    return min(_MOST_RESERVED, _limit() // 4)
+
+
+def spare_descriptors(newest: int, reserve: int) -> int:
+    """Return how many descriptors are left without *reserve*, after *newest* was opened."""
+    return _limit() - reserve - 1 - newest
+
+
+def _limit() -> int:
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return _UNLIMITED if limit == resource.RLIM_INFINITY else limit

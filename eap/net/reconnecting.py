@@ -11,8 +11,8 @@ from typing import NamedTuple
 from eap.net.tcp import set_stream_options
 
 
-class Pauses(NamedTuple):
-    """Pauses between two attempts to connect."""
+class ReconnectPolicy(NamedTuple):
+    """ReconnectPolicy between two attempts to connect."""
 
     first_s: float
     longest_s: float
@@ -55,7 +55,7 @@ class ReconnectingLink(ABC):
         reason: Why there is no connection, as it was reported; empty while there is one.
     """
 
-    def __init__(self, pauses: Pauses) -> None:
+    def __init__(self, pauses: ReconnectPolicy) -> None:
         self.reason = ""
         self._pauses = pauses
 

@@ -1,8 +1,8 @@
-"""Type-4 frames over TCP: one connection out, one connection in, and the listener.
+"""Type-4 frames over TCP: outgoing connections, incoming connections, and their writer.
 
-The two octets of the frame header are the only delimiter on the stream.  Nothing here waits: the
-cycle drives connecting, sending and receiving, and a peer that is slow loses frames instead.
-Answers to a request come back on the connection that it went by.
+The two bytes of the frame header are the only delimiter on the stream.  Nothing here waits: the
+cycle drives connecting, sending and receiving, and frames to a slow peer are dropped instead.
+Answers to a request come back on the connection that carried the request.
 """
 
 from __future__ import annotations
@@ -13,13 +13,51 @@ import socket
 from collections.abc import Sequence
 
 from eap.codec.ethercat import EAP_PORT, EtherCatHeader, FrameType
-from eap.errors import EnvironmentalError
 from eap.ids import Destination
 from eap.net.connections import OWN_HOST, Activity
 from eap.net.mmsg import count_error
-from eap.net.tcpwriter import TcpWriter
-from eap.net.udpsocket import bind_failure
 from eap.pd.link import OutFrame, Taker
+
+_SEND_BUFFER = 32 << 10
+_DEAD_PEER_MS = 3000
+
+
+class TcpWriter:
+    """Sends frames; one that has begun is always finished, and meanwhile others are lost whole.
+
+    Every call raises the OSError that the connection ends with.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # What does not go out soon is stale: neither queue much of it nor retry for minutes.
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _DEAD_PEER_MS)
+        self._sock = sock
+        self._rest = memoryview(b"")
+
+    def flush(self) -> bool:
+        """Go on with a frame that has begun; return whether there is none any more."""
+        if self._rest:
+            try:
+                self._rest = self._rest[self._sock.send(self._rest) :]
+            except BlockingIOError:
+                return False
+        return not self._rest
+
+    def send(self, frame: OutFrame) -> bool:
+        """Send *frame* or begin to; return False if the peer is too slow for it."""
+        if not self.flush():
+            return False
+        try:
+            sent = self._sock.send(frame.buffer)
+        except BlockingIOError:
+            return False
+        if sent < len(frame.buffer):
+            self._rest = memoryview(bytes(frame.view[sent:]))
+        return True
+
 
 FRAMES_PER_DRAIN = 256
 
@@ -27,31 +65,12 @@ _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 2_000_000_000
 _CONNECT_NS = 1_000_000_000
 _RECEIVE_BUFFER = 32 << 10
-_BACKLOG = 512
-"""Connections that the kernel keeps until they are accepted: a crowd must not hide a client."""
 _CONNECTING = (errno.EINPROGRESS, errno.EALREADY)
 _CONNECTED = (0, errno.EISCONN)
 
 CONNECTION = "connection "
 """What the destinations of answers on accepted connections begin with."""
 _numbers = itertools.count(1)
-
-
-def open_tcp_listener(address: str, port: int = EAP_PORT) -> socket.socket:
-    """Return a socket that listens on *address*.
-
-    Raises:
-        EnvironmentalError: the port is taken, and by whom, or the address is not this machine's.
-    """
-    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind((address, port))
-        sock.listen(_BACKLOG)
-    except OSError as error:
-        sock.close()
-        raise EnvironmentalError(bind_failure("TCP", address, port, error)) from None
-    return sock
 
 
 def set_stream_options(sock: socket.socket, unconfirmed_s: float = 60.0) -> None:

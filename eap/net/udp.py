@@ -1,11 +1,19 @@
-"""The UDP driver: one bound socket, received in batches and sent in batches."""
+"""UDP driver: one bound socket, received and sent in batches, and its ICMP errors.
+
+The error queue is separate from the queue of datagrams, so another process than the sender may read
+it; that takes no privilege.  Asking for errors has two effects.  Each error also makes the next
+call on the socket fail, even for another destination: that call has to be made once more.  Sockets
+that share an address (SO_REUSEPORT) each get the errors of some destinations, so all must be read.
+"""
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import Destination
@@ -102,3 +110,57 @@ def _destination(sender: tuple[int, bytes]) -> str:
     if host == _NO_ADDRESS:
         return ""
     return f"{host}:{port}" if port else host
+
+
+IP_RECVERR = 11
+ERRORS_PER_CALL = 256
+
+_EXTENDED_ERROR = struct.Struct("@IBBBxII")  # errno, origin, type, code, info, data
+_CONTROL_SIZE = 512
+_ORIGIN_ICMP = 2
+_UNREACHABLE = 3
+_TIME_EXCEEDED = 11
+_TOO_LARGE = 4
+
+
+class UdpError(NamedTuple):
+    """One datagram about which somebody complained."""
+
+    address: str
+    """Where it was sent, as is *port*."""
+    port: int
+    unreachable: bool
+    """Whether it did not arrive, because nobody listens there or because of the way there."""
+    reason: str
+    """The errno's name, such as ECONNREFUSED."""
+
+
+def enable_errors(sock: socket.socket) -> None:
+    """Have the kernel queue what it learns about datagrams that *sock* sends from now on."""
+    sock.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
+
+
+def take_errors(sock: socket.socket, limit: int = ERRORS_PER_CALL) -> list[UdpError]:
+    """Take at most *limit* errors from the queue of *sock*, without waiting."""
+    found: list[UdpError] = []
+    for _ in range(limit):
+        try:
+            _, control, _, address = sock.recvmsg(
+                1, _CONTROL_SIZE, socket.MSG_ERRQUEUE | socket.MSG_DONTWAIT
+            )
+        except OSError:  # empty: what is pending without an entry says nothing of a destination
+            break
+        for level, kind, data in control:
+            if (level, kind) == (socket.IPPROTO_IP, IP_RECVERR):
+                found.append(_parse(data, address))
+    return found
+
+
+def _parse(data: bytes, address: tuple[str, int]) -> UdpError:
+    number, origin, kind, code, _, _ = _EXTENDED_ERROR.unpack_from(data)
+    return UdpError(
+        *address,
+        origin == _ORIGIN_ICMP
+        and (kind == _TIME_EXCEEDED or (kind == _UNREACHABLE and code != _TOO_LARGE)),
+        errno.errorcode.get(number, str(number)),
+    )

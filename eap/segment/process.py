@@ -25,7 +25,7 @@ from devicebus.sim.segment import SegmentEnd
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net import realtime
-from eap.net.segmentsocket import SegmentSocket, open_segment
+from eap.net.busport import SegmentSocket, open_segment
 from eap.runtime.busfile import Bus, load_or_raise
 from eap.runtime.handover import SegmentHandover
 from eap.runtime.signals import catch_end_signals

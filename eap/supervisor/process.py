@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from eap.ams.spec import RoutingSpec
 from eap.config.load import Plant
 from eap.errors import ConfigError, EnvironmentalError
-from eap.net.descriptors import raise_descriptor_limit
+from eap.net.realtime import raise_descriptor_limit
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name

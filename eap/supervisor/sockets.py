@@ -18,10 +18,16 @@ from eap.closeable import Closeable
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.amssocket import open_ams_broadcast, open_ams_listener, open_ams_socket
+from eap.net.ipsocket import (
+    open_ams_broadcast,
+    open_ams_listener,
+    open_ams_socket,
+    open_tcp_listener,
+    open_udp_group_pair,
+    open_udp_pair,
+    open_udp_receiver,
+)
 from eap.net.packetsocket import open_arp, open_packet_pair
-from eap.net.tcp import open_tcp_listener
-from eap.net.udpsocket import open_udp_group_pair, open_udp_pair, open_udp_receiver
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.runtime.handover import NO_DESCRIPTOR, PortName, SharedSocket, SocketKind
 from eap.supervisor.bus_sockets import open_buses, open_message_pair

@@ -19,9 +19,8 @@ from typing import NamedTuple, Protocol
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError, ImageError
 from eap.ids import Destination, DestinationKind, MacAddr
-from eap.net.arpprobe import ArpProber
-from eap.net.neighbour import NeighbourTable
-from eap.net.udperrors import ERRORS_PER_CALL, enable_errors, take_errors
+from eap.net.neighbour import ArpProber, NeighbourTable
+from eap.net.udp import ERRORS_PER_CALL, enable_errors, take_errors
 from eap.pd.address import from_word
 from eap.pd.image import Image
 from eap.pd.layout import FrameSlot

@@ -12,8 +12,7 @@ from typing import Any
 from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.errors import EnvironmentalError, ImageError
-from eap.net.csv_replay import open_replay
-from eap.net.host import Host
+from eap.net.host import Host, open_replay
 from eap.pd.spec import CsvSource, HostSource, Source, StationSpec, Writer
 from eap.runtime.station_image import StationImage
 

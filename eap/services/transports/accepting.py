@@ -25,7 +25,7 @@ from eap.net.connections import (
     ListenerStats,
     host_of,
 )
-from eap.net.descriptors import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
+from eap.net.realtime import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
 from eap.services.rate_limits import caused_by
 
 _ACCEPT_SLICE_NS, _LOCAL_ACCEPT_SLICE_NS = 5_000_000, 20_000_000

@@ -43,7 +43,7 @@ from eap.codec.amsdiscovery import (
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.errors import CodecError, ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, NetId, parse_host
-from eap.net.password import read_password
+from eap.net.host import read_password
 from eap.release import RELEASE
 from eap.runtime.discards import Refusal
 from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates, caused_by

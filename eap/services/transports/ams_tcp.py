@@ -25,7 +25,7 @@ from eap.ams.transport_table import Transport
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.ids import NetId, parse_host
 from eap.net.connections import OVERDUE_NS, CloseReason, Limits
-from eap.net.reconnecting import Pauses, ReconnectingLink, connect_tcp
+from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.discards import Refusal
 from eap.services.routing.service import TransportSender
@@ -256,7 +256,7 @@ class AmsUplink(ReconnectingLink):
         may_be_client: Callable[[], bool] = bool,
         overdue_ns: int = OVERDUE_NS,
     ) -> None:
-        super().__init__(Pauses(FIRST_WAIT_S, LONGEST_WAIT_S, _STABLE_S))
+        super().__init__(ReconnectPolicy(FIRST_WAIT_S, LONGEST_WAIT_S, _STABLE_S))
         self.peer = peer
         self._may_be_client = may_be_client
         self._was_open = False

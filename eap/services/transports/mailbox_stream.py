@@ -23,7 +23,7 @@ from eap.codec.ams import StateFlags
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxHeader
 from eap.net.connections import OWN_HOST, Activity, CloseReason, Limits
-from eap.net.reconnecting import Pauses, ReconnectingLink, connect_tcp
+from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.discards import Refusal
 from eap.runtime.handover import PortName
@@ -114,7 +114,7 @@ class _StreamUplink(ReconnectingLink):
     """Link to one other station, and the data that waits for its connection."""
 
     def __init__(self, address: str, source: str, hops: HopRouter, serve: Serve) -> None:
-        super().__init__(Pauses(FIRST_PAUSE_S, LONGEST_PAUSE_S, _LASTING_S))
+        super().__init__(ReconnectPolicy(FIRST_PAUSE_S, LONGEST_PAUSE_S, _LASTING_S))
         self._address = address
         self._source = source or None
         self._hops = hops

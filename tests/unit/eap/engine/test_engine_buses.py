@@ -14,8 +14,8 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
 from eap.engine.engine_buses import REST_NS, EngineBuses
 from eap.engine.successor import EngineStation
+from eap.net.busport import SegmentSocket
 from eap.net.image_file import ImageFile
-from eap.net.segmentsocket import SegmentSocket
 from eap.pd.station import Station
 from eap.runtime.bus_request import EngineMessage, EngineStarted
 from eap.runtime.busfile import load_or_raise

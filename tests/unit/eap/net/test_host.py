@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from eap.errors import EnvironmentalError
-from eap.net.host import Host
+from eap.net.host import Host, open_replay, read_password, read_password_text
 from eap.pd.spec import INTERFACE_MEASURES, Measure
 
 STAT = "cpu  {user} 10 20 {idle} 50 1 2 3 4 5\ncpu0 1 2 3 4 5 6 7 8 0 0\nctxt 987654\n"
@@ -106,3 +108,72 @@ def test_this_host_can_be_measured():
     assert host.read(Measure.MEMORY_TOTAL) > host.read(Measure.MEMORY_AVAILABLE) > 0
     assert 0 <= host.read(Measure.CPU_PERCENT) <= 100
     assert host.read(Measure.RX_OCTETS, "lo") >= 0
+
+
+MS = 1_000_000
+
+
+def test_rows_follow_each_other_and_begin_again(tmp_path):
+    path = tmp_path / "oven.csv"
+    path.write_text("time,temperature\n0,180.5\n1,181\n2,179.25\n")
+    replay = open_replay(path, "temperature", period_ms=100)
+    times = (0, 99, 100, 250, 300, 650)
+    assert [replay.value(at * MS) for at in times] == [
+        "180.5",
+        "180.5",
+        "181",
+        "179.25",
+        "180.5",
+        "180.5",
+    ]
+
+
+def test_a_short_row_has_an_empty_value(tmp_path):
+    path = tmp_path / "short.csv"
+    path.write_text("a,b\n1\n")
+    assert open_replay(path, "b", period_ms=1).value(0) == ""
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "No such file"),
+        (b"a,b\n1,2\n", "no column 'c'"),
+        (b"", "no column 'c'"),
+        (b"c\n", "no rows"),
+        (b"c\n\xff\n", "UTF-8"),
+        (b'c\n"1\n', "no CSV file"),
+    ],
+)
+def test_a_file_that_cannot_be_replayed_is_named(tmp_path, content, words):
+    path = tmp_path / "bad.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(EnvironmentalError, match=words) as caught:
+        open_replay(path, "c", period_ms=1)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("content", ["secret", "secret\n", "secret\r\nmore\n"])
+def test_the_first_line_is_the_password(tmp_path, content):
+    file = tmp_path / "pw"
+    file.write_bytes(content.encode())
+    assert read_password(file) == b"secret"
+    assert read_password_text(file) == "secret"
+
+
+def test_octets_that_are_no_text(tmp_path):
+    file = tmp_path / "pw"
+    file.write_bytes(b"\xff\n")
+    assert read_password(file) == b"\xff"
+    with pytest.raises(EnvironmentalError, match="pw: its first line is not UTF-8"):
+        read_password_text(file)
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("pipe", "."):
+        with pytest.raises(EnvironmentalError, match=r"kept in a regular file|Is a directory"):
+            read_password(tmp_path / name)
+    with pytest.raises(EnvironmentalError, match="gone: No such file"):
+        read_password(tmp_path / "gone")

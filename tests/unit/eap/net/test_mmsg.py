@@ -18,8 +18,7 @@ from eap.net.mmsg import (
     count_error,
     note_receive_error,
 )
-from eap.net.udp import _socket_address
-from eap.net.udperrors import enable_errors, take_errors
+from eap.net.udp import _socket_address, enable_errors, take_errors
 from eap.pd.link import OutFrame
 
 pytestmark = pytest.mark.net

@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 import socket
+import struct
+import time
+from ipaddress import IPv4Address
 
 import pytest
 
-from eap.ids import MacAddr
-from eap.net.neighbour import Neighbour, NeighbourState, NeighbourTable, Route, RouteKind
+from eap.codec.arp import ETHERTYPE_ARP, REPLY, REQUEST, ArpMessage
+from eap.errors import EnvironmentalError
+from eap.ids import BROADCAST_MAC, MacAddr
+from eap.net.bpf import MAX_ADDRESSES
+from eap.net.neighbour import (
+    ArpProber,
+    ArpSighting,
+    Neighbour,
+    NeighbourState,
+    NeighbourTable,
+    Route,
+    RouteKind,
+)
+from eap.net.packetsocket import open_arp
 from eap.pd.monitor import Evidence
 from tests.unit.eap.net.conftest import ip
 
@@ -79,3 +94,165 @@ def test_behind_a_gateway_only_that_the_gateway_is_gone(table):
 def test_question_at_the_wrong_interface_is_answered_with_nothing(table):
     set_state("reachable")
     assert table.neighbour(THERE, 9999) is None
+
+
+pytestmark = [pytest.mark.net, pytest.mark.root]
+
+ADDRESS = IPv4Address("10.77.0.2")
+OTHER = IPv4Address("10.77.0.3")
+
+
+class Host:
+    """Whoever is at the other end of the cable."""
+
+    def __init__(self, interface):
+        self.sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(0x0003))
+        self.sock.bind((interface, 0x0003))
+        self.sock.settimeout(5)
+        self.mac = MacAddr(self.sock.getsockname()[4])
+
+    def hear(self, tag=b""):
+        """Return the next frame with ARP, and the message in it."""
+        head = tag + struct.pack("!H", ETHERTYPE_ARP)
+        while True:
+            data = self.sock.recv(2000)
+            if data[12 : 12 + len(head)] == head:
+                return data, ArpMessage.decode(data, 12 + len(head))
+
+    def say(self, message, to=BROADCAST_MAC, tag=b""):
+        self.sock.send(to + self.mac + tag + struct.pack("!H", ETHERTYPE_ARP) + message)
+
+    def answer(self, asked, tag=b""):
+        reply = ArpMessage(REPLY, self.mac, asked.target, asked.sender_mac, asked.sender)
+        self.say(reply.encode(), asked.sender_mac, tag)
+
+
+@pytest.fixture
+def host(cable):
+    host = Host(cable[1])
+    yield host
+    host.sock.close()
+
+
+@pytest.fixture
+def make_prober(cable):
+    opened = []
+
+    def make(**options):
+        prober = ArpProber(open_arp(cable[0]), **options)
+        opened.append(prober)
+        prober.watch([ADDRESS])
+        return prober
+
+    yield make
+    for prober in opened:
+        prober.close()
+
+
+def wait_heard(prober):
+    limit = time.monotonic() + 5
+    while not (found := prober.drain()):
+        assert time.monotonic() < limit
+    return found
+
+
+def test_probe_as_rfc_5227_has_it(make_prober, host):
+    prober = make_prober()
+    assert prober.probe(ADDRESS)
+    frame, asked = host.hear()
+    assert frame[:12] == BROADCAST_MAC + prober.mac
+    assert len(frame) == 60
+    assert asked == ArpMessage.probe(prober.mac, ADDRESS)
+
+
+def test_answer_tells_who_has_the_address(make_prober, host):
+    prober = make_prober()
+    prober.probe(ADDRESS)
+    host.answer(host.hear()[1])
+    assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
+
+
+def test_announcements_and_questions_of_the_host_show_it_too(make_prober, host):
+    prober = make_prober()
+    host.say(ArpMessage(REQUEST, host.mac, ADDRESS, MacAddr(bytes(6)), ADDRESS).encode())
+    assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
+    host.say(ArpMessage(REQUEST, host.mac, ADDRESS, MacAddr(bytes(6)), OTHER).encode())
+    assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
+
+
+def test_who_asks_whether_it_may_have_the_address_claims_it(make_prober, host):
+    prober = make_prober()
+    host.say(ArpMessage.probe(host.mac, ADDRESS).encode())
+    assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=True)]
+
+
+def test_other_addresses_and_nonsense_are_not_heard(make_prober, host):
+    prober = make_prober()
+    host.say(ArpMessage(REPLY, host.mac, OTHER, prober.mac, IPv4Address(0)).encode())
+    host.say(ArpMessage(REPLY, BROADCAST_MAC, ADDRESS, prober.mac, OTHER).encode())
+    host.say(b"\x00\x02" + ArpMessage(REPLY, host.mac, ADDRESS, prober.mac, OTHER).encode()[2:])
+    host.say(ArpMessage(REPLY, prober.mac, ADDRESS, prober.mac, OTHER).encode())
+    host.say(ArpMessage(REPLY, host.mac, ADDRESS, prober.mac, OTHER).encode())
+    assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
+    assert prober.drain() == []
+    assert prober.errors == {"malformed": 1}
+
+
+def test_each_vlan_by_itself(make_prober, host):
+    tagged, plain = make_prober(vlan_id=7, priority=5), make_prober()
+    tagged.probe(ADDRESS)
+    tag = struct.pack("!HH", 0x8100, 5 << 13 | 7)
+    # The kernel takes the tag off before it shows the frame to a plain packet socket.
+    asked = host.hear()[1]
+    host.answer(asked, tag)
+    assert wait_heard(tagged) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
+    assert plain.drain() == []
+    host.answer(asked)
+    assert wait_heard(plain) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
+    assert tagged.drain() == []
+
+
+def test_own_addresses_cannot_be_asked_for(make_prober, cable):
+    ip(f"addr add {ADDRESS}/24 dev {cable[1]}")
+    prober = make_prober()
+    assert not prober.probe(ADDRESS)
+    assert not prober.probe(IPv4Address("127.0.0.9"))
+    assert prober.probe(OTHER)
+
+
+def test_nobody_answers_on_the_loopback_interface(cable):
+    del cable
+    prober = ArpProber(open_arp("lo"))
+    assert not prober.probe(ADDRESS)
+    prober.close()
+
+
+def test_interface_that_is_down_gives_no_answer(make_prober, cable):
+    prober = make_prober()
+    ip(f"link set {cable[0]} down")
+    assert not prober.probe(ADDRESS)
+    prober.drain()
+    assert prober.errors.get("ENETDOWN")
+
+
+def test_missing_interface_is_named(cable):
+    del cable
+    with pytest.raises(EnvironmentalError, match="no interface 'nowhere'"):
+        open_arp("nowhere")
+
+
+@pytest.mark.host_root
+def test_no_ethernet_is_refused(cable):
+    del cable
+    ip("tuntap add dev tun0 mode tun")
+    ip("link set tun0 up")
+    with pytest.raises(EnvironmentalError, match="tun0 is not an Ethernet interface"):
+        open_arp("tun0")
+
+
+def test_as_many_addresses_as_the_kernel_takes(make_prober):
+    prober = make_prober()
+    addresses = [IPv4Address(0x0A000000 + n) for n in range(MAX_ADDRESSES + 1)]
+    prober.watch(addresses[:300])
+    with pytest.raises(EnvironmentalError, match="1001 addresses to monitor"):
+        prober.watch(addresses)

@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from eap.net.reconnecting import Backoff, Pauses, ReconnectingLink, connect_tcp
+from eap.net.reconnecting import Backoff, ReconnectingLink, ReconnectPolicy, connect_tcp
 
 
 def test_waits_grow_up_to_a_limit_and_begin_anew() -> None:
@@ -23,7 +23,7 @@ def test_waits_differ() -> None:
 class Link(ReconnectingLink):
     """Link whose connections end for the reasons of a list; an empty list ends it."""
 
-    def __init__(self, reasons: list[str], pauses: Pauses) -> None:
+    def __init__(self, reasons: list[str], pauses: ReconnectPolicy) -> None:
         super().__init__(pauses)
         self.reasons = reasons
         self.reported: list[tuple[str, bool]] = []
@@ -40,7 +40,7 @@ class Link(ReconnectingLink):
 
 
 def test_link_connects_again_until_it_ends_orderly() -> None:
-    link = Link(["refused", "refused", "silent", ""], Pauses(0.001, 0.001, 10))
+    link = Link(["refused", "refused", "silent", ""], ReconnectPolicy(0.001, 0.001, 10))
     asyncio.run(asyncio.wait_for(link.run(), 10))
     reported = [("refused", True), ("refused", False), ("silent", True), ("", True)]
     assert link.reported == reported
@@ -48,7 +48,7 @@ def test_link_connects_again_until_it_ends_orderly() -> None:
 
 
 def test_link_that_is_no_longer_wanted_ends_after_the_pause() -> None:
-    link = Link(["refused"], Pauses(0.001, 0.001, 10))
+    link = Link(["refused"], ReconnectPolicy(0.001, 0.001, 10))
     asyncio.run(asyncio.wait_for(link.run(), 10))
     assert link.reported == [("refused", True)]
 

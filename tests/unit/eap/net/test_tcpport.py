@@ -10,8 +10,9 @@ import pytest
 from eap.ids import InterfaceUri
 from eap.net import tcpport
 from eap.net.connections import CloseReason, Limits
+from eap.net.ipsocket import open_tcp_listener
 from eap.net.loopback import LoopbackLines
-from eap.net.tcp import TcpReceiver, open_tcp_listener
+from eap.net.tcp import TcpReceiver
 from eap.net.tcpport import TcpPort
 from eap.pd.link import OutFrame
 from tests.support.appliance import wait_until

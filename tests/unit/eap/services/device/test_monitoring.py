@@ -15,8 +15,7 @@ import pytest
 from eap.codec.arp import ETHERTYPE_ARP, REPLY, ArpMessage
 from eap.errors import ImageError
 from eap.ids import MacAddr
-from eap.net.arpprobe import ArpProber
-from eap.net.neighbour import NeighbourTable
+from eap.net.neighbour import ArpProber, NeighbourTable
 from eap.net.packetsocket import open_arp
 from eap.pd.address import to_word
 from eap.pd.frame_status import frame_status

@@ -12,9 +12,9 @@ from time import monotonic_ns
 import pytest
 
 from eap.codec.ethercat import EtherCatHeader
+from eap.net.ipsocket import prepare_receiver
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
-from eap.net.udpsocket import prepare_receiver
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.services.transports.mailbox_frames import (
     MAX_BACKOFF,
