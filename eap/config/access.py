@@ -35,10 +35,10 @@ _MAC_COLONS = 5
 
 
 def access_rules(index: Index, station: StationSection, loose: set[str]) -> Iterator[AccessRule]:
-    """Yield the rules of *station*; *loose* are its plant's stations without their own prefix.
+    """Yield the rules of *station*; *loose* are the stations without a NetID prefix of their own.
 
     Raises:
-        MisfitError: a rule says something that there is not.
+        SectionError: a rule names something that does not exist.
     """
     for number, access in enumerate(station.access):
         yield AccessRule(
@@ -59,20 +59,18 @@ def access_rules(index: Index, station: StationSection, loose: set[str]) -> Iter
 
 
 def rule_name(access: AccessSection, number: int) -> str:
-    """Return how people call the rule; *number* is its place, from 0."""
+    """Return the name of a rule in messages; *number* is its position, from 0."""
     return access.name or str(number + 1)
 
 
 def parse_services(texts: tuple[str, ...]) -> tuple[AccessService, ...]:
-    """Return what a rule is about, nothing for everything; ``write`` is all that is no reading."""
+    """Return the services of a rule, none for all; ``write`` is every service but reading."""
     found: list[AccessService] = []
     for text in texts:
         if text == ALL:
             return ()
         if text not in SERVICES:
-            raise MisfitError(
-                "", f"no access is called {text!r}{suggest(text, SERVICES)}", _SERVICES
-            )
+            raise MisfitError("", f"unknown access {text!r}{suggest(text, SERVICES)}", _SERVICES)
         found += _WRITES if text == AccessService.WRITE else [AccessService(text)]
     return tuple(dict.fromkeys(found))
 
@@ -94,14 +92,14 @@ def _is_mac(text: str) -> bool:
 
 
 def parse_source(index: Index, text: str, loose: set[str]) -> list[str]:
-    """Return the beginnings of NetIDs that *text*, a station or some numbers, stands for."""
+    """Return the NetID prefixes that *text*, a station or some numbers, stands for."""
     if (station := index.stations.get(text)) is not None:
         return _beginnings(station, loose)
     return [_net_id(text)]
 
 
 def parse_target(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
-    """Return what *text* names."""
+    """Return the targets that *text* names: a station, a port, a slave, or a NetID."""
     where, separator, number = text.partition(":")
     if not separator:
         return _targets(index, text, loose)
@@ -154,7 +152,7 @@ def _targets(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
 
 
 def _slave(index: Index, station: StationSection, port: PortSection, slave: str) -> int:
-    """Return the station address of a slave; any number will do where nothing is expected."""
+    """Return the station address of a slave; without a bus file any number is valid."""
     bus = index.buses.get((station.name, port.name))
     known = {each.name: each.station for each in bus.slaves} if bus else {}
     if port.kind is not PortKind.BUS:
@@ -186,7 +184,7 @@ _OBJECT_SERVICES = {AccessService.READ, AccessService.WRITE}
 
 
 def check_access(index: Index, report: FindingReport, folder: Path) -> None:
-    """Report every rule and user that cannot be as they are; files are in *folder*."""
+    """Report every invalid rule and user; files are in *folder*."""
     loose = without_prefix(index)
     for station in index.plant.stations:
         named = ((each.at, each.name) for each in station.access if each.name)
@@ -206,7 +204,7 @@ def _check_rule(
     loose: set[str],
     report: FindingReport,
 ) -> bool:
-    """Report what is wrong with a rule; return whether it can be compared with others."""
+    """Report the errors of a rule; return whether it can be compared with other rules."""
     is_fine = True
 
     def try_all(key: str, texts: tuple[str, ...], parse: Callable[[str], object]) -> None:
@@ -223,7 +221,11 @@ def _check_rule(
     if report.has(f"{access.at}.allow") or report.has(f"{access.at}.deny"):
         is_fine = False
     elif bool(access.allow) == bool(access.deny):
-        message = "access rule has both allow and deny" if access.allow else "nothing is said"
+        message = (
+            "access rule has both allow and deny"
+            if access.allow
+            else "access rule has neither allow nor deny"
+        )
         report.add(access.at, message, "allow or deny with what it is about, such as allow: [read]")
         is_fine = False
     key = "allow" if access.allow else "deny"
@@ -259,7 +261,7 @@ def _check_transport(text: str, known: list[str]) -> None:
 def _check_order(
     index: Index, station: StationSection, loose: set[str], report: FindingReport
 ) -> None:
-    """Report rules that never decide anything."""
+    """Report rules that never match a request."""
     before: list[tuple[AccessSection, AccessRule]] = []
     try:
         rules = list(access_rules(index, station, loose))
@@ -267,12 +269,12 @@ def _check_order(
         return  # a finding of its own
     for access, rule in zip(station.access, rules, strict=True):
         if reason := _why_never(rule):
-            report.add(access.at, f"access rule can never fit: {reason}", "a rule that can")
+            report.add(access.at, f"access rule never matches: {reason}", "a rule that can match")
         for earlier, other in before:
             if _covers(other, rule):
                 line = report.line_of(earlier.at)
-                message = f"access rule is never asked: the one of line {line} fits before it"
-                report.add(access.at, message, "it before that one, or not at all")
+                message = f"access rule never applies: the rule in line {line} matches before it"
+                report.add(access.at, message, "this rule before that one, or no such rule")
                 break
         before.append((access, rule))
 
@@ -281,14 +283,14 @@ def _why_never(rule: AccessRule) -> str:
     kinds = {_kind(transport) for transport in rule.transports}
     is_known = kinds.isdisjoint(IP_DOORS) if rule.networks else bool(rule.macs)
     if kinds and is_known and not (rule.macs and TransportKind.ETHERNET in kinds):
-        return f"who comes by {', '.join(rule.transports)} has no such address"
+        return f"clients of {', '.join(rule.transports)} have no such address"
     if rule.objects and rule.services and _OBJECT_SERVICES.isdisjoint(rule.services):
-        return f"{', '.join(rule.services)} is not about objects"
+        return f"{', '.join(rule.services)} does not access objects"
     return ""
 
 
 def _covers(one: AccessRule, other: AccessRule) -> bool:
-    """Tell whether *one* fits whenever *other* does."""
+    """Return whether *one* matches every request that *other* matches."""
     return (
         _covers_senders(one, other)
         and _all_in(one.net_ids, other.net_ids, _begins)
@@ -320,7 +322,7 @@ def _within(outer: tuple[T, ...], inner: tuple[T, ...], is_in: Callable[[T, T], 
 
 
 def _all_in(outer: tuple[T, ...], inner: tuple[T, ...], is_in: Callable[[T, T], bool]) -> bool:
-    """Tell whether each of *inner* is in one of *outer*; nothing given stands for everything."""
+    """Return whether each of *inner* is in one of *outer*; an empty list stands for everything."""
     if not outer:
         return True
     return bool(inner) and _within(outer, inner, is_in)

@@ -24,11 +24,11 @@ class Broker(NamedTuple):
     host: str
     port: int
     is_secret: bool
-    """Whether it is reached by TLS although no ``tls`` says how."""
+    """Whether the URL requires TLS, with or without a ``tls`` section."""
 
 
 def parse_url(text: str) -> Broker:
-    """Read the URL of a broker; raise ValueError if it is none."""
+    """Read the URL of a broker; raise ValueError if it is invalid."""
     scheme, separator, rest = text.partition("://")
     if not separator or scheme not in _PORTS:
         raise ValueError(f"{text!r} is no broker")
@@ -44,7 +44,7 @@ def brokers_of(station: StationSection) -> list[RouteSection]:
 
 
 def find_network(station: StationSection, network: str) -> RouteSection | None:
-    """Return by which entry *station* takes part in *network*."""
+    """Return the entry by which *station* is in *network*."""
     return next((each for each in brokers_of(station) if each.network == network), None)
 
 
@@ -61,7 +61,7 @@ def shared_network(station: StationSection, other: StationSection) -> str:
 
 
 def broker_spec(route: RouteSection, folder: Path) -> MqttSpec:
-    """Return what services need to know of the broker of *route*; its files are in *folder*."""
+    """Return the specification of the broker of *route* for services; its files are in *folder*."""
     broker = parse_url(route.mqtt)
     tls = route.tls or (TlsSection() if broker.is_secret else None)
     return MqttSpec(
@@ -98,7 +98,7 @@ _MAX_CLIENT_ID = 65_535
 
 
 def check_brokers(index: Index, report: FindingReport, folder: Path) -> None:
-    """Report every broker that cannot be as it is; files are in *folder*."""
+    """Report every invalid broker; files are in *folder*."""
     client_ids: dict[tuple[Broker, str], RouteSection] = {}
     for station in index.plant.stations:
         _check_networks(station, report)
@@ -110,7 +110,9 @@ def check_brokers(index: Index, report: FindingReport, folder: Path) -> None:
                 if first is not route:
                     line = report.line_of(f"{first.at}.client_id")
                     message = f"client_id {route.client_id!r} is used twice (first in line {line})"
-                    expected = "one of its own: a broker drops who had it before, or none"
+                    expected = (
+                        "one of its own, or none: a broker disconnects the first client with it"
+                    )
                     report.add(f"{route.at}.client_id", message, expected)
 
 
@@ -123,7 +125,7 @@ def _check_url(route: RouteSection, report: FindingReport) -> Broker | None:
         return None
     if len(route.client_id.encode()) > _MAX_CLIENT_ID:
         message = "client_id is too long"
-        report.add(f"{route.at}.client_id", message, f"at most {_MAX_CLIENT_ID} octets")
+        report.add(f"{route.at}.client_id", message, f"at most {_MAX_CLIENT_ID} bytes")
     return broker
 
 
@@ -178,7 +180,7 @@ HOST = "an IPv4 address or a host name, and :PORT if it is not the usual one"
 
 
 def why_unreadable(file: Path) -> str:
-    """Return why *file* cannot be read as a whole; empty if it can."""
+    """Return the reason that *file* cannot be read as a whole; empty if it can."""
     try:
         if file.exists() and not file.is_file() and not file.is_dir():
             return "no regular file"  # a pipe would keep us waiting
@@ -194,14 +196,14 @@ _SOURCES = "mqtt:NETWORK of a broker of the station, or an IPv4 address or netwo
 
 
 def learn_sources(station: StationSection) -> bool | tuple[str, ...]:
-    """Return from where *station*, which has no findings, learns routes."""
+    """Return the sources of auto-discovered routes of *station*, which has no findings."""
     if isinstance(station.learn, bool):
         return station.learn
     return tuple(_parse(station, text) for text in station.learn)
 
 
 def check_learning(index: Index, report: FindingReport) -> None:
-    """Report every source of learned routes that is none."""
+    """Report every invalid source of auto-discovered routes."""
     for station in index.plant.stations:
         if isinstance(station.learn, bool):
             continue
@@ -213,17 +215,17 @@ def check_learning(index: Index, report: FindingReport) -> None:
 
 
 def warn_of_open_brokers(index: Index, report: FindingReport) -> tuple[PlantFinding, ...]:
-    """Return a warning for each broker that teaches routes without knowing its clients.
+    """Return a warning for each broker that announces routes without authenticating its clients.
 
-    A station that names the network in ``learn`` wants that.
+    There is none for a station that names the network in ``learn``.
     """
     found = []
     for station in index.plant.stations:
         for route in brokers_of(station) if station.learn is True else ():
             if _is_anonymous(route):
                 message = (
-                    f"station {station.name} learns routes from anybody at {route.mqtt}: the"
-                    " broker asks for no user"
+                    f"station {station.name} learns routes from any client of {route.mqtt}: the"
+                    " broker requires no user"
                 )
                 expected = f"learn: [mqtt:{route.network}] if that is meant, else learn: false"
                 line = report.line_of(f"{route.at}.mqtt")
@@ -232,12 +234,12 @@ def warn_of_open_brokers(index: Index, report: FindingReport) -> tuple[PlantFind
 
 
 def _is_anonymous(route: RouteSection) -> bool:
-    """Say whether a station shows its broker neither a user nor a certificate."""
+    """Return whether a station connects to its broker with neither a user nor a certificate."""
     return not route.user and (route.tls is None or not route.tls.certificate)
 
 
 def _parse(station: StationSection, text: str) -> str:
-    """Return a source in its usual form; raise ValueError if it is none."""
+    """Return a source in its usual form; raise ValueError if it is invalid."""
     if not text.startswith(_MQTT):
         try:
             return str(IPv4Network(text, strict=False))

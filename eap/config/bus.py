@@ -18,7 +18,7 @@ from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
 from eap.suggest import suggest
 
 DescribeBus: TypeAlias = Callable[[Path], ExpectedBus | tuple[PlantFinding, ...]]
-"""Reads a bus file; returns its findings if it has any, and never raises for what it holds."""
+"""Reads a bus file; returns its findings if it has any, and never raises for its content."""
 
 
 SCHEMES = ("sim", "ethernet", "udp")
@@ -28,7 +28,7 @@ _SLAVE_NAME = "a text without spaces and slashes, by which a plant can address i
 
 
 def check_bus_port(port: PortSection, uri: InterfaceUri, report: FindingReport) -> None:
-    """Report what no bus port on *uri* can have."""
+    """Report an interface that no bus port can have."""
     path = f"{port.at}.interface"
     if uri.scheme not in SCHEMES:
         report.add(path, f"{uri.scheme}:// is no interface of a bus port", INTERFACE)
@@ -47,9 +47,9 @@ def check_bus_port(port: PortSection, uri: InterfaceUri, report: FindingReport) 
 def describe_buses(
     plant: PlantFile, folder: Path, describe: DescribeBus, report: FindingReport
 ) -> dict[tuple[str, str], ExpectedBus | None]:
-    """Return what is known of the bus at each (station, port); None where its file is no bus file.
+    """Return the description of the bus at each (station, port); None if its file is invalid.
 
-    What is wrong with the files goes to *report*.
+    Findings of the files go to *report*.
     """
     found: dict[tuple[str, str], ExpectedBus | None] = {}
     known: dict[Path, ExpectedBus | None] = {}
@@ -71,7 +71,7 @@ def describe_buses(
 
 
 def bus_file(port: PortSection, folder: Path) -> tuple[str, Path | None]:
-    """Return where *port* names its bus file (a path in the plant file), and the file, if any."""
+    """Return the path in the plant file that names the bus file of *port*, and the file, if any."""
     try:
         uri = InterfaceUri.parse(port.interface)
     except ValueError:
@@ -82,7 +82,7 @@ def bus_file(port: PortSection, folder: Path) -> tuple[str, Path | None]:
 
 
 def _unusable(file: Path) -> str:
-    """Return why there is nothing to read at *file*; empty if there is."""
+    """Return the reason that *file* cannot be read; empty if it can."""
     try:
         if file.is_file():
             return ""
@@ -109,7 +109,7 @@ def _describe(file: Path, describe: DescribeBus, report: FindingReport) -> Expec
 def _has_names(
     path: str, port: PortSection, description: ExpectedBus, report: FindingReport
 ) -> bool:
-    """Tell whether all slaves can be addressed, after reporting those that cannot."""
+    """Return whether all slaves can be addressed, after reporting those that cannot."""
     wrong = [
         slave.name
         for slave in description.slaves
@@ -150,9 +150,9 @@ def gateway_spec(index: Index, station: StationSection, port: PortSection) -> Ga
 
 
 def gateway_port(station: StationSection, port: PortSection) -> int:
-    """Return the port number that a gateway has to itself, 0 for none.
+    """Return the port number of a gateway of its own, 0 for none.
 
-    The one to the first bus is served where the station takes all frames.
+    The gateway to the first bus shares the port of the station, 34980.
     """
     buses = [each.name for each in station.ports if each.kind is PortKind.BUS]
     number = buses.index(port.name)
@@ -167,7 +167,7 @@ def hosts_of(index: Index, station: StationSection) -> Iterator[str]:
 
 
 def parse_address(text: str) -> int:
-    """Return a virtual address as a plant file has it; raise MisfitError if it is none."""
+    """Return a virtual address as a plant file has it; raise SectionError if it is invalid."""
     try:
         address = int(text, 0)
     except ValueError:
@@ -180,12 +180,12 @@ def parse_address(text: str) -> int:
 def resolve(
     index: Index, station: StationSection, port: PortSection, address: int, target: Plain
 ) -> GatewayAddress:
-    """Return the target of *address*; raise MisfitError if there is no such one."""
+    """Return the target of *address*; raise SectionError if it does not exist."""
     if isinstance(target, list):
         known = _virtual(port)
         members = tuple(_member(index, station, port, each, known) for each in target)
         if not members:
-            raise MisfitError("", "a group of nobody", _MEMBER)
+            raise MisfitError("", "a group without addresses", _MEMBER)
         return GatewayAddress(address, members=members)
     names = str(target).split("/")
     if len(names) == 1:
@@ -220,7 +220,7 @@ def _member(
 
 
 def _slave(index: Index, station: StationSection, port: PortSection, slave: object) -> int:
-    """Return the station address of a slave that is named by it, or by its name."""
+    """Return the station address of a slave, given by that address or by its name."""
     slaves = slaves_of(index, station, port)
     for each in slaves:
         if slave in {each.name, each.station} or str(slave) == str(each.station):
@@ -238,7 +238,7 @@ def _slave(index: Index, station: StationSection, port: PortSection, slave: obje
 
 
 def slaves_of(index: Index, station: StationSection, port: PortSection) -> tuple[BusSlaveSpec, ...]:
-    """Return the slaves that a bus is known to have, none where nothing describes it."""
+    """Return the described slaves of a bus, none if no bus file describes it."""
     bus = index.buses.get((station.name, port.name))
     return bus.slaves if bus else ()
 
@@ -266,7 +266,7 @@ _BIT_15 = 0x8000
 
 
 def check_gateways(index: Index, report: FindingReport) -> None:
-    """Report every gateway that cannot be as it is."""
+    """Report every invalid gateway."""
     taken = list(_taken(index))
     for station in index.plant.stations:
         for port in station.ports:
@@ -286,14 +286,14 @@ def _check_addresses(
         try:
             address = parse_address(text)
             if address in first:
-                message = f"gateway address {text} is {first[address]} once more"
+                message = f"gateway address {text} is a duplicate of {first[address]}"
                 report.add(f"{path}.{text}", message, "each address once")
                 continue
             first[address] = text
             if address & _BIT_15 and address & ~_BIT_15 in stations:
                 slave = address & ~_BIT_15
                 message = f"gateway address {text} is that of slave {slave} with bit 15 set"
-                report.add(f"{path}.{text}", message, f"{ADDRESS} that stands for nobody yet")
+                report.add(f"{path}.{text}", message, f"{ADDRESS} that is not in use")
             resolve(index, station, port, address, target)
         except MisfitError as exc:
             if not is_unread:
@@ -329,7 +329,7 @@ def _check_place(
 
 
 def _taken(index: Index) -> Iterator[tuple[str, int, str, str]]:
-    """Yield what the ports of the plant have: address, port number, whose, and its path."""
+    """Yield the addresses in use by ports: host, port number, owner, and path in the file."""
     for (station, name), uri in index.uris.items():
         port = index.ports[station, name]
         path = f"{port.at}.interface"

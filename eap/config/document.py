@@ -110,12 +110,12 @@ def _text(path: Path) -> str:
     except UnicodeDecodeError as exc:
         line = octets.count(b"\n", 0, exc.start) + 1
         raise _UnreadableError(
-            line, f"octet {octets[exc.start]:#04x} is no UTF-8", "UTF-8"
+            line, f"byte {octets[exc.start]:#04x} is not UTF-8", "UTF-8"
         ) from None
 
 
 def _tab_in(text: str, line: int) -> str:
-    """Return where *line* has a tab that YAML does not take; empty without one."""
+    """Return the position of a tab in *line* that YAML does not allow; empty without one."""
     lines = text.split("\n")
     written = lines[line - 1] if 0 < line <= len(lines) else ""
     if _TAB_INDENT.match(written):
@@ -124,7 +124,7 @@ def _tab_in(text: str, line: int) -> str:
 
 
 class _Open:
-    """A list or mapping whose end has not been seen."""
+    """A list or mapping that is still open."""
 
     __slots__ = ("anchor", "items", "line", "mapping")
 
@@ -254,25 +254,25 @@ _UNITS = {"us": " of microseconds", "ms": " of milliseconds"}
 
 
 _NULLS = frozenset(("null", "~"))
-"""Said on purpose; an empty value may be a value forgotten."""
+"""Explicit nulls; an empty value may be a forgotten one."""
 
 
 class _BrokenError(Exception):
     """The value was reported and cannot be used."""
 
     number: int | None = None
-    """The number if it is only out of range: good enough to go on checking with."""
+    """The number if it is only out of range, so that the checks can continue with it."""
 
 
 def convert(root: Node, report: FindingReport) -> PlantFile | None:
-    """Return what *root* describes without the items that were reported; None if it is no plant."""
+    """Convert *root* to a plant file without the reported items; None if it is not a plant."""
     return convert_to(PlantFile, root, report, "plant")
 
 
 def convert_to(kind: type[T], root: Node, report: FindingReport, what: str) -> T | None:
-    """Return what *root* describes as *kind*; None if it is none.  *what* is its name in findings.
+    """Convert *root* to *kind* without the reported items; None if it cannot be read.
 
-    Items that were reported are left out.
+    *what* names it in findings.
     """
     report.lines[""] = root.line
     try:
@@ -285,7 +285,7 @@ def convert_to(kind: type[T], root: Node, report: FindingReport, what: str) -> T
 
 @cache
 def _describe_type(kind: type) -> inspect.Type:
-    """Return what msgspec knows of *kind*; finding out takes longer than reading most files."""
+    """Return the description of *kind* by msgspec, cached because it takes long to make."""
     return inspect.type_info(kind)
 
 
@@ -485,7 +485,7 @@ class _Converter:
         raise self._refuse(node, path, key, _describe(kind, key))
 
     def _plain(self, node: Node, path: str, key: str) -> Any:
-        """Read a value whose type only the data type of its variable knows."""
+        """Read a value whose type depends on the data type of its variable."""
         if isinstance(node.value, list):
             return [self._plain(item, path, f"an element of {key}") for item in node.value]
         if node.value is None or isinstance(node.value, dict):
@@ -494,7 +494,7 @@ class _Converter:
 
 
 def read_net_id(text: str, path: str, report: FindingReport) -> NetId:
-    """Return the NetID of a station or port; report at *path* why it is none, and go on."""
+    """Return the NetID of a station or port; report an invalid one at *path*."""
     try:
         return NetId.parse(text)
     except ValueError as exc:

@@ -53,7 +53,7 @@ def check_publish(index: Index, report: FindingReport) -> None:
 def check_port_reference(
     index: Index, report: FindingReport, station: StationSection, at: str, name: str
 ) -> None:
-    """Report a *name* at *at* that is no EAP port of *station*."""
+    """Report a *name* at *at* that is not an EAP port of *station*."""
     known = [port.name for port in station.ports if port.kind is PortKind.EAP]
     if name in known or name in report.broken:
         return
@@ -92,8 +92,8 @@ def _check_frame(
         size += PdHeader.SIZE + (pdo.layout(kinds).size if kinds else 0)
     kind = None if destination is None else destination.kind
     if size > (budget := rules.frame_budget(uri.scheme, kind)):
-        message = f"frame {frame.name!r} has {size} octets with its {len(pds)} PDs"
-        expected = f"at most {budget} to {destination or 'who asks'} (more frames carry more)"
+        message = f"frame {frame.name!r} has {size} bytes with its {len(pds)} PDs"
+        expected = f"at most {budget} to {destination or 'the requester'} (more frames carry more)"
         report.add(frame.at, message, expected)
 
 
@@ -115,7 +115,7 @@ def _check_pd(
 
 
 def is_unread(index: Index, report: FindingReport, station: StationSection, name: str) -> bool:
-    """Tell whether *name* may belong to something that was reported already."""
+    """Return whether *name* may belong to a section that was reported already."""
     if name in report.broken:
         return True
     if any(name.startswith(f"{port}.") for port in index.unread_buses(station)):
@@ -163,7 +163,7 @@ _ONE_PORT = "one port for both: an answer goes back as its request came"
 
 
 def check_polls(index: Index, report: FindingReport) -> None:
-    """Report every request and answer that do not find each other."""
+    """Report every request without an answer, and every answer without a request."""
     for station in index.plant.stations:
         for frame in station.frames:
             _check_poll_frame(report, station, frame)
@@ -205,7 +205,7 @@ def _check_answer(
     sent = index.sent.get((station.name, pd.name))
     chain = [] if sent is None else _chain(index, sent)
     if len(chain) > 1 and chain[0] == chain[-1]:
-        message = f"polls go in a circle: {', '.join(each.label for each in chain)}"
+        message = f"polls form a loop: {', '.join(each.label for each in chain)}"
         report.add(path, message, _PUSHED)
     elif len(chain) > 1:
         message = f"PD {pd.name!r} answers {chain[1].label}, which is polled itself "
@@ -218,7 +218,7 @@ def _check_answer(
 
 
 def _chain(index: Index, sent: SentPd) -> list[SentPd]:
-    """Return the polled PDs from *sent* to what it answers, and on; a circle ends as it began."""
+    """Return the chain of polled PDs that *sent* answers; a loop ends with the PD it began with."""
     chain = [sent]
     while True:
         last = chain[-1]
@@ -251,7 +251,7 @@ def _check_question(
     for sent in publishers:
         _check_asked(index, report, subscription, sent, own)
     if own.pd.poll and not publishers:
-        message = f"{subscription.name!r} is asked for by {name!r}, which is polled itself "
+        message = f"{subscription.name!r} is requested by {name!r}, which is polled itself "
         message += f"(line {report.line_of(f'{own.pd.at}.poll')})"
         report.add(path, message, _PUSHED)
 
@@ -259,7 +259,7 @@ def _check_question(
 def _check_asked(
     index: Index, report: FindingReport, subscription: SubscribeSection, sent: SentPd, own: SentPd
 ) -> None:
-    """Report that *sent*, which *subscription* takes, does not answer *own*."""
+    """Report that *sent*, which *subscription* receives, does not answer *own*."""
     path = f"{subscription.at}.poll"
     if not sent.pd.poll:
         message = f"{subscription.name!r} is polled, but {sent.label} is sent by itself"
@@ -277,12 +277,14 @@ def _check_unasked(index: Index, report: FindingReport, subscription: SubscribeS
     for sent in index.publishers(subscription):
         if sent.pd.poll:
             line = report.line_of(f"{sent.pd.at}.poll")
-            message = f"{sent.label} is sent only to who asks for it (line {line})"
-            report.add(f"{subscription.at}.from", message, "poll: the PD of this station that asks")
+            message = f"{sent.label} is sent only on request (line {line})"
+            report.add(
+                f"{subscription.at}.from", message, "poll: the PD of this station that requests it"
+            )
 
 
 def check_subscribe(index: Index, report: FindingReport) -> None:
-    """Report every RxPD that would receive nothing, or something else than it expects."""
+    """Report every RxPD that would receive nothing, or another layout than it expects."""
     for station in index.plant.stations:
         check_names(((s.at, s.name) for s in station.subscribe), "subscription", report)
         taken: dict[tuple[str, str, int], str] = {}
@@ -318,7 +320,7 @@ def _check_source(
     elif not set(source.split("/")) & report.broken:
         known = [f"{s.name}/{pd.name}" for s in index.plant.stations for pd in s.publish]
         if source not in known:  # else its frame or port was reported
-            message = f"nobody in this plant publishes {source!r}{suggest(source, known)}"
+            message = f"no station of this plant publishes {source!r}{suggest(source, known)}"
             report.add(path, message, f"STATION/PD: {one_of(known)}")
 
 
@@ -353,7 +355,7 @@ def _check_numbers(
             report.add(f"{path}.publisher", str(exc), "a NetID or any")
             return
     if not subscription.foreign:
-        message = f"nobody in this plant publishes id {source.id} as {source.publisher}"
+        message = f"no station of this plant publishes id {source.id} as {source.publisher}"
         report.add(path, message, "a publisher of this plant, or foreign: true")
 
 

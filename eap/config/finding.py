@@ -1,4 +1,4 @@
-"""Findings in a plant file with their places: collected, not raised, so that all is seen."""
+"""Findings in a plant file with their lines: collected, not raised, so that users see all."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _VARYING = re.compile(r"'[^']*'|\S*\d\S*|, did you mean [^?]*\?")
 
 
 class PlantFinding(msgspec.Struct, frozen=True):
-    """One thing to correct."""
+    """One error in a plant file."""
 
     file: str
     line: int
-    """From 1; 0 when the file as a whole is meant."""
+    """From 1; 0 for the file as a whole."""
     path: str
     """Such as ``stations[0].publish[1].id``; empty for the file as a whole."""
     message: str
@@ -39,8 +39,8 @@ class FindingReport:
     *broken* holds the names of items that could not be read: a reference to one of them is no
     finding of its own.  *stations* are the names of the stations, as far as they are known.
 
-    A part of the file that is used in several places, by an anchor, is wrong once: the finding of
-    its first place says how many more there are.
+    A part of the file that an anchor repeats has one finding, at its first use, with the number of
+    further uses.
     """
 
     def __init__(self, file: str) -> None:
@@ -60,7 +60,7 @@ class FindingReport:
         self._nodes[path] = node
 
     def add(self, path: str, message: str, expected: str, *, line: int | None = None) -> None:
-        """Report *message* at *path*; without *line* the one of the path or of what holds it."""
+        """Report *message* at *path*; *line* defaults to that of the path or of its parent."""
         where = self.line_of(path) if line is None else line
         finding = PlantFinding(self.file, where, path, message, expected)
         first = self._first_use.setdefault(self._cause(path, message), finding)
@@ -75,23 +75,23 @@ class FindingReport:
             self.add(f"{at}.{breach.key}", breach.message, breach.expected)
 
     def adopt(self, findings: Iterable[PlantFinding]) -> None:
-        """Take over what is wrong with another file."""
+        """Add the findings of another file."""
         self._adopted += findings
 
     def has(self, path: str) -> bool:
-        """Tell whether something is wrong at *path* itself."""
+        """Return whether *path* itself has a finding."""
         return any(finding.path == path for finding in self._findings.values()) or any(
             path in paths for paths in self._further_uses.values()
         )
 
     def line_of(self, path: str) -> int:
-        """Return the line of *path*, or of the nearest thing around it that the file has."""
+        """Return the line of *path*, or of its nearest parent that the file has."""
         while path and path not in self.lines:
             path = _parent(path)
         return self.lines.get(path, 0)
 
     def _cause(self, path: str, message: str) -> tuple[int, str, str]:
-        """Return what the findings of one part of the file have in common in all its places."""
+        """Return the key that findings of one part of the file share in all its uses."""
         known = path
         while known and known not in self._nodes:
             known = _parent(known)
@@ -120,6 +120,6 @@ def _parent(path: str) -> str:
 
 
 def one_of(known: Iterable[str]) -> str:
-    """Return *known* as the text of what was expected."""
+    """Return *known* as the expectation of a finding."""
     names = ", ".join(known)
     return f"one of {names}" if names else "none (there are none here)"

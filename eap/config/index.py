@@ -40,7 +40,7 @@ _OTHER = re.compile(r"[^\w-]")
 
 
 class DescribedEntry(msgspec.Struct, frozen=True):
-    """One entry of process data; *type* as ``datatypes.parse`` reads it, empty for padding."""
+    """One entry of process data; *type* for ``datatypes.parse``, empty for padding."""
 
     name: str
     type: str
@@ -50,7 +50,7 @@ class DescribedEntry(msgspec.Struct, frozen=True):
 
 
 class DescribedSlave(msgspec.Struct, frozen=True, kw_only=True):
-    """One slave as its description has it; what is None may be anything."""
+    """One slave of a bus file; a field that is None is not checked."""
 
     name: str
     vendor: int
@@ -70,7 +70,7 @@ class ExpectedBus(msgspec.Struct, frozen=True):
 
 
 class BusVariable(NamedTuple):
-    """A variable that a station has because of a bus; *type* is canonical."""
+    """A variable that a bus adds to a station; *type* is canonical."""
 
     type: str
     is_output: bool
@@ -85,7 +85,7 @@ class NamedBus(NamedTuple):
 
 
 def name_bus(port: str, description: ExpectedBus) -> NamedBus:
-    """Give the process data of the bus at *port* its names.
+    """Return the slaves and variables of the bus at *port*, with the names of its process data.
 
     ``PORT.SLAVE.ENTRY``, and beside these the states of bus and slaves.
     """
@@ -133,7 +133,7 @@ def _variables(
 
 
 def _unique_names(entries: Sequence[DescribedEntry]) -> list[str]:
-    """Return the last part of each entry's name; one that is there twice gets its object."""
+    """Return the last part of the name of each entry; a duplicate gets its object index."""
     plain = [_plain(entry) for entry in entries]
     counts = Counter([STATE, *(name for name, e in zip(plain, entries, strict=True) if e.type)])
     taken = {name for name, times in counts.items() if times == 1} | {STATE}
@@ -166,7 +166,7 @@ _Value = TypeVar("_Value")
 
 
 class SentPd(NamedTuple):
-    """A PD that a station of the plant sends, with all that it hangs on."""
+    """A PD that a station of the plant sends, with its station, frame and port."""
 
     station: StationSection
     pd: PublishSection
@@ -180,11 +180,11 @@ class SentPd(NamedTuple):
 
 
 class Index:
-    """The plant by names; what cannot be resolved is simply absent.
+    """The plant by names; what cannot be resolved is absent.
 
     Args:
         plant: The file.
-        buses: What is known of the buses by station and port, None where that cannot be read.
+        buses: Descriptions of the buses by station and port, None if the file is invalid.
     """
 
     def __init__(
@@ -230,11 +230,11 @@ class Index:
         return port if port is not None and port.kind is PortKind.EAP else None
 
     def bus_variables(self, station: StationSection) -> dict[str, BusVariable]:
-        """Return the variables that *station* has because of its buses."""
+        """Return the variables that buses add to *station*."""
         return self._bus_variables.get(station.name, {})
 
     def unread_buses(self, station: StationSection) -> list[str]:
-        """Return the bus ports of *station* whose description could not be read."""
+        """Return the bus ports of *station* without a readable description."""
         return [port for name, port in self._unread if name == station.name]
 
     def names(self, station: StationSection) -> list[str]:
@@ -245,7 +245,7 @@ class Index:
         return [*names, *self.bus_variables(station)]
 
     def publishers(self, subscription: SubscribeSection) -> list[SentPd]:
-        """Return the PDs of this plant that *subscription* names: one, none, or several for any."""
+        """Return the PDs of this plant that *subscription* receives; several only for any."""
         source = subscription.source
         if isinstance(source, str):
             station, _, name = source.partition("/")
@@ -289,7 +289,7 @@ class Index:
         return None
 
     def types(self, sent: SentPd) -> list[DataType] | None:
-        """Return the types of a PD's variables; None if one is missing or has no valid type."""
+        """Return the types of the variables of a PD; None if one is missing or invalid."""
         texts = [self.type_text(sent.station, name) for name in sent.pd.variables]
         return parse_types(texts)
 
@@ -304,7 +304,7 @@ class Index:
 
 
 def parse_types(texts: list[str | None]) -> list[DataType] | None:
-    """Return all types, None if one is missing or is none."""
+    """Return all types, None if one is missing or invalid."""
     try:
         kinds = [datatypes.parse(text) for text in texts if text is not None]
     except ValueError:

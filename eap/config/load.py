@@ -79,14 +79,14 @@ from eap.pd.spec import (
 )
 
 STAGGER_GROUPS = 8
-"""Into how many moments of the cycle the stations are spread.
+"""Number of moments of the cycle over which the stations are spread.
 
-More of them send more evenly, but each is a wake-up of the engine: the fifteen stations of the
+More moments spread the frames more evenly, but each wakes the engine: the fifteen stations of the
 solar line took 15 % of a core in fifteen groups and 12 % in eight, where half of them still start
 on time.
 """
 MIN_STAGGER_US = 250
-"""Time that a group may take before the next one begins."""
+"""Shortest distance between the starts of two groups."""
 
 
 def derive(index: Index, folder: Path) -> tuple[StationSpec, ...]:
@@ -152,7 +152,7 @@ def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
 
 
 def _links(index: Index, station: StationSection) -> Iterator[LinkSpec]:
-    """Yield the links as they are to run: each behind those that write what it reads."""
+    """Yield the links in execution order: each after those that write its source."""
     ways = [
         ends(link, _type(index, station, link.source), _type(index, station, link.target))
         for link in station.links
@@ -177,7 +177,7 @@ def _type(index: Index, station: StationSection, name: str) -> datatypes.DataTyp
 
 def _variable(name: str, variable: VariableSection, writer: Writer) -> VariableSpec:
     kind = datatypes.parse(variable.type)
-    # As the type holds it, so that a dictionary gives back the same.
+    # Converted to the type and back, so that reading a dictionary returns the same value.
     default: Any = None
     if variable.default is not None:
         default = kind.to_plain(kind.from_plain(variable.default))
@@ -250,7 +250,7 @@ def _subscription(index: Index, subscription: SubscribeSection) -> RxPdSpec:
 
 
 def _sender_address(index: Index, subscription: SubscribeSection, publishers: list[SentPd]) -> str:
-    """Return the address that the frames of *publishers* come from, empty for any.
+    """Return the source address of the frames of *publishers*, empty for any.
 
     The plant knows it where the publisher's port has an address of its own: the IPv4 address of a
     UDP or TCP port, the ``mac`` of an Ethernet port.
@@ -270,7 +270,7 @@ def _own_address(index: Index, sent: SentPd) -> str:
 
 
 def _pace(index: Index, publishers: list[SentPd]) -> tuple[int, int]:
-    """Return step and device cycle of *publishers*, 0 for what they do not have in common."""
+    """Return step and device cycle of *publishers*, 0 if theirs differ."""
     steps = {index.step(sent) for sent in publishers}
     cycles = {index.cycle_us(sent.station) for sent in publishers}
     return steps.pop() if len(steps) == 1 else 0, cycles.pop() if len(cycles) == 1 else 0
@@ -324,7 +324,7 @@ def _group(text: str) -> str:
 
 
 def _heard(index: Index, station: StationSection, port: PortSection) -> Iterator[Destination]:
-    """Yield where the frames go that *port* subscribes to."""
+    """Yield the destinations of the frames that *port* subscribes to."""
     for subscription in station.subscribe:
         if subscription.port == port.name:
             for sent in index.publishers(subscription):
@@ -354,7 +354,7 @@ def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
 
 
 def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
-    """Return the names of everything in the plant."""
+    """Return the names of the stations, ports and slaves of the plant."""
     return tuple(
         DirectoryStation(
             name=station.name,
@@ -423,7 +423,7 @@ def _derived(
                 hop=hop,
                 octets=octets,
                 router=router,
-                # The broker tells who is there; all asking all each second is a load of its own.
+                # The broker announces who is connected; probing each pair of stations adds load.
                 is_probed=hop.kind is not TransportKind.MQTT,
                 is_derived=True,
             )
@@ -435,9 +435,9 @@ class Plant(msgspec.Struct, frozen=True):
     name: str
     stations: tuple[StationSpec, ...]
     routing: Mapping[str, RoutingSpec] = {}
-    """Specification of the router of each station."""
+    """Specification of the router of each station, by its name."""
     directory: tuple[DirectoryStation, ...] = ()
-    """The names of everything in the plant."""
+    """Names of the stations, ports and slaves of the plant."""
     audit_required: bool = False
     """Whether changes that cannot be recorded are refused."""
 
@@ -448,15 +448,15 @@ class PlantResult(msgspec.Struct, frozen=True):
     plant: Plant | None
     findings: tuple[PlantFinding, ...]
     lines: Mapping[str, int] = {}
-    """Of a plant: the line of each path of its file."""
+    """Line of each path of the file of a valid plant."""
     warnings: tuple[PlantFinding, ...] = ()
-    """Of a plant: what is worth a look."""
+    """Warnings about a plant that is valid."""
 
 
 def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
-    """Read, check and complete the plant file at *path*; never raises for what the file holds.
+    """Read, check and complete the plant file at *path*; never raises for the content of the file.
 
-    *describe_bus* reads the bus files that it names; their findings follow its own.
+    *describe_bus* reads the bus files that it names; their findings follow those of the plant.
     """
     report = FindingReport(str(path))
     root = read(path, report)

@@ -1,6 +1,6 @@
 """The text of a new plant file: stations in a ring or a star, with everything allocated.
 
-What comes out is for people: it explains itself, passes the checks and runs as it is.
+The text has comments for its readers, passes the checks and runs unchanged.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MIN_STATIONS = 2
 MAX_STATIONS = 250
 DEFAULT_ADDRESS = "127.0.1.{n}"
 NUMBER = "{n}"
-"""Where the number of a station goes, from 1 on."""
+"""Placeholder for the number of a station, from 1 on."""
 _STATE_ID = 1000
 _COMMAND_ID = 2000
 _MIN_TIMEOUT_MS = 50
@@ -37,9 +37,9 @@ class Shape(StrEnum):
     """Direction of process data between stations."""
 
     RING = "ring"
-    """Each station the next one."""
+    """Each station sends to the next one."""
     STAR = "star"
-    """The first station all others, and they the first."""
+    """The first station sends to all others, and they to the first."""
 
 
 class NewPlant(msgspec.Struct, frozen=True):
@@ -79,10 +79,10 @@ def plant_text(
         address: An IPv4 address or an interface; ``{n}`` in it is the station's number, and an
             IPv4 address without it is that of the first station, the others follow.
         cycle_us: Device cycle.
-        file: What the file is going to be called, for the commands that it shows.
+        file: Name of the file, for the commands in its comments.
 
     Raises:
-        ConfigError: there cannot be such a name, so many stations, or such addresses.
+        ConfigError: the name, the number of stations or the address is invalid.
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(f"plant name {name!r}: expected a text without spaces and slashes")
@@ -252,7 +252,7 @@ def _station(place: _PortPlace) -> Iterator[str]:
 
 
 def _destination(place: _PortPlace) -> str:
-    """Return where frames for *place* go; the file does not know MAC addresses."""
+    """Return the destination of frames for *place*; the file has no MAC addresses."""
     return "multicast" if place.interface.startswith("ethernet://") else f"{place.name}/eap0"
 
 

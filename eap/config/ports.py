@@ -35,7 +35,7 @@ EXPECTED = {
     "ethernet": "a MAC address, STATION/PORT, a port's NetID, multicast, broadcast or requester",
     "loop": "STATION/PORT, a port's NetID, a MAC address, multicast, broadcast or requester",
 }
-"""What ``to`` may be on each kind of interface."""
+"""Valid values of ``to`` on each kind of interface."""
 _KEYWORDS = {
     ("broadcast", "udp"): IP_BROADCAST,
     ("broadcast", "ethernet"): str(BROADCAST_MAC),
@@ -46,10 +46,10 @@ _KEYWORDS = {
 
 
 def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
-    """Return the address that *text* means for a frame that leaves by *uri*.
+    """Return the address that *text* stands for in a frame that leaves by *uri*.
 
     Raises:
-        ValueError: there is no such address, or no frame gets there from this interface.
+        ValueError: the address does not exist, or no frame reaches it from this interface.
     """
     if text in {"broadcast", "multicast"}:
         keyword = _KEYWORDS.get((text, uri.scheme))
@@ -69,9 +69,9 @@ def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
 
 
 def _of_net_id(destination: Destination, uri: InterfaceUri, index: Index) -> Destination:
-    """Return where the port of that NetID is, or the one EAP port of the router that has it.
+    """Return the address of the port with that NetID, or of the only EAP port of that router.
 
-    On Ethernet it may be outside the plant: what it sends tells its MAC address.
+    On Ethernet it may be outside the plant: the engine learns its MAC address from its frames.
     """
     if not any(NetId.parse(destination.host)):
         raise ValueError(f"NetID {destination.host} stands for any")
@@ -99,7 +99,7 @@ def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
     station, _, name = text.partition("/")
     target = index.uris.get((station, name))
     if target is None:
-        raise ValueError(f"{text} is no port of this plant")
+        raise ValueError(f"no port {text} in this plant")
     port = index.ports[station, name]
     if target.scheme == "loop" == uri.scheme and target.host == uri.host:
         return Destination.parse(str(EAP_MULTICAST_MAC))
@@ -114,7 +114,7 @@ def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
 
 
 def takes_tcp(port: PortSection, uri: InterfaceUri) -> bool:
-    """Tell whether *port* takes type 4 from TCP connections."""
+    """Return whether *port* accepts type 4 on TCP connections."""
     return uri.scheme == "tcp" or (uri.scheme == "udp" and port.tcp)
 
 
@@ -123,9 +123,9 @@ def reaches(
     sender: tuple[PortSection, InterfaceUri],
     receiver: tuple[PortSection, InterfaceUri],
 ) -> bool:
-    """Tell whether a frame from *sender* arrives at *receiver*, which joins groups as needed.
+    """Return whether a frame from *sender* arrives at *receiver*, which joins groups as needed.
 
-    A MAC address is believed: which interface has it is not in the plant file.
+    Any MAC address counts as reached: the plant file does not say which interface has it.
     """
     port, uri = receiver
     if sender[1].scheme == "loop" or uri.scheme == "loop":
@@ -146,7 +146,7 @@ def reaches(
 
 
 def group_of(destination: Destination) -> str | None:
-    """Return the group that a receiver has to join for *destination*, None if there is none."""
+    """Return the multicast group that a receiver has to join for *destination*, if any."""
     if not destination.is_group or destination.host == IP_BROADCAST:
         return None
     if destination.kind is DestinationKind.MAC:
@@ -165,7 +165,7 @@ def check_address(
     sent: tuple[StationSection, FrameSection],
     destination: Destination | None,
 ) -> None:
-    """Report a frame to a NetID that is its own, or whose MAC address nothing will tell."""
+    """Report a frame to a NetID that is its own, or whose MAC address cannot be learned."""
     station, frame = sent
     if destination is None or destination.kind is not DestinationKind.NET_ID:
         return
@@ -177,8 +177,8 @@ def check_address(
             report.add(f"{frame.at}.to", f"{message}its own port", "another port")
         elif not port.mac and not _is_heard(index, key, station, own):
             line = report.line_of(port.at)
-            message += f"{'/'.join(key)}, whose MAC address nothing will tell: no frame from there "
-            message += "comes here by a MAC address or a group"
+            message += f"{'/'.join(key)}, whose MAC address cannot be learned: no frame from there "
+            message += "arrives by a MAC address or a group"
             report.add(
                 f"{frame.at}.to", message, f"such a frame, or mac: on that port (line {line})"
             )
@@ -187,7 +187,7 @@ def check_address(
 def _is_heard(
     index: Index, key: tuple[str, str], station: StationSection, own: PortSection
 ) -> bool:
-    """Tell whether a frame of port *key* gets to port *own* whatever NetIDs stand for."""
+    """Return whether a frame of port *key* arrives at port *own* without resolving a NetID."""
     sender = index.ports[key], index.uris[key]
     receiver = own, index.uris[station.name, own.name]
     subscribed = [
@@ -203,7 +203,7 @@ def _is_heard(
         if (name, frame.port) != key:
             continue
         if frame.to == REQUESTER:
-            return True  # if this port asks
+            return True  # if this port sends the request
         try:
             destination = resolve(frame.to, sender[1], index)
         except ValueError:
@@ -218,7 +218,7 @@ def _is_heard(
 def check_monitoring(
     report: FindingReport, frame: FrameSection, destination: Destination | None, uri: InterfaceUri
 ) -> None:
-    """Report monitoring of what cannot be monitored, and addresses that are none.
+    """Report monitoring of a destination that cannot be monitored, and invalid addresses.
 
     *destination* is None for frames to the requester.
     """
@@ -246,13 +246,13 @@ _SCHEMES = {row.key.partition(".")[0]: row.schemes for row in profile.row_of(pro
 _LIMITED = {
     "vlan": "has a vlan",
     "broadcast": "listens to UDP broadcasts",
-    "tcp": "takes type 4 from TCP",
+    "tcp": "receives type 4 over TCP",
 }
-"""Keys of a port that only some interfaces have, and what they do."""
+"""Keys of a port that only some interfaces have, and their effects."""
 
 
 def check_ports(index: Index, report: FindingReport) -> None:
-    """Report every station and port that cannot be as it is."""
+    """Report every invalid station and port."""
     plant = index.plant
     if not is_name(plant.plant):
         report.add("plant", f"plant name {plant.plant!r}", NAME)
@@ -411,7 +411,7 @@ def _check_addresses(index: Index, report: FindingReport) -> None:
 
 
 def _own_keys(station: str, port: PortSection, uri: InterfaceUri) -> Iterator[tuple[str, ...]]:
-    """Yield the resources of *port* that no other port may have."""
+    """Yield the addresses of *port* that no other port may have."""
     if uri.scheme == "udp":
         yield "UDP", uri.host, str(uri.port or EAP_PORT)
     if port.kind is PortKind.EAP and takes_tcp(port, uri):
@@ -423,7 +423,7 @@ def _own_keys(station: str, port: PortSection, uri: InterfaceUri) -> Iterator[tu
 
 
 def _check_segments(index: Index, report: FindingReport) -> None:
-    """Report EAP ports on the interface that a bus of the same station is wired to."""
+    """Report EAP ports on the interface of a bus of the same station."""
     buses = {
         (station, uri.host): index.ports[station, name]
         for (station, name), uri in index.uris.items()
@@ -435,7 +435,7 @@ def _check_segments(index: Index, report: FindingReport) -> None:
         if bus is None or uri.scheme != "ethernet" or port.kind is PortKind.BUS:
             continue
         line = report.line_of(f"{port.at}.interface")
-        message = f"the slaves of {bus.name} would pass on and send back the frames of {name}"
+        message = f"the slaves of {bus.name} would forward and return the frames of {name}"
         report.add(
             f"{bus.at}.interface",
             f"{uri} is the interface of {name} too (line {line}): {message}",

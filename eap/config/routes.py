@@ -34,7 +34,7 @@ from eap.suggest import suggest
 
 VIA = "STATION/PORT, mqtt:NETWORK, an IPv4 address, tcp:// and one, a MAC address or a NetID"
 MQTT = "mqtt:"
-"""Begin of a ``via`` that names a network."""
+"""Prefix of a ``via`` that names a network."""
 _SCHEMES = {
     DestinationKind.IP: ("udp",),
     DestinationKind.TCP: ("tcp", "udp"),
@@ -50,11 +50,11 @@ _KINDS = {
 
 
 class MisfitError(ValueError):
-    """A key of a section cannot be what it is.
+    """The value of a key of a section is invalid.
 
     Attributes:
-        key: Which one.
-        expected: What it could be.
+        key: The key.
+        expected: Description of valid values.
     """
 
     def __init__(self, key: str, message: str, expected: str) -> None:
@@ -64,7 +64,7 @@ class MisfitError(ValueError):
 
 
 class NextHop(NamedTuple):
-    """First hop of a route, and the NetID of the router there, empty if it is not known."""
+    """First hop of a route, and the NetID of its router, empty if it is not known."""
 
     hop: HopSpec
     router: str
@@ -76,10 +76,10 @@ def target_of(index: Index, route: RouteSection) -> StationSection | None:
 
 
 def next_hop(index: Index, station: StationSection, route: RouteSection) -> NextHop:
-    """Return where *route* of *station* leads first.
+    """Return the first hop of *route* of *station*.
 
     Raises:
-        MisfitError: there is no such way.
+        SectionError: the hop does not exist or cannot be reached.
     """
     if route.ams_tcp and route.via:
         raise MisfitError("via", f"route {route.to!r} has via and ams_tcp", "one of the two")
@@ -166,7 +166,7 @@ def _ams_tcp(host: str, port: int) -> HopSpec:
 
 
 def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> NextHop:
-    """``mqtt:NETWORK``: to the target itself; ``mqtt:NETWORK/STATION``: to who passes it on."""
+    """Resolve ``mqtt:NETWORK`` to the target itself, ``mqtt:NETWORK/STATION`` to that forwarder."""
     network, _, name = route.via.removeprefix(MQTT).partition("/")
     if find_network(station, network) is None:
         known = [f"{MQTT}{each.network}" for each in brokers_of(station)]
@@ -187,7 +187,7 @@ def _foreign_router(route: RouteSection) -> str:
     try:
         return str(NetId.parse(route.net_id))
     except ValueError:
-        message = f"route {route.to!r} does not say which router of the network takes it"
+        message = f"route {route.to!r} does not say which router of the network receives it"
         raise MisfitError("via", message, "mqtt:NETWORK/STATION, or a net_id") from None
 
 
@@ -219,7 +219,7 @@ def _by_address(index: Index, station: StationSection, route: RouteSection) -> N
 
 
 def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: RouteSection) -> str:
-    """Return the port whose network *destination* is in."""
+    """Return the port whose IPv4 address shares most leading bits with *destination*."""
     if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
         there = int(IPv4Address(destination.host))
         return min(ports, key=lambda name: int(IPv4Address(ports[name].host)) ^ there)
@@ -243,12 +243,12 @@ def reach(index: Index, route: RouteSection, loose: set[str]) -> list[tuple[str,
     target = target_of(index, route)
     if target is None:
         return [(str(NetId.parse(route.net_id)), route.octets or STATION_OCTETS)]
-    # One NetID only can stand for another, so a virtual one is for all that begin alike.
+    # A virtual NetID replaces a prefix: it cannot stand for several NetIDs of one station.
     return net_ids_of(target, set() if route.virtual else loose)
 
 
 def net_ids_of(station: StationSection, loose: set[str]) -> list[tuple[str, int]]:
-    """Return by which NetIDs, and octets of them, everything at *station* is reached."""
+    """Return the NetIDs of *station*, each with the number of octets to match."""
     router = str(station.net_id)
     if station.name not in loose:
         return [(router, STATION_OCTETS)]
@@ -256,7 +256,7 @@ def net_ids_of(station: StationSection, loose: set[str]) -> list[tuple[str, int]
 
 
 def without_prefix(index: Index) -> set[str]:
-    """Return the stations whose NetIDs have no four octets to themselves."""
+    """Return the stations that share the first four octets of a NetID, or use several."""
     owners: dict[bytes, set[str]] = {}
     for station in index.plant.stations:
         for prefix in prefixes(station):
@@ -266,22 +266,22 @@ def without_prefix(index: Index) -> set[str]:
 
 
 def prefixes(station: StationSection) -> set[bytes]:
-    """Return the first four octets of each NetID of *station* that is one."""
+    """Return the first four octets of each valid NetID of *station*."""
     owned = [station.net_id, *(port.net_id for port in station.ports)]
     return {net_id.station for net_id in owned if net_id}
 
 
 _IP_SCHEMES = {"udp", "tcp"}
 _PREFERENCE = (TransportKind.UDP, TransportKind.TCP, TransportKind.ETHERNET)
-"""UDP first: it needs no connection, and the kernel knows who has an address."""
+"""UDP first: it needs no connection, and the kernel resolves addresses."""
 
 
 class _Candidate(NamedTuple):
-    """A way from port to port; the smallest one is taken."""
+    """A hop from port to port; the smallest one is used."""
 
     preference: int
     differing_bits: int
-    """Of IPv4 addresses, from the first one that differs on: hosts of one network come first."""
+    """Bits of the IPv4 addresses from the first difference on: hosts of one network come first."""
     order: int
     hop: HopSpec
 
@@ -289,17 +289,17 @@ class _Candidate(NamedTuple):
 def find_hop(
     index: Index, station: StationSection, target: StationSection, *, own: str = "", other: str = ""
 ) -> HopSpec | None:
-    """Return how packets go from *station* to *target* directly, None if no interface is shared.
+    """Return the direct hop from *station* to *target*, None if they share no interface.
 
-    Interfaces are taken for shared if both are of IP, on this host or both not, or if they are
+    Interfaces count as shared if both are of IP, on this host or both not, or if they are
     Ethernet interfaces of one name and VLAN.
 
     Args:
         index: The plant.
-        station: From where.
-        target: To where; another station.
-        own: The port to leave by; any if empty.
-        other: The port to arrive at; any if empty.
+        station: Sender.
+        target: Receiver; another station.
+        own: Port of the sender; any if empty.
+        other: Port of the receiver; any if empty.
     """
     found = (
         _hop(index, (station.name, mine), (target.name, theirs), is_wanted=bool(other))
@@ -325,9 +325,9 @@ def _eap_ports(index: Index, station: StationSection, name: str) -> Iterator[str
 def _hop(
     index: Index, own: tuple[str, str], other: tuple[str, str], *, is_wanted: bool
 ) -> tuple[HopSpec, int] | None:
-    """Return the hop from port to port, and how many bits of their addresses differ.
+    """Return the hop from port to port, and the number of bits from the first difference on.
 
-    With *is_wanted* the file says that it is there, whatever the names of the interfaces are.
+    With *is_wanted* the file names the port, so that the names of the interfaces may differ.
     """
     uri, target = index.uris[own], index.uris[other]
     if uri.scheme in _IP_SCHEMES and target.scheme in _IP_SCHEMES:
@@ -350,7 +350,7 @@ _OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four nu
 
 
 def check_routes(index: Index, report: FindingReport, folder: Path) -> None:
-    """Report every route and broker that cannot be as it is; files are in *folder*."""
+    """Report every invalid route and broker; files are in *folder*."""
     loose = without_prefix(index)
     for station in index.plant.stations:
         claimed: dict[bytes, RouteSection] = {}
@@ -363,7 +363,7 @@ def check_routes(index: Index, report: FindingReport, folder: Path) -> None:
 
 
 def _check_keys(route: RouteSection, report: FindingReport) -> None:
-    """Report keys of routes at brokers, and the other way round."""
+    """Report keys of routes on brokers, and keys of brokers on routes."""
     if f"{route.at}.mqtt" in report.lines:
         what, others, expected = "a broker", RouteSection.ROUTE_KEYS, RouteSection.MQTT_KEYS
     else:
@@ -409,7 +409,7 @@ def _check_net_id(index: Index, route: RouteSection, report: FindingReport) -> N
     elif not known and not route.net_id:
         hint = suggest(route.to, index.stations)
         message = f"no station {route.to!r} in this plant{hint}, and no net_id"
-        report.add(f"{route.at}.to", message, "a station, default, or a net_id of who is meant")
+        report.add(f"{route.at}.to", message, "a station, default, or a net_id of the target")
     if known and route.octets is not None:
         report.add(f"{route.at}.octets", f"octets of the route to {route.to!r}", "it with a net_id")
     if is_default and route.virtual:
@@ -482,26 +482,26 @@ def _check_owners(
 def follow_routes(
     index: Index, routing: Mapping[str, RoutingSpec], report: FindingReport
 ) -> tuple[PlantFinding, ...]:
-    """Return a warning for each written route that runs in a circle or gets nowhere.
+    """Return a warning for each configured route that runs in a loop or ends before its target.
 
     Args:
         index: A plant without findings.
         routing: Specifications of its routers.
-        report: Of the plant file, for its lines.
+        report: Report of the plant file, for its lines.
     """
     plant = _Plant(index, routing)
     found = []
     for station in index.plant.stations:
         for route in station.routes:
             if message := _follow(plant, station, route.to):
-                expected = "routes that end at who is meant"
+                expected = "routes that end at their target"
                 line = report.line_of(route.at)
                 found.append(PlantFinding(report.file, line, route.at, message, expected))
     return tuple(found)
 
 
 def _follow(plant: _Plant, station: StationSection, to: str) -> str:
-    """Return what is wrong with the route called *to*, empty if nothing is known to be."""
+    """Return the error of the route called *to*, empty if none is known."""
     for spec in plant.routing[station.name].routes:
         if spec.name == to and spec.octets:
             names = [station.name]
@@ -510,13 +510,13 @@ def _follow(plant: _Plant, station: StationSection, to: str) -> str:
             while following and plant.owners.get(net_id) != following:
                 if following in names:
                     circle = " -> ".join([*names, following])
-                    return f"the route to {to!r} runs in a circle: {circle}"
+                    return f"the route to {to!r} runs in a loop: {circle}"
                 names.append(following)
                 found = plant.table(following).find(net_id)
                 if found is None:
                     if plant.may_learn(following):
                         break
-                    return f"the route to {to!r} ends at {following}, which has none on to it"
+                    return f"the route to {to!r} ends at {following}, which has no route to it"
                 net_id = found[0].to_real(net_id)
                 following = plant.next_station(str(found[0].router or ""))
     return ""
@@ -536,11 +536,11 @@ class _Plant:
             self.owners |= {port.net_id: station.name for port in station.ports}
 
     def next_station(self, router: str) -> str:
-        """Return the station that has a router, empty if that is not of this plant."""
+        """Return the station of a router, empty if the router is not in this plant."""
         return self._routers.get(router, "")
 
     def may_learn(self, station: str) -> bool:
-        """Tell whether others make routes known to a station."""
+        """Return whether a station auto-discovers routes."""
         routing = self.routing[station]
         return any(routing.learns_by_mqtt(each.network) for each in routing.mqtt)
 

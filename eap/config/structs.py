@@ -1,6 +1,6 @@
-"""The plant file as people write it; docs/plant-file.md explains every key.
+"""Sections and keys of a plant file; docs/plant-file.md explains every key.
 
-Shapes and ranges only: the ``check_`` modules see to what depends on another part of the file.
+Types and ranges only: the ``check_`` functions check references between parts of the file.
 Units are in the names.  Every section knows its path in the file, for findings.
 """
 
@@ -33,15 +33,15 @@ FrameTimeout = Annotated[int, Meta(ge=2_000, le=10_000_000)]
 FrameRetries = Annotated[int, Meta(ge=0, le=20)]
 Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
 MAX_BITS = 8 * 0xFFFF
-"""Of the largest variable."""
+"""Size of the largest variable."""
 MAX_PATIENCE_MS = 600_000
-"""How long an answer may take at most."""
+"""Largest timeout of an answer."""
 BitOffset = Annotated[int, Meta(ge=0, le=MAX_BITS - 1)]
 Plain: TypeAlias = bool | int | float | str | list[bool | int | float]
 
 
 NO_NET_ID = NetId(b"")
-"""In place of a NetID that cannot be read, which is a finding of its own."""
+"""Placeholder for an invalid NetID, which is a finding of its own."""
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,7 +50,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True):
     at: str = ""
 
     SHORT: ClassVar[str] = ""
-    """The key that a bare text in place of the section stands for."""
+    """Key of a scalar that replaces the section (short form)."""
 
 
 class VlanSection(Section, frozen=True):
@@ -69,7 +69,7 @@ class GatewayLimits(Section, frozen=True):
 
 
 class GatewaySection(Section, frozen=True):
-    """The mailbox gateway of a bus port; the short form just says whether it answers."""
+    """The mailbox gateway of a bus port; the short form is ``enabled``."""
 
     enabled: bool = True
     port: Annotated[int, Meta(ge=1, le=0xFFFF)] | None = None
@@ -131,7 +131,7 @@ class PortSection(Section, frozen=True):
 
 
 class VariableSection(Section, frozen=True):
-    """A variable; the short form in the file is just its type."""
+    """A variable; the short form in the file is its type."""
 
     type: str
     unit: str = ""
@@ -206,7 +206,7 @@ class PublishSection(Section, frozen=True):
 
 
 class FromSection(Section, frozen=True):
-    """A publisher that is known by its numbers."""
+    """A publisher given by NetID and PD id."""
 
     publisher: str
     id: U16
@@ -215,7 +215,7 @@ class FromSection(Section, frozen=True):
 
 
 ANY_SOURCE = "any"
-"""Source of a subscription that takes frames from every address."""
+"""Source of a subscription that accepts frames from any address."""
 
 
 class SubscribeSection(Section, frozen=True):
@@ -233,11 +233,11 @@ class SubscribeSection(Section, frozen=True):
     poll: str = ""
     changeable: bool = False
     sender: str = msgspec.field(default="", name="source")
-    """Address that the frames must come from, ANY_SOURCE, or the publisher's where it is known."""
+    """Required source address of the frames, or ANY_SOURCE; by default that of the publisher."""
 
 
 class LinkSection(Section, frozen=True):
-    """One variable of a station follows another one."""
+    """A link: one variable of a station follows another."""
 
     source: str = msgspec.field(name="from")
     target: str = msgspec.field(name="to")
@@ -259,7 +259,7 @@ class TlsSection(Section, frozen=True):
 
 
 class RouteSection(Section, frozen=True):
-    """A route of a station, or with *mqtt* a broker by which it reaches others."""
+    """A route of a station, or with *mqtt* a broker by which it reaches other stations."""
 
     to: str = ""
     via: str = ""
@@ -327,7 +327,7 @@ class UserSection(Section, frozen=True):
 
 
 class StationSection(Section, frozen=True):
-    """A router with its ports, and what the station sends and receives."""
+    """A station: its router, ports, variables, and the PDs it sends and receives."""
 
     name: str
     net_id: NetId
@@ -356,9 +356,9 @@ class AuditDuty(StrEnum):
     """Treatment of changes that the audit cannot record."""
 
     OPTIONAL = "optional"
-    """They are made; what is lost is counted."""
+    """The change is made; lost audit lines are counted."""
     REQUIRED = "required"
-    """They are refused."""
+    """The change is refused."""
 
 
 class PlantAccess(Section, frozen=True):

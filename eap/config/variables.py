@@ -36,7 +36,7 @@ from eap.suggest import suggest
 
 
 def check_variables(index: Index, report: FindingReport, folder: Path) -> None:
-    """Report variables that cannot exist and sources that cannot fill them."""
+    """Report invalid variables and sources that cannot fill them."""
     for station in index.plant.stations:
         own = {f"{station.at}.variables.{n}": (n, v) for n, v in station.variables.items()}
         received = {
@@ -98,7 +98,7 @@ def _check_source(
             if any(name in (each.variables or {}) for each in station.subscribe):
                 message = f"{name!r} is received, so it cannot have a source"
             else:
-                message = f"{name!r} is no variable of {station.name}{suggest(name, known)}"
+                message = f"station {station.name} has no variable {name!r}{suggest(name, known)}"
             report.add(path, message, one_of(known))
         return
     period = getattr(source, "period_ms", 1)
@@ -118,7 +118,7 @@ def _check_source(
             _check_number(path, name, kind, report)
             _check_span(path, kind, source, report)
         case RandomSource():
-            pass  # random octets are values of every type
+            pass  # random bytes are values of every type
 
 
 def _check_number(path: str, name: str, kind: DataType, report: FindingReport) -> None:
@@ -189,7 +189,7 @@ class Span(NamedTuple):
     bits: int
 
     def overlaps(self, other: Span) -> bool:
-        """Tell whether both have a bit in common."""
+        """Return whether both spans have a bit in common."""
         return (
             self.variable == other.variable
             and self.start < other.start + other.bits
@@ -205,17 +205,17 @@ class Ends(NamedTuple):
 
 
 def is_bitwise(link: LinkSection) -> bool:
-    """Tell whether *link* says which bits it copies."""
+    """Return whether *link* selects the bits that it copies."""
     return any(each is not None for each in (link.from_bit, link.to_bit, link.bits))
 
 
 def is_scaled(link: LinkSection) -> bool:
-    """Tell whether *link* computes its value."""
+    """Return whether *link* computes its value."""
     return link.scale is not None or link.offset is not None
 
 
 def ends(link: LinkSection, source: DataType, target: DataType) -> Ends:
-    """Return the bits at both ends of *link*; without ``bits`` as many as both have."""
+    """Return the bits at both ends of *link*; without ``bits`` as many as both ends have."""
     if not is_bitwise(link):
         return Ends(
             Span(link.source, 0, source.bit_length), Span(link.target, 0, target.bit_length)
@@ -226,7 +226,7 @@ def ends(link: LinkSection, source: DataType, target: DataType) -> Ends:
 
 
 def in_order(links: Sequence[Ends]) -> list[int]:
-    """Return the positions of *links* as they are to run; those in and behind a circle are missing.
+    """Return the positions of *links* in execution order, without those in and behind a loop.
 
     Links that do not depend on each other keep their order.
     """
@@ -249,7 +249,7 @@ def in_order(links: Sequence[Ends]) -> list[int]:
 
 
 def find_circles(links: Sequence[Ends]) -> list[list[int]]:
-    """Return circles of *links* that have no link in common, each in the way its values go."""
+    """Return loops of *links* that have no link in common, each in the direction of its values."""
     before = _predecessors(links)
     left = set(range(len(links))) - set(in_order(links))
     circles = []
@@ -262,7 +262,7 @@ def find_circles(links: Sequence[Ends]) -> list[list[int]]:
 
 
 def _walk_back(before: Sequence[Sequence[int]], left: set[int]) -> list[int]:
-    """Go back from a link until it repeats; take the circle, or what leads to none, off *left*."""
+    """Walk back to the first repeated link; remove the loop, or a link without one, from *left*."""
     way = [min(left)]
     while True:
         earlier = next((each for each in before[way[-1]] if each in left), None)
@@ -296,7 +296,7 @@ _KEYS = ("from_bit", "to_bit", "bits", "scale", "offset", "swap")
 
 
 def check_links(index: Index, report: FindingReport) -> None:
-    """Report every link that cannot run, or whose target has another writer."""
+    """Report every link that cannot run, or that shares its target with another writer."""
     for station in index.plant.stations:
         known: list[tuple[LinkSection, Ends]] = []
         for link in station.links:
@@ -348,7 +348,7 @@ def _check_writer(
 
 
 def _fits(link: LinkSection, source: DataType, target: DataType, report: FindingReport) -> bool:
-    """Tell whether a link can be between these types, after reporting why not."""
+    """Return whether a link can connect these types, after reporting the reason if not."""
     if any(report.has(f"{link.at}.{key}") for key in _KEYS):
         return False
     if is_bitwise(link):
@@ -365,7 +365,7 @@ def _fits_whole(
     if link.swap:
         if source.size == target.size > 1 and not (source.is_bits or target.is_bits):
             return True
-        report.add(f"{link.at}.swap", shown, "two variables of as many octets, at least 2")
+        report.add(f"{link.at}.swap", shown, "two variables of the same size, at least 2 bytes")
         return False
     if source != target:
         expected = (
@@ -411,13 +411,13 @@ def _fits_scaled(
         report.add(f"{link.at}.{key}", shown, f"numbers such as INT or REAL where there is a {key}")
         return False
     if link.swap and source.size < 2:
-        report.add(f"{link.at}.swap", shown, "a source of at least 2 octets")
+        report.add(f"{link.at}.swap", shown, "a source of at least 2 bytes")
         return False
     is_plain = link.scale in {None, 1} and not link.offset
     if link.swap and is_plain and source != target and source.size == target.size:
-        # Who runs it could not tell it from a swap alone, which converts nothing.
+        # The engine does not distinguish it from a swap alone, which converts nothing.
         message = f"{shown}: a swap with {key} {getattr(link, key):g} computes nothing"
-        report.add(f"{link.at}.{key}", message, "swap alone to copy the octets, or another number")
+        report.add(f"{link.at}.{key}", message, "swap alone to copy the bytes, or another number")
         return False
     return True
 
@@ -444,4 +444,4 @@ def _check_circles(links: list[tuple[LinkSection, Ends]], report: FindingReport)
     for circle in find_circles([both for _, both in links]):
         members = [links[position][0] for position in circle]
         way = " → ".join([members[0].source, *(link.target for link in members)])
-        report.add(members[0].at, f"links go in a circle: {way}", "one of them to be left out")
+        report.add(members[0].at, f"links form a loop: {way}", "one of them to be left out")

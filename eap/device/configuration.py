@@ -32,15 +32,15 @@ from eap.od.profiles.table import CONFIG, Form, ProfileObject, to_text
 VERSION = 1
 
 Configuration: TypeAlias = dict[int, dict[int, bytes]]
-"""Octets of all entries that are kept, by index and sub-index."""
+"""Bytes of all entries that are kept, by index and sub-index."""
 
 
 class StoredError(ConfigError):
-    """Stored data that is no configuration of this dictionary."""
+    """Stored data that is not a configuration of this dictionary."""
 
 
 class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """As JSON: indexes and octets in hexadecimal digits."""
+    """JSON form: indexes and bytes in hexadecimal digits."""
 
     version: int
     profile: int
@@ -48,7 +48,7 @@ class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_configuration(dictionary: EapDictionary) -> Configuration:
-    """Return everything of *dictionary* that is kept."""
+    """Return the configuration of *dictionary*."""
     found: Configuration = {}
     for item in dictionary:
         kept = {sub: each.octets for sub, each in item.entries.items() if _is_kept(each)}
@@ -60,10 +60,10 @@ def read_configuration(dictionary: EapDictionary) -> Configuration:
 def restore_configuration(
     dictionary: EapDictionary, kept: Mapping[int, Mapping[int, bytes]]
 ) -> None:
-    """Give *dictionary* the configuration *kept*, and nothing of what it had.
+    """Replace the configuration of *dictionary* by *kept*.
 
     Raises:
-        SdoAbortError: there is no such entry, or it cannot hold that; nothing has changed then.
+        SdoAbortError: an entry does not exist or cannot hold its value; nothing has changed.
     """
     wanted = dictionary.blank()
     _put_all(wanted, kept)
@@ -71,9 +71,9 @@ def restore_configuration(
 
 
 def adopt_configuration(dictionary: EapDictionary, wanted: EapDictionary) -> None:
-    """Give *dictionary* the configuration of *wanted*, another one of the same port.
+    """Replace the configuration of *dictionary* by that of *wanted*, another one of the same port.
 
-    Objects that are the same in both are not touched: most of a large station usually are.
+    Objects that are equal in both are not touched: usually most objects of a large station.
     """
     before, after = read_configuration(dictionary), read_configuration(wanted)
     changed = {index: kept for index, kept in after.items() if before.get(index) != kept}
@@ -99,10 +99,10 @@ def dump_configuration(dictionary: EapDictionary) -> dict[str, Any]:
 
 
 def load_configuration(dictionary: EapDictionary, plain: object) -> None:
-    """Take back what :func:`dump_configuration` gave.
+    """Restore the result of :func:`dump_configuration`.
 
     Raises:
-        StoredError: it is of another version or profile, or no configuration; nothing has changed.
+        StoredError: the data has another version or profile, or is invalid; nothing has changed.
     """
     try:
         stored = msgspec.convert(plain, _Stored, str_keys=True)
@@ -125,7 +125,7 @@ def load_configuration(dictionary: EapDictionary, plain: object) -> None:
 
 
 def _is_kept(entry: Entry) -> bool:
-    # Of flags Python makes objects; there are as many entries as a station has of everything.
+    # "&" of two flags creates an object; this runs for every entry of a station.
     return int.__and__(entry.access, CONFIG) == CONFIG
 
 
@@ -186,18 +186,18 @@ class EntryChange(msgspec.Struct, frozen=True):
     index: int
     subindex: int
     name: str
-    """Of the object and the entry, for people."""
+    """Name of the object and the entry."""
     old: str
-    """Value in words; empty if there is none."""
+    """Value as text; empty if there is none."""
     new: str
     data: bytes
-    """What is to be written."""
+    """Data of the download."""
     interim: bool = False
-    """Whether people see no difference: it makes way for others, or repeats what they undo."""
+    """Whether the write is an interim step, such as clearing an entry that is set later."""
 
 
 def compare(old: EapDictionary, new: EapDictionary) -> list[EntryChange]:
-    """Return what makes the configuration of *new* out of that of *old*."""
+    """Return the changes from the configuration of *old* to that of *new*."""
     return list(_Comparison(old, new).run())
 
 
@@ -249,7 +249,7 @@ class _Comparison:
         return [index for index in self._members(row, self._old) if index in self._new]
 
     def _cut_lists(self) -> Iterator[EntryChange]:
-        """Shorten the lists of frames that lose a PD or change its place."""
+        """Shorten the lists of frames that lose a PD or move one."""
         row = profile.TX_FRAME
         for index in self._both(row):
             if self._is_rewritten(index):
@@ -257,12 +257,12 @@ class _Comparison:
                 yield self._change(index, 0, data, interim=data != self._new[index][0])
 
     def _is_rewritten(self, index: int) -> bool:
-        """Tell whether the list of a frame is more than continued."""
+        """Return whether the list of a frame changes other than at its end."""
         before, after = self._old[index], self._new[index]
         return any(after.get(sub) != before[sub] for sub in before if sub >= FrameSub.TXPD)
 
     def _mappings_to_write(self) -> list[int]:
-        """Return the mappings that change, or map variables whose type does or that go."""
+        """Return the mappings that change, or whose variables change their type or are removed."""
         moved = {
             index
             for row in profile.VARIABLES
@@ -287,7 +287,7 @@ class _Comparison:
                 yield self._change(index, 0, _NONE, interim=index in self._new)
 
     def _detached(self) -> Iterator[EntryChange]:
-        """Let go references that change, and those between PDs that all go."""
+        """Clear references that change, and those between PDs that are all removed."""
         for row in _PDS:
             for index in self._members(row, self._old):
                 goes = index not in self._new
@@ -306,7 +306,7 @@ class _Comparison:
                 yield self._change(index, subindex)
 
     def _before(self, row: ProfileObject, index: int) -> dict[int, bytes]:
-        """Return what the object at *index* holds when its turn to be written comes."""
+        """Return the entries of the object at *index* immediately before it is written."""
         after = self._new[index]
         if index in self._old:
             before = dict(self._old[index])
@@ -329,7 +329,7 @@ class _Comparison:
         after = self._new.get(index, {})
         for subindex in sorted(after)[1:]:
             if not any(after[subindex]):
-                continue  # a hole in one that is being written; no client can write it
+                continue  # a hole in a mapping that is being written; no client can write 0 there
             is_same = self._old.get(index, {}).get(subindex) == after[subindex]
             yield self._change(index, subindex, interim=is_same)
         if after and after[0] != _NONE:
@@ -338,7 +338,7 @@ class _Comparison:
     def _change(
         self, index: int, subindex: int, data: bytes | None = None, *, interim: bool = False
     ) -> EntryChange:
-        """Make the change that writes *data*, or what the new dictionary has."""
+        """Return the change that writes *data*, or the value of the new dictionary."""
         before = self._old.get(index, {}).get(subindex)
         after = self._new.get(index, {}).get(subindex)
         goes = index not in self._new and subindex == 0
@@ -363,7 +363,7 @@ class _Comparison:
         )
 
     def _title(self, index: int) -> str:
-        """Return the names of an object and of what it is about, such as ``TxPD 0 (state)``."""
+        """Return the title of an object and the name of its subject, such as ``TxPD 0 (state)``."""
         dictionary = self._new_dictionary if index in self._new else self._old_dictionary
         title, own = profile.row_of(index).title(index), dictionary.name_of(index)
         return f"{title} ({own})" if own else title
@@ -376,7 +376,7 @@ class _Comparison:
 
 
 def _kept(dictionary: EapDictionary) -> Configuration:
-    """Return the configuration without mappings that hold nothing: they are as good as none."""
+    """Return the configuration without empty mappings, which map nothing."""
     return {
         index: entries
         for index, entries in read_configuration(dictionary).items()

@@ -51,7 +51,7 @@ NAME_AT = {
     0xD: (0xD000, Tx.NAME),
     0xE: (0xE000, Rx.NAME),
 }
-"""By the high digit of an index: where the name of what it is about stands."""
+"""Range and sub-index of the entry that names an object, by the high digit of its index."""
 _STEMS = {0x6: "tx-variable", 0x7: "rx-variable", 0x8: "frame", 0xD: "txpd", 0xE: "rxpd"}
 """Names of new objects, without their number."""
 _CHANGEABLE = {
@@ -63,13 +63,13 @@ _CHANGEABLE = {
 
 
 class LiveValues(Protocol):
-    """The process image of a station, or nothing while there is none."""
+    """Live values of a station: its process image while the engine runs."""
 
     def octets(self, key: str, name: str) -> bytes | None:
-        """Return what *key* (of the profile's live entries) shows of the object called *name*.
+        """Return the value of *key* (a live entry of the profile) for the object called *name*.
 
-        None, or octets of another length than the entry has, reads as zero: the object is not yet,
-        or no longer, part of what runs.
+        None, or bytes of another length than the entry has, reads as zero: the engine does not run
+        the object yet, or no longer.
         """
 
     def at_one_moment(self) -> AbstractContextManager[None]:
@@ -77,7 +77,7 @@ class LiveValues(Protocol):
 
 
 class NothingRuns:
-    """The live values of a device whose engine does not run."""
+    """Live values of a device whose engine does not run."""
 
     def octets(self, key: str, name: str) -> bytes | None:
         """Return None for everything."""
@@ -101,7 +101,7 @@ class DeviceIdentity(NamedTuple):
     serial: int = 0
 
     def entries(self) -> dict[tuple[int, int], str | int]:
-        """Return what devices of any profile show: values by index and subindex."""
+        """Return the entries that all profiles share: values by index and sub-index."""
         return {
             (0x1008, 0): self.device_name,
             (0x1009, 0): self.hardware_version,
@@ -119,8 +119,8 @@ class EapDictionary(ObjectDictionary):
     Args:
         station: The station as it was started: its port is taken from it, nothing else is.
         port: Name of the port.
-        live: Where live entries get their values.
-        identity: What 0x1000 to 0x1018 show.
+        live: Source of the values of live entries.
+        identity: Values of 0x1000 to 0x1018.
 
     Attributes:
         on_request: Called with the number of the state that a client writes to 0xF200:01.
@@ -172,7 +172,7 @@ class EapDictionary(ObjectDictionary):
         self._members[row.first][item.index] = item
 
     def remove(self, index: int) -> None:
-        """Remove an object, and the one that shows what became of it."""
+        """Remove an object, and its companion with the live values."""
         super().remove(index)
         row = profile.find(index)
         if row is not None:
@@ -185,7 +185,7 @@ class EapDictionary(ObjectDictionary):
         return [index for row in rows for index in sorted(self._members[row.first])]
 
     def make(self, row: ProfileObject, index: int) -> OdObject:
-        """Add an object of a dynamic range, and the one that shows what becomes of it."""
+        """Add an object of a dynamic range, and its companion with the live values."""
         item = self.make_object(row, index)
         self.add(item)
         number = index - row.first
@@ -212,7 +212,7 @@ class EapDictionary(ObjectDictionary):
         return partial(self._derived, index, subindex) if row.derived else None
 
     def grow(self, index: int, last: int) -> None:
-        """Give the list of the object at *index* entries up to *last*, not counted yet."""
+        """Add entries up to *last* to the list of the object at *index*, without counting them."""
         item, row = self[index], profile.row_of(index)
         list_row, source = row.list_row, partial(self._source, index)
         if list_row is not None:
@@ -220,7 +220,7 @@ class EapDictionary(ObjectDictionary):
                 item.entries[subindex] = make_entry(list_row, subindex, source)
 
     def resize(self, index: int, count: int) -> None:
-        """Give the object at *index* as many entries as sub-index 0 = *count* says."""
+        """Add or remove entries of the object at *index* so that sub-index 0 is *count*."""
         item = self[index]
         self.grow(index, count)
         for subindex in [sub for sub in item.entries if sub > count]:
@@ -228,7 +228,7 @@ class EapDictionary(ObjectDictionary):
         item.entries[0].value = count
 
     def put(self, index: int, subindex: int, octets: bytes) -> None:
-        """Store the octets of an entry and what follows: a variable's type, rights of access."""
+        """Store the bytes of an entry, and update the types and access rights that depend on it."""
         item, row = self[index], profile.row_of(index)
         if row in profile.VARIABLES and subindex == Var.TYPE_NAME:
             self._retype(item, row, datatypes.parse(octets.decode()))
@@ -240,7 +240,7 @@ class EapDictionary(ObjectDictionary):
                     item.entries[each.subindex].access = each.access | more
 
     def _retype(self, item: OdObject, row: ProfileObject, kind: DataType) -> None:
-        """Give a variable another type; its default is forgotten."""
+        """Change the type of a variable; its default is reset."""
         if item.entries[Var.DEFAULT].kind == kind:
             return
         source = partial(self._source, item.index)
@@ -250,19 +250,19 @@ class EapDictionary(ObjectDictionary):
         item.entries[Var.DEFAULT_GIVEN].value = False
 
     def name_of(self, index: int) -> str:
-        """Return the name of what the object at *index* is about, empty for the device itself."""
+        """Return the name of the subject of the object at *index*, empty for the device itself."""
         where = NAME_AT.get(index >> 12)
         if where is None:
             return ""
         return self._objects[where[0] | index & 0xFFF].entries[where[1]].octets.decode()
 
     def pdo_length(self, pd_index: int) -> int:
-        """Return the octets of data of a PD; 0 as long as it has no whole PDO."""
+        """Return the size of the data of a PD in bytes; 0 as long as it has no complete PDO."""
         mapping = self._objects.get(self[pd_index].entries[Tx.PDO_INDEX].value)
         return 0 if mapping is None else -(-mapped_bits(self, mapping) // 8)
 
     def frame_length(self, index: int) -> int:
-        """Return the octets of the frame at *index* with all PDs that it lists and that exist."""
+        """Return the size of the frame at *index* in bytes, with all existing PDs that it lists."""
         listed = [pd for _, pd in self.listed_pds(index) if pd in self]
         return FIRST_PD + sum(PdHeader.SIZE + self.pdo_length(pd) for pd in listed)
 
@@ -314,7 +314,7 @@ class EapDictionary(ObjectDictionary):
         return self.live.at_one_moment()
 
     def _live(self, index: int, key: str, size: int) -> bytes:
-        """Return what *key* shows of what the object is about; zero if that does not run."""
+        """Return the live value of *key* for the subject of an object; zero without one."""
         octets = self.live.octets(key, self.name_of(index))
         return octets if octets is not None and len(octets) == size else bytes(size)
 
@@ -336,11 +336,11 @@ class EapDictionary(ObjectDictionary):
         return kind.bit_length if subindex == Var.BIT_LENGTH else kind.code
 
     def blank(self) -> EapDictionary:
-        """Return an empty dictionary of the same port, for which nothing runs."""
+        """Return an empty dictionary of the same port, without live values."""
         return EapDictionary(self.station, self.port.name, identity=self.identity)
 
     def show_status(self, word: int, fault: DeviceFault | None) -> None:
-        """Show the device's state, and why it is not another one, in 0xF100."""
+        """Show the state of the device, and the fault that keeps it there, in 0xF100."""
         entries = self[profile.STATUS].entries
         entries[Status.STATE].value = word
         entries[Status.ERROR_CODE].value = fault.code if fault else 0
@@ -350,7 +350,7 @@ class EapDictionary(ObjectDictionary):
         entries[Status.ERROR_OBJECT].value = object_id
 
     def download(self, index: int, subindex: int, data: bytes, state: OdState) -> None:
-        """Write one entry; makes and deletes dynamic objects."""
+        """Write one entry; creates and deletes dynamic objects."""
         with self._all_or_nothing(index):
             is_new = self._make_free(index, subindex, state)
             row = profile.row_of(index)
@@ -360,7 +360,7 @@ class EapDictionary(ObjectDictionary):
             self._settle(row, index, [subindex], state)
 
     def download_complete(self, index: int, first: int, data: bytes, state: OdState) -> None:
-        """Write a whole object; a list becomes as long as sub-index 0 says."""
+        """Write a whole object by complete access; sub-index 0 sets the length of a list."""
         with self._all_or_nothing(index):
             self._make_free(index, first, state)
             row = profile.row_of(index)
@@ -370,7 +370,7 @@ class EapDictionary(ObjectDictionary):
     def check_download(
         self, index: int, subindex: int, size: int, state: OdState, *, complete: bool = False
     ) -> None:
-        """Refuse what can be refused before the data of a download is there."""
+        """Abort a download that is invalid before its data has arrived."""
         row = profile.find(index)
         if row is None or not (row.dynamic or (row.list_row and index in self)):
             super().check_download(index, subindex, size, state, complete=complete)
@@ -409,7 +409,7 @@ class EapDictionary(ObjectDictionary):
             raise SdoAbortError(AbortCode.DEVICE_STATE, index, subindex, detail)
 
     def _make_free(self, index: int, subindex: int, state: OdState) -> bool:
-        """Make the object at *index* if it is a dynamic one that is not there."""
+        """Create the object at *index* if it is dynamic and does not exist."""
         row = profile.find(index)
         if index in self or row is None or not row.dynamic:
             _ = self[index]  # refuses what is not there
@@ -427,7 +427,7 @@ class EapDictionary(ObjectDictionary):
         has_count = first == 0 and is_counted(item)
         if first == 0:
             if len(data) < 2:
-                raise SdoAbortError(AbortCode.TOO_SHORT, index, 0, "sub-index 0 takes two octets")
+                raise SdoAbortError(AbortCode.TOO_SHORT, index, 0, "sub-index 0 has two bytes")
             count, data = data[0] if has_count else count, data[2:]
         if has_count:
             if count == 0 and data:
@@ -442,7 +442,7 @@ class EapDictionary(ObjectDictionary):
             self._write_count(row, item, bytes((count,)), state)
 
     def _make_room(self, row: ProfileObject, item: OdObject, count: int, state: OdState) -> None:
-        """Empty what can be emptied and make place for *count* entries; 0 may delete it all."""
+        """Empty a mapping and add *count* entries, or resize a list; 0 may delete the object."""
         if row.mapping:
             self._write_count(row, item, b"\0", state)
             self.grow(item.index, min(count, profile.MAX_ENTRIES))
@@ -516,7 +516,7 @@ class EapDictionary(ObjectDictionary):
             raise SdoAbortError(code, index, subindex, detail)
 
     def _settle(self, row: ProfileObject, index: int, written: list[int], state: OdState) -> None:
-        """Check what written entries mean for frames, and tell those who want to know."""
+        """Check the budgets of the frames that written entries affect, and call the callbacks."""
         if index not in self:
             return
         frames = {
@@ -536,7 +536,7 @@ class EapDictionary(ObjectDictionary):
                 raise SdoAbortError(AbortCode.PARAMETER, index, written[0], str(exc)) from None
 
     def _frames_to_check(self, row: ProfileObject, index: int, subindex: int) -> list[int]:
-        """Return the frames whose length or budget the entry has a part in."""
+        """Return the frames whose length or budget depends on the entry."""
         if row is profile.TX_FRAME:
             return [index] if subindex >= FrameSub.TXPD or subindex == FrameSub.ADDRESS_MODE else []
         if row is profile.TX_PD and subindex == Tx.PDO_INDEX:
@@ -557,12 +557,13 @@ class EapDictionary(ObjectDictionary):
         mode = AddressMode(self[frame].entries[FrameSub.ADDRESS_MODE].value)
         budget = frame_budget(self.uri.scheme, mode.kind)
         if length > budget:
-            detail = f"{self.name_of(frame)} would have {length} octets, at most {budget} go there"
+            name = self.name_of(frame)
+            detail = f"{name} would have {length} bytes, at most {budget} fit its destination"
             raise SdoAbortError(AbortCode.PDO_LENGTH, index, subindex, detail)
 
 
 def is_counted(item: OdObject) -> bool:
-    """Tell whether writing sub-index 0 of *item* means something."""
+    """Return whether sub-index 0 of *item* can be written."""
     return item.entries[0].access == CONFIG
 
 
@@ -574,11 +575,11 @@ def _right(row: ProfileObject) -> Access:
 def _part(
     index: int, chosen: list[tuple[int, Entry]], data: bytes, state: OdState
 ) -> Iterator[tuple[int, bytes]]:
-    """Yield the octets of each of *chosen* that can be written, out of a complete access."""
+    """Yield the bytes of each writable entry of *chosen* from the data of a complete access."""
     plan = pdo.layout([entry.kind for _, entry in chosen])
     if len(data) != plan.size:
         code = AbortCode.TOO_SHORT if len(data) < plan.size else AbortCode.TOO_LONG
-        raise SdoAbortError(code, index, 1, f"{len(data)} octets for entries of {plan.size}")
+        raise SdoAbortError(code, index, 1, f"{len(data)} bytes for entries of {plan.size}")
     if chosen and not any(entry.access & state.write_right for _, entry in chosen):
         writable = any(entry.access & Access.WRITE_ANY for _, entry in chosen)
         code = AbortCode.DEVICE_STATE if writable else AbortCode.READ_ONLY

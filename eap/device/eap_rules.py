@@ -42,7 +42,7 @@ from eap.pd.spec import (
 )
 
 REQUESTED = frozenset({2, 4, 8})
-"""States that can be asked for; Init cannot."""
+"""States that a client can request; Init cannot be requested."""
 _BOOL = 0x01
 
 
@@ -160,11 +160,11 @@ class MappingEntry(NamedTuple):
 
     @classmethod
     def decode(cls, word: int) -> MappingEntry:
-        """Take an entry's 32 bits apart."""
+        """Decode the 32 bits of a mapping entry."""
         return cls(word >> 16, word >> 8 & 0xFF, word & 0xFF)
 
     def encode(self) -> int:
-        """Return the 32 bits."""
+        """Return the mapping entry as 32 bits."""
         return self.target << 16 | self.subindex << 8 | self.bits
 
 
@@ -202,7 +202,7 @@ def encode_mapping(variables: Iterable[tuple[int, DataType]]) -> list[int]:
 def check_mapped(
     dictionary: ObjectDictionary, word: int, right: Access, index: int, subindex: int
 ) -> None:
-    """Refuse an entry that maps what is not there, not mappable with *right*, or of another size.
+    """Abort if an entry maps a missing object, one not mappable with *right*, or another size.
 
     Raises:
         SdoAbortError: NO_OBJECT, NO_SUBINDEX, NOT_STORED, NOT_MAPPABLE or LENGTH.
@@ -231,11 +231,11 @@ def check_mapped(
 def lay_out_mapping(
     dictionary: ObjectDictionary, index: int, count: int, limit: int
 ) -> MappingLayout:
-    """Return what the first *count* entries of the mapping at *index* amount to.
+    """Return the layout of the first *count* entries of the mapping at *index*.
 
     Raises:
         SdoAbortError: PARAMETER for padding that is missing or too much, PDO_LENGTH for more than
-            *limit* octets, and what :meth:`ObjectDictionary.entry` raises for what is gone.
+            *limit* bytes, and what :meth:`ObjectDictionary.entry` raises for removed objects.
     """
     entries = dictionary[index].entries
     indexes = []
@@ -257,13 +257,13 @@ def lay_out_mapping(
         end += kind.bit_length
     octets = -(-end // 8)
     if octets > limit:
-        detail = f"{octets} octets, the largest frame of this port has room for {limit}"
+        detail = f"{octets} bytes, the largest frame of this port holds {limit}"
         raise SdoAbortError(AbortCode.PDO_LENGTH, index, 0, detail)
     return MappingLayout(tuple(indexes), octets)
 
 
 def mapped_bits(dictionary: ObjectDictionary, item: OdObject) -> int:
-    """Return the bits of the entries in force of a mapping, as far as what they map exists."""
+    """Return the bits of the active entries of a mapping whose targets exist."""
     bits = 0
     for subindex in range(1, item.max_subindex + 1):
         mapped = MappingEntry.decode(item.entries[subindex].value)
@@ -280,7 +280,7 @@ def _is_whole(dictionary: ObjectDictionary, word: int) -> bool:
 
 
 class FoundRecord(NamedTuple):
-    """A record with where it stands; of a TxPD with the Found of its frame."""
+    """A record with the port and index of its object; of a TxPD also the record of its frame."""
 
     port: str
     at: int
@@ -312,11 +312,11 @@ def check_station(
     pds: list[FoundRecord],
     subscriptions: list[FoundRecord],
 ) -> None:
-    """Refuse what cannot run.
+    """Check that the engine can run a station.
 
     Args:
-        before: The station whose sources and links *spec* has.
-        spec: What was read back.
+        before: The station with the sources and links.
+        spec: The specification that was read back.
         frames: Its TxFrames.
         pds: Its TxPDs.
         subscriptions: Its RxPDs.
@@ -389,7 +389,7 @@ def _check_received(spec: StationSpec, subscriptions: Iterable[FoundRecord]) -> 
 
 
 def _check_polls(pds: list[FoundRecord], subscriptions: list[FoundRecord]) -> None:
-    """Refuse requests that are not there, and those that are answers themselves."""
+    """Raise a fault for poll requests that are missing or are answers themselves."""
     sent = {(each.port, each.record.name): each.record for each in pds}
     received = {(each.port, each.record.name): each.record for each in subscriptions}
     for found, others, subindex in (
@@ -412,7 +412,7 @@ def _check_polls(pds: list[FoundRecord], subscriptions: list[FoundRecord]) -> No
 def _check_station_needs(
     before: StationSpec, spec: StationSpec, subscriptions: Iterable[FoundRecord]
 ) -> None:
-    """Refuse variables that sources and links of the station do not find as they need them."""
+    """Raise a fault for variables that do not fit the sources and links of the station."""
     now = {each.name: each for each in spec.variables}
     types = {each.name: each.type for each in before.variables}
     received = {name for each in subscriptions for name in each.record.variables}

@@ -64,11 +64,11 @@ _NO_CHANGE = OnChangeSpec()
 
 
 def fill(dictionary: EapDictionary, like: EapDictionary | None = None) -> None:
-    """Make objects of what the station of *dictionary* says of its port.
+    """Create the objects of the port of *dictionary* from the specification of its station.
 
     Args:
-        dictionary: An empty one.
-        like: Another one of the same port; what has the same name there gets the same index.
+        dictionary: An empty dictionary.
+        like: Another one of the same port; objects of the same name get the same index.
 
     Raises:
         DeviceFault: the port has more than there are objects for, or a PD more variables than a
@@ -107,7 +107,7 @@ class _Filling:
         return [each.name for each in station.variables if each.name in wanted]
 
     def run(self) -> None:
-        """Make all objects."""
+        """Create all objects."""
         self._fill_device()
         for row, variables in (
             (profile.TX_VARIABLE, self._tx_variables),
@@ -160,7 +160,7 @@ class _Filling:
                 index = next(free, None)
                 if index is None:
                     room = sum(row.last - row.first + 1 for row in rows)
-                    detail = f"{len(names)} objects, there is room for {room}"
+                    detail = f"{len(names)} objects, at most {room}"
                     raise DeviceFault(FaultCode.NO_ROOM, detail, rows[0].first)
                 chosen[name] = index
         return chosen
@@ -216,7 +216,7 @@ class _Filling:
             value = _value(record, path)
             if not is_plain and value:
                 value = references[value] if row.refers else row.from_plain(value)
-            if value or row.default is not None:  # else a new object has it already
+            if value or row.default is not None:  # otherwise a new object has it already
                 values[subindex] = value
         self._set(index, values)
 
@@ -224,7 +224,7 @@ class _Filling:
         numbered = dict(enumerate(values, first))
         last = max(numbered, default=first - 1)
         if last > profile.MAX_ENTRIES:
-            detail = f"{len(numbered)} entries, there is room for {profile.MAX_ENTRIES - first + 1}"
+            detail = f"{len(numbered)} entries, at most {profile.MAX_ENTRIES - first + 1}"
             raise DeviceFault(FaultCode.NO_ROOM, detail, index)
         self._dictionary.resize(index, last)
         self._set(index, numbered)
@@ -240,14 +240,14 @@ class _Filling:
 
 
 def _value(record: Any, path: tuple[str, ...]) -> Any:
-    """Return the value at *path* of *record*; of what is not there its default."""
+    """Return the value at *path* of *record*; the default if the parent is None."""
     for name in path:
         record = getattr(_NO_CHANGE if record is None else record, name)
     return record
 
 
 def _address(frame: TxFrameSpec) -> dict[int, Any]:
-    """Return the entries of a TxFrame that say where it goes."""
+    """Return the entries of a TxFrame that hold its destination."""
     if frame.destination == REQUESTER:
         return {FrameSub.ADDRESS_MODE: AddressMode.REQUESTER}
     destination = Destination.parse(frame.destination)
@@ -264,9 +264,9 @@ def _address(frame: TxFrameSpec) -> dict[int, Any]:
 
 
 def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -> StationSpec:
-    """Return what *station* is with its EAP ports as *dictionaries* say.
+    """Return *station* with its EAP ports read back from *dictionaries*.
 
-    What stood in *station* keeps its place, new things come behind; so what was filled from a
+    Records of *station* keep their order, new ones follow; so a dictionary that was filled from a
     specification reads back as that specification.
 
     Args:
@@ -274,7 +274,7 @@ def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -
         dictionaries: By name of the port; EAP ports that are missing here send and receive nothing.
 
     Raises:
-        DeviceFault: it cannot run.
+        DeviceFault: the engine cannot run it.
     """
     ports = [port for port in station.ports if port.name in dictionaries]
     readers = [PortReader(dictionaries[port.name]) for port in ports]
@@ -298,7 +298,7 @@ def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -
 
 
 def _with_alternates(spec: StationSpec, station: StationSpec) -> StationSpec:
-    """Return *spec* with the alternates of those RxPDs that are laid out as *station* has them."""
+    """Return *spec* with the alternates of RxPDs that have the same layout in *station*."""
     types = types_of(station)
     known = {_expected(pd, types): pd.alternates for pd in station.subscriptions if pd.alternates}
     if not known:
@@ -319,7 +319,7 @@ def _in_order(records: list[Any], before: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def _times(station: StationSpec, readers: list[PortReader]) -> tuple[int, int]:
-    """Return device cycle and phase, which all ports have to agree on."""
+    """Return device cycle and phase, which must be equal on all ports."""
     found = [reader.times() for reader in readers] or [(station.cycle_us, station.phase_us)]
     for reader, times in zip(readers, found, strict=False):
         if times != found[0]:
@@ -332,7 +332,7 @@ def _times(station: StationSpec, readers: list[PortReader]) -> tuple[int, int]:
 
 
 def _variables(station: StationSpec, readers: list[PortReader]) -> list[VariableSpec]:
-    """Return the variables of all ports and of the buses; equal ones of several ports are one."""
+    """Return the variables of all ports and buses, each once even if several ports have it."""
     on_bus = bus_variables(station)
     merged = {each.name: each for each in station.variables if each.name in on_bus}
     for reader in readers:
@@ -398,7 +398,7 @@ class PortReader:
         return fields["cycle_us"], fields["phase_us"]
 
     def port(self) -> PortSpec:
-        """Return the port as it is to be."""
+        """Return the specification of the port."""
         value = self._values(profile.PORT)
         for each in profile.row_of(profile.PORT).entries:
             if each.schemes and value(each.subindex) and self._scheme not in each.schemes:
@@ -457,7 +457,7 @@ class PortReader:
         length = self._dictionary.frame_length(index)
         budget = frame_budget(self._scheme, mode.kind)
         if length > budget:
-            detail = f"{length} octets, at most {budget} go there"
+            detail = f"{length} bytes, at most {budget} fit its destination"
             raise self.fault(FaultCode.FRAME_TOO_LONG, detail, index, FrameSub.FRAME_LENGTH)
         record = TxFrameSpec(
             **self._fields(index),
@@ -477,7 +477,7 @@ class PortReader:
         if (kind := mode.kind) is None:
             return REQUESTER
         if kind not in DESTINATIONS[self._scheme]:
-            detail = f"{mode.name} is no way to address from {self._scheme}"
+            detail = f"{mode.name} is not an address mode of {self._scheme}"
             raise self.fault(FaultCode.NO_DESTINATION, detail, index, FrameSub.ADDRESS_MODE)
         number = 0
         if kind is DestinationKind.MAC:
@@ -505,7 +505,7 @@ class PortReader:
     def _tx(self, index: int) -> TxPdSpec:
         fields = self._fields(index)
         trigger = fields["trigger"]
-        # Its times switch sending on change on, as they do without such an entry.
+        # A nonzero time enables sending on change even if the entry Tx.ON_CHANGE is 0.
         if not (self._values(index)(Tx.ON_CHANGE) or any(trigger["on_change"].values())):
             trigger["on_change"] = None
         return msgspec.convert({**fields, "variables": self._mapped(index)}, TxPdSpec)
@@ -524,7 +524,7 @@ class PortReader:
             yield FoundRecord(self.name, index, msgspec.convert({**fields, **mapped}, RxPdSpec))
 
     def _mapped(self, index: int) -> tuple[str, ...]:
-        """Return the names of a PD's variables; its PDO has to be there and whole."""
+        """Return the names of the variables of a PD; its PDO must exist and be complete."""
         dictionary, pdo = self._dictionary, self._values(index)(Tx.PDO_INDEX)
         name = dictionary.name_of(index)
         if not pdo:
@@ -545,6 +545,6 @@ class PortReader:
 
 
 def _known_mac(octets: bytes) -> str:
-    """Return the address behind a NetID; empty if it is to be learned, as a group has no owner."""
+    """Return the MAC address of a NetID; empty if it is zero or a group, so that it is learned."""
     address = MacAddr(octets)
     return str(address) if any(address) and not address.is_group else ""

@@ -1,9 +1,9 @@
-"""EAP state machine: states that can be requested, checks on the way, and the last refusal.
+"""EAP state machine: requests of states, checks of transitions, and the last fault.
 
-Rule 1: Init is left at the start and never asked for again.
-Rule 2: a request goes through the states in between; where one refuses, the device stays in the
-last that it reached, and keeps error code and text until a request succeeds.
-Rule 3: the way from PreOp to SafeOp checks everything that the dictionaries say (ETG.1005).
+Rule 1: the device leaves Init at the start and never returns to it.
+Rule 2: a request goes through the states in between; if a transition fails, the device stays in the
+last state that it reached, and keeps error code and text until a request succeeds.
+Rule 3: the transition from PreOp to SafeOp checks the dictionaries as a whole (ETG.1005).
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ _REQUESTS = {
 
 
 class StateActions(Protocol):
-    """Actions of transitions; each may raise DeviceFault to refuse, the stops may not."""
+    """Actions of transitions; those that start may raise DeviceFault, those that stop may not."""
 
     def start_sending(self, spec: StationSpec) -> None:
-        """PreOp to SafeOp: run *spec*; it is what was read back from the dictionaries."""
+        """Go from PreOp to SafeOp: run *spec*, which was read back from the dictionaries."""
 
     def start_receiving(self) -> None:
-        """SafeOp to Op."""
+        """Go from SafeOp to Op."""
 
     def stop_receiving(self) -> None:
-        """Op to SafeOp."""
+        """Go from Op to SafeOp."""
 
     def stop_sending(self) -> None:
-        """SafeOp to PreOp."""
+        """Go from SafeOp to PreOp."""
 
 
 class StateResult(NamedTuple):
-    """State of the device after a request; *fault* is the reason if it is not the requested one."""
+    """State of the device after a request; *fault* is set if it is not the requested state."""
 
     state: DeviceState
     fault: DeviceFault | None
@@ -64,7 +64,7 @@ class EapStateMachine:
 
     Args:
         check: Reads the specification back from the dictionaries; raises DeviceFault.
-        actions: What transitions do.
+        actions: Actions of the transitions.
     """
 
     def __init__(self, check: Callable[[], StationSpec], actions: StateActions) -> None:
@@ -76,16 +76,16 @@ class EapStateMachine:
 
     @property
     def status(self) -> StateResult:
-        """State and last refusal."""
+        """State and last fault."""
         return StateResult(self._device.state, self._fault)
 
     @property
     def od_state(self) -> OdState | None:
-        """The rights with which clients reach the dictionaries; None without a mailbox."""
+        """State that decides the access rights of clients; None without a mailbox."""
         return _OD_STATES.get(self._device.state)
 
     def serve(self, dictionary: EapDictionary) -> None:
-        """Show the state in *dictionary* and take requests from there."""
+        """Show the state in *dictionary* and accept requests from it."""
         self._dictionaries.append(dictionary)
         dictionary.on_request = self.request
         self._show()
@@ -102,7 +102,7 @@ class EapStateMachine:
         return self.status
 
     def request(self, wanted: int) -> StateResult:
-        """Go to the state numbered *wanted* as far as possible."""
+        """Go to the state numbered *wanted*, or as close to it as possible."""
         try:
             self._walk(_state_of(wanted, self._device.state))
         except DeviceFault as exc:
@@ -133,7 +133,7 @@ class EapStateMachine:
 
 
 def _state_of(wanted: int, now: DeviceState) -> DeviceState:
-    """Return the state numbered *wanted*; refuse what is none, and what cannot be asked for."""
+    """Return the state numbered *wanted*; raise DeviceFault if it cannot be requested."""
     try:
         state = DeviceState(wanted)
     except ValueError:

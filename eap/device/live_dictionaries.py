@@ -31,7 +31,7 @@ class RouterValues(Protocol):
     """The running router; values are numbers, octets or texts, as the router9000's types say."""
 
     def number(self, key: RouterLive) -> int:
-        """Return what *key* stands for, of the router as a whole."""
+        """Return the value of *key* for the router as a whole."""
 
     def state_of(self, port: str) -> int:
         """Return the state of a port."""
@@ -43,16 +43,16 @@ class RouterValues(Protocol):
         """Return all routes in their order."""
 
     def of_route(self, key: RouterLive, route: object) -> Any:
-        """Return what *key* stands for, of one of the routes."""
+        """Return the value of *key* for one route."""
 
 
 class RouterDictionary(ObjectDictionary):
     """Dictionary of a station's router, for clients to read.
 
     Args:
-        station: Whose router it is.
-        values: Where live entries get theirs.
-        identity: What 0x1008 to 0x1018 show.
+        station: Station of the router.
+        values: Source of the values of live entries.
+        identity: Values of 0x1008 to 0x1018.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class RouterDictionary(ObjectDictionary):
         self._set_fixed(station, identity)
 
     def name_of(self, index: int) -> str:
-        """Return the name of what the object at *index* is about, empty for the router itself."""
+        """Return the name of the subject of the object at *index*, empty for the router itself."""
         if _is_route(index):
             return str(self[index].entries[3].value)
         return self._names.get(index, "")
@@ -157,38 +157,38 @@ class MasterValues(Protocol):
         """Return the station addresses of the configuration, in the order of the bus."""
 
     def detected(self) -> Sequence[int]:
-        """Return those that the last scan has found."""
+        """Return the station addresses that the last scan detected."""
 
     def of_configured(self, station: int, key: MasterLive) -> Any:
-        """Return what *key* stands for, of a configured slave."""
+        """Return the value of *key* for a configured slave."""
 
     def of_detected(self, station: int, key: MasterLive) -> Any:
-        """Return what *key* stands for, of a slave that was found."""
+        """Return the value of *key* for a detected slave."""
 
     def of_diagnosis(self, station: int, key: MasterLive) -> Any:
-        """Return what *key* stands for, of how a configured slave is."""
+        """Return the value of *key* for the diagnosis of a configured slave."""
 
     def of_master(self, key: MasterLive) -> Any:
-        """Return what *key* stands for, of the master itself."""
+        """Return the value of *key* for the master itself."""
 
     def write_slave(self, station: int, key: MasterLive, value: int) -> None:
-        """Do what a download asks for, or raise SdoAbortError."""
+        """Execute a download, or raise SdoAbortError."""
 
     def write_master(self, key: MasterLive, data: bytes) -> None:
-        """Do what a download asks for, or raise SdoAbortError."""
+        """Execute a download, or raise SdoAbortError."""
 
 
 class MasterDictionary(ObjectDictionary):
     """Dictionary of a master.
 
     Args:
-        values: Where live entries get theirs.
-        identity: What 0x1008 to 0x1018 show.
-        full: Whether objects of slaves reach as far as any master's, or as far as TwinCAT's.
-        padded: Whether in complete access an entry of an even size begins at an even octet.
+        values: Source of the values of live entries.
+        identity: Values of 0x1008 to 0x1018.
+        full: Whether objects of slaves have all entries of ETG.1510, or those that TwinCAT has.
+        padded: Whether in complete access an entry of an even size begins at an even offset.
     """
 
-    # ETG.1510 clients ask for all there is, and take whatever stands behind the rights for a name.
+    # ETG.1510 clients request all of the entry description and read any extra bytes as the name.
     tells_values = False
 
     def __init__(
@@ -226,14 +226,14 @@ class MasterDictionary(ObjectDictionary):
         return len(self._objects) + len(self._moving())
 
     def upload_complete(self, index: int, first: int, state: OdState) -> bytes:
-        """Return a whole object as :class:`ObjectDictionary` does, padded where that is wanted."""
+        """Return a whole object as :class:`ObjectDictionary` does, padded if configured."""
         if index == _DETECT and not self._padded:
             raise SdoAbortError(AbortCode.PARAMETER, index, first, "no complete access, as TwinCAT")
         octets = super().upload_complete(index, first, state)
         return self._pad(self[index], octets, first) if self._padded else octets
 
     def _pad(self, item: OdObject, octets: bytes, first: int) -> bytes:
-        """Put an octet in front of each entry of an even size that begins at an odd one."""
+        """Insert a byte before each entry of an even size that begins at an odd offset."""
         start = 2 if first == 0 else 0
         padded = bytearray(octets[:start])
         for subindex, entry in item.entries.items():

@@ -55,7 +55,7 @@ class PdLayout(NamedTuple):
     size: int
     variables: tuple[PdVariable, ...]
     any_version: bool = False
-    """Of what is received: whether another version fits as well."""
+    """Whether a receiver accepts any other version, too."""
 
 
 def lay_out(version: int, variables: Iterable[tuple[str, str]]) -> PdLayout:
@@ -84,19 +84,19 @@ def types_of(spec: StationSpec) -> dict[str, str]:
 
 
 def bus_variables(station: StationSpec) -> set[str]:
-    """Return the names of the variables that *station* has because of its buses.
+    """Return the names of the variables that buses add to *station*.
 
-    They are not configured here; a Tx variable of the same name is one of them.
+    They are not configured in the dictionary; a Tx variable of the same name is one of them.
     """
     prefixes = tuple(f"{port.name}." for port in station.ports if port.kind is PortKind.BUS)
     return {each.name for each in station.variables if each.name.startswith(prefixes)}
 
 
 def kept_versions(old: StationSpec, new: StationSpec) -> list[str]:
-    """Return a line for people on every PD whose layout changes while its version does not.
+    """Return a message for every PD whose layout changes while its version does not.
 
-    A subscriber that is not changed too then discards the PD for its length or, worse, reads other
-    variables out of it than were sent.
+    A subscriber that does not change, too, discards such a PD for its length or, worse, reads other
+    variables from it than were sent.
     """
     before = {key: layout for key, _, layout in sent_pds(old)}
     lines = []
@@ -111,12 +111,12 @@ def kept_versions(old: StationSpec, new: StationSpec) -> list[str]:
 
 
 def _harm(old: PdLayout, new: PdLayout) -> str:
-    """Return what happens to who takes *new* for *old*, empty for nothing."""
+    """Return the effect on a subscriber that reads *new* as *old*, empty for none."""
     if old.version != new.version:
         return ""
     if old.size != new.size:
         return (
-            f"changes from {old.size} to {new.size} octets, for which subscribers outside this "
+            f"changes from {old.size} to {new.size} bytes, for which subscribers outside this "
             f"change discard it"
         )
     places = {each.name: (each.type, each.bit_offset) for each in old.variables}
@@ -130,7 +130,7 @@ def _harm(old: PdLayout, new: PdLayout) -> str:
 
 
 class Step(NamedTuple):
-    """One station's change: *spec* is what it runs from now on, *why* a line for people."""
+    """Change of one station: *spec* is its next specification, *why* the reason for users."""
 
     station: str
     spec: StationSpec
@@ -138,20 +138,20 @@ class Step(NamedTuple):
 
 
 def steps(old: Mapping[str, StationSpec], new: Mapping[str, StationSpec]) -> list[Step]:
-    """Return how to get from *old* to *new* without a PD that is sent and not taken.
+    """Return the steps from *old* to *new* in which receivers accept every PD that is sent.
 
-    Stations that are the same in both, or only in one of them, need no step.  Between two steps
-    frames on their way have to arrive: configure a station, wait for its answer, go on.
+    Stations that are equal in both, or only in one of them, need no step.  Between two steps the
+    frames in flight have to arrive: configure a station, wait for its answer, continue.
 
     Args:
-        old: What runs now, by station; it may hold alternates of a change that was broken off.
-        new: What is to run, of which every subscription takes what its publisher sends.
+        old: Running specifications by station; they may hold alternates of an aborted change.
+        new: Next specifications, in which every subscription accepts the PD of its publisher.
     """
     return _Rollout(old, new).run()
 
 
 def without_alternates(spec: StationSpec) -> StationSpec:
-    """Return *spec* with nothing of a change that is under way."""
+    """Return *spec* without the alternates of a change in progress."""
     pds = tuple(replace(pd, alternates=()) for pd in spec.subscriptions)
     return spec if pds == spec.subscriptions else replace(spec, subscriptions=pds)
 
@@ -166,18 +166,18 @@ class _Wire:
             self.switch(name, spec)
 
     def switch(self, station: str, spec: StationSpec) -> None:
-        """Let *station* send what *spec* says."""
+        """Replace the PDs of *station* by those of *spec*."""
         sent = self._sent[station] = {}
         for key, _, layout in sent_pds(spec):
             sent.setdefault(key, []).append(layout)
             self._senders.setdefault(key.pd_id, {})[station] = None
 
     def of(self, station: str) -> dict[PdKey, list[PdLayout]]:
-        """Return what *station* sends."""
+        """Return the layouts of the PDs that *station* sends."""
         return self._sent.get(station, {})
 
     def heard(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, PdKey, PdLayout]]:
-        """Yield what *pd* of *station* is for, and which other station sends it."""
+        """Yield sender, key and layout of each PD that *pd* of *station* receives."""
         for sender in self._senders.get(pd.pd_id, {}):
             if sender == station:
                 continue
@@ -188,7 +188,7 @@ class _Wire:
 
 
 class _Rollout:
-    """The steps so far, and what runs after them."""
+    """The steps so far, and the specifications that run after them."""
 
     def __init__(self, old: Mapping[str, StationSpec], new: Mapping[str, StationSpec]) -> None:
         self._current = dict(old)
@@ -206,18 +206,18 @@ class _Rollout:
             if prepared == self._current[name]:
                 waiting.append(name)
             elif name in senders or self._ending(name) or self._faster(name):
-                self._step(name, prepared, "takes old and new layouts; sends as before")
+                self._step(name, prepared, "accepts old and new layouts; sends as before")
                 waiting.append(name)
             else:
                 self._change(name)
         self._change_in_order(waiting, senders)
         for name in self._changed:
             if self._current[name] != self._new[name]:
-                self._step(name, self._new[name], "takes no old layouts any more")
+                self._step(name, self._new[name], "accepts no old layouts any more")
         return self._steps
 
     def _change_in_order(self, waiting: list[str], senders: set[str]) -> None:
-        """Change all of *waiting* over: who needs no alternates first, else a sender."""
+        """Change all of *waiting* over: first those that need no alternates, then senders."""
         left = dict.fromkeys(waiting)
         old_senders = {name: self._senders_of_old(name) for name in waiting}
         best_after = {
@@ -234,10 +234,10 @@ class _Rollout:
             self._change(name)
 
     def _change(self, name: str) -> None:
-        """Let *name* run what is new, and take what is still sent otherwise."""
+        """Change *name* to its new specification, with alternates for old layouts still sent."""
         new = self._tolerant(name, self._new[name], self._now)
-        more = "" if new == self._new[name] else "; takes old layouts too"
-        self._step(name, new, f"is as it is to be{more}")
+        more = "" if new == self._new[name] else "; accepts old layouts too"
+        self._step(name, new, f"runs the new configuration{more}")
 
     def _step(self, name: str, spec: StationSpec, why: str) -> None:
         self._current[name] = spec
@@ -249,7 +249,7 @@ class _Rollout:
         return any(now.get(key) != sent for key, sent in self._later.of(name).items())
 
     def _senders_of_old(self, name: str) -> set[str]:
-        """Return who sends what *name* will not take when it has changed over."""
+        """Return the senders of layouts that *name* will not accept after its change."""
         spec = self._new[name]
         types = types_of(spec)
         return {
@@ -260,19 +260,19 @@ class _Rollout:
         }
 
     def _ending(self, name: str) -> set[str]:
-        """Return who sends PDs to *name* that it will not send any more."""
+        """Return the senders to *name* of PDs that end."""
         return _only_in(self._now, self._later, self._current[name])
 
     def _beginning(self, name: str) -> set[str]:
-        """Return who will send PDs to *name* that it does not send yet."""
+        """Return the senders to *name* of PDs that begin."""
         return _only_in(self._later, self._now, self._new[name])
 
     def _slower(self, name: str) -> set[str]:
-        """Return who will send PDs to *name* in larger steps, or in none that is fixed."""
+        """Return the senders to *name* of PDs whose steps grow or are no longer fixed."""
         return self._repaced(name, lambda old, new: old < new)
 
     def _faster(self, name: str) -> set[str]:
-        """Return who will send PDs to *name* in smaller steps."""
+        """Return the senders to *name* of PDs whose steps shrink."""
         return self._repaced(name, lambda old, new: old > new)
 
     def _repaced(self, name: str, compare: Callable[[float, float], bool]) -> set[str]:
@@ -285,7 +285,7 @@ class _Rollout:
         }
 
     def _tolerant(self, name: str, spec: StationSpec, wire: _Wire) -> StationSpec:
-        """Return *spec* with alternates for what *wire* brings *name* beside what it takes."""
+        """Return *spec* with alternates for the layouts on *wire* that *name* does not accept."""
         types = types_of(spec)
         pds = tuple(self._with_alternates(name, pd, types, wire) for pd in spec.subscriptions)
         return spec if pds == spec.subscriptions else replace(spec, subscriptions=pds)
@@ -304,10 +304,10 @@ class _Rollout:
     def _own_names(
         self, name: str, pd: RxPdSpec, forms: list[PdLayout]
     ) -> dict[tuple[str, str], str] | None:
-        """Return what *pd* of *name* calls each variable that its sender names, by name and type.
+        """Return the names in *pd* of *name* for the variables of its sender, by name and type.
 
-        That is known from a layout that both are made for, now or later; None if there is none.
-        A PD that no station sends yet has no names, as there is nothing to keep up to date.
+        They follow from a layout that both have, now or later; None if there is none.  A PD that no
+        station sends yet has no names, because it has no values to keep up to date.
         """
         for wire in (self._now, self._later):
             for _, _, layout in wire.heard(name, pd):
@@ -318,7 +318,7 @@ class _Rollout:
 
 
 def _only_in(wire: _Wire, other: _Wire, spec: StationSpec) -> set[str]:
-    """Return who sends PDs to *spec* on *wire* that are not on the *other*."""
+    """Return the senders to *spec* of PDs that are on *wire* and not on *other*."""
     return {
         sender
         for pd in spec.subscriptions
@@ -328,7 +328,7 @@ def _only_in(wire: _Wire, other: _Wire, spec: StationSpec) -> set[str]:
 
 
 def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[PdLayout]:
-    """Return the layout of *pd* itself and those of its alternates, with its own names."""
+    """Return the layout of *pd* itself and those of its alternates, with local names."""
     own = lay_out(pd.version, ((name, types[name]) for name in pd.variables))
     return [own._replace(any_version=pd.ignore_version)] + [
         lay_out(each.version, ((v.name, v.type) for v in each.variables)) for each in pd.alternates
@@ -336,7 +336,7 @@ def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[PdLayout]:
 
 
 def _takes(forms: list[PdLayout], layout: PdLayout) -> bool:
-    """Tell whether a PD of *layout* is taken by one of *forms*."""
+    """Return whether one of *forms* accepts a PD of *layout*."""
     return any(
         form.size == layout.size and (form.any_version or form.version == layout.version)
         for form in forms
@@ -344,7 +344,7 @@ def _takes(forms: list[PdLayout], layout: PdLayout) -> bool:
 
 
 def _names(form: PdLayout, layout: PdLayout) -> dict[tuple[str, str], str]:
-    """Return what *form* calls the variables of *layout* that lie where its own do."""
+    """Return the names in *form* of the variables of *layout* at equal offsets."""
     places = {(each.bit_offset, each.type): each.name for each in form.variables}
     return {
         (each.name, each.type): places[each.bit_offset, each.type]
@@ -354,7 +354,7 @@ def _names(form: PdLayout, layout: PdLayout) -> dict[tuple[str, str], str]:
 
 
 def _alternate(ours: dict[tuple[str, str], str], layout: PdLayout) -> RxAlternateSpec:
-    """Return *layout* with the own name of each variable, empty for what there is none of."""
+    """Return *layout* as an alternate with the local name of each variable, empty for none."""
     variables = (
         TakenVariableSpec(ours.pop((each.name, each.type), ""), each.type)
         for each in layout.variables

@@ -45,7 +45,7 @@ def test_apply_and_back(stub, file):
             line
             for number in (1, 2, 3)
             for line in (
-                f"station-0{number} is as it is to be: ok",
+                f"station-0{number} runs the new configuration: ok",
                 f"  {CHANGE}  20000 -> 10000 us  ok",
             )
         ),
@@ -54,7 +54,7 @@ def test_apply_and_back(stub, file):
     assert run("apply", file).output == "nothing was changed\n"
     result = run("rollback", file, "--station", "station-02")
     assert result.output.splitlines() == [
-        "station-02 is as it is to be: ok",
+        "station-02 runs the new configuration: ok",
         f"  {CHANGE}  10000 -> 20000 us  ok",
         "1 station changed, 2 as before",
     ]
@@ -67,7 +67,7 @@ def test_json(stub, file):
     assert [step["station"] for step in document["steps"]] == [f"station-0{n}" for n in (1, 2, 3)]
     assert document["steps"][0]["results"][0]["ok"] is True
     document = json.loads(run("rollback", file, "--json").output)
-    assert [step["why"] for step in document["steps"]] == ["is as it is to be"] * 3
+    assert [step["why"] for step in document["steps"]] == ["runs the new configuration"] * 3
 
 
 def test_refusal_in_the_middle(stub, file):
@@ -75,7 +75,7 @@ def test_refusal_in_the_middle(stub, file):
     result = run("apply", file)
     assert result.exit_code == 1
     assert result.output.splitlines()[2:] == [
-        "station-02 is as it is to be: refused",
+        "station-02 runs the new configuration: refused",
         f"  {CHANGE}  20000 -> 10000 us  not today",
         "  ! not today",
         "1 station changed, 2 as before",

@@ -148,7 +148,7 @@ def test_a_sender_is_a_network_or_a_mac_address():
 
 
 def test_access_that_there_is_not_is_told():
-    with pytest.raises(MisfitError, match=r"no access is called 'wirte', did you mean write\?"):
+    with pytest.raises(MisfitError, match=r"unknown access 'wirte', did you mean write\?"):
         parse_services(("wirte",))
 
 
@@ -169,11 +169,14 @@ def test_access_rule_with_former_key_doors_names_its_transports(index):
 @pytest.mark.parametrize(
     ("items", "finding"),
     [
-        (["from: [10.0.0.1]"], "8: nothing is said; allow or deny with what it is about, such as"),
+        (
+            ["from: [10.0.0.1]"],
+            "8: access rule has neither allow nor deny; allow or deny with what it is about, such as",
+        ),
         (["allow: [read], deny: [write]"], "8: access rule has both allow and deny; allow or deny"),
         (["allow: read"], "8: allow is 'read'; a list"),
-        (["allow: [raed]"], "8: allow: no access is called 'raed', did you mean read?; one of a"),
-        (["deny: [no]"], "8: deny: no access is called 'no'; one of all, read, write, control"),
+        (["allow: [raed]"], "8: allow: unknown access 'raed', did you mean read?; one of a"),
+        (["deny: [no]"], "8: deny: unknown access 'no'; one of all, read, write, control"),
         (["allow: [all], from: [me]"], "8: from: 'me' is no IPv4 network and no MAC address; a"),
         (["allow: [all], net_ids: [rihgt]"], "8: net_ids: 'rihgt' is no NetID, nor the first num"),
         (["allow: [all], to: [right/eap1]"], "8: to: station right has no port 'eap1', did you me"),
@@ -186,12 +189,12 @@ def test_access_rule_with_former_key_doors_names_its_transports(index):
         (["name: a, allow: [read], transports: [udp]", "name: a, allow: [all]"],
          "9: access rule 'a' exists already (line 8); a name of its own"),
         (["allow: [all], from: [10.0.0.1], transports: [mqtt]"],
-         "8: access rule can never fit: who comes by mqtt has no such address; a rule that can"),
+         "8: access rule never matches: clients of mqtt have no such address; a rule that can"),
         (["allow: [all], from: ['02:00:00:00:00:01'], transports: [udp]"],
-         "8: access rule can never fit: who comes by udp has no such address; a rule that can"),
+         "8: access rule never matches: clients of udp have no such address; a rule that can"),
         (["allow: [all], from: ['02:00:00:00:00:0x']"], "8: from: '02:00:00:00:00:0x' is no IPv4"),
         (["allow: [files, raw], objects: [0x6000]"],
-         "8: access rule can never fit: files, raw is not about objects; a rule that can"),
+         "8: access rule never matches: files, raw does not access objects; a rule that can"),
     ],
 )  # fmt: skip
 def test_a_rule_that_cannot_be_is_one_finding(findings, items, finding):
@@ -199,7 +202,7 @@ def test_a_rule_that_cannot_be_is_one_finding(findings, items, finding):
     assert found.startswith(finding)
 
 
-NEVER = "9: access rule is never asked: the one of line 8 fits before it; it before that one, or"
+NEVER = "9: access rule never applies: the rule in line 8 matches before it; this rule before that one, or"
 
 
 @pytest.mark.parametrize(

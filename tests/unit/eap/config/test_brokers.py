@@ -132,7 +132,7 @@ ONE = "mqtt: mqtt://b, network: n"
         ([f"{ONE}, tls: {{ca: gone}}"], "8: gone: No such file or directory; a file, its path fro"),
         ([f"{ONE}, tls: {{key: line.yaml}}"], "8: a key without a certificate; certificate: as we"),
         ([f"{ONE}, qos: 3"], "8: qos is 3; a whole number from 0 to 2"),
-        ([f"{ONE}, client_id: {'a' * 65536}"], "8: client_id is too long; at most 65535 octets"),
+        ([f"{ONE}, client_id: {'a' * 65536}"], "8: client_id is too long; at most 65535 bytes"),
     ],
 )
 def test_a_broker_that_cannot_be_is_one_finding(findings, items, finding):
@@ -218,7 +218,7 @@ def warnings(load_plant):
 def test_broker_that_anybody_may_teach_by_is_a_warning_until_learn_names_it(warnings):
     [warning] = warnings(*learning("true", LEARNING_ONE))
     assert warning == (
-        "9: station left learns routes from anybody at mqtt://b: the broker asks for no user;"
+        "9: station left learns routes from any client of mqtt://b: the broker requires no user;"
         " learn: [mqtt:n] if that is meant, else learn: false"
     )
     assert warnings(*learning("[mqtt:n]", LEARNING_ONE)) == []

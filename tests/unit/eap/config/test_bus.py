@@ -210,7 +210,7 @@ def test_an_eap_port_is_not_on_the_interface_of_a_bus(findings):
     assert found == [
         (
             "7: ethernet://eth1 is the interface of eap0 too (line 6): the slaves of bus0 would"
-            " pass on and send back the frames of eap0; an interface of its own for a bus"
+            " forward and return the frames of eap0; an interface of its own for a bus"
         )
     ]
 

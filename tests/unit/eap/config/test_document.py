@@ -85,7 +85,7 @@ def test_merge_keys_give_way_to_own_keys_and_to_earlier_ones(tree):
         ("a: [1, 2\nb: 3", "p.yaml:2: not YAML: "),
         ("a: 1\nb: c: d", "p.yaml:2: not YAML: mapping values are not allowed"),
         ("a: \x07", "p.yaml: not YAML: unacceptable character"),
-        (b"a: 1\nb: \xff", "p.yaml:2: octet 0xff is no UTF-8"),
+        (b"a: 1\nb: \xff", "p.yaml:2: byte 0xff is not UTF-8"),
         ("a: *x", "p.yaml:1: no anchor &x ends before this"),
         ("a: &a [*a]", "p.yaml:1: no anchor &a ends before this"),
         ("a: 1\n---\nb: 2", "p.yaml:2: a second YAML document begins"),

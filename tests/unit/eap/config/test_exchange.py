@@ -42,7 +42,7 @@ def frame(text):
         ),
         (
             [("to: 127.0.9.2", "to: rigth/eap0")],
-            "13: destination of frame 'out': rigth/eap0 is no ",
+            "13: destination of frame 'out': no port rigth/eap0 ",
         ),
         (
             [pd("cycle_us: 15000")],
@@ -154,7 +154,7 @@ def test_a_frame_is_as_large_as_its_wire_allows(findings, left, right, to, large
     [finding] = findings(*edits, *((old, new.format(largest + 1)) for old, new in sizes))
     total = largest + 23
     assert finding.startswith(
-        f"11: frame 'out' has {total} octets with its 1 PDs; at most {total - 1}"
+        f"11: frame 'out' has {total} bytes with its 1 PDs; at most {total - 1}"
     )
 
 
@@ -165,7 +165,7 @@ def test_the_budget_counts_every_pd_of_a_frame(findings):
     )
     size = [("count: UDINT", "count: UDINT\n      big: BLOCK(720)"), (old, old + more)]
     [finding] = findings(*size)
-    assert finding.startswith("14: frame 'out' has 1486 octets with its 3 PDs; at most 1472 to 127")
+    assert finding.startswith("14: frame 'out' has 1486 bytes with its 3 PDs; at most 1472 to 127")
 
 
 def test_frames_leave_by_eap_ports(findings):
@@ -371,7 +371,7 @@ def test_what_goes_together_is_well(load_edited, edits):
         ),
         (
             [(CLIENT, "from: mill/part,")],
-            "16: mill/part is sent only to who asks for it (line 26); poll: the PD of this station",
+            "16: mill/part is sent only on request (line 26); poll: the PD of this station",
         ),
         (
             [(SERVER, "variables: [turns]}"), (ANSWER_FRAME, "port: eap0, to: desk/eap0}")],
@@ -422,7 +422,7 @@ def test_an_answer_is_no_request_although_nobody_knows_who_asked(load_edited):
 def test_a_question_is_no_answer(load_edited):
     more = f"{NEWS}      - {{name: saw, port: eap0, {FOREIGN} poll: part}}\n"
     (finding,) = load_edited((NEWS, more)).findings
-    message = "'saw' is asked for by 'part', which is polled itself (line 26)"
+    message = "'saw' is requested by 'part', which is polled itself (line 26)"
     assert (finding.line, finding.message) == (30, message)
 
 
@@ -434,8 +434,8 @@ def test_polls_do_not_go_in_a_circle(load_edited):
     )
     circles = [f.message for f in result.findings if "circle" in f.message]
     assert circles == [
-        "polls go in a circle: mill/part, saw/cut, mill/part",
-        "polls go in a circle: saw/cut, mill/part, saw/cut",
+        "polls form a loop: mill/part, saw/cut, mill/part",
+        "polls form a loop: saw/cut, mill/part, saw/cut",
     ]
 
 
@@ -460,15 +460,15 @@ VARIABLES = ", variables: {a: REAL, b: UDINT}}"
         ([("seen, port: eap0", "seen, port: eap9")], "21: station right has no port 'eap9'"),
         (
             [(FROM, "from: left/sate")],
-            "21: nobody in this plant publishes 'left/sate', did you mean",
+            "21: no station of this plant publishes 'left/sate', did you mean",
         ),
         (
             [(FROM, "from: {publisher: 9.9.9.9.9.9, id: 7}")],
-            "21: nobody in this plant publishes id",
+            "21: no station of this plant publishes id",
         ),
         (
             [(FROM, "from: {publisher: any, id: 7}")],
-            "21: nobody in this plant publishes id 7 as any",
+            "21: no station of this plant publishes id 7 as any",
         ),
         ([(FROM, "from: {publisher: x, id: 7}, foreign: true")], "21: 'x' is not an AMS NetID"),
         (

@@ -55,7 +55,7 @@ def test_a_port_that_cannot_be_is_one_finding(findings, edits, finding):
         ("ethernet://eth0", ", mac: 1", "mac is '1'; the address of one station's interface"),
         ("ethernet://eth0", ", mac: 01-00-00-00-00-01", "mac is '01-00-00-00-00-01'; the address"),
         ("udp://127.0.9.1", ", mac: 02-00-00-00-00-01", "port eap0 has a MAC address; it only on"),
-        ("ethernet://eth0", ", tcp: true", "port eap0 takes type 4 from TCP"),
+        ("ethernet://eth0", ", tcp: true", "port eap0 receives type 4 over TCP"),
         ("ethernet://eth0", ", join: [239.1.1.1]", "'239.1.1.1' cannot be joined"),
         ("loop://line", ", join: [239.1.1.1]", "'239.1.1.1' cannot be joined"),
         ("ethernet://eth0", ", ams: true", "port eap0 says whether AMS is served at its IP addr"),
@@ -316,7 +316,7 @@ def test_net_id_on_udp_is_the_address_of_its_port(load_plant):
 def test_net_id_that_nothing_tells(findings):
     (only,) = findings(*ETHERNET, to("127.0.9.2.2.1"))
     assert only.startswith(
-        "13: frame 'out' goes to the NetID of right/eap0, whose MAC address noth"
+        "13: frame 'out' goes to the NetID of right/eap0, whose MAC address cannot"
     )
     assert only.endswith("; such a frame, or mac: on that port (line 19)")
 

@@ -429,20 +429,20 @@ def test_a_circle_is_named_at_each_route_of_it(warnings):
         middle=[f"{NORTH}, via: east/eap0"],
         east=[f"{NORTH}, via: west/eap0"],
     ) == [
-        "7: the route to 'north' runs in a circle: west -> middle -> east -> west",
-        "12: the route to 'north' runs in a circle: middle -> east -> west -> middle",
-        "17: the route to 'north' runs in a circle: east -> west -> middle -> east",
+        "7: the route to 'north' runs in a loop: west -> middle -> east -> west",
+        "12: the route to 'north' runs in a loop: middle -> east -> west -> middle",
+        "17: the route to 'north' runs in a loop: east -> west -> middle -> east",
     ]
 
 
 def test_a_circle_by_a_default_route_is_one_too(warnings):
     found = warnings(west=[f"{NORTH}, via: middle/eap0"], middle=["to: default, via: west/eap0"])
-    assert found == ["7: the route to 'north' runs in a circle: west -> middle -> west"]
+    assert found == ["7: the route to 'north' runs in a loop: west -> middle -> west"]
 
 
 def test_a_route_that_ends_on_the_way_is_named(warnings):
     assert warnings(west=[f"{NORTH}, via: middle/eap0"]) == [
-        "7: the route to 'north' ends at middle, which has none on to it"
+        "7: the route to 'north' ends at middle, which has no route to it"
     ]
 
 
@@ -455,6 +455,6 @@ def test_who_learns_nothing_has_no_route_by_a_broker(warnings):
 def test_stations_send_each_other_what_is_for_a_third(warnings):
     found = warnings(west=["to: east, via: middle/eap0"], middle=["to: east, via: west/eap0"])
     assert found == [
-        "7: the route to 'east' runs in a circle: west -> middle -> west",
-        "12: the route to 'east' runs in a circle: middle -> west -> middle",
+        "7: the route to 'east' runs in a loop: west -> middle -> west",
+        "12: the route to 'east' runs in a loop: middle -> west -> middle",
     ]

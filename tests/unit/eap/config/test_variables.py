@@ -32,7 +32,10 @@ def source(name, text):
             ("count: UDINT", "count: UDINT\n      raw: {type: BLOCK(2), default: 0011}"),
             "10: default of raw: 11 is not a value of BLOCK(2); 2 octets in hexadecimal",
         ),
-        (source("cuont", "{kind: counter}"), "11: 'cuont' is no variable of left, did you mean c"),
+        (
+            source("cuont", "{kind: counter}"),
+            "11: station left has no variable 'cuont', did you mean c",
+        ),
         (
             source("speed", "{kind: sine, amplitude: 1, period_ms: 0}"),
             "11: period_ms is 0; more th",
@@ -311,8 +314,11 @@ def test_these_links_run(findings, link):
             "from: word, to: level, swap: true, offset: 0",
             "word is UINT, level is INT: a swap with offset 0 computes nothing; swap alone",
         ),
-        ("from: fault, to: bits, swap: true", "fault is BOOL, bits is BIT2; two variables of as"),
-        ("from: level, to: level", "links go in a circle: level → level; one of them to be left"),
+        (
+            "from: fault, to: bits, swap: true",
+            "fault is BOOL, bits is BIT2; two variables of the same",
+        ),
+        ("from: level, to: level", "links form a loop: level → level; one of them to be left"),
     ],
 )
 def test_a_link_that_cannot_run_is_one_finding(findings, link, finding):
@@ -348,7 +354,7 @@ def test_circles_are_named(findings):
     links = ["from: word, to: level, scale: 1", "from: fault, to: bus0.valves.lamp"]
     back = "from: level, to: word, swap: true"
     assert findings(*linked(*links, back)) == [
-        "21: links go in a circle: word → level → word; one of them to be left out"
+        "21: links form a loop: word → level → word; one of them to be left out"
     ]
 
 

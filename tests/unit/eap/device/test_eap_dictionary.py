@@ -279,7 +279,7 @@ def test_a_pd_for_which_a_frame_has_no_room_is_refused_in_its_list(udp):
     two_large_pds(udp)
     frame(udp, 0x8000, 0xD000)
     reason = _refused(udp, AbortCode.PDO_LENGTH, 0x8000, FrameSub.TXPD + 1, 0xD001)
-    assert "frame0 would have 1630 octets, at most 1472 go there" in reason
+    assert "frame0 would have 1630 bytes, at most 1472 fit its destination" in reason
 
 
 def test_a_pd_that_grows_beyond_its_frame_is_refused_where_it_grows(udp):

@@ -121,7 +121,7 @@ def test_a_default_is_kept_as_the_type_has_it():
     [
         ([VariableSpec("n" * 256, "UINT")], [], 0x6000, "at most 255 octets"),
         ([VariableSpec("own", "UINT")], ["own"] * 255, 0x1A00, "at most 254 entries"),
-        ([VariableSpec(f"v{n}", "BIT1") for n in range(4097)], [], 0x6000, "room for 4096"),
+        ([VariableSpec(f"v{n}", "BIT1") for n in range(4097)], [], 0x6000, "at most 4096"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_its_object(variables, sent, index, reason):
@@ -137,5 +137,5 @@ def test_a_frame_lists_as_many_pds_as_its_object_has_entries():
     pds = tuple(TxPdSpec(f"pd{number}", number, ("own",)) for number in range(240))
     frames = (TxFrameSpec("f", "eap0", "tcp://10.0.0.2", pds),)
     station = replace(BLANK, variables=(VariableSpec("own", "BIT1"),), frames=frames)
-    with pytest.raises(DeviceFault, match="240 entries, there is room for 239"):
+    with pytest.raises(DeviceFault, match="240 entries, at most 239"):
         filled(station)

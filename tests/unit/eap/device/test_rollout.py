@@ -145,9 +145,9 @@ def test_the_receiver_goes_first_and_once_more():
     old, new = plant({("a", 1): 0}, heard), plant({("a", 1): 1}, heard)
     way, running = follow(old, new)
     assert shown(way) == [
-        "b is as it is to be; takes old layouts too",
-        "a is as it is to be",
-        "b takes no old layouts any more",
+        "b runs the new configuration; accepts old layouts too",
+        "a runs the new configuration",
+        "b accepts no old layouts any more",
     ]
     assert running == new
     assert without_alternates(way[0].spec) == new["b"]
@@ -173,11 +173,11 @@ def test_stations_that_send_and_receive_take_both_before_they_send_anew():
     old, new = plant(versions, heard), plant(dict.fromkeys(versions, 1), heard)
     way, running = follow(old, new)
     assert shown(way) == [
-        "a takes old and new layouts; sends as before",
-        "b takes old and new layouts; sends as before",
-        "a is as it is to be; takes old layouts too",
-        "b is as it is to be",
-        "a takes no old layouts any more",
+        "a accepts old and new layouts; sends as before",
+        "b accepts old and new layouts; sends as before",
+        "a runs the new configuration; accepts old layouts too",
+        "b runs the new configuration",
+        "a accepts no old layouts any more",
     ]
     assert running == new
     assert without_alternates(way[0].spec) == old["a"]
@@ -205,7 +205,7 @@ def test_who_receives_a_changed_pd_from_now_on_waits_for_its_sender():
     old = plant({("a", 1): 0}, {"b": []})
     new = plant({("a", 1): 1}, {"b": [("a", 1)]})
     way, _ = follow(old, new)
-    assert shown(way) == ["a is as it is to be", "b is as it is to be"]
+    assert shown(way) == ["a runs the new configuration", "b runs the new configuration"]
 
 
 def test_who_receives_it_no_longer_goes_first():
@@ -230,9 +230,9 @@ def test_who_takes_both_while_one_pd_changes_and_another_ends_goes_last():
     new = plant({("b", 2): 1}, {"a": [("b", 2)]})
     way, _ = follow(old, new)
     assert shown(way) == [
-        "a takes old and new layouts; sends as before",
-        "b is as it is to be",
-        "a is as it is to be",
+        "a accepts old and new layouts; sends as before",
+        "b runs the new configuration",
+        "a runs the new configuration",
     ]
 
 
@@ -292,7 +292,7 @@ def test_a_version_that_is_ignored_needs_no_alternate():
     pd = replace(new["a"].frames[0].pds[0], version=9)
     new["a"] = replace(new["a"], frames=(replace(new["a"].frames[0], pds=(pd,)),))
     way, _ = follow(old, new)
-    assert shown(way) == ["a is as it is to be"]
+    assert shown(way) == ["a runs the new configuration"]
 
 
 def test_what_no_plant_sends_gets_no_alternate():
@@ -345,7 +345,7 @@ def test_a_change_that_was_broken_off_can_be_finished_taken_back_or_followed_by_
 def test_who_receives_its_own_pd_changes_both_ends_at_once():
     heard = {"a": [("a", 1)]}
     way = steps(plant({("a", 1): 0}, heard), plant({("a", 1): 1}, heard))
-    assert shown(way) == ["a is as it is to be"]
+    assert shown(way) == ["a runs the new configuration"]
 
 
 def test_in_a_ring_only_the_first_needs_a_third_step():
@@ -385,8 +385,8 @@ def sending(version: int, *variables: str, pd_id: int = 7) -> StationSpec:
 @pytest.mark.parametrize(
     ("new", "told"),
     [
-        (sending(1, "a:UINT", "b:UINT", "c:BOOL"), "changes from 4 to 5 octets"),
-        (sending(1, "a:UINT"), "changes from 4 to 2 octets"),
+        (sending(1, "a:UINT", "b:UINT", "c:BOOL"), "changes from 4 to 5 bytes"),
+        (sending(1, "a:UINT"), "changes from 4 to 2 bytes"),
         (sending(1, "a:UINT", "b:INT"), "keeps its size with other variables"),
         (sending(1, "a:UDINT"), "keeps its size with other variables"),
         (sending(1, "b:UINT", "a:UINT"), "keeps its size with other variables"),

@@ -141,7 +141,7 @@ def test_layout_that_changes_under_its_version_is_told(plain):
     shorter = replace(frame.pds[0], variables=frame.pds[0].variables[1:])
     changed = replace(plain, frames=(replace(frame, pds=(shorter,)),))
     (line,) = describe_rest(plain, changed)
-    assert "PD 'state' (id 7) changes from 19 to 17 octets" in line
+    assert "PD 'state' (id 7) changes from 19 to 17 bytes" in line
 
 
 @pytest.mark.parametrize(
