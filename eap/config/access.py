@@ -19,7 +19,7 @@ from eap.config.brokers import brokers_of, check_file
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.ports import check_names
-from eap.config.routes import WHOLE, MisfitError, net_ids_of, without_prefix
+from eap.config.routes import NET_ID_OCTETS, SectionError, net_ids_of, stations_without_prefix
 from eap.config.structs import AccessSection, PortSection, StationSection
 from eap.ids import STATION_OCTETS, MacAddr, ObjectId
 from eap.pd.spec import PortKind
@@ -34,8 +34,8 @@ _TOP_PORT = 0xFFFF
 _MAC_COLONS = 5
 
 
-def access_rules(index: Index, station: StationSection, loose: set[str]) -> Iterator[AccessRule]:
-    """Yield the rules of *station*; *loose* are the stations without a NetID prefix of their own.
+def access_rules(index: Index, station: StationSection, shared: set[str]) -> Iterator[AccessRule]:
+    """Yield the rules of *station*; *shared* are the stations without a NetID prefix of their own.
 
     Raises:
         SectionError: a rule names something that does not exist.
@@ -47,11 +47,11 @@ def access_rules(index: Index, station: StationSection, loose: set[str]) -> Iter
             networks=tuple(parse_sender(text) for text in access.networks if not _is_mac(text)),
             macs=tuple(parse_sender(text) for text in access.networks if _is_mac(text)),
             net_ids=tuple(
-                net_id for text in access.net_ids for net_id in parse_source(index, text, loose)
+                net_id for text in access.net_ids for net_id in parse_source(index, text, shared)
             ),
             transports=access.transports or access.doors,
             targets=tuple(
-                target for text in access.to for target in parse_target(index, text, loose)
+                target for text in access.to for target in parse_target(index, text, shared)
             ),
             services=parse_services(access.allow or access.deny),
             objects=tuple(parse_objects(text) for text in access.objects),
@@ -70,7 +70,7 @@ def parse_services(texts: tuple[str, ...]) -> tuple[AccessService, ...]:
         if text == ALL:
             return ()
         if text not in SERVICES:
-            raise MisfitError("", f"unknown access {text!r}{suggest(text, SERVICES)}", _SERVICES)
+            raise SectionError("", f"unknown access {text!r}{suggest(text, SERVICES)}", _SERVICES)
         found += _WRITES if text == AccessService.WRITE else [AccessService(text)]
     return tuple(dict.fromkeys(found))
 
@@ -84,41 +84,41 @@ def parse_sender(text: str) -> str:
         return str(MacAddr.parse(text) if _is_mac(text) else IPv4Network(text, strict=False))
     except ValueError:
         message = f"{text!r} is no IPv4 network and no MAC address"
-        raise MisfitError("", message, "a network such as 10.0.0.0/24, or an address") from None
+        raise SectionError("", message, "a network such as 10.0.0.0/24, or an address") from None
 
 
 def _is_mac(text: str) -> bool:
     return text.count(":") == _MAC_COLONS or text.count("-") == _MAC_COLONS
 
 
-def parse_source(index: Index, text: str, loose: set[str]) -> list[str]:
+def parse_source(index: Index, text: str, shared: set[str]) -> list[str]:
     """Return the NetID prefixes that *text*, a station or some numbers, stands for."""
     if (station := index.stations.get(text)) is not None:
-        return _beginnings(station, loose)
+        return _net_id_prefixes(station, shared)
     return [_net_id(text)]
 
 
-def parse_target(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
+def parse_target(index: Index, text: str, shared: set[str]) -> list[AccessTarget]:
     """Return the targets that *text* names: a station, a port, a slave, or a NetID."""
     where, separator, number = text.partition(":")
     if not separator:
-        return _targets(index, text, loose)
+        return _targets(index, text, shared)
     if not number.isdecimal() or int(number) > _TOP_PORT:
-        raise MisfitError("", f"{number!r} is no AMS port", TARGET)
-    return [AccessTarget(each.net_id, int(number)) for each in _targets(index, where, loose)]
+        raise SectionError("", f"{number!r} is no AMS port", TARGET)
+    return [AccessTarget(each.net_id, int(number)) for each in _targets(index, where, shared)]
 
 
 def parse_objects(text: str) -> ObjectRange:
     """Return the objects that *text* stands for."""
     first, dash, last = (part.strip() for part in text.partition("-"))
     if dash and ":" in text:
-        raise MisfitError("", f"{text!r} names no objects", OBJECTS)
+        raise SectionError("", f"{text!r} names no objects", OBJECTS)
     try:
         low, high = ObjectId.parse(first), ObjectId.parse(last if dash else first)
     except ValueError:
-        raise MisfitError("", f"{text!r} names no objects", OBJECTS) from None
+        raise SectionError("", f"{text!r} names no objects", OBJECTS) from None
     if low > high:
-        raise MisfitError("", f"{text!r} ends before it begins", OBJECTS)
+        raise SectionError("", f"{text!r} ends before it begins", OBJECTS)
     if ":" in text:
         return ObjectRange(low.object_index, low.object_index, low.subindex, low.subindex)
     return ObjectRange(low.object_index, high.object_index)
@@ -130,21 +130,21 @@ def _parts(text: str) -> tuple[str, str, str]:
     return station, port, slave
 
 
-def _targets(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
+def _targets(index: Index, text: str, shared: set[str]) -> list[AccessTarget]:
     name, port_name, slave = _parts(text)
     station = index.stations.get(name)
     if station is None:
         if "/" not in text and text[:1].isdigit():
             return [AccessTarget(_net_id(text))]
         hint = suggest(name, index.stations)
-        raise MisfitError("", f"no station {name!r} in this plant{hint}", TARGET)
+        raise SectionError("", f"no station {name!r} in this plant{hint}", TARGET)
     if not port_name:
-        return [AccessTarget(net_id) for net_id in _beginnings(station, loose)]
+        return [AccessTarget(net_id) for net_id in _net_id_prefixes(station, shared)]
     port = index.ports.get((name, port_name))
     if port is None:
         names = [each.name for each in station.ports]
         message = f"station {name} has no port {port_name!r}{suggest(port_name, names)}"
-        raise MisfitError("", message, one_of(names))
+        raise SectionError("", message, one_of(names))
     net_id = str(port.net_id)
     if not slave:
         return [AccessTarget(net_id)]
@@ -156,26 +156,26 @@ def _slave(index: Index, station: StationSection, port: PortSection, slave: str)
     bus = index.buses.get((station.name, port.name))
     known = {each.name: each.station for each in bus.slaves} if bus else {}
     if port.kind is not PortKind.BUS:
-        raise MisfitError("", f"{station.name}/{port.name} has no slaves", "a bus port")
+        raise SectionError("", f"{station.name}/{port.name} has no slaves", "a bus port")
     if slave in known:
         return known[slave]
     if slave.isdecimal() and (int(slave) in known.values() or not known) and int(slave) < _TOP_PORT:
         return int(slave)
     message = f"bus {station.name}/{port.name} has no slave {slave!r}{suggest(slave, known)}"
-    raise MisfitError("", message, one_of([*known, *map(str, known.values())]))
+    raise SectionError("", message, one_of([*known, *map(str, known.values())]))
 
 
-def _beginnings(station: StationSection, loose: set[str]) -> list[str]:
-    return [".".join(net_id.split(".")[:octets]) for net_id, octets in net_ids_of(station, loose)]
+def _net_id_prefixes(station: StationSection, shared: set[str]) -> list[str]:
+    return [".".join(net_id.split(".")[:octets]) for net_id, octets in net_ids_of(station, shared)]
 
 
 def _net_id(text: str) -> str:
     numbers = text.split(".")
-    if STATION_OCTETS <= len(numbers) <= WHOLE and all(
+    if STATION_OCTETS <= len(numbers) <= NET_ID_OCTETS and all(
         each.isascii() and each.isdigit() and int(each) < 256 for each in numbers
     ):
         return ".".join(str(int(each)) for each in numbers)
-    raise MisfitError("", f"{text!r} is no NetID, nor the first numbers of one", TARGET)
+    raise SectionError("", f"{text!r} is no NetID, nor the first numbers of one", TARGET)
 
 
 T = TypeVar("T")
@@ -185,13 +185,13 @@ _OBJECT_SERVICES = {AccessService.READ, AccessService.WRITE}
 
 def check_access(index: Index, report: FindingReport, folder: Path) -> None:
     """Report every invalid rule and user; files are in *folder*."""
-    loose = without_prefix(index)
+    shared = stations_without_prefix(index)
     for station in index.plant.stations:
         named = ((each.at, each.name) for each in station.access if each.name)
         check_names(named, "access rule", report)
-        fine = [_check_rule(index, station, each, loose, report) for each in station.access]
+        fine = [_check_rule(index, station, each, shared, report) for each in station.access]
         if all(fine):
-            _check_order(index, station, loose, report)
+            _check_order(index, station, shared, report)
         check_names(((user.at, user.name) for user in station.users), "user", report)
         for user in station.users:
             check_file(f"{user.at}.password_file", user.password_file, report, folder)
@@ -201,7 +201,7 @@ def _check_rule(
     index: Index,
     station: StationSection,
     access: AccessSection,
-    loose: set[str],
+    shared: set[str],
     report: FindingReport,
 ) -> bool:
     """Report the errors of a rule; return whether it can be compared with other rules."""
@@ -212,7 +212,7 @@ def _check_rule(
         for position, text in enumerate(texts):
             try:
                 parse(text)
-            except MisfitError as exc:
+            except SectionError as exc:
                 report.add(f"{access.at}.{key}[{position}]", f"{key}: {exc}", exc.expected)
                 is_fine = False
             except ValueError:
@@ -231,8 +231,8 @@ def _check_rule(
     key = "allow" if access.allow else "deny"
     try_all(key, access.allow or access.deny, lambda text: parse_services((text,)))
     try_all("from", access.networks, parse_sender)
-    try_all("net_ids", access.net_ids, lambda text: parse_source(index, text, loose))
-    try_all("to", access.to, lambda text: parse_target(index, text, loose))
+    try_all("net_ids", access.net_ids, lambda text: parse_source(index, text, shared))
+    try_all("to", access.to, lambda text: parse_target(index, text, shared))
     try_all("objects", access.objects, parse_objects)
     known = _transports(station)
     if access.transports and access.doors:
@@ -255,20 +255,20 @@ def _transports(station: StationSection) -> list[str]:
 def _check_transport(text: str, known: list[str]) -> None:
     if text not in known:
         expected = f"{one_of(TransportKind)}, or one transport such as udp:PORT or mqtt:NETWORK"
-        raise MisfitError("", f"no transport {text!r}{suggest(text, known)}", expected)
+        raise SectionError("", f"no transport {text!r}{suggest(text, known)}", expected)
 
 
 def _check_order(
-    index: Index, station: StationSection, loose: set[str], report: FindingReport
+    index: Index, station: StationSection, shared: set[str], report: FindingReport
 ) -> None:
     """Report rules that never match a request."""
     before: list[tuple[AccessSection, AccessRule]] = []
     try:
-        rules = list(access_rules(index, station, loose))
+        rules = list(access_rules(index, station, shared))
     except ValueError:
         return  # a finding of its own
     for access, rule in zip(station.access, rules, strict=True):
-        if reason := _why_never(rule):
+        if reason := _reason_never_matching(rule):
             report.add(access.at, f"access rule never matches: {reason}", "a rule that can match")
         for earlier, other in before:
             if _covers(other, rule):
@@ -279,7 +279,7 @@ def _check_order(
         before.append((access, rule))
 
 
-def _why_never(rule: AccessRule) -> str:
+def _reason_never_matching(rule: AccessRule) -> str:
     kinds = {_kind(transport) for transport in rule.transports}
     is_known = kinds.isdisjoint(IP_DOORS) if rule.networks else bool(rule.macs)
     if kinds and is_known and not (rule.macs and TransportKind.ETHERNET in kinds):
@@ -293,7 +293,7 @@ def _covers(one: AccessRule, other: AccessRule) -> bool:
     """Return whether *one* matches every request that *other* matches."""
     return (
         _covers_senders(one, other)
-        and _all_in(one.net_ids, other.net_ids, _begins)
+        and _all_in(one.net_ids, other.net_ids, _is_prefix)
         and _all_in(
             one.transports, other.transports, lambda outer, inner: outer in {inner, _kind(inner)}
         )
@@ -301,7 +301,7 @@ def _covers(one: AccessRule, other: AccessRule) -> bool:
             one.targets,
             other.targets,
             lambda outer, inner: (
-                _begins(outer.net_id, inner.net_id) and outer.port in {None, inner.port}
+                _is_prefix(outer.net_id, inner.net_id) and outer.port in {None, inner.port}
             ),
         )
         and _all_in(one.services, other.services, lambda outer, inner: outer == inner)
@@ -332,7 +332,7 @@ def _in_network(outer: str, inner: str) -> bool:
     return IPv4Network(inner).subnet_of(IPv4Network(outer))
 
 
-def _begins(outer: str, inner: str) -> bool:
+def _is_prefix(outer: str, inner: str) -> bool:
     return f"{inner}.".startswith(f"{outer}.")
 
 

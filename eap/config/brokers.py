@@ -23,7 +23,7 @@ class Broker(NamedTuple):
 
     host: str
     port: int
-    is_secret: bool
+    needs_tls: bool
     """Whether the URL requires TLS, with or without a ``tls`` section."""
 
 
@@ -63,7 +63,7 @@ def shared_network(station: StationSection, other: StationSection) -> str:
 def broker_spec(route: RouteSection, folder: Path) -> MqttSpec:
     """Return the specification of the broker of *route* for services; its files are in *folder*."""
     broker = parse_url(route.mqtt)
-    tls = route.tls or (TlsSection() if broker.is_secret else None)
+    tls = route.tls or (TlsSection() if broker.needs_tls else None)
     return MqttSpec(
         network=route.network,
         host=broker.host,
@@ -104,7 +104,7 @@ def check_brokers(index: Index, report: FindingReport, folder: Path) -> None:
         _check_networks(station, report)
         for route in brokers_of(station):
             broker = _check_url(route, report)
-            _check_secrets(route, report, folder)
+            _check_credentials(route, report, folder)
             if broker is not None and route.client_id:
                 first = client_ids.setdefault((broker, route.client_id), route)
                 if first is not route:
@@ -153,7 +153,7 @@ def _is_network(name: str) -> bool:
     return not any(each == "/" or each.isspace() for each in name)
 
 
-def _check_secrets(route: RouteSection, report: FindingReport, folder: Path) -> None:
+def _check_credentials(route: RouteSection, report: FindingReport, folder: Path) -> None:
     if route.password_file and not route.user:
         report.add(f"{route.at}.password_file", "a password without a user", "user: as well")
     check_file(f"{route.at}.password_file", route.password_file, report, folder)
@@ -172,14 +172,14 @@ def _check_secrets(route: RouteSection, report: FindingReport, folder: Path) -> 
 
 def check_file(path: str, file: str, report: FindingReport, folder: Path) -> None:
     """Report *file*, named at *path*, if it is given and cannot be read."""
-    if file and (reason := why_unreadable(folder / file)):
+    if file and (reason := unreadable_reason(folder / file)):
         report.add(path, f"{file}: {reason}", _FILE)
 
 
 HOST = "an IPv4 address or a host name, and :PORT if it is not the usual one"
 
 
-def why_unreadable(file: Path) -> str:
+def unreadable_reason(file: Path) -> str:
     """Return the reason that *file* cannot be read as a whole; empty if it can."""
     try:
         if file.exists() and not file.is_file() and not file.is_dir():
@@ -195,14 +195,14 @@ _MQTT = f"{TransportKind.MQTT}:"
 _SOURCES = "mqtt:NETWORK of a broker of the station, or an IPv4 address or network"
 
 
-def learn_sources(station: StationSection) -> bool | tuple[str, ...]:
+def discovery_sources(station: StationSection) -> bool | tuple[str, ...]:
     """Return the sources of auto-discovered routes of *station*, which has no findings."""
     if isinstance(station.learn, bool):
         return station.learn
     return tuple(_parse(station, text) for text in station.learn)
 
 
-def check_learning(index: Index, report: FindingReport) -> None:
+def check_discovery(index: Index, report: FindingReport) -> None:
     """Report every invalid source of auto-discovered routes."""
     for station in index.plant.stations:
         if isinstance(station.learn, bool):

@@ -11,7 +11,7 @@ from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import ExpectedBus, Index
-from eap.config.routes import MisfitError
+from eap.config.routes import SectionError
 from eap.config.structs import Plain, PlantFile, PortSection, StationSection
 from eap.ids import InterfaceUri
 from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
@@ -131,21 +131,21 @@ _LAST = 0xFFFE
 
 def gateway_spec(index: Index, station: StationSection, port: PortSection) -> GatewaySpec:
     """Return the specification of the gateway of a bus port; the checks have passed it."""
-    said = port.gateway
+    section = port.gateway
     return GatewaySpec(
-        enabled=said.enabled,
+        enabled=section.enabled,
         port=gateway_port(station, port),
-        answer_ms=said.answer_ms,
-        silent=said.silent,
-        full=said.full,
-        padded=said.padded,
+        answer_ms=section.answer_ms,
+        silent=section.silent,
+        full=section.full,
+        padded=section.padded,
         addresses=tuple(
-            resolve(index, station, port, parse_address(text), target)
-            for text, target in said.addresses.items()
+            resolve_gateway_address(index, station, port, parse_address(text), target)
+            for text, target in section.addresses.items()
         ),
-        in_flight=said.limits.in_flight,
-        rate=said.limits.rate,
-        clients=said.limits.clients,
+        in_flight=section.limits.in_flight,
+        rate=section.limits.rate,
+        clients=section.limits.clients,
     )
 
 
@@ -159,7 +159,7 @@ def gateway_port(station: StationSection, port: PortSection) -> int:
     return port.gateway.port or (EAP_PORT + number if number else 0)
 
 
-def hosts_of(index: Index, station: StationSection) -> Iterator[str]:
+def ip_addresses_of(index: Index, station: StationSection) -> Iterator[str]:
     """Yield the IP addresses of a station, each once."""
     uris = (index.uris.get((station.name, each.name)) for each in _eap_ports(station))
     found = (uri.host for uri in uris if uri is not None and uri.scheme in {"udp", "tcp"})
@@ -173,11 +173,11 @@ def parse_address(text: str) -> int:
     except ValueError:
         address = 0
     if not 0 < address <= _LAST:
-        raise MisfitError(text, f"gateway address {text!r}", ADDRESS)
+        raise SectionError(text, f"gateway address {text!r}", ADDRESS)
     return address
 
 
-def resolve(
+def resolve_gateway_address(
     index: Index, station: StationSection, port: PortSection, address: int, target: Plain
 ) -> GatewayAddress:
     """Return the target of *address*; raise SectionError if it does not exist."""
@@ -185,21 +185,21 @@ def resolve(
         known = _virtual(port)
         members = tuple(_member(index, station, port, each, known) for each in target)
         if not members:
-            raise MisfitError("", "a group without addresses", _MEMBER)
+            raise SectionError("", "a group without addresses", _MEMBER)
         return GatewayAddress(address, members=members)
     names = str(target).split("/")
     if len(names) == 1:
         return GatewayAddress(address, station=_slave(index, station, port, target))
     other = index.stations.get(names[0])
-    there = index.ports.get((names[0], names[1]))
-    if other is None or there is None or there.kind is not PortKind.BUS or len(names) > 3:
+    other_port = index.ports.get((names[0], names[1]))
+    if other is None or other_port is None or other_port.kind is not PortKind.BUS or len(names) > 3:
         buses = [f"{at}/{name}" for (at, name), each in index.ports.items() if _is_bus(each)]
         hint = suggest("/".join(names[:2]), buses)
-        raise MisfitError("", f"there is no bus port for {target!r}{hint}", TARGET)
-    number = _slave(index, other, there, names[2]) if len(names) == 3 else MASTER_PORT
-    if there is port and number != MASTER_PORT:
+        raise SectionError("", f"there is no bus port for {target!r}{hint}", TARGET)
+    number = _slave(index, other, other_port, names[2]) if len(names) == 3 else MASTER_PORT
+    if other_port is port and number != MASTER_PORT:
         return GatewayAddress(address, station=number)
-    return GatewayAddress(address, net_id=str(there.net_id), port=number)
+    return GatewayAddress(address, net_id=str(other_port.net_id), port=number)
 
 
 def _member(
@@ -214,7 +214,7 @@ def _member(
         number = int(text, 0)
         if number in known:
             if isinstance(known[number], list):
-                raise MisfitError("", f"0x{number:04X} is a group itself", _MEMBER)
+                raise SectionError("", f"0x{number:04X} is a group itself", _MEMBER)
             return number
     return _slave(index, station, port, member)
 
@@ -232,9 +232,9 @@ def _slave(index: Index, station: StationSection, port: PortSection, slave: obje
         if not slaves and 0 < number <= _LAST:
             return number  # nothing describes the bus: any slave may be there
         last = f"; its last one is {slaves[-1].station}" if slaves else ""
-        raise MisfitError("", f"{name} has no slave {number}{last}", TARGET)
+        raise SectionError("", f"{name} has no slave {number}{last}", TARGET)
     hint = suggest(text, [each.name for each in slaves])
-    raise MisfitError("", f"{name} has no slave {text!r}{hint}", TARGET)
+    raise SectionError("", f"{name} has no slave {text!r}{hint}", TARGET)
 
 
 def slaves_of(index: Index, station: StationSection, port: PortSection) -> tuple[BusSlaveSpec, ...]:
@@ -248,7 +248,7 @@ def _virtual(port: PortSection) -> dict[int, Plain]:
     for text, target in port.gateway.addresses.items():
         try:
             found[parse_address(text)] = target
-        except MisfitError:
+        except SectionError:
             continue  # a finding of its own
     return found
 
@@ -267,12 +267,12 @@ _BIT_15 = 0x8000
 
 def check_gateways(index: Index, report: FindingReport) -> None:
     """Report every invalid gateway."""
-    taken = list(_taken(index))
+    taken = list(_used_ports(index))
     for station in index.plant.stations:
         for port in station.ports:
             if port.kind is PortKind.BUS:
                 _check_addresses(index, station, port, report)
-                _check_place(index, station, port, taken, report)
+                _check_port_number(index, station, port, taken, report)
 
 
 def _check_addresses(
@@ -281,7 +281,7 @@ def _check_addresses(
     path = f"{port.at}.gateway.addresses"
     first: dict[int, str] = {}
     stations = {slave.station for slave in slaves_of(index, station, port)}
-    is_unread = port.name in index.unread_buses(station)
+    is_unresolved = port.name in index.unread_buses(station)
     for text, target in port.gateway.addresses.items():
         try:
             address = parse_address(text)
@@ -294,15 +294,15 @@ def _check_addresses(
                 slave = address & ~_BIT_15
                 message = f"gateway address {text} is that of slave {slave} with bit 15 set"
                 report.add(f"{path}.{text}", message, f"{ADDRESS} that is not in use")
-            resolve(index, station, port, address, target)
-        except MisfitError as exc:
-            if not is_unread:
+            resolve_gateway_address(index, station, port, address, target)
+        except SectionError as exc:
+            if not is_unresolved:
                 report.add(f"{path}.{text}", str(exc), exc.expected)
         except ValueError:
             continue  # a NetID that is a finding of its own
 
 
-def _check_place(
+def _check_port_number(
     index: Index,
     station: StationSection,
     port: PortSection,
@@ -315,7 +315,7 @@ def _check_place(
     path = f"{port.at}.gateway.port"
     if path not in report.lines:
         path = port.at
-    for host in hosts_of(index, station):
+    for host in ip_addresses_of(index, station):
         for other_host, other_number, what, at in taken:
             if other_number == number and (host == other_host or _ANY in {host, other_host}):
                 line = report.line_of(at)
@@ -328,7 +328,7 @@ def _check_place(
         taken.append((host, number, f"the gateway to {station.name}/{port.name}", path))
 
 
-def _taken(index: Index) -> Iterator[tuple[str, int, str, str]]:
+def _used_ports(index: Index) -> Iterator[tuple[str, int, str, str]]:
     """Yield the addresses in use by ports: host, port number, owner, and path in the file."""
     for (station, name), uri in index.uris.items():
         port = index.ports[station, name]

@@ -23,7 +23,7 @@ import yaml
 from msgspec import inspect
 
 from eap.config.finding import FindingReport, one_of
-from eap.config.structs import NO_NET_ID, PlantFile, Section
+from eap.config.structs import INVALID_NET_ID, PlantFile, Section
 from eap.ids import NetId
 from eap.suggest import nearest, suggest
 
@@ -123,7 +123,7 @@ def _tab_in(text: str, line: int) -> str:
     return "has a tab behind '-', '?' or ':'" if _TAB_BEHIND_SIGN.search(written) else ""
 
 
-class _Open:
+class _OpenCollection:
     """A list or mapping that is still open."""
 
     __slots__ = ("anchor", "items", "line", "mapping")
@@ -139,17 +139,17 @@ class _Builder:
     def __init__(self, report: FindingReport) -> None:
         self._report = report
         self._anchors: dict[str | None, Node] = {}
-        self._stack: list[_Open] = []
+        self._stack: list[_OpenCollection] = []
         self._root: Node | None = None
 
     def build(self, text: str) -> Node:
         for event in yaml.parse(text, Loader=yaml.CSafeLoader):
-            self._take(event)
+            self._handle(event)
         if self._root is None:
             raise _UnreadableError(1, "the file is empty", "a plant file (docs/plant-file.md)")
         return self._root
 
-    def _take(self, event: yaml.Event) -> None:
+    def _handle(self, event: yaml.Event) -> None:
         line = event.start_mark.line + 1 if event.start_mark else 0
         match event:
             case yaml.DocumentStartEvent() if self._root is not None:
@@ -161,19 +161,19 @@ class _Builder:
                     raise _UnreadableError(
                         line, f"no anchor &{anchor} ends before this", "a known anchor"
                     )
-                self._place(node, None)
+                self._add_node(node, None)
             case yaml.ScalarEvent():
-                self._place(_scalar(event, line), event.anchor)
+                self._add_node(_scalar(event, line), event.anchor)
             case yaml.CollectionStartEvent():
                 if len(self._stack) >= MAX_DEPTH:
                     raise _UnreadableError(line, "nested too deeply", f"at most {MAX_DEPTH} levels")
                 mapping = isinstance(event, yaml.MappingStartEvent)
-                self._stack.append(_Open(line, event.anchor, mapping=mapping))
+                self._stack.append(_OpenCollection(line, event.anchor, mapping=mapping))
             case yaml.CollectionEndEvent():
                 done = self._stack.pop()
-                self._place(self._close(done), done.anchor)
+                self._add_node(self._close(done), done.anchor)
 
-    def _place(self, node: Node, anchor: str | None) -> None:
+    def _add_node(self, node: Node, anchor: str | None) -> None:
         if anchor is not None:
             self._anchors[anchor] = node
         if self._stack:
@@ -181,7 +181,7 @@ class _Builder:
         else:
             self._root = node
 
-    def _close(self, done: _Open) -> Node:
+    def _close(self, done: _OpenCollection) -> Node:
         value: list[Node] | dict[str, tuple[int, Node]]
         if done.mapping:
             value = self._mapping(done.items)
@@ -257,7 +257,7 @@ _NULLS = frozenset(("null", "~"))
 """Explicit nulls; an empty value may be a forgotten one."""
 
 
-class _BrokenError(Exception):
+class _ReportedError(Exception):
     """The value was reported and cannot be used."""
 
     number: int | None = None
@@ -278,7 +278,7 @@ def convert_to(kind: type[T], root: Node, report: FindingReport, what: str) -> T
     try:
         described = _describe_type(kind)  # type: ignore[arg-type]  # classes are hashable
         found: T = _Converter(report).value(root, described, "", what)
-    except _BrokenError:
+    except _ReportedError:
         return None
     return found
 
@@ -306,7 +306,7 @@ class _Converter:
                 return self._entries(node, kind.value_type, path, key)
         return self._scalar(node, kind, path, key)
 
-    def _refuse(self, node: Node, path: str, key: str, expected: str) -> _BrokenError:
+    def _unexpected(self, node: Node, path: str, key: str, expected: str) -> _ReportedError:
         match node.value:
             case dict():
                 shown = "is a mapping"
@@ -317,7 +317,7 @@ class _Converter:
             case value:
                 shown = f"is {value!r}"
         self._report.add(path, f"{key} {shown}", expected)
-        return _BrokenError()
+        return _ReportedError()
 
     def _union(self, node: Node, kind: inspect.UnionType, path: str, key: str) -> Any:
         kinds = [each for each in kind.types if not isinstance(each, inspect.NoneType)]
@@ -344,19 +344,19 @@ class _Converter:
         if isinstance(node.value, bool):
             return node.value
         if not isinstance(node.value, list):
-            raise self._refuse(node, path, key, "true, false or a list")
+            raise self._unexpected(node, path, key, "true, false or a list")
         return self._items(node, kind.item_type, path, key)
 
     def _tagged(self, node: Node, structs: list[inspect.StructType], path: str, key: str) -> Any:
         tags = {str(each.tag): each for each in structs}
         if not isinstance(node.value, dict) or "kind" not in node.value:
-            raise self._refuse(node, path, key, f"a mapping with a kind ({', '.join(tags)})")
+            raise self._unexpected(node, path, key, f"a mapping with a kind ({', '.join(tags)})")
         tag = str(getattr(node.value["kind"][1], "text", ""))
         if tag not in tags:
             self._enter(node, path)
             message = f"unknown kind {tag!r}{suggest(tag, tags)}"
             self._report.add(f"{path}.kind", message, one_of(tags))
-            raise _BrokenError
+            raise _ReportedError
         # The key of a source is the variable it fills.
         values = {
             **{name: entry for name, entry in node.value.items() if name != "kind"},
@@ -379,7 +379,7 @@ class _Converter:
             node = Node(node.line, {short: (node.line, node)})
         if not isinstance(node.value, dict):
             known = ", ".join(each.encode_name for each in kind.fields if each.required)
-            raise self._refuse(node, path, key, f"a mapping{f' with {known}' if known else ''}")
+            raise self._unexpected(node, path, key, f"a mapping{f' with {known}' if known else ''}")
         self._enter(node, path)
         own = issubclass(kind.cls, Section)
         fields = {each.encode_name: each for each in kind.fields if not (own and each.name == "at")}
@@ -395,13 +395,13 @@ class _Converter:
                 continue
             try:
                 values[field.name] = self.value(given[name], field.type, where, name)
-            except _BrokenError as exc:
+            except _ReportedError as exc:
                 if field.required and exc.number is not None:
                     values[field.name] = exc.number
                 else:
                     broken |= field.required
         if broken:
-            raise _BrokenError
+            raise _ReportedError
         return kind.cls(**values)
 
     def _known(
@@ -431,32 +431,32 @@ class _Converter:
         if node.value is None:
             return ()
         if not isinstance(node.value, list):
-            raise self._refuse(node, path, key, "a list")
+            raise self._unexpected(node, path, key, "a list")
         found = []
         for position, item in enumerate(node.value):
             where = f"{path}[{position}]"
             self._report.enter(where, item.line, item)
             try:
                 found.append(self.value(item, kind, where, f"item {position + 1} of {key}"))
-            except _BrokenError:
-                self._remember(item)
+            except _ReportedError:
+                self._mark_broken(item)
         return tuple(found)
 
     def _entries(self, node: Node, kind: inspect.Type, path: str, key: str) -> dict[str, Any]:
         if node.value is None:
             return {}
         if not isinstance(node.value, dict):
-            raise self._refuse(node, path, key, "a mapping from names")
+            raise self._unexpected(node, path, key, "a mapping from names")
         self._enter(node, path)
         found = {}
         for name, (_, item) in node.value.items():
             try:
                 found[name] = self.value(item, kind, f"{path}.{name}", name)
-            except _BrokenError:
+            except _ReportedError:
                 self._report.broken.add(name)
         return found
 
-    def _remember(self, item: Node) -> None:
+    def _mark_broken(self, item: Node) -> None:
         if isinstance(item.value, dict) and "name" in item.value:
             self._report.broken.add(str(item.value["name"][1].value))
 
@@ -471,7 +471,7 @@ class _Converter:
                 low, high = kind.ge, kind.le
                 if (low is None or value >= low) and (high is None or value <= high):
                     return value
-                out_of_range = self._refuse(node, path, key, _describe(kind, key))
+                out_of_range = self._unexpected(node, path, key, _describe(kind, key))
                 out_of_range.number = value
                 raise out_of_range
             case inspect.FloatType() if isinstance(value, int | float):
@@ -482,14 +482,14 @@ class _Converter:
             case inspect.CustomType(cls=cls) if cls is NetId:
                 if isinstance(node, ScalarNode) and value is not None:
                     return read_net_id(node.text, path, self._report)
-        raise self._refuse(node, path, key, _describe(kind, key))
+        raise self._unexpected(node, path, key, _describe(kind, key))
 
     def _plain(self, node: Node, path: str, key: str) -> Any:
         """Read a value whose type depends on the data type of its variable."""
         if isinstance(node.value, list):
             return [self._plain(item, path, f"an element of {key}") for item in node.value]
         if node.value is None or isinstance(node.value, dict):
-            raise self._refuse(node, path, key, "a value, or a list of values for an array")
+            raise self._unexpected(node, path, key, "a value, or a list of values for an array")
         return node.value
 
 
@@ -499,7 +499,7 @@ def read_net_id(text: str, path: str, report: FindingReport) -> NetId:
         return NetId.parse(text)
     except ValueError as exc:
         report.add(path, f"net_id: {exc}", "an AMS NetID such as 5.23.91.23.1.1")
-        return NO_NET_ID
+        return INVALID_NET_ID
 
 
 def _title(given: dict[str, Node], key: str) -> str:

@@ -15,11 +15,11 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.ports import (
     EXPECTED,
-    check_address,
-    check_monitoring,
+    check_frame_monitoring,
     check_names,
+    check_net_id_destination,
     reaches,
-    resolve,
+    resolve_destination,
 )
 from eap.config.structs import (
     ANY_SOURCE,
@@ -77,14 +77,14 @@ def _check_frame(
     if uri is None or index.eap_port(station, frame.port) is None:
         return
     try:
-        destination = None if frame.to == REQUESTER else resolve(frame.to, uri, index)
+        destination = None if frame.to == REQUESTER else resolve_destination(frame.to, uri, index)
     except ValueError as exc:
         if not set(frame.to.split("/")) & report.broken and uri.scheme in EXPECTED:
             message = f"destination of frame {frame.name!r}: {exc}"
             report.add(f"{frame.at}.to", message, EXPECTED[uri.scheme])
         return
-    check_address(index, report, (station, frame), destination)
-    check_monitoring(report, frame, destination, uri)
+    check_net_id_destination(index, report, (station, frame), destination)
+    check_frame_monitoring(report, frame, destination, uri)
     size = FIRST_PD
     for pd in pds:
         sent = index.sent.get((station.name, pd.name))
@@ -107,14 +107,16 @@ def _check_pd(
     if not pd.variables and f"{pd.at}.variables[0]" not in report.lines:
         report.add(f"{pd.at}.variables", f"PD {pd.name!r} has no variables", "at least one")
     for position, name in enumerate(pd.variables):
-        if index.type_text(station, name) is None and not is_unread(index, report, station, name):
+        if index.type_text(station, name) is None and not is_unresolved(
+            index, report, station, name
+        ):
             names = index.names(station)
             message = f"station {station.name} has no variable {name!r}{suggest(name, names)}"
             report.add(f"{pd.at}.variables[{position}]", message, one_of(names))
     _check_triggers(index, report, station, pd)
 
 
-def is_unread(index: Index, report: FindingReport, station: StationSection, name: str) -> bool:
+def is_unresolved(index: Index, report: FindingReport, station: StationSection, name: str) -> bool:
     """Return whether *name* may belong to a section that was reported already."""
     if name in report.broken:
         return True
@@ -173,9 +175,9 @@ def check_polls(index: Index, report: FindingReport) -> None:
                 _check_answer(index, report, station, pd)
         for subscription in station.subscribe:
             if subscription.poll:
-                _check_question(index, report, station, subscription)
+                _check_polled_subscription(index, report, station, subscription)
             else:
-                _check_unasked(index, report, subscription)
+                _check_unpolled(index, report, subscription)
 
 
 def _check_poll_frame(report: FindingReport, station: StationSection, frame: FrameSection) -> None:
@@ -232,7 +234,7 @@ def _chain(index: Index, sent: SentPd) -> list[SentPd]:
         chain.append(polled)
 
 
-def _check_question(
+def _check_polled_subscription(
     index: Index, report: FindingReport, station: StationSection, subscription: SubscribeSection
 ) -> None:
     path, name = f"{subscription.at}.poll", subscription.poll
@@ -249,14 +251,14 @@ def _check_question(
         report.add(path, message, _ONE_PORT)
     publishers = index.publishers(subscription)
     for sent in publishers:
-        _check_asked(index, report, subscription, sent, own)
+        _check_request(index, report, subscription, sent, own)
     if own.pd.poll and not publishers:
         message = f"{subscription.name!r} is requested by {name!r}, which is polled itself "
         message += f"(line {report.line_of(f'{own.pd.at}.poll')})"
         report.add(path, message, _PUSHED)
 
 
-def _check_asked(
+def _check_request(
     index: Index, report: FindingReport, subscription: SubscribeSection, sent: SentPd, own: SentPd
 ) -> None:
     """Report that *sent*, which *subscription* receives, does not answer *own*."""
@@ -273,7 +275,7 @@ def _check_asked(
         report.add(path, message, one_of(asked) if asked else "a PD that is received there")
 
 
-def _check_unasked(index: Index, report: FindingReport, subscription: SubscribeSection) -> None:
+def _check_unpolled(index: Index, report: FindingReport, subscription: SubscribeSection) -> None:
     for sent in index.publishers(subscription):
         if sent.pd.poll:
             line = report.line_of(f"{sent.pd.at}.poll")
@@ -295,10 +297,10 @@ def check_subscribe(index: Index, report: FindingReport) -> None:
             _check_sender(index, report, station, subscription)
             _check_variables(subscription, report)
             for sent in publishers:
-                _check_ends(index, report, subscription, sent)
+                _check_match(index, report, subscription, sent)
             _check_arrival(index, report, station, subscription)
             _check_timeout(index, report, station, subscription)
-            _check_once(subscription, publishers, taken, report)
+            _check_duplicates(subscription, publishers, taken, report)
 
 
 def _check_source(
@@ -368,7 +370,7 @@ def _check_variables(subscription: SubscribeSection, report: FindingReport) -> N
         report.add(path, f"subscription {name!r} has no variables", "at least one")
 
 
-def _check_ends(
+def _check_match(
     index: Index, report: FindingReport, subscription: SubscribeSection, sent: SentPd
 ) -> None:
     """Report where *subscription* differs from the PD *sent*, naming both lines."""
@@ -412,7 +414,7 @@ def _check_arrival(
         if sender_uri is None or sent.frame.to == REQUESTER:
             return  # an answer goes back to its requester, which is checked with the polls
         try:
-            destination = resolve(sent.frame.to, sender_uri, index)
+            destination = resolve_destination(sent.frame.to, sender_uri, index)
         except ValueError:
             return  # reported with the frame
         if reaches(destination, (sent.port, sender_uri), (receiver, uri)):
@@ -444,7 +446,7 @@ def _check_timeout(
             report.add(path, message, f"at least {-(-period // 1000)}, or 0 for never")
 
 
-def _check_once(
+def _check_duplicates(
     subscription: SubscribeSection,
     publishers: list[SentPd],
     taken: dict[tuple[str, str, int], str],

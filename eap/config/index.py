@@ -140,7 +140,7 @@ def _unique_names(entries: Sequence[DescribedEntry]) -> list[str]:
     names = []
     for entry, name in zip(entries, plain, strict=True):
         if counts[name] > 1 and entry.type:
-            names.append(_free(f"{name}_{_place(entry)}", taken))
+            names.append(_free(f"{name}_{_object_suffix(entry)}", taken))
             taken.add(names[-1])
         else:
             names.append(name)
@@ -148,10 +148,10 @@ def _unique_names(entries: Sequence[DescribedEntry]) -> list[str]:
 
 
 def _plain(entry: DescribedEntry) -> str:
-    return _OTHER.sub("_", entry.name) or _place(entry)
+    return _OTHER.sub("_", entry.name) or _object_suffix(entry)
 
 
-def _place(entry: DescribedEntry) -> str:
+def _object_suffix(entry: DescribedEntry) -> str:
     return f"{entry.index:04X}_{entry.subindex:02X}"
 
 

@@ -28,8 +28,8 @@ from eap.config.access import access_rules, check_access
 from eap.config.brokers import (
     broker_spec,
     brokers_of,
-    check_learning,
-    learn_sources,
+    check_discovery,
+    discovery_sources,
     shared_network,
     warn_of_open_brokers,
 )
@@ -38,19 +38,19 @@ from eap.config.document import convert, read, read_net_id
 from eap.config.exchange import check_polls, check_publish, check_subscribe
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index, SentPd
-from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve
+from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.routes import (
     check_routes,
     find_hop,
     follow_routes,
     net_ids_of,
     next_hop,
-    reach,
-    without_prefix,
+    route_net_ids,
+    stations_without_prefix,
 )
 from eap.config.structs import (
     ANY_SOURCE,
-    AuditDuty,
+    AuditMode,
     FrameSection,
     FromSection,
     PlantFile,
@@ -59,7 +59,7 @@ from eap.config.structs import (
     SubscribeSection,
     VariableSection,
 )
-from eap.config.variables import check_links, check_variables, ends, in_order, is_bitwise
+from eap.config.variables import check_links, check_variables, ends, execution_order, is_bitwise
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (
@@ -153,18 +153,18 @@ def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
 
 def _links(index: Index, station: StationSection) -> Iterator[LinkSpec]:
     """Yield the links in execution order: each after those that write its source."""
-    ways = [
+    spans = [
         ends(link, _type(index, station, link.source), _type(index, station, link.target))
         for link in station.links
     ]
-    for position in in_order(ways):
-        link, way = station.links[position], ways[position]
+    for position in execution_order(spans):
+        link, span = station.links[position], spans[position]
         yield LinkSpec(
             source=link.source,
             target=link.target,
-            source_bit=way.source.start,
-            target_bit=way.target.start,
-            bits=way.source.bits if is_bitwise(link) else 0,
+            source_bit=span.source.start,
+            target_bit=span.target.start,
+            bits=span.source.bits if is_bitwise(link) else 0,
             scale=1.0 if link.scale is None else link.scale,
             offset=link.offset or 0.0,
             swap=link.swap,
@@ -207,7 +207,7 @@ def _frames(index: Index, station: StationSection) -> Iterator[TxFrameSpec]:
 def _destination(index: Index, station: StationSection, frame: FrameSection) -> str:
     if frame.to == REQUESTER:
         return REQUESTER
-    return str(resolve(frame.to, index.uris[station.name, frame.port], index))
+    return str(resolve_destination(frame.to, index.uris[station.name, frame.port], index))
 
 
 def _mac(index: Index, destination: str) -> str:
@@ -225,7 +225,7 @@ def _subscription(index: Index, subscription: SubscribeSection) -> RxPdSpec:
         sent = publishers[0]
         pd_id, version = sent.pd.id, sent.pd.version
         publisher = str(sent.port.net_id)
-        step, sender_cycle_us = _pace(index, publishers)
+        step, sender_cycle_us = _common_step(index, publishers)
     if isinstance(source, FromSection):
         pd_id = source.id
         publisher = "" if source.publisher == "any" else str(NetId.parse(source.publisher))
@@ -269,7 +269,7 @@ def _own_address(index: Index, sent: SentPd) -> str:
     return str(MacAddr.parse(sent.port.mac)) if sent.port.mac else ""
 
 
-def _pace(index: Index, publishers: list[SentPd]) -> tuple[int, int]:
+def _common_step(index: Index, publishers: list[SentPd]) -> tuple[int, int]:
     """Return step and device cycle of *publishers*, 0 if theirs differ."""
     steps = {index.step(sent) for sent in publishers}
     cycles = {index.cycle_us(sent.station) for sent in publishers}
@@ -277,7 +277,7 @@ def _pace(index: Index, publishers: list[SentPd]) -> tuple[int, int]:
 
 
 def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
-    destinations = list(_heard(index, station, port))
+    destinations = list(_received_destinations(index, station, port))
     groups = [_group(text) for text in port.join]
     groups += [group for each in destinations if (group := group_of(each)) is not None]
     return PortSpec(
@@ -323,7 +323,9 @@ def _group(text: str) -> str:
     return str(MacAddr.parse(text)) if len(text) == len("01:01:05:04:00:00") else text
 
 
-def _heard(index: Index, station: StationSection, port: PortSection) -> Iterator[Destination]:
+def _received_destinations(
+    index: Index, station: StationSection, port: PortSection
+) -> Iterator[Destination]:
     """Yield the destinations of the frames that *port* subscribes to."""
     for subscription in station.subscribe:
         if subscription.port == port.name:
@@ -331,23 +333,26 @@ def _heard(index: Index, station: StationSection, port: PortSection) -> Iterator
                 if sent.frame.to == REQUESTER:
                     continue
                 uri = index.uris[sent.station.name, sent.port.name]
-                yield resolve(sent.frame.to, uri, index)
+                yield resolve_destination(sent.frame.to, uri, index)
 
 
 def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
     """Return the routing of each station by its name; files are in *folder*."""
-    loose = without_prefix(index)
-    known = {each.name: net_ids_of(each, loose) for each in index.plant.stations}
+    shared = stations_without_prefix(index)
+    known = {each.name: net_ids_of(each, shared) for each in index.plant.stations}
     return {
         station.name: RoutingSpec(
-            routes=(*_written(index, station, loose), *_derived(index, station, known)),
+            routes=(
+                *_configured_routes(index, station, shared),
+                *_derived_routes(index, station, known),
+            ),
             mqtt=tuple(broker_spec(each, folder) for each in brokers_of(station)),
-            access=tuple(access_rules(index, station, loose)),
+            access=tuple(access_rules(index, station, shared)),
             users=tuple(
                 AmsUser(user.name, str((folder / user.password_file).resolve()))
                 for user in station.users
             ),
-            learn=learn_sources(station),
+            learn=discovery_sources(station),
         )
         for station in index.plant.stations
     }
@@ -379,12 +384,14 @@ def _slaves(index: Index, station: StationSection, port: str) -> dict[str, int]:
     return {slave.name: slave.station for slave in bus.slaves} if bus else {}
 
 
-def _written(index: Index, station: StationSection, loose: set[str]) -> Iterator[RouteSpec]:
+def _configured_routes(
+    index: Index, station: StationSection, shared: set[str]
+) -> Iterator[RouteSpec]:
     for route in station.routes:
         if route.mqtt:
             continue
         hop, router = next_hop(index, station, route)
-        for net_id, octets in reach(index, route, loose):
+        for net_id, octets in route_net_ids(index, route, shared):
             yield RouteSpec(
                 name=route.to,
                 net_id=net_id,
@@ -398,7 +405,7 @@ def _written(index: Index, station: StationSection, loose: set[str]) -> Iterator
             )
 
 
-def _derived(
+def _derived_routes(
     index: Index, station: StationSection, known: dict[str, list[tuple[str, int]]]
 ) -> Iterator[RouteSpec]:
     """Yield routes to the stations that share an interface or a broker with *station*.
@@ -473,7 +480,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     check_polls(index, report)
     check_links(index, report)
     check_routes(index, report, path.parent)
-    check_learning(index, report)
+    check_discovery(index, report)
     check_access(index, report, path.parent)
     if findings := report.findings():
         return PlantResult(None, findings)
@@ -482,7 +489,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
         derive(index, path.parent),
         derive_routing(index, path.parent),
         derive_directory(index),
-        audit_required=plant_file.access.audit is AuditDuty.REQUIRED,
+        audit_required=plant_file.access.audit is AuditMode.REQUIRED,
     )
     warnings = (*follow_routes(index, plant.routing, report), *warn_of_open_brokers(index, report))
     return PlantResult(plant, (), report.lines, warnings)

@@ -51,7 +51,7 @@ class NewPlant(msgspec.Struct, frozen=True):
     stations: int
 
 
-class _PortPlace(NamedTuple):
+class _StationAddress(NamedTuple):
     """One station's name and addresses."""
 
     number: int
@@ -107,7 +107,7 @@ def plant_text(
     )
 
 
-def _place(number: int, address: str, count: int) -> _PortPlace:
+def _place(number: int, address: str, count: int) -> _StationAddress:
     text = address.replace(NUMBER, str(number))
     try:
         uri = InterfaceUri.parse(text if "://" in text else f"udp://{text}")
@@ -130,10 +130,10 @@ def _place(number: int, address: str, count: int) -> _PortPlace:
             f" 10.0.0.{NUMBER} or ethernet://eth0"
         )
     width = max(2, len(str(count)))
-    return _PortPlace(number, f"station-{number:0{width}}", str(uri), net_id)
+    return _StationAddress(number, f"station-{number:0{width}}", str(uri), net_id)
 
 
-def _head(name: str, shape: Shape, places: list[_PortPlace]) -> Iterator[str]:
+def _head(name: str, shape: Shape, places: list[_StationAddress]) -> Iterator[str]:
     what = {
         Shape.RING: "each tells the next one its state",
         Shape.STAR: f"{places[0].name} tells all others what to do, and they tell it their states",
@@ -142,21 +142,21 @@ def _head(name: str, shape: Shape, places: list[_PortPlace]) -> Iterator[str]:
     yield "#"
 
 
-def _ring_drawing(places: list[_PortPlace]) -> Iterator[str]:
+def _ring_drawing(places: list[_StationAddress]) -> Iterator[str]:
     names = [place.name for place in places]
     if len(names) > _SHOWN:
         names = [*names[:2], "…", names[-1]]
     yield " ──► ".join([*names, names[0]])
 
 
-def _star_drawing(places: list[_PortPlace]) -> Iterator[str]:
+def _star_drawing(places: list[_StationAddress]) -> Iterator[str]:
     hub, *others = (place.name for place in places)
     shown = others if len(others) <= _SHOWN else [others[0], "…", others[-1]]
     for row, other in enumerate(shown):
         yield f"{hub if row == 0 else '':{len(hub)}} ◄──► {other}"
 
 
-def _usage(places: list[_PortPlace], file: str) -> Iterator[str]:
+def _usage(places: list[_StationAddress], file: str) -> Iterator[str]:
     first, second = places[0], places[1]
     yield "#"
     if first.interface.startswith("ethernet://"):
@@ -202,7 +202,7 @@ def _shared(shape: Shape, timeout_ms: int) -> Iterator[str]:
     yield ""
 
 
-def _ring(places: list[_PortPlace]) -> Iterator[str]:
+def _ring(places: list[_StationAddress]) -> Iterator[str]:
     for place, following in zip(places, [*places[1:], places[0]], strict=True):
         previous = places[place.number - 2]
         yield from _station(place)
@@ -215,7 +215,7 @@ def _ring(places: list[_PortPlace]) -> Iterator[str]:
         yield ""
 
 
-def _star(places: list[_PortPlace]) -> Iterator[str]:
+def _star(places: list[_StationAddress]) -> Iterator[str]:
     hub, *others = places
     yield from _station(hub)
     yield "    frames:"
@@ -240,7 +240,7 @@ def _star(places: list[_PortPlace]) -> Iterator[str]:
         yield ""
 
 
-def _station(place: _PortPlace) -> Iterator[str]:
+def _station(place: _StationAddress) -> Iterator[str]:
     yield "  - <<: *station"
     yield f"    name: {place.name}"
     yield f"    net_id: {place.net_id}.1.1"
@@ -251,10 +251,10 @@ def _station(place: _PortPlace) -> Iterator[str]:
     )
 
 
-def _destination(place: _PortPlace) -> str:
+def _destination(place: _StationAddress) -> str:
     """Return the destination of frames for *place*; the file has no MAC addresses."""
     return "multicast" if place.interface.startswith("ethernet://") else f"{place.name}/eap0"
 
 
-def _to(place: _PortPlace) -> str:
+def _to(place: _StationAddress) -> str:
     return f"to-{place.name.removeprefix('station-')}"

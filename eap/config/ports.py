@@ -45,7 +45,7 @@ _KEYWORDS = {
 }
 
 
-def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
+def resolve_destination(text: str, uri: InterfaceUri, index: Index) -> Destination:
     """Return the address that *text* stands for in a frame that leaves by *uri*.
 
     Raises:
@@ -57,10 +57,10 @@ def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
             raise ValueError(f"{text} has no usual address on {uri.scheme}://")
         return Destination.parse(keyword)
     if "/" in text and "://" not in text:
-        return _of_port(text, uri, index)
+        return _port_address(text, uri, index)
     destination = Destination.parse(text)
     if destination.kind is DestinationKind.NET_ID:
-        return _of_net_id(destination, uri, index)
+        return _net_id_address(destination, uri, index)
     if destination.kind not in DESTINATIONS.get(uri.scheme, ()):
         raise ValueError(f"{text} cannot be reached from {uri}")
     if destination.kind is DestinationKind.TCP and destination.is_group:
@@ -68,7 +68,7 @@ def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
     return destination
 
 
-def _of_net_id(destination: Destination, uri: InterfaceUri, index: Index) -> Destination:
+def _net_id_address(destination: Destination, uri: InterfaceUri, index: Index) -> Destination:
     """Return the address of the port with that NetID, or of the only EAP port of that router.
 
     On Ethernet it may be outside the plant: the engine learns its MAC address from its frames.
@@ -80,7 +80,7 @@ def _of_net_id(destination: Destination, uri: InterfaceUri, index: Index) -> Des
         several = ", ".join(f"{station}/{name}" for station, name in owners)
         raise ValueError(f"NetID {destination.host} is a router's, with several ports: {several}")
     if owners:
-        return _of_port("/".join(owners[0]), uri, index)
+        return _port_address("/".join(owners[0]), uri, index)
     if uri.scheme != "ethernet":
         raise ValueError(f"no port of this plant has the NetID {destination.host}")
     return destination
@@ -95,7 +95,7 @@ def find_net_id(text: str, index: Index) -> list[tuple[str, str]]:
     ]
 
 
-def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
+def _port_address(text: str, uri: InterfaceUri, index: Index) -> Destination:
     station, _, name = text.partition("/")
     target = index.uris.get((station, name))
     if target is None:
@@ -108,12 +108,12 @@ def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
         return Destination.parse(address)
     if target.scheme == uri.scheme == "ethernet" and port.kind is PortKind.EAP:
         return Destination(DestinationKind.NET_ID, str(port.net_id))
-    if uri.scheme in {"udp", "tcp"} and takes_tcp(port, target):
+    if uri.scheme in {"udp", "tcp"} and accepts_tcp(port, target):
         return Destination.parse(f"tcp://{address}")
     raise ValueError(f"{text} ({target}) has no address that is known for frames from {uri}")
 
 
-def takes_tcp(port: PortSection, uri: InterfaceUri) -> bool:
+def accepts_tcp(port: PortSection, uri: InterfaceUri) -> bool:
     """Return whether *port* accepts type 4 on TCP connections."""
     return uri.scheme == "tcp" or (uri.scheme == "udp" and port.tcp)
 
@@ -138,7 +138,7 @@ def reaches(
     if (destination.port or EAP_PORT) != (uri.port or EAP_PORT):
         return False
     if destination.kind is DestinationKind.TCP:
-        return takes_tcp(port, uri) and uri.host in {destination.host, "0.0.0.0"}  # noqa: S104
+        return accepts_tcp(port, uri) and uri.host in {destination.host, "0.0.0.0"}  # noqa: S104
     if uri.scheme != "udp":
         return False
     directed = port.broadcast and destination.host.endswith(".255")
@@ -159,7 +159,7 @@ def _vid(port: PortSection) -> int:
     return port.vlan.id if port.vlan else 0
 
 
-def check_address(
+def check_net_id_destination(
     index: Index,
     report: FindingReport,
     sent: tuple[StationSection, FrameSection],
@@ -175,7 +175,7 @@ def check_address(
         message = f"frame {frame.name!r} goes to the NetID of "
         if port is own:
             report.add(f"{frame.at}.to", f"{message}its own port", "another port")
-        elif not port.mac and not _is_heard(index, key, station, own):
+        elif not port.mac and not _is_mac_learned(index, key, station, own):
             line = report.line_of(port.at)
             message += f"{'/'.join(key)}, whose MAC address cannot be learned: no frame from there "
             message += "arrives by a MAC address or a group"
@@ -184,7 +184,7 @@ def check_address(
             )
 
 
-def _is_heard(
+def _is_mac_learned(
     index: Index, key: tuple[str, str], station: StationSection, own: PortSection
 ) -> bool:
     """Return whether a frame of port *key* arrives at port *own* without resolving a NetID."""
@@ -205,7 +205,7 @@ def _is_heard(
         if frame.to == REQUESTER:
             return True  # if this port sends the request
         try:
-            destination = resolve(frame.to, sender[1], index)
+            destination = resolve_destination(frame.to, sender[1], index)
         except ValueError:
             continue  # a finding of its own
         is_known = destination.kind is not DestinationKind.NET_ID or bool(own.mac)
@@ -215,7 +215,7 @@ def _is_heard(
     return False
 
 
-def check_monitoring(
+def check_frame_monitoring(
     report: FindingReport, frame: FrameSection, destination: Destination | None, uri: InterfaceUri
 ) -> None:
     """Report monitoring of a destination that cannot be monitored, and invalid addresses.
@@ -400,7 +400,7 @@ def _check_addresses(index: Index, report: FindingReport) -> None:
     for (station, name), uri in index.uris.items():
         port = index.ports[station, name]
         path = f"{port.at}.interface"
-        for key in _own_keys(station, port, uri):
+        for key in _own_addresses(station, port, uri):
             if key in first:
                 line = report.line_of(first[key])
                 message = f"{uri} is used twice (first in line {line})"
@@ -410,11 +410,11 @@ def _check_addresses(index: Index, report: FindingReport) -> None:
     _check_segments(index, report)
 
 
-def _own_keys(station: str, port: PortSection, uri: InterfaceUri) -> Iterator[tuple[str, ...]]:
+def _own_addresses(station: str, port: PortSection, uri: InterfaceUri) -> Iterator[tuple[str, ...]]:
     """Yield the addresses of *port* that no other port may have."""
     if uri.scheme == "udp":
         yield "UDP", uri.host, str(uri.port or EAP_PORT)
-    if port.kind is PortKind.EAP and takes_tcp(port, uri):
+    if port.kind is PortKind.EAP and accepts_tcp(port, uri):
         yield "TCP", uri.host, str(uri.port or EAP_PORT)
     if uri.scheme == "ethernet":
         # Stations share an interface, ports of one station would take each frame twice.

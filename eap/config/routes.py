@@ -49,7 +49,7 @@ _KINDS = {
 }
 
 
-class MisfitError(ValueError):
+class SectionError(ValueError):
     """The value of a key of a section is invalid.
 
     Attributes:
@@ -82,10 +82,10 @@ def next_hop(index: Index, station: StationSection, route: RouteSection) -> Next
         SectionError: the hop does not exist or cannot be reached.
     """
     if route.ams_tcp and route.via:
-        raise MisfitError("via", f"route {route.to!r} has via and ams_tcp", "one of the two")
+        raise SectionError("via", f"route {route.to!r} has via and ams_tcp", "one of the two")
     if route.port and (route.ams_tcp or route.via.startswith(MQTT)):
         message = f"route {route.to!r} leaves by no port of its own"
-        raise MisfitError("port", message, "port only for type 5 (via an address or STATION/PORT)")
+        raise SectionError("port", message, "port only for type 5 (via an address or STATION/PORT)")
     if route.ams_tcp:
         return _by_ams_tcp(index, station, route)
     if route.via.startswith(MQTT):
@@ -104,17 +104,17 @@ def _check_own_port(index: Index, station: StationSection, route: RouteSection) 
         message = (
             f"station {station.name} has no EAP port {route.port!r}{suggest(route.port, names)}"
         )
-        raise MisfitError("port", message, one_of(names))
+        raise SectionError("port", message, one_of(names))
 
 
 def _direct(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     target = target_of(index, route)
     if target is None:
-        raise MisfitError("", f"route {route.to!r} has no via and no ams_tcp", f"via: {VIA}")
+        raise SectionError("", f"route {route.to!r} has no via and no ams_tcp", f"via: {VIA}")
     hop = find_hop(index, station, target, own=route.port)
     if hop is None:
         message = f"{station.name} and {target.name} share no interface"
-        raise MisfitError("to", message, "via: a station between them, or ams_tcp:")
+        raise SectionError("to", message, "via: a station between them, or ams_tcp:")
     return NextHop(hop, str(target.net_id))
 
 
@@ -126,12 +126,12 @@ def _other_port(
     other = index.stations.get(name)
     if other is None:
         hint = suggest(name, index.stations)
-        raise MisfitError(key, f"no station {name!r} in this plant{hint}", one_of(index.stations))
+        raise SectionError(key, f"no station {name!r} in this plant{hint}", one_of(index.stations))
     if other is station:
-        raise MisfitError(key, f"{text} is of station {name} itself", "a port of another station")
+        raise SectionError(key, f"{text} is of station {name} itself", "a port of another station")
     if index.eap_port(other, port) is None:
         names = [f"{name}/{each.name}" for each in other.ports if each.kind is PortKind.EAP]
-        raise MisfitError(key, f"station {name} has no EAP port {port!r}", one_of(names))
+        raise SectionError(key, f"station {name} has no EAP port {port!r}", one_of(names))
     return other, port
 
 
@@ -141,7 +141,7 @@ def _by_station(index: Index, station: StationSection, route: RouteSection) -> N
     if hop is None:
         own = f"port {route.port}" if route.port else "any port"
         message = f"{route.via} cannot be reached from {own} of {station.name}"
-        raise MisfitError("via", message, "ports that are both of IP, or both of Ethernet")
+        raise SectionError("via", message, "ports that are both of IP, or both of Ethernet")
     return NextHop(hop, str(other.net_id))
 
 
@@ -151,12 +151,12 @@ def _by_ams_tcp(index: Index, station: StationSection, route: RouteSection) -> N
         uri = index.uris.get((other.name, port))
         if uri is None or uri.scheme not in {"udp", "tcp"} or not index.ports[other.name, port].ams:
             message = f"{route.ams_tcp} does not serve AMS/TCP"
-            raise MisfitError("ams_tcp", message, "a port on udp:// or tcp:// without ams: false")
+            raise SectionError("ams_tcp", message, "a port on udp:// or tcp:// without ams: false")
         return NextHop(_ams_tcp(uri.host, AMS_TCP_PORT), str(other.net_id))
     try:
         host, number = parse_host(route.ams_tcp, AMS_TCP_PORT)
     except ValueError as exc:
-        raise MisfitError("ams_tcp", f"ams_tcp: {exc}", f"{HOST}, or STATION/PORT") from None
+        raise SectionError("ams_tcp", f"ams_tcp: {exc}", f"{HOST}, or STATION/PORT") from None
     target = target_of(index, route)
     return NextHop(_ams_tcp(host, number), str(target.net_id) if target else "")
 
@@ -171,14 +171,16 @@ def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> Next
     if find_network(station, network) is None:
         known = [f"{MQTT}{each.network}" for each in brokers_of(station)]
         message = f"station {station.name} is in no MQTT network {network!r}"
-        raise MisfitError("via", message, one_of(known))
+        raise SectionError("via", message, one_of(known))
     other = index.stations.get(name) if name else target_of(index, route)
     if name and other is None:
         hint = suggest(name, index.stations)
-        raise MisfitError("via", f"no station {name!r} in this plant{hint}", one_of(index.stations))
+        raise SectionError(
+            "via", f"no station {name!r} in this plant{hint}", one_of(index.stations)
+        )
     if other is not None and find_network(other, network) is None:
         message = f"station {other.name} is in no MQTT network {network!r}"
-        raise MisfitError("via", message, "a network that both are in")
+        raise SectionError("via", message, "a network that both are in")
     router = str(other.net_id) if other is not None else _foreign_router(route)
     return NextHop(HopSpec(TransportKind.MQTT, network, router), router)
 
@@ -188,16 +190,16 @@ def _foreign_router(route: RouteSection) -> str:
         return str(NetId.parse(route.net_id))
     except ValueError:
         message = f"route {route.to!r} does not say which router of the network receives it"
-        raise MisfitError("via", message, "mqtt:NETWORK/STATION, or a net_id") from None
+        raise SectionError("via", message, "mqtt:NETWORK/STATION, or a net_id") from None
 
 
 def _by_address(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     try:
         destination = Destination.parse(route.via)
     except ValueError as exc:
-        raise MisfitError("via", f"via: {exc}", VIA) from None
+        raise SectionError("via", f"via: {exc}", VIA) from None
     if destination.is_group:
-        raise MisfitError("via", f"{route.via} is a group", "the address of one station")
+        raise SectionError("via", f"{route.via} is a group", "the address of one station")
     schemes = _SCHEMES[destination.kind]
     ports = {
         port.name: uri
@@ -208,8 +210,8 @@ def _by_address(index: Index, station: StationSection, route: RouteSection) -> N
     if not ports:
         own = f"port {route.port}" if route.port else f"station {station.name}"
         message = f"{route.via} cannot be reached from {own}"
-        raise MisfitError("via", message, f"a port on {' or '.join(schemes)}://")
-    port = _nearest(ports, destination, route)
+        raise SectionError("via", message, f"a port on {' or '.join(schemes)}://")
+    port = _closest_port(ports, destination, route)
     target = target_of(index, route)
     address = destination.host
     if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
@@ -218,44 +220,46 @@ def _by_address(index: Index, station: StationSection, route: RouteSection) -> N
     return NextHop(hop, str(target.net_id) if target else "")
 
 
-def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: RouteSection) -> str:
+def _closest_port(
+    ports: dict[str, InterfaceUri], destination: Destination, route: RouteSection
+) -> str:
     """Return the port whose IPv4 address shares most leading bits with *destination*."""
     if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
         there = int(IPv4Address(destination.host))
         return min(ports, key=lambda name: int(IPv4Address(ports[name].host)) ^ there)
     if len(ports) > 1:
         message = f"route {route.to!r} does not say by which Ethernet interface"
-        raise MisfitError("port", message, one_of(ports))
+        raise SectionError("port", message, one_of(ports))
     return next(iter(ports))
 
 
-WHOLE = 6
-NOBODY = NetId(bytes(WHOLE))
+NET_ID_OCTETS = 6
+ANY_NET_ID = NetId(bytes(NET_ID_OCTETS))
 
 
-def reach(index: Index, route: RouteSection, loose: set[str]) -> list[tuple[str, int]]:
+def route_net_ids(index: Index, route: RouteSection, shared: set[str]) -> list[tuple[str, int]]:
     """Return NetID and octets to match of each part of *route*.
 
-    *loose* are the stations that :func:`without_prefix` returns.
+    *shared* are the stations that :func:`stations_without_prefix` returns.
     """
     if route.to == DEFAULT_TARGET:
-        return [(str(NOBODY), 0)]
+        return [(str(ANY_NET_ID), 0)]
     target = target_of(index, route)
     if target is None:
         return [(str(NetId.parse(route.net_id)), route.octets or STATION_OCTETS)]
     # A virtual NetID replaces a prefix: it cannot stand for several NetIDs of one station.
-    return net_ids_of(target, set() if route.virtual else loose)
+    return net_ids_of(target, set() if route.virtual else shared)
 
 
-def net_ids_of(station: StationSection, loose: set[str]) -> list[tuple[str, int]]:
+def net_ids_of(station: StationSection, shared: set[str]) -> list[tuple[str, int]]:
     """Return the NetIDs of *station*, each with the number of octets to match."""
     router = str(station.net_id)
-    if station.name not in loose:
+    if station.name not in shared:
         return [(router, STATION_OCTETS)]
-    return [(router, WHOLE), *((str(port.net_id), WHOLE) for port in station.ports)]
+    return [(router, NET_ID_OCTETS), *((str(port.net_id), NET_ID_OCTETS) for port in station.ports)]
 
 
-def without_prefix(index: Index) -> set[str]:
+def stations_without_prefix(index: Index) -> set[str]:
     """Return the stations that share the first four octets of a NetID, or use several."""
     owners: dict[bytes, set[str]] = {}
     for station in index.plant.stations:
@@ -351,14 +355,14 @@ _OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four nu
 
 def check_routes(index: Index, report: FindingReport, folder: Path) -> None:
     """Report every invalid route and broker; files are in *folder*."""
-    loose = without_prefix(index)
+    shared = stations_without_prefix(index)
     for station in index.plant.stations:
         claimed: dict[bytes, RouteSection] = {}
         for route in station.routes:
             _check_keys(route, report)
             if not route.mqtt:
                 _check_route(index, station, route, report)
-                _check_claims(index, (station, route), claimed, loose, report)
+                _check_claims(index, (station, route), claimed, shared, report)
     check_brokers(index, report, folder)
 
 
@@ -392,7 +396,7 @@ def _check_route(
         return  # reported already
     try:
         next_hop(index, station, route)
-    except MisfitError as exc:
+    except SectionError as exc:
         path = f"{route.at}.{exc.key}" if exc.key else route.at
         report.add(path, str(exc), exc.expected)
     except ValueError:
@@ -435,13 +439,13 @@ def _check_claims(
     index: Index,
     sent: tuple[StationSection, RouteSection],
     claimed: dict[bytes, RouteSection],
-    loose: set[str],
+    shared: set[str],
     report: FindingReport,
 ) -> None:
     """Report NetIDs that belong to another station, or to another route of the station."""
     station, route = sent
     try:
-        claims = reach(index, route, loose)
+        claims = route_net_ids(index, route, shared)
         if route.virtual and route.to != DEFAULT_TARGET:
             claims = [(route.virtual, octets) for _, octets in claims]
         keys = [NetId.parse(net_id)[:octets] for net_id, octets in claims]
@@ -449,7 +453,7 @@ def _check_claims(
         return  # a finding of its own
     for key in keys:
         if key in claimed:
-            _report_doubled(claimed[key], route, report)
+            _report_duplicate(claimed[key], route, report)
             return
         claimed[key] = route
     if route.to != DEFAULT_TARGET and (route.virtual or target_of(index, route) is None):
@@ -457,7 +461,7 @@ def _check_claims(
         _check_owners(index, station, where, keys, report)
 
 
-def _report_doubled(first: RouteSection, route: RouteSection, report: FindingReport) -> None:
+def _report_duplicate(first: RouteSection, route: RouteSection, report: FindingReport) -> None:
     line = report.line_of(first.at)
     if first.to == route.to:
         report.add(route.at, f"a second route to {route.to!r} (first in line {line})", "one")
@@ -489,7 +493,7 @@ def follow_routes(
         routing: Specifications of its routers.
         report: Report of the plant file, for its lines.
     """
-    plant = _Plant(index, routing)
+    plant = _PlantRouters(index, routing)
     found = []
     for station in index.plant.stations:
         for route in station.routes:
@@ -500,7 +504,7 @@ def follow_routes(
     return tuple(found)
 
 
-def _follow(plant: _Plant, station: StationSection, to: str) -> str:
+def _follow(plant: _PlantRouters, station: StationSection, to: str) -> str:
     """Return the error of the route called *to*, empty if none is known."""
     for spec in plant.routing[station.name].routes:
         if spec.name == to and spec.octets:
@@ -509,12 +513,12 @@ def _follow(plant: _Plant, station: StationSection, to: str) -> str:
             following = plant.next_station(spec.router)
             while following and plant.owners.get(net_id) != following:
                 if following in names:
-                    circle = " -> ".join([*names, following])
-                    return f"the route to {to!r} runs in a loop: {circle}"
+                    loop = " -> ".join([*names, following])
+                    return f"the route to {to!r} runs in a loop: {loop}"
                 names.append(following)
                 found = plant.table(following).find(net_id)
                 if found is None:
-                    if plant.may_learn(following):
+                    if plant.discovers_routes(following):
                         break
                     return f"the route to {to!r} ends at {following}, which has no route to it"
                 net_id = found[0].to_real(net_id)
@@ -522,7 +526,7 @@ def _follow(plant: _Plant, station: StationSection, to: str) -> str:
     return ""
 
 
-class _Plant:
+class _PlantRouters:
     """The routers of a plant by their NetIDs."""
 
     def __init__(self, index: Index, routing: Mapping[str, RoutingSpec]) -> None:
@@ -539,7 +543,7 @@ class _Plant:
         """Return the station of a router, empty if the router is not in this plant."""
         return self._routers.get(router, "")
 
-    def may_learn(self, station: str) -> bool:
+    def discovers_routes(self, station: str) -> bool:
         """Return whether a station auto-discovers routes."""
         routing = self.routing[station]
         return any(routing.learns_by_mqtt(each.network) for each in routing.mqtt)

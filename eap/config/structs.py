@@ -34,13 +34,13 @@ FrameRetries = Annotated[int, Meta(ge=0, le=20)]
 Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
 MAX_BITS = 8 * 0xFFFF
 """Size of the largest variable."""
-MAX_PATIENCE_MS = 600_000
+MAX_ANSWER_MS = 600_000
 """Largest timeout of an answer."""
 BitOffset = Annotated[int, Meta(ge=0, le=MAX_BITS - 1)]
 Plain: TypeAlias = bool | int | float | str | list[bool | int | float]
 
 
-NO_NET_ID = NetId(b"")
+INVALID_NET_ID = NetId(b"")
 """Placeholder for an invalid NetID, which is a finding of its own."""
 
 
@@ -73,7 +73,7 @@ class GatewaySection(Section, frozen=True):
 
     enabled: bool = True
     port: Annotated[int, Meta(ge=1, le=0xFFFF)] | None = None
-    answer_ms: Annotated[int, Meta(ge=10, le=MAX_PATIENCE_MS)] = 900
+    answer_ms: Annotated[int, Meta(ge=10, le=MAX_ANSWER_MS)] = 900
     silent: bool = False
     full: bool = False
     padded: bool = False
@@ -269,7 +269,7 @@ class RouteSection(Section, frozen=True):
     octets: Annotated[int, Meta(ge=4, le=6)] | None = None
     virtual: str = ""
     unidirectional: bool = False
-    timeout_ms: Annotated[int, Meta(ge=0, le=MAX_PATIENCE_MS)] = 0
+    timeout_ms: Annotated[int, Meta(ge=0, le=MAX_ANSWER_MS)] = 0
     probe: bool = True
     mqtt: str = ""
     network: str = ""
@@ -352,7 +352,7 @@ class Defaults(Section, frozen=True):
     cycle_us: DeviceCycle = 10_000
 
 
-class AuditDuty(StrEnum):
+class AuditMode(StrEnum):
     """Treatment of changes that the audit cannot record."""
 
     OPTIONAL = "optional"
@@ -364,7 +364,7 @@ class AuditDuty(StrEnum):
 class PlantAccess(Section, frozen=True):
     """Rules for the access to all stations; each has rules of its own beside them."""
 
-    audit: AuditDuty = AuditDuty.OPTIONAL
+    audit: AuditMode = AuditMode.OPTIONAL
 
 
 class PlantFile(Section, frozen=True):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from eap.codec import datatypes
 from eap.codec.values import DataType
-from eap.config.exchange import is_unread
+from eap.config.exchange import is_unresolved
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.ports import check_names
@@ -225,7 +225,7 @@ def ends(link: LinkSection, source: DataType, target: DataType) -> Ends:
     return Ends(Span(link.source, from_bit, bits), Span(link.target, to_bit, bits))
 
 
-def in_order(links: Sequence[Ends]) -> list[int]:
+def execution_order(links: Sequence[Ends]) -> list[int]:
     """Return the positions of *links* in execution order, without those in and behind a loop.
 
     Links that do not depend on each other keep their order.
@@ -248,32 +248,32 @@ def in_order(links: Sequence[Ends]) -> list[int]:
     return order
 
 
-def find_circles(links: Sequence[Ends]) -> list[list[int]]:
+def find_loops(links: Sequence[Ends]) -> list[list[int]]:
     """Return loops of *links* that have no link in common, each in the direction of its values."""
     before = _predecessors(links)
-    left = set(range(len(links))) - set(in_order(links))
-    circles = []
+    left = set(range(len(links))) - set(execution_order(links))
+    loops = []
     while left:
-        circle = _walk_back(before, left)
-        if circle:
-            first = circle.index(min(circle))
-            circles.append(circle[first:] + circle[:first])
-    return circles
+        loop = _walk_back(before, left)
+        if loop:
+            first = loop.index(min(loop))
+            loops.append(loop[first:] + loop[:first])
+    return loops
 
 
 def _walk_back(before: Sequence[Sequence[int]], left: set[int]) -> list[int]:
     """Walk back to the first repeated link; remove the loop, or a link without one, from *left*."""
-    way = [min(left)]
+    path = [min(left)]
     while True:
-        earlier = next((each for each in before[way[-1]] if each in left), None)
+        earlier = next((each for each in before[path[-1]] if each in left), None)
         if earlier is None:
-            left.discard(way[-1])
+            left.discard(path[-1])
             return []
-        if earlier in way:
-            circle = way[way.index(earlier) :][::-1]
-            left.difference_update(circle)
-            return circle
-        way.append(earlier)
+        if earlier in path:
+            loop = path[path.index(earlier) :][::-1]
+            left.difference_update(loop)
+            return loop
+        path.append(earlier)
 
 
 def _predecessors(links: Sequence[Ends]) -> list[list[int]]:
@@ -307,8 +307,8 @@ def check_links(index: Index, report: FindingReport) -> None:
             if source is None or target is None or not _fits(link, source, target, report):
                 continue
             known.append((link, ends(link, source, target)))
-        _check_once(known, report)
-        _check_circles(known, report)
+        _check_duplicates(known, report)
+        _check_loops(known, report)
 
 
 def _kind(
@@ -317,7 +317,7 @@ def _kind(
     """Return the type of a variable; None, with a finding, if there is none."""
     text = index.type_text(station, name)
     if text is None:
-        if not is_unread(index, report, station, name):
+        if not is_unresolved(index, report, station, name):
             names = index.names(station)
             message = f"station {station.name} has no variable {name!r}{suggest(name, names)}"
             report.add(path, message, one_of(names))
@@ -426,7 +426,7 @@ def _is_number(kind: DataType) -> bool:
     return kind.scalar_range is not None and kind.text != "BOOL"
 
 
-def _check_once(links: list[tuple[LinkSection, Ends]], report: FindingReport) -> None:
+def _check_duplicates(links: list[tuple[LinkSection, Ends]], report: FindingReport) -> None:
     first: dict[str, list[tuple[LinkSection, Ends]]] = {}
     for link, both in links:
         others = first.setdefault(link.target, [])
@@ -440,8 +440,8 @@ def _check_once(links: list[tuple[LinkSection, Ends]], report: FindingReport) ->
             )
 
 
-def _check_circles(links: list[tuple[LinkSection, Ends]], report: FindingReport) -> None:
-    for circle in find_circles([both for _, both in links]):
-        members = [links[position][0] for position in circle]
-        way = " → ".join([members[0].source, *(link.target for link in members)])
-        report.add(members[0].at, f"links form a loop: {way}", "one of them to be left out")
+def _check_loops(links: list[tuple[LinkSection, Ends]], report: FindingReport) -> None:
+    for loop in find_loops([both for _, both in links]):
+        members = [links[position][0] for position in loop]
+        path = " → ".join([members[0].source, *(link.target for link in members)])
+        report.add(members[0].at, f"links form a loop: {path}", "one of them to be left out")

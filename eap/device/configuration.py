@@ -204,7 +204,7 @@ def compare(old: EapDictionary, new: EapDictionary) -> list[EntryChange]:
 class _Comparison:
     def __init__(self, old: EapDictionary, new: EapDictionary) -> None:
         self._old_dictionary, self._new_dictionary = old, new
-        self._old, self._new = _kept(old), _kept(new)
+        self._old, self._new = _without_empty_mappings(old), _without_empty_mappings(new)
         self._blank = new.blank()
 
     def run(self) -> Iterator[EntryChange]:
@@ -214,7 +214,7 @@ class _Comparison:
         yield from self._cut_lists()
         rewritten = self._mappings_to_write()
         yield from self._emptied(rewritten)
-        yield from self._detached()
+        yield from self._cleared_references()
         for row in (*_PDS, *profile.VARIABLES):
             yield from self._removed(row)
         for row in profile.VARIABLES:
@@ -286,7 +286,7 @@ class _Comparison:
             if index in self._old:
                 yield self._change(index, 0, _NONE, interim=index in self._new)
 
-    def _detached(self) -> Iterator[EntryChange]:
+    def _cleared_references(self) -> Iterator[EntryChange]:
         """Clear references that change, and those between PDs that are all removed."""
         for row in _PDS:
             for index in self._members(row, self._old):
@@ -375,7 +375,7 @@ class _Comparison:
         return f"{self._title(index)}: {entry}"
 
 
-def _kept(dictionary: EapDictionary) -> Configuration:
+def _without_empty_mappings(dictionary: EapDictionary) -> Configuration:
     """Return the configuration without empty mappings, which map nothing."""
     return {
         index: entries

@@ -76,7 +76,7 @@ class LiveValues(Protocol):
         """Show counters of one moment for the length of a block."""
 
 
-class NothingRuns:
+class NoLiveValues:
     """Live values of a device whose engine does not run."""
 
     def octets(self, key: str, name: str) -> bytes | None:
@@ -139,7 +139,7 @@ class EapDictionary(ObjectDictionary):
         self.station = station
         self.port: PortSpec = next(each for each in station.ports if each.name == port)
         self.uri = InterfaceUri.parse(self.port.interface)
-        self.live: LiveValues = live or NothingRuns()
+        self.live: LiveValues = live or NoLiveValues()
         self.identity = identity
         self.on_request: Callable[[int], object] | None = None
         self.on_change: Callable[[int, int], None] | None = None
@@ -281,7 +281,7 @@ class EapDictionary(ObjectDictionary):
                     return index
         return 0
 
-    def user_of(self, index: int) -> tuple[int, int] | None:
+    def reference_to(self, index: int) -> tuple[int, int] | None:
         """Return the entry (object, sub-index) that refers to the object at *index*, if any."""
         row = profile.row_of(index)
         if row in profile.VARIABLES:
@@ -352,20 +352,22 @@ class EapDictionary(ObjectDictionary):
     def download(self, index: int, subindex: int, data: bytes, state: OdState) -> None:
         """Write one entry; creates and deletes dynamic objects."""
         with self._all_or_nothing(index):
-            is_new = self._make_free(index, subindex, state)
+            is_new = self._create_missing(index, subindex, state)
             row = profile.row_of(index)
             if is_new and subindex == 0 and data == b"\0" and not row.mapping:
                 raise SdoAbortError(AbortCode.NO_OBJECT, index, 0)
             self._write(row, index, subindex, data, state)
-            self._settle(row, index, [subindex], state)
+            self._finish_download(row, index, [subindex], state)
 
     def download_complete(self, index: int, first: int, data: bytes, state: OdState) -> None:
         """Write a whole object by complete access; sub-index 0 sets the length of a list."""
         with self._all_or_nothing(index):
-            self._make_free(index, first, state)
+            self._create_missing(index, first, state)
             row = profile.row_of(index)
             self._write_whole(row, index, first, data, state)
-            self._settle(row, index, list(self[index].entries) if index in self else [], state)
+            self._finish_download(
+                row, index, list(self[index].entries) if index in self else [], state
+            )
 
     def check_download(
         self, index: int, subindex: int, size: int, state: OdState, *, complete: bool = False
@@ -408,7 +410,7 @@ class EapDictionary(ObjectDictionary):
             detail = "objects are made in PreOp"
             raise SdoAbortError(AbortCode.DEVICE_STATE, index, subindex, detail)
 
-    def _make_free(self, index: int, subindex: int, state: OdState) -> bool:
+    def _create_missing(self, index: int, subindex: int, state: OdState) -> bool:
         """Create the object at *index* if it is dynamic and does not exist."""
         row = profile.find(index)
         if index in self or row is None or not row.dynamic:
@@ -432,7 +434,7 @@ class EapDictionary(ObjectDictionary):
         if has_count:
             if count == 0 and data:
                 raise SdoAbortError(AbortCode.TOO_LONG, index, 0, "nothing follows a 0")
-            self._make_room(row, item, count, state)
+            self._resize(row, item, count, state)
             if index not in self:
                 return
         chosen = [(sub, each) for sub, each in item.entries.items() if 1 <= sub <= count]
@@ -441,7 +443,7 @@ class EapDictionary(ObjectDictionary):
         if has_count and row.mapping:
             self._write_count(row, item, bytes((count,)), state)
 
-    def _make_room(self, row: ProfileObject, item: OdObject, count: int, state: OdState) -> None:
+    def _resize(self, row: ProfileObject, item: OdObject, count: int, state: OdState) -> None:
         """Empty a mapping and add *count* entries, or resize a list; 0 may delete the object."""
         if row.mapping:
             self._write_count(row, item, b"\0", state)
@@ -487,7 +489,9 @@ class EapDictionary(ObjectDictionary):
                 detail = f"{max(item.entries)} entries are written"
                 raise SdoAbortError(AbortCode.NO_SUBINDEX, index, count, detail)
             for subindex in range(1, count + 1):
-                check_mapped(self, item.entries[subindex].value, _right(row), index, subindex)
+                check_mapped(
+                    self, item.entries[subindex].value, _mapping_right(row), index, subindex
+                )
             lay_out_mapping(self, index, count, data_budget(self.uri.scheme))
         elif count == 0 and row.dynamic:
             self._check_unused(index, 0)
@@ -505,17 +509,19 @@ class EapDictionary(ObjectDictionary):
         if item.max_subindex:
             raise SdoAbortError(AbortCode.SUBINDEX_0_NOT_ZERO, item.index, subindex)
         word = int.from_bytes(data, "little")
-        check_mapped(self, word, _right(row), item.index, subindex)
+        check_mapped(self, word, _mapping_right(row), item.index, subindex)
 
     def _check_unused(self, index: int, subindex: int) -> None:
-        user = self.user_of(index)
+        user = self.reference_to(index)
         if user is not None:
             is_mapped = profile.row_of(index) in profile.VARIABLES
             code = AbortCode.MAPPED if is_mapped else AbortCode.PARAMETER
             detail = f"{ObjectId(*user)} refers to it"
             raise SdoAbortError(code, index, subindex, detail)
 
-    def _settle(self, row: ProfileObject, index: int, written: list[int], state: OdState) -> None:
+    def _finish_download(
+        self, row: ProfileObject, index: int, written: list[int], state: OdState
+    ) -> None:
         """Check the budgets of the frames that written entries affect, and call the callbacks."""
         if index not in self:
             return
@@ -567,7 +573,7 @@ def is_counted(item: OdObject) -> bool:
     return item.entries[0].access == CONFIG
 
 
-def _right(row: ProfileObject) -> Access:
+def _mapping_right(row: ProfileObject) -> Access:
     is_sent = row in {profile.TX_PDO, profile.MORE_TX_PDO}
     return Access.TX_MAPPABLE if is_sent else Access.RX_MAPPABLE
 

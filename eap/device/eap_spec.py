@@ -74,10 +74,10 @@ def fill(dictionary: EapDictionary, like: EapDictionary | None = None) -> None:
         DeviceFault: the port has more than there are objects for, or a PD more variables than a
             mapping has entries, or a text is too long for its entry.
     """
-    _Filling(dictionary, like).run()
+    _DictionaryFiller(dictionary, like).run()
 
 
-class _Filling:
+class _DictionaryFiller:
     def __init__(self, dictionary: EapDictionary, like: EapDictionary | None) -> None:
         self._dictionary = dictionary
         self._like = like

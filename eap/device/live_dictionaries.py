@@ -209,7 +209,7 @@ class MasterDictionary(ObjectDictionary):
             self[index].entries[subindex].value = value
 
     def __contains__(self, index: int) -> bool:
-        return index in self._objects or index in self._moving()
+        return index in self._objects or index in self._dynamic_indexes()
 
     def __getitem__(self, index: int) -> OdObject:
         """Return the object at *index*; refuse with NO_OBJECT."""
@@ -220,10 +220,10 @@ class MasterDictionary(ObjectDictionary):
 
     def __iter__(self) -> Iterator[OdObject]:
         """Yield the objects in the order of their indexes."""
-        return (self[index] for index in sorted({*self._objects, *self._moving()}))
+        return (self[index] for index in sorted({*self._objects, *self._dynamic_indexes()}))
 
     def __len__(self) -> int:
-        return len(self._objects) + len(self._moving())
+        return len(self._objects) + len(self._dynamic_indexes())
 
     def upload_complete(self, index: int, first: int, state: OdState) -> bytes:
         """Return a whole object as :class:`ObjectDictionary` does, padded if configured."""
@@ -246,7 +246,7 @@ class MasterDictionary(ObjectDictionary):
             start += size
         return bytes(padded)
 
-    def _moving(self) -> set[int]:
+    def _dynamic_indexes(self) -> set[int]:
         found: set[int] = set()
         for row in master1100.SLAVES:
             found.update(range(row.first, row.first + len(self._stations(row))))

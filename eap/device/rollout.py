@@ -156,27 +156,27 @@ def without_alternates(spec: StationSpec) -> StationSpec:
     return spec if pds == spec.subscriptions else replace(spec, subscriptions=pds)
 
 
-class _Wire:
+class _SentPds:
     """PDs that all stations send at one moment."""
 
     def __init__(self, specs: Mapping[str, StationSpec]) -> None:
         self._sent: dict[str, dict[PdKey, list[PdLayout]]] = {}
         self._senders: dict[int, dict[str, None]] = {}
         for name, spec in specs.items():
-            self.switch(name, spec)
+            self.update(name, spec)
 
-    def switch(self, station: str, spec: StationSpec) -> None:
+    def update(self, station: str, spec: StationSpec) -> None:
         """Replace the PDs of *station* by those of *spec*."""
         sent = self._sent[station] = {}
         for key, _, layout in sent_pds(spec):
             sent.setdefault(key, []).append(layout)
             self._senders.setdefault(key.pd_id, {})[station] = None
 
-    def of(self, station: str) -> dict[PdKey, list[PdLayout]]:
+    def sent_by(self, station: str) -> dict[PdKey, list[PdLayout]]:
         """Return the layouts of the PDs that *station* sends."""
         return self._sent.get(station, {})
 
-    def heard(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, PdKey, PdLayout]]:
+    def received_by(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, PdKey, PdLayout]]:
         """Yield sender, key and layout of each PD that *pd* of *station* receives."""
         for sender in self._senders.get(pd.pd_id, {}):
             if sender == station:
@@ -193,19 +193,19 @@ class _Rollout:
     def __init__(self, old: Mapping[str, StationSpec], new: Mapping[str, StationSpec]) -> None:
         self._current = dict(old)
         self._new = new
-        self._now = _Wire(old)
-        self._later = _Wire(new)
+        self._now = _SentPds(old)
+        self._later = _SentPds(new)
         self._changed = [name for name in old if name in new and old[name] != new[name]]
         self._steps: list[Step] = []
 
     def run(self) -> list[Step]:
-        senders = {name for name in self._changed if self._sends_otherwise(name)}
+        senders = {name for name in self._changed if self._sends_differently(name)}
         waiting = []
         for name in self._changed:
-            prepared = self._tolerant(name, self._current[name], self._later)
+            prepared = self._accept_layouts(name, self._current[name], self._later)
             if prepared == self._current[name]:
                 waiting.append(name)
-            elif name in senders or self._ending(name) or self._faster(name):
+            elif name in senders or self._ending_senders(name) or self._faster_senders(name):
                 self._step(name, prepared, "accepts old and new layouts; sends as before")
                 waiting.append(name)
             else:
@@ -221,10 +221,13 @@ class _Rollout:
         left = dict.fromkeys(waiting)
         old_senders = {name: self._senders_of_old(name) for name in waiting}
         best_after = {
-            name: old_senders[name] | self._ending(name) | self._faster(name) for name in waiting
+            name: old_senders[name] | self._ending_senders(name) | self._faster_senders(name)
+            for name in waiting
         }
         for name in waiting:
-            for sender in (self._beginning(name) | self._slower(name)) & best_after.keys():
+            for sender in (
+                self._beginning_senders(name) | self._slower_senders(name)
+            ) & best_after.keys():
                 best_after[sender].add(name)
         while left:
             best = (name for name in left if not best_after[name] & left.keys())
@@ -235,18 +238,18 @@ class _Rollout:
 
     def _change(self, name: str) -> None:
         """Change *name* to its new specification, with alternates for old layouts still sent."""
-        new = self._tolerant(name, self._new[name], self._now)
+        new = self._accept_layouts(name, self._new[name], self._now)
         more = "" if new == self._new[name] else "; accepts old layouts too"
         self._step(name, new, f"runs the new configuration{more}")
 
     def _step(self, name: str, spec: StationSpec, why: str) -> None:
         self._current[name] = spec
-        self._now.switch(name, spec)
+        self._now.update(name, spec)
         self._steps.append(Step(name, spec, why))
 
-    def _sends_otherwise(self, name: str) -> bool:
-        now = self._now.of(name)
-        return any(now.get(key) != sent for key, sent in self._later.of(name).items())
+    def _sends_differently(self, name: str) -> bool:
+        now = self._now.sent_by(name)
+        return any(now.get(key) != sent for key, sent in self._later.sent_by(name).items())
 
     def _senders_of_old(self, name: str) -> set[str]:
         """Return the senders of layouts that *name* will not accept after its change."""
@@ -255,47 +258,47 @@ class _Rollout:
         return {
             sender
             for pd in spec.subscriptions
-            for sender, _, layout in self._now.heard(name, pd)
-            if not _takes(_forms(pd, types), layout)
+            for sender, _, layout in self._now.received_by(name, pd)
+            if not _accepts(_accepted_layouts(pd, types), layout)
         }
 
-    def _ending(self, name: str) -> set[str]:
+    def _ending_senders(self, name: str) -> set[str]:
         """Return the senders to *name* of PDs that end."""
         return _only_in(self._now, self._later, self._current[name])
 
-    def _beginning(self, name: str) -> set[str]:
+    def _beginning_senders(self, name: str) -> set[str]:
         """Return the senders to *name* of PDs that begin."""
         return _only_in(self._later, self._now, self._new[name])
 
-    def _slower(self, name: str) -> set[str]:
+    def _slower_senders(self, name: str) -> set[str]:
         """Return the senders to *name* of PDs whose steps grow or are no longer fixed."""
-        return self._repaced(name, lambda old, new: old < new)
+        return self._senders_with_step(name, lambda old, new: old < new)
 
-    def _faster(self, name: str) -> set[str]:
+    def _faster_senders(self, name: str) -> set[str]:
         """Return the senders to *name* of PDs whose steps shrink."""
-        return self._repaced(name, lambda old, new: old > new)
+        return self._senders_with_step(name, lambda old, new: old > new)
 
-    def _repaced(self, name: str, compare: Callable[[float, float], bool]) -> set[str]:
+    def _senders_with_step(self, name: str, compare: Callable[[float, float], bool]) -> set[str]:
         old = {pd.name: pd.step or inf for pd in self._current[name].subscriptions}
         return {
             sender
             for pd in self._new[name].subscriptions
             if pd.name in old and compare(old[pd.name], pd.step or inf)
-            for sender, _, _ in self._now.heard(name, pd)
+            for sender, _, _ in self._now.received_by(name, pd)
         }
 
-    def _tolerant(self, name: str, spec: StationSpec, wire: _Wire) -> StationSpec:
+    def _accept_layouts(self, name: str, spec: StationSpec, wire: _SentPds) -> StationSpec:
         """Return *spec* with alternates for the layouts on *wire* that *name* does not accept."""
         types = types_of(spec)
         pds = tuple(self._with_alternates(name, pd, types, wire) for pd in spec.subscriptions)
         return spec if pds == spec.subscriptions else replace(spec, subscriptions=pds)
 
     def _with_alternates(
-        self, name: str, pd: RxPdSpec, types: Mapping[str, str], wire: _Wire
+        self, name: str, pd: RxPdSpec, types: Mapping[str, str], wire: _SentPds
     ) -> RxPdSpec:
-        for _, _, layout in wire.heard(name, pd):
-            forms = _forms(pd, types)
-            if not _takes(forms, layout):
+        for _, _, layout in wire.received_by(name, pd):
+            forms = _accepted_layouts(pd, types)
+            if not _accepts(forms, layout):
                 ours = self._own_names(name, pd, forms)
                 if ours is not None:
                     pd = replace(pd, alternates=(*pd.alternates, _alternate(ours, layout)))
@@ -310,24 +313,24 @@ class _Rollout:
         station sends yet has no names, because it has no values to keep up to date.
         """
         for wire in (self._now, self._later):
-            for _, _, layout in wire.heard(name, pd):
+            for _, _, layout in wire.received_by(name, pd):
                 for form in forms:
-                    if _takes([form], layout):
+                    if _accepts([form], layout):
                         return _names(form, layout)
-        return None if any(self._now.heard(name, pd)) else {}
+        return None if any(self._now.received_by(name, pd)) else {}
 
 
-def _only_in(wire: _Wire, other: _Wire, spec: StationSpec) -> set[str]:
+def _only_in(wire: _SentPds, other: _SentPds, spec: StationSpec) -> set[str]:
     """Return the senders to *spec* of PDs that are on *wire* and not on *other*."""
     return {
         sender
         for pd in spec.subscriptions
-        for sender, key, _ in wire.heard(spec.name, pd)
-        if key not in other.of(sender)
+        for sender, key, _ in wire.received_by(spec.name, pd)
+        if key not in other.sent_by(sender)
     }
 
 
-def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[PdLayout]:
+def _accepted_layouts(pd: RxPdSpec, types: Mapping[str, str]) -> list[PdLayout]:
     """Return the layout of *pd* itself and those of its alternates, with local names."""
     own = lay_out(pd.version, ((name, types[name]) for name in pd.variables))
     return [own._replace(any_version=pd.ignore_version)] + [
@@ -335,7 +338,7 @@ def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[PdLayout]:
     ]
 
 
-def _takes(forms: list[PdLayout], layout: PdLayout) -> bool:
+def _accepts(forms: list[PdLayout], layout: PdLayout) -> bool:
     """Return whether one of *forms* accepts a PD of *layout*."""
     return any(
         form.size == layout.size and (form.any_version or form.version == layout.version)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.device.eap_dictionary import DeviceIdentity, NothingRuns
+from eap.device.eap_dictionary import DeviceIdentity, NoLiveValues
 from eap.errors import EapError, EngineGoneError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -64,4 +64,4 @@ def make_device(
     """Return a device of the plant ``demo`` and the engine that it asks."""
     engine = engine or StationEngine(spec, state)
     keeper = StationKeeper(spec, state, StationStore("demo", spec.name).configuration, engine)
-    return StationDevice(keeper, NothingRuns(), DeviceIdentity(device_name="test")), engine
+    return StationDevice(keeper, NoLiveValues(), DeviceIdentity(device_name="test")), engine

@@ -13,7 +13,7 @@ from eap.config.brokers import (
     find_network,
     parse_url,
     shared_network,
-    why_unreadable,
+    unreadable_reason,
 )
 from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import NetId
@@ -156,12 +156,12 @@ def test_a_broker_with_its_files_is_no_finding(findings):
 
 def test_a_file_is_readable_or_says_why_not(tmp_path):
     (tmp_path / "secret").touch()
-    assert why_unreadable(tmp_path / "secret") == ""
-    assert why_unreadable(tmp_path / "gone") == "No such file or directory"
-    assert why_unreadable(tmp_path) == "Is a directory"
+    assert unreadable_reason(tmp_path / "secret") == ""
+    assert unreadable_reason(tmp_path / "gone") == "No such file or directory"
+    assert unreadable_reason(tmp_path) == "Is a directory"
     os.mkfifo(tmp_path / "pipe")
-    assert why_unreadable(tmp_path / "pipe") == "no regular file"
-    assert "null" in why_unreadable(tmp_path / "a\0b")
+    assert unreadable_reason(tmp_path / "pipe") == "no regular file"
+    assert "null" in unreadable_reason(tmp_path / "a\0b")
 
 
 LEARNING_PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'

@@ -432,8 +432,8 @@ def test_polls_do_not_go_in_a_circle(load_edited):
         (CLIENT, f"{FOREIGN} poll: request,"),
         (NEWS, CHAIN[CHAIN.index("\n  - name: saw") :]),
     )
-    circles = [f.message for f in result.findings if "circle" in f.message]
-    assert circles == [
+    loops = [f.message for f in result.findings if "loop" in f.message]
+    assert loops == [
         "polls form a loop: mill/part, saw/cut, mill/part",
         "polls form a loop: saw/cut, mill/part, saw/cut",
     ]

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.config.ports import group_of, reaches, resolve
+from eap.config.ports import group_of, reaches, resolve_destination
 from eap.config.structs import PortSection, VlanSection
 from eap.ids import Destination, InterfaceUri, NetId
 from eap.pd.spec import PortKind
@@ -157,9 +157,9 @@ def port(interface, **options):
 def test_what_may_be_written_becomes_an_address(index, text, interface, destination):
     if destination is ValueError:
         with pytest.raises(ValueError, match=r"."):
-            resolve(text, InterfaceUri.parse(interface), index())
+            resolve_destination(text, InterfaceUri.parse(interface), index())
     else:
-        assert str(resolve(text, InterfaceUri.parse(interface), index())) == destination
+        assert str(resolve_destination(text, InterfaceUri.parse(interface), index())) == destination
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_what_may_be_written_becomes_an_address(index, text, interface, destinat
 )
 def test_a_port_of_the_plant_has_an_address(index, interface, sender, destination):
     plant = index(('"udp://127.0.9.2"', f'"{interface}"'))
-    assert str(resolve("right/eap0", InterfaceUri.parse(sender), plant)) == destination
+    assert str(resolve_destination("right/eap0", InterfaceUri.parse(sender), plant)) == destination
 
 
 def test_a_router_with_several_ports_has_no_address(index):
@@ -185,15 +185,15 @@ def test_a_router_with_several_ports_has_no_address(index):
         )
     )
     uri = InterfaceUri.parse("udp://127.0.9.1")
-    assert str(resolve("127.0.9.2.3.1", uri, plant)) == "127.0.9.3"
+    assert str(resolve_destination("127.0.9.2.3.1", uri, plant)) == "127.0.9.3"
     with pytest.raises(ValueError, match="with several ports: right/eap0, right/eap1"):
-        resolve("127.0.9.2.1.1", uri, plant)
+        resolve_destination("127.0.9.2.1.1", uri, plant)
 
 
 def test_a_udp_port_that_takes_tcp_has_a_tcp_address(index):
     plant = index(("net_id: 127.0.9.2.2.1", "net_id: 127.0.9.2.2.1, tcp: true"))
     uri = InterfaceUri.parse("tcp://127.0.9.1")
-    assert str(resolve("right/eap0", uri, plant)) == "tcp://127.0.9.2"
+    assert str(resolve_destination("right/eap0", uri, plant)) == "tcp://127.0.9.2"
 
 
 @pytest.mark.parametrize(

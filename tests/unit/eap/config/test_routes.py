@@ -5,14 +5,14 @@ import pytest
 from eap.ams.spec import HopSpec, TransportKind
 from eap.config.load import load
 from eap.config.routes import (
-    MisfitError,
+    SectionError,
     find_hop,
     net_ids_of,
     next_hop,
     prefixes,
-    reach,
+    route_net_ids,
+    stations_without_prefix,
     target_of,
-    without_prefix,
 )
 from eap.config.structs import RouteSection as Route
 
@@ -144,7 +144,7 @@ def test_a_route_leads_to_its_next_hop(follow, route, hop, router):
     ],
 )
 def test_a_way_that_there_is_not_says_why(follow, route, key, message):
-    with pytest.raises(MisfitError) as caught:
+    with pytest.raises(SectionError) as caught:
         follow(route)
     assert caught.value.key == key
     assert str(caught.value).startswith(message)
@@ -152,7 +152,7 @@ def test_a_way_that_there_is_not_says_why(follow, route, key, message):
 
 def test_ams_tcp_is_where_a_port_serves_it(index):
     plant = index((RIGHT_PORT, RIGHT_PORT.replace("}", ", ams: false}")))
-    with pytest.raises(MisfitError, match="right/eap0 does not serve AMS/TCP"):
+    with pytest.raises(SectionError, match="right/eap0 does not serve AMS/TCP"):
         next_hop(plant, plant.stations["left"], Route(to="x", ams_tcp="right/eap0"))
 
 
@@ -162,7 +162,7 @@ def test_of_several_ethernet_interfaces_one_has_to_be_named(index):
         f"\n      {ports}".replace("eap0", "eap1").replace("//a", "//b").replace("2.1}", "9.1}")
     )
     plant = index((LEFT_PORT, ports))
-    with pytest.raises(MisfitError, match="does not say by which Ethernet interface"):
+    with pytest.raises(SectionError, match="does not say by which Ethernet interface"):
         next_hop(plant, plant.stations["left"], Route(to="x", via="5.1.2.3.1.1"))
 
 
@@ -174,7 +174,7 @@ def test_a_default_route_leads_to_no_station(index):
 
 def test_a_station_whose_net_ids_begin_alike_is_reached_by_four_octets(index):
     plant = index()
-    assert without_prefix(plant) == set()
+    assert stations_without_prefix(plant) == set()
     assert net_ids_of(plant.stations["left"], set()) == [("127.0.9.1.1.1", 4)]
 
 
@@ -185,10 +185,10 @@ def test_a_station_whose_net_ids_begin_alike_is_reached_by_four_octets(index):
         ("net_id: 127.0.9.1.2.1", "net_id: 127.0.9.2.9.9", {"left", "right"}),
     ],
 )
-def test_others_are_reached_by_each_of_their_net_ids(index, old, new, loose):
+def test_others_are_reached_by_each_of_their_net_ids(index, old, new, shared):
     plant = index((old, new))
-    assert without_prefix(plant) == loose
-    found = net_ids_of(plant.stations["right"], loose)
+    assert stations_without_prefix(plant) == shared
+    found = net_ids_of(plant.stations["right"], shared)
     assert [octets for _, octets in found] == [6, 6]
     assert found[1][0] == "127.0.9.2.2.1"
 
@@ -209,7 +209,7 @@ def test_net_ids_that_are_none_are_passed_over(index):
     ],
 )
 def test_a_route_is_for_the_net_ids_of_its_target(index, route, found):
-    assert reach(index(), route, {"left"}) == found
+    assert route_net_ids(index(), route, {"left"}) == found
 
 
 LEFT = '{name: eap0, kind: eap, interface: "udp://127.0.9.1", net_id: 127.0.9.1.2.1}'

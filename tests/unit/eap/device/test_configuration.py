@@ -146,7 +146,7 @@ def test_the_plain_form_is_for_json(udp):
     assert other.upload(0x6000, Var.NAME, OdState.OP) == b"level"
 
 
-def _kept(dictionary):
+def _without_empty_mappings(dictionary):
     return {
         index: entries
         for index, entries in read_configuration(dictionary).items()
@@ -164,7 +164,7 @@ def test_changes_written_in_their_order_make_the_new_dictionary(
         for name, old in filled(before).items():
             for change in compare(old, new[name]):
                 old.download(change.index, change.subindex, change.data, OdState.PREOP)
-            assert _kept(old) == _kept(new[name])
+            assert _without_empty_mappings(old) == _without_empty_mappings(new[name])
             assert compare(old, new[name]) == []
 
 

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from eap.codec import datatypes
 from eap.device.configuration import read_configuration
-from eap.device.eap_dictionary import DeviceIdentity, EapDictionary, NothingRuns
+from eap.device.eap_dictionary import DeviceIdentity, EapDictionary, NoLiveValues
 from eap.device.rollout import bus_variables
 from eap.od import info, model
 from eap.od.abort import AbortCode, SdoAbortError
@@ -250,7 +250,7 @@ def test_a_pdo_that_is_too_long_for_any_frame_is_refused_at_the_mapping(udp, eth
         write(dictionary, 0x1A01, 2, 0x0000_0007)
         write(dictionary, 0x1A01, 3, 0x6000_01FF)
         reason = _refused(dictionary, AbortCode.PDO_LENGTH, 0x1A01, 0, 3)
-        assert f"{largest + 1} octets" in reason
+        assert f"{largest + 1} bytes" in reason
 
 
 def test_padding_has_to_be_where_bits_end_and_nowhere_else(udp):
@@ -593,10 +593,10 @@ def test_no_free_index_is_left(udp):
 def test_users_of_an_object_are_found(udp):
     sender(udp)
     frame(udp, 0x8001, 0xD005)
-    assert udp.user_of(0x6000) == (0x1A00, 1)
-    assert udp.user_of(0xD000) == (0x8000, FrameSub.TXPD)
-    assert udp.user_of(0x8000) is None
-    assert udp.user_of(0x1A00) is None
+    assert udp.reference_to(0x6000) == (0x1A00, 1)
+    assert udp.reference_to(0xD000) == (0x8000, FrameSub.TXPD)
+    assert udp.reference_to(0x8000) is None
+    assert udp.reference_to(0x1A00) is None
 
 
 def test_names_are_those_of_what_an_object_is_about(udp):
@@ -618,4 +618,4 @@ def test_variables_of_buses_belong_to_no_dictionary():
 
 
 def test_nothing_is_shown_of_what_does_not_run():
-    assert {NothingRuns().octets(key, "any") for key in EapLive} == {None}
+    assert {NoLiveValues().octets(key, "any") for key in EapLive} == {None}
