@@ -17,7 +17,7 @@ from devicebus.mailbox.conversation import (
 )
 from devicebus.mailbox.match import answers, is_aoe_fragment
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ams.fragment import Assembler, iter_fragments
+from eap.ams.reassembly import Assembler, iter_fragments
 from eap.codec.ams import AmsHeader, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxHeader, MailboxType
 

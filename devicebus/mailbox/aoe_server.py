@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from devicebus.mailbox.protocol import MailboxSizes, raise_mailbox_error
-from eap.ads.answer import AmsAnswer, response_to
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
 from eap.ads.notifications import Client
 from eap.ads.objects import ObjectSpace
-from eap.ams.fragment import Assembler, iter_fragments
+from eap.ams.reassembly import Assembler, iter_fragments
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,

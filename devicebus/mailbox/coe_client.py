@@ -15,34 +15,34 @@ from devicebus.errors import MailboxProtocolError
 from devicebus.mailbox.conversation import Conversation, MailboxRequest, Progress, reading
 from devicebus.mailbox.match import INFO_START
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.codec.coe import CoeHeader, CoeService, encode_message
-from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import (
+from eap.codec.coe import (
     EXPEDITED_SIZE,
     INITIATE_OVERHEAD,
     SEGMENT_MINIMUM,
     SEGMENT_OVERHEAD,
-    SdoHeader,
-    SdoRequest,
-    SdoResponse,
-    SdoSegmentHeader,
-    decode_segment,
-    encode_abort,
-    encode_initiate,
-    encode_plain,
-    encode_segment,
-    encode_segment_answer,
-)
-from eap.codec.sdoinfo import (
+    CoeHeader,
+    CoeService,
     EntryDescription,
     EntryRequest,
     InfoError,
     ListRequest,
     ObjectDescription,
     ObjectRequest,
+    SdoHeader,
     SdoInfoHeader,
     SdoInfoOpcode,
+    SdoRequest,
+    SdoResponse,
+    SdoSegmentHeader,
+    decode_segment,
+    encode_abort,
+    encode_initiate,
+    encode_message,
+    encode_plain,
+    encode_segment,
+    encode_segment_answer,
 )
+from eap.codec.mailbox import MailboxType
 from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, ValueInfo

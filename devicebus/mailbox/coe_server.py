@@ -10,31 +10,32 @@ from collections import deque
 from collections.abc import Callable
 
 from devicebus.mailbox.protocol import MailboxSizes, decode_or_error, raise_mailbox_error
-from eap.codec.coe import CoeHeader, CoeService, Emergency, encode_message
-from eap.codec.mailbox import MailboxError
-from eap.codec.sdo import (
+from eap.codec.coe import (
     EXPEDITED_SIZE,
     INITIATE_OVERHEAD,
     SEGMENT_OVERHEAD,
+    CoeHeader,
+    CoeService,
+    Emergency,
+    EntryRequest,
+    InfoError,
+    ListRequest,
+    ObjectRequest,
     SdoHeader,
+    SdoInfoHeader,
+    SdoInfoOpcode,
     SdoRequest,
     SdoResponse,
     SdoSegmentHeader,
     decode_segment,
     encode_abort,
     encode_initiate,
+    encode_message,
     encode_plain,
     encode_segment,
     encode_segment_answer,
 )
-from eap.codec.sdoinfo import (
-    EntryRequest,
-    InfoError,
-    ListRequest,
-    ObjectRequest,
-    SdoInfoHeader,
-    SdoInfoOpcode,
-)
+from eap.codec.mailbox import MailboxError
 from eap.errors import CodecError, TruncatedError
 from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError

@@ -23,8 +23,8 @@ import msgspec
 
 from devicebus.errors import MailboxProtocolError
 from eap.codec import foe
+from eap.codec.coe import encode_abort
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import encode_abort
 from eap.errors import CodecError
 from eap.od.abort import AbortCode
 

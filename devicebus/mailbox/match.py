@@ -11,14 +11,19 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
-from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.coe import (
+    CoeHeader,
+    CoeService,
+    SdoHeader,
+    SdoInfoHeader,
+    SdoInfoOpcode,
+    SdoRequest,
+    SdoResponse,
+)
 from eap.codec.eoe import EoeHeader
 from eap.codec.foe import FoeHeader, FoeOpcode
-from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SdoHeader, SdoRequest, SdoResponse
-from eap.codec.sdoinfo import SdoInfoHeader, SdoInfoOpcode
+from eap.codec.mailbox import MailboxType, VoeHeader
 from eap.codec.soe import SoeHeader, SoeOpcode
-from eap.codec.voe import VoeHeader
 from eap.errors import CodecError
 
 INFO_START = CoeHeader.SIZE + SdoInfoHeader.SIZE

@@ -26,16 +26,20 @@ from eap.codec.soe import (
     Element,
     Idn,
     SoeAttribute,
+    SoeErrorCode,
     SoeHeader,
     SoeOpcode,
+    SoeScalar,
+    SoeValue,
     decode_list,
     decode_message,
+    decode_scalar,
+    decode_value,
     encode_fragments,
     encode_message,
     error_code_of,
+    name_of,
 )
-from eap.codec.soeerror import SoeErrorCode, name_of
-from eap.codec.soevalue import SoeScalar, SoeValue, decode_scalar, decode_value
 
 MAX_SIZE = 0x80020
 """Octets of the longest answer: eight elements that are lists as long as there can be."""

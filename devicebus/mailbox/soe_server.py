@@ -20,15 +20,19 @@ from eap.codec.soe import (
     Idn,
     ListHead,
     SoeAttribute,
+    SoeErrorCode,
     SoeHeader,
     SoeOpcode,
+    SoeScalar,
     decode_list,
+    decode_scalar,
     encode_fragments,
     encode_list,
     encode_message,
+    encode_scalar,
+    encode_value,
+    name_of,
 )
-from eap.codec.soeerror import SoeErrorCode, name_of
-from eap.codec.soevalue import SoeScalar, decode_scalar, encode_scalar, encode_value
 from eap.errors import CodecError
 from eap.od.model import OdState
 

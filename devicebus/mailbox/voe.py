@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Conversation, MailboxRequest
 from devicebus.mailbox.protocol import decode_or_error
-from eap.codec.mailbox import MailboxType
-from eap.codec.voe import VoeHeader
+from eap.codec.mailbox import MailboxType, VoeHeader
 
 
 def exchange(

@@ -20,10 +20,8 @@ from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import Register, SyncManager
 from devicebus.wire.sii import SiiProtocol
 from eap.codec import foe, soe
-from eap.codec.coe import CoeService, encode_message
-from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SdoRequest, encode_plain
-from eap.codec.voe import VoeHeader
+from eap.codec.coe import CoeService, SdoRequest, encode_message, encode_plain
+from eap.codec.mailbox import MailboxType, VoeHeader
 
 SETTLE_NS = 2_000_000
 """How long an answer to the first message is waited for, to be thrown away."""

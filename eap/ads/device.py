@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.notifications import Client, NotificationTable
 from eap.ads.operation import (
     AdsRefusedError,
@@ -19,8 +19,7 @@ from eap.ads.operation import (
     WriteControl,
 )
 from eap.ads.request import Outcomes, take_request
-from eap.ads.space import AdsSpace
-from eap.ads.state import DeviceDataSpace, States
+from eap.ads.space import AdsSpace, DeviceDataSpace, States
 from eap.codec.ads import AdsDeviceInfo, AdsError
 from eap.codec.adsnotification import AddNotification
 

@@ -1,8 +1,10 @@
-"""Endpoint of an AMS client or hop: the transport, and the connection or address behind it."""
+"""Endpoints of AMS clients and hops, and the answers that go back to them."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+from eap.codec.ams import AmsHeader, StateFlags
 
 
 class Endpoint(NamedTuple):
@@ -23,3 +25,33 @@ class Endpoint(NamedTuple):
     def __str__(self) -> str:
         # A door to one address only is named after it, which need not be said twice.
         return f"{self.connection} by {self.transport.removesuffix(f':{self.connection}')}"
+
+
+_RESPONSE = StateFlags.RESPONSE.value  # a plain number: operators of flags are slow
+
+
+class AmsAnswer(NamedTuple):
+    """What goes back to the sender of a request."""
+
+    data: bytes = b""
+    error_code: int = 0
+    """Of the AMS header: why the request reached nobody."""
+    why: str = ""
+    """For people, where results inside *data* refuse something: what, and why."""
+
+
+def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
+    """Return the packet that brings *answer* back to who sent the request with *header*."""
+    data = answer.data
+    back = AmsHeader(
+        header.source,
+        header.source_port,
+        header.target,
+        header.target_port,
+        header.command,
+        header.state_flags | _RESPONSE,
+        len(data),
+        answer.error_code,
+        header.invoke_id,
+    )
+    return back.encode() + data

@@ -1,17 +1,19 @@
-"""The I/O server behind port 300: the list of a station's ports, as TwinCAT lists its devices.
+"""I/O server behind port 300 and the EtherCAT masters that it lists, as TwinCAT shows them.
 
-The groups are those that Beckhoff's adstool asks for (ECatAccess.cpp of AdsLib), the numbers of
-types those of TwinCAT's TCatSysManagerLib.
+The groups are those that Beckhoff's adstool reads (ECatAccess.cpp of AdsLib), the numbers of types
+those of TwinCAT's TCatSysManagerLib.  Beckhoff documents the groups of a master: states are AL
+states (ETG.1000.6); in the state of a slave 0x10 is an error, 0x20 a wrong identity, 0x40 an init
+command that failed, and beside it is the state of its links.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.space import AdsSpace
+from eap.ads.space import BOOT, INIT, OP, PREOP, SAFEOP, AdsSpace, Source, steady
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import encode_text
 from eap.ids import NetId
@@ -94,3 +96,109 @@ _OF_ONE: dict[int, Callable[[IoDevice], bytes]] = {
     _Offset.NET_ID: lambda device: bytes(device.net_id),
     _Offset.TYPE: lambda device: device.type.to_bytes(2, "little"),
 }
+
+
+_STATE_OFFSET = 0x100
+_AL_STATES = frozenset((INIT, PREOP, BOOT, SAFEOP, OP))
+
+
+class SlaveState(NamedTuple):
+    """One slave of the configuration."""
+
+    address: int
+    """Its station address."""
+    state: int
+    link: int
+
+
+class Master(Protocol):
+    """The bus that is shown."""
+
+    def state(self) -> int:
+        """Return the AL state of the master itself."""
+
+    def slaves(self) -> Sequence[SlaveState]:
+        """Return all slaves of the configuration, in their order on the bus."""
+
+    def request_state(self, state: int) -> None:
+        """Have the master go to *state*, without waiting; raise AdsRefusedError."""
+
+    def request_slave_state(self, address: int, state: int) -> None:
+        """Have one slave go to *state*, without waiting; raise AdsRefusedError."""
+
+
+class MasterSpace(AdsSpace):
+    """The groups 3, 6, 7 and 9 of a master."""
+
+    groups: Collection[int] = frozenset(
+        (
+            IndexGroup.MASTER_STATE,
+            IndexGroup.SLAVE_COUNT,
+            IndexGroup.SLAVE_ADDRESSES,
+            IndexGroup.SLAVE_STATES,
+        )
+    )
+
+    def __init__(self, master: Master) -> None:
+        self._master = master
+        self._readers: dict[tuple[int, int], Callable[[], bytes]] = {
+            (IndexGroup.MASTER_STATE, _STATE_OFFSET): self._state,
+            (IndexGroup.SLAVE_COUNT, 0): self._count,
+            (IndexGroup.SLAVE_ADDRESSES, 0): self._addresses,
+            (IndexGroup.SLAVE_STATES, 0): self._states,
+        }
+
+    def read(self, group: int, offset: int, length: int) -> bytes:
+        """Return states, addresses or their number; of lists as many as fit."""
+        reader = self._readers.get((group, offset))
+        if reader is not None:
+            octets = reader()
+            return octets[: min(length, len(octets)) // 2 * 2]
+        if group != IndexGroup.SLAVE_STATES:
+            raise AdsRefusedError(AdsError.INDEX_OFFSET)
+        return _pair(self._slave(offset))[:length]
+
+    def write(self, group: int, offset: int, data: bytes) -> None:
+        """Ask for a state, of the master by the offset, of a slave by the two octets written."""
+        if group == IndexGroup.MASTER_STATE:
+            self._master.request_state(_al_state(offset))
+        elif group == IndexGroup.SLAVE_STATES:
+            if len(data) != 2:
+                raise AdsRefusedError(AdsError.SIZE)
+            slave = self._slave(offset)
+            state = _al_state(int.from_bytes(data, "little"))
+            self._master.request_slave_state(slave.address, state)
+        else:
+            raise AdsRefusedError(AdsError.ACCESS)
+
+    def watch(self, group: int, offset: int, length: int) -> Source:
+        """Return what gives states; a list that gets shorter ends it."""
+        return steady(lambda: self.read(group, offset, length), length)
+
+    def _slave(self, address: int) -> SlaveState:
+        for slave in self._master.slaves():
+            if slave.address == address:
+                return slave
+        raise AdsRefusedError(AdsError.INDEX_OFFSET)
+
+    def _state(self) -> bytes:
+        return self._master.state().to_bytes(2, "little")
+
+    def _count(self) -> bytes:
+        return len(self._master.slaves()).to_bytes(2, "little")
+
+    def _addresses(self) -> bytes:
+        return b"".join(slave.address.to_bytes(2, "little") for slave in self._master.slaves())
+
+    def _states(self) -> bytes:
+        return b"".join(map(_pair, self._master.slaves()))
+
+
+def _pair(slave: SlaveState) -> bytes:
+    return bytes((slave.state, slave.link))
+
+
+def _al_state(number: int) -> int:
+    if number not in _AL_STATES:
+        raise AdsRefusedError(AdsError.VALUE)
+    return number

@@ -1,8 +1,9 @@
-"""ADS requests taken apart into operations, and the answers put together again.
+"""ADS requests and their answers on both sides, and parts of sum commands.
 
-Beckhoff ADS specification, commands 1 to 7 and 9.  Whoever cannot answer at once, because a bus
-lies between, does what ``AdsDevice.answer`` does in steps of its own: ``take_request``, one
-outcome for each operation into ``Outcomes``, ``answer``.
+Beckhoff ADS specification, commands 1 to 7 and 9.  A server that cannot answer at once, because a
+bus lies between, does the work of ``AdsDevice.answer`` in steps of its own: ``accept_request``, one
+outcome for each operation into ``Outcomes``, ``answer``.  A client that may have only some items of
+a sum command done still gets an answer to each of them, in its own order.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import (
     AdsRefusedError,
+    DeleteNotification,
     Operation,
     OperationOutcome,
+    Read,
     ReadDeviceInfo,
     ReadState,
     ReadWrite,
@@ -202,3 +205,126 @@ def _parse_sum(request: ReadWrite) -> AdsRequest:
     return AdsRequest(
         AmsCommand.READ_WRITE, tuple(operations), request.group, request.length, request.offset
     )
+
+
+_COMMANDS: dict[type[Operation], AmsCommand] = {
+    ReadDeviceInfo: AmsCommand.READ_DEVICE_INFO,
+    Read: AmsCommand.READ,
+    Write: AmsCommand.WRITE,
+    ReadState: AmsCommand.READ_STATE,
+    WriteControl: AmsCommand.WRITE_CONTROL,
+    AddNotification: AmsCommand.ADD_NOTIFICATION,
+    DeleteNotification: AmsCommand.DELETE_NOTIFICATION,
+    ReadWrite: AmsCommand.READ_WRITE,
+}
+_RESULT_SIZE = 4
+_LENGTH_SIZE = 4
+
+
+def encode_query(operation: Operation) -> tuple[AmsCommand, bytes]:
+    """Return command and body of the request for one operation."""
+    command = _COMMANDS[type(operation)]
+    match operation:
+        case Read(group, offset, length):
+            body = AdsRange(group, offset, length).encode()
+        case Write(group, offset, data):
+            body = AdsRange(group, offset, len(data)).encode() + data
+        case ReadWrite(group, offset, length, data):
+            body = AdsReadWrite(group, offset, length, len(data)).encode() + data
+        case WriteControl(ads_state, device_state, data):
+            body = AdsWriteControl(ads_state, device_state, len(data)).encode() + data
+        case AddNotification():
+            body = operation.encode()
+        case DeleteNotification(handle):
+            body = handle.to_bytes(4, "little")
+        case _:
+            body = b""
+    return command, body
+
+
+def decode_outcome(command: int, error_code: int, body: bytes) -> OperationOutcome:
+    """Return how a request with one operation came out.
+
+    What is too short to be an answer comes out as SIZE.
+
+    Args:
+        command: Of the request.
+        error_code: Of the AMS header of its answer.
+        body: What follows that.
+    """
+    if error_code:
+        return OperationOutcome(error_code)
+    if len(body) < _RESULT_SIZE:
+        return OperationOutcome(AdsError.SIZE, why=f"an answer of {len(body)} octets")
+    result = int.from_bytes(body[:_RESULT_SIZE], "little")
+    data = body[_RESULT_SIZE:]
+    if result:
+        return OperationOutcome(result)
+    if command in _WITH_LENGTH:
+        length, data = int.from_bytes(data[:_LENGTH_SIZE], "little"), data[_LENGTH_SIZE:]
+        if len(data) < length:
+            return OperationOutcome(AdsError.SIZE, why=f"{len(data)} octets of {length}")
+        data = data[:length]
+    return OperationOutcome(data=data)
+
+
+_HEAD = 8
+"""Octets of result and length in front of all answers."""
+_RESULT = 4
+_SHORT_HEADS = frozenset(
+    (IndexGroup.SUM_READ, IndexGroup.SUM_WRITE, IndexGroup.SUM_DELETE_NOTIFICATION)
+)
+"""Whose items are answered by a result; those of the others by a result and four octets more."""
+_PADDED = frozenset((IndexGroup.SUM_READ, IndexGroup.SUM_READ_EX))
+_RETURNED = frozenset((IndexGroup.SUM_READ_WRITE, IndexGroup.SUM_READ_EX_2))
+
+
+def has_results(request: AdsRequest) -> bool:
+    """Say whether the answer to *request* has a result for each item."""
+    return bool(request.sum_group) and (
+        request.sum_group != IndexGroup.SUM_READ or bool(request.index_offset)
+    )
+
+
+def part_of(request: AdsRequest, operations: Sequence[Operation]) -> AdsRequest:
+    """Return a sum command with only some *operations* of *request*."""
+    return request._replace(operations=tuple(operations), index_offset=len(operations))
+
+
+def encode_sum(request: AdsRequest) -> bytes:
+    """Return the body of the ReadWrite that is a sum command."""
+    heads, behind = [], []
+    for operation in request.operations:
+        _, body = encode_query(operation)
+        data = operation.data if isinstance(operation, Write | ReadWrite) else b""
+        heads.append(body[: len(body) - len(data)])
+        behind.append(data)
+    items = b"".join(heads + behind)
+    head = AdsReadWrite(request.sum_group, request.index_offset, request.read_length, len(items))
+    return head.encode() + items
+
+
+def split_answer(request: AdsRequest, body: bytes) -> list[OperationOutcome] | None:
+    """Return how each item of a sum command came out, None if it failed as a whole."""
+    if len(body) < _HEAD or any(body[:_RESULT]):
+        return None
+    data = body[_HEAD:]
+    operations, group = request.operations, request.sum_group
+    size = _RESULT if group in _SHORT_HEADS else 2 * _RESULT
+    if len(data) < size * len(operations):
+        return None
+    outcomes, at = [], size * len(operations)
+    for number, operation in enumerate(operations):
+        head = data[number * size : (number + 1) * size]
+        if group in _PADDED:
+            length = asked_length(operation)
+        else:
+            length = int.from_bytes(head[_RESULT:], "little") if group in _RETURNED else 0
+        found = data[at : at + length]
+        if len(found) < length:
+            return None
+        at += length
+        if group == IndexGroup.SUM_ADD_NOTIFICATION:
+            found = head[_RESULT:]
+        outcomes.append(OperationOutcome(int.from_bytes(head[:_RESULT], "little"), found))
+    return outcomes

@@ -1,12 +1,17 @@
-"""What stands behind index groups: the part of a device that a family of them belongs to."""
+"""Spaces of index groups: the base class, the states of a device, and the system service.
+
+Own mapping of states, for Beckhoff documents none: Op is RUN, SafeOp STOP, PreOp CONFIG, Init INIT;
+the device state is the number of the EtherCAT state itself.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import NoReturn, TypeAlias
 
 from eap.ads.operation import AdsRefusedError
-from eap.codec.ads import AdsError
+from eap.codec.ads import AdsError, AdsState, AdsStates, AdsSystemState, IndexGroup
 
 Source: TypeAlias = Callable[[], bytes]
 """Gives the octets that a notification watches, whenever it is called.
@@ -64,3 +69,83 @@ class AdsSpace:
 
 def _refuse() -> NoReturn:
     raise AdsRefusedError(AdsError.ACCESS)
+
+
+States: TypeAlias = Callable[[], AdsStates]
+"""Says in which states a device is now."""
+
+INIT, PREOP, BOOT, SAFEOP, OP = 1, 2, 3, 4, 8
+"""AL states (ETG.1000.6)."""
+_TOLD: dict[int, AdsState] = {
+    INIT: AdsState.INIT,
+    PREOP: AdsState.CONFIG,
+    BOOT: AdsState.LOAD_CONFIG,
+    SAFEOP: AdsState.STOP,
+    OP: AdsState.RUN,
+}
+_ASKED: dict[int, int] = {
+    AdsState.INIT: INIT,
+    AdsState.RESET: INIT,
+    AdsState.CONFIG: PREOP,
+    AdsState.RECONFIG: PREOP,
+    AdsState.LOAD_CONFIG: BOOT,
+    AdsState.STOP: SAFEOP,
+    AdsState.SUSPEND: SAFEOP,
+    AdsState.RUN: OP,
+    AdsState.START: OP,
+    AdsState.RESUME: OP,
+}
+
+
+def states_of(al_state: int) -> AdsStates:
+    """Return what ReadState tells of a device in *al_state*."""
+    return AdsStates(_TOLD.get(al_state, AdsState.INVALID), al_state)
+
+
+def al_state_for(ads_state: int) -> int:
+    """Return the AL state that a WriteControl to *ads_state* asks for; refuse with VALUE.
+
+    The device state beside it says nothing: clients send back the one that they read before.
+    """
+    try:
+        return _ASKED[ads_state]
+    except KeyError:
+        raise AdsRefusedError(AdsError.VALUE) from None
+
+
+class DeviceDataSpace(AdsSpace):
+    """The states of a device as values, to be read and watched."""
+
+    groups: Collection[int] = frozenset((IndexGroup.DEVICE_DATA,))
+
+    def __init__(self, states: States) -> None:
+        self._states = states
+
+    def read(self, group: int, offset: int, length: int) -> bytes:
+        """Return ADS state and device state from *offset* 0 on, or the latter from 2 on."""
+        del group
+        if offset not in {0, 2}:
+            raise AdsRefusedError(AdsError.INDEX_OFFSET)
+        return self._states().encode()[offset : offset + length]
+
+    def watch(self, group: int, offset: int, length: int) -> Source:
+        """Return what gives the states."""
+        if len(self.read(group, offset, length)) != length:
+            raise AdsRefusedError(AdsError.SIZE)
+        return partial(self.read, group, offset, length)
+
+
+class SystemSpace(AdsSpace):
+    """The state of the whole station; *state* is called whenever somebody asks."""
+
+    groups: Collection[int] = frozenset((IndexGroup.SYSTEM_STATE,))
+
+    def __init__(self, state: Callable[[], AdsSystemState]) -> None:
+        self._state = state
+
+    def read(self, group: int, offset: int, length: int) -> bytes:
+        """Return the state, cut to *length*."""
+        del group
+        if offset:
+            raise AdsRefusedError(AdsError.INDEX_OFFSET)
+        return self._state().encode()[:length]

@@ -1,16 +1,274 @@
-"""The values of ADS symbols, by name, by handle and by place; and the lists of the symbols."""
+"""ADS symbols: the variables of one configuration, their types, handles and values.
+
+Numbers of odd widths are widened to the next type that IEC 61131-3 has, so that every client can
+read them; texts get the NUL at their end that a PLC's strings have.
+
+A handle is made of the version of the table and the index of the symbol in it.  So nothing is kept
+for a client, a handle outlives its connection, and one of an older table is refused as such.  Case
+does not matter in a name, unless it makes two names of one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from functools import partial
-from typing import Protocol
+from bisect import bisect_right
+from collections.abc import Collection, Iterable
+from functools import cached_property, partial
+from typing import NamedTuple, Protocol
 
 from eap.ads.operation import AdsRefusedError
 from eap.ads.space import AdsSpace, Source
-from eap.ads.symbol_table import Symbol, SymbolTable
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.adssymbol import decode_name
+from eap.codec.adssymbol import (
+    AdsType,
+    DataTypeEntry,
+    HandleInfo,
+    SymbolEntry,
+    SymbolFlag,
+    SymbolPlace,
+    UploadInfo,
+    decode_name,
+    encode_data_type,
+    encode_entry,
+    encode_text,
+)
+from eap.codec.values import Array, Block, Boolean, DataType, Integer, Real, String
+
+_INTEGERS = {
+    (True, 1): (AdsType.INT8, "SINT"),
+    (True, 2): (AdsType.INT16, "INT"),
+    (True, 4): (AdsType.INT32, "DINT"),
+    (True, 8): (AdsType.INT64, "LINT"),
+    (False, 1): (AdsType.UINT8, "USINT"),
+    (False, 2): (AdsType.UINT16, "UINT"),
+    (False, 4): (AdsType.UINT32, "UDINT"),
+    (False, 8): (AdsType.UINT64, "ULINT"),
+}
+_REALS = {4: (AdsType.REAL32, "REAL"), 8: (AdsType.REAL64, "LREAL")}
+
+
+class SymbolType(NamedTuple):
+    """How values of one of our types go to ADS clients and come from them."""
+
+    kind: DataType
+    id: AdsType
+    name: str
+    """As IEC 61131-3 writes it."""
+    size: int
+    """Octets for a client."""
+
+    def describe(self) -> list[DataTypeEntry]:
+        """Return what clients may want to know of this type, and of its elements."""
+        if isinstance(self.kind, Array):
+            (of,) = symbol_type(self.kind.element).describe()
+        elif isinstance(self.kind, Block):
+            of = DataTypeEntry("BYTE", AdsType.UINT8, 1)
+        else:
+            return [DataTypeEntry(self.name, self.id, self.size)]
+        return [of, DataTypeEntry(self.name, self.id, self.size, of.name, self.size // of.size)]
+
+    def to_client(self, octets: bytes) -> bytes:
+        """Return what a client reads of a value; *octets* are those of our type."""
+        if self.size == self.kind.size:
+            return octets
+        if isinstance(self.kind, String):
+            return octets + b"\0"
+        return self._resized(octets, _element(self.kind).size, self.size // self.kind.count)
+
+    def from_client(self, data: bytes) -> bytes:
+        """Return the octets of our type for what a client writes.
+
+        Raises:
+            AdsRefusedError: SIZE or VALUE.
+        """
+        if isinstance(self.kind, String):
+            return self._from_text(data)
+        if len(data) != self.size:
+            raise AdsRefusedError(AdsError.SIZE)
+        if isinstance(self.kind, Boolean):
+            return bytes((any(data),))
+        element = _element(self.kind)
+        if self.size != self.kind.size:
+            return self._resized(data, self.size // self.kind.count, element.size)
+        if element.is_bits and data[0] >> element.bit_length:
+            raise AdsRefusedError(AdsError.VALUE)
+        return data
+
+    def _from_text(self, data: bytes) -> bytes:
+        if len(data) > self.size:
+            raise AdsRefusedError(AdsError.SIZE)
+        text, _, _ = data.partition(b"\0")
+        if len(text) > self.kind.size:
+            raise AdsRefusedError(AdsError.SIZE)
+        return text.ljust(self.kind.size, b"\0")
+
+    def _resized(self, data: bytes, before: int, after: int) -> bytes:
+        element = _element(self.kind)
+        signed = isinstance(element, Integer) and element.signed
+        octets = bytearray()
+        for at in range(0, len(data), before):
+            number = int.from_bytes(data[at : at + before], "little", signed=signed)
+            try:
+                octets += number.to_bytes(after, "little", signed=signed)
+            except OverflowError:
+                raise AdsRefusedError(AdsError.VALUE) from None
+        return bytes(octets)
+
+
+def symbol_type(kind: DataType) -> SymbolType:
+    """Return how clients know *kind*."""
+    if isinstance(kind, String):
+        return SymbolType(kind, AdsType.STRING, f"STRING({kind.size})", kind.size + 1)
+    if isinstance(kind, Block):
+        return SymbolType(kind, AdsType.UINT8, f"ARRAY [0..{kind.size - 1}] OF BYTE", kind.size)
+    element = _element(kind)
+    type_id, name, size = _scalar(element)
+    if isinstance(kind, Array):
+        name = f"ARRAY [0..{kind.count - 1}] OF {name}"
+    return SymbolType(kind, type_id, name, size * kind.count)
+
+
+def _element(kind: DataType) -> DataType:
+    return kind.element if isinstance(kind, Array) else kind
+
+
+def _scalar(kind: DataType) -> tuple[AdsType, str, int]:
+    if isinstance(kind, Boolean):
+        return AdsType.BIT, "BOOL", 1
+    if isinstance(kind, Real):
+        return *_REALS[kind.size], kind.size
+    signed = isinstance(kind, Integer) and kind.signed
+    size = next(size for size in (1, 2, 4, 8) if size >= kind.size)
+    type_id, name = _INTEGERS[signed, size]
+    # BYTE, WORD and DWORD keep their names; only their ids are those of numbers.
+    own = kind.text if kind.text in {"BYTE", "WORD", "DWORD"} else name
+    return type_id, own, size
+
+
+_INDEX_BITS = 24
+_UTF_8 = (("TcEncoding", "UTF-8"),)
+"""Attribute of texts; clients take those without for texts in the code page of TwinCAT."""
+_ALIGNMENT = 8
+"""Octets: no value of a client's lies across what its processor reads at once."""
+
+
+class Variable(NamedTuple):
+    """What is known of one variable."""
+
+    name: str
+    type: DataType
+    comment: str = ""
+    read_only: str = ""
+    """Why clients do not write it, as what follows its name; empty if they do."""
+
+
+class Symbol(NamedTuple):
+    """One variable, how clients know its type, and where they find it."""
+
+    variable: Variable
+    type: SymbolType
+    place: SymbolPlace
+
+    def describe(self) -> bytes:
+        """Return its entry."""
+        flags = SymbolFlag.READ_ONLY if self.variable.read_only else 0
+        return encode_entry(
+            SymbolEntry(
+                self.place,
+                self.type.id,
+                flags,
+                self.variable.name,
+                self.type.name,
+                self.variable.comment,
+                _UTF_8 if self.type.id == AdsType.STRING else (),
+            )
+        )
+
+    def describe_handle(self, handle: int) -> bytes:
+        """Return *handle* with size and name of its type."""
+        name = encode_text(self.type.name)
+        return HandleInfo(handle, self.type.size, 0, len(name)).encode() + name + b"\0"
+
+
+class SymbolTable:
+    """All symbols of one configuration.
+
+    Args:
+        variables: In the order in which they are told.
+        version: Counts configurations; 8 bits of it are told.
+    """
+
+    def __init__(self, variables: Iterable[Variable], version: int) -> None:
+        self.version = version & 0xFF
+        self._symbols: list[Symbol] = []
+        offset = 0
+        for variable in variables:
+            kind = symbol_type(variable.type)
+            place = SymbolPlace(IndexGroup.DATA, offset, kind.size)
+            self._symbols.append(Symbol(variable, kind, place))
+            offset += kind.size + -kind.size % _ALIGNMENT
+        self._offsets = [symbol.place.offset for symbol in self._symbols]
+        self._indexes = {symbol.variable.name: n for n, symbol in enumerate(self._symbols)}
+        self._folded: dict[str, int | None] = {}
+        for name, index in self._indexes.items():
+            key = name.casefold()
+            self._folded[key] = None if key in self._folded else index
+        self._types = {
+            entry.name: encode_data_type(entry)
+            for symbol in self._symbols
+            for entry in symbol.type.describe()
+        }
+        self.type_upload = b"".join(self._types.values())
+
+    @cached_property
+    def upload(self) -> bytes:
+        """All entries; made when the first client asks, for a large table takes its time."""
+        return b"".join(symbol.describe() for symbol in self._symbols)
+
+    @property
+    def info(self) -> UploadInfo:
+        """How much there is to upload."""
+        return UploadInfo(
+            len(self._symbols), len(self.upload), len(self._types), len(self.type_upload)
+        )
+
+    def data_type(self, name: str) -> bytes:
+        """Return the entry of a type that symbols have; refuse with SYMBOL_NOT_FOUND."""
+        try:
+            return self._types[name.upper()]
+        except KeyError:
+            raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND) from None
+
+    def handle_of(self, name: str) -> int:
+        """Return the handle of a symbol; refuse with SYMBOL_NOT_FOUND."""
+        index = self._indexes.get(name)
+        if index is None:
+            index = self._folded.get(name.casefold())
+        if index is None:
+            raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND)
+        return self.version << _INDEX_BITS | index + 1
+
+    def by_handle(self, handle: int) -> Symbol:
+        """Return a symbol; refuse handles of other tables, and those that never were any."""
+        if handle >> _INDEX_BITS != self.version:
+            raise AdsRefusedError(AdsError.SYMBOL_VERSION)
+        index = (handle & (1 << _INDEX_BITS) - 1) - 1
+        if not 0 <= index < len(self._symbols):
+            raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND)
+        return self._symbols[index]
+
+    def successor_of(self, symbol: Symbol) -> Symbol:
+        """Return what *symbol* of an older table is here; refuse with SYMBOL_VERSION."""
+        index = self._indexes.get(symbol.variable.name)
+        if index is None or self._symbols[index].type != symbol.type:
+            raise AdsRefusedError(AdsError.SYMBOL_VERSION)
+        return self._symbols[index]
+
+    def at(self, offset: int) -> tuple[Symbol, int]:
+        """Return the symbol that *offset* lies in, and how far; refuse with INDEX_OFFSET."""
+        index = bisect_right(self._offsets, offset) - 1
+        if index < 0 or offset >= self._offsets[index] + self._symbols[index].place.size:
+            raise AdsRefusedError(AdsError.INDEX_OFFSET)
+        return self._symbols[index], offset - self._offsets[index]
 
 
 class VariableStore(Protocol):

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Outcome
 from eap.ams.error_reply import Refusal
 from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import InFlight
+from eap.ams.record import Outcome
 from eap.ams.report import Obstacle, RouteState
 from eap.ams.routes import Route, RouteTable
 from eap.ams.transport_table import Transport

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eap.ads.answer import AmsAnswer, response_to
-from eap.ads.endpoint import Endpoint
-from eap.ams.action import Action, Outcome, Trace
-from eap.ams.record import Record, describe
+from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
+from eap.ams.record import Outcome, Record, Trace, describe
 from eap.ams.routes import Route
-from eap.ams.transport_table import TransportTable
+from eap.ams.transport_table import Action, TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 

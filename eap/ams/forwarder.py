@@ -7,31 +7,26 @@ router before this one gave is kept: a packet that runs in a circle is known by 
 
 from __future__ import annotations
 
-from eap.ads.answer import AmsAnswer, response_to
-from eap.ads.endpoint import Endpoint
-from eap.ams.access_filter import AccessFilter, exchange_body
-from eap.ams.action import Action, Outcome, Trace
+from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
+from eap.ams.access_filter import AccessFilter, AuthorizedRequest, exchange_body
 from eap.ams.admission import Admission, Limits
-from eap.ams.authorized_request import AuthorizedRequest
 from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
 from eap.ams.hop_prober import HopProber
-from eap.ams.inflight import InFlight, Pending
-from eap.ams.invoke import InvokeIds, is_marked
-from eap.ams.loop_detector import LoopDetector
-from eap.ams.notification_cleanup import NotificationCleanup
+from eap.ams.inflight import InFlight, InvokeIds, LoopDetector, Pending, is_marked
 from eap.ams.notification_forwarder import (
     FOLLOWED,
+    NotificationCleanup,
     NotificationForwarder,
     Samples,
     deleted_handles,
     encode_deleted,
 )
-from eap.ams.record import Record, describe
+from eap.ams.record import Outcome, Record, Trace, describe
 from eap.ams.report import Obstacle, RouteState
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import SubscriptionRestorer
 from eap.ams.subscriptions import MAX_PER_CLIENT, MAX_TOTAL, Subscription
-from eap.ams.transport_table import TransportTable
+from eap.ams.transport_table import Action, TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
 from eap.ids import NetId

@@ -1,14 +1,74 @@
-"""Requests that wait for their answers: by invoke id, by connection and by deadline."""
+"""Requests that wait for their answers, their invoke IDs, and packets that run in a circle.
+
+AoE has no hop count.  The first router gives each forwarded request an invoke ID of its own and the
+routers behind it keep that ID, so each router recognizes a request that it has forwarded already.
+Such an ID differs from those of clients, which count from 1, by its upper ten bits: they follow
+from the lower bits and are never all 0 (own format; other peers treat an invoke ID as opaque).
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.authorized_request import AuthorizedRequest
+from eap.ams.access_filter import AuthorizedRequest
 from eap.ams.routes import Route
 from eap.codec.ams import AmsHeader
+
+_SERIAL_BITS = 22
+_SERIALS = 1 << _SERIAL_BITS
+_FACTOR = 2654435761
+"""Knuth's multiplier: neighbours get upper bits that have nothing in common."""
+
+
+class InvokeIds:
+    """Gives ids one after the other; one comes again after four millions.
+
+    Args:
+        first: Where to begin; another number at each start keeps the answers to what an earlier
+            process asked from being taken for those of this one.
+    """
+
+    def __init__(self, first: int) -> None:
+        self._serial = first % _SERIALS
+
+    def take(self, taken: Container[int]) -> int:
+        """Return the next id that is not among *taken*."""
+        while True:
+            self._serial = serial = (self._serial + 1) % _SERIALS
+            invoke_id = _mark(serial) << _SERIAL_BITS | serial
+            if invoke_id not in taken:
+                return invoke_id
+
+
+def is_marked(invoke_id: int) -> bool:
+    """Say whether a router gave this id."""
+    return invoke_id >> _SERIAL_BITS == _mark(invoke_id & _SERIALS - 1)
+
+
+def _mark(serial: int) -> int:
+    return (serial * _FACTOR >> 12 & 0x3FF) or 1
+
+
+MAX_PASSED = 1024
+"""Packets that are remembered; one that runs in a circle comes again long before so many others."""
+
+
+class LoopDetector:
+    """The latest packets, by invoke id and addresses."""
+
+    def __init__(self) -> None:
+        self._latest: OrderedDict[tuple[int, bytes], None] = OrderedDict()
+
+    def __contains__(self, packet: tuple[int, bytes]) -> bool:
+        return packet in self._latest
+
+    def add(self, invoke_id: int, addresses: bytes) -> None:
+        """Remember a packet."""
+        self._latest[invoke_id, addresses] = None
+        if len(self._latest) > MAX_PASSED:
+            self._latest.popitem(last=False)
 
 
 class Pending:

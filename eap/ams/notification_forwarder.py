@@ -1,7 +1,8 @@
-"""Subscriptions that pass a router: requests and answers are followed, samples go to their clients.
+"""Notifications across a router: requests and answers are tracked, samples go to their clients.
 
-The first router on the way keeps what it needs to restore a subscription (restorer.py): it is the
-one whose client has a connection to it and whose request bears no mark of a router before it.
+The first router on the path keeps the parameters that it needs to restore a subscription
+(``subscription_restorer``): it is the one whose client has a connection to it and whose request
+bears no mark of another router.
 """
 
 from __future__ import annotations
@@ -9,17 +10,95 @@ from __future__ import annotations
 import struct
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
+from struct import Struct
 from typing import NamedTuple
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Reply
-from eap.ams.inflight import Pending
-from eap.ams.invoke import is_marked
+from eap.ams.admission import Limits
+from eap.ams.inflight import InFlight, InvokeIds, Pending, is_marked
 from eap.ams.subscriptions import MAX_PER_CLIENT, Grant, Subscription, Subscriptions, divide
-from eap.ams.transport_table import TransportTable
+from eap.ams.transport_table import Action, Reply, TransportTable
 from eap.codec.ads import AdsError, AdsReadWrite, IndexGroup
 from eap.codec.adsnotification import AddNotification, decode_notification
-from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
+from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, StateFlags, encode_packet
+from eap.ids import NetId
+
+_WRITE = Struct("<III")  # group, offset, length
+
+
+class NotificationCleanup:
+    """Asks servers to end notifications.
+
+    Args:
+        transports: By which they are asked.
+        in_flight: What waits for an answer, these requests too.
+        ids: Of requests of this router.
+        limits: How much may wait, and for how long.
+    """
+
+    def __init__(
+        self, transports: TransportTable, in_flight: InFlight, ids: InvokeIds, limits: Limits
+    ) -> None:
+        self._transports = transports
+        self._in_flight = in_flight
+        self._ids = ids
+        self._limits = limits
+
+    def end(self, grants: Iterable[Grant], now_ns: int) -> list[Action]:
+        """Have notifications ended, for nobody and as long as there is room to wait for it."""
+        actions: list[Action] = []
+        for grant in grants:
+            if grant.route.hop.transport not in self._transports.transports:
+                continue
+            if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
+                break
+            handle = grant.handle.to_bytes(4, "little")
+            actions.append(self._ask(grant, AmsCommand.DELETE_NOTIFICATION, handle, now_ns))
+            actions += self.release(grant, now_ns)
+        return actions
+
+    def release(self, grant: Grant, now_ns: int) -> list[Action]:
+        """Give back the handle of a symbol that this router looked up."""
+        if grant.symbol_handle is None:
+            return []
+        handle = grant.symbol_handle.to_bytes(4, "little")
+        body = _WRITE.pack(IndexGroup.RELEASE_HANDLE, 0, len(handle)) + handle
+        return [self._ask(grant, AmsCommand.WRITE, body, now_ns)]
+
+    def end_unwanted(self, header: AmsHeader, handle: int, endpoint: Endpoint) -> list[Action]:
+        """Return what ends a notification that no client here has, at the server that sent it.
+
+        Not while the answer may still come that tells its handle: datagrams overtake each other.
+        """
+        if any(pending.handles for pending in self._in_flight.on(endpoint.transport, None)):
+            return []
+        head = AmsHeader(
+            header.source,
+            header.source_port,
+            header.target,
+            header.target_port,
+            AmsCommand.DELETE_NOTIFICATION,
+            StateFlags.ADS | StateFlags.NO_RETURN,
+        )
+        return [self._transports.reply(endpoint, encode_packet(head, handle.to_bytes(4, "little")))]
+
+    def _ask(self, grant: Grant, command: AmsCommand, body: bytes, now_ns: int) -> Action:
+        invoke_id = self._ids.take(self._in_flight)
+        header = header_to(grant.onward, command, invoke_id)
+        route, deadline_ns = grant.route, now_ns + self._limits.timeout_ns
+        self._in_flight.add(
+            Pending(invoke_id, header, None, route, grant.onward, now_ns, deadline_ns)
+        )
+        return self._transports.forward(route.hop, encode_packet(header, body), invoke_id)
+
+
+def header_to(addresses: bytes, command: int, invoke_id: int) -> AmsHeader:
+    """Return the header of a request with the *addresses* of its server and its client."""
+    target, target_port, source, source_port = ADDRESSES.unpack(addresses)
+    return AmsHeader(
+        NetId(target), target_port, NetId(source), source_port, command, invoke_id=invoke_id
+    )
+
 
 _GRANTED = struct.Struct("<II")  # result, handle
 _HANDLE = 4

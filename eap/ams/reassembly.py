@@ -1,13 +1,291 @@
-"""Fragments that come from many sides, put together in bounded memory."""
+"""AMS packets put together from a TCP stream or from AoE fragments, in bounded memory (ETG.1020).
+
+Each fragment is a packet of its own, with the addresses of the whole packet; the first one carries
+the rest of its header, from the command on, in front of the data.  The invoke ID holds the number
+of the fragment in its low word and that of the packet in its high word.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
+from typing import NamedTuple, TypeAlias
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.fragment import Assembler, Taken
-from eap.codec.ams import AmsHeader
+from eap.codec.ams import (
+    AmsCommand,
+    AmsHeader,
+    AmsTcpHeader,
+    RouterCommand,
+    StateFlags,
+    decode_prefix,
+    encode_packet,
+)
+from eap.codec.wire import Buffer
 from eap.errors import MalformedError
+from eap.ids import NetId
+
+
+class TooLong(NamedTuple):
+    """A packet over the limit: only its header is kept, the rest is thrown away as it comes."""
+
+    header: AmsHeader
+    length: int
+    """Of the whole packet in octets, as its prefix says."""
+
+
+class Asked(NamedTuple):
+    """What a local client asks the router itself."""
+
+    command: RouterCommand
+    data: bytes
+
+
+Piece: TypeAlias = bytes | TooLong | Asked
+
+_COMMANDS = frozenset(RouterCommand)
+_LONGEST_COMMAND = 16
+"""Octets behind the prefix of one."""
+
+
+class PacketCutter:
+    """What a connection brought and has not been taken yet.
+
+    It never holds more than one packet of the limit, one prefix, and what came last.
+
+    Args:
+        limit: Octets of the longest packet that is taken.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._buffer = bytearray()
+        self._skip = 0
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether a packet has begun and is not whole."""
+        return bool(self._buffer) or self._skip > 0
+
+    def receive(self, data: Buffer) -> None:
+        """Take what came."""
+        skipped = min(self._skip, len(data))
+        self._skip -= skipped
+        self._buffer += memoryview(data)[skipped:]
+
+    def receive_one(self, data: bytes) -> bytes | None:
+        """Return the packet if *data* is exactly one, as it mostly is; else take what came."""
+        start = AmsTcpHeader.SIZE
+        end = len(data)
+        # The limit is below 4 GB and no packet is empty, so these octets are the whole prefix.
+        if (
+            not self._buffer
+            and not self._skip
+            and start + AmsHeader.SIZE <= end <= start + self._limit
+            and data[:start] == (end - start << 16).to_bytes(start, "little")
+        ):
+            return data[start:]
+        self.receive(data)
+        return None
+
+    def next_piece(self) -> Piece | None:
+        """Return the next whole packet, None if there is none yet.
+
+        Raises:
+            MalformedError: this is no stream of AMS packets; nothing can be cut from it any more.
+        """
+        start = AmsTcpHeader.SIZE
+        if len(self._buffer) < start:
+            return None
+        if int.from_bytes(self._buffer[:2], "little") in _COMMANDS:
+            return self._cut_command()
+        length = decode_prefix(self._buffer)
+        if length > self._limit:
+            return self._cut_header(length)
+        if len(self._buffer) < start + length:
+            return None
+        packet = bytes(self._buffer[start : start + length])
+        del self._buffer[: start + length]
+        return packet
+
+    def _cut_command(self) -> Asked | None:
+        start, prefix = AmsTcpHeader.SIZE, AmsTcpHeader.decode(self._buffer)
+        end = start + prefix.length
+        if prefix.length > _LONGEST_COMMAND:
+            raise MalformedError(
+                f"length {prefix.length} behind a command, expected {_LONGEST_COMMAND} or less",
+                layout="AmsTcpHeader",
+                offset=0,
+            )
+        if len(self._buffer) < end:
+            return None
+        asked = Asked(RouterCommand(prefix.reserved), bytes(self._buffer[start:end]))
+        del self._buffer[:end]
+        return asked
+
+    def _cut_header(self, length: int) -> TooLong | None:
+        start = AmsTcpHeader.SIZE
+        if len(self._buffer) < start + AmsHeader.SIZE:
+            return None
+        header = AmsHeader.decode(self._buffer, start)
+        here = min(start + length, len(self._buffer))
+        self._skip = start + length - here
+        del self._buffer[:here]
+        return TooLong(header, length)
+
+
+FRAGMENT_TIMEOUT_NS = 2_000_000_000
+"""How long the next fragment may take; what came before is forgotten then."""
+MAX_PACKETS = 8
+"""Packets of which fragments are kept at a time; the oldest makes room."""
+MAX_LENGTH = 1 << 20
+"""Octets of the longest packet that is put together."""
+_ADDRESSES = 16
+"""Octets of a header that every fragment repeats."""
+_REST = AmsHeader.SIZE - _ADDRESSES
+
+
+def iter_fragments(packet: bytes, number: int, room: int) -> Iterator[bytes]:
+    """Yield the packets that carry *packet*, each with at most *room* octets of it.
+
+    Nobody acknowledges them.
+
+    Args:
+        packet: A whole packet.
+        number: Of the packet, another one for each; 16 bits count.
+        room: Octets behind the header of each.
+    """
+    header = AmsHeader.decode(packet)
+    content = packet[_ADDRESSES:]
+    for fragment, at in enumerate(range(0, len(content), room)):
+        head = AmsHeader(
+            header.target,
+            header.target_port,
+            header.source,
+            header.source_port,
+            AmsCommand.FRAGMENT,
+            StateFlags.ADS | StateFlags.NO_RETURN,
+            invoke_id=(number & 0xFFFF) << 16 | fragment,
+        )
+        yield encode_packet(head, content[at : at + room])
+
+
+class _Partial:
+    """What came so far of one packet."""
+
+    __slots__ = ("content", "deadline_ns", "next")
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+        self.next = 0
+        self.deadline_ns = 0
+
+
+class Taken(NamedTuple):
+    """What a fragment leads to."""
+
+    packet: bytes | None
+    """The whole packet, if this was its last fragment."""
+    acknowledgement: bytes | None
+    """What the sender waits for before it sends the next."""
+
+
+class Assembler:
+    """Puts fragments together again.
+
+    Attributes:
+        dropped: Packets of which fragments were missing, late, or did not fit together.
+        octets: Kept of the packets that are not complete.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self.octets = 0
+        self._partial: dict[tuple[int, NetId, int], _Partial] = {}
+
+    def reset(self) -> None:
+        """Forget the packets that are not complete."""
+        self._partial.clear()
+        self.octets = 0
+
+    def __len__(self) -> int:
+        return len(self._partial)
+
+    def receive(self, header: AmsHeader, body: bytes, now_ns: int) -> Taken:
+        """Take the fragment with *header* and *body*.
+
+        Raises:
+            MalformedError: one before it is missing, or the whole is longer than it says.
+        """
+        number, fragment = header.invoke_id >> 16, header.invoke_id & 0xFFFF
+        key = number, header.source, header.source_port
+        self.expire(now_ns)
+        if fragment == 0:
+            self._start(key)
+        partial = self._partial.get(key)
+        if partial is None or partial.next != fragment:
+            self._drop(key)
+            raise MalformedError(f"fragment {fragment} of packet {number} out of order",
+                                 layout="AmsHeader")  # fmt: skip
+        partial.content += body
+        self.octets += len(body)
+        partial.next += 1
+        partial.deadline_ns = now_ns + FRAGMENT_TIMEOUT_NS
+        missing = _missing(partial.content)
+        if missing < 0:
+            self._drop(key)
+            raise MalformedError(f"packet {number} is {-missing} octets too long",
+                                 layout="AmsHeader")  # fmt: skip
+        if missing:
+            return Taken(None, _acknowledge(header))
+        self._forget(key)
+        return Taken(header.encode()[:_ADDRESSES] + bytes(partial.content), None)
+
+    def expire(self, now_ns: int) -> None:
+        """Forget the packets whose next fragment is late."""
+        for key in [key for key, each in self._partial.items() if now_ns > each.deadline_ns]:
+            self._drop(key)
+
+    def _start(self, key: tuple[int, NetId, int]) -> None:
+        if key in self._partial:
+            self._drop(key)
+        elif len(self._partial) >= MAX_PACKETS:
+            self._drop(next(iter(self._partial)))
+        self._partial[key] = _Partial()
+
+    def _drop(self, key: tuple[int, NetId, int]) -> None:
+        self._forget(key)
+        self.dropped += 1
+
+    def _forget(self, key: tuple[int, NetId, int]) -> None:
+        partial = self._partial.pop(key, None)
+        if partial is not None:
+            self.octets -= len(partial.content)
+
+
+def _missing(content: bytearray) -> int:
+    """Return how many octets are still to come; at least one while nobody can know."""
+    if len(content) < _REST:
+        return _REST - len(content)
+    length = int.from_bytes(content[4:8], "little")
+    if length > MAX_LENGTH:
+        return MAX_LENGTH - length
+    return _REST + length - len(content)
+
+
+def _acknowledge(header: AmsHeader) -> bytes | None:
+    if header.state_flags & StateFlags.NO_RETURN:
+        return None
+    return AmsHeader(
+        header.source,
+        header.source_port,
+        header.target,
+        header.target_port,
+        header.command,
+        header.state_flags | StateFlags.RESPONSE,
+        invoke_id=header.invoke_id,
+    ).encode()
+
 
 MAX_SENDERS = 64
 """Ways that fragments are kept of at a time; the one that began first makes room."""

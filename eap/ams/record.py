@@ -1,17 +1,144 @@
-"""What a router remembers of what it did: counts, traffic by way, and the latest traces."""
+"""Record of a router: traces of packets, counters, and traffic by endpoint and by route."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict, deque
+from collections.abc import Hashable
+from enum import StrEnum
+from typing import Generic, NamedTuple, TypeVar
 
 import msgspec
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Outcome, Trace
 from eap.ams.hop_prober import PROBE_PORT
 from eap.ams.routes import RouteKey
-from eap.ams.traffic import TrafficTable
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
+from eap.ids import NetId
+
+
+class Outcome(StrEnum):
+    """What became of a packet."""
+
+    ANSWERED = "answered"
+    FAILED = "failed"
+    """The router itself answered, with an error."""
+    DENIED = "denied"
+    """Access rules forbid it, or items of it."""
+    LOOP = "loop"
+    """It ran in a circle; if it was a request it was answered with an error."""
+    LATE = "late"
+    """An answer or a notification that nobody waits for, or not any more."""
+    DROPPED = "dropped"
+    """Nothing was answered: broken, doubled, or of the kind that has no answer."""
+    INTERRUPTED = "interrupted"
+    """Nothing comes for subscriptions any more; they are to be restored."""
+    RESTORED = "restored"
+    """Subscriptions that were interrupted are established again."""
+
+
+class Trace(NamedTuple):
+    """What became of one packet; *text* is for people and names the hop where there is one."""
+
+    at_ns: int
+    outcome: Outcome
+    came_by: Endpoint | None
+    """None if its connection is gone."""
+    hop: Endpoint | None
+    """None if it went no further."""
+    header: AmsHeader | None
+    """Of the request, as it came; None if it could not be read."""
+    error_code: int
+    """Of the AMS header of the answer."""
+    took_ns: int
+    text: str
+
+
+MAX_WAYS = 4096
+"""Ways that are counted at a time; the one that was there first makes room."""
+MAX_SOURCES = 8
+"""NetIDs that are remembered of those who ask by one way."""
+
+KeyT = TypeVar("KeyT", bound=Hashable)
+
+
+class Traffic(msgspec.Struct):
+    """Packets of one way, in one direction of asking.
+
+    Attributes:
+        since_ns: When it was used first.
+        requests: That went there, or came from there.
+        answers: That came from there, or went there.
+        errors: Requests that did not get to their targets.
+        octets_asked: Octets of the requests.
+        octets_answered: Octets of the answers.
+        round_trip_ns: Of the latest answer.
+        last_error: In words.
+        sources: NetIDs that asked, the first of them.
+        is_answered: Whether the latest of the requests that are over was answered.
+    """
+
+    since_ns: int = 0
+    requests: int = 0
+    answers: int = 0
+    errors: int = 0
+    octets_asked: int = 0
+    octets_answered: int = 0
+    round_trip_ns: int = 0
+    last_error: str = ""
+    sources: tuple[NetId, ...] = ()
+    is_answered: bool = False
+
+    def ask(self, octets: int, source: NetId | None = None) -> None:
+        """Count a request."""
+        self.requests += 1
+        self.octets_asked += octets
+        if source is not None and source not in self.sources and len(self.sources) < MAX_SOURCES:
+            self.sources += (source,)
+
+    def answer(self, octets: int, took_ns: int) -> None:
+        """Count an answer."""
+        self.answers += 1
+        self.octets_answered += octets
+        self.round_trip_ns = took_ns
+        self.is_answered = True
+
+    def fail(self, text: str) -> None:
+        """Count a request that did not get to its target."""
+        self.errors += 1
+        self.last_error = text
+        self.is_answered = False
+
+
+class TrafficTable(Generic[KeyT]):
+    """The traffic of all ways, by what they are known by."""
+
+    def __init__(self) -> None:
+        self._endpoints: OrderedDict[KeyT, Traffic] = OrderedDict()
+
+    def of(self, endpoint: KeyT, now_ns: int) -> Traffic:
+        """Return the traffic of *endpoint*, which may be new."""
+        traffic = self._endpoints.get(endpoint)
+        if traffic is None:
+            if len(self._endpoints) >= MAX_WAYS:
+                self._endpoints.popitem(last=False)
+            traffic = self._endpoints[endpoint] = Traffic(now_ns)
+        return traffic
+
+    def get(self, endpoint: KeyT) -> Traffic | None:
+        """Return a copy of the traffic of *endpoint*, None if it was never used."""
+        traffic = self._endpoints.get(endpoint)
+        return None if traffic is None else msgspec.structs.replace(traffic)
+
+    def forget(self, endpoint: KeyT) -> None:
+        """Leave *endpoint* out from now on: it is closed."""
+        self._endpoints.pop(endpoint, None)
+
+    def snapshot(self) -> dict[KeyT, Traffic]:
+        """Return a copy of all."""
+        return {
+            endpoint: msgspec.structs.replace(each) for endpoint, each in self._endpoints.items()
+        }
+
 
 _ANSWERED = Outcome.ANSWERED  # looked up once: members of enums are slow
 MAX_EVENTS = 1024

@@ -1,15 +1,27 @@
-"""Routes and connections as people want to see them: state, time, figures, what was wrong last."""
+"""Reports on routes and connections: state, figures, last error, advice, and the hops of a trace.
+
+The hop report is an own format, served at the router's NetID and AMS port 10000: a ReadWrite of the
+index group ROUTE_QUERY with a :class:`HopQuestion` is answered with a :class:`HopReport` in JSON.
+A question with *further* is forwarded: the next router is asked in the name of this one, the only
+one that it knows.
+"""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from typing import NamedTuple
 
+import msgspec
+
 from eap.ads.endpoint import Endpoint
 from eap.ams.hop_prober import HopProber
+from eap.ams.record import Traffic
 from eap.ams.routes import Route
-from eap.ams.spec import AccessService
-from eap.ams.traffic import Traffic
+from eap.ams.spec import AccessService, TransportKind
+from eap.codec.ads import AdsError
+from eap.codec.wire import WireStruct, net_id, u8, u16
+from eap.errors import MalformedError
+from eap.ids import NetId
 
 
 class RouteState(StrEnum):
@@ -96,3 +108,189 @@ def report_route(
     is_up = known.is_answered or (hop_prober is not None and hop_prober.is_heard(route.hop))
     state = RouteState.UP if is_up else RouteState.UNKNOWN
     return RouteReport(route, state, "", round_trip_ns, known, next_name)
+
+
+_ALIVE = frozenset({AdsError.TARGET_PORT})
+"""Errors of the AMS header that only who has the NetID answers with."""
+_UNREACHED: dict[str, str] = {
+    TransportKind.AMS_TCP: (
+        "see whether it is switched on, and listens on that TCP port (a firewall?)"
+    ),
+    TransportKind.UDP: "see whether it is switched on, in the same network, and its station runs",
+    TransportKind.TCP: "see whether its station runs, and takes connections on that port",
+    TransportKind.ETHERNET: "see to the cable and the MAC address, and whether its station runs",
+    TransportKind.MQTT: (
+        "see whether both stations are connected to the broker, under the same network"
+    ),
+}
+"""What to do about a hop that is down, by the kind of the door."""
+_CLIENT = "nothing is wrong if it only asks; to be asked, it has to listen there"
+
+
+class Advice(NamedTuple):
+    """What to tell people."""
+
+    is_reached: bool
+    text: str
+    hint: str = ""
+
+
+def advise(
+    error: int, target: NetId, route: RouteReport | None, own: NetId, *, is_own: bool
+) -> Advice:
+    """Say what the *error* of an AMS header means.
+
+    Args:
+        error: 0 for none.
+        target: Who was asked.
+        route: That was taken; None for none.
+        own: NetID of the router that asked.
+        is_own: Whether *target* is of its station.
+    """
+    if not error:
+        return Advice(is_reached=True, text="answers")
+    words = AdsError.words_of(error)
+    if error in _ALIVE:
+        return Advice(is_reached=True, text=f"is there; {words}")
+    if is_own:
+        return Advice(is_reached=False, text=f"this station itself answers: {words}")
+    if route is None:
+        return Advice(
+            is_reached=False,
+            text=f"there is no route to {target}",
+            hint="add one: 'eapctl routes add', or under routes in the plant file",
+        )
+    return _behind(error, words, target, route, own)
+
+
+def _behind(error: int, words: str, target: NetId, report: RouteReport, own: NetId) -> Advice:
+    """Say what is wrong with a route, or behind it."""
+    hop = report.route.hop
+    where = f"{report.next_name} ({hop})"
+    if report.state in {RouteState.DOWN, RouteState.CLIENT}:
+        hint = _CLIENT if report.state is RouteState.CLIENT else _UNREACHED.get(hop.kind, "")
+        obstacle = Obstacle(report.state, report.why)
+        return Advice(is_reached=False, text=f"{where} {obstacle}", hint=hint)
+    if error == AdsError.TIMEOUT:
+        hint = (
+            f"it may be overloaded, or answer only whom it has a route to, as TwinCAT does: there,"
+            f" add one to {own} at the address of this host"
+        )
+        return Advice(is_reached=False, text=f"no answer from {where} in time", hint=hint)
+    if error == AdsError.TARGET_MACHINE:
+        hint = f"the router there needs a route to {target}, or it is not the NetID that is meant"
+        return Advice(is_reached=False, text=f"{where} knows no way to {target}", hint=hint)
+    if error == AdsError.HOST_UNREACHABLE:
+        hint = "'eapctl trace' names the hop"
+        return Advice(is_reached=False, text=f"the way is cut behind {where}", hint=hint)
+    if error == AdsError.ACCESS_DENIED:
+        hint = "allow it under access in the plant file, of this station or of one on the way"
+        return Advice(is_reached=False, text="access rules forbid to ask for its state", hint=hint)
+    return Advice(is_reached=False, text=f"{where} or somebody behind it answers: {words}")
+
+
+MAX_FURTHER = 16
+"""Routers that a question is handed on to; more are no way that anybody means."""
+MAX_REPORT = 4096
+"""Octets."""
+
+
+class HopQuestion(WireStruct, frozen=True):
+    """Where do requests for this address go?  *further*: how many routers further on that is."""
+
+    target: net_id
+    port: u16
+    further: u8 = 0
+    reserved: u8 = 0
+
+
+class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What one router says.
+
+    Attributes:
+        station: Its name.
+        net_id: Its NetID.
+        is_here: Whether the address is one of its own station.
+        route: Name of the route that it has; empty if none.
+        next_net_id: NetID of the router at the other end of it, as this one knows it; empty if it
+            does not know that.
+        next_name: Name of that router, as this one knows it.
+        transport: By which packets leave.
+        address: That they go to.
+        target: NetID of the target over there.
+        state: Of the route: ``up``, ``down`` or ``unknown``.
+        why: Why it passes nothing on; empty if it does.
+        may: What access rules let the asker do: true, false, or null if that depends on the object.
+        interrupted: How many subscriptions to the NetID it is restoring.
+        interrupted_s: For how many seconds; None for none.
+        error: Of ADS, why the router that was asked next did not answer; 0 if there was none.
+    """
+
+    station: str
+    net_id: str
+    is_here: bool = False
+    route: str = ""
+    next_net_id: str = ""
+    next_name: str = ""
+    transport: str = msgspec.field(name="door", default="")
+    address: str = ""
+    target: str = ""
+    state: str = ""
+    why: str = ""
+    may: dict[AccessService, bool | None] = {}
+    error: int = 0
+    interrupted: int = 0
+    interrupted_s: int | None = None
+
+
+def report_of(
+    station: str, net_id: NetId, target: NetId, location: Location, now_ns: int
+) -> HopReport:
+    """Return what the router of *station* says of *target*, for which it found *location*."""
+    found, since_ns = location.route, location.interrupted_at_ns
+    report = HopReport(
+        station=station, net_id=str(net_id), is_here=location.is_here, why=location.why,
+        may=location.may, interrupted=location.interrupted,
+        interrupted_s=None if since_ns is None else (now_ns - since_ns) // 1_000_000_000,
+    )  # fmt: skip
+    if found is None:
+        return report
+    route, next_router = found.route, found.route.next_router
+    return msgspec.structs.replace(
+        report,
+        route=route.name,
+        next_net_id="" if next_router is None else str(next_router),
+        next_name=found.next_name,
+        transport=route.hop.transport,
+        address=route.hop.connection,
+        target=str(route.to_real(target)),
+        state=found.state,
+    )
+
+
+_DECODER = msgspec.json.Decoder(HopReport)
+
+
+def encode_report(report: HopReport) -> bytes:
+    """Return the data of an answer."""
+    return msgspec.json.encode(report)
+
+
+def decode_report(data: bytes) -> HopReport:
+    """Read the data of an answer; raise MalformedError if it is none."""
+    try:
+        report = _DECODER.decode(data)
+        for net_id in (report.net_id, report.next_net_id, report.target):
+            NetId.parse(net_id or report.net_id)
+        _require_printable(report)
+    except (msgspec.DecodeError, UnicodeDecodeError, ValueError) as exc:
+        raise MalformedError(f"not a report of a hop: {exc}", layout="HopReport") from None
+    return report
+
+
+def _require_printable(report: HopReport) -> None:
+    """Raise ValueError for a text that would do something to a terminal."""
+    texts = (report.station, report.route, report.next_name, report.transport, report.address)
+    for text in (*texts, report.why):
+        if not text.isprintable():
+            raise ValueError(f"{text!r} cannot be printed")

@@ -9,21 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable
 from typing import TypeAlias
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
 from eap.ams.access_filter import AccessFilter
-from eap.ams.action import Action, Deliver, Outcome, Reply, Trace
 from eap.ams.admission import Limits
 from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
 from eap.ams.forwarder import Forwarder
 from eap.ams.hop_prober import MISSES, HopProber
 from eap.ams.reassembly import Reassembly
-from eap.ams.record import Record, Stats
+from eap.ams.record import Outcome, Record, Stats, Trace
 from eap.ams.report import ConnectionReport, Location, RouteReport, report_route
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
-from eap.ams.transport_table import Transport, TransportTable
+from eap.ams.transport_table import Action, Deliver, Reply, Transport, TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError, MalformedError
@@ -50,7 +48,7 @@ class Router:
         net_id: Of the router itself.
         table: The routes; they may change at any time.
         transports: By which packets come and go.
-        first_invoke_id: Another one at each start, see :class:`~eap.ams.invoke.InvokeIds`.
+        first_invoke_id: Another one at each start, see :class:`~eap.ams.inflight.InvokeIds`.
         limits: How much it takes on.
         hop_prober: Finds dead hops; without one only doors tell of them.
         access: Who may do what; without rules others than this host only read.

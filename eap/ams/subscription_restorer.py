@@ -26,16 +26,14 @@ from typing import NamedTuple, TypeAlias
 import msgspec
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Action, Outcome
 from eap.ams.admission import Limits
 from eap.ams.error_reply import ErrorReplier, Refusal
-from eap.ams.inflight import InFlight, Pending
-from eap.ams.invoke import InvokeIds
-from eap.ams.notification_cleanup import NotificationCleanup, header_to
-from eap.ams.notification_forwarder import BY_HANDLE, symbol_place
+from eap.ams.inflight import InFlight, InvokeIds, Pending
+from eap.ams.notification_forwarder import BY_HANDLE, NotificationCleanup, header_to, symbol_place
+from eap.ams.record import Outcome
 from eap.ams.routes import Route
 from eap.ams.subscriptions import Grant, Subscription, Subscriptions, key_of
-from eap.ams.transport_table import TransportTable
+from eap.ams.transport_table import Action, TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
 

@@ -1,15 +1,47 @@
-"""Packets on their way out: in one piece, or in fragments where a door has not the room."""
+"""Actions of a router, and the transports by which its packets leave, whole or in fragments."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Forward, Reply
-from eap.ams.fragment import iter_fragments
+from eap.ams.reassembly import iter_fragments
 from eap.codec.ams import AmsHeader
+
+
+class Forward(NamedTuple):
+    """A request for the next hop."""
+
+    hop: Endpoint
+    packets: tuple[bytes, ...]
+    """One, or its fragments in their order."""
+    ticket: int
+    """Names the request, for a door that cannot send it."""
+
+
+class Reply(NamedTuple):
+    """An answer or a notification, for the connection that it belongs to."""
+
+    endpoint: Endpoint
+    packets: tuple[bytes, ...]
+    """One, or its fragments in their order."""
+
+
+class Deliver(NamedTuple):
+    """A request for a service of this station."""
+
+    ticket: int
+    """Names the request, for its answer."""
+    header: AmsHeader
+    body: bytes
+    came_by: Endpoint
+    """Where notifications go, if it is about any."""
+
+
+Action: TypeAlias = Forward | Reply | Deliver
 
 
 class Transport(msgspec.Struct, frozen=True):

@@ -1,4 +1,9 @@
-"""ADS symbols: how a server tells of its variables (AdsSymbolEntry and its kin of AdsDef.h)."""
+"""ADS symbols and data types: entries of variables and of their types.
+
+AdsSymbolEntry and its kin of AdsDef.h; AdsDatatypeEntry and AdsDatatypeArrayInfo of Beckhoff's
+TcAdsDef.h, as the open client ads-client reads them.  Structures, methods and attributes of data
+types do not occur here.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +90,7 @@ class _InfoTail(WireStruct, frozen=True):
 _INFO_3_SIZE = 64
 
 
-class _EntryHead(WireStruct, frozen=True):
+class _SymbolHead(WireStruct, frozen=True):
     """AdsSymbolEntry; lengths of texts without their NUL."""
 
     entry_length: u32
@@ -131,8 +136,8 @@ def encode_entry(entry: SymbolEntry) -> bytes:
     lengths = [len(text) for text in texts]
     place = entry.place
     attributes = _encode_attributes(entry.attributes)
-    head = _EntryHead(
-        _EntryHead.SIZE + sum(lengths) + len(texts) + len(attributes),
+    head = _SymbolHead(
+        _SymbolHead.SIZE + sum(lengths) + len(texts) + len(attributes),
         place.group,
         place.offset,
         place.size,
@@ -161,10 +166,10 @@ def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
         TruncatedError: the data ends before the entry does.
         MalformedError: its texts do not fit in it.
     """
-    head = _EntryHead.decode(data, offset)
+    head = _SymbolHead.decode(data, offset)
     end = offset + head.entry_length
     lengths = (head.name_length, head.type_length, head.comment_length)
-    if head.entry_length < _EntryHead.SIZE + sum(lengths) + len(lengths):
+    if head.entry_length < _SymbolHead.SIZE + sum(lengths) + len(lengths):
         raise MalformedError(
             f"{head.entry_length} octets do not hold texts of {lengths}",
             layout="AdsSymbolEntry",
@@ -177,7 +182,7 @@ def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
             offset=offset,
         )
     texts = []
-    at = offset + _EntryHead.SIZE
+    at = offset + _SymbolHead.SIZE
     for length in lengths:
         texts.append(bytes(data[at : at + length]).decode(_ENCODING, "replace"))
         at += length + 1
@@ -198,3 +203,70 @@ def decode_name(data: Buffer) -> str:
         return octets.decode()
     except UnicodeDecodeError:
         return octets.decode(_ENCODING, "replace")
+
+
+class DataTypeFlag(IntFlag):
+    """ADSDATATYPEFLAG."""
+
+    DATA_TYPE = 0x0001
+
+
+class _DataTypeHead(WireStruct, frozen=True):
+    """Lengths of texts without their NUL."""
+
+    entry_length: u32
+    version: u32
+    hash: u32
+    type_hash: u32
+    size: u32
+    offset: u32
+    type: u32
+    flags: u32
+    name_length: u16
+    type_length: u16
+    comment_length: u16
+    dimensions: u16
+    items: u16
+
+
+class _Dimension(WireStruct, frozen=True):
+    lower_bound: u32
+    elements: u32
+
+
+class DataTypeEntry(NamedTuple):
+    """A number, a text, or a list of one dimension that begins with element 0."""
+
+    name: str
+    type: int
+    """Id of the type, or of the elements."""
+    size: int
+    """Octets."""
+    element: str = ""
+    """Name of the elements' type; empty if it is no list."""
+    elements: int = 0
+    """Of a list."""
+
+
+def encode_data_type(entry: DataTypeEntry) -> bytes:
+    """Return an entry with its texts and its dimension, if it has one."""
+    name, element = encode_text(entry.name), encode_text(entry.element)
+    behind = name + b"\0" + element + b"\0\0"
+    if entry.elements:
+        behind += _Dimension(0, entry.elements).encode()
+    head = _DataTypeHead(
+        entry_length=_DataTypeHead.SIZE + len(behind),
+        version=1,
+        hash=0,
+        type_hash=0,
+        size=entry.size,
+        offset=0,
+        type=entry.type,
+        flags=DataTypeFlag.DATA_TYPE,
+        name_length=len(name),
+        type_length=len(element),
+        comment_length=0,
+        dimensions=1 if entry.elements else 0,
+        items=0,
+    )
+    return head.encode() + behind

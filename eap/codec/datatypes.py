@@ -1,4 +1,4 @@
-"""Base data types of process variables by name (ETG.1020).
+"""Base data types of process variables by name (ETG.1020), and their layout in a PD.
 
 Names are those of ESI files and IEC 61131-3; the shorter and the CANopen names are read as well.
 """
@@ -6,13 +6,14 @@ Names are those of ESI files and IEC 61131-3; the shorter and the CANopen names 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
+from typing import NamedTuple
 
 from eap.codec.values import Array, Block, Boolean, DataType, Integer, Plain, Real, String, Value
 from eap.suggest import suggest
 
-__all__ = ["MAX_SIZE", "DataType", "Plain", "Value", "parse"]
+__all__ = ["MAX_SIZE", "DataType", "PdoLayout", "Plain", "Value", "layout", "parse"]
 
 MAX_SIZE = 0xFFFF
 """Octets of the largest variable: a PD's length is 16 bits wide."""
@@ -144,3 +145,32 @@ def _array(text: str, element: DataType, count: int) -> DataType:
 def _check_size(text: str, size: int) -> None:
     if not 0 < size <= MAX_SIZE:
         raise ValueError(f"{text!r} has {size} octets, expected 1 to {MAX_SIZE}")
+
+
+class PdoLayout(NamedTuple):
+    """Start of each variable, in bits from the start of the data, and the size in bytes."""
+
+    bit_offsets: tuple[int, ...]
+    size: int
+
+
+def layout(types: Iterable[DataType]) -> PdoLayout:
+    """Place one variable of each of *types*, in this order.
+
+    This is the one rule that publisher and subscriber share: bits (BOOL, BIT1 to BIT8) pack behind
+    each other from bit 0 up, everything else starts on the next whole byte, and the PD ends on one.
+    Nothing is aligned to more than a byte (mappings of ETG.1000.6 know bit lengths only; the
+    skipped bits are padding entries of one).
+    """
+    offsets: list[int] = []
+    end = 0
+    for kind in types:
+        if not kind.is_bits:
+            end = _whole_octet(end)
+        offsets.append(end)
+        end += kind.bit_length
+    return PdoLayout(tuple(offsets), _whole_octet(end) // 8)
+
+
+def _whole_octet(bits: int) -> int:
+    return (bits + 7) // 8 * 8

@@ -1,4 +1,4 @@
-"""Mailbox messages: the header shared by all mailbox protocols, and the error reply.
+"""Mailbox messages: the common header, the error reply and the header of VoE.
 
 The same message travels in a slave's mailbox and, behind a frame header of type 5, between
 stations and to a mailbox gateway (ETG.8200).
@@ -11,7 +11,7 @@ from enum import IntEnum
 from typing import Annotated
 
 from eap.codec.ethercat import EtherCatHeader, FrameType
-from eap.codec.wire import Bits, Buffer, WireStruct, bit, bits2, bits3, bits6, u16
+from eap.codec.wire import Bits, Buffer, WireStruct, bit, bits2, bits3, bits6, u16, u32
 from eap.errors import MalformedError, TruncatedError
 
 
@@ -203,3 +203,10 @@ _LENGTH_BITS, _TYPE_AT = 11, 12
 _LENGTH_MASK = (1 << _LENGTH_BITS) - 1
 _TYPE_MASK, _COUNTER_AT = 0x0F, 4
 _TYPES = {each.value: each for each in MailboxType}
+
+
+class VoeHeader(WireStruct, frozen=True):
+    """ETG.1000.6: whose protocol the data behind it is, and which of them."""
+
+    vendor_id: u32
+    vendor_type: u16

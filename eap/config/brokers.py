@@ -6,7 +6,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import NamedTuple
 
-from eap.ams.mqtt.topics import check_network
+from eap.ams.mqtt.messages import check_network
 from eap.ams.spec import MqttSpec, TlsSpec, TransportKind
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index

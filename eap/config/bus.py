@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import TypeAlias
 
-from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import ExpectedBus, Index

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
@@ -89,7 +89,7 @@ def _check_frame(
     for pd in pds:
         sent = index.sent.get((station.name, pd.name))
         kinds = index.types(sent) if sent else None
-        size += PdHeader.SIZE + (pdo.layout(kinds).size if kinds else 0)
+        size += PdHeader.SIZE + (datatypes.layout(kinds).size if kinds else 0)
     kind = None if destination is None else destination.kind
     if size > (budget := rules.frame_budget(uri.scheme, kind)):
         message = f"frame {frame.name!r} has {size} bytes with its {len(pds)} PDs"

@@ -7,8 +7,8 @@ from ipaddress import IPv4Address
 
 from msgspec.structs import replace
 
+from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.amsdiscovery import AMS_UDP_PORT
-from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.bus import INTERFACE, check_bus_port
 from eap.config.finding import FindingReport

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from eap.ads.endpoint import Endpoint
+from eap.ams.directory import ip_hop, read_address
 from eap.ams.routes import Origin, RouteTable
 from eap.ams.routes import Route as AmsRoute
 from eap.ams.spec import DEFAULT_TARGET, HopSpec, RouteSpec, RoutingSpec, TransportKind
-from eap.ams.via import ip_hop, read_address
-from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.brokers import HOST, brokers_of, check_brokers, find_network
 from eap.config.finding import FindingReport, PlantFinding, one_of

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from msgspec import Meta, field
 
-from eap.ams.hop_report import HopReport
+from eap.ams.report import HopReport
 from eap.control.protocol import Document, Method, Parameters
 
 PAGE = 1000

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from typing import NamedTuple, Protocol
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.device import eap_rules
@@ -582,7 +582,7 @@ def _part(
     index: int, chosen: list[tuple[int, Entry]], data: bytes, state: OdState
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the bytes of each writable entry of *chosen* from the data of a complete access."""
-    plan = pdo.layout([entry.kind for _, entry in chosen])
+    plan = datatypes.layout([entry.kind for _, entry in chosen])
     if len(data) != plan.size:
         code = AbortCode.TOO_SHORT if len(data) < plan.size else AbortCode.TOO_LONG
         raise SdoAbortError(code, index, 1, f"{len(data)} bytes for entries of {plan.size}")

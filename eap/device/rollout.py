@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.pd.spec import (
     PortKind,
     RxAlternateSpec,
@@ -61,7 +61,7 @@ class PdLayout(NamedTuple):
 def lay_out(version: int, variables: Iterable[tuple[str, str]]) -> PdLayout:
     """Return the layout of *variables*, given by name and type in PDO order."""
     kinds = [(name, datatypes.parse(text)) for name, text in variables]
-    plan = pdo.layout(kind for _, kind in kinds)
+    plan = datatypes.layout(kind for _, kind in kinds)
     rows = zip(kinds, plan.bit_offsets, strict=True)
     return PdLayout(
         version, plan.size, tuple(PdVariable(name, kind.text, bit) for (name, kind), bit in rows)

@@ -20,8 +20,7 @@ from devicebus.mailbox.conversation import (
 )
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_client import IdnDescription
-from eap.codec.sdo import EXPEDITED_SIZE
-from eap.codec.sdoinfo import EntryDescription, ObjectDescription
+from eap.codec.coe import EXPEDITED_SIZE, EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.conversations import (

@@ -33,9 +33,8 @@ from devicebus.mailbox.conversation import (
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_client import IdnDescription
 from eap.closeable import Closeable
+from eap.codec.coe import EXPEDITED_SIZE, EntryDescription, ObjectDescription
 from eap.codec.ethercat import EtherCatHeader
-from eap.codec.sdo import EXPEDITED_SIZE
-from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.async_client import PORT, TIMEOUT_S, TRIES, AsyncGatewayClient, silence

@@ -15,11 +15,9 @@ from typing import TypeAlias
 
 import msgspec
 
-from eap.codec.coe import CoeHeader, CoeService
-from eap.codec.coe import encode_message as encode_coe
-from eap.codec.foe import FoeOpcode, text_of
-from eap.codec.mailbox import MailboxHeader, MailboxType
-from eap.codec.sdo import (
+from eap.codec.coe import (
+    CoeHeader,
+    CoeService,
     SdoHeader,
     SdoRequest,
     SdoResponse,
@@ -27,8 +25,10 @@ from eap.codec.sdo import (
     encode_initiate,
     encode_plain,
 )
+from eap.codec.coe import encode_message as encode_coe
+from eap.codec.foe import FoeOpcode, text_of
+from eap.codec.mailbox import MailboxHeader, MailboxType, VoeHeader
 from eap.codec.soe import Element, SoeHeader, SoeOpcode
-from eap.codec.voe import VoeHeader
 from eap.errors import MalformedError
 
 _TYPES = {

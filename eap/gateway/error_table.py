@@ -25,7 +25,7 @@ from devicebus import errors
 from eap.codec.ads import AdsError
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxError
-from eap.codec.soeerror import SoeErrorCode
+from eap.codec.soe import SoeErrorCode
 from eap.errors import EapError, EngineGoneError
 from eap.gateway.dialect import DialectFailure
 from eap.od.abort import AbortCode, SdoAbortError

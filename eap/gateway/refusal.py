@@ -9,15 +9,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eap.ads.answer import AmsAnswer, response_to
+from eap.ads.endpoint import AmsAnswer, response_to
 from eap.codec.ams import AmsHeader
-from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.coe import (
+    CoeHeader,
+    CoeService,
+    InfoError,
+    SdoInfoHeader,
+    SdoInfoOpcode,
+    encode_abort,
+)
 from eap.codec.coe import encode_message as encode_coe
 from eap.codec.foe import Busy, FoeOpcode
 from eap.codec.foe import encode_message as encode_foe
 from eap.codec.mailbox import MailboxErrorReply, MailboxType
-from eap.codec.sdo import encode_abort
-from eap.codec.sdoinfo import InfoError, SdoInfoHeader, SdoInfoOpcode
 from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.codec.soe import encode_message as encode_soe
 from eap.errors import CodecError, EapError

@@ -13,12 +13,10 @@ from eap.ads.operation import AdsRefusedError, Operation, Read, ReadWrite, Write
 from eap.ads.request import parse_request
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import StateFlags, decode_packet
-from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.coe import CoeHeader, CoeService, SdoHeader, SdoInfoOpcode, SdoRequest
 from eap.codec.eoe import EoeType
 from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SdoHeader, SdoRequest
-from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.errors import CodecError
 

@@ -17,8 +17,8 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.amsdiscovery import AMS_UDP_PORT
-from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.net import bpf

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 
-from eap.codec import pdo
+from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, Entry, OdObject, OdState
@@ -86,7 +86,7 @@ class ObjectDictionary:
         """
         if complete:
             chosen = self._whole(index, subindex, count=0xFF)
-            limit = pdo.layout([entry.kind for _, entry in chosen]).size + 2 * (subindex == 0)
+            limit = datatypes.layout([entry.kind for _, entry in chosen]).size + 2 * (subindex == 0)
             if size > limit:
                 raise SdoAbortError(
                     AbortCode.TOO_LONG, index, subindex, f"{size} octets for entries of {limit}"
@@ -103,7 +103,7 @@ class ObjectDictionary:
         Gaps and entries that may not be read now are left out, and are zero, respectively.
         """
         chosen = self._whole(index, first)
-        plan = pdo.layout([entry.kind for _, entry in chosen])
+        plan = datatypes.layout([entry.kind for _, entry in chosen])
         data = bytearray(plan.size)
         with self.at_one_moment():
             for (_, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
@@ -125,7 +125,7 @@ class ObjectDictionary:
         chosen = self._whole(index, first, count=count)
         if first == 0:
             data = data[2:]
-        plan = pdo.layout([entry.kind for _, entry in chosen])
+        plan = datatypes.layout([entry.kind for _, entry in chosen])
         if len(data) != plan.size:
             short = len(data) < plan.size
             code = AbortCode.TOO_SHORT if short else AbortCode.TOO_LONG

@@ -17,7 +17,7 @@ from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import AlStatus
 from eap.codec.mailbox import MailboxError
-from eap.codec.soeerror import SoeErrorCode
+from eap.codec.soe import SoeErrorCode
 from eap.errors import ConfigError, EapError
 from eap.gateway.address import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.client import GatewayClient

@@ -15,10 +15,18 @@ from devicebus.mailbox import coe_client, soe_client
 from devicebus.mailbox.conversation import Conversation, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec import datatypes
+from eap.codec.coe import EntryDescription
 from eap.codec.datatypes import DataType
-from eap.codec.sdoinfo import EntryDescription
-from eap.codec.soe import Display, Element, Idn, SoeAttribute, decode_list
-from eap.codec.soevalue import SoeScalar, SoeValue, encode_value
+from eap.codec.soe import (
+    Display,
+    Element,
+    Idn,
+    SoeAttribute,
+    SoeScalar,
+    SoeValue,
+    decode_list,
+    encode_value,
+)
 from eap.errors import ConfigError, EapError
 from eap.gateway.error_table import Cause, cause_of
 from eap.ids import ObjectId

@@ -14,7 +14,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 
-from eap.codec import pdo
+from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.errors import ConfigError, ControlError, EapError
 from eap.ids import ObjectId
@@ -299,7 +299,7 @@ def _parts(found: ObjectInfo, first: int, octets: bytes) -> list[OdValue]:
             rows.append(_value(found.index, count, octets[:1]))
         octets = octets[2:]
     kinds = [each.kind for each in chosen if each.kind is not None]
-    plan = pdo.layout(kinds)
+    plan = datatypes.layout(kinds)
     if len(kinds) != len(chosen) or plan.size != len(octets):
         return rows
     for entry, kind, bit_offset in zip(chosen, kinds, plan.bit_offsets, strict=True):

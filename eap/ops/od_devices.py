@@ -21,7 +21,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.operation import Read, Write
 from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.sdoinfo import EntryDescription, ObjectDescription
+from eap.codec.coe import EntryDescription, ObjectDescription
 from eap.control.device import (
     OD_DESCRIBE,
     OD_DUMP,

@@ -14,8 +14,8 @@ import msgspec
 
 from devicebus.wire.alstatus import state_name
 from eap.ads.operation import Operation, OperationOutcome, ReadState, WriteControl
-from eap.ads.query import decode_outcome, encode_query
-from eap.ads.state import BOOT, INIT, OP, PREOP, SAFEOP, states_of
+from eap.ads.request import decode_outcome, encode_query
+from eap.ads.space import BOOT, INIT, OP, PREOP, SAFEOP, states_of
 from eap.codec.ads import AdsError, AdsStates
 from eap.control.device import StateAnswer, StateError
 from eap.control.protocol import Document, ErrorCode

@@ -22,7 +22,7 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.pd import PdHeader
 from eap.pd import pieces
@@ -338,7 +338,7 @@ def _tx_slots(
                 port=frame.port,
                 pd_id=pd.pd_id,
                 version=pd.version,
-                size=pdo.layout([types[name] for name in pd.variables]).size,
+                size=datatypes.layout([types[name] for name in pd.variables]).size,
                 variables=pd.variables,
                 words=words.take(TxWord.SIZE),
                 frame_words=slot.words,
@@ -358,7 +358,7 @@ def _rx_slots(
     named = {variable.name: variable for variable in spec.variables}
     for pd, first_word in zip(spec.subscriptions, words, strict=True):
         kinds = [datatypes.parse(named[name].type) for name in pd.variables]
-        plan = pdo.layout(kinds)
+        plan = datatypes.layout(kinds)
         offset = octets.take(PdHeader.SIZE + plan.size)
         data = 8 * (offset + PdHeader.SIZE)
         bits = [data + bit_offset for bit_offset in plan.bit_offsets]
@@ -422,7 +422,7 @@ def lay_out_alternates(
     if not pd.alternates:
         return ()
     own = dict(zip(pd.variables, zip(kinds, bits, strict=True), strict=True))
-    layouts = {(pd.version, pdo.layout(kinds).size)}
+    layouts = {(pd.version, datatypes.layout(kinds).size)}
     found = []
     for alternate in pd.alternates:
         found.append(_lay_out_alternate(pd, alternate, own, 8 * offset))
@@ -438,7 +438,7 @@ def _lay_out_alternate(
     pd: RxPdSpec, alternate: RxAlternateSpec, own: Mapping[str, tuple[DataType, int]], header: int
 ) -> AlternateSlot:
     theirs = [datatypes.parse(each.type) for each in alternate.variables]
-    plan = pdo.layout(theirs)
+    plan = datatypes.layout(theirs)
     moves = [Move(_QUALITY, header + _QUALITY, _QUALITY_BITS)]
     missing = dict(own)
     for each, kind, start in zip(alternate.variables, theirs, plan.bit_offsets, strict=True):

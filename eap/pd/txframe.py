@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdFrameHeader, PdHeader
 from eap.ids import NetId
@@ -37,7 +37,7 @@ class Gather:
     def __init__(self, image: Image, inputs: Inputs, variables: Sequence[str]) -> None:
         slots = [image.slots[name] for name in variables]
         kinds = [datatypes.parse(slot.type) for slot in slots]
-        plan = pdo.layout(kinds)
+        plan = datatypes.layout(kinds)
         self.size = plan.size
         runs: list[Run] = []
         self._bits: list[Run] = []

@@ -6,8 +6,7 @@ import struct
 
 import pytest
 
-from eap.ads.answer import response_to
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import Endpoint, response_to
 from eap.ads.notifications import Client
 from eap.codec.ams import AmsCommand, decode_packet
 from eap.ids import NetId

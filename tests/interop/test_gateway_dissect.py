@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from eap.codec import foe, sdo, sdoinfo, soe
+from eap.codec import coe, foe, soe
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.mailbox import MailboxType, decode_frame
 from tests.support.gatewayplant import COUPLER, DRIVE, MUTE, SENSOR, gateway_plant
@@ -132,8 +132,8 @@ def test_coe(replies: list[Reply]) -> None:
             code = int.from_bytes(reply.body[6:10], "little")
             assert reply.field("coe.abortcode") == code
             seen["abort"] += 1
-        elif command >> 5 == sdo.SdoResponse.UPLOAD:
-            head = sdo.SdoHeader.decode(reply.body, CoeHeader.SIZE)
+        elif command >> 5 == coe.SdoResponse.UPLOAD:
+            head = coe.SdoHeader.decode(reply.body, CoeHeader.SIZE)
             place = reply.field("coe.sdoidx"), reply.field("coe.sdosub")
             assert place == (head.index, head.subindex)
             assert reply.field("coe.sdoscsiu_expedited") == head.expedited
@@ -146,13 +146,13 @@ def test_coe(replies: list[Reply]) -> None:
 def _check_info(reply: Reply) -> None:
     opcode = reply.body[2] & 0x7F
     assert reply.field("coe.sdoinfoopcode") == opcode
-    if opcode == sdoinfo.SdoInfoOpcode.OBJECT_RESPONSE:
-        told = sdoinfo.ObjectDescription.decode(reply.body[6:])
+    if opcode == coe.SdoInfoOpcode.OBJECT_RESPONSE:
+        told = coe.ObjectDescription.decode(reply.body[6:])
         assert reply.field("coe.sdoinfoindex") == told.index
         assert reply.field("coe.sdoinfodatatype") == told.data_type
         assert reply.field("coe.sdoinfomaxsub") == told.max_subindex
         assert reply.field("coe.sdoinfoobjcode") == told.code
-    elif opcode == sdoinfo.SdoInfoOpcode.ENTRY_RESPONSE:
+    elif opcode == coe.SdoInfoOpcode.ENTRY_RESPONSE:
         index, subindex, info = reply.body[6] | reply.body[7] << 8, reply.body[8], reply.body[9]
         assert reply.field("coe.sdoinfoindex") == index
         assert reply.field("coe.sdoinfosubindex") == subindex

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from eap.ads.device import AdsDevice
-from eap.ads.io import IoDevice, IoDeviceType, IoSpace
-from eap.ads.master import MasterSpace, SlaveState
+from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, SlaveState
 from eap.ads.operation import AdsRefusedError, WriteControl
-from eap.ads.state import OP, SAFEOP, al_state_for, states_of
-from eap.ads.symbol_table import SymbolTable, Variable
-from eap.ads.symbols import SymbolSpace
-from eap.ads.system import SystemSpace
+from eap.ads.space import OP, SAFEOP, SystemSpace, al_state_for, states_of
+from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, AdsSystemState, device_name
 from eap.ids import NetId

@@ -10,7 +10,7 @@ from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
 from eap.ads.objects import ObjectSpace
 from eap.ads.operation import WriteControl
-from eap.ads.state import al_state_for, states_of
+from eap.ads.space import al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsStates, device_name
 from eap.control.protocol import ErrorCode
 from eap.control.routes import TracedPath

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TypeAlias
 
-from eap.ads.answer import AmsAnswer, response_to
+from eap.ads.endpoint import AmsAnswer, response_to
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId

@@ -6,13 +6,13 @@ from collections.abc import Iterable
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
-from eap.ams.action import Action, Deliver, Forward, Outcome, Reply
 from eap.ams.admission import Limits
 from eap.ams.hop_prober import HopProber
+from eap.ams.record import Outcome
 from eap.ams.router import AnswerNow, Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule
-from eap.ams.transport_table import Transport
+from eap.ams.transport_table import Action, Deliver, Forward, Reply, Transport
 from eap.ids import NetId
 from tests.support.ams import Ams, parse
 

@@ -8,10 +8,9 @@ from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite, Write
-from eap.ads.query import decode_outcome, encode_query
+from eap.ads.request import decode_outcome, encode_query
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import Operation, OperationOutcome
 from eap.ads.request import encode_outcome, parse_request
 from eap.codec.ads import AdsError

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.directory import Directory
 from eap.ams.spec import (
     DirectoryPort,

@@ -6,7 +6,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill
 from eap.ids import InterfaceUri
@@ -114,7 +114,7 @@ def _triggers(draw: st.DrawFn) -> TriggerSpec:
 
 def _fits(variables: list[VariableSpec], names: tuple[str, ...], limit: int) -> bool:
     types = {each.name: datatypes.parse(each.type) for each in variables}
-    return pdo.layout([types[name] for name in names]).size <= limit
+    return datatypes.layout([types[name] for name in names]).size <= limit
 
 
 @st.composite

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import ReadWrite
 from eap.ads.request import parse_request
 from eap.ams.access import AccessList
-from eap.ams.hop_report import HopQuestion, encode_report
-from eap.ams.report import Location
+from eap.ams.report import HopQuestion, Location, encode_report
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule

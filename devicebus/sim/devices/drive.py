@@ -16,8 +16,7 @@ from devicebus.errors import SoeError
 from devicebus.mailbox.soe_server import ProcedureCommand, SoeParameter
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
-from eap.codec.soe import Display, Idn, SoeAttribute
-from eap.codec.soeerror import SoeErrorCode, name_of
+from eap.codec.soe import Display, Idn, SoeAttribute, SoeErrorCode, name_of
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Entry
 

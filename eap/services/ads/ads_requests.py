@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import TypeAlias
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import Operation, OperationOutcome
 from eap.ads.request import Outcomes, encode_outcome, take_request
 

@@ -7,13 +7,11 @@ from functools import partial
 from secrets import randbelow
 from time import monotonic_ns
 
-from eap.ads.answer import AmsAnswer
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import Client, NotificationTable
 from eap.ads.operation import Operation, OperationOutcome, WriteControl
-from eap.ads.space import AdsSpace
-from eap.ads.state import states_of
+from eap.ads.space import AdsSpace, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsStates
 from eap.services.ads.ads_requests import begin_answer
 from eap.services.ads.state_control import control_state

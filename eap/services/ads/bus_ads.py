@@ -13,8 +13,7 @@ from functools import partial
 from itertools import islice
 from typing import TypeAlias
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import Client
 from eap.ads.operation import (
     AdsRefusedError,

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from time import monotonic_ns
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.io import NoSegmentSpace
 from eap.ads.notifications import Client
 from eap.ads.objects import ObjectSpace

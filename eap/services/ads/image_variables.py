@@ -11,8 +11,7 @@ from contextlib import contextmanager
 
 from eap.ads.operation import AdsRefusedError
 from eap.ads.space import AdsSpace, Source
-from eap.ads.symbol_table import SymbolTable, Variable
-from eap.ads.symbols import SymbolSpace
+from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError
 from eap.codec.values import String

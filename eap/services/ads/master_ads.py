@@ -24,7 +24,7 @@ from devicebus.wire.datagram import (
 )
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
-from eap.ads.master import MasterSpace, SlaveState
+from eap.ads.io import MasterSpace, SlaveState
 from eap.ads.notifications import Client, NotificationTable
 from eap.ads.objects import ObjectSpace
 from eap.ads.operation import (
@@ -34,7 +34,7 @@ from eap.ads.operation import (
     ReadWrite,
     WriteControl,
 )
-from eap.ads.state import INIT, al_state_for, states_of
+from eap.ads.space import INIT, al_state_for, states_of
 from eap.ams.access import place_of
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, to_filetime

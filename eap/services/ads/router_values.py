@@ -7,8 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from eap.ams.action import Outcome
-from eap.ams.record import Stats
+from eap.ams.record import Outcome, Stats
 from eap.ams.report import ConnectionReport, RouteReport, RouteState
 from eap.ams.routes import Route, RouteTable
 from eap.errors import ImageError

@@ -25,14 +25,13 @@ from eap.ads.operation import (
     Write,
     WriteControl,
 )
-from eap.ads.query import decode_outcome, encode_query
-from eap.ads.state import DeviceDataSpace, al_state_for, states_of
+from eap.ads.request import decode_outcome, encode_query
+from eap.ads.space import DeviceDataSpace, al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoPlace, SoePlace, device_name
 from eap.codec.ams import AmsHeader, decode_packet
-from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
-from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Element, Idn
-from eap.codec.soeerror import SoeErrorCode
-from eap.codec.voe import VoeHeader
+from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
+from eap.codec.mailbox import VoeHeader
+from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Element, Idn, SoeErrorCode
 from eap.errors import TruncatedError
 from eap.ids import NetId
 from eap.runtime.bus_request import SlaveDescription, no_mailbox

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eap.ads.operation import AdsRefusedError, OperationOutcome, WriteControl
-from eap.ads.state import al_state_for
+from eap.ads.space import al_state_for
 from eap.codec.ads import AdsError
 from eap.errors import ControlError
 from eap.services.device.station_device import StationDevice

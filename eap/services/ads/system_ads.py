@@ -11,7 +11,7 @@ from secrets import randbelow
 
 from eap.ads.notifications import Client
 from eap.ads.operation import Operation, OperationOutcome, WriteControl
-from eap.ads.system import SystemSpace
+from eap.ads.space import SystemSpace
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsSystemState
 from eap.codec.ams import SYSTEM_PORT
 from eap.services.ads.ads_service import AdsService

@@ -21,7 +21,7 @@ import msgspec
 
 from eap.ads.operation import Operation, WriteControl
 from eap.ams.access import host_of, place_of
-from eap.ams.authorized_request import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
 from eap.ams.directory import Directory
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import ObjectId

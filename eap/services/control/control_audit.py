@@ -12,9 +12,8 @@ from typing import Any, TypeAlias
 
 from eap.ads.operation import Operation, Read, ReadWrite
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.coe import CoeHeader
+from eap.codec.coe import CoeHeader, SdoHeader
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SdoHeader
 from eap.control.bus import BusOpenParameters, MailboxData, kind_of
 from eap.control.device import ApplyAnswer, StateAnswer
 from eap.control.protocol import Request

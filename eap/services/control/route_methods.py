@@ -8,12 +8,11 @@ from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import Any
 
-from eap.ams.directory import Directory
+from eap.ams.directory import Directory, parse_via
 from eap.ams.spec import RouteSpec, TransportKind
-from eap.ams.via import parse_via
 from eap.codec import staticroutes
 from eap.codec.ads import AdsError
-from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.staticroutes import TCP_IP, StaticRoute
 from eap.control import routes as words
 from eap.control.protocol import ErrorCode, of_station, unless_unavailable

@@ -14,9 +14,8 @@ from devicebus.errors import FoeError, MailboxRefusedError, SoeError
 from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, ReadWrite
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.coe import CoeHeader
+from eap.codec.coe import CoeHeader, SdoHeader
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SdoHeader
 from eap.errors import EapError, MalformedError
 from eap.gateway.dialect import (
     DialectFailure,

@@ -14,14 +14,13 @@ import msgspec
 from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read
 from eap.ams.access import AccessList, Decision
-from eap.ams.authorized_request import AuditedOperation, AuditEntry
+from eap.ams.access_filter import AuditedOperation, AuditEntry
 from eap.ams.spec import AccessService
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
-from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.coe import CoeHeader, CoeService, SdoHeader, SdoRequest
 from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SdoHeader, SdoRequest
 from eap.codec.soe import SoeHeader
 from eap.gateway.error_table import Cause, ads_result
 from eap.ids import NetId

@@ -15,22 +15,26 @@ from devicebus.mailbox.coe_server import (
     transfer_of,
 )
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.codec.coe import CoeHeader, CoeService, encode_message
-from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import (
+from eap.codec.coe import (
     EXPEDITED_SIZE,
     INITIATE_OVERHEAD,
     SEGMENT_OVERHEAD,
+    CoeHeader,
+    CoeService,
+    InfoError,
     SdoHeader,
+    SdoInfoHeader,
+    SdoInfoOpcode,
     SdoRequest,
     SdoResponse,
     encode_abort,
     encode_initiate,
+    encode_message,
     encode_plain,
     encode_segment,
     encode_segment_answer,
 )
-from eap.codec.sdoinfo import InfoError, SdoInfoHeader, SdoInfoOpcode
+from eap.codec.mailbox import MailboxType
 from eap.errors import TruncatedError
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import GatewayError

@@ -9,8 +9,7 @@ from collections.abc import Iterable
 from time import monotonic_ns, time
 from typing import Any
 
-from eap.ams.action import Outcome, Trace
-from eap.ams.record import reason_of
+from eap.ams.record import Outcome, Trace, reason_of
 from eap.ams.report import ConnectionReport, RouteReport
 from eap.ams.routes import Origin, Route
 from eap.ams.subscription_restorer import Interruption

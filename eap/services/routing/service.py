@@ -19,8 +19,7 @@ from itertools import count
 from time import monotonic_ns
 from typing import NamedTuple, Protocol, TypeAlias
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError

@@ -22,19 +22,17 @@ import os
 from collections.abc import Callable, Collection, Hashable
 from time import monotonic_ns
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList, host_of
-from eap.ams.action import Action, Forward, Outcome, Reply, Trace
+from eap.ams.access_filter import AuditEntry
 from eap.ams.admission import Limits
-from eap.ams.authorized_request import AuditEntry
 from eap.ams.hop_prober import HopProber
-from eap.ams.record import Record, Stats, reason_of
+from eap.ams.record import Outcome, Record, Stats, Trace, reason_of
 from eap.ams.report import ConnectionReport, Location, RouteReport
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
-from eap.ams.transport_table import Transport
+from eap.ams.transport_table import Action, Forward, Reply, Transport
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.services.rate_limits import caused_by

@@ -19,10 +19,10 @@ from msgspec.structs import replace
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
-from eap.ams.authorized_request import AuditEntry
+from eap.ams.access_filter import AuditEntry
 from eap.ams.routes import Origin, Route, RouteTable
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
-from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
 from eap.ids import STATION_OCTETS, Destination, DestinationKind, InterfaceUri, NetId, prefix_text

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from eap.ams.routing_change import describe_routing, routing_needs_new_start
-from eap.ams.spec import RoutingSpec
+from eap.ams.spec import RoutingSpec, describe_routing, routing_needs_new_start
 from eap.errors import ControlError, EnvironmentalError
 from eap.runtime.store import AppliedRouting, StationFile, digest_of
 from eap.services.routing.station_routes import StationRoutes

@@ -1,7 +1,7 @@
 """The path to an AMS address, hop by hop: each router reports where it forwards requests.
 
 A query for a router further on is forwarded by those before it, so no routes to the routers between
-are needed (own format, see :class:`~eap.ams.hop_report.HopQuestion`).  A router of another make
+are needed (own format, see :class:`~eap.ams.report.HopQuestion`).  A router of another make
 answers it with an error; the hops behind that one stay unknown.
 """
 
@@ -14,23 +14,24 @@ from typing import NamedTuple, Protocol
 
 from msgspec.structs import replace
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome, ReadState, ReadWrite
-from eap.ads.query import decode_outcome, encode_query
-from eap.ads.request import encode_outcome, parse_request
-from eap.ams.advice import Advice, advise
+from eap.ads.request import decode_outcome, encode_outcome, encode_query, parse_request
 from eap.ams.directory import AmsAddress, Directory
-from eap.ams.hop_report import (
+from eap.ams.report import (
     MAX_FURTHER,
     MAX_REPORT,
+    Advice,
     HopQuestion,
     HopReport,
+    Location,
+    RouteReport,
+    RouteState,
+    advise,
     decode_report,
     encode_report,
     report_of,
 )
-from eap.ams.report import Location, RouteReport, RouteState
 from eap.ams.spec import TransportKind
 from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader

@@ -13,8 +13,8 @@ from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
+from eap.codec.coe import SdoInfoOpcode
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.errors import EapError
 from eap.gateway.error_table import cause_of_result
 from eap.services.slaves.file_stream import AHEAD, FileStream

@@ -12,10 +12,9 @@ from devicebus.mailbox import aoe_client, coe_client, soe_client, voe
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet
-from eap.codec.mailbox import MailboxType
-from eap.codec.sdoinfo import SdoInfoOpcode
+from eap.codec.coe import SdoInfoOpcode
+from eap.codec.mailbox import MailboxType, VoeHeader
 from eap.codec.soe import Idn
-from eap.codec.voe import VoeHeader
 from eap.runtime.bus_request import SlaveDescription, no_mailbox
 from eap.services.slaves.bus_client import BusClient
 from eap.services.slaves.file_stream import AHEAD, LocalFile

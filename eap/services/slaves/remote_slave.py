@@ -16,16 +16,16 @@ from typing import Protocol
 from devicebus.errors import FoeError, SoeError
 from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.answer import AmsAnswer, response_to
+from eap.ads.endpoint import AmsAnswer, response_to
 from eap.ads.operation import Operation, Read, ReadState, ReadWrite, Write
-from eap.ads.query import decode_outcome, encode_query
+from eap.ads.request import decode_outcome, encode_query
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
+from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
 from eap.codec.foe import DATA_OVERHEAD
 from eap.codec.foe import name_of as name_of_foe
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
-from eap.codec.soeerror import SoeErrorCode, name_of
+from eap.codec.soe import SoeErrorCode, name_of
 from eap.gateway.error_table import cause_of_result
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.services.slaves.access import RemoteAccessError

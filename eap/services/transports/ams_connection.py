@@ -24,12 +24,14 @@ from typing import ClassVar, Protocol
 
 import msgspec
 
-from eap.ads.answer import AmsAnswer, response_to
-from eap.ams.stream import Asked, PacketCutter, Piece, TooLong
+from eap.ads.endpoint import AmsAnswer, response_to
+from eap.ams.reassembly import Asked, PacketCutter, Piece, TooLong
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
-from eap.codec.amstcp import (
+from eap.codec.ams import (
+    AmsCommand,
+    AmsHeader,
     RouterCommand,
+    StateFlags,
     encode_net_id,
     encode_opened_port,
     encode_with_prefix,

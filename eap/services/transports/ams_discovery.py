@@ -22,11 +22,11 @@ from typing import NamedTuple
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.access import Decision
-from eap.ams.authorized_request import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
 from eap.ams.routes import Origin, RouteTable
 from eap.ams.spec import AccessService, AmsUser, HopSpec, RouteSpec, TransportKind
 from eap.codec.ads import AdsError
-from eap.codec.ams import SYSTEM_PORT, AmsHeader
+from eap.codec.ams import AMS_TCP_PORT, SYSTEM_PORT, AmsHeader
 from eap.codec.amsdiscovery import (
     RESPONSE,
     TEMPORARY,
@@ -40,7 +40,6 @@ from eap.codec.amsdiscovery import (
     encode_text,
     encode_version,
 )
-from eap.codec.amstcp import AMS_TCP_PORT
 from eap.errors import CodecError, ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, NetId, parse_host
 from eap.net.host import read_password

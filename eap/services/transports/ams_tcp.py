@@ -22,7 +22,7 @@ from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Route
 from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
-from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ams import AMS_TCP_PORT
 from eap.ids import NetId, parse_host
 from eap.net.connections import OVERDUE_NS, CloseReason, Limits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp

@@ -10,8 +10,7 @@ from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import Client
 from eap.ads.request import MAX_ANSWER
-from eap.ads.symbol_table import SymbolTable, Variable
-from eap.ads.symbols import SymbolSpace
+from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name
 from eap.codec.adsnotification import decode_notification

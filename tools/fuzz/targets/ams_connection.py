@@ -6,9 +6,8 @@ import asyncio
 from collections import deque
 from typing import Any
 
-from eap.ads.answer import AmsAnswer, response_to
-from eap.codec.ams import AmsHeader
-from eap.codec.amstcp import AmsTcpHeader, encode_with_prefix
+from eap.ads.endpoint import AmsAnswer, response_to
+from eap.codec.ams import AmsHeader, AmsTcpHeader, encode_with_prefix
 from eap.runtime.discards import Refusal
 from eap.services.transports.ams_connection import MAX_REQUESTS, AmsConnection
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.authorized_request import AuditEntry
+from eap.ams.access_filter import AuditEntry
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AmsUser, RouteSpec, RoutingSpec
 from eap.codec.amsdiscovery import (

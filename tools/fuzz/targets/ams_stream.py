@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from eap.ams.stream import PacketCutter, TooLong
-from eap.codec.amstcp import encode_with_prefix
+from eap.ams.reassembly import PacketCutter, TooLong
+from eap.codec.ams import encode_with_prefix
 from eap.errors import MalformedError
 
 LIMIT = 64

@@ -17,7 +17,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.voe import VoeServer
 from devicebus.master.mailboxes import Unsolicited
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite
 from eap.ads.request import take_request
 from eap.ams.access import AccessList

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
-from eap.ams.action import Deliver, Forward, Reply
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule, ObjectRange
-from eap.ams.transport_table import Transport
+from eap.ams.transport_table import Deliver, Forward, Reply, Transport
 from eap.codec.ams import AmsHeader, decode_packet
 from eap.ids import NetId
 from tools.fuzz.messages import cut

@@ -10,8 +10,7 @@ from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_server import ProcedureCommand, SoeParameter, SoeServer
 from eap.codec.mailbox import MailboxType
-from eap.codec.soe import Display, Idn, SoeAttribute
-from eap.codec.soevalue import decode_value
+from eap.codec.soe import Display, Idn, SoeAttribute, decode_value
 from eap.errors import CodecError
 from eap.od.model import OdState
 from tools.fuzz.messages import answer_with, cut

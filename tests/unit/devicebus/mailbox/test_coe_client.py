@@ -21,9 +21,8 @@ from devicebus.mailbox import coe_client
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.conversation import Progress
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.codec.coe import CoeService
+from eap.codec.coe import CoeService, EntryDescription, ObjectDescription
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.info import ListType

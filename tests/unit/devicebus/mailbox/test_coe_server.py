@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.coe_server import MAX_PENDING, CoeServer, SdoInfoServer, SdoServer
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.codec.coe import CoeService, decode_message
+from eap.codec.coe import CoeService, SdoInfoHeader, SdoInfoOpcode, decode_message
 from eap.codec.mailbox import MailboxError
-from eap.codec.sdoinfo import SdoInfoHeader, SdoInfoOpcode
 from eap.od.abort import AbortCode
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import (

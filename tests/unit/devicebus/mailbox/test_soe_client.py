@@ -18,8 +18,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_client import IdnDescription
 from devicebus.mailbox.soe_server import ProcedureCommand, SoeParameter, SoeServer
 from eap.codec.mailbox import MailboxType
-from eap.codec.soe import Display, Element, Idn, SoeAttribute, encode_list
-from eap.codec.soeerror import SoeErrorCode
+from eap.codec.soe import Display, Element, Idn, SoeAttribute, SoeErrorCode, encode_list
 from eap.od.model import OdState
 from tests.support.examples import examples
 from tests.support.mailbox import Fault, Line, open_line, run_with, talk_to

@@ -16,8 +16,15 @@ from devicebus.mailbox.soe_server import (
     SoeServer,
 )
 from eap.codec.mailbox import MailboxError
-from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Display, Element, SoeAttribute
-from eap.codec.soeerror import SoeErrorCode
+from eap.codec.soe import (
+    COMMAND_CLEAR,
+    COMMAND_START,
+    DataState,
+    Display,
+    Element,
+    SoeAttribute,
+    SoeErrorCode,
+)
 from eap.od.model import OdState
 
 

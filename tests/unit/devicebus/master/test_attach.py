@@ -8,7 +8,7 @@ from devicebus.errors import BusError
 from devicebus.mailbox import coe_client, foe_client, soe_client, voe
 from devicebus.mailbox.coe_server import SdoServer
 from devicebus.wire.alstatus import AlState
-from eap.codec.sdo import SdoRequest
+from eap.codec.coe import SdoRequest
 from eap.codec.soe import Idn
 from tests.support.loopbus import LoopBus
 

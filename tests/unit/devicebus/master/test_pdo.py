@@ -23,9 +23,8 @@ from devicebus.wire.sii import (
     SiiPdoHeader,
     SiiSyncManager,
 )
-from eap.codec.coe import CoeService, encode_message
+from eap.codec.coe import CoeService, SdoResponse, encode_initiate, encode_message
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SdoResponse, encode_initiate
 from eap.od.abort import SdoAbortError
 from tests.support.busline import Bench, Line, open_mailbox, segment, slave
 

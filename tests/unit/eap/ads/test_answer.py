@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.ads.answer import AmsAnswer, response_to
+from eap.ads.endpoint import AmsAnswer, response_to
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.ids import NetId
 

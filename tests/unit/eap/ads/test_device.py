@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ads.answer import AmsAnswer
 from eap.ads.device import FIRST_CHANGE_NS, AdsDevice
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import Client
 from eap.ads.operation import Read, Write
 from eap.ads.request import MAX_ANSWER

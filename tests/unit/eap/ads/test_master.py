@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.master import MasterSpace
+from eap.ads.io import MasterSpace
 from eap.ads.operation import AdsRefusedError
 from tests.support.adsdevice import FakeMaster
 

@@ -12,8 +12,14 @@ from eap.ads.operation import (
     ReadWrite,
     Write,
 )
-from eap.ads.part import encode_sum, has_results, part_of, split_answer
-from eap.ads.request import AdsRequest, parse_request
+from eap.ads.request import (
+    AdsRequest,
+    encode_sum,
+    has_results,
+    parse_request,
+    part_of,
+    split_answer,
+)
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import AmsCommand

@@ -14,8 +14,7 @@ from eap.ads.operation import (
     Write,
     WriteControl,
 )
-from eap.ads.query import decode_outcome, encode_query
-from eap.ads.request import encode_outcome, parse_request
+from eap.ads.request import decode_outcome, encode_outcome, encode_query, parse_request
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import AmsCommand

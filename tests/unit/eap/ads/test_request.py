@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import (
     AdsRefusedError,
     DeleteNotification,

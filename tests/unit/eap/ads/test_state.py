@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.state import DeviceDataSpace, al_state_for, states_of
+from eap.ads.space import DeviceDataSpace, al_state_for, states_of
 from eap.codec.ads import AdsState, AdsStates, IndexGroup
 
 DATA = IndexGroup.DEVICE_DATA

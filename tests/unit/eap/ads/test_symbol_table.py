@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.symbol_table import SymbolTable, Variable
+from eap.ads.symbols import SymbolTable, Variable
 from eap.codec import datatypes
 from eap.codec.adssymbol import UploadInfo
 

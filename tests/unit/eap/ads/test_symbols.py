@@ -3,8 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.symbol_table import SymbolTable, Variable
-from eap.ads.symbols import SymbolSpace
+from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import (

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.system import SystemSpace
+from eap.ads.space import SystemSpace
 from eap.codec.ads import AdsState, AdsSystemState, IndexGroup
 
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.types import symbol_type
+from eap.ads.symbols import symbol_type
 from eap.codec import datatypes
 from eap.codec.adssymbol import AdsType
 

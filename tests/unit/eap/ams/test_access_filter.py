@@ -3,16 +3,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write
-from eap.ads.part import encode_sum
-from eap.ads.request import AdsRequest
-from eap.ams.access_filter import MAX_ENTRIES
-from eap.ams.action import Deliver, Forward, Outcome
+from eap.ads.request import AdsRequest, encode_sum
+from eap.ams.access_filter import MAX_ENTRIES, AuditEntry
 from eap.ams.admission import Limits
-from eap.ams.authorized_request import AuditEntry
+from eap.ams.record import Outcome
 from eap.ams.spec import AccessRule, ObjectRange
+from eap.ams.transport_table import Deliver, Forward
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
 from tests.support.ams import NOTIFICATION, READ, READ_WRITE, Ams

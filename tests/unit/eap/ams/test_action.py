@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.ams.action import Outcome
+from eap.ams.record import Outcome
 
 
 def test_outcomes_have_the_names_that_people_read() -> None:

@@ -3,10 +3,10 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Outcome
 from eap.ams.admission import Admission, Limits
 from eap.ams.error_reply import Refusal
 from eap.ams.inflight import InFlight, Pending
+from eap.ams.record import Outcome
 from eap.ams.routes import Route, RouteTable
 from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError

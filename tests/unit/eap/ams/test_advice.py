@@ -3,9 +3,8 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.advice import advise
-from eap.ams.report import RouteReport, RouteState
-from eap.ams.traffic import Traffic
+from eap.ams.record import Traffic
+from eap.ams.report import RouteReport, RouteState, advise
 from eap.codec.ads import AdsError
 from eap.ids import NetId
 from tests.support.aoerouter import FAR, ROUTER, route

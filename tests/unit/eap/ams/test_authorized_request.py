@@ -6,7 +6,7 @@ from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Read, Write
 from eap.ads.request import AdsRequest, parse_request
 from eap.ams.access import Decision
-from eap.ams.authorized_request import AuditedOperation, AuthorizedRequest
+from eap.ams.access_filter import AuditedOperation, AuthorizedRequest
 from eap.ams.spec import AccessService
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader

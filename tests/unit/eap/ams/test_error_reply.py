@@ -3,9 +3,8 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Outcome
 from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
-from eap.ams.record import Record
+from eap.ams.record import Outcome, Record
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport, TransportTable
 from eap.codec.ads import AdsError

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
-from eap.ams.action import Forward, Outcome
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.admission import Limits
-from eap.ams.invoke import is_marked
+from eap.ams.inflight import is_marked
+from eap.ams.record import Outcome
 from eap.ams.routes import Route
+from eap.ams.transport_table import Forward
 from eap.codec.ams import StateFlags
 from eap.ids import NetId
 from tests.support.ams import Ams, parse

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ams.fragment import (
+from eap.ams.reassembly import (
     FRAGMENT_TIMEOUT_NS,
     MAX_LENGTH,
     MAX_PACKETS,

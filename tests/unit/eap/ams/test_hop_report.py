@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.hop_report import (
+from eap.ams.report import (
     MAX_REPORT,
     HopQuestion,
     HopReport,

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.ams.invoke import InvokeIds, is_marked
+from eap.ams.inflight import InvokeIds, is_marked
 
 
 def test_ids_are_marked_and_differ() -> None:

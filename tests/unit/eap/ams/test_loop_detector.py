@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.ams.loop_detector import MAX_PASSED, LoopDetector
+from eap.ams.inflight import MAX_PASSED, LoopDetector
 
 
 def test_only_the_latest_packets_are_known() -> None:

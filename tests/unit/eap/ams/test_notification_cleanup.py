@@ -1,7 +1,7 @@
 from __future__ import annotations
 
-from eap.ams.action import Outcome
 from eap.ams.admission import Limits
+from eap.ams.record import Outcome
 from tests.support.ams import DELETE_NOTIFICATION, Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, SECOND_LINK, Station, route
 from tests.unit.eap.ams.test_notification_forwarder import (

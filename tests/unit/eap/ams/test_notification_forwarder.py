@@ -3,10 +3,10 @@ from __future__ import annotations
 import struct
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Forward
-from eap.ams.invoke import InvokeIds
+from eap.ams.inflight import InvokeIds
 from eap.ams.routes import Route
 from eap.ams.subscriptions import MAX_PER_CLIENT
+from eap.ams.transport_table import Forward
 from eap.ids import NetId
 from tests.support.ams import (
     ADD_NOTIFICATION,

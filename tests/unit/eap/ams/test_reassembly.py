@@ -4,8 +4,7 @@ import pytest
 
 from eap.ads.endpoint import Endpoint
 from eap.ams import reassembly
-from eap.ams.fragment import FRAGMENT_TIMEOUT_NS, iter_fragments
-from eap.ams.reassembly import MAX_SENDERS, Reassembly
+from eap.ams.reassembly import FRAGMENT_TIMEOUT_NS, MAX_SENDERS, Reassembly, iter_fragments
 from eap.codec.ams import decode_packet
 from eap.errors import MalformedError
 from tests.support.ams import Ams

@@ -1,8 +1,7 @@
 from __future__ import annotations
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Outcome, Trace
-from eap.ams.record import MAX_EVENTS, MAX_LATEST, Record, describe
+from eap.ams.record import MAX_EVENTS, MAX_LATEST, Outcome, Record, Trace, describe
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 from eap.ads.endpoint import Endpoint
+from eap.ams.record import Traffic
 from eap.ams.report import Obstacle, RouteState, report_route
-from eap.ams.traffic import Traffic
 from eap.ams.transport_table import Transport
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, Station, route

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Action, Forward, Reply
+from eap.ams.transport_table import Action, Forward, Reply
 from eap.codec.adsnotification import (
     AddNotification,
     Sample,

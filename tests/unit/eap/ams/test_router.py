@@ -2,12 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
-from eap.ams.action import Deliver, Outcome, Reply
-from eap.ams.fragment import iter_fragments
+from eap.ads.endpoint import AmsAnswer, Endpoint
+from eap.ams.reassembly import iter_fragments
+from eap.ams.record import Outcome
 from eap.ams.routes import Origin
-from eap.ams.transport_table import Transport
+from eap.ams.transport_table import Deliver, Reply, Transport
 from eap.codec.ams import AmsHeader, StateFlags, decode_packet
 from eap.ids import NetId
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams, parse

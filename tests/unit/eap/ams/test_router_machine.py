@@ -6,11 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
-from eap.ams.action import Action, Deliver, Forward, Reply
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.admission import Limits
-from eap.ams.fragment import Assembler
+from eap.ams.reassembly import Assembler
+from eap.ams.transport_table import Action, Deliver, Forward, Reply
 from eap.codec.ams import decode_packet
 from eap.ids import NetId
 from tests.support.ams import Ams, parse

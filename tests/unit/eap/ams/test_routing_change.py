@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from eap.ams.routing_change import describe_routing, routing_needs_new_start
 from eap.ams.spec import (
     AccessRule,
     AmsUser,
@@ -11,6 +10,8 @@ from eap.ams.spec import (
     RouteSpec,
     RoutingSpec,
     TransportKind,
+    describe_routing,
+    routing_needs_new_start,
 )
 
 HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")

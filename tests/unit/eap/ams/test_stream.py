@@ -4,9 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ams.stream import Asked, PacketCutter, TooLong
-from eap.codec.ams import AmsHeader, encode_packet
-from eap.codec.amstcp import AmsTcpHeader, RouterCommand, encode_with_prefix
+from eap.ams.reassembly import Asked, PacketCutter, TooLong
+from eap.codec.ams import AmsHeader, AmsTcpHeader, RouterCommand, encode_packet, encode_with_prefix
 from eap.errors import MalformedError
 from eap.ids import NetId
 

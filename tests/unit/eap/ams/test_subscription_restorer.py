@@ -8,9 +8,9 @@ import struct
 import msgspec
 import pytest
 
-from eap.ams.action import Action, Forward, Outcome
 from eap.ams.admission import Limits
-from eap.ams.invoke import InvokeIds
+from eap.ams.inflight import InvokeIds
+from eap.ams.record import Outcome
 from eap.ams.subscription_restorer import (
     GROUP,
     MAX_ASKED,
@@ -20,6 +20,7 @@ from eap.ams.subscription_restorer import (
     TIMEOUT_NS,
 )
 from eap.ams.subscriptions import Subscription
+from eap.ams.transport_table import Action, Forward
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader, decode_packet
 from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, READ_WRITE, Ams, parse

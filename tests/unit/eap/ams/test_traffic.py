@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.traffic import MAX_SOURCES, MAX_WAYS, Traffic, TrafficTable
+from eap.ams.record import MAX_SOURCES, MAX_WAYS, Traffic, TrafficTable
 from eap.ids import NetId
 
 

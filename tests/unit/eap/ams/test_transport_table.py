@@ -3,9 +3,8 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Forward, Reply
-from eap.ams.fragment import Assembler
-from eap.ams.transport_table import Transport, TransportTable
+from eap.ams.reassembly import Assembler
+from eap.ams.transport_table import Forward, Reply, Transport, TransportTable
 from eap.codec.ams import decode_packet
 from tests.support.ams import Ams
 

@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.directory import Directory
+from eap.ams.directory import Directory, parse_via
 from eap.ams.spec import DirectoryPort, DirectoryStation, HopSpec, TransportKind
-from eap.ams.via import parse_via
 from eap.ids import NetId
 
 FAR = "9.1.1.1.1.1"

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-from eap.codec.adsdatatype import DataTypeEntry, encode_data_type
-from eap.codec.adssymbol import AdsType
+from eap.codec.adssymbol import AdsType, DataTypeEntry, encode_data_type
 
 
 def test_number_lies_as_clients_read_it() -> None:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec.amstcp import (
+from eap.codec.ams import (
     AmsTcpHeader,
     decode_prefix,
     encode_net_id,

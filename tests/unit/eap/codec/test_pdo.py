@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.codec import datatypes
-from eap.codec.pdo import layout
+from eap.codec.datatypes import layout
 
 
 @pytest.mark.parametrize(

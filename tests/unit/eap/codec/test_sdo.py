@@ -6,12 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec.coe import CoeHeader, CoeService, decode_message
-from eap.codec.sdo import (
+from eap.codec.coe import (
+    CoeHeader,
+    CoeService,
     SdoHeader,
     SdoRequest,
     SdoResponse,
     SdoSegmentHeader,
+    decode_message,
     decode_segment,
     encode_abort,
     encode_initiate,

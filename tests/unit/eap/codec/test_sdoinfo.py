@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec.sdoinfo import (
+from eap.codec.coe import (
     EntryDescription,
     EntryRequest,
     InfoError,

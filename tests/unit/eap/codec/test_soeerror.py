@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.codec.soeerror import SoeErrorCode, name_of
+from eap.codec.soe import SoeErrorCode, name_of
 
 
 def test_every_code_has_a_text_of_its_own() -> None:

@@ -6,8 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec.soe import Display, SoeAttribute
-from eap.codec.soevalue import decode_scalar, decode_value, encode_scalar, encode_value
+from eap.codec.soe import (
+    Display,
+    SoeAttribute,
+    decode_scalar,
+    decode_value,
+    encode_scalar,
+    encode_value,
+)
 from eap.errors import CodecError, MalformedError, TruncatedError
 
 UNSIGNED = SoeAttribute(length=2, display=Display.UNSIGNED)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec.voe import VoeHeader
+from eap.codec.mailbox import VoeHeader
 from eap.errors import TruncatedError
 from tests.support.vectors import load_message
 from tests.support.wirerecords import records

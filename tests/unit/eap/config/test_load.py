@@ -18,9 +18,9 @@ from eap.ams.spec import (
     RouteSpec,
     TransportKind,
 )
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
+from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.amsdiscovery import AMS_UDP_PORT
-from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.load import INTERFACE_PATH, NET_ID_PATHS, blank
 from eap.ids import NetId
@@ -82,7 +82,7 @@ def test_the_solar_line_has_the_sizes_of_the_contract():
         assert station.cycle_us == 10_000
         types = {v.name: datatypes.parse(v.type) for v in station.variables}
         for pd in (pd for frame in station.frames for pd in frame.pds):
-            sizes[pdo.layout(types[name] for name in pd.variables).size] += 1
+            sizes[datatypes.layout(types[name] for name in pd.variables).size] += 1
         received += len(station.subscriptions)
         assert all(rx.step == 1 for rx in station.subscriptions)
     assert sizes == {600: 26, 1024: 28}

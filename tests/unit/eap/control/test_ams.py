@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.hop_report import HopReport
+from eap.ams.report import HopReport
 from eap.ams.spec import AccessService
 from eap.control.protocol import parameters
 from eap.control.routes import AskParameters, hop_row

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_rules import (
     MappingEntry,
@@ -123,7 +123,7 @@ def test_padding_is_what_the_layout_of_a_pd_leaves_out(texts):
         write(dictionary, 0x1A00, subindex, word)
     write(dictionary, 0x1A00, 0, len(words))
     placed = lay_out_mapping(dictionary, 0x1A00, len(words), 65535)
-    assert placed.octets == pdo.layout(kinds).size
+    assert placed.octets == datatypes.layout(kinds).size
     assert placed.indexes == tuple(range(0x6000, 0x6000 + len(texts)))
     assert -(-mapped_bits(dictionary, dictionary[0x1A00]) // 8) == placed.octets
 

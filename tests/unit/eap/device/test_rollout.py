@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.device.rollout import (
     PdKey,
     Step,
@@ -90,7 +90,7 @@ def _variables(
 
 
 def size(types: Sequence[str]) -> int:
-    return pdo.layout([datatypes.parse(each) for each in types]).size
+    return datatypes.layout([datatypes.parse(each) for each in types]).size
 
 
 def mismatches(running: Plant) -> list[str]:

@@ -8,7 +8,7 @@ from devicebus import errors
 from eap.codec.ads import AdsError
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxError
-from eap.codec.soeerror import SoeErrorCode
+from eap.codec.soe import SoeErrorCode
 from eap.errors import EngineGoneError
 from eap.gateway.error_table import Cause, ads_result, cause_of, cause_of_result
 from eap.od.abort import AbortCode, SdoAbortError

@@ -11,8 +11,7 @@ from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.foe import Busy, FoeErrorCode, FoeOpcode, decode_message, text_of
 from eap.codec.mailbox import MailboxError, MailboxType
-from eap.codec.soe import SoeHeader, error_code_of
-from eap.codec.soeerror import SoeErrorCode
+from eap.codec.soe import SoeErrorCode, SoeHeader, error_code_of
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import refuse
 from eap.ids import NetId

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from eap.codec.coe import EntryDescription, ObjectDescription
 from eap.codec.datatypes import parse
-from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.errors import ControlError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, ObjectCode

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.codec.pd import PdHeader
 from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
@@ -296,7 +296,7 @@ def test_any_alternate_brings_its_variables_and_nothing_else(pair, random):
     image.memory[first:end] = random.randbytes(end - first)
     before = bytes(image.memory)
 
-    plan = pdo.layout([datatypes.parse(kind) for _, kind in brought])
+    plan = datatypes.layout([datatypes.parse(kind) for _, kind in brought])
     sent = random.randbytes(PdHeader.SIZE + plan.size)
     slot.alternates[0].copy_plan().run(sent, image.memory)
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec import datatypes, pdo
+from eap.codec import datatypes
 from eap.codec.pd import iter_pds
 from eap.ids import NetId
 from eap.pd.image import Image, Inputs
@@ -171,7 +171,7 @@ def test_the_data_are_the_variables_in_pdo_order(data):
         image.write(variable.name, value)
     order = data.draw(st.lists(st.integers(0, len(kinds) - 1), min_size=1, max_size=10))
     whole = collect(image, Inputs(image), [f"v{i}" for i in order], data.draw(st.integers(0, 20)))
-    layout = pdo.layout([types[i] for i in order])
+    layout = datatypes.layout([types[i] for i in order])
     assert len(whole) == layout.size
     bits = int.from_bytes(whole, "little")
     end = 0

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ams.mqtt.info import MAX_INFO, MAX_NAME, Info, decode_info, encode_info
+from eap.ams.mqtt.messages import MAX_INFO, MAX_NAME, Info, decode_info, encode_info
 from eap.errors import MalformedError
 
 DOCUMENTED = (

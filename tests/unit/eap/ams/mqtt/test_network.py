@@ -7,10 +7,12 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.mqtt import network as mqtt_network
-from eap.ams.mqtt.info import Info, encode_info
+from eap.ams.mqtt.messages import FIRST_PORT, Info, encode_info
 from eap.ams.mqtt.network import (
     CONFIRM_NS,
+    EXPIRY_NS,
     MAX_PACKET,
+    REFRESH_NS,
     Action,
     Arrived,
     Closed,
@@ -23,8 +25,6 @@ from eap.ams.mqtt.network import (
     Subscribe,
     Warn,
 )
-from eap.ams.mqtt.peers import EXPIRY_NS, REFRESH_NS
-from eap.ams.mqtt.ports import FIRST_PORT
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import MqttSpec
 from eap.ids import NetId
@@ -280,7 +280,7 @@ def test_what_comes_to_nothing_is_counted_and_said_once(
 
 def test_routers_and_senders_have_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt_network, "MAX_SENDERS", 2)
-    monkeypatch.setattr("eap.ams.mqtt.peers.MAX_PEERS", 1)
+    monkeypatch.setattr("eap.ams.mqtt.network.MAX_PEERS", 1)
     place = Place()
     place.hear_of(FAR, HERE)
     assert place.hear_of("7.1.1.1.1.1", HERE)[0] == Dropped(Drop.FULL)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ams.mqtt.payload import Payload, decode_payload, encode_payload
+from eap.ams.mqtt.messages import Payload, decode_payload, encode_payload
 from eap.errors import TruncatedError
 from tests.support.ams import Ams
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.mqtt import peers as mqtt_peers
-from eap.ams.mqtt.info import Info
-from eap.ams.mqtt.peers import EXPIRY_NS, REFRESH_NS, Change, Peers
+from eap.ams.mqtt import network as mqtt_peers
+from eap.ams.mqtt.messages import Info
+from eap.ams.mqtt.network import EXPIRY_NS, REFRESH_NS, Change, Peers
 from eap.ams.routes import Origin, Route, RouteTable
 from eap.ids import NetId
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.ams.mqtt.ports import FIRST_PORT, LAST_PORT, ClientPorts
+from eap.ams.mqtt.messages import FIRST_PORT, LAST_PORT, ClientPorts
 from eap.ids import NetId
 from tests.support.ams import NOTIFICATION, Ams, parse
 

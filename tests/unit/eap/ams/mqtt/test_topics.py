@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ams.mqtt.topics import TopicKind, Topics, check_network
+from eap.ams.mqtt.messages import TopicKind, Topics, check_network
 from eap.ids import NetId
 
 OWN, OTHER = NetId.parse("5.1.1.1.1.1"), NetId.parse("6.1.1.1.1.1")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import struct
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import OperationOutcome
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand

@@ -7,8 +7,7 @@ import struct
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.space import AdsSpace
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G

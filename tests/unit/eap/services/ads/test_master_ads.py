@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, brd
-from eap.ads.master import SlaveState
+from eap.ads.io import SlaveState
 from eap.ads.operation import AdsRefusedError, DeleteNotification, WriteControl
 from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification

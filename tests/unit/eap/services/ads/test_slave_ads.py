@@ -10,7 +10,7 @@ from eap.ads.operation import Read, ReadState, ReadWrite, Write, WriteControl
 from eap.codec.ads import AdsError, AdsRange, AdsState, IndexGroup, SoePlace
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand, AmsHeader
-from eap.codec.sdoinfo import EntryDescription, ObjectDescription
+from eap.codec.coe import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.ids import NetId
 from eap.runtime.bus_request import ExchangeMailbox

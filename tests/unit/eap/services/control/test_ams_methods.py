@@ -6,8 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.directory import Directory
 from eap.ams.routes import Route
 from eap.ams.spec import DirectoryStation

@@ -10,7 +10,7 @@ import pytest
 from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, ReadWrite, Write, WriteControl
 from eap.ams.access import Decision
-from eap.ams.authorized_request import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
 from eap.ams.directory import Directory
 from eap.ams.spec import AccessService, DirectoryPort, DirectoryStation
 from eap.codec.ads import IndexGroup

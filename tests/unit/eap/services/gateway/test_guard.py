@@ -7,7 +7,7 @@ import pytest
 from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Read, Write
 from eap.ams.access import AccessList
-from eap.ams.authorized_request import AuditEntry
+from eap.ams.access_filter import AuditEntry
 from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType

@@ -12,10 +12,10 @@ from devicebus.mailbox import soe_client
 from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_server import SoeParameter, SoeServer
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import Read, ReadWrite, Write
-from eap.ads.query import encode_query
-from eap.ams.fragment import Assembler, iter_fragments
+from eap.ads.request import encode_query
+from eap.ams.reassembly import Assembler, iter_fragments
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxType

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from eap.codec.coe import CoeHeader
+from eap.codec.coe import SEGMENT_MINIMUM, CoeHeader, SdoHeader
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import SEGMENT_MINIMUM, SdoHeader
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
 from eap.services.gateway import gateway
 from eap.services.gateway.gateway import Settings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.codec.ads import AdsError
 from eap.ids import NetId
 from tests.support import aoe

@@ -5,11 +5,10 @@ from collections.abc import Awaitable
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import Operation, Read, ReadState, ReadWrite
-from eap.ads.query import decode_outcome, encode_query
-from eap.ams.hop_report import HopQuestion, decode_report
+from eap.ads.request import decode_outcome, encode_query
+from eap.ams.report import HopQuestion, decode_report
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId

@@ -7,10 +7,9 @@ import pytest
 from msgspec.structs import replace
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Outcome, Trace
+from eap.ams.record import Outcome, Trace, Traffic
 from eap.ams.report import ConnectionReport, RouteReport, RouteState
 from eap.ams.routes import Origin, Route
-from eap.ams.traffic import Traffic
 from eap.codec.ams import AmsHeader
 from eap.control.routes import RoutesListParameters
 from eap.ids import NetId

@@ -7,11 +7,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.ads.answer import AmsAnswer
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import Endpoint
-from eap.ads.io import IoDevice, IoDeviceType, IoSpace
-from eap.ads.master import MasterSpace, SlaveState
+from eap.ads.endpoint import AmsAnswer, Endpoint
+from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, SlaveState
 from eap.ads.notifications import Client
 from eap.ams.directory import Directory
 from eap.ams.routes import Route

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.codec.ads import AdsError
 from eap.codec.ams import decode_packet
 from eap.services.routing import service as service_module

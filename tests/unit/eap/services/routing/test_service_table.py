@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.services.routing.service import ServiceTable

@@ -6,8 +6,7 @@ import asyncio
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
 from eap.ams.admission import Limits
 from eap.ams.routes import Route

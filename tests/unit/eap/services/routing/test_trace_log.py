@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.action import Outcome, Trace
-from eap.ams.record import describe
+from eap.ams.record import Outcome, Trace, describe
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.services.routing.station_router import TraceLog

@@ -4,7 +4,7 @@ import asyncio
 from itertools import count
 from typing import Any
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ams.spec import AccessRule
 from eap.ams.spec import AccessService as Service
 from eap.codec.ads import AdsError, AdsStates

@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from devicebus.errors import MailboxBusyError, NoMailboxError, SoeError
 from devicebus.mailbox.conversation import MailboxRequest
+from eap.codec.coe import ListRequest, SdoInfoOpcode
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdoinfo import ListRequest, SdoInfoOpcode
 from eap.codec.soe import Element, Idn
 from eap.errors import EngineGoneError
 from eap.od.abort import AbortCode, SdoAbortError

@@ -6,11 +6,11 @@ import asyncio
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
+from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import Read, Write
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet
-from eap.codec.sdoinfo import SdoInfoOpcode
+from eap.codec.coe import SdoInfoOpcode
 from eap.errors import CodecError
 from eap.ids import NetId
 from eap.od.abort import AbortCode, SdoAbortError

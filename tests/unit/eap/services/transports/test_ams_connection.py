@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 import pytest
 
-from eap.ads.answer import AmsAnswer, response_to
+from eap.ads.endpoint import AmsAnswer, response_to
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.net.connections import CloseReason

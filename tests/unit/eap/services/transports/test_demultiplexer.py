@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.fragment import iter_fragments
+from eap.ams.reassembly import iter_fragments
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
 from eap.ids import NetId

@@ -7,8 +7,7 @@ import socket
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
 from eap.ids import NetId

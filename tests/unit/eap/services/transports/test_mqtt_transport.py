@@ -7,8 +7,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from eap.ads.answer import AmsAnswer
-from eap.ads.endpoint import Endpoint
+from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.routes import Origin, Route
 from eap.ams.spec import MqttSpec, RoutingSpec
 from eap.ams.transport_table import Transport

@@ -1,0 +1,248 @@
+"""Messages of AMS over MQTT: topics, payloads, the info of a router, and ports of its clients.
+
+All routers of a network have topics that begin with its name and their NetID (Beckhoff
+ADS-over-MQTT): ``…/info`` holds the info of a router, requests come by ``…/ams``, answers and
+notifications by ``…/ams/res``.  The info is a little XML,
+``<info><online name="HOST" osVersion="…" osPlatform="…" tcVersion="…">true</online></info>``; with
+``false`` the router is offline, which is also its last will.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from enum import Enum
+from typing import TYPE_CHECKING, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+from eap.codec.ams import AmsCommand, AmsHeader, AmsTcpHeader, StateFlags, encode_with_prefix
+from eap.errors import MalformedError, TruncatedError
+from eap.ids import NetId
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+
+MAX_NETWORK = 128
+"""Characters of the name of a network."""
+
+
+class TopicKind(Enum):
+    """What a topic is for; the value is what follows the NetID."""
+
+    INFO = "info"
+    REQUESTS = "ams"
+    ANSWERS = "ams/res"
+
+
+class Topics:
+    """Topics of one router in a network.
+
+    Raises:
+        ValueError: no network can have that name.
+
+    Attributes:
+        info: Where it tells of itself.
+        filters: What it subscribes to.
+    """
+
+    def __init__(self, network: str, net_id: NetId) -> None:
+        check_network(network)
+        self._start = f"{network}/"
+        self.info = self.of(str(net_id), TopicKind.INFO)
+        self.all_info = self.of("+", TopicKind.INFO)
+        self.filters = (f"{self._start}{net_id}/ams/#", self.all_info)
+
+    def of(self, address: str, kind: TopicKind) -> str:
+        """Return the topic of the router with the NetID *address*."""
+        return f"{self._start}{address}/{kind.value}"
+
+    def parse(self, topic: str) -> tuple[NetId, TopicKind] | None:
+        """Return whose topic it is and what for; None for one that means nothing here."""
+        if not topic.startswith(self._start):
+            return None
+        address, _, rest = topic[len(self._start) :].partition("/")
+        kind = _KINDS.get(rest)
+        try:
+            net_id = NetId.parse(address)
+        except ValueError:
+            return None
+        # Not 05.1.1.1.1.1: nobody has two topics for one thing.
+        return (net_id, kind) if kind is not None and str(net_id) == address else None
+
+
+def check_network(name: str) -> None:
+    """Raise ValueError, and say why, if no network can have that name."""
+    if not name or len(name) > MAX_NETWORK:
+        raise ValueError(f"{name[:40]!r} is no name of a network: 1 to {MAX_NETWORK} characters")
+    if not name.isprintable() or set(name) & set("+#"):
+        raise ValueError(f"{name!r} is no name of a network: no '+', '#' or control characters")
+    if name.startswith(("$", "/")) or name.endswith("/"):
+        raise ValueError(f"{name!r} is no name of a network: no '$' or '/' in front, no '/' behind")
+
+
+_KINDS = {kind.value: kind for kind in TopicKind}
+
+
+class Payload(NamedTuple):
+    """What a message brought."""
+
+    packet: bytes
+    is_prefixed: bool
+
+
+def decode_payload(payload: bytes) -> Payload:
+    """Return the packet in a message.
+
+    Raises:
+        TruncatedError: there is not even a header.
+    """
+    start = AmsTcpHeader.SIZE
+    if len(payload) >= start + AmsHeader.SIZE:
+        prefix = AmsTcpHeader.decode(payload)
+        if prefix.reserved == 0 and prefix.length == len(payload) - start:
+            return Payload(payload[start:], is_prefixed=True)
+    if len(payload) < AmsHeader.SIZE:
+        text = f"{len(payload)} octets, expected {AmsHeader.SIZE} or more"
+        raise TruncatedError(text, layout="AmsHeader")
+    return Payload(payload, is_prefixed=False)
+
+
+def encode_payload(payload: Payload) -> bytes:
+    """Return the message that carries a packet."""
+    return encode_with_prefix(payload.packet) if payload.is_prefixed else payload.packet
+
+
+MAX_INFO = 4096
+"""Octets; what is longer is not read."""
+MAX_NAME = 64
+_UNIX = 4
+"""Number of the platform; 2, which routers on Windows have, is that of Windows NT."""
+_WORDS = {"true": True, "false": False}
+
+
+class Info(NamedTuple):
+    """What a router tells."""
+
+    name: str
+    """Of its host; empty if it does not say."""
+    is_online: bool
+    is_unidirectional: bool = False
+    """Whether it lets nobody ask it anything."""
+
+
+def encode_info(info: Info) -> bytes:
+    """Return the message that tells *info*."""
+    more = ' unidirectional="true"' if info.is_unidirectional else ""
+    word = "true" if info.is_online else "false"
+    attributes = f'name={quoteattr(info.name)} osPlatform="{_UNIX}"{more}'
+    return f"<info><online {attributes}>{word}</online></info>".encode()
+
+
+def decode_info(payload: bytes) -> Info:
+    """Return what a message tells; nothing at all says that the router is gone.
+
+    Raises:
+        MalformedError: it is no such message, or longer than any.
+    """
+    if not payload:
+        return Info("", is_online=False)
+    online = _parse(payload).find("online")
+    word = "" if online is None else (online.text or "").strip().lower()
+    if online is None or word not in _WORDS:
+        raise MalformedError(f"online is {word[:20]!r}, expected true or false", layout="info")
+    name = "".join(filter(str.isprintable, online.get("name", ""))).strip()
+    is_unidirectional = online.get("unidirectional", "").lower() == "true"
+    return Info(name[:MAX_NAME], _WORDS[word], is_unidirectional)
+
+
+def _parse(payload: bytes) -> Element:
+    from defusedxml import ElementTree  # the plant file's checks read topics only
+
+    if len(payload) > MAX_INFO:
+        raise MalformedError(f"{len(payload)} octets, expected at most {MAX_INFO}", layout="info")
+    try:
+        root: Element = ElementTree.fromstring(payload.rstrip(b"\0"), forbid_dtd=True)
+    except (SyntaxError, ValueError, LookupError) as exc:
+        text = str(exc)[:80] or type(exc).__name__
+        raise MalformedError(f"this is not XML that is read: {text}", layout="info") from None
+    if root.tag != "info":
+        raise MalformedError(f"it begins with {root.tag[:20]!r}, expected 'info'", layout="info")
+    return root
+
+
+FIRST_PORT, LAST_PORT = 0xA000, 0xDFFF
+"""Ports given out; nothing of a station has one of these."""
+_TARGET, _SOURCE, _COMMAND, _FLAGS = slice(0, 8), slice(8, 16), slice(16, 18), slice(18, 20)
+_COMES_BACK = frozenset({AmsCommand.NOTIFICATION.value, AmsCommand.FRAGMENT.value})
+
+
+class ClientPorts:
+    """Which client has which port; the one silent for longest makes room.
+
+    Args:
+        net_id: Of the router.
+    """
+
+    def __init__(self, net_id: NetId) -> None:
+        self._net_id = bytes(net_id)
+        self._ports: OrderedDict[bytes, int] = OrderedDict()
+        self._clients: dict[int, bytes] = {}
+
+    def __len__(self) -> int:
+        return len(self._ports)
+
+    def outward(self, packet: bytes) -> bytes:
+        """Return a packet of a client as it goes to others."""
+        if not is_request(packet):
+            return packet
+        client = packet[_SOURCE]
+        if client[:6] == self._net_id and not _is_given(_port(client)):
+            return packet
+        source = self._net_id + self._port_of(client).to_bytes(2, "little")
+        return packet[: _SOURCE.start] + source + packet[_SOURCE.stop :]
+
+    def inward(self, packet: bytes) -> bytes:
+        """Return a packet of others as the client gets it that it is for."""
+        target = packet[_TARGET]
+        client = self._clients.get(_port(target)) if target[:6] == self._net_id else None
+        if client is None or not comes_back(packet):
+            return packet
+        self._ports.move_to_end(client)
+        return client + packet[_TARGET.stop :]
+
+    def _port_of(self, client: bytes) -> int:
+        port = self._ports.get(client)
+        if port is not None:
+            self._ports.move_to_end(client)
+            return port
+        if len(self._ports) > LAST_PORT - FIRST_PORT:
+            _, port = self._ports.popitem(last=False)
+        else:
+            port = FIRST_PORT + len(self._ports)
+        self._ports[client] = port
+        self._clients[port] = client
+        return port
+
+
+def is_request(packet: bytes) -> bool:
+    """Say whether a packet asks something: neither an answer nor a notification."""
+    command, flags = _number(packet, _COMMAND), _number(packet, _FLAGS)
+    return not flags & StateFlags.RESPONSE and command != AmsCommand.NOTIFICATION
+
+
+def comes_back(packet: bytes) -> bool:
+    """Say whether a packet is, or may be, for who asked before."""
+    is_response = _number(packet, _FLAGS) & StateFlags.RESPONSE
+    return bool(is_response) or _number(packet, _COMMAND) in _COMES_BACK
+
+
+def _number(packet: bytes, where: slice) -> int:
+    return int.from_bytes(packet[where], "little")
+
+
+def _port(address: bytes) -> int:
+    return int.from_bytes(address[6:], "little")
+
+
+def _is_given(port: int) -> bool:
+    return FIRST_PORT <= port <= LAST_PORT
