@@ -70,7 +70,7 @@ def _send_fragments(packet: bytes, number: int, sizes: MailboxSizes) -> Conversa
     room = min(sizes.to_slave, sizes.to_master) - MailboxHeader.SIZE - AmsHeader.SIZE
     if room < 1:
         raise MailboxSizeError(
-            f"AoE request of {len(packet)} octets: a mailbox of {sizes.to_slave} octets holds no"
+            f"AoE request of {len(packet)} bytes: a mailbox of {sizes.to_slave} bytes holds no"
             " fragment of it"
         )
     for fragment in iter_fragments(packet, number, room):

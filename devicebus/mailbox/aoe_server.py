@@ -45,7 +45,7 @@ class AdsServer:
     Args:
         dictionary: What is read and written.
         state: Says in which state the slave is now.
-        name: Of the device; 15 octets of it are told.
+        name: Of the device; 15 bytes of it are told.
 
     Attributes:
         address: NetID and port of the slave; None until a request has told them.

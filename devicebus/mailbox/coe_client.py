@@ -48,9 +48,9 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, ValueInfo
 
 MAX_SIZE = 1 << 24
-"""Octets of the largest object that an upload takes unless told otherwise."""
+"""Bytes of the largest object that an upload takes unless told otherwise."""
 MAX_SHORT = 1_000
-"""Segments of less than seven octets that a slave may send before it only keeps us busy."""
+"""Segments of less than seven bytes that a slave may send before it only keeps us busy."""
 
 
 class UploadStart(NamedTuple):
@@ -89,7 +89,7 @@ def begin_upload(
         return UploadStart(len(head.data), head.data)
     size = head.value
     if size > max_size:
-        yield from sdo.give_up(AbortCode.OUT_OF_MEMORY, f"{size} octets, taken are {max_size}")
+        yield from sdo.give_up(AbortCode.OUT_OF_MEMORY, f"{size} bytes, taken are {max_size}")
     return UploadStart(size, rest[:size])
 
 
@@ -114,9 +114,9 @@ def continue_upload(
             segment, data = decode_segment(body)
         content += data
         if len(content) > size:
-            yield from sdo.give_up(AbortCode.TOO_LONG, f"more than the {size} octets announced")
+            yield from sdo.give_up(AbortCode.TOO_LONG, f"more than the {size} bytes announced")
         if segment.last and len(content) < size:
-            raise MailboxProtocolError(f"{sdo}: {len(content)} octets of {size} announced")
+            raise MailboxProtocolError(f"{sdo}: {len(content)} bytes of {size} announced")
         short += len(data) < SEGMENT_MINIMUM
         if not data or short > MAX_SHORT:
             reason = f"{short} short segments" if data else "a segment without data"
@@ -164,7 +164,7 @@ def download(
 
 
 def download_unsized(index: int, subindex: int, octets: bytes) -> Conversation[None]:
-    """Write an entry from four octets; as many count as the entry has.  Raises as download()."""
+    """Write an entry from four bytes; as many count as the entry has.  Raises as download()."""
     value = int.from_bytes(octets, "little")
     head = SdoHeader(0, 1, 0, 0, SdoRequest.DOWNLOAD, index, subindex, value)
     yield from _Sdo(index, subindex).ask(head.encode())
@@ -209,7 +209,7 @@ class _Sdo:
 
 
 MAX_INFO_SIZE = 0x20002
-"""Octets of the longest description: a list of all indexes there can be."""
+"""Bytes of the longest description: a list of all indexes there can be."""
 _MAX_LATE = 16
 """Fragments of other answers that are dropped before a request gives up."""
 
@@ -224,7 +224,7 @@ def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:
     body = yield from read_list(list_type)
     if len(body) % 2:
         what = f"object list {list_type.name}"
-        raise MailboxProtocolError(f"{what}: {len(body)} octets, expected whole indexes")
+        raise MailboxProtocolError(f"{what}: {len(body)} bytes, expected whole indexes")
     return list(struct.unpack(f"<{len(body) // 2}H", body))[1:]
 
 
@@ -245,20 +245,20 @@ def entry_description(
 
 
 def read_list(list_type: int) -> Conversation[bytes]:
-    """As object_list(), but return the octets, list type included."""
+    """As object_list(), but return the bytes, list type included."""
     request = ListRequest(list_type).encode()
     return (yield from _ask(f"object list {list_type}", SdoInfoOpcode.LIST_REQUEST, request))
 
 
 def read_object(index: int) -> Conversation[bytes]:
-    """As object_description(), but return the octets."""
+    """As object_description(), but return the bytes."""
     what = f"object description 0x{index:04X}"
     request = ObjectRequest(index).encode()
     return (yield from _ask(what, SdoInfoOpcode.OBJECT_REQUEST, request, index=index))
 
 
 def read_entry(index: int, subindex: int, value_info: int) -> Conversation[bytes]:
-    """As entry_description(), but return the octets."""
+    """As entry_description(), but return the bytes."""
     what = f"entry description {ObjectId(index, subindex)}"
     request = EntryRequest(index, subindex, value_info).encode()
     opcode = SdoInfoOpcode.ENTRY_REQUEST
@@ -266,7 +266,7 @@ def read_entry(index: int, subindex: int, value_info: int) -> Conversation[bytes
 
 
 def read(opcode: SdoInfoOpcode, request: bytes) -> Conversation[bytes]:
-    """Send any request; return the octets of the answer.  Raises as object_list() does."""
+    """Send any request; return the bytes of the answer.  Raises as object_list() does."""
     index = 0 if opcode is SdoInfoOpcode.LIST_REQUEST else int.from_bytes(request[:2], "little")
     subindex = int.from_bytes(request[2:3], "little")
     what = f"SDO information {opcode.name} {ObjectId(index, subindex)}"
@@ -323,5 +323,5 @@ def _ask(
         left = header.fragments_left
         body += message.data[INFO_START:]
         if len(body) > MAX_INFO_SIZE:
-            raise MailboxProtocolError(f"{what}: more than {MAX_INFO_SIZE} octets")
+            raise MailboxProtocolError(f"{what}: more than {MAX_INFO_SIZE} bytes")
     return body

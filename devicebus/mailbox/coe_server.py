@@ -82,9 +82,9 @@ class SegmentedTransfer:
         self.data += data
         where = self.head.index, self.head.subindex
         if len(self.data) > self.size:
-            raise SdoAbortError(AbortCode.TOO_LONG, *where, f"more than {self.size} octets")
+            raise SdoAbortError(AbortCode.TOO_LONG, *where, f"more than {self.size} bytes")
         if head.last and len(self.data) < self.size:
-            raise SdoAbortError(AbortCode.TOO_SHORT, *where, f"less than {self.size} octets")
+            raise SdoAbortError(AbortCode.TOO_SHORT, *where, f"less than {self.size} bytes")
         return bool(head.last)
 
 
@@ -112,7 +112,7 @@ def size_of_download(head: SdoHeader, data: bytes) -> int:
     if not head.has_size:
         raise SdoAbortError(AbortCode.COMMAND, *where, "neither expedited nor with a size")
     if len(data) > head.value:
-        raise SdoAbortError(AbortCode.LENGTH, *where, f"{len(data)} octets of {head.value}")
+        raise SdoAbortError(AbortCode.LENGTH, *where, f"{len(data)} bytes of {head.value}")
     return int(head.value)
 
 
@@ -141,7 +141,7 @@ class SdoServer:
         """Act on an SDO request behind its CoE header; return the answer, if it has one."""
         if len(body) < SdoHeader.SIZE:
             raise_mailbox_error(
-                MailboxError.SIZE_TOO_SHORT, f"an SDO of {len(body)} octets, expected 8"
+                MailboxError.SIZE_TOO_SHORT, f"an SDO of {len(body)} bytes, expected 8"
             )
         specifier = body[0] >> 5
         if specifier == _ABORT:
@@ -191,7 +191,7 @@ class SdoServer:
         data = head.data
         if head.has_size or head.complete:
             return data
-        # The client did not say how many of the four octets count, so the entry does.
+        # The client did not say how many of the four bytes count, so the entry does.
         return data[: self._dictionary.entry(head.index, head.subindex).kind.size]
 
     def _continue(self, segment: bytes) -> bytes:
@@ -236,7 +236,7 @@ class SdoServer:
 
 
 _OVERHEAD = 12
-"""Octets of a mailbox in front of the body: headers of mailbox, CoE and SDO information."""
+"""Bytes of a mailbox in front of the body: headers of mailbox, CoE and SDO information."""
 
 
 class SdoInfoServer:
@@ -346,7 +346,7 @@ class CoeServer:
         return messages
 
     def send_emergency(self, error_code: int, register: int = 0, data: bytes = b"") -> None:
-        """Report an error, or with code 0 its end; *data* is up to five octets of the vendor."""
+        """Report an error, or with code 0 its end; *data* is up to five bytes of the vendor."""
         emergency = Emergency(error_code, register, data.ljust(5, b"\0"))
         self._push(encode_message(CoeService.EMERGENCY, emergency.encode()))
 

@@ -71,8 +71,8 @@ class Progress:
     """Progress of a transfer; it may be read at any time.
 
     Attributes:
-        done: Octets transferred.
-        total: Octets in all, None where the protocol does not tell.
+        done: Bytes transferred.
+        total: Bytes in all, None where the protocol does not tell.
     """
 
     __slots__ = ("_seen", "done", "total")
@@ -83,7 +83,7 @@ class Progress:
         self._seen: deque[tuple[int, int]] = deque()
 
     def rate(self, now_ns: int) -> float:
-        """Return octets a second over the last two seconds, 0 when asked for the first time.
+        """Return bytes a second over the last two seconds, 0 when asked for the first time.
 
         To be asked a few times a second by one user.
         """

@@ -26,29 +26,29 @@ from eap.codec.mailbox import MailboxError, MailboxType
 from eap.errors import CodecError, MalformedError
 
 MAX_FRAME = 1522
-"""Octets of the longest Ethernet frame, with a VLAN tag and without check sequence, rounded up."""
+"""Bytes of the longest Ethernet frame, with a VLAN tag and without check sequence, rounded up."""
 _TIME_SIZE = 4
 _WORDS = EoeHeader.SIZE + FragmentWord.SIZE
 
 
 def iter_fragments(frame: bytes, number: int, room: int, *, port: int = 0) -> Iterator[bytes]:
-    """Yield the messages that carry *frame*, each with at most *room* octets of it.
+    """Yield the messages that carry *frame*, each with at most *room* bytes of it.
 
     Args:
         frame: An Ethernet frame without check sequence.
         number: From 0 to 15, another one for each frame.
-        room: Octets of a message behind the two words of EoE; at least 32, unless all fits in one.
+        room: Bytes of a message behind the two words of EoE; at least 32, unless all fits in one.
         port: Of the slave; 0 for any.
 
     Raises:
         CodecError: the frame is too long, or its fragments do not fit.
     """
     if not 0 < len(frame) <= MAX_FRAME:
-        raise CodecError(f"a frame of {len(frame)} octets, expected 1 to {MAX_FRAME}",
+        raise CodecError(f"a frame of {len(frame)} bytes, expected 1 to {MAX_FRAME}",
                          layout="EoeHeader")  # fmt: skip
     step = room if room >= len(frame) else room // FRAGMENT_UNIT * FRAGMENT_UNIT
     if not step:
-        raise CodecError(f"room for {room} octets, expected 32", layout="EoeHeader")
+        raise CodecError(f"room for {room} bytes, expected 32", layout="EoeHeader")
     units = (len(frame) + FRAGMENT_UNIT - 1) // FRAGMENT_UNIT
     for fragment, start in enumerate(range(0, len(frame), step)):
         piece = frame[start : start + step]

@@ -33,7 +33,7 @@ BUSY_LIMIT = 6_000
 BUSY_TIMEOUT_NS = 120_000_000_000
 """How long it may be busy, however long it takes to say so."""
 MAX_SIZE = 1 << 28
-"""Octets of the largest file that is read unless told otherwise."""
+"""Bytes of the largest file that is read unless told otherwise."""
 
 
 def read(
@@ -45,7 +45,7 @@ def read(
     progress: Progress | None = None,
     max_size: int = MAX_SIZE,
 ) -> Conversation[int]:
-    """Read a file into *sink*, in the order of its octets; return how many there were.
+    """Read a file into *sink*, in the order of its bytes; return how many there were.
 
     What *sink* raises ends the transfer, also at the slave.
 
@@ -68,7 +68,7 @@ def read(
             )
         if len(data) > room or progress.done + len(data) > max_size:
             limit = min(room, max_size - progress.done)
-            yield from foe.give_up(FoeErrorCode.ILLEGAL, f"{len(data)} octets, taken are {limit}")
+            yield from foe.give_up(FoeErrorCode.ILLEGAL, f"{len(data)} bytes, taken are {limit}")
         try:
             sink(data)
         except OSError:
@@ -90,11 +90,11 @@ def write(
     password: int = 0,
     progress: Progress | None = None,
 ) -> Conversation[int]:
-    """Write a file from *source*; return how many octets there were.
+    """Write a file from *source*; return how many bytes there were.
 
     Args:
         name: Of the file, at the slave.
-        source: Called with a number of octets; returns as many or fewer, none at the end.
+        source: Called with a number of bytes; returns as many or fewer, none at the end.
         sizes: Of the slave's mailboxes.
         password: Up to 32 bits.
         progress: What is told how far it is.
@@ -135,7 +135,7 @@ def _request(opcode: FoeOpcode, password: int, name: str, sizes: MailboxSizes) -
     room = sizes.to_slave - DATA_OVERHEAD
     if len(octets) > room:
         raise MailboxSizeError(
-            f"file name {name!r} has {len(octets)} octets, the slave's mailbox has room for {room}"
+            f"file name {name!r} has {len(octets)} bytes, the slave's mailbox has room for {room}"
         )
     return encode_message(opcode, password, octets)
 

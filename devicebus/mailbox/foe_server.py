@@ -32,7 +32,7 @@ class FileReader(Protocol):
     """A file that is being read; any binary file object is one."""
 
     def read(self, size: int, /) -> bytes:
-        """Return the next *size* octets, fewer only at the end."""
+        """Return the next *size* bytes, fewer only at the end."""
 
     def close(self) -> None:
         """Nothing more will be read."""
@@ -42,7 +42,7 @@ class FileWriter(Protocol):
     """A file that is being written; each method may raise FoeError."""
 
     def write(self, data: bytes, /) -> object:
-        """Take the next octets."""
+        """Take the next bytes."""
 
     def commit(self) -> None:
         """Make what was written the content of the file: it is complete."""
@@ -195,7 +195,7 @@ class MemoryFile:
         password: What a request must carry.
         readable, writable: What may be done with it.
         allowed_in: In which state.
-        max_size: Octets it may grow to.
+        max_size: Bytes it may grow to.
         check: Called with the content before it replaces the old one; refuses with FoeError.
     """
 
@@ -282,7 +282,7 @@ class MemoryReader:
         self._rest = memoryview(content)
 
     def read(self, size: int, /) -> bytes:
-        """Return the next octets."""
+        """Return the next bytes."""
         data, self._rest = bytes(self._rest[:size]), self._rest[size:]
         return data
 
@@ -300,7 +300,7 @@ class MemoryWriter:
         self._content = bytearray()
 
     def write(self, data: bytes, /) -> None:
-        """Take the next octets."""
+        """Take the next bytes."""
         if len(self._content) + len(data) > self._file.max_size:
             raise refusal(FoeErrorCode.DISK_FULL, self._file.name)
         self._content += data

@@ -1,4 +1,4 @@
-"""Which message of a slave answers which request, told by nothing but their octets (ETG.1000.6).
+"""Which message of a slave answers which request, told by nothing but their bytes (ETG.1000.6).
 
 Whatever is too short to say what it is answers any request of its protocol: the conversation then
 says what is missing, instead of waiting for nothing.  Who listens for the fragments of an answer
@@ -36,7 +36,7 @@ _INFO_KEYS: dict[int, int] = {
     SdoInfoOpcode.OBJECT_REQUEST: 2,
     SdoInfoOpcode.ENTRY_REQUEST: 3,
 }
-"""Octets of a request's body that its answer repeats: list, index, or index and subindex."""
+"""Bytes of a request's body that its answer repeats: list, index, or index and subindex."""
 _PDO_NUMBER = 0x01FF
 _REMOTE: dict[int, int] = {
     CoeService.TX_PDO_REMOTE_REQUEST: CoeService.TX_PDO,
@@ -173,7 +173,7 @@ _SHORTEST = {
     MailboxType.FOE: FoeHeader.SIZE,
     MailboxType.SOE: 1,
 }
-"""Octets of a request without which it asks nothing."""
+"""Bytes of a request without which it asks nothing."""
 
 
 def answers(kind: MailboxType, request: bytes, reply: bytes) -> bool:

@@ -12,11 +12,11 @@ from eap.errors import MalformedError, TruncatedError
 T = TypeVar("T")
 
 MINIMUM_SIZE = 16
-"""Octets of the smallest mailbox that holds the header of every protocol but AoE."""
+"""Bytes of the smallest mailbox that holds the header of every protocol but AoE."""
 
 
 class MailboxSizes:
-    """Octets of a slave's two mailboxes, mailbox header included; master and slave know both.
+    """Bytes of a slave's two mailboxes, mailbox header included; master and slave know both.
 
     The servers of one slave share one object, so that a new size holds for all of them.
     """
@@ -28,21 +28,21 @@ class MailboxSizes:
 
     @classmethod
     def of_data(cls, size: int) -> Self:
-        """Return mailboxes that hold *size* octets behind their headers, both ways."""
+        """Return mailboxes that hold *size* bytes behind their headers, both ways."""
         return cls(size + MailboxHeader.SIZE, size + MailboxHeader.SIZE)
 
     def set(self, to_slave: int, to_master: int) -> None:
         """Change both; raise ValueError if one is too small for a message."""
         if min(to_slave, to_master) < MINIMUM_SIZE:
             raise ValueError(
-                f"mailboxes of {to_slave} and {to_master} octets, expected at least {MINIMUM_SIZE}"
+                f"mailboxes of {to_slave} and {to_master} bytes, expected at least {MINIMUM_SIZE}"
             )
         self.to_slave = to_slave
         self.to_master = to_master
 
     @property
     def data_to_master(self) -> int:
-        """Octets behind the mailbox header of the longest message to the master."""
+        """Bytes behind the mailbox header of the longest message to the master."""
         return self.to_master - MailboxHeader.SIZE
 
 

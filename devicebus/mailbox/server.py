@@ -83,7 +83,7 @@ class MailboxServer:
             protocol.reset()
 
     def receive_message(self, message: Buffer, now_ns: int) -> None:
-        """Act on a message, header first; octets behind its length are ignored."""
+        """Act on a message, header first; bytes behind its length are ignored."""
         if len(message) < MailboxHeader.SIZE or not self.is_ready:
             self._dropped += 1
             return

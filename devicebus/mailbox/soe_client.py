@@ -42,11 +42,11 @@ from eap.codec.soe import (
 )
 
 MAX_SIZE = 0x80020
-"""Octets of the longest answer: eight elements that are lists as long as there can be."""
+"""Bytes of the longest answer: eight elements that are lists as long as there can be."""
 _MAX_LATE = 16
 """Answers to others, in fragments, that are dropped before a read gives up."""
 _NAMELESS = 2
-"""Octets of a request before the IDN, which fragments do not carry."""
+"""Bytes of a request before the IDN, which fragments do not carry."""
 POLL_DELAY_NS = 10_000_000
 EXECUTION_TIMEOUT_NS = 60_000_000_000
 
@@ -105,7 +105,7 @@ def _read(
         content += body
         progress.done = len(content)
         if len(content) > MAX_SIZE:
-            raise MailboxProtocolError(f"{what}: more than {MAX_SIZE} octets")
+            raise MailboxProtocolError(f"{what}: more than {MAX_SIZE} bytes")
         if not header.incomplete:
             return message, bytes(content)
         left = now_left
@@ -166,7 +166,7 @@ def execute(
     for _ in range(max(1, timeout_ns // POLL_DELAY_NS)):
         message, octets = yield from _read(idn, Element.DATA_STATE, drive, None, POLL_DELAY_NS)
         if len(octets) < 2:
-            raise MailboxProtocolError(f"{what}: a data state of {len(octets)} octets")
+            raise MailboxProtocolError(f"{what}: a data state of {len(octets)} bytes")
         state = DataState(int.from_bytes(octets[:2], "little") & DataState.FAILED)
         if state & DataState.ERROR or not state & DataState.EXECUTING:
             break

@@ -92,7 +92,7 @@ def _refusal(code: SoeErrorCode) -> SoeError:
 
 
 MAX_LENGTH = 0xFFFF
-"""Octets of the longest list: its head has 16 bits for them."""
+"""Bytes of the longest list: its head has 16 bits for them."""
 _MISSING = {
     Element.NAME: SoeErrorCode.NO_NAME,
     Element.UNIT: SoeErrorCode.NO_UNIT,
@@ -121,8 +121,8 @@ class SoeParameter:
         value: What it starts with, and its default.
         unit: Element 4.
         limits: Elements 5 and 6, each None if there is none; checked on writing.
-        max_length: Octets to which a list may grow; those it starts with if left out.
-        read: Where the octets of the value come from instead of being stored (a list without its
+        max_length: Bytes to which a list may grow; those it starts with if left out.
+        read: Where the bytes of the value come from instead of being stored (a list without its
             head).
         write: Called with them before they are stored; refuses with SoeError.
         procedure: What the IDN does, if it is a procedure command.
@@ -359,7 +359,7 @@ class SoeServer:
     def send_emergency(
         self, error_code: int, register: int = 0, data: bytes = b"", *, drive: int = 0
     ) -> None:
-        """Report an error of a drive; *data* is up to five octets of the vendor."""
+        """Report an error of a drive; *data* is up to five bytes of the vendor."""
         emergency = Emergency(error_code, register, data.ljust(5, b"\0"))
         self._push(SoeOpcode.EMERGENCY, drive, 0, emergency.encode(), 0)
 

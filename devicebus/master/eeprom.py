@@ -15,9 +15,9 @@ TRIES = 4
 RETRY_NS = 4_000_000
 """How long it is left alone then: it stores a word in up to 10 ms, and is deaf meanwhile."""
 MIN_LIMIT = 4096
-"""Octets that an EEPROM may fill whatever size it gives: many give none."""
+"""Bytes that an EEPROM may fill whatever size it gives: many give none."""
 MAX_SIZE = 0x20000
-"""Octets that word addresses of 16 bits reach."""
+"""Bytes that word addresses of 16 bits reach."""
 
 _ADDRESS_AND_DATA = 14
 _END = b"\xff\xff"
@@ -30,7 +30,7 @@ def take_over(station: int) -> Procedure[None]:
 
 
 def read_words(station: int, word: int) -> Procedure[bytes]:
-    """Read four or eight octets, as many as the controller gives, from a word address on.
+    """Read four or eight bytes, as many as the controller gives, from a word address on.
 
     Raises:
         SiiError: the EEPROM stays busy or does not acknowledge.
@@ -43,7 +43,7 @@ def read_words(station: int, word: int) -> Procedure[bytes]:
 
 
 def write_word(station: int, word: int, data: bytes) -> Procedure[None]:
-    """Write two octets at a word address; raises as :func:`read_words` does."""
+    """Write two bytes at a word address; raises as :func:`read_words` does."""
     control = EepromControl(write_enable=1, command=EepromCommand.WRITE).encode()
     request = control + word.to_bytes(4, "little") + data
     yield from _command(station, request, f"writing word 0x{word:04X}")
@@ -69,7 +69,7 @@ def read_image(station: int) -> Procedure[bytes]:
     offset = SiiFixed.SIZE
     while True:
         if offset + CategoryHeader.SIZE > size:
-            raise SiiError(f"slave {station}: no end of the EEPROM within its {size} octets")
+            raise SiiError(f"slave {station}: no end of the EEPROM within its {size} bytes")
         yield from _extend(station, image, offset + CategoryHeader.SIZE)
         if image[offset : offset + 2] == _END:
             return bytes(image[: offset + 2])
@@ -77,7 +77,7 @@ def read_image(station: int) -> Procedure[bytes]:
         end = offset + CategoryHeader.SIZE + 2 * header.length
         if end > size:
             raise SiiError(
-                f"slave {station}: EEPROM category {header.type} ends at octet {end}, expected at"
+                f"slave {station}: EEPROM category {header.type} ends at byte {end}, expected at"
                 f" most {size}"
             )
         yield from _extend(station, image, end)
@@ -92,7 +92,7 @@ def write_image(station: int, image: bytes) -> Procedure[None]:
         WorkingCounterError: the slave did not answer.
     """
     if len(image) % 2 or len(image) > MAX_SIZE:
-        raise SiiError(f"an image of {len(image)} octets, expected whole words up to {MAX_SIZE}")
+        raise SiiError(f"an image of {len(image)} bytes, expected whole words up to {MAX_SIZE}")
     yield from take_over(station)
     there = bytearray()
     yield from _extend(station, there, len(image))

@@ -1,4 +1,4 @@
-"""Outputs and inputs of all slaves as two blocks of octets, and their values by name."""
+"""Outputs and inputs of all slaves as two blocks of bytes, and their values by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BASE = 0x0001_0000
 MAX_FMMUS = 16
 """Of a controller, whatever it says of itself."""
 _STRIDE = 0x0800
-"""Between the addresses of two datagrams; more than the octets of one."""
+"""Between the addresses of two datagrams; more than the bytes of one."""
 
 
 class SlaveProcessData(NamedTuple):
@@ -31,7 +31,7 @@ class SlaveProcessData(NamedTuple):
 
 
 class SlaveLayout(NamedTuple):
-    """A slave's part of the image, outputs and inputs each from an octet on."""
+    """A slave's part of the image, outputs and inputs each from a byte on."""
 
     station: int
     outputs: int
@@ -78,12 +78,12 @@ class ProcessDataLayout(NamedTuple):
 
     @property
     def outputs_size(self) -> int:
-        """Octets of all outputs."""
+        """Bytes of all outputs."""
         return sum(group.outputs_size for group in self.groups)
 
     @property
     def inputs_size(self) -> int:
-        """Octets of all inputs."""
+        """Bytes of all inputs."""
         return sum(group.inputs_size for group in self.groups)
 
 
@@ -122,7 +122,7 @@ def _group(slaves: Sequence[SlaveProcessData]) -> Iterator[list[SlaveProcessData
         size = sum(channel.size for channel in slave.channels)
         if size > MAX_DATA:
             raise BusError(
-                f"slave {slave.station}: {size} octets of process data, expected at most {MAX_DATA}"
+                f"slave {slave.station}: {size} bytes of process data, expected at most {MAX_DATA}"
             )
         if members and total + size > MAX_DATA:
             yield members
@@ -256,11 +256,11 @@ class BusImage:
             raise BusError(f"slave {station}: {name!r} is an input, expected an output")
         kind = data_type_of(variable)
         if kind is None and not isinstance(value, bytes):
-            raise ValueError(f"{value!r} for {name!r}, expected octets")
+            raise ValueError(f"{value!r} for {name!r}, expected bytes")
         self.write_octets(variable, kind.encode(value) if kind else bytes(value))  # type: ignore[arg-type]
 
     def read_octets(self, variable: ProcessVariable) -> bytes:
-        """Return the bits of an entry, from bit 0 of the first octet on."""
+        """Return the bits of an entry, from bit 0 of the first byte on."""
         block = self.outputs if variable.is_output else self.inputs
         first, shift = divmod(variable.bit_offset, 8)
         bits = variable.bit_length

@@ -107,13 +107,13 @@ INDEXES = 256
 MAX_DATAGRAMS = 15
 """Datagrams of a frame; some slaves and masters know no more."""
 MAX_BODY = 1498
-"""Octets of a frame behind its header, as many as an Ethernet frame carries."""
+"""Bytes of a frame behind its header, as many as an Ethernet frame carries."""
 MAX_DATA = MAX_BODY - OVERHEAD
-"""Octets of one access."""
+"""Bytes of one access."""
 MIN_COST = 64
 """What a datagram takes of the budget at least: a short one costs as much time as this many."""
 MAX_PIGGYBACK = 256
-"""Octets of acyclic datagrams in a cyclic frame: 20 µs of it at 100 Mbit/s."""
+"""Bytes of acyclic datagrams in a cyclic frame: 20 µs of it at 100 Mbit/s."""
 MAX_ACYCLIC_FRAMES = 8
 """Acyclic frames under way at once; more would only wait in somebody's buffer."""
 
@@ -149,7 +149,7 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True):
     round_trip_ns: int
     """Mean of the latest round trips, 0 before the first."""
     max_acyclic_octets: int = 0
-    """Most octets of acyclic datagrams that one cycle has sent, headers included."""
+    """Most bytes of acyclic datagrams that one cycle has sent, headers included."""
 
 
 class Exchange:
@@ -258,7 +258,7 @@ class Link:
             ValueError: there is none, or one does not fit a frame.
         """
         if not datagrams or max(len(datagram.data) for datagram in datagrams) > MAX_DATA:
-            raise ValueError(f"accesses of at most {MAX_DATA} octets are needed, at least one")
+            raise ValueError(f"accesses of at most {MAX_DATA} bytes are needed, at least one")
         exchange = Exchange(len(datagrams), done, is_cyclic=cyclic)
         queue = self._cyclic if cyclic else self._acyclic
         tries = self._tries
@@ -427,7 +427,7 @@ class Link:
         *,
         cyclic: bool,
     ) -> None:
-        """Add what *room* octets hold."""
+        """Add what *room* bytes hold."""
         size = 0
         while queue and len(items) < MAX_DATAGRAMS:
             octets = OVERHEAD + len(queue[0].datagram.data)

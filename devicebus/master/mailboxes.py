@@ -231,7 +231,7 @@ class Mailbox:
         if ask.listen or size <= self.sizes.to_slave:
             return None
         return MailboxSizeError(
-            f"{who}: a message of {size} octets, the slave's mailbox holds {self.sizes.to_slave}"
+            f"{who}: a message of {size} bytes, the slave's mailbox holds {self.sizes.to_slave}"
         )
 
     def _begin(self, work: Procedure[None], now_ns: int) -> None:
@@ -395,7 +395,7 @@ class Mailbox:
             detail = MailboxErrorReply.decode(data).detail
         except CodecError:
             return MailboxProtocolError(
-                f"slave {self.station}: a mailbox error of {len(data)} octets, expected 4"
+                f"slave {self.station}: a mailbox error of {len(data)} bytes, expected 4"
             )
         return MailboxRefusedError(
             f"slave {self.station}: mailbox error {MailboxError.text_of(detail)}", detail=detail

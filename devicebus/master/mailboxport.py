@@ -28,7 +28,7 @@ _PDI_CONTROL = _IN + 7
 
 
 class MailboxArea(NamedTuple):
-    """Where the mailboxes lie in a slave's memory; sizes in octets, 0 without a mailbox."""
+    """Where the mailboxes lie in a slave's memory; sizes in bytes, 0 without a mailbox."""
 
     to_slave: int
     to_slave_size: int
@@ -45,8 +45,8 @@ class MailboxArea(NamedTuple):
         for start, size in (self[:2], self[2:]):
             if size > MAX_DATA or not FIRST_MEMORY <= start <= 0x1_0000 - size:
                 raise BusError(
-                    f"slave {station}: its mailbox of {size} octets at 0x{start:04X} cannot be,"
-                    f" expected at most {MAX_DATA} octets from 0x{FIRST_MEMORY:04X} on"
+                    f"slave {station}: its mailbox of {size} bytes at 0x{start:04X} cannot be,"
+                    f" expected at most {MAX_DATA} bytes from 0x{FIRST_MEMORY:04X} on"
                 )
 
     def sync_managers(self) -> tuple[SyncManager, SyncManager]:

@@ -53,7 +53,7 @@ class ProcessDataChannel(NamedTuple):
     is_output: bool
     pdos: tuple[Pdo, ...]
     fixed_size: int = 0
-    """Octets that it has without any PDO."""
+    """Bytes that it has without any PDO."""
 
     @property
     def size(self) -> int:
@@ -199,7 +199,7 @@ def _read_list(index: int, size: int) -> Conversation[list[int]]:
         octets = yield from coe_client.upload(index, subindex)
         if len(octets) != size:
             raise MailboxProtocolError(
-                f"{ObjectId(index, subindex)} has {len(octets)} octets, expected {size}"
+                f"{ObjectId(index, subindex)} has {len(octets)} bytes, expected {size}"
             )
         numbers.append(int.from_bytes(octets, "little"))
     return numbers

@@ -23,12 +23,12 @@ class FaultyDictionary(ObjectDictionary):
         self.aborts: dict[int, int] = {}
 
     def upload(self, index: int, subindex: int, state: OdState) -> bytes:
-        """Return the octets of one entry."""
+        """Return the bytes of one entry."""
         self._check(index, subindex)
         return super().upload(index, subindex, state)
 
     def download(self, index: int, subindex: int, data: bytes, state: OdState) -> None:
-        """Write the octets of one entry."""
+        """Write the bytes of one entry."""
         self._check(index, subindex)
         super().download(index, subindex, data, state)
 

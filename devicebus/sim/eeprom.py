@@ -33,7 +33,7 @@ class Eeprom:
 
     Args:
         memory: Of the ESC.
-        image: Octets, changed by writes.
+        image: Bytes, changed by writes.
 
     Attributes:
         extra_ns: A fault: how much longer each command takes.

@@ -20,7 +20,7 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlEvent, Register
 
 REGISTERS = int(Register.MEMORY)
-"""Octets of the register space."""
+"""Bytes of the register space."""
 
 _READ = (
     (0x0000, 0x000A), (0x0010, 0x0014), (0x0020, 0x0022), (0x0030, 0x0032), (0x0040, 0x0041),
@@ -44,7 +44,7 @@ _WRITE_DC = (
 
 
 class AccessMap(NamedTuple):
-    """One octet a register: 1 where it can be read, written."""
+    """One byte a register: 1 where it can be read, written."""
 
     readable: bytes
     writable: bytes
@@ -95,7 +95,7 @@ class EscSettings(msgspec.Struct, frozen=True, kw_only=True):
     fmmus: int = 8
     sync_managers: int = 16
     ram: int = 8192
-    """Octets of process data memory."""
+    """Bytes of process data memory."""
     port_descriptor: int = 0x0F
     """Two bits a port: 0 none, 1 not configured, 2 E-bus, 3 MII."""
     has_dc: bool = True
@@ -262,7 +262,7 @@ class Esc:
         return True
 
     def peek(self, address: int, length: int) -> bytes:
-        """Return octets as they are, with no effect."""
+        """Return bytes as they are, with no effect."""
         return bytes(self.memory[address : address + length])
 
     def _refresh(self, page: int, now_ns: int) -> None:

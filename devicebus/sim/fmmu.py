@@ -1,6 +1,6 @@
 """FMMUs: which bits of the logical memory are which bits of a slave (ETG.1000.4).
 
-Units on whole octets, which is almost all of them, are copied as octets; the others bit by bit.
+Units on whole bytes, which is almost all of them, are copied as bytes; the others bit by bit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class EscMemory(Protocol):
 
 
 class FmmuWindow(NamedTuple):
-    """One active FMMU; *first* and *last* are octets of the logical memory."""
+    """One active FMMU; *first* and *last* are bytes of the logical memory."""
 
     first: int
     last: int
@@ -38,7 +38,7 @@ class FmmuWindow(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether it maps whole octets to whole octets."""
+        """Whether it maps whole bytes to whole bytes."""
         return not self.first_bit and not self.physical_bit and not self.bits % 8
 
 
@@ -68,13 +68,13 @@ class FmmuSlice(NamedTuple):
     """What a window shares with a datagram."""
 
     first: int
-    """Its octets in the data, up to *end*."""
+    """Its bytes in the data, up to *end*."""
     end: int
     physical: int
-    """Its octets in the memory, *size* of them."""
+    """Its bytes in the memory, *size* of them."""
     size: int
     mask: int
-    """As many ones as it has bits; 0 for whole octets on both sides."""
+    """As many ones as it has bits; 0 for whole bytes on both sides."""
     shift: int
     """Bits in front of it in the data."""
     physical_shift: int

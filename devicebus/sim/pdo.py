@@ -26,7 +26,7 @@ class MappedEntry(NamedTuple):
 
 
 class _ByteRun(NamedTuple):
-    """An entry on whole octets, *first* to *end*."""
+    """An entry on whole bytes, *first* to *end*."""
 
     entry: Entry
     first: int
@@ -34,13 +34,13 @@ class _ByteRun(NamedTuple):
 
 
 class _BitRun(NamedTuple):
-    """What shares the octets from *first* to *end*: entries, and the shift and mask of each."""
+    """What shares the bytes from *first* to *end*: entries, and the shift and mask of each."""
 
     places: tuple[tuple[Entry, int, int], ...]
     first: int
     end: int
     is_small: bool
-    """Whether every entry is one octet, as those of digital inputs and outputs are."""
+    """Whether every entry is one byte, as those of digital inputs and outputs are."""
 
 
 class PdoMapping:
@@ -48,7 +48,7 @@ class PdoMapping:
 
     Attributes:
         parts: What is mapped, in order.
-        size: Octets.
+        size: Bytes.
     """
 
     def __init__(self, parts: Iterable[MappedEntry] = ()) -> None:
@@ -57,7 +57,7 @@ class PdoMapping:
         self._runs = tuple(_runs(self.parts))
 
     def unpack(self, data: bytes) -> None:
-        """Give the octets of *data* to the entries."""
+        """Give the bytes of *data* to the entries."""
         for run in self._runs:
             if isinstance(run, _ByteRun):
                 run.entry.octets = data[run.first : run.end]
@@ -71,7 +71,7 @@ class PdoMapping:
                 entry.octets = (word >> shift & mask).to_bytes(entry.kind.size, "little")
 
     def pack(self) -> bytes:
-        """Return the octets of all entries."""
+        """Return the bytes of all entries."""
         pieces = []
         for run in self._runs:
             size = run.end - run.first
@@ -108,11 +108,11 @@ class ProcessData:
         self.inputs = self._plan(self._numbers(INPUTS))
 
     def read_pdo(self, index: int) -> bytes | None:
-        """Return the octets of one PDO, assigned or not; None if it is not there."""
+        """Return the bytes of one PDO, assigned or not; None if it is not there."""
         return self._plan([index]).pack() if index in self._dictionary else None
 
     def write_pdo(self, index: int, data: bytes) -> bool:
-        """Give the octets of one PDO to its entries; return False if it has not this size."""
+        """Give the bytes of one PDO to its entries; return False if it has not this size."""
         plan = self._plan([index])
         if index not in self._dictionary or len(data) != plan.size:
             return False
@@ -148,7 +148,7 @@ class ProcessData:
 
 
 def _runs(parts: Iterable[MappedEntry]) -> Iterator[_ByteRun | _BitRun]:
-    """Take together what shares octets; what has octets of its own is copied as a whole."""
+    """Take together what shares bytes; what has bytes of its own is copied as a whole."""
     places: list[tuple[Entry, int, int]] = []
     first = end = 0
     for part in parts:

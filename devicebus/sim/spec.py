@@ -107,7 +107,7 @@ class FileSpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MailboxSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """The mailbox and its protocols; *size* octets each way."""
+    """The mailbox and its protocols; *size* bytes each way."""
 
     size: MailboxSize = 256
     coe: bool = True

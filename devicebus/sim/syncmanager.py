@@ -1,6 +1,6 @@
 """One sync manager: who may touch its area of the memory, and when (ETG.1000.4).
 
-In both modes an access opens with the first octet and is complete with the last.  A mailbox then
+In both modes an access opens with the first byte and is complete with the last.  A mailbox then
 belongs to the other side; a buffered area has three buffers, so that neither side ever waits and
 nobody sees half of what the other writes.
 """
@@ -67,7 +67,7 @@ class SyncChannel:
 
     @property
     def length(self) -> int:
-        """Octets of the area, 0 while disabled."""
+        """Bytes of the area, 0 while disabled."""
         return self.end - self.start if self.is_enabled else 0
 
     @property

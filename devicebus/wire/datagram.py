@@ -42,7 +42,7 @@ _LOGICAL = frozenset((Command.LRD, Command.LWR, Command.LRW))
 
 
 class DatagramHeader(WireStruct, frozen=True):
-    """ETG.1000.4: ten octets in front of a datagram's data.
+    """ETG.1000.4: ten bytes in front of a datagram's data.
 
     *adp* is a position or a station address, *ado* a register offset; in logical commands they are
     the low and the high word of the address.  *more* says that another datagram follows.
@@ -65,13 +65,13 @@ class DatagramHeader(WireStruct, frozen=True):
 
 
 class WorkingCounter(WireStruct, frozen=True):
-    """ETG.1000.4: the two octets behind a datagram's data, counted up by every slave that acts."""
+    """ETG.1000.4: the two bytes behind a datagram's data, counted up by every slave that acts."""
 
     value: u16 = 0
 
 
 OVERHEAD = DatagramHeader.SIZE + WorkingCounter.SIZE
-"""Octets of a datagram beside its data."""
+"""Bytes of a datagram beside its data."""
 
 
 class Datagram(NamedTuple):
@@ -85,7 +85,7 @@ class Datagram(NamedTuple):
 def iter_datagrams(frame: Buffer) -> Iterator[Datagram]:
     """Yield each datagram of a whole frame; nothing is copied.
 
-    Octets behind the last datagram are ignored.
+    Bytes behind the last datagram are ignored.
 
     Raises:
         TruncatedError: the frame is shorter than its Length, or a datagram reaches past it.
@@ -97,7 +97,7 @@ def iter_datagrams(frame: Buffer) -> Iterator[Datagram]:
     end = EtherCatHeader.SIZE + ethercat.length
     if end > len(frame):
         raise TruncatedError(
-            f"length {ethercat.length}, but {len(frame) - EtherCatHeader.SIZE} octets follow",
+            f"length {ethercat.length}, but {len(frame) - EtherCatHeader.SIZE} bytes follow",
             layout="EtherCatHeader",
         )
     view = memoryview(frame)[:end]

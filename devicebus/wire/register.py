@@ -74,7 +74,7 @@ class AlControl(WireStruct, frozen=True):
 
 
 class AlStatus(WireStruct, frozen=True):
-    """ETG.1000.6: where the slave stands and why, the six octets at 0x0130."""
+    """ETG.1000.6: where the slave stands and why, the six bytes at 0x0130."""
 
     state: bits4
     error: bit = 0
@@ -105,7 +105,7 @@ class DlStatus(WireStruct, frozen=True):
 
 
 class SyncManager(WireStruct, frozen=True):
-    """ETG.1000.4: one sync manager channel, eight octets from 0x0800 on."""
+    """ETG.1000.4: one sync manager channel, eight bytes from 0x0800 on."""
 
     start: u16
     length: u16
@@ -129,7 +129,7 @@ class SyncManager(WireStruct, frozen=True):
 
 
 class SmStatus(IntEnum):
-    """Bits of a sync manager's status octet."""
+    """Bits of a sync manager's status byte."""
 
     WRITE_INTERRUPT = 0x01
     READ_INTERRUPT = 0x02
@@ -137,7 +137,7 @@ class SmStatus(IntEnum):
 
 
 class Fmmu(WireStruct, frozen=True):
-    """ETG.1000.4: one fieldbus memory management unit, sixteen octets from 0x0600 on.
+    """ETG.1000.4: one fieldbus memory management unit, sixteen bytes from 0x0600 on.
 
     SII categories number the directions the other way round: 1 outputs, 2 inputs.
     """
@@ -166,7 +166,7 @@ class EepromControl(WireStruct, frozen=True):
     reserved: bits4 = 0
     emulation: bit = 0
     read_eight: bit = 0
-    """Reads give eight octets instead of four."""
+    """Reads give eight bytes instead of four."""
     two_byte_address: bit = 0
     command: bits3 = 0
     """1 read, 2 write, 4 reload."""

@@ -1,7 +1,7 @@
 """The slave information interface: what a slave's EEPROM tells about it (ETG.1000.6, ETG.2010).
 
 An image is 64 fixed words, then categories; each is a type, a length in words, and its data.  The
-end is the type 0xFFFF.  Categories that nobody here needs are kept as octets.
+end is the type 0xFFFF.  Categories that nobody here needs are kept as bytes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ i16 = Annotated[int, Scalar("h")]
 
 
 class SiiFixed(WireStruct, frozen=True):
-    """ETG.2010 table 2: the first 64 words; offsets and sizes of mailboxes are in octets."""
+    """ETG.2010 table 2: the first 64 words; offsets and sizes of mailboxes are in bytes."""
 
     pdi_control: u16 = 0
     pdi_configuration: u16 = 0
@@ -132,7 +132,7 @@ class SiiDc(WireStruct, frozen=True):
 T = TypeVar("T", bound=WireStruct)
 
 CHECKED = 14
-"""Octets at the start that the check sum covers."""
+"""Bytes at the start that the check sum covers."""
 _END = 0xFFFF
 
 
@@ -168,7 +168,7 @@ class CategoryHeader(WireStruct, frozen=True):
 
 
 class StringCount(WireStruct, frozen=True):
-    """A count of strings, or the octets of one."""
+    """A count of strings, or the bytes of one."""
 
     value: Annotated[int, Scalar("B")]
 
@@ -186,7 +186,7 @@ class SiiPdo(NamedTuple):
 
 
 class Sii(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole image; *other* are categories that stay octets, by type."""
+    """A whole image; *other* are categories that stay bytes, by type."""
 
     fixed: SiiFixed
     strings: tuple[str, ...] = ()
@@ -241,7 +241,7 @@ def iter_categories(data: Buffer) -> Iterator[tuple[int, memoryview]]:
         if offset > len(view):
             raise TruncatedError(
                 f"category {header.type} has {header.length} words, but"
-                f" {len(view) - start} octets follow",
+                f" {len(view) - start} bytes follow",
                 layout="CategoryHeader",
                 offset=start,
             )
@@ -311,7 +311,7 @@ def _decode_strings(body: memoryview) -> tuple[str, ...]:
         octets = body[offset + 1 : offset + 1 + size]
         if len(octets) < size:
             raise TruncatedError(
-                f"a string of {size} octets, but {len(octets)} follow", layout="StringCount"
+                f"a string of {size} bytes, but {len(octets)} follow", layout="StringCount"
             )
         strings.append(bytes(octets).decode("latin-1"))
         offset += 1 + size

@@ -40,13 +40,13 @@ VENDOR = b"\x5a\x0e\0\0"
 MODE, RESET = Idn.parse("S-0-0032"), Idn.parse("S-0-0099")
 HERE, THERE = NetId.parse("1.2.3.4.5.6"), NetId.parse("127.0.0.1.3.1")
 BLOCK = "0030 41 1810 01 00000100 01"
-"""One octet of 65536."""
+"""One byte of 65536."""
 
 
 class Evil(MailboxServer):
     """A mailbox that answers with what *script* says as soon as there was a request.
 
-    A text is the data of a message in hexadecimal, in the protocol of the request; octets are a
+    A text is the data of a message in hexadecimal, in the protocol of the request; bytes are a
     whole message as it lies in the mailbox.
     """
 
@@ -148,7 +148,7 @@ def packet(
 
 
 def message(kind: int, data: str, *, counter: int = 0, length: int | None = None) -> bytes:
-    """Octets as they lie in the mailbox; counter 0 is never taken for a repetition."""
+    """Bytes as they lie in the mailbox; counter 0 is never taken for a repetition."""
     octets = bytes.fromhex(data)
     head = MailboxHeader(0, type=MailboxType.COE, counter=counter)
     whole = bytearray(encode_message(head, octets))
@@ -166,7 +166,7 @@ def segments(data: str, flags: int = 0) -> Iterator[str]:
 
 CASES = {
     "silence": Case(COE, upload, [], MailboxTimeoutError, "no COE reply within 2000 ms"),
-    "no message at all": Case(COE, upload, [b""], MailboxProtocolError, "error of 0 octets"),
+    "no message at all": Case(COE, upload, [b""], MailboxProtocolError, "error of 0 bytes"),
     "length beyond the mailbox": Case(
         COE, upload, [message(3, "0030", length=0xFFFF)], MailboxTimeoutError, "no COE reply"
     ),
@@ -192,7 +192,7 @@ CASES = {
     ),
     "cut SDO": Case(COE, upload, ["0030 43 18"], MailboxProtocolError, "needs 8 octets"),
     "object of 4 GiB": Case(
-        COE, upload, ["0030 41 1810 01 ffffffff"], MailboxProtocolError, "4294967295 octets"
+        COE, upload, ["0030 41 1810 01 ffffffff"], MailboxProtocolError, "4294967295 bytes"
     ),
     "other object": Case(
         COE, upload, ["0030 43 1910 01 00000000"], MailboxTimeoutError, "no COE reply"
@@ -205,10 +205,10 @@ CASES = {
     ),
     "segment too long": Case(
         COE, upload, ["0030 41 1810 01 05000000 01", "0030 00 0102030405060708"],
-        MailboxProtocolError, "more than the 5 octets",
+        MailboxProtocolError, "more than the 5 bytes",
     ),
     "last segment too soon": Case(
-        COE, upload, [BLOCK, "0030 01 01020304050607"], MailboxProtocolError, "8 octets of 65536"
+        COE, upload, [BLOCK, "0030 01 01020304050607"], MailboxProtocolError, "8 bytes of 65536"
     ),
     "segment out of order": Case(
         COE, upload, [BLOCK, "0030 10 01020304050607"], MailboxTimeoutError, "no COE reply"
@@ -329,9 +329,9 @@ def test_lies_end_in_named_errors_in_time_and_the_bus_runs_on(
 
 
 EEPROMS = {
-    "category without end": ("0a00 ff0f", "EEPROM category 10 ends at octet"),
+    "category without end": ("0a00 ff0f", "EEPROM category 10 ends at byte"),
     "more strings than there are": ("0a00 0200 ff 01 61 00 ffff", "string|StringCount"),
-    "string longer than its category": ("0a00 0200 01 c8 6161 ffff", "a string of 200 octets"),
+    "string longer than its category": ("0a00 0200 01 c8 6161 ffff", "a string of 200 bytes"),
     "PDO without its entries": ("3200 0400 001a ff 03 0000 0000 ffff", "SiiPdoEntry"),
     "cut general category": ("1e00 0100 0000 ffff", "SiiGeneral"),
 }
@@ -339,7 +339,7 @@ EEPROMS = {
 
 
 def tamper(line: Paced, text: str) -> bytes:
-    """Put octets in the place of the second slave's categories; return what there was."""
+    """Put bytes in the place of the second slave's categories; return what there was."""
     image = line.segment.slaves[1].esc.eeprom.image
     before = bytes(image)
     image[128:] = bytes.fromhex(text).ljust(len(image) - 128, b"\0")
@@ -364,7 +364,7 @@ def test_a_mailbox_that_lies_over_the_registers_is_no_mailbox(line: Paced) -> No
     """Sizes and places from the EEPROM are not believed blindly."""
     image = line.segment.slaves[1].esc.eeprom.image
     image[0x30:0x38] = bytes.fromhex("0000 ffff 0008 ffff")
-    with pytest.raises(BusError, match="slave 1002: its mailbox of 65535 octets at 0x0000 cannot"):
+    with pytest.raises(BusError, match="slave 1002: its mailbox of 65535 bytes at 0x0000 cannot"):
         line.wait(line.core.bring_up(line.now_ns))
 
 

@@ -38,7 +38,7 @@ MAX_ASSIGNED = 8
 SPARE_ENTRIES = 8
 """What a PDO may map beside what it maps from the start."""
 MIN_ROOM = 32
-"""Octets that a direction may take at least, whatever it takes from the start."""
+"""Bytes that a direction may take at least, whatever it takes from the start."""
 _MAX_ENTRIES = 254
 _PDO_MAPPING = 0x21
 

@@ -33,7 +33,7 @@ from eap.od.dictionary import ObjectDictionary
 PDI_SPI = 0x0805
 PDI_DIGITAL = 0x0004
 DEVICE_EMULATION = 0x0100
-"""In word 0 the high octet is the ESC configuration."""
+"""In word 0 the high byte is the ESC configuration."""
 IMAGE_SIZE = 2048
 RAM = 8192
 _FIRST = 0x1000
@@ -97,7 +97,7 @@ def plan_channels(
     end = at + 3 * max(input_size, MIN_ROOM)
     if end > _FIRST + RAM:
         raise ValueError(
-            f"mailboxes and process data, three times each, take {end - _FIRST} octets,"
+            f"mailboxes and process data, three times each, take {end - _FIRST} bytes,"
             f" expected at most {RAM}"
         )
     return SyncManagerLayout(tuple(channels), first, first + 1)
@@ -159,7 +159,7 @@ def build_image(
 
 
 def _fill(image: Sii) -> bytes:
-    """Return the octets of an EEPROM that is large enough, which says how large it is."""
+    """Return the bytes of an EEPROM that is large enough, which says how large it is."""
     octets = sii.encode(image)
     size = IMAGE_SIZE
     while size < len(octets):

@@ -79,7 +79,7 @@ def test_fragments_lie_as_on_the_wire() -> None:
 
 
 def test_mailbox_that_holds_no_fragment_is_too_small() -> None:
-    with pytest.raises(MailboxSizeError, match="32 octets: a mailbox of 37 octets"):
+    with pytest.raises(MailboxSizeError, match="32 bytes: a mailbox of 37 bytes"):
         next(aoe_client.exchange(READ, b"", MailboxSizes(37, 64)))
 
 

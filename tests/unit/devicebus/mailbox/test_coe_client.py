@@ -1,4 +1,4 @@
-"""Conversations octet for octet, with slaves that do not behave, and with ours on a bad line."""
+"""Conversations byte for byte, with slaves that do not behave, and with ours on a bad line."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tests.support.mailbox import Fault, Line, open_line, run_with, talk_to
 COE = MailboxType.COE
 SIZES = MailboxSizes(32, 32)
 FOUR = "0030 41 1810 01 04000000 01"
-"""One octet of four."""
+"""One byte of four."""
 
 
 @pytest.mark.parametrize(
@@ -121,12 +121,12 @@ def test_abort_between_segments() -> None:
     [
         (["0030"], "needs 8 octets", None),
         (["0030 43 1810 01 0000"], "needs 8 octets", None),
-        (["0030 41 1810 01 ffffffff"], "4294967295 octets, taken are", AbortCode.OUT_OF_MEMORY),
+        (["0030 41 1810 01 ffffffff"], "4294967295 bytes, taken are", AbortCode.OUT_OF_MEMORY),
         ([FOUR, "0030"], "needs 1 octets", None),
         ([FOUR, "0030 00"], "without data", AbortCode.GENERAL),
         ([FOUR, "0030 0e 01020304050607"], "without data", AbortCode.GENERAL),
         ([FOUR, "0030 00 01020304"], "more than the 4", AbortCode.TOO_LONG),
-        ([FOUR, "0030 0b 01020304050607"], "3 octets of 4", None),
+        ([FOUR, "0030 0b 01020304050607"], "3 bytes of 4", None),
     ],
 )  # fmt: skip
 def test_answer_that_breaks_the_protocol(
@@ -425,7 +425,7 @@ def test_incomplete_bit_alone_does_not_count() -> None:
 @pytest.mark.parametrize(
     ("answers", "reason"),
     [
-        (["0080 02 00 0000 0100 00"], "3 octets, expected whole indexes"),
+        (["0080 02 00 0000 0100 00"], "3 bytes, expected whole indexes"),
         (["0080 02"], "needs 4 octets"),
         (["0080 07 00 0000 0100"], "needs 4 octets"),
         (["0080 82 00 0500 0100 0010", "0080 82 00 0300 0110"], "5 fragments left, then 3"),
@@ -434,7 +434,7 @@ def test_incomplete_bit_alone_does_not_count() -> None:
                 f"0080 82 00 {left & 255:02x}{left >> 8:02x} 0100 {'00' * 1000}"
                 for left in range(0xFFFF, 0xFF00, -1)
             ],
-            "more than 131074 octets",
+            "more than 131074 bytes",
         ),
     ],
 )

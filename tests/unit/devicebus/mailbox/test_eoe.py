@@ -58,9 +58,9 @@ def test_short_frame_fits_a_small_mailbox() -> None:
 @pytest.mark.parametrize(
     ("frame", "room", "reason"),
     [
-        (b"", 100, "a frame of 0 octets"),
-        (bytes(MAX_FRAME + 1), 100, "a frame of 1523 octets"),
-        (bytes(40), 31, "room for 31 octets"),
+        (b"", 100, "a frame of 0 bytes"),
+        (bytes(MAX_FRAME + 1), 100, "a frame of 1523 bytes"),
+        (bytes(40), 31, "room for 31 bytes"),
     ],
 )
 def test_frame_that_cannot_be_sent(frame: bytes, room: int, reason: str) -> None:

@@ -1,4 +1,4 @@
-"""Requests and answers octet for octet; mailboxes have room for 4 octets of a file."""
+"""Requests and answers byte for byte; mailboxes have room for 4 bytes of a file."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from tests.support.mailbox import Fault, Line
 
 
 class Echo:
-    """Answers each octet of a request with a message of its own; keeps what it got."""
+    """Answers each byte of a request with a message of its own; keeps what it got."""
 
     def __init__(self) -> None:
         self.received: list[tuple[bytes, int]] = []

@@ -1,4 +1,4 @@
-"""Conversations octet for octet, with slaves that do not behave, and with ours on a bad line."""
+"""Conversations byte for byte, with slaves that do not behave, and with ours on a bad line."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_read_that_breaks_the_protocol(answers: list[str], reason: str) -> None:
 
 def test_endless_fragments_end_with_the_limit() -> None:
     answers = (f"0a 40 {n & 255:02x}{n >> 8:02x} {'00' * 1000}" for n in range(0xFFFF, 0, -1))
-    with pytest.raises(MailboxProtocolError, match="more than 524320 octets"):
+    with pytest.raises(MailboxProtocolError, match="more than 524320 bytes"):
         talk_to(SOE, soe_client.read(MODE), *itertools.islice(answers, 600))
 
 
@@ -188,7 +188,7 @@ def test_procedure_command_that_is_neither_done_nor_cleared() -> None:
 
 
 def test_data_state_that_is_cut_breaks_the_protocol() -> None:
-    with pytest.raises(MailboxProtocolError, match="a data state of 1 octets"):
+    with pytest.raises(MailboxProtocolError, match="a data state of 1 bytes"):
         talk_to(SOE, soe_client.execute(RESET, SIZES), "04 40 6300", "02 01 6300 07")
 
 

@@ -1,4 +1,4 @@
-"""Requests and answers octet for octet; mailboxes have room for 6 octets of data."""
+"""Requests and answers byte for byte; mailboxes have room for 6 bytes of data."""
 
 from __future__ import annotations
 

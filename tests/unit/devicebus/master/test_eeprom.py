@@ -22,7 +22,7 @@ def line():
 
 
 class Chip:
-    """An EEPROM made by hand: four octets a read, and what else goes wrong."""
+    """An EEPROM made by hand: four bytes a read, and what else goes wrong."""
 
     def __init__(self, image, *, busy=0, refuse=0, wkc=1):
         self.image = image
@@ -80,7 +80,7 @@ def test_an_image_is_written_where_it_differs(line, monkeypatch):
 
 
 def test_odd_images_are_refused():
-    with pytest.raises(SiiError, match="3 octets, expected whole words"):
+    with pytest.raises(SiiError, match="3 bytes, expected whole words"):
         drive(eeprom.write_image(1001, b"abc"), Chip(b""))
 
 
@@ -128,8 +128,8 @@ FIXED = SiiFixed().encode()
 @pytest.mark.parametrize(
     ("tail", "text"),
     [
-        (b"\x0a\0\xff\xff", "category 10 ends at octet 131202, expected at most 4096"),
-        (b"\x0a\0\0\0" * 2000, "no end of the EEPROM within its 4096 octets"),
+        (b"\x0a\0\xff\xff", "category 10 ends at byte 131202, expected at most 4096"),
+        (b"\x0a\0\0\0" * 2000, "no end of the EEPROM within its 4096 bytes"),
     ],
 )
 def test_lengths_that_cannot_be_end_in_an_error(tail, text):

@@ -87,7 +87,7 @@ def test_a_bus_without_process_data_has_none():
 
 
 def test_what_cannot_be_laid_out_is_refused():
-    with pytest.raises(BusError, match="slave 5: 1500 octets of process data, expected at most"):
+    with pytest.raises(BusError, match="slave 5: 1500 bytes of process data, expected at most"):
         plan_image([shape(5, (8,) * 1500)])
     with pytest.raises(BusError, match="slave 5: 2 sync managers with process data, but 1 FMMUs"):
         plan_image([shape(5, (8,), (8,), fmmus=1)])
@@ -145,7 +145,7 @@ def test_inputs_are_read_where_they_came(image):
 def test_octets_without_a_type(image):
     image.write(1001, "odd", b"\xcd\x0a")
     assert image.read(1001, "odd") == b"\xcd\x0a"
-    with pytest.raises(ValueError, match="5 for 'odd', expected octets"):
+    with pytest.raises(ValueError, match="5 for 'odd', expected bytes"):
         image.write(1001, "odd", 5)
 
 

@@ -98,7 +98,7 @@ def test_a_message_that_does_not_fit_is_refused_before_it_is_sent(line, box):
         yield from large()
 
     refused = start(line, box, large())
-    with pytest.raises(MailboxSizeError, match=r"a request: .* 257 octets, .* mailbox holds 256"):
+    with pytest.raises(MailboxSizeError, match=r"a request: .* 257 bytes, .* mailbox holds 256"):
         refused.result()
     assert line.frames == frames
     with pytest.raises(MailboxSizeError):
@@ -369,7 +369,7 @@ def test_an_endless_talker_is_taken_in_portions(line, box):
 
 
 def raw(line, octets):
-    """Let the slave answer the next request with these octets."""
+    """Let the slave answer the next request with these bytes."""
     mailbox = server(line)
     mailbox.receive_message = lambda message, now: mailbox._queue.append(octets)
 
@@ -379,11 +379,11 @@ def raw(line, octets):
     [
         (b"\xff\xff\0\0\0\x13", MailboxTimeoutError, "no COE reply"),
         (b"\x0a\0\0\0\0\x19" + bytes(10), MailboxTimeoutError, "no COE reply"),
-        (b"", MailboxProtocolError, "a mailbox error of 0 octets"),
+        (b"", MailboxProtocolError, "a mailbox error of 0 bytes"),
         (encode_mailbox(MailboxHeader(0, type=MailboxType.FOE), bytes(6)), MailboxTimeoutError,
          "no COE reply"),
         (encode_mailbox(MailboxHeader(0, type=MailboxType.ERR), b"\1"), MailboxProtocolError,
-         "a mailbox error of 1 octets"),
+         "a mailbox error of 1 bytes"),
         (encode_mailbox(MailboxHeader(0, type=MailboxType.ERR), b"\1\0\x99\0"),
          MailboxRefusedError, "mailbox error 0x0099"),
     ],

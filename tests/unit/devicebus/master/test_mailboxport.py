@@ -32,9 +32,9 @@ def test_configuring_writes_both():
 @pytest.mark.parametrize(
     ("area", "reason"),
     [
-        ((0x1000, 1487, 0x1800, 32), "its mailbox of 1487 octets at 0x1000 cannot be"),
-        ((0x1000, 32, 0x0800, 32), "32 octets at 0x0800 cannot be, .* from 0x1000 on"),
-        ((0x1000, 32, 0xFFF0, 32), "32 octets at 0xFFF0 cannot be"),
+        ((0x1000, 1487, 0x1800, 32), "its mailbox of 1487 bytes at 0x1000 cannot be"),
+        ((0x1000, 32, 0x0800, 32), "32 bytes at 0x0800 cannot be, .* from 0x1000 on"),
+        ((0x1000, 32, 0xFFF0, 32), "32 bytes at 0xFFF0 cannot be"),
     ],
 )
 def test_mailboxes_that_cannot_be(area, reason):

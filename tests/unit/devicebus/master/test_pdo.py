@@ -123,7 +123,7 @@ def response(index, subindex, octets):
     [
         ([(0x1C12, 0, b"\xff")], "0x1C12:00 is ff, expected a count up to 254"),
         ([(0x1C12, 0, b"\1\0\0\0")], "0x1C12:00 is 01000000, expected a count"),
-        ([(0x1C12, 0, b"\1"), (0x1C12, 1, b"\0")], "0x1C12:01 has 1 octets, expected 2"),
+        ([(0x1C12, 0, b"\1"), (0x1C12, 1, b"\0")], "0x1C12:01 has 1 bytes, expected 2"),
     ],
 )
 def test_lists_that_are_none_are_refused(replies, text):

@@ -172,7 +172,7 @@ def test_one_with_more_process_data_than_can_be_is_left_out():
         msgspec.structs.replace(content, sync_managers=huge, rx_pdos=(), tx_pdos=())
     )
     image[: len(octets)] = octets
-    with pytest.raises(BusError, match="slave 1002: 2800 octets of process data"):
+    with pytest.raises(BusError, match="slave 1002: 2800 bytes of process data"):
         line.wait(line.core.bring_up(line.now_ns))
     assert line.segment.slaves[0].state is AlState.OP
     assert line.core.cycle.is_full

@@ -10,7 +10,7 @@ from devicebus.wire.register import Fmmu
 
 
 class Memory:
-    """256 octets that anybody may touch, but for those from 128 on."""
+    """256 bytes that anybody may touch, but for those from 128 on."""
 
     def __init__(self, content=bytes(256)):
         self.octets = bytearray(content)

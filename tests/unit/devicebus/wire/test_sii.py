@@ -98,7 +98,7 @@ def test_damage_shows_in_the_checksum():
 
 
 def test_checksum_is_crc8_with_all_ones():
-    # The empty message leaves the initial value; one zero octet gives 0xF3 by hand division.
+    # The empty message leaves the initial value; one zero byte gives 0xF3 by hand division.
     assert sii.checksum(b"") == 0xFF
     assert sii.checksum(b"\0") == 0xF3
 

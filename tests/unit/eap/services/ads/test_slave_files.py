@@ -80,7 +80,7 @@ def test_file_progress_has_the_octets_so_far():
         (OPEN_WRITE, b"boot.bin", AdsError.STATE, "(0x8008)"),
         (OPEN_READ, b"locked.bin", AdsError.ACCESS, "(0x80"),
         (OPEN_READ, b"\xff\xff", AdsError.VALUE, "no UTF-8"),
-        (OPEN_READ, bytes(300).replace(b"\0", b"n"), AdsError.SIZE, "300 octets"),
+        (OPEN_READ, bytes(300).replace(b"\0", b"n"), AdsError.SIZE, "300 bytes"),
     ],
 )
 def test_file_that_cannot_be_opened_holds_up_no_other(group, name, result, why):
