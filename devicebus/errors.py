@@ -1,7 +1,7 @@
-"""What can go wrong on the device bus.
+"""Errors of the device bus.
 
 EapError
-└── BusError                    something on a bus did not go as asked
+└── BusError                    an operation on a bus failed
     ├── FrameLostError          a frame did not come back, also not when sent again
     ├── WorkingCounterError     fewer slaves answered than were addressed
     ├── IdentityError           a slave is not the one that was expected
@@ -28,7 +28,7 @@ from eap.errors import EapError
 
 
 class BusError(EapError):
-    """Base class of all errors of the device bus."""
+    """Base class of the errors of the device bus."""
 
 
 class FrameLostError(BusError):
@@ -49,7 +49,7 @@ class IdentityError(BusError):
 
 
 class AlStatusError(BusError):
-    """A slave refused a state; *code* is its AL status code, *state* where it stands now."""
+    """A slave refused a state; *code* is its AL status code, *state* its present state."""
 
     def __init__(self, message: str, *, code: int, state: int) -> None:
         super().__init__(message)
@@ -66,7 +66,7 @@ class SiiError(BusError):
 
 
 class NoMailboxError(BusError):
-    """A slave has no mailbox at all, or none in the state where it is kept."""
+    """A slave has no mailbox at all, or none in its target state."""
 
 
 class MailboxClosedError(BusError):
@@ -94,7 +94,7 @@ class MailboxRefusedError(BusError):
 
 
 class MailboxProtocolError(BusError):
-    """A slave's answer breaks the protocol: nothing that was read can be trusted."""
+    """A slave's answer breaks the protocol; data read so far is invalid."""
 
 
 class SoeError(BusError):
@@ -106,7 +106,7 @@ class SoeError(BusError):
 
 
 class FoeError(BusError):
-    """An FoE server refused; *code* as ETG.1000.6 numbers it, *text* in its own words."""
+    """An FoE server refused; *code* as ETG.1000.6 numbers it, *text* is the slave's own text."""
 
     def __init__(self, message: str, *, code: int, text: str = "") -> None:
         super().__init__(message)

@@ -35,20 +35,20 @@ _NET_ID_OFFSET = 3
 _NET_ID_SIZE = 6
 _SERVICES = frozenset((AmsCommand.READ_DEVICE_INFO, AmsCommand.READ_STATE, AmsCommand.READ,
                        AmsCommand.WRITE, AmsCommand.READ_WRITE))  # fmt: skip
+# Only notifications belong to a client, and AoE of a slave has none: one client does for all.
 _MASTER = Client(Endpoint("", ""), NetId(bytes(_NET_ID_SIZE)), 0)
-"""Without notifications nothing belongs to a client."""
 
 
 class AdsServer:
-    """The services of one slave, its dictionary without notifications; the handler of an AoeServer.
+    """ADS services of one slave, without notifications; the handler of an AoeServer.
 
     Args:
-        dictionary: What is read and written.
-        state: Says in which state the slave is now.
-        name: Of the device; 15 bytes of it are told.
+        dictionary: Objects to read and write.
+        state: Returns the present state of the slave.
+        name: Device name; device info carries its first 15 bytes.
 
     Attributes:
-        address: NetID and port of the slave; None until a request has told them.
+        address: NetID and port of the slave; None until a request has set them.
     """
 
     def __init__(
@@ -61,13 +61,13 @@ class AdsServer:
             [ObjectSpace(dictionary, state)],
         )
 
-    def forget(self) -> None:
-        """Take any address next: the mailbox starts again."""
+    def reset_address(self) -> None:
+        """Forget the address: the mailbox restarts, the next request sets it."""
         self.address = None
 
     def __call__(self, header: AmsHeader, data: bytes) -> AmsAnswer:
         """Answer one request."""
-        if header.command == AmsCommand.WRITE and self._take_address(header, data):
+        if header.command == AmsCommand.WRITE and self._set_address(header, data):
             return AmsAnswer(encode_result(AdsError.NONE))
         if self.address is None:
             self.address = header.target, header.target_port
@@ -79,12 +79,12 @@ class AdsServer:
             return AmsAnswer(error_code=AdsError.SERVICE)
         return self._device.answer(header.command, data, _MASTER, 0)
 
-    def _take_address(self, header: AmsHeader, data: bytes) -> bool:
+    def _set_address(self, header: AmsHeader, data: bytes) -> bool:
         if len(data) < AdsRange.SIZE + _NET_ID_SIZE:
             return False
-        asked = AdsRange.decode(data)
-        place = IndexGroup.ADDRESS, _NET_ID_OFFSET, _NET_ID_SIZE
-        if (asked.group, asked.offset, asked.length) != place:
+        requested = AdsRange.decode(data)
+        location = IndexGroup.ADDRESS, _NET_ID_OFFSET, _NET_ID_SIZE
+        if (requested.group, requested.offset, requested.length) != location:
             return False
         octets = data[AdsRange.SIZE : AdsRange.SIZE + _NET_ID_SIZE]
         if not any(octets[:4]):
@@ -94,12 +94,12 @@ class AdsServer:
 
 
 class AoeServer:
-    """The AoE protocol of a slave.
+    """AoE protocol of a slave.
 
     Args:
-        handler: Called with header and data of each request; returns None if it has no answer.
+        handler: Called with header and data of each request; returns None without an answer.
         sizes: Of the slave's mailboxes.
-        forget: Called when the mailbox starts again.
+        reset_handler: Called when the mailbox restarts.
     """
 
     def __init__(
@@ -107,16 +107,16 @@ class AoeServer:
         handler: Callable[[AmsHeader, bytes], AmsAnswer | None],
         sizes: MailboxSizes,
         *,
-        forget: Callable[[], None] | None = None,
+        reset_handler: Callable[[], None] | None = None,
     ) -> None:
         self.assembler = Assembler()
-        self._forget = forget
+        self._reset_handler = reset_handler
         self._handler = handler
         self._sizes = sizes
         self._number = 0
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Act on a packet behind its mailbox header and return the answer, if it has one."""
+        """Handle a packet (without mailbox header) and return its answers."""
         try:
             header, body = decode_packet(data)
         except CodecError as exc:
@@ -142,10 +142,10 @@ class AoeServer:
         return []
 
     def reset(self) -> None:
-        """Forget the packets that are not complete, and what the handler remembers."""
+        """Discard incomplete packets and reset the handler."""
         self.assembler.reset()
-        if self._forget is not None:
-            self._forget()
+        if self._reset_handler is not None:
+            self._reset_handler()
 
     def _answer(self, header: AmsHeader, body: bytes) -> list[bytes]:
         answer = self._handler(header, body)

@@ -1,8 +1,8 @@
-"""SDO uploads and downloads as conversations: the master's side of CoE (ETG.1000.6).
+"""CoE as conversations: SDO transfers, SDO information and PDOs of a slave (ETG.1000.6).
 
-An answer is known by index and subindex, a segment by its toggle bit (:mod:`match`).  Refusals
-are raised as SdoAbortError, broken answers as MailboxProtocolError, after an abort that tells the
-slave.
+An answer is identified by index and subindex, a segment by its toggle bit (:mod:`match`).  An SDO
+abort of the slave is raised as SdoAbortError.  After an invalid answer the slave gets an abort and
+MailboxProtocolError is raised.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, ValueInfo
 
 MAX_SIZE = 1 << 24
-"""Bytes of the largest object that an upload takes unless told otherwise."""
+"""Default limit for the size of an uploaded object, in bytes."""
 MAX_SHORT = 1_000
-"""Segments of less than seven bytes that a slave may send before it only keeps us busy."""
+"""Limit for segments of less than seven bytes: a slave that sends more never ends a transfer."""
 
 
 class UploadStart(NamedTuple):
-    """First answer of an upload: the size of the object, and as much of it as one message holds."""
+    """First answer of an upload: size of the object, and the data of the first message."""
 
     size: int
     data: bytes
@@ -71,8 +71,8 @@ def upload(
     """Read an entry, or with *complete* a whole object from subindex 0 or 1 on.
 
     Raises:
-        SdoAbortError: the slave refuses.
-        MailboxProtocolError: its answer is no answer, or longer than *max_size*.
+        SdoAbortError: the slave aborts the transfer.
+        MailboxProtocolError: the answer is invalid, or longer than *max_size*.
     """
     start = yield from begin_upload(index, subindex, complete=complete, max_size=max_size)
     return (yield from continue_upload(index, subindex, start, progress=progress))
@@ -81,15 +81,17 @@ def upload(
 def begin_upload(
     index: int, subindex: int, *, complete: bool = False, max_size: int = MAX_SIZE
 ) -> Conversation[UploadStart]:
-    """Do the first step of upload(); raises as that does."""
+    """Run the first step of upload(); raises as upload() does."""
     sdo = _Sdo(index, subindex)
     plain = encode_plain(SdoRequest.UPLOAD, index, subindex, complete=complete)
-    head, rest = yield from sdo.ask(plain)
+    head, rest = yield from sdo.exchange(plain)
     if head.expedited:
         return UploadStart(len(head.data), head.data)
     size = head.value
     if size > max_size:
-        yield from sdo.give_up(AbortCode.OUT_OF_MEMORY, f"{size} bytes, taken are {max_size}")
+        yield from sdo.abort(
+            AbortCode.OUT_OF_MEMORY, f"{size} bytes, at most {max_size} are accepted"
+        )
     return UploadStart(size, rest[:size])
 
 
@@ -101,7 +103,7 @@ def continue_upload(
     progress: Progress | None = None,
     sink: Callable[[bytes], object] | None = None,
 ) -> Conversation[bytes]:
-    """Do the other steps of upload(), if any; each piece goes to *sink* as it comes."""
+    """Run the remaining steps of upload(); *sink* receives each segment's data."""
     sdo, size = _Sdo(index, subindex), start.size
     content = bytearray(start.data)
     progress = progress or Progress()
@@ -109,18 +111,18 @@ def continue_upload(
     toggle = short = 0
     while len(content) < size:
         asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
-        body = yield from sdo.ask_segment(asked)
+        body = yield from sdo.exchange_segment(asked)
         with reading(f"segment of {sdo}"):
             segment, data = decode_segment(body)
         content += data
         if len(content) > size:
-            yield from sdo.give_up(AbortCode.TOO_LONG, f"more than the {size} bytes announced")
+            yield from sdo.abort(AbortCode.TOO_LONG, f"more than the {size} bytes announced")
         if segment.last and len(content) < size:
             raise MailboxProtocolError(f"{sdo}: {len(content)} bytes of {size} announced")
         short += len(data) < SEGMENT_MINIMUM
         if not data or short > MAX_SHORT:
             reason = f"{short} short segments" if data else "a segment without data"
-            yield from sdo.give_up(AbortCode.GENERAL, reason)
+            yield from sdo.abort(AbortCode.GENERAL, reason)
         progress.done = len(content)
         if sink is not None:
             sink(data)
@@ -146,32 +148,32 @@ def download(
     sdo = _Sdo(index, subindex)
     progress = progress or Progress()
     progress.total = len(data)
-    room = sizes.to_slave - INITIATE_OVERHEAD
+    data_size = sizes.to_slave - INITIATE_OVERHEAD
     first = encode_initiate(
-        SdoRequest.DOWNLOAD, index, subindex, data, complete=complete, room=room
+        SdoRequest.DOWNLOAD, index, subindex, data, complete=complete, room=data_size
     )
-    yield from sdo.ask(first)
-    progress.done = len(data) if len(data) <= EXPEDITED_SIZE else min(room, len(data))
+    yield from sdo.exchange(first)
+    progress.done = len(data) if len(data) <= EXPEDITED_SIZE else min(data_size, len(data))
     step = sizes.to_slave - SEGMENT_OVERHEAD
     toggle = 0
     while progress.done < len(data):
         piece = data[progress.done : progress.done + step]
         last = progress.done + len(piece) == len(data)
         segment = encode_segment(SdoRequest.DOWNLOAD_SEGMENT, piece, toggle=toggle, last=last)
-        yield from sdo.ask_segment(segment)
+        yield from sdo.exchange_segment(segment)
         progress.done += len(piece)
         toggle ^= 1
 
 
 def download_unsized(index: int, subindex: int, octets: bytes) -> Conversation[None]:
-    """Write an entry from four bytes; as many count as the entry has.  Raises as download()."""
+    """Write an entry from four bytes, cut to the size of the entry.  Raises as download()."""
     value = int.from_bytes(octets, "little")
     head = SdoHeader(0, 1, 0, 0, SdoRequest.DOWNLOAD, index, subindex, value)
-    yield from _Sdo(index, subindex).ask(head.encode())
+    yield from _Sdo(index, subindex).exchange(head.encode())
 
 
 class _Sdo:
-    """One transfer: what it sends, and which messages answer that."""
+    """One SDO transfer: its requests, and the check of its answers."""
 
     def __init__(self, index: int, subindex: int) -> None:
         self.index = index
@@ -180,8 +182,8 @@ class _Sdo:
     def __str__(self) -> str:
         return f"SDO {ObjectId(self.index, self.subindex)}"
 
-    def ask(self, body: bytes) -> Conversation[tuple[SdoHeader, bytes]]:
-        """Send the first message of a transfer; return the head of the answer and the rest."""
+    def exchange(self, body: bytes) -> Conversation[tuple[SdoHeader, bytes]]:
+        """Send the first message of a transfer; return head and data of the answer."""
         request = encode_message(CoeService.SDO_REQUEST, body)
         data = (yield MailboxRequest(MailboxType.COE, request)).data
         with reading(f"answer to {self}"):
@@ -190,8 +192,8 @@ class _Sdo:
             raise SdoAbortError(head.value, self.index, self.subindex)
         return head, data[CoeHeader.SIZE + SdoHeader.SIZE :]
 
-    def ask_segment(self, body: bytes) -> Conversation[bytes]:
-        """Send a segment or ask for one; return the answer behind its CoE header."""
+    def exchange_segment(self, body: bytes) -> Conversation[bytes]:
+        """Send a segment or a segment request; return the answer without its CoE header."""
         request = encode_message(CoeService.SDO_REQUEST, body)
         data = (yield MailboxRequest(MailboxType.COE, request)).data
         with reading(f"segment of {self}"):
@@ -201,7 +203,7 @@ class _Sdo:
                 raise SdoAbortError(code, self.index, self.subindex)
         return data[CoeHeader.SIZE :]
 
-    def give_up(self, code: AbortCode, reason: str) -> Conversation[NoReturn]:
+    def abort(self, code: AbortCode, reason: str) -> Conversation[NoReturn]:
         """Abort the transfer and raise."""
         abort = encode_abort(self.index, self.subindex, code)
         yield MailboxRequest(MailboxType.COE, abort, expects_reply=False)
@@ -209,9 +211,9 @@ class _Sdo:
 
 
 MAX_INFO_SIZE = 0x20002
-"""Bytes of the longest description: a list of all indexes there can be."""
+"""Limit for a description in bytes: a list of all 65,536 indexes."""
 _MAX_LATE = 16
-"""Fragments of other answers that are dropped before a request gives up."""
+"""Limit for dropped fragments of other answers before a request fails."""
 
 
 def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:
@@ -229,7 +231,7 @@ def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:
 
 
 def object_description(index: int) -> Conversation[ObjectDescription]:
-    """Read what the slave says of an object; raises as object_list() does."""
+    """Read the description of an object; raises as object_list() does."""
     body = yield from read_object(index)
     with reading(f"object description 0x{index:04X}"):
         return ObjectDescription.decode(body)
@@ -238,27 +240,27 @@ def object_description(index: int) -> Conversation[ObjectDescription]:
 def entry_description(
     index: int, subindex: int, value_info: int = ~ValueInfo(0)
 ) -> Conversation[EntryDescription]:
-    """Read what the slave says of an entry; raises as object_list() does."""
+    """Read the description of an entry; raises as object_list() does."""
     body = yield from read_entry(index, subindex, value_info)
     with reading(f"entry description {ObjectId(index, subindex)}"):
         return EntryDescription.decode(body)
 
 
 def read_list(list_type: int) -> Conversation[bytes]:
-    """As object_list(), but return the bytes, list type included."""
+    """Return the encoded answer of object_list(), list type included."""
     request = ListRequest(list_type).encode()
     return (yield from _ask(f"object list {list_type}", SdoInfoOpcode.LIST_REQUEST, request))
 
 
 def read_object(index: int) -> Conversation[bytes]:
-    """As object_description(), but return the bytes."""
+    """Return the encoded answer of object_description()."""
     what = f"object description 0x{index:04X}"
     request = ObjectRequest(index).encode()
     return (yield from _ask(what, SdoInfoOpcode.OBJECT_REQUEST, request, index=index))
 
 
 def read_entry(index: int, subindex: int, value_info: int) -> Conversation[bytes]:
-    """As entry_description(), but return the bytes."""
+    """Return the encoded answer of entry_description()."""
     what = f"entry description {ObjectId(index, subindex)}"
     request = EntryRequest(index, subindex, value_info).encode()
     opcode = SdoInfoOpcode.ENTRY_REQUEST
@@ -266,7 +268,7 @@ def read_entry(index: int, subindex: int, value_info: int) -> Conversation[bytes
 
 
 def read(opcode: SdoInfoOpcode, request: bytes) -> Conversation[bytes]:
-    """Send any request; return the bytes of the answer.  Raises as object_list() does."""
+    """Send an SDO information request; return its encoded answer.  Raises as object_list()."""
     index = 0 if opcode is SdoInfoOpcode.LIST_REQUEST else int.from_bytes(request[:2], "little")
     subindex = int.from_bytes(request[2:3], "little")
     what = f"SDO information {opcode.name} {ObjectId(index, subindex)}"
@@ -274,7 +276,7 @@ def read(opcode: SdoInfoOpcode, request: bytes) -> Conversation[bytes]:
 
 
 def read_pdo(service: CoeService, number: int) -> Conversation[bytes]:
-    """Ask for a PDO through the mailbox; *service* is TX_PDO or RX_PDO."""
+    """Read a PDO through the mailbox; *service* is TX_PDO or RX_PDO."""
     remote = {
         CoeService.TX_PDO: CoeService.TX_PDO_REMOTE_REQUEST,
         CoeService.RX_PDO: CoeService.RX_PDO_REMOTE_REQUEST,
@@ -285,7 +287,7 @@ def read_pdo(service: CoeService, number: int) -> Conversation[bytes]:
 
 
 def write_rx_pdo(number: int, data: bytes) -> Conversation[None]:
-    """Send an RxPDO through the mailbox; nothing confirms it."""
+    """Send an RxPDO through the mailbox, which has no confirmation."""
     request = encode_message(CoeService.RX_PDO, data, number=number)
     yield MailboxRequest(MailboxType.COE, request, expects_reply=False)
 
@@ -298,7 +300,7 @@ def _ask(
     index: int = 0,
     subindex: int = 0,
 ) -> Conversation[bytes]:
-    """Send a request; return the bodies of all fragments of the answer."""
+    """Send a request; return the joined bodies of the answer's fragments."""
     sent = encode_message(CoeService.SDO_INFORMATION, SdoInfoHeader(opcode).encode() + request)
     body = b""
     left: int | None = None

@@ -48,17 +48,17 @@ SEGMENTS = {
     SdoRequest.DOWNLOAD_SEGMENT.value: _DOWNLOAD,
     SdoRequest.UPLOAD_SEGMENT.value: _UPLOAD,
 }
-"""Command specifiers of segments, and of the first messages of their transfers."""
+"""Command specifiers of segments, with those of the first message of their transfer."""
 _UPLOADED, _RESPONSE = SdoResponse.UPLOAD, CoeService.SDO_RESPONSE
 
 
 class SegmentedTransfer:
-    """SDO in segments, as its server sees it.
+    """Server side of a segmented SDO transfer.
 
     Args:
-        head: Of its first message.
-        size: Bytes in all.
-        data: What has come, of a download; what has still to go, of an upload.
+        head: SDO header of the first message.
+        size: Total size in bytes.
+        data: Received data of a download; remaining data of an upload.
 
     Attributes:
         toggle: Toggle bit of the next segment.
@@ -72,11 +72,11 @@ class SegmentedTransfer:
         self.data = bytearray(data)
         self.toggle = 0
 
-    def take(self, segment: bytes) -> bool:
-        """Add a segment of a download; return true for the last one.
+    def add_segment(self, segment: bytes) -> bool:
+        """Append a segment of a download; return true for the last segment.
 
         Raises:
-            SdoAbortError: it does not end where the first message said.
+            SdoAbortError: the total size is not that of the first message.
         """
         head, data = decode_segment(segment)
         self.data += data
@@ -89,10 +89,10 @@ class SegmentedTransfer:
 
 
 def transfer_of(segment: bytes, running: SegmentedTransfer | None) -> SegmentedTransfer:
-    """Return the running transfer, which a segment goes on with.
+    """Return the running transfer that *segment* continues.
 
     Raises:
-        SdoAbortError: it belongs to no transfer under way, or is not its next one.
+        SdoAbortError: no such transfer is under way, or the toggle bit is wrong.
     """
     head = SdoSegmentHeader.decode(segment)
     if running is None or running.head.specifier != SEGMENTS.get(head.specifier):
@@ -103,10 +103,10 @@ def transfer_of(segment: bytes, running: SegmentedTransfer | None) -> SegmentedT
 
 
 def size_of_download(head: SdoHeader, data: bytes) -> int:
-    """Return the size that the first message of a normal download names, *data* behind its head.
+    """Return the total size of a normal download from its first message's head and *data*.
 
     Raises:
-        SdoAbortError: it names none, or less than it brings.
+        SdoAbortError: the message has no size, or more data than its size.
     """
     where = head.index, head.subindex
     if not head.has_size:
@@ -117,12 +117,12 @@ def size_of_download(head: SdoHeader, data: bytes) -> int:
 
 
 class SdoServer:
-    """The SDO service of a slave.
+    """SDO service of a slave.
 
     Args:
-        dictionary: What is read and written.
-        state: Says in which state the slave is now.
-        sizes: Of the slave's mailboxes.
+        dictionary: Objects to read and write.
+        state: Returns the present state of the slave.
+        sizes: Sizes of the slave's mailboxes.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class SdoServer:
         self._transfer = None
 
     def receive_request(self, body: bytes) -> list[bytes]:
-        """Act on an SDO request behind its CoE header; return the answer, if it has one."""
+        """Handle an SDO request (without CoE header) and return its answers."""
         if len(body) < SdoHeader.SIZE:
             raise_mailbox_error(
                 MailboxError.SIZE_TOO_SHORT, f"an SDO of {len(body)} bytes, expected 8"
@@ -170,10 +170,10 @@ class SdoServer:
         index, subindex, complete = head.index, head.subindex, bool(head.complete)
         read = self._dictionary.upload_complete if complete else self._dictionary.upload
         data = read(index, subindex, self._state())
-        room = self._sizes.to_master - INITIATE_OVERHEAD
-        if len(data) > max(room, EXPEDITED_SIZE):
-            self._transfer = SegmentedTransfer(head, len(data), data[room:])
-        return encode_initiate(_UPLOADED, index, subindex, data, complete=complete, room=room)
+        data_size = self._sizes.to_master - INITIATE_OVERHEAD
+        if len(data) > max(data_size, EXPEDITED_SIZE):
+            self._transfer = SegmentedTransfer(head, len(data), data[data_size:])
+        return encode_initiate(_UPLOADED, index, subindex, data, complete=complete, room=data_size)
 
     def _start_download(self, head: SdoHeader, rest: bytes) -> bytes:
         where = (head.index, head.subindex)
@@ -203,29 +203,33 @@ class SdoServer:
         head = transfer.head
         try:
             is_upload = head.specifier == _UPLOAD
-            answer = self._send_segment(transfer) if is_upload else self._take(transfer, segment)
+            answer = (
+                self._send_segment(transfer)
+                if is_upload
+                else self._receive_segment(transfer, segment)
+            )
         except SdoAbortError as exc:
             return encode_abort(head.index, head.subindex, exc.code)
         return encode_message(_RESPONSE, answer)
 
     def _send_segment(self, transfer: SegmentedTransfer) -> bytes:
-        room = self._sizes.to_master - SEGMENT_OVERHEAD
-        data, toggle = bytes(transfer.data[:room]), transfer.toggle
-        del transfer.data[:room]
+        data_size = self._sizes.to_master - SEGMENT_OVERHEAD
+        data, toggle = bytes(transfer.data[:data_size]), transfer.toggle
+        del transfer.data[:data_size]
         last = not transfer.data
-        self._go_on(transfer, last=last)
+        self._keep_until(transfer, last=last)
         return encode_segment(SdoResponse.UPLOAD_SEGMENT, data, toggle=toggle, last=last)
 
-    def _take(self, transfer: SegmentedTransfer, segment: bytes) -> bytes:
+    def _receive_segment(self, transfer: SegmentedTransfer, segment: bytes) -> bytes:
         head, toggle = transfer.head, transfer.toggle
-        last = transfer.take(segment)
+        last = transfer.add_segment(segment)
         if last:
             complete = bool(head.complete)
             self._store(head.index, head.subindex, bytes(transfer.data), complete=complete)
-        self._go_on(transfer, last=last)
+        self._keep_until(transfer, last=last)
         return encode_segment_answer(SdoResponse.DOWNLOAD_SEGMENT, toggle=toggle)
 
-    def _go_on(self, transfer: SegmentedTransfer, *, last: bool) -> None:
+    def _keep_until(self, transfer: SegmentedTransfer, *, last: bool) -> None:
         transfer.toggle ^= 1
         self._transfer = None if last else transfer
 
@@ -236,18 +240,18 @@ class SdoServer:
 
 
 _OVERHEAD = 12
-"""Bytes of a mailbox in front of the body: headers of mailbox, CoE and SDO information."""
+"""Bytes in front of the body: headers of mailbox, CoE and SDO information."""
 
 
 class SdoInfoServer:
-    """The SDO information service of a slave."""
+    """SDO information service of a slave."""
 
     def __init__(self, dictionary: ObjectDictionary, sizes: MailboxSizes) -> None:
         self._dictionary = dictionary
         self._sizes = sizes
 
     def receive_request(self, body: bytes) -> list[bytes]:
-        """Answer a request behind its CoE header with as many fragments as it takes."""
+        """Handle a request (without CoE header) and return the fragments of its answer."""
         try:
             header = SdoInfoHeader.decode(body)
             opcode, answer = self._answer(header.opcode, body[SdoInfoHeader.SIZE :])
@@ -258,8 +262,8 @@ class SdoInfoServer:
         except CodecError:
             opcode, answer = SdoInfoOpcode.ERROR, InfoError(AbortCode.COMMAND).encode()
         # An index is never cut in two.
-        room = (self._sizes.to_master - _OVERHEAD) & ~1
-        pieces = [answer[at : at + room] for at in range(0, len(answer), room)]
+        data_size = (self._sizes.to_master - _OVERHEAD) & ~1
+        pieces = [answer[at : at + data_size] for at in range(0, len(answer), data_size)]
         return [
             encode_message(
                 CoeService.SDO_INFORMATION,
@@ -276,16 +280,16 @@ class SdoInfoServer:
             index = ObjectRequest.decode(body).index
             return SdoInfoOpcode.OBJECT_RESPONSE, info.object_description(self._dictionary, index)
         if opcode is SdoInfoOpcode.ENTRY_REQUEST:
-            asked = EntryRequest.decode(body)
+            request = EntryRequest.decode(body)
             described = info.entry_description(
-                self._dictionary, asked.index, asked.subindex, asked.value_info
+                self._dictionary, request.index, request.subindex, request.value_info
             )
             return SdoInfoOpcode.ENTRY_RESPONSE, described
         raise SdoAbortError(AbortCode.COMMAND, 0, 0, f"opcode {opcode.name} is no request")
 
 
 MAX_PENDING = 16
-"""Emergencies and PDOs that wait for the master; what comes on top is dropped and counted."""
+"""Limit for queued emergencies and PDOs; further ones are dropped and counted."""
 
 _ANSWERED_BY = {
     CoeService.TX_PDO_REMOTE_REQUEST: CoeService.TX_PDO,
@@ -294,12 +298,12 @@ _ANSWERED_BY = {
 
 
 class CoeServer:
-    """The CoE protocol of a slave.
+    """CoE protocol of a slave.
 
     Args:
-        dictionary: What SDOs read and write, and SDO information describes.
-        state: Says in which state the slave is now.
-        sizes: Of the slave's mailboxes.
+        dictionary: Objects of SDO and SDO information.
+        state: Returns the present state of the slave.
+        sizes: Sizes of the slave's mailboxes.
         read_pdo: Returns the TxPDO or RxPDO of a number (told apart by the service TX_PDO or
             RX_PDO), None if there is none; without it the slave has no PDOs in its mailbox.
         write_pdo: Takes an RxPDO; returns whether there is one of this number.
@@ -320,15 +324,15 @@ class CoeServer:
         self._write_pdo = write_pdo
         self._pending: deque[bytes] = deque()
         self.dropped = 0
-        """Emergencies and PDOs lost because the master did not fetch those before."""
+        """Number of emergencies and PDOs lost because the queue was full."""
 
     def reset(self) -> None:
-        """Forget the transfer under way and what waits to be sent."""
+        """Discard the transfer under way and the queued messages."""
         self._sdo.reset()
         self._pending.clear()
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Act on a message behind its mailbox header and return the answers."""
+        """Handle a message (without mailbox header) and return its answers."""
         del now_ns
         header = decode_or_error(CoeHeader.decode, data)
         body = data[CoeHeader.SIZE :]
@@ -339,19 +343,19 @@ class CoeServer:
         return self._answer_pdo(header, body)
 
     def messages_to_send(self, now_ns: int) -> list[bytes]:
-        """Take emergencies and PDOs that are due."""
+        """Return and remove the queued emergencies and PDOs."""
         del now_ns
         messages = list(self._pending)
         self._pending.clear()
         return messages
 
     def send_emergency(self, error_code: int, register: int = 0, data: bytes = b"") -> None:
-        """Report an error, or with code 0 its end; *data* is up to five bytes of the vendor."""
+        """Queue an emergency; code 0 reports the end, *data* is up to five vendor bytes."""
         emergency = Emergency(error_code, register, data.ljust(5, b"\0"))
         self._push(encode_message(CoeService.EMERGENCY, emergency.encode()))
 
     def send_tx_pdo(self, number: int, data: bytes) -> None:
-        """Send a TxPDO through the mailbox unasked."""
+        """Queue an unsolicited TxPDO for the mailbox."""
         self._push(encode_message(CoeService.TX_PDO, data, number=number))
 
     def _push(self, message: bytes) -> None:

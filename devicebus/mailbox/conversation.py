@@ -5,9 +5,9 @@
         more = yield MailboxRequest(MailboxType.COE, request, listen=True)  # nothing is sent
         return first.data + more.data
 
-Its driver (:mod:`devicebus.drive`, or a master's mailbox) sends the request, waits, and resumes the
-generator with the reply.  It throws MailboxTimeoutError into it when none comes,
-MailboxRefusedError when the slave answers with a mailbox error, and closes it to cancel.
+The driver (:mod:`devicebus.drive`, or a master's mailbox) sends the request, waits, and resumes the
+generator with the reply.  It throws MailboxTimeoutError when no reply comes and MailboxRefusedError
+when the slave answers with a mailbox error, and closes the generator to cancel it.
 
 The records travel as they are, in MessagePack, between the processes that share a master.
 """
@@ -31,11 +31,11 @@ from eap.od.abort import AbortCode
 T = TypeVar("T")
 
 RESPONSE_TIMEOUT_NS = 2_000_000_000
-"""Limit for the answer of a slave, unless a protocol says otherwise (ESI default)."""
+"""Default time-out for the answer of a slave (default of ESI files)."""
 
 
 class MailboxRequest(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One step of a conversation; :func:`devicebus.mailbox.match.answers` knows its reply."""
+    """One step of a conversation; :func:`devicebus.mailbox.match.answers` identifies its reply."""
 
     type: MailboxType
     request: bytes
@@ -46,7 +46,7 @@ class MailboxRequest(msgspec.Struct, frozen=True, array_like=True, gc=False):
     delay_ns: int = 0
     """Pause before sending, as after a busy reply."""
     expects_reply: bool = True
-    """If not, the conversation goes on as soon as this is sent, with a message without data."""
+    """If false, the conversation is resumed after sending, with a message without data."""
 
 
 class MailboxMessage(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -55,24 +55,24 @@ class MailboxMessage(msgspec.Struct, frozen=True, array_like=True, gc=False):
     type: MailboxType
     data: bytes
     at_ns: int = 0
-    """Time of arrival; 0 where no clock is at hand, and a number of messages is the only limit."""
+    """Time of arrival; 0 without a clock, where a count of messages is the only limit."""
     counter: int = 0
-    """Counter of its mailbox header: the slave's own, which says nothing about the request."""
+    """Counter of its mailbox header: the slave's own sequence, unrelated to the request."""
 
 
 Conversation: TypeAlias = Generator[MailboxRequest, MailboxMessage, T]
 
 
 RATE_WINDOW_NS = 2_000_000_000
-"""Longest time that a rate is the mean of."""
+"""Averaging window of Progress.rate()."""
 
 
 class Progress:
-    """Progress of a transfer; it may be read at any time.
+    """Progress of a transfer, readable at any time.
 
     Attributes:
         done: Bytes transferred.
-        total: Bytes in all, None where the protocol does not tell.
+        total: Total size in bytes, None where the protocol does not carry it.
     """
 
     __slots__ = ("_seen", "done", "total")
@@ -83,9 +83,9 @@ class Progress:
         self._seen: deque[tuple[int, int]] = deque()
 
     def rate(self, now_ns: int) -> float:
-        """Return bytes a second over the last two seconds, 0 when asked for the first time.
+        """Return bytes per second over the last two seconds, 0 at the first call.
 
-        To be asked a few times a second by one user.
+        Intended for one caller, a few times a second.
         """
         seen = self._seen
         while len(seen) > 1 and seen[1][0] <= now_ns - RATE_WINDOW_NS:
@@ -97,7 +97,7 @@ class Progress:
 
 @contextmanager
 def reading(what: str) -> Iterator[None]:
-    """Raise errors of a decoder about a slave's message as MailboxProtocolError."""
+    """Convert CodecError, raised while a slave's message is decoded, to MailboxProtocolError."""
     try:
         yield
     except CodecError as exc:
@@ -105,7 +105,7 @@ def reading(what: str) -> Iterator[None]:
 
 
 _ABORT_TIMEOUT_NS = 50_000_000
-"""Short: a slave that does not take messages shall not keep others waiting for this one."""
+"""Short: a slave that accepts no messages must not delay other clients by this one."""
 ABORT_MESSAGES = {
     MailboxType.COE: MailboxRequest(
         MailboxType.COE,
@@ -120,8 +120,8 @@ ABORT_MESSAGES = {
         expects_reply=False,
     ),
 }
-"""Requests that end a transfer whose client has left in the middle of it, by protocol.
+"""Messages that end an abandoned transfer, by protocol.
 
-Other protocols have no transfers that stay open.  A slave without a transfer ignores them, so they
-may be sent whenever that is not known.
+Other protocols have no transfers that stay open.  A slave without a transfer ignores the message,
+so it is safe to send it whenever the slave's state is unknown.
 """

@@ -26,19 +26,19 @@ from eap.codec.mailbox import MailboxError, MailboxType
 from eap.errors import CodecError, MalformedError
 
 MAX_FRAME = 1522
-"""Bytes of the longest Ethernet frame, with a VLAN tag and without check sequence, rounded up."""
+"""Longest Ethernet frame in bytes: with a VLAN tag, without check sequence, rounded up."""
 _TIME_SIZE = 4
 _WORDS = EoeHeader.SIZE + FragmentWord.SIZE
 
 
-def iter_fragments(frame: bytes, number: int, room: int, *, port: int = 0) -> Iterator[bytes]:
-    """Yield the messages that carry *frame*, each with at most *room* bytes of it.
+def iter_fragments(frame: bytes, number: int, data_size: int, *, port: int = 0) -> Iterator[bytes]:
+    """Yield the EoE fragments of *frame*, each with at most *data_size* bytes of it.
 
     Args:
         frame: An Ethernet frame without check sequence.
-        number: From 0 to 15, another one for each frame.
-        room: Bytes of a message behind the two words of EoE; at least 32, unless all fits in one.
-        port: Of the slave; 0 for any.
+        number: Frame number from 0 to 15, incremented for each frame.
+        data_size: Bytes of a message after the two EoE words; at least 32, unless all fits in one.
+        port: Port of the slave; 0 for any.
 
     Raises:
         CodecError: the frame is too long, or its fragments do not fit.
@@ -46,9 +46,11 @@ def iter_fragments(frame: bytes, number: int, room: int, *, port: int = 0) -> It
     if not 0 < len(frame) <= MAX_FRAME:
         raise CodecError(f"a frame of {len(frame)} bytes, expected 1 to {MAX_FRAME}",
                          layout="EoeHeader")  # fmt: skip
-    step = room if room >= len(frame) else room // FRAGMENT_UNIT * FRAGMENT_UNIT
+    step = data_size if data_size >= len(frame) else data_size // FRAGMENT_UNIT * FRAGMENT_UNIT
     if not step:
-        raise CodecError(f"room for {room} bytes, expected 32", layout="EoeHeader")
+        raise CodecError(
+            f"fragments of {data_size} bytes, expected at least 32", layout="EoeHeader"
+        )
     units = (len(frame) + FRAGMENT_UNIT - 1) // FRAGMENT_UNIT
     for fragment, start in enumerate(range(0, len(frame), step)):
         piece = frame[start : start + step]
@@ -59,10 +61,10 @@ def iter_fragments(frame: bytes, number: int, room: int, *, port: int = 0) -> It
 
 
 class FrameAssembler:
-    """Puts fragments together again, one frame at a time.
+    """Reassembly of Ethernet frames from fragments, one frame at a time.
 
     Attributes:
-        dropped: Frames of which fragments were missing or did not fit together.
+        dropped: Number of frames with missing or inconsistent fragments.
     """
 
     def __init__(self) -> None:
@@ -73,11 +75,11 @@ class FrameAssembler:
         self._dropped_number = -1
 
     def reset(self) -> None:
-        """Forget the frame that is not complete."""
+        """Discard the incomplete frame."""
         self._content = None
 
     def receive(self, message: bytes) -> bytes | None:
-        """Take a message of type FRAGMENT; return the frame that it completes, if it does.
+        """Add a message of type FRAGMENT; return the completed frame, or None.
 
         Raises:
             CodecError: the message is too short.
@@ -87,7 +89,7 @@ class FrameAssembler:
         data = message[_WORDS:]
         if header.last and header.time_appended:
             if len(data) < _TIME_SIZE:
-                raise MalformedError("no room for the time that is appended", layout="EoeHeader")
+                raise MalformedError("time stamp announced, but missing", layout="EoeHeader")
             data = data[:-_TIME_SIZE]
         if word.fragment == 0:
             if self._content is not None:
@@ -120,26 +122,26 @@ class FrameAssembler:
 
 
 def set_ip(settings: IpSettings, *, port: int = 0) -> Conversation[None]:
-    """Give a slave Ethernet settings; those that are None stay as they are.
+    """Write a slave's Ethernet settings; fields that are None stay unchanged.
 
     Raises:
-        EoeError: the slave refuses.
-        MailboxProtocolError: its answer is no answer.
+        EoeError: the slave refuses the settings.
+        MailboxProtocolError: the answer is invalid.
         CodecError: the name is too long.
     """
     request = encode_message(EoeType.SET_IP_REQUEST, settings.encode(), port=port)
-    yield from _ask("EoE set IP", request)
+    yield from _exchange("EoE set IP", request)
 
 
 def get_ip(*, port: int = 0) -> Conversation[IpSettings]:
     """Read a slave's Ethernet settings; raises as set_ip() does."""
     request = encode_message(EoeType.GET_IP_REQUEST, port=port)
-    body = yield from _ask("EoE get IP", request)
+    body = yield from _exchange("EoE get IP", request)
     with reading("EoE get IP"):
         return IpSettings.decode(body)
 
 
-def _ask(what: str, request: bytes) -> Conversation[bytes]:
+def _exchange(what: str, request: bytes) -> Conversation[bytes]:
     message = yield MailboxRequest(MailboxType.EOE, request)
     with reading(what):
         _, result, body = decode_message(message.data)
@@ -149,7 +151,7 @@ def _ask(what: str, request: bytes) -> Conversation[bytes]:
 
 
 MAX_PENDING = 64
-"""Fragments that wait for the master; a frame that would exceed them is dropped and counted."""
+"""Limit for queued fragments; a frame that exceeds it is dropped and counted."""
 _RESPONSE = {
     EoeType.SET_IP_REQUEST: EoeType.SET_IP_RESPONSE,
     EoeType.GET_IP_REQUEST: EoeType.GET_IP_RESPONSE,
@@ -159,12 +161,12 @@ _RESPONSE = {
 
 
 class EoeServer:
-    """The EoE protocol of a slave.
+    """EoE protocol of a slave.
 
     Args:
-        sizes: Of the slave's mailboxes.
-        settings: What it starts with.
-        accept: Judges new settings; anything but OK refuses them.
+        sizes: Sizes of the slave's mailboxes.
+        settings: Initial IP settings.
+        accept: Checks new settings; any result but OK refuses them.
         receive_frame: Called with each Ethernet frame from the master; returns frames to send back.
     """
 
@@ -179,7 +181,7 @@ class EoeServer:
         self.settings = settings or IpSettings()
         self.assembler = FrameAssembler()
         self.dropped = 0
-        """Frames lost because the master did not fetch those before, or too long to be sent."""
+        """Number of frames lost because the queue was full or the frame too long."""
         self._sizes = sizes
         self._accept = accept
         self._receive_frame = receive_frame
@@ -187,37 +189,37 @@ class EoeServer:
         self._frame_number = 0
 
     def reset(self) -> None:
-        """Forget the frame that is not complete, and what waits to be sent."""
+        """Discard the incomplete frame and the queued fragments."""
         self.assembler.reset()
         self._pending.clear()
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Act on a message behind its mailbox header and return the answer, if it has one."""
+        """Handle a message (without mailbox header) and return its answers."""
         del now_ns
         header, _, body = decode_or_error(decode_message, data)
         if header.type is EoeType.FRAGMENT:
-            decode_or_error(self._take_fragment, data)
+            decode_or_error(self._receive_fragment, data)
             return []
         if header.type not in _RESPONSE:
             raise_mailbox_error(MailboxError.SERVICE_NOT_SUPPORTED, f"type {header.type.name}")
         return [self._answer(header, bytes(body))]
 
     def messages_to_send(self, now_ns: int) -> list[bytes]:
-        """Take the next fragment of the frames that wait."""
+        """Return and remove the next queued fragment."""
         del now_ns
         return [self._pending.popleft()] if self._pending else []
 
     def send_frame(self, frame: bytes) -> None:
-        """Send an Ethernet frame to the master; raise CodecError if it is none."""
-        room = self._sizes.to_master - DATA_OVERHEAD
-        fragments = list(iter_fragments(frame, self._frame_number, room))
+        """Queue an Ethernet frame for the master; raise CodecError if it is invalid."""
+        data_size = self._sizes.to_master - DATA_OVERHEAD
+        fragments = list(iter_fragments(frame, self._frame_number, data_size))
         if len(self._pending) + len(fragments) > MAX_PENDING:
             self.dropped += 1
             return
         self._frame_number = (self._frame_number + 1) % 16
         self._pending += fragments
 
-    def _take_fragment(self, data: bytes) -> None:
+    def _receive_fragment(self, data: bytes) -> None:
         frame = self.assembler.receive(data)
         if frame is None or self._receive_frame is None:
             return

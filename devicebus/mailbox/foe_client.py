@@ -1,7 +1,7 @@
-"""FoE as conversations: the master's side of reading and writing files (ETG.1000.6).
+"""FoE as conversations: reading and writing files of a slave (ETG.1000.6).
 
-A file is never held: what is read goes to a sink and what is written comes from a source, one
-message at a time.  Each message waits for the answer to the one before.
+A file is never held in memory: a read passes data to a sink and a write takes it from a source, one
+message at a time.  Each message is sent after the answer to the one before.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from eap.codec.foe import (
 from eap.codec.mailbox import MailboxType
 
 STEP_TIMEOUT_NS = 3_000_000_000
-"""How long the answer to each message may take."""
+"""Time-out for the answer to each message."""
 BUSY_DELAY_NS = 10_000_000
 BUSY_LIMIT = 6_000
-"""Times in a row that a slave may be busy: a minute, at least."""
+"""Limit for consecutive busy answers: at least one minute."""
 BUSY_TIMEOUT_NS = 120_000_000_000
-"""How long it may be busy, however long it takes to say so."""
+"""Limit for the time that a slave stays busy, whatever the delay of its answers."""
 MAX_SIZE = 1 << 28
-"""Bytes of the largest file that is read unless told otherwise."""
+"""Default limit for the size of a file that is read, in bytes."""
 
 
 def read(
@@ -45,38 +45,40 @@ def read(
     progress: Progress | None = None,
     max_size: int = MAX_SIZE,
 ) -> Conversation[int]:
-    """Read a file into *sink*, in the order of its bytes; return how many there were.
+    """Read a file into *sink* and return its size.
 
-    What *sink* raises ends the transfer, also at the slave.
+    An error raised by *sink* ends the transfer, also at the slave.
 
     Raises:
-        FoeError: the slave refuses.
-        MailboxProtocolError: it breaks the protocol, or the file is longer than *max_size*.
-        MailboxTimeoutError: it is busy for too long.
+        FoeError: the slave refuses the transfer.
+        MailboxProtocolError: an answer is invalid, or the file is longer than *max_size*.
+        MailboxTimeoutError: the slave is busy for too long.
         MailboxSizeError: the name does not fit the mailbox.
     """
-    foe = _Transfer(f"FoE read of {name!r}")
+    transfer = _Transfer(f"FoE read of {name!r}")
     progress = progress or Progress()
-    room = sizes.to_master - DATA_OVERHEAD
+    packet_size = sizes.to_master - DATA_OVERHEAD
     sent = _request(FoeOpcode.READ, password, name, sizes)
     expected = 1
     while True:
-        header, data = yield from foe.ask(sent)
+        header, data = yield from transfer.exchange(sent)
         if header.number != expected:
-            yield from foe.give_up(
+            yield from transfer.fail(
                 FoeErrorCode.PACKET_NUMBER, f"packet {header.number}, expected {expected}"
             )
-        if len(data) > room or progress.done + len(data) > max_size:
-            limit = min(room, max_size - progress.done)
-            yield from foe.give_up(FoeErrorCode.ILLEGAL, f"{len(data)} bytes, taken are {limit}")
+        if len(data) > packet_size or progress.done + len(data) > max_size:
+            limit = min(packet_size, max_size - progress.done)
+            yield from transfer.fail(
+                FoeErrorCode.ILLEGAL, f"{len(data)} bytes, at most {limit} are accepted"
+            )
         try:
             sink(data)
         except OSError:
-            yield from foe.tell(FoeErrorCode.DISK_FULL)
+            yield from transfer.send_error(FoeErrorCode.DISK_FULL)
             raise
         progress.done += len(data)
         sent = encode_message(FoeOpcode.ACK, expected)
-        if len(data) < room:
+        if len(data) < packet_size:
             yield MailboxRequest(MailboxType.FOE, sent, expects_reply=False)
             return progress.done
         expected += 1
@@ -90,41 +92,42 @@ def write(
     password: int = 0,
     progress: Progress | None = None,
 ) -> Conversation[int]:
-    """Write a file from *source*; return how many bytes there were.
+    """Write a file from *source* and return its size.
 
     Args:
-        name: Of the file, at the slave.
+        name: Name of the file at the slave.
         source: Called with a number of bytes; returns as many or fewer, none at the end.
-        sizes: Of the slave's mailboxes.
-        password: Up to 32 bits.
-        progress: What is told how far it is.
+        sizes: Sizes of the slave's mailboxes.
+        password: Password of the file, up to 32 bits.
+        progress: Updated after each message.
 
     Raises:
-        FoeError: the slave refuses.
-        MailboxProtocolError: it breaks the protocol.
-        MailboxTimeoutError: it is busy for too long.
+        FoeError: the slave refuses the transfer.
+        MailboxProtocolError: an answer is invalid.
+        MailboxTimeoutError: the slave is busy for too long.
         MailboxSizeError: the name does not fit the mailbox.
     """
-    foe = _Transfer(f"FoE write of {name!r}")
+    transfer = _Transfer(f"FoE write of {name!r}")
     progress = progress or Progress()
-    room = sizes.to_slave - DATA_OVERHEAD
+    packet_size = sizes.to_slave - DATA_OVERHEAD
     sent = _request(FoeOpcode.WRITE, password, name, sizes)
-    yield from foe.ask(sent)
+    yield from transfer.exchange(sent)
     number = 0
-    size = room
-    while size == room:
+    size = packet_size
+    while size == packet_size:
         try:
-            data = _take(source, room)
+            data = _read_fully(source, packet_size)
         except OSError:
-            yield from foe.tell(FoeErrorCode.NOT_DEFINED)
+            yield from transfer.send_error(FoeErrorCode.NOT_DEFINED)
             raise
         number += 1
         size = len(data)
         sent = encode_message(FoeOpcode.DATA, number, data)
-        header, _ = yield from foe.ask(sent)
+        header, _ = yield from transfer.exchange(sent)
         if header.number != number:
-            yield from foe.give_up(
-                FoeErrorCode.PACKET_NUMBER, f"packet {header.number} confirmed, sent was {number}"
+            yield from transfer.fail(
+                FoeErrorCode.PACKET_NUMBER,
+                f"packet {header.number} acknowledged, expected {number}",
             )
         progress.done += size
     return progress.done
@@ -132,15 +135,15 @@ def write(
 
 def _request(opcode: FoeOpcode, password: int, name: str, sizes: MailboxSizes) -> bytes:
     octets = name.encode()
-    room = sizes.to_slave - DATA_OVERHEAD
-    if len(octets) > room:
+    packet_size = sizes.to_slave - DATA_OVERHEAD
+    if len(octets) > packet_size:
         raise MailboxSizeError(
-            f"file name {name!r} has {len(octets)} bytes, the slave's mailbox has room for {room}"
+            f"file name {name!r} has {len(octets)} bytes, the mailbox holds {packet_size}"
         )
     return encode_message(opcode, password, octets)
 
 
-def _take(source: Callable[[int], bytes], size: int) -> bytes:
+def _read_fully(source: Callable[[int], bytes], size: int) -> bytes:
     data = source(size)
     while data and len(data) < size:
         more = source(size - len(data))
@@ -151,44 +154,44 @@ def _take(source: Callable[[int], bytes], size: int) -> bytes:
 
 
 class _Transfer:
-    """What reading and writing have in common."""
+    """Message exchange of a read or a write."""
 
     def __init__(self, what: str) -> None:
         self.what = what
 
-    def ask(self, sent: bytes) -> Conversation[tuple[FoeHeader, bytes]]:
+    def exchange(self, sent: bytes) -> Conversation[tuple[FoeHeader, bytes]]:
         """Send a message, again while the slave is busy; return header and body of the answer."""
-        ask = MailboxRequest(MailboxType.FOE, sent, timeout_ns=STEP_TIMEOUT_NS)
+        request = MailboxRequest(MailboxType.FOE, sent, timeout_ns=STEP_TIMEOUT_NS)
         since_ns: int | None = None
         times = 0
         while times < BUSY_LIMIT:
-            message = yield ask
+            message = yield request
             with reading(self.what):
                 header, body = decode_message(message.data)
             if header.opcode is FoeOpcode.ERROR:
-                raise self._refusal(header.number, text_of(body))
+                raise self._error_of(header.number, text_of(body))
             if header.opcode is not FoeOpcode.BUSY:
                 return header, bytes(body)
             times += 1
             since_ns = message.at_ns if since_ns is None else since_ns
             if message.at_ns - since_ns > BUSY_TIMEOUT_NS:
                 break
-            ask = replace(ask, delay_ns=BUSY_DELAY_NS)
-        yield from self.tell(FoeErrorCode.NOT_DEFINED)
+            request = replace(request, delay_ns=BUSY_DELAY_NS)
+        yield from self.send_error(FoeErrorCode.NOT_DEFINED)
         raise MailboxTimeoutError(f"{self.what}: still busy after {times} answers")
 
-    def tell(self, code: FoeErrorCode) -> Conversation[None]:
-        """Tell the slave that the transfer is over."""
+    def send_error(self, code: FoeErrorCode) -> Conversation[None]:
+        """Send an error message, which ends the transfer at the slave."""
         yield MailboxRequest(
             MailboxType.FOE, encode_message(FoeOpcode.ERROR, code), expects_reply=False
         )
 
-    def give_up(self, code: FoeErrorCode, reason: str) -> Conversation[None]:
-        """Tell the slave and raise."""
-        yield from self.tell(code)
+    def fail(self, code: FoeErrorCode, reason: str) -> Conversation[None]:
+        """End the transfer at the slave and raise MailboxProtocolError."""
+        yield from self.send_error(code)
         raise MailboxProtocolError(f"{self.what}: {reason}")
 
-    def _refusal(self, code: int, text: str) -> FoeError:
-        words = f", the slave says {text!r}" if text else ""
+    def _error_of(self, code: int, text: str) -> FoeError:
+        words = f", text of the slave {text!r}" if text else ""
         message = f"{self.what}: {name_of(code)} (0x{code:04X}){words}"
         return FoeError(message, code=code, text=text)

@@ -1,7 +1,7 @@
-"""FoE on the side of a slave: files read and written one message at a time (ETG.1000.6).
+"""FoE of a slave: files read and written one message at a time (ETG.1000.6).
 
-Where the files are is somebody else's concern: a :class:`FileStore`, such as
-:class:`devicebus.mailbox.foe_server.MemoryStore`, opens them and refuses with FoeError.
+A :class:`FileStore` opens the files and refuses with FoeError; :class:`MemoryStore` is the store of
+a simulated slave, with its own rules for each file.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ _REQUESTS = frozenset((FoeOpcode.READ, FoeOpcode.WRITE))
 
 
 class FileReader(Protocol):
-    """A file that is being read; any binary file object is one."""
+    """File opened for reading; any binary file object is one."""
 
     def read(self, size: int, /) -> bytes:
         """Return the next *size* bytes, fewer only at the end."""
 
     def close(self) -> None:
-        """Nothing more will be read."""
+        """Close the file."""
 
 
 class FileWriter(Protocol):
-    """A file that is being written; each method may raise FoeError."""
+    """File opened for writing; each method may raise FoeError."""
 
     def write(self, data: bytes, /) -> object:
-        """Take the next bytes."""
+        """Append *data*."""
 
     def commit(self) -> None:
-        """Make what was written the content of the file: it is complete."""
+        """Replace the file's content by the written data, which is complete."""
 
     def discard(self) -> None:
-        """Forget what was written: the rest will not come."""
+        """Discard the written data, which is incomplete."""
 
 
 class FileStore(Protocol):
@@ -62,23 +62,22 @@ class FileStore(Protocol):
 
 
 class FoeServer:
-    """The FoE protocol of a slave; one transfer at a time, a new request ends the one before.
+    """FoE protocol of a slave; a new request ends the transfer before it.
 
     Args:
-        store: The files.
-        sizes: Of the slave's mailboxes.
+        store: Files of the slave.
+        sizes: Sizes of the slave's mailboxes.
 
     Attributes:
-        packet_time_ns: How long storing the data of one message takes; until then the slave says
-            that it is busy.
-        refuses: Error code with which every request is refused; 0 refuses none.
+        packet_time_ns: Time to store the data of one message; the server answers BUSY meanwhile.
+        forced_error: Fault: error code that answers every request; 0 for none.
     """
 
     def __init__(self, store: FileStore, sizes: MailboxSizes, *, packet_time_ns: int = 0) -> None:
         self._store = store
         self._sizes = sizes
         self.packet_time_ns = packet_time_ns
-        self.refuses = 0
+        self.forced_error = 0
         self._reader: FileReader | None = None
         self._writer: FileWriter | None = None
         self._number = 0
@@ -87,7 +86,7 @@ class FoeServer:
         self._busy_from_ns = self._busy_until_ns = 0
 
     def reset(self) -> None:
-        """Forget the transfer under way."""
+        """Discard the transfer under way."""
         reader, self._reader = self._reader, None
         writer, self._writer = self._writer, None
         if reader is not None:
@@ -101,7 +100,7 @@ class FoeServer:
         return []
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Act on a message behind its mailbox header and return the answer."""
+        """Handle a message (without mailbox header) and return its answers."""
         try:
             header = FoeHeader.decode(data)
             return self._answer(header, data[FoeHeader.SIZE :], now_ns)
@@ -117,9 +116,9 @@ class FoeServer:
 
     def _answer(self, header: FoeHeader, body: bytes, now_ns: int) -> list[bytes]:
         opcode = header.opcode
-        if self.refuses and opcode in _REQUESTS:
-            text = name_of(self.refuses)
-            raise FoeError(text, code=self.refuses, text=text)
+        if self.forced_error and opcode in _REQUESTS:
+            text = name_of(self.forced_error)
+            raise FoeError(text, code=self.forced_error, text=text)
         if opcode is FoeOpcode.READ:
             self.reset()
             self._reader = self._store.open_read(text_of(body), header.number)
@@ -134,7 +133,7 @@ class FoeServer:
             self.reset()
             return []
         if opcode is FoeOpcode.DATA and self._writer is not None:
-            return self._take(self._writer, header.number, body, now_ns)
+            return self._write_packet(self._writer, header.number, body, now_ns)
         if opcode is FoeOpcode.ACK and self._reader is not None:
             return self._confirm(self._reader, header.number)
         if opcode is FoeOpcode.BUSY and self._reader is not None:
@@ -150,14 +149,16 @@ class FoeServer:
         return self._send_next(reader, number + 1)
 
     def _send_next(self, reader: FileReader, number: int) -> list[bytes]:
-        room = self._sizes.to_master - DATA_OVERHEAD
-        data = reader.read(room)
+        packet_size = self._sizes.to_master - DATA_OVERHEAD
+        data = reader.read(packet_size)
         self._number = number
-        self._is_last = len(data) < room
+        self._is_last = len(data) < packet_size
         self._sent = encode_message(FoeOpcode.DATA, number, data)
         return [self._sent]
 
-    def _take(self, writer: FileWriter, number: int, data: bytes, now_ns: int) -> list[bytes]:
+    def _write_packet(
+        self, writer: FileWriter, number: int, data: bytes, now_ns: int
+    ) -> list[bytes]:
         if number != self._number + 1:
             raise _wrong_number(number, self._number + 1)
         if now_ns < self._busy_until_ns:
@@ -179,7 +180,7 @@ def _wrong_number(number: int, expected: int) -> FoeError:
 
 
 class AllowedIn(Enum):
-    """In which state of its slave a file is there."""
+    """States of the slave in which a file exists."""
 
     ANY_STATE = auto()
     BOOT = auto()
@@ -187,16 +188,16 @@ class AllowedIn(Enum):
 
 
 class MemoryFile:
-    """One file.
+    """One file of a MemoryStore.
 
     Args:
-        name: As FoE asks for it.
-        content: What it starts with.
-        password: What a request must carry.
-        readable, writable: What may be done with it.
-        allowed_in: In which state.
-        max_size: Bytes it may grow to.
-        check: Called with the content before it replaces the old one; refuses with FoeError.
+        name: File name in FoE requests.
+        content: Initial content.
+        password: Required password.
+        readable, writable: Access rights.
+        allowed_in: States in which the file exists.
+        max_size: Maximum size in bytes.
+        check: Called with the new content before it replaces the old; refuses with FoeError.
     """
 
     def __init__(
@@ -222,13 +223,13 @@ class MemoryFile:
 
 
 class MemoryStore:
-    """The files of one slave.
+    """Files of one slave in memory.
 
     Args:
-        files: What is there from the start.
-        is_boot: Says whether the slave is in state BOOT.
-        creates: Whether a file that is not there may be written.
-        overwrites: Whether one that is there may be; a file's own rules hold besides.
+        files: Initial files.
+        is_boot: Returns true while the slave is in state BOOT.
+        creates: Allows writing a file that does not exist.
+        overwrites: Allows writing an existing file, within the file's own rules.
     """
 
     def __init__(
@@ -248,7 +249,7 @@ class MemoryStore:
         """Open a file for reading."""
         file = self.files.get(name)
         if file is None:
-            raise refusal(FoeErrorCode.NOT_FOUND, name)
+            raise store_error(FoeErrorCode.NOT_FOUND, name)
         self._check(file, password, is_allowed=file.readable)
         return MemoryReader(file.content)
 
@@ -257,26 +258,26 @@ class MemoryStore:
         file = self.files.get(name)
         if file is None:
             if not self._creates or not name:
-                raise refusal(FoeErrorCode.NOT_FOUND, name)
+                raise store_error(FoeErrorCode.NOT_FOUND, name)
             return MemoryWriter(MemoryFile(name), self.files)
         self._check(file, password, is_allowed=file.writable)
         if not self._overwrites:
-            raise refusal(FoeErrorCode.ALREADY_EXISTS, name)
+            raise store_error(FoeErrorCode.ALREADY_EXISTS, name)
         return MemoryWriter(file, self.files)
 
     def _check(self, file: MemoryFile, password: int, *, is_allowed: bool) -> None:
         if file.allowed_in is AllowedIn.BOOT and not self._is_boot():
-            raise refusal(FoeErrorCode.BOOTSTRAP_ONLY, file.name)
+            raise store_error(FoeErrorCode.BOOTSTRAP_ONLY, file.name)
         if file.allowed_in is AllowedIn.OTHERS and self._is_boot():
-            raise refusal(FoeErrorCode.NOT_IN_BOOTSTRAP, file.name)
+            raise store_error(FoeErrorCode.NOT_IN_BOOTSTRAP, file.name)
         if password != file.password:
-            raise refusal(FoeErrorCode.NO_RIGHTS, file.name)
+            raise store_error(FoeErrorCode.NO_RIGHTS, file.name)
         if not is_allowed:
-            raise refusal(FoeErrorCode.ACCESS_DENIED, file.name)
+            raise store_error(FoeErrorCode.ACCESS_DENIED, file.name)
 
 
 class MemoryReader:
-    """A file that is being read; it keeps the content that it was opened with."""
+    """File opened for reading, with its content at the time of opening."""
 
     def __init__(self, content: bytes) -> None:
         self._rest = memoryview(content)
@@ -287,12 +288,12 @@ class MemoryReader:
         return data
 
     def close(self) -> None:
-        """Let go of the content."""
+        """Release the content."""
         self._rest = memoryview(b"")
 
 
 class MemoryWriter:
-    """A file that is being written; its old content stays until the new one is complete."""
+    """File opened for writing; its old content stays until the new content is complete."""
 
     def __init__(self, file: MemoryFile, files: dict[str, MemoryFile]) -> None:
         self._file = file
@@ -300,13 +301,13 @@ class MemoryWriter:
         self._content = bytearray()
 
     def write(self, data: bytes, /) -> None:
-        """Take the next bytes."""
+        """Append *data*."""
         if len(self._content) + len(data) > self._file.max_size:
-            raise refusal(FoeErrorCode.DISK_FULL, self._file.name)
+            raise store_error(FoeErrorCode.DISK_FULL, self._file.name)
         self._content += data
 
     def commit(self) -> None:
-        """Make what was written the content of the file."""
+        """Replace the file's content by the written data."""
         content = bytes(self._content)
         if self._file.check is not None:
             self._file.check(content)
@@ -314,11 +315,11 @@ class MemoryWriter:
         self._files[self._file.name] = self._file
 
     def discard(self) -> None:
-        """Forget what was written."""
+        """Discard the written data."""
         self._content.clear()
 
 
-def refusal(code: FoeErrorCode, what: str) -> FoeError:
-    """Make the error with which a store refuses; the master gets the code and these words."""
+def store_error(code: FoeErrorCode, what: str) -> FoeError:
+    """Return the FoeError of a refused request; the master receives its code and text."""
     text = f"{what}: {name_of(code)}"
     return FoeError(text, code=code, text=text)

@@ -1,9 +1,9 @@
-"""Which message of a slave answers which request, told by nothing but their bytes (ETG.1000.6).
+"""Matching of a slave's replies to requests, by their content alone (ETG.1000.6).
 
-Whatever is too short to say what it is answers any request of its protocol: the conversation then
-says what is missing, instead of waiting for nothing.  Who listens for the fragments of an answer
-gives a request that is cut: it names only what those repeat, and the more it is cut, the more
-answers it.
+The mailbox counter cannot match them: a reply carries the slave's own sequence.  A reply that is
+too short to identify matches any request of its protocol, so that the conversation reports the
+defect instead of a time-out.  A conversation that listens for fragments passes a shortened request:
+it holds only the fields that fragments repeat.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.errors import CodecError
 
 INFO_START = CoeHeader.SIZE + SdoInfoHeader.SIZE
-"""Where the body of an SDO information message begins."""
+"""Offset of the body in an SDO information message."""
 _FRAGMENT = AmsCommand.FRAGMENT.to_bytes(2, "little")
 _AMS_REST = 16
 _SDO_END = CoeHeader.SIZE + SdoHeader.SIZE
@@ -36,7 +36,7 @@ _INFO_KEYS: dict[int, int] = {
     SdoInfoOpcode.OBJECT_REQUEST: 2,
     SdoInfoOpcode.ENTRY_REQUEST: 3,
 }
-"""Bytes of a request's body that its answer repeats: list, index, or index and subindex."""
+"""Length of the request's body that the answer repeats: list type, index, index and subindex."""
 _PDO_NUMBER = 0x01FF
 _REMOTE: dict[int, int] = {
     CoeService.TX_PDO_REMOTE_REQUEST: CoeService.TX_PDO,
@@ -76,7 +76,7 @@ def _answers_sdo(request: bytes, reply: bytes) -> bool:
     service = _service(reply)
     found = reply[2] >> 5 if len(reply) > CoeHeader.SIZE else None
     if found == SdoResponse.ABORT and len(reply) >= _SDO_END:
-        # A segment has no index: whoever has to abort at one may not know it either.
+        # A segment has no index, so an abort during a segment may carry another index.
         is_sdo = service in {CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE}
         return is_sdo and (is_segment or reply[3:6] == request[3:6])
     if service != CoeService.SDO_RESPONSE:
@@ -104,11 +104,11 @@ def _answers_foe(request: bytes, reply: bytes) -> bool:
     number = int.from_bytes(reply[2:6], "little")
     sent = int.from_bytes(request[2:6], "little")
     if asked in {FoeOpcode.READ, FoeOpcode.ACK}:
-        # What follows packet 1 belongs to a transfer before this one: late, and not wrong.
-        # The number before comes twice when a reply is repeated; any other is wrong, not late.
+        # Packets above 1 in answer to a read request belong to the transfer before: late, not
+        # wrong. A repeated reply has the number of the packet before; any other number is an error.
         is_late = number > 1 if asked == FoeOpcode.READ else number == sent
         return found == FoeOpcode.DATA and not is_late
-    if asked == FoeOpcode.BUSY:  # "send that packet once more, later"
+    if asked == FoeOpcode.BUSY:  # BUSY asks for the same packet again
         return found == FoeOpcode.DATA
     if asked == FoeOpcode.WRITE:
         return found == FoeOpcode.ACK and number == 0
@@ -121,7 +121,7 @@ def _answers_soe(request: bytes, reply: bytes) -> bool:
     if reply[0] & 0xE7 != (request[0] & 0xE7) + 1:  # opcode and drive
         return False
     is_incomplete, is_error = reply[0] & 0x08, reply[0] & 0x10
-    # Fragments have no IDN, neither those of an answer nor those that a drive refuses.
+    # Fragments carry the number of fragments left in place of the IDN.
     may_lack_idn = is_incomplete or (is_error and reply[0] & 0x07 == SoeOpcode.WRITE_RESPONSE)
     return bool(may_lack_idn) or reply.startswith(request[2:4], 2)
 
@@ -144,14 +144,14 @@ def _continues_aoe(asked: AmsHeader, found: AmsHeader, body: bytes) -> bool:
         return found.invoke_id == asked.invoke_id + 1
     if found.invoke_id & 0xFFFF or len(body) < _AMS_REST:
         return True
-    # The first fragment begins with the header that it had as a whole, from the command on.
+    # The first fragment begins with the original AMS header from offset 16 (the command) on.
     is_response = body[2] & StateFlags.RESPONSE
     keys = int.from_bytes(body[:2], "little"), int.from_bytes(body[12:16], "little")
     return bool(is_response) and keys == (asked.command, asked.invoke_id)
 
 
 def _answers_eoe(request: bytes, reply: bytes) -> bool:
-    # Every response is numbered one higher than its request, and names no more than that.
+    # The type of a response is that of its request plus 1; it repeats no other field.
     return len(reply) < EoeHeader.SIZE or reply[0] & 0x0F == (request[0] & 0x0F) + 1
 
 
@@ -173,18 +173,18 @@ _SHORTEST = {
     MailboxType.FOE: FoeHeader.SIZE,
     MailboxType.SOE: 1,
 }
-"""Bytes of a request without which it asks nothing."""
+"""Minimum length of a request that can be answered."""
 
 
 def answers(kind: MailboxType, request: bytes, reply: bytes) -> bool:
-    """Say whether *reply* answers *request*, both of one protocol and without mailbox header."""
+    """Return true if *reply* answers *request*, both of one protocol, without mailbox header."""
     if len(request) < _SHORTEST.get(kind, 0):
         return False
     return kind in _ANSWERS and _ANSWERS[kind](request, reply)
 
 
 def has_more(kind: MailboxType, reply: bytes) -> bool:
-    """Say whether fragments may follow a message; only the last one of AoE does not tell."""
+    """Return true if fragments may follow *reply*; AoE does not mark its last fragment."""
     match kind:
         case MailboxType.COE:
             is_info = len(reply) >= INFO_START and _service(reply) == CoeService.SDO_INFORMATION
@@ -197,6 +197,6 @@ def has_more(kind: MailboxType, reply: bytes) -> bool:
 
 
 def is_aoe_fragment(reply: bytes) -> bool:
-    """Say whether a packet is a part of another one, and not the acknowledgement of one."""
+    """Return true if *reply* is an AoE fragment, and not the acknowledgement of one."""
     flags = int.from_bytes(reply[18:20], "little")
     return reply[16:18] == _FRAGMENT and not flags & StateFlags.RESPONSE

@@ -12,13 +12,13 @@ from eap.errors import MalformedError, TruncatedError
 T = TypeVar("T")
 
 MINIMUM_SIZE = 16
-"""Bytes of the smallest mailbox that holds the header of every protocol but AoE."""
+"""Smallest mailbox in bytes: it holds the headers of every protocol but AoE."""
 
 
 class MailboxSizes:
-    """Bytes of a slave's two mailboxes, mailbox header included; master and slave know both.
+    """Sizes of a slave's two mailboxes in bytes, mailbox header included.
 
-    The servers of one slave share one object, so that a new size holds for all of them.
+    The servers of one slave share one object, so a new size applies to all of them.
     """
 
     __slots__ = ("to_master", "to_slave")
@@ -28,11 +28,11 @@ class MailboxSizes:
 
     @classmethod
     def of_data(cls, size: int) -> Self:
-        """Return mailboxes that hold *size* bytes behind their headers, both ways."""
+        """Return sizes with *size* bytes of data, without the header, in both directions."""
         return cls(size + MailboxHeader.SIZE, size + MailboxHeader.SIZE)
 
     def set(self, to_slave: int, to_master: int) -> None:
-        """Change both; raise ValueError if one is too small for a message."""
+        """Set both sizes; raise ValueError if one is too small for a message."""
         if min(to_slave, to_master) < MINIMUM_SIZE:
             raise ValueError(
                 f"mailboxes of {to_slave} and {to_master} bytes, expected at least {MINIMUM_SIZE}"
@@ -42,24 +42,24 @@ class MailboxSizes:
 
     @property
     def data_to_master(self) -> int:
-        """Bytes behind the mailbox header of the longest message to the master."""
+        """Longest message to the master in bytes, without mailbox header."""
         return self.to_master - MailboxHeader.SIZE
 
 
 class ProtocolServer(Protocol):
-    """One mailbox protocol on the side of the slave; data is what follows the mailbox header."""
+    """One mailbox protocol of a slave; messages are without mailbox header."""
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Act on a request and return the answers, in order.
+        """Handle a request and return its answers in order.
 
-        Raises MailboxRefusedError for what can only be answered with a mailbox error.
+        Raises MailboxRefusedError for a request that is answered with a mailbox error.
         """
 
     def messages_to_send(self, now_ns: int) -> list[bytes]:
-        """Take what nobody asked for."""
+        """Return and remove the unsolicited messages that are queued."""
 
     def reset(self) -> None:
-        """Forget every transfer: the mailbox starts again."""
+        """Discard every transfer: the mailbox restarts."""
 
 
 def raise_mailbox_error(detail: MailboxError, reason: str) -> NoReturn:
@@ -68,7 +68,7 @@ def raise_mailbox_error(detail: MailboxError, reason: str) -> NoReturn:
 
 
 def decode_or_error(decode: Callable[[bytes], T], data: bytes) -> T:
-    """Return what *decode* makes of a message; what it cannot read gets a mailbox error."""
+    """Return the decoded message; raise the mailbox error of one that cannot be decoded."""
     try:
         return decode(data)
     except TruncatedError as exc:
@@ -78,16 +78,16 @@ def decode_or_error(decode: Callable[[bytes], T], data: bytes) -> T:
 
 
 def next_counter(counter: int) -> int:
-    """Return the counter of the message behind the one with *counter*."""
+    """Return the counter that follows *counter*: 1 to 7, then 1 again; 0 disables the check."""
     return counter % 7 + 1
 
 
 class CounterCheck:
-    """Judges the counters of one sender's messages.
+    """Check of one sender's counters: repeated and missing messages.
 
     Attributes:
-        repeated: Messages with the counter of the one before, which is what a repeat has.
-        gaps: Times that at least one message seems to be missing.
+        repeated: Number of messages with the counter of the message before.
+        gaps: Number of gaps in the sequence.
     """
 
     __slots__ = ("_last", "gaps", "repeated")
@@ -98,11 +98,11 @@ class CounterCheck:
         self._last = 0
 
     def restart(self) -> None:
-        """Take any counter next; the counts stay."""
+        """Accept any counter next; the counts stay."""
         self._last = 0
 
     def is_new(self, counter: int) -> bool:
-        """Count a message; say whether it is another one than the last."""
+        """Count a message; return false for a repetition of the message before."""
         last, self._last = self._last, counter
         if not counter or not last:
             return True

@@ -1,7 +1,8 @@
 """A slave's mailbox: protocols behind one pair of sync managers (ETG.1000.4).
 
-It keeps the rules that all protocols share: what repeats a counter is dropped, every reply has the
-address of its request and the slave's own counter, what no protocol takes gets a mailbox error.
+Rules of all protocols: a request with the counter of the one before is dropped, a reply has the
+address of its request and the slave's own counter, a request of an unsupported protocol is answered
+with a mailbox error.
 """
 
 from __future__ import annotations
@@ -28,31 +29,31 @@ from eap.codec.mailbox import (
 from eap.codec.wire import Buffer
 
 MAX_QUEUED = 8
-"""Messages waiting for the master from which on no further request is taken."""
+"""Limit for queued replies; at this limit no further request is accepted."""
 
 
 class MailboxServerStats(NamedTuple):
-    """Counters of one mailbox since it was made."""
+    """Counters of one mailbox since its creation."""
 
     received: int
     sent: int
     repeated_requests: int
-    """Dropped, because their counter was that of the request before."""
+    """Requests dropped because their counter was that of the request before."""
     gaps: int
     refused: int
-    """Answered with a mailbox error."""
+    """Requests answered with a mailbox error."""
     repeated_replies: int
-    """Sent again because the master asked for it."""
+    """Replies sent again at the master's repeat request."""
     dropped: int
-    """Requests that came while the queue was full, or were too short to be answered."""
+    """Requests received while the queue was full, or too short to be answered."""
 
 
 class MailboxServer:
-    """What a slave does with its mailbox; the caller moves whole messages from and to memory.
+    """Mailbox of a slave; the caller moves whole messages between it and the memory.
 
     Args:
-        protocols: The servers of this slave.
-        sizes: The object that those servers look at.
+        protocols: Protocol servers of this slave.
+        sizes: Mailbox sizes, shared with those servers.
     """
 
     def __init__(
@@ -63,27 +64,27 @@ class MailboxServer:
         self._watch = CounterCheck()
         self._queue: deque[bytes] = deque()
         self._counter = 0
-        self._posted: bytes | None = None
-        self._read: bytes | None = None
+        self._offered: bytes | None = None
+        self._last_read: bytes | None = None
         self._received = self._sent = self._refused = self._repeated = self._dropped = 0
 
     @property
     def is_ready(self) -> bool:
-        """Whether a request may be taken; if not, it is to stay in its mailbox."""
+        """True while a request is accepted; otherwise it stays in the mailbox memory."""
         return len(self._queue) < MAX_QUEUED
 
     def start(self, to_slave: int, to_master: int) -> None:
-        """Begin anew with mailboxes of these sizes; nothing of before is sent any more."""
+        """Restart with mailboxes of these sizes; queued messages are discarded."""
         self.sizes.set(to_slave, to_master)
         self._watch.restart()
         self._queue.clear()
         self._counter = 0
-        self._posted = self._read = None
+        self._offered = self._last_read = None
         for protocol in self.protocols.values():
             protocol.reset()
 
     def receive_message(self, message: Buffer, now_ns: int) -> None:
-        """Act on a message, header first; bytes behind its length are ignored."""
+        """Handle a message with its header; bytes after its length are ignored."""
         if len(message) < MailboxHeader.SIZE or not self.is_ready:
             self._dropped += 1
             return
@@ -100,34 +101,34 @@ class MailboxServer:
             self._enqueue(kind, data, address)
 
     def next_message(self, now_ns: int) -> bytes | None:
-        """Take the message that comes next into the empty mailbox to the master."""
+        """Return and remove the next message for the empty mailbox to the master."""
         if not self._queue:
             for kind, protocol in self.protocols.items():
                 for data in protocol.messages_to_send(now_ns):
                     self._enqueue(kind, data, 0)
-        self._posted = self._queue.popleft() if self._queue else None
-        self._sent += self._posted is not None
-        return self._posted
+        self._offered = self._queue.popleft() if self._queue else None
+        self._sent += self._offered is not None
+        return self._offered
 
     def handle_read(self) -> None:
-        """Note that the master emptied the mailbox."""
-        if self._posted is not None:
-            self._read, self._posted = self._posted, None
+        """Handle the master's read of the mailbox."""
+        if self._offered is not None:
+            self._last_read, self._offered = self._offered, None
 
     def repeat_message(self) -> bytes | None:
-        """Return the message that the master read last, to lie in the mailbox again.
+        """Return the message that the master read last, to be offered again.
 
-        What lies there now, not read yet, follows later.  None: the master has read nothing so far,
-        and the mailbox stays as it is.
+        A newer message that is in the mailbox already follows later.  None: the master has read
+        nothing so far, and the mailbox stays unchanged.
         """
-        if self._read is None:
+        if self._last_read is None:
             return None
-        if self._posted is not None:
-            self._queue.appendleft(self._posted)
+        if self._offered is not None:
+            self._queue.appendleft(self._offered)
             self._sent -= 1
-        self._posted = self._read
+        self._offered = self._last_read
         self._repeated += 1
-        return self._posted
+        return self._offered
 
     def stats(self) -> MailboxServerStats:
         """Return the counters."""
@@ -143,10 +144,10 @@ class MailboxServer:
 
     def _dispatch(self, message: Buffer, now_ns: int) -> tuple[MailboxType, list[bytes]]:
         length = int.from_bytes(message[:2], "little")
-        room = min(len(message), self.sizes.to_slave) - MailboxHeader.SIZE
-        if not 0 < length <= room:
+        max_length = min(len(message), self.sizes.to_slave) - MailboxHeader.SIZE
+        if not 0 < length <= max_length:
             raise_mailbox_error(
-                MailboxError.INVALID_HEADER, f"length {length}, expected 1 to {room}"
+                MailboxError.INVALID_HEADER, f"length {length}, expected 1 to {max_length}"
             )
         if message[4] & 0x3F:
             raise_mailbox_error(

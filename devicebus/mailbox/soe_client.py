@@ -1,7 +1,7 @@
-"""SoE as conversations: the master's side of reading and writing IDNs (ETG.1000.6).
+"""SoE as conversations: reading, writing and describing IDNs of a drive (ETG.1000.6).
 
-An answer is known by drive and IDN.  The fragments of one carry no IDN but the last, so fragments
-that end in another IDN were late, and are dropped.
+An answer is identified by drive and IDN.  Only the last fragment of an answer carries the IDN, so
+fragments that end in another IDN are a late answer and are dropped.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from eap.codec.soe import (
 )
 
 MAX_SIZE = 0x80020
-"""Bytes of the longest answer: eight elements that are lists as long as there can be."""
+"""Limit for an answer in bytes: eight elements, each a list of maximum length."""
 _MAX_LATE = 16
-"""Answers to others, in fragments, that are dropped before a read gives up."""
+"""Limit for dropped answers to other requests before a read fails."""
 _NAMELESS = 2
-"""Bytes of a request before the IDN, which fragments do not carry."""
+"""Bytes of a request in front of the IDN, which fragments do not carry."""
 POLL_DELAY_NS = 10_000_000
 EXECUTION_TIMEOUT_NS = 60_000_000_000
 
@@ -59,11 +59,11 @@ def read(
     progress: Progress | None = None,
     delay_ns: int = 0,
 ) -> Conversation[bytes]:
-    """Read elements of an IDN, one behind the other; lists and texts come with their heads.
+    """Read elements of an IDN, concatenated; lists and texts include their length header.
 
     Raises:
-        SoeError: the drive refuses.
-        MailboxProtocolError: its answer is no answer.
+        SoeError: the drive refuses the request.
+        MailboxProtocolError: the answer is invalid.
     """
     _, content = yield from _read(idn, elements, drive, progress, delay_ns)
     return content
@@ -72,7 +72,7 @@ def read(
 def _read(
     idn: Idn, elements: int, drive: int, progress: Progress | None, delay_ns: int
 ) -> Conversation[tuple[MailboxMessage, bytes]]:
-    """As read(); return the last message as well."""
+    """Read elements as read() does; return the last message as well."""
     what = f"SoE read of {idn} at drive {drive}"
     progress = progress or Progress()
     number = idn.number
@@ -84,8 +84,8 @@ def _read(
         if left is None and not late:
             message = yield MailboxRequest(MailboxType.SOE, request, delay_ns=delay_ns)
         else:
-            named = request if left is None else request[:_NAMELESS]
-            message = yield MailboxRequest(MailboxType.SOE, named, listen=True)
+            listened = request if left is None else request[:_NAMELESS]
+            message = yield MailboxRequest(MailboxType.SOE, listened, listen=True)
         with reading(what):
             header, body = decode_message(message.data)
         is_foreign = not header.incomplete and header.idn != number
@@ -99,7 +99,7 @@ def _read(
                 left = None
                 continue
         elif header.error:
-            raise _refusal(what, body)
+            raise _error_of(what, body)
         elif left is not None and now_left != left - 1:
             raise MailboxProtocolError(f"{what}: {left} fragments left, then {now_left}")
         content += body
@@ -120,26 +120,26 @@ def write(
     drive: int = 0,
     progress: Progress | None = None,
 ) -> Conversation[None]:
-    """Write an element of an IDN; lists are given with their heads.
+    """Write an element of an IDN; a list includes its length header.
 
     Raises:
-        SoeError: the drive refuses.
-        MailboxProtocolError: its answer is no answer.
+        SoeError: the drive refuses the request.
+        MailboxProtocolError: the answer is invalid.
     """
     what = f"SoE write of {idn} at drive {drive}"
     progress = progress or Progress()
     progress.total = len(data)
-    room = sizes.to_slave - DATA_OVERHEAD
+    fragment_size = sizes.to_slave - DATA_OVERHEAD
     header = SoeHeader(SoeOpcode.WRITE_REQUEST, 0, 0, drive, elements, idn.number)
-    *fragments, last = encode_fragments(header, data, room)
+    *fragments, last = encode_fragments(header, data, fragment_size)
     for fragment in fragments:
         yield MailboxRequest(MailboxType.SOE, fragment, expects_reply=False)
-        progress.done += room
+        progress.done += fragment_size
     message = yield MailboxRequest(MailboxType.SOE, last)
     with reading(what):
         answer, body = decode_message(message.data)
     if answer.error:
-        raise _refusal(what, body)
+        raise _error_of(what, body)
     if answer.idn != idn.number or answer.incomplete:
         raise MailboxProtocolError(f"{what}: answered for {Idn.of(answer.idn)}")
     progress.done = len(data)
@@ -152,12 +152,12 @@ def execute(
     drive: int = 0,
     timeout_ns: int = EXECUTION_TIMEOUT_NS,
 ) -> Conversation[None]:
-    """Start a procedure command, wait until it is done, and clear it.
+    """Start a procedure command, wait for its end, and clear it.
 
     Raises:
-        SoeError: the drive refuses, or the command failed.
-        MailboxTimeoutError: it is not done after *timeout_ns*.
-        MailboxProtocolError: an answer is no answer.
+        SoeError: the drive refuses, or the command fails.
+        MailboxTimeoutError: the command still runs after *timeout_ns*.
+        MailboxProtocolError: an answer is invalid.
     """
     what = f"procedure command {idn} at drive {drive}"
     yield from write(idn, COMMAND_START.to_bytes(2, "little"), sizes, drive=drive)
@@ -177,14 +177,14 @@ def execute(
         yield from write(idn, COMMAND_CLEAR.to_bytes(2, "little"), sizes, drive=drive)
     except BusError:
         if not state & DataState.EXECUTING:
-            raise  # else that it was not done says more
+            raise  # otherwise the time-out is the more useful error
     if state & DataState.ERROR:
         raise SoeError(f"{what}: failed", code=SoeErrorCode.GENERAL)
     if state & DataState.EXECUTING:
         raise MailboxTimeoutError(f"{what}: not done after {timeout_ns / 1e9:g} s")
 
 
-def _refusal(what: str, body: memoryview) -> SoeError:
+def _error_of(what: str, body: memoryview) -> SoeError:
     with reading(what):
         code = error_code_of(body)
     return SoeError(f"{what}: {name_of(code)} (0x{code:04X})", code=code)
@@ -195,7 +195,7 @@ _IDNS = SoeAttribute(length=1, is_list=1)
 
 
 class IdnDescription(msgspec.Struct, frozen=True):
-    """One IDN with the elements that it has; None for those it has not."""
+    """IDN with its elements; None for a missing element."""
 
     idn: Idn
     attribute: SoeAttribute
@@ -206,11 +206,11 @@ class IdnDescription(msgspec.Struct, frozen=True):
     maximum: SoeScalar | None = None
     default: SoeValue | None = None
     data_state: int | None = None
-    """Of a procedure command; other IDNs usually have none."""
+    """Element 1 of a procedure command; other IDNs usually have none."""
 
 
 def idn_list(idn: Idn = LIST_OF_ALL, *, drive: int = 0) -> Conversation[list[Idn]]:
-    """Read a list of IDNs, such as that of all of them; raises as read() does."""
+    """Read a list of IDNs, by default of all IDNs; raises as read() does."""
     octets = yield from read(idn, drive=drive)
     with reading(f"IDN list {idn}"):
         _, numbers = decode_list(octets)
@@ -218,9 +218,9 @@ def idn_list(idn: Idn = LIST_OF_ALL, *, drive: int = 0) -> Conversation[list[Idn
 
 
 def describe(idn: Idn, *, drive: int = 0) -> Conversation[IdnDescription]:
-    """Read everything about an IDN, one element at a time; raises as read() does.
+    """Read all elements of an IDN, one at a time; raises as read() does.
 
-    An element that the drive refuses is missing, except attribute and value.
+    An element that the drive refuses is None; attribute and value are required.
     """
     octets = yield from read(idn, Element.ATTRIBUTE, drive=drive)
     with reading(f"attribute of {idn}"):

@@ -1,4 +1,10 @@
-"""SoE on the side of a slave: up to eight drives with their IDNs (ETG.1000.6)."""
+"""SoE of a slave: up to eight drives with their IDNs (ETG.1000.6).
+
+A :class:`SoeParameter` is one IDN with its elements; it refuses with SoeError.  A
+:class:`ProcedureCommand` runs behind an IDN that is a procedure command (IEC 61800-7-300): writing
+3 (set and enabled) starts it, writing 0 clears it, and a command must be cleared before the next
+start.
+"""
 
 from __future__ import annotations
 
@@ -38,13 +44,13 @@ from eap.od.model import OdState
 
 
 class ProcedureCommand:
-    """One procedure command.
+    """Procedure command and its data state.
 
     Args:
-        duration_ns: How long it takes.
-        start: Called when it starts; refuses with SoeError, such as COMMAND_NOT_NOW.
-        finish: Called when its time is over; returns whether it succeeded.
-        is_interruptible: Whether it may be cleared before it is done.
+        duration_ns: Execution time.
+        start: Called at the start; refuses with SoeError, such as COMMAND_NOT_NOW.
+        finish: Called after the execution time; returns true for success.
+        is_interruptible: Allows clearing during execution.
     """
 
     def __init__(
@@ -63,36 +69,36 @@ class ProcedureCommand:
         self._end_ns = 0
 
     def command(self, value: int, now_ns: int) -> None:
-        """Act on what was written to the IDN; raise SoeError if it cannot be done."""
+        """Handle a value written to the IDN; raise SoeError if it is refused."""
         state = self.state(now_ns)
         if value == COMMAND_CLEAR:
             if state == DataState.BUSY and not self._is_interruptible:
-                raise _refusal(SoeErrorCode.COMMAND_NOT_INTERRUPTIBLE)
+                raise _command_error(SoeErrorCode.COMMAND_NOT_INTERRUPTIBLE)
             self._state = DataState(0)
             return
         if value != COMMAND_START:
-            raise _refusal(SoeErrorCode.INVALID_VALUE)
+            raise _command_error(SoeErrorCode.INVALID_VALUE)
         if state:
-            raise _refusal(SoeErrorCode.COMMAND_ACTIVE)
+            raise _command_error(SoeErrorCode.COMMAND_ACTIVE)
         if self._start is not None:
             self._start()
         self._state = DataState.BUSY
         self._end_ns = now_ns + self.duration_ns
 
     def state(self, now_ns: int) -> DataState:
-        """Return the data state, after finishing what is due."""
+        """Return the data state at *now_ns*, after ending a command that is due."""
         if self._state == DataState.BUSY and now_ns >= self._end_ns:
             is_good = self._finish is None or self._finish()
             self._state = DataState.DONE if is_good else DataState.FAILED
         return self._state
 
 
-def _refusal(code: SoeErrorCode) -> SoeError:
+def _command_error(code: SoeErrorCode) -> SoeError:
     return SoeError(name_of(code), code=code)
 
 
 MAX_LENGTH = 0xFFFF
-"""Bytes of the longest list: its head has 16 bits for them."""
+"""Longest list in bytes: its length header has 16 bits."""
 _MISSING = {
     Element.NAME: SoeErrorCode.NO_NAME,
     Element.UNIT: SoeErrorCode.NO_UNIT,
@@ -112,20 +118,20 @@ _READ_ONLY = {
 
 
 class SoeParameter:
-    """One IDN.
+    """One IDN with its elements; only its value (element 7) is writable.
 
     Args:
-        idn: Its number as text, such as ``S-0-0032``.
-        name: Element 2; empty means that it has none.
+        idn: Number as text, such as ``S-0-0032``.
+        name: Element 2; empty for none.
         attribute: Element 3: type, length and protection of the value.
-        value: What it starts with, and its default.
+        value: Initial value and default.
         unit: Element 4.
-        limits: Elements 5 and 6, each None if there is none; checked on writing.
-        max_length: Bytes to which a list may grow; those it starts with if left out.
-        read: Where the bytes of the value come from instead of being stored (a list without its
-            head).
-        write: Called with them before they are stored; refuses with SoeError.
-        procedure: What the IDN does, if it is a procedure command.
+        limits: Elements 5 and 6, each None for none; checked on writing.
+        max_length: Maximum length of a list in bytes; by default the initial length.
+        read: Returns the encoded value in place of the stored one (a list without its length
+            header).
+        write: Called with the encoded value before it is stored; refuses with SoeError.
+        procedure: Command behind the IDN, if it is a procedure command.
     """
 
     def __init__(
@@ -163,32 +169,32 @@ class SoeParameter:
         }
 
     def read(self, elements: int, now_ns: int) -> bytes:
-        """Return the elements asked for, one behind the other; raise SoeError if one is missing."""
+        """Return the requested elements, concatenated; raise SoeError if one is missing."""
         asked = [element for element in Element if elements & element]
         if not asked:
-            raise self.refusal(SoeErrorCode.NO_ELEMENT)
+            raise self.error(SoeErrorCode.NO_ELEMENT)
         return b"".join(self._read_element(element, now_ns) for element in asked)
 
     def write(self, elements: int, data: bytes, state: OdState, now_ns: int) -> None:
-        """Write the value; raise SoeError if it is refused, or another element is meant."""
+        """Write the value; raise SoeError if it is refused, or another element is requested."""
         for element, code in _READ_ONLY.items():
             if elements & element:
-                raise self.refusal(code)
+                raise self.error(code)
         if not elements:
-            raise self.refusal(SoeErrorCode.NO_ELEMENT)
+            raise self.error(SoeErrorCode.NO_ELEMENT)
         self._check_protection(state)
         octets = self._checked_list(data) if self.attribute.is_list else self._checked(data)
         if self.procedure is not None:
             try:
                 self.procedure.command(int.from_bytes(octets, "little"), now_ns)
             except SoeError as exc:
-                raise self.refusal(exc.code) from None
+                raise self.error(exc.code) from None
         if self._write is not None:
             self._write(octets)
         self.octets = octets
 
-    def refusal(self, code: int) -> SoeError:
-        """Make the error with which the drive refuses."""
+    def error(self, code: int) -> SoeError:
+        """Return the SoeError of a refused request."""
         return SoeError(f"{self.idn}: {name_of(code)} (0x{code:04X})", code=code)
 
     def _read_element(self, element: Element, now_ns: int) -> bytes:
@@ -196,11 +202,11 @@ class SoeParameter:
             return self._framed(self.octets if self._read is None else self._read())
         if element is Element.DATA_STATE:
             if self.procedure is None:
-                raise self.refusal(SoeErrorCode.NO_DATA_STATE)
+                raise self.error(SoeErrorCode.NO_DATA_STATE)
             return self.procedure.state(now_ns).to_bytes(2, "little")
         octets = self._fixed[element]
         if octets is None:
-            raise self.refusal(_MISSING[element])
+            raise self.error(_MISSING[element])
         return octets
 
     def _framed(self, octets: bytes) -> bytes:
@@ -216,28 +222,28 @@ class SoeParameter:
             OdState.OP: attribute.protected_op,
         }
         if all(protected.values()):
-            raise self.refusal(SoeErrorCode.VALUE_READ_ONLY)
+            raise self.error(SoeErrorCode.VALUE_READ_ONLY)
         if protected[state]:
-            raise self.refusal(SoeErrorCode.VALUE_PROTECTED)
+            raise self.error(SoeErrorCode.VALUE_PROTECTED)
 
     def _checked_list(self, data: bytes) -> bytes:
         try:
             head, octets = decode_list(data)
         except CodecError:
-            raise self.refusal(SoeErrorCode.VALUE_TOO_SHORT) from None
+            raise self.error(SoeErrorCode.VALUE_TOO_SHORT) from None
         if head.length > self.max_length or len(data) > len(encode_list(octets)):
-            raise self.refusal(SoeErrorCode.VALUE_TOO_LONG)
+            raise self.error(SoeErrorCode.VALUE_TOO_LONG)
         if self.attribute.display != Display.TEXT:
             if len(octets) % self.attribute.size:
-                raise self.refusal(SoeErrorCode.INVALID_VALUE)
+                raise self.error(SoeErrorCode.INVALID_VALUE)
             self._check_limits(octets)
         return octets
 
     def _checked(self, data: bytes) -> bytes:
         if len(data) < self.attribute.size:
-            raise self.refusal(SoeErrorCode.VALUE_TOO_SHORT)
+            raise self.error(SoeErrorCode.VALUE_TOO_SHORT)
         if len(data) > self.attribute.size:
-            raise self.refusal(SoeErrorCode.VALUE_TOO_LONG)
+            raise self.error(SoeErrorCode.VALUE_TOO_LONG)
         self._check_limits(data)
         return data
 
@@ -246,15 +252,15 @@ class SoeParameter:
         for at in range(0, len(octets), self.attribute.size):
             number = decode_scalar(self.attribute, octets[at:])
             if minimum is not None and number < minimum:
-                raise self.refusal(SoeErrorCode.BELOW_MINIMUM)
+                raise self.error(SoeErrorCode.BELOW_MINIMUM)
             if maximum is not None and number > maximum:
-                raise self.refusal(SoeErrorCode.ABOVE_MAXIMUM)
+                raise self.error(SoeErrorCode.ABOVE_MAXIMUM)
 
 
 MAX_PENDING = 16
-"""Notifications and emergencies that wait; what comes on top is dropped and counted."""
+"""Limit for queued notifications and emergencies; further ones are dropped and counted."""
 FRAGMENT_TIMEOUT_NS = 2_000_000_000
-"""How long the next fragment of a write may take; what came before is forgotten then."""
+"""Time-out for the next fragment of a write; the fragments before it are discarded then."""
 LIST_OF_ALL = "S-0-0017"
 _MAX_WRITTEN = MAX_LENGTH + ListHead.SIZE
 _RESPONSE = {
@@ -264,7 +270,7 @@ _RESPONSE = {
 
 
 class _PendingWrite:
-    """The fragments of a write so far."""
+    """Fragments of a write received so far."""
 
     __slots__ = ("content", "deadline_ns", "drive", "elements", "left")
 
@@ -275,20 +281,20 @@ class _PendingWrite:
         self.content = bytearray()
         self.deadline_ns = 0
 
-    def take(self, header: SoeHeader, body: bytes, now_ns: int) -> None:
-        """Add a fragment; what goes beyond any list is counted and not kept."""
+    def add(self, header: SoeHeader, body: bytes, now_ns: int) -> None:
+        """Add a fragment; data beyond the longest list is counted and not stored."""
         self.left = header.idn
         self.content += body[: _MAX_WRITTEN + 1 - len(self.content)]
         self.deadline_ns = now_ns + FRAGMENT_TIMEOUT_NS
 
 
 class SoeServer:
-    """The SoE protocol of a slave.
+    """SoE protocol of a slave.
 
     Args:
-        drives: The IDNs of each drive by its number from 0 to 7; the list of all of them,
+        drives: IDNs of each drive by its number from 0 to 7; the list of all of them,
             S-0-0017, is added.
-        state: Says in which state the slave is now.
+        state: Returns the present state of the slave.
         sizes: Of the slave's mailboxes.
     """
 
@@ -307,16 +313,16 @@ class SoeServer:
         self._running: dict[tuple[int, int], SoeParameter] = {}
         self._pending: deque[bytes] = deque()
         self.dropped = 0
-        """Notifications and emergencies lost because the master did not fetch those before."""
+        """Number of notifications and emergencies lost because the queue was full."""
 
     def reset(self) -> None:
-        """Forget fragments, and what waits to be sent; procedure commands run on."""
+        """Discard fragments and queued messages; procedure commands continue."""
         self._partial = None
         self._running.clear()
         self._pending.clear()
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Act on a message behind its mailbox header and return the answer in its fragments."""
+        """Handle a message (without mailbox header) and return the fragments of its answer."""
         header = decode_or_error(SoeHeader.decode, data)
         if header.opcode not in _RESPONSE:
             raise_mailbox_error(MailboxError.SERVICE_NOT_SUPPORTED, f"opcode {header.opcode.name}")
@@ -339,7 +345,7 @@ class SoeServer:
         return encode_fragments(head, answer, room)
 
     def messages_to_send(self, now_ns: int) -> list[bytes]:
-        """Take emergencies, and notifications of procedure commands that ended by now."""
+        """Return and remove queued emergencies and notifications of ended procedure commands."""
         for (drive, number), parameter in list(self._running.items()):
             procedure = parameter.procedure
             state = procedure.state(now_ns) if procedure is not None else DataState(0)
@@ -352,14 +358,14 @@ class SoeServer:
         return messages
 
     def send_notification(self, idn: Idn, drive: int, state: DataState) -> None:
-        """Tell the master the data state of a procedure command."""
+        """Queue a notification with the data state of a procedure command."""
         data = state.to_bytes(2, "little")
         self._push(SoeOpcode.NOTIFICATION, drive, idn.number, data, Element.DATA_STATE)
 
     def send_emergency(
         self, error_code: int, register: int = 0, data: bytes = b"", *, drive: int = 0
     ) -> None:
-        """Report an error of a drive; *data* is up to five bytes of the vendor."""
+        """Queue an emergency of a drive; *data* is up to five vendor bytes."""
         emergency = Emergency(error_code, register, data.ljust(5, b"\0"))
         self._push(SoeOpcode.EMERGENCY, drive, 0, emergency.encode(), 0)
 
@@ -371,18 +377,18 @@ class SoeServer:
         self._pending.append(message)
 
     def _join(self, header: SoeHeader, body: bytes, now_ns: int) -> bytes | None:
-        """Return the whole content of a write, or None while fragments are missing."""
+        """Return the complete content of a write, or None while fragments are missing."""
         partial = self._partial
         if partial is not None and not self._continues(partial, header, body, now_ns):
             partial = None
         if header.incomplete:
             self._partial = partial or _PendingWrite(header)
-            self._partial.take(header, body, now_ns)
+            self._partial.add(header, body, now_ns)
             return None
         self._partial = None
         if partial is None:
             return body
-        partial.take(header, body, now_ns)
+        partial.add(header, body, now_ns)
         return bytes(partial.content)
 
     def _continues(
@@ -394,7 +400,7 @@ class SoeServer:
             return False
         if header.incomplete:
             return header.idn < partial.left
-        # Masters that count total / room are one too high if the last fragment is a full one.
+        # SOEM counts total / room fragments left: one too many if the last fragment is full.
         is_full = len(body) == self._sizes.to_slave - DATA_OVERHEAD
         return partial.left == 1 or (partial.left == 2 and is_full)
 
@@ -403,7 +409,7 @@ class SoeServer:
         if header.opcode is SoeOpcode.READ_REQUEST:
             return parameter.read(header.elements, now_ns)
         if len(body) > _MAX_WRITTEN:
-            raise parameter.refusal(SoeErrorCode.VALUE_TOO_LONG)
+            raise parameter.error(SoeErrorCode.VALUE_TOO_LONG)
         parameter.write(header.elements, body, self._state(), now_ns)
         if parameter.procedure is not None:
             self._running[header.drive, header.idn] = parameter
@@ -411,11 +417,11 @@ class SoeServer:
 
     def _find(self, drive: int, number: int) -> SoeParameter:
         if drive not in self.drives:
-            raise _refusal(SoeErrorCode.INVALID_DRIVE)
+            raise _command_error(SoeErrorCode.INVALID_DRIVE)
         try:
             return self.drives[drive][number]
         except KeyError:
-            raise _refusal(SoeErrorCode.NO_IDN) from None
+            raise _command_error(SoeErrorCode.NO_IDN) from None
 
 
 def _with_list(items: Iterable[SoeParameter]) -> dict[int, SoeParameter]:

@@ -1,4 +1,4 @@
-"""VoE for both sides: messages of a vendor behind his header (ETG.1000.6)."""
+"""VoE for both sides: messages after a vendor's header (ETG.1000.6)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from eap.codec.mailbox import MailboxType, VoeHeader
 def exchange(
     vendor_id: int, vendor_type: int, data: bytes, *, timeout_ns: int = RESPONSE_TIMEOUT_NS
 ) -> Conversation[bytes]:
-    """Send data to a slave; return the data of its answer of the same vendor and type."""
+    """Send data to a slave; return the data of the answer with the same vendor and type."""
     head = VoeHeader(vendor_id, vendor_type).encode()
     message = yield MailboxRequest(MailboxType.VOE, head + data, timeout_ns=timeout_ns)
     return message.data[VoeHeader.SIZE :]
 
 
 def send(vendor_id: int, vendor_type: int, data: bytes) -> Conversation[None]:
-    """Send data to a slave that does not answer."""
+    """Send data to a slave without waiting for an answer."""
     head = VoeHeader(vendor_id, vendor_type).encode()
     yield MailboxRequest(MailboxType.VOE, head + data, expects_reply=False)
 
 
 class VoeServer:
-    """The VoE protocol of a slave.
+    """VoE protocol of a slave.
 
     Args:
         handler: Called with vendor id, vendor type and data of each request; returns the data of
@@ -36,7 +36,7 @@ class VoeServer:
         self._handler = handler
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Act on a message behind its mailbox header and return the answer, if it has one."""
+        """Handle a message (without mailbox header) and return its answers."""
         del now_ns
         header = decode_or_error(VoeHeader.decode, data)
         if self._handler is None:
@@ -50,4 +50,4 @@ class VoeServer:
         return []
 
     def reset(self) -> None:
-        """Do nothing: this server remembers nothing."""
+        """Do nothing: this server has no state."""

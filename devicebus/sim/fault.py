@@ -41,7 +41,7 @@ def _foe(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     server = mailbox.protocols.get(MailboxType.FOE) if mailbox else None
     if isinstance(server, FoeServer):
         server.packet_time_ns = 1000 * spec.delay_us if on else 0
-        server.refuses = spec.code if on else 0
+        server.forced_error = spec.code if on else 0
 
 
 def _sdo(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
@@ -97,9 +97,9 @@ def _al_error(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> 
 def _refuse(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del now_ns
     state = AlState[spec.state]
-    slave.refuses.pop(state, None)
+    slave.refused_states.pop(state, None)
     if on:
-        slave.refuses[state] = spec.code or AlStatusCode.UNSPECIFIED
+        slave.refused_states[state] = spec.code or AlStatusCode.UNSPECIFIED
 
 
 def _drift(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:

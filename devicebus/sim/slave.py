@@ -91,14 +91,14 @@ class SimulatedSlave:
         esc: Its controller.
         device: What it is.
         is_powered: False for one that is switched off; set by :meth:`switch`.
-        refuses: Fault: AL status code with which it refuses each state that is in here.
+        refused_states: Fault: AL status code with which it refuses each state that is in here.
     """
 
     def __init__(self, esc: Esc, device: Device) -> None:
         self.esc = esc
         self.device = device
         self.is_powered = True
-        self.refuses: dict[AlState, int] = {}
+        self.refused_states: dict[AlState, int] = {}
         self._protocols = dict(device.mailbox.protocols) if device.mailbox else {}
         self._forget()
 
@@ -197,7 +197,7 @@ class SimulatedSlave:
         if target not in ALLOWED[self.state]:
             self._refuse(AlStatusCode.INVALID_STATE_CHANGE)
             return
-        code = self.refuses.get(target, 0) or self._prepare(target, now_ns)
+        code = self.refused_states.get(target, 0) or self._prepare(target, now_ns)
         if code:
             self._refuse(code)
         elif self._deadline_ns is None:

@@ -1,4 +1,4 @@
-"""The states of a slave, and why it refuses one (ETG.1000.6, AL status codes)."""
+"""AL states and AL status codes of a slave (ETG.1000.6)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class AlState(IntEnum):
 
 
 ERROR = 0x10
-"""In AL status: a request was refused; in AL control: that is acknowledged."""
+"""Error bit: in AL status a refused request, in AL control its acknowledgement."""
 
 _TEXTS = {
     0x0000: "no error",
@@ -86,7 +86,7 @@ _TEXTS = {
 
 
 class AlStatusCode(IntEnum):
-    """The codes that this project sends or decides by; all others are only shown."""
+    """Codes that this project sends or evaluates; all others are only displayed."""
 
     NO_ERROR = 0x0000
     UNSPECIFIED = 0x0001
@@ -106,12 +106,12 @@ class AlStatusCode(IntEnum):
 
 
 def name_of(code: int) -> str:
-    """Return what an AL status code means, also when the standard does not know it."""
+    """Return the text of an AL status code, also of one that the standard does not define."""
     return _TEXTS.get(code, f"code 0x{code:04X} of the vendor")
 
 
 def state_name(status: int) -> str:
-    """Return an AL status as people write it: ``SAFEOP+ERROR``."""
+    """Return the text of an AL status, such as ``SAFEOP+ERROR``."""
     state = status & 0x0F
     name = AlState(state).name if state in set(AlState) else f"state {state}"
     return f"{name}+ERROR" if status & ERROR else name

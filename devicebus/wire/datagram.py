@@ -1,4 +1,8 @@
-"""Datagrams of the device protocol: what a type-1 frame carries."""
+"""Datagrams of a type-1 frame, and the requests of a master with their replies.
+
+DatagramRequest and DatagramReply are passed as they are, in MessagePack, between the processes that
+share a master.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ from eap.errors import CodecError, MalformedError, TruncatedError
 
 
 class Command(IntEnum):
-    """ETG.1000.4: how a datagram is addressed and whether slaves read, write or do both."""
+    """ETG.1000.4: command of a datagram, its addressing and its direction."""
 
     NOP = 0
     APRD = 1
@@ -34,7 +38,7 @@ class Command(IntEnum):
 
     @property
     def is_logical(self) -> bool:
-        """Whether ADP and ADO together are one logical address."""
+        """True if ADP and ADO are the two words of a logical address."""
         return self in _LOGICAL
 
 
@@ -42,7 +46,7 @@ _LOGICAL = frozenset((Command.LRD, Command.LWR, Command.LRW))
 
 
 class DatagramHeader(WireStruct, frozen=True):
-    """ETG.1000.4: ten bytes in front of a datagram's data.
+    """ETG.1000.4: header of a datagram, ten bytes in front of its data.
 
     *adp* is a position or a station address, *ado* a register offset; in logical commands they are
     the low and the high word of the address.  *more* says that another datagram follows.
@@ -65,13 +69,13 @@ class DatagramHeader(WireStruct, frozen=True):
 
 
 class WorkingCounter(WireStruct, frozen=True):
-    """ETG.1000.4: the two bytes behind a datagram's data, counted up by every slave that acts."""
+    """ETG.1000.4: two bytes after a datagram's data, incremented by every slave that acts."""
 
     value: u16 = 0
 
 
 OVERHEAD = DatagramHeader.SIZE + WorkingCounter.SIZE
-"""Bytes of a datagram beside its data."""
+"""Bytes of a datagram in addition to its data."""
 
 
 class Datagram(NamedTuple):
@@ -138,13 +142,13 @@ def encode_frame(datagrams: Sequence[Datagram]) -> bytes:
 
 
 AS_SET = 0
-"""Tries of a datagram that is sent as often as the master's settings say."""
+"""Value of *tries* for the number of tries of the master's settings."""
 
 
 class DatagramRequest(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One datagram to send; *data* is what is written, or zeros where the reply goes.
+    """One datagram to send; *data* is the data to write, or zeros in place of the reply.
 
-    *tries* is 1 where sending it twice would do harm.
+    *tries* is 1 where a repetition does harm.
     """
 
     command: Command
@@ -160,16 +164,16 @@ class DatagramReply(msgspec.Struct, frozen=True, array_like=True, gc=False):
     data: bytes
     wkc: int
     tries: int = 1
-    """Times it was sent: with more than one, slaves may have acted more than once."""
+    """Times the datagram was sent; after more than one, slaves may have acted more than once."""
 
 
 def aprd(position: int, ado: int, size: int) -> DatagramRequest:
-    """Read from the slave at a position of the line, counted from 0."""
+    """Read from the slave at a position in the segment, counted from 0."""
     return DatagramRequest(Command.APRD, -position & 0xFFFF, ado, bytes(size))
 
 
 def apwr(position: int, ado: int, data: bytes) -> DatagramRequest:
-    """Write to the slave at a position of the line, counted from 0."""
+    """Write to the slave at a position in the segment, counted from 0."""
     return DatagramRequest(Command.APWR, -position & 0xFFFF, ado, data)
 
 
@@ -184,7 +188,7 @@ def fpwr(station: int, ado: int, data: bytes, *, tries: int = AS_SET) -> Datagra
 
 
 def brd(ado: int, size: int) -> DatagramRequest:
-    """Read from all slaves; what they have is ORed."""
+    """Read from all slaves; the data is ORed."""
     return DatagramRequest(Command.BRD, 0, ado, bytes(size))
 
 
@@ -194,10 +198,10 @@ def bwr(ado: int, data: bytes) -> DatagramRequest:
 
 
 def frmw(station: int, ado: int, size: int) -> DatagramRequest:
-    """Read from one slave and write what it has to all others; sent once, as it ages."""
+    """Read from one slave and write its data to all others; sent once, for a time value ages."""
     return DatagramRequest(Command.FRMW, station, ado, bytes(size), 1)
 
 
 def logical(command: Command, address: int, data: bytes) -> DatagramRequest:
-    """Read, write or both through the FMMUs; sent once, for the next cycle sends it anew."""
+    """Read, write or both through the FMMUs; sent once, for the next cycle repeats it."""
     return DatagramRequest(command, address & 0xFFFF, address >> 16, data, 1)

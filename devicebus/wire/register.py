@@ -8,7 +8,7 @@ from eap.codec.wire import WireStruct, bit, bits2, bits3, bits4, u8, u16, u32
 
 
 class Register(IntEnum):
-    """Addresses; registers that exist once per port, FMMU or SM are followed by the others."""
+    """Register addresses; for one per port, FMMU or sync manager the address of the first."""
 
     TYPE = 0x0000
     FEATURES = 0x0008
@@ -64,7 +64,7 @@ class Register(IntEnum):
 
 
 class AlControl(WireStruct, frozen=True):
-    """ETG.1000.6: the state that the master asks for, at 0x0120."""
+    """ETG.1000.6: AL control, the state that the master requests, at 0x0120."""
 
     state: bits4
     acknowledge: bit = 0
@@ -74,7 +74,7 @@ class AlControl(WireStruct, frozen=True):
 
 
 class AlStatus(WireStruct, frozen=True):
-    """ETG.1000.6: where the slave stands and why, the six bytes at 0x0130."""
+    """ETG.1000.6: AL status and AL status code, the six bytes at 0x0130."""
 
     state: bits4
     error: bit = 0
@@ -178,7 +178,7 @@ class EepromControl(WireStruct, frozen=True):
 
 
 class EepromCommand(IntEnum):
-    """What EepromControl.command asks for; any other combination of its bits is an error."""
+    """Values of EepromControl.command; any other combination of its bits is an error."""
 
     NONE = 0
     READ = 1

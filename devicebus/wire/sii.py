@@ -1,7 +1,7 @@
-"""The slave information interface: what a slave's EEPROM tells about it (ETG.1000.6, ETG.2010).
+"""Slave information interface (SII): EEPROM image of a slave (ETG.1000.6, ETG.2010).
 
 An image is 64 fixed words, then categories; each is a type, a length in words, and its data.  The
-end is the type 0xFFFF.  Categories that nobody here needs are kept as bytes.
+type 0xFFFF ends it.  Categories without a decoder stay bytes.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class SiiDc(WireStruct, frozen=True):
 T = TypeVar("T", bound=WireStruct)
 
 CHECKED = 14
-"""Bytes at the start that the check sum covers."""
+"""Number of bytes at the start that the check sum covers."""
 _END = 0xFFFF
 
 
@@ -150,7 +150,7 @@ class SiiCategory(IntEnum):
 
 
 class SiiProtocol(IntFlag):
-    """The mailbox protocols of word 0x1C."""
+    """Mailbox protocols of word 0x1C."""
 
     AOE = 0x01
     EOE = 0x02
@@ -161,38 +161,38 @@ class SiiProtocol(IntFlag):
 
 
 class CategoryHeader(WireStruct, frozen=True):
-    """ETG.2010: what stands in front of each category; *length* is in words."""
+    """ETG.2010: header of a category; *length* is in words."""
 
     type: u16
     length: u16
 
 
 class StringCount(WireStruct, frozen=True):
-    """A count of strings, or the bytes of one."""
+    """Count of strings, or the length of one string."""
 
     value: Annotated[int, Scalar("B")]
 
 
 class SiiPdo(NamedTuple):
-    """One PDO and what it maps."""
+    """One PDO with its mapped entries."""
 
     header: SiiPdoHeader
     entries: tuple[SiiPdoEntry, ...] = ()
 
     @property
     def bit_length(self) -> int:
-        """Bits of all entries."""
+        """Sum of the bit lengths of all entries."""
         return sum(entry.bit_length for entry in self.entries)
 
 
 class Sii(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole image; *other* are categories that stay bytes, by type."""
+    """Decoded image; *other* are the categories without a decoder, by type."""
 
     fixed: SiiFixed
     strings: tuple[str, ...] = ()
     general: SiiGeneral | None = None
     fmmus: tuple[int, ...] = ()
-    """What each FMMU is for: 1 outputs, 2 inputs, 3 mailbox state."""
+    """Use of each FMMU: 1 outputs, 2 inputs, 3 mailbox state."""
     sync_managers: tuple[SiiSyncManager, ...] = ()
     tx_pdos: tuple[SiiPdo, ...] = ()
     rx_pdos: tuple[SiiPdo, ...] = ()
@@ -205,7 +205,7 @@ class Sii(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def name(self) -> str:
-        """The device's name, or nothing."""
+        """Name of the device; empty without category General."""
         return self.string(self.general.name) if self.general else ""
 
 
@@ -220,7 +220,7 @@ def checksum(data: Buffer) -> int:
 
 
 def is_intact(data: Buffer) -> bool:
-    """Whether the check sum of the first words fits, so that an ESC would load them."""
+    """Return true if the check sum of the first words is right, so that an ESC loads them."""
     return len(data) > CHECKED and checksum(data[:CHECKED]) == data[CHECKED]
 
 
@@ -249,7 +249,7 @@ def iter_categories(data: Buffer) -> Iterator[tuple[int, memoryview]]:
 
 
 def decode(data: Buffer) -> Sii:
-    """Read a whole image; the check sum is not judged (:func:`is_intact`).
+    """Decode an image without verifying its check sum (:func:`is_intact`).
 
     Raises:
         TruncatedError: the image, a category or a list in it is shorter than it says.
@@ -278,7 +278,7 @@ def decode(data: Buffer) -> Sii:
 
 
 def encode(sii: Sii) -> bytes:
-    """Return the image; the check sum is set.
+    """Encode an image with its check sum.
 
     Raises:
         CodecError: a value does not fit its field.

@@ -254,7 +254,7 @@ CASES = {
         3 * SECOND,
     ),
     "confirmation from the future": Case(
-        FOE, put, ["0400 00000000", "0400 09000000"], MailboxProtocolError, "packet 9 confirmed"
+        FOE, put, ["0400 00000000", "0400 09000000"], MailboxProtocolError, "packet 9 acknowledged"
     ),
     "cut SoE": Case(SOE, idn, ["0240 20"], MailboxProtocolError, "needs 4 octets"),
     "fragments with a hole": Case(

@@ -11,7 +11,7 @@ from zlib import crc32
 from devicebus.mailbox.aoe_server import AdsServer, AoeServer
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.eoe import EoeServer
-from devicebus.mailbox.foe_server import AllowedIn, FoeServer, MemoryFile, MemoryStore, refusal
+from devicebus.mailbox.foe_server import AllowedIn, FoeServer, MemoryFile, MemoryStore, store_error
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.soe_server import SoeParameter, SoeServer
@@ -134,7 +134,7 @@ def build_mailbox(
         servers[MailboxType.VOE] = VoeServer()
     if spec.aoe:
         ads = AdsServer(device.dictionary, device.od_state, device.name)
-        servers[MailboxType.AOE] = AoeServer(ads, sizes, forget=ads.forget)
+        servers[MailboxType.AOE] = AoeServer(ads, sizes, reset_handler=ads.reset_address)
     return MailboxServer(servers, sizes)
 
 
@@ -179,4 +179,4 @@ def _file(spec: FileSpec) -> MemoryFile:
 
 def _check_sum(name: str, content: bytes) -> None:
     if crc32(content[:-_CRC_SIZE]).to_bytes(_CRC_SIZE, "little") != content[-_CRC_SIZE:]:
-        raise refusal(FoeErrorCode.CHECKSUM, name)
+        raise store_error(FoeErrorCode.CHECKSUM, name)

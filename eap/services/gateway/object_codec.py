@@ -162,7 +162,7 @@ class ObjectCodec:
         if self._stream is not None:
             answer = await self._upload_segment(self._stream, toggle)
         else:
-            if transfer.take(body):
+            if transfer.add_segment(body):
                 data, complete = bytes(transfer.data), bool(head.complete)
                 await self._access.write_object(head.index, head.subindex, data, complete=complete)
                 self.reset()

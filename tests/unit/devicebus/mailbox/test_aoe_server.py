@@ -49,7 +49,7 @@ def test_address_is_that_of_the_first_request(server):
     other = NetId.parse("5.1.2.3.9.1")
     assert call(server, AmsCommand.READ_STATE, target=other)[:2] == (b"", 7)
     assert call(server, AmsCommand.READ_STATE, port=1002)[:2] == (b"", 6)
-    server.forget()
+    server.reset_address()
     assert call(server, AmsCommand.READ_STATE, target=other).error_code == 0
 
 
@@ -207,7 +207,7 @@ def test_long_answer_goes_in_fragments() -> None:
 
 def test_request_in_fragments_is_acknowledged_and_answered() -> None:
     forgotten = []
-    server = AoeServer(answer, MailboxSizes(), forget=lambda: forgotten.append(1))
+    server = AoeServer(answer, MailboxSizes(), reset_handler=lambda: forgotten.append(1))
     *first, last = iter_fragments(REQUEST, 5, 12)
     for each in first:
         head, body = decode_packet(each)

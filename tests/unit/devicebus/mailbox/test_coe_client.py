@@ -121,7 +121,7 @@ def test_abort_between_segments() -> None:
     [
         (["0030"], "needs 8 octets", None),
         (["0030 43 1810 01 0000"], "needs 8 octets", None),
-        (["0030 41 1810 01 ffffffff"], "4294967295 bytes, taken are", AbortCode.OUT_OF_MEMORY),
+        (["0030 41 1810 01 ffffffff"], "4294967295 bytes, at most", AbortCode.OUT_OF_MEMORY),
         ([FOUR, "0030"], "needs 1 octets", None),
         ([FOUR, "0030 00"], "without data", AbortCode.GENERAL),
         ([FOUR, "0030 0e 01020304050607"], "without data", AbortCode.GENERAL),

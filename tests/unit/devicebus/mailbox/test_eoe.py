@@ -22,8 +22,8 @@ CAPTURED = [vector.octets[6:] for vector in load("eoe_mailbox")][2:]
 FRAME = bytes(range(100))
 
 
-def fragments(frame: bytes = FRAME, number: int = 0, room: int = 40) -> list[bytes]:
-    return list(iter_fragments(frame, number, room))
+def fragments(frame: bytes = FRAME, number: int = 0, data_size: int = 40) -> list[bytes]:
+    return list(iter_fragments(frame, number, data_size))
 
 
 def receive(assembler: FrameAssembler, *messages: bytes) -> list[bytes]:
@@ -39,9 +39,9 @@ def test_captured_frame_is_read_and_written_again(number: int) -> None:
 
 
 def test_fragments_lie_as_on_the_wire() -> None:
-    words = [message[:4].hex(" ") for message in fragments(number=5, room=40)]
+    words = [message[:4].hex(" ") for message in fragments(number=5, data_size=40)]
     assert words == ["00 00 00 51", "00 00 41 50", "00 00 82 50", "00 01 c3 50"]
-    assert [len(message) - 4 for message in fragments(room=70)] == [64, 36]
+    assert [len(message) - 4 for message in fragments(data_size=70)] == [64, 36]
 
 
 @given(st.binary(min_size=1, max_size=MAX_FRAME), st.integers(32, 1600), st.integers(0, 15))
@@ -52,7 +52,7 @@ def test_round_trip(frame: bytes, room: int, number: int) -> None:
 
 
 def test_short_frame_fits_a_small_mailbox() -> None:
-    assert receive(FrameAssembler(), *fragments(b"short", room=6)) == [b"short"]
+    assert receive(FrameAssembler(), *fragments(b"short", data_size=6)) == [b"short"]
 
 
 @pytest.mark.parametrize(
@@ -60,18 +60,18 @@ def test_short_frame_fits_a_small_mailbox() -> None:
     [
         (b"", 100, "a frame of 0 bytes"),
         (bytes(MAX_FRAME + 1), 100, "a frame of 1523 bytes"),
-        (bytes(40), 31, "room for 31 bytes"),
+        (bytes(40), 31, "fragments of 31 bytes"),
     ],
 )
 def test_frame_that_cannot_be_sent(frame: bytes, room: int, reason: str) -> None:
     with pytest.raises(CodecError, match=reason):
-        fragments(frame, room=room)
+        fragments(frame, data_size=room)
 
 
 def test_time_behind_a_frame_is_no_part_of_it() -> None:
     header = EoeHeader(0, last=1, time_appended=1).encode() + FragmentWord(0, 1, 0).encode()
     assert receive(FrameAssembler(), header + b"frame" + b"time") == [b"frame"]
-    with pytest.raises(CodecError, match="no room for the time"):
+    with pytest.raises(CodecError, match="time stamp announced"):
         FrameAssembler().receive(header + b"tim")
 
 
@@ -92,7 +92,7 @@ def test_fragments_of_two_frames_do_not_mix() -> None:
 
 def test_offset_that_does_not_fit_drops_the_frame() -> None:
     assembler = FrameAssembler()
-    first, second = fragments(bytes(64), room=32)
+    first, second = fragments(bytes(64), data_size=32)
     wrong = second[:2] + FragmentWord(1, 2, 0).encode() + second[4:]
     assert receive(assembler, first, wrong) == []
     assert assembler.dropped == 1
@@ -100,7 +100,7 @@ def test_offset_that_does_not_fit_drops_the_frame() -> None:
 
 def test_reset_forgets_the_frame_under_way() -> None:
     assembler = FrameAssembler()
-    first, last = fragments(bytes(64), room=32)
+    first, last = fragments(bytes(64), data_size=32)
     assembler.receive(first)
     assembler.reset()
     assert receive(assembler, last) == []

@@ -149,7 +149,7 @@ def test_refusal_is_raised_with_its_code_and_text() -> None:
         (["03 00 0100"], "needs 6 octets"),
         (["03 00 00000000 61"], "packet 0, expected 1"),
         (["03 00 01000000 61626364", "03 00 03000000 61"], "packet 3, expected 2"),
-        (["03 00 01000000 6162636465"], "5 bytes, taken are 4"),
+        (["03 00 01000000 6162636465"], "5 bytes, at most"),
     ],
 )
 def test_read_that_breaks_the_protocol(answers: list[str], reason: str) -> None:
@@ -159,7 +159,7 @@ def test_read_that_breaks_the_protocol(answers: list[str], reason: str) -> None:
 
 def test_endless_file_ends_with_the_limit() -> None:
     packets = (f"03 00 {n.to_bytes(4, 'little').hex()} 61626364" for n in itertools.count(1))
-    with pytest.raises(MailboxProtocolError, match="4 bytes, taken are 2"):
+    with pytest.raises(MailboxProtocolError, match="4 bytes, at most"):
         read(packets, max_size=402)
 
 
@@ -167,8 +167,11 @@ def test_endless_file_ends_with_the_limit() -> None:
     ("answers", "reason"),
     [
         (["04"], "needs 6 octets"),
-        (["04 00 00000000", "04 00 05000000"], "packet 5 confirmed, sent was 1"),
-        (["04 00 00000000", "04 00 01000000", "04 00 05000000"], "packet 5 confirmed, sent was 2"),
+        (["04 00 00000000", "04 00 05000000"], "packet 5 acknowledged, expected 1"),
+        (
+            ["04 00 00000000", "04 00 01000000", "04 00 05000000"],
+            "packet 5 acknowledged, expected 2",
+        ),
     ],
 )
 def test_write_that_breaks_the_protocol(answers: list[str], reason: str) -> None:
@@ -178,7 +181,7 @@ def test_write_that_breaks_the_protocol(answers: list[str], reason: str) -> None
 
 def test_name_longer_than_the_mailbox_is_refused_at_once() -> None:
     with pytest.raises(
-        MailboxSizeError, match="'abcde' has 5 bytes, the slave's mailbox has room for 4"
+        MailboxSizeError, match="'abcde' has 5 bytes, the mailbox holds 4"
     ):
         next(foe_client.read("abcde", bytearray().extend, SIZES))
 

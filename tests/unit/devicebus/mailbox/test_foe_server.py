@@ -15,7 +15,7 @@ from devicebus.mailbox.foe_server import (
     FoeServer,
     MemoryFile,
     MemoryStore,
-    refusal,
+    store_error,
 )
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import FoeErrorCode
@@ -194,18 +194,18 @@ def test_any_request_gets_one_answer_at_most(requests: list[bytes]) -> None:
 @pytest.mark.parametrize("request_", [READ, WRITE])
 def test_every_request_is_refused_with_a_code_and_its_text(code, request_) -> None:
     slave = Slave(b"ab")
-    slave.server.refuses = code
+    slave.server.forced_error = code
     assert slave.error(request_) is code
     assert len(bytes.fromhex(slave.ask(request_))) > 6
-    slave.server.refuses = 0
+    slave.server.forced_error = 0
     assert slave.ask(READ) == "03 00 01 00 00 00 61 62"
-    slave.server.refuses = code
+    slave.server.forced_error = code
     assert slave.ask("04 00 01000000") == ""
 
 
 def wrong_checksum(content: bytes) -> None:
     if sum(content) % 256:
-        raise refusal(FoeErrorCode.CHECKSUM, "sum is not 0")
+        raise store_error(FoeErrorCode.CHECKSUM, "sum is not 0")
 
 
 def make(*, is_boot: bool = False, creates: bool = False, overwrites: bool = True) -> MemoryStore:
@@ -316,5 +316,5 @@ def test_existing_file_may_be_kept() -> None:
 
 
 def test_refusal_says_what_and_why() -> None:
-    error = refusal(FoeErrorCode.DISK_FULL, "log.txt")
+    error = store_error(FoeErrorCode.DISK_FULL, "log.txt")
     assert (str(error), error.code, error.text) == (error.text, 0x8003, "log.txt: disk full")

@@ -127,7 +127,7 @@ def test_slaves_without_boot_say_so():
 
 def test_refusals_are_told():
     line = line_of(slave("a"))
-    line.segment.slaves[0].refuses[AlState.SAFEOP] = 0x1E
+    line.segment.slaves[0].refused_states[AlState.SAFEOP] = 0x1E
     with pytest.raises(AlStatusError, match="0x001E, invalid input configuration"):
         request(line, AlState.SAFEOP)
     assert line.core.slaves[1001].state is AlState.PREOP

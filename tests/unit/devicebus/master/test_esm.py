@@ -76,10 +76,10 @@ def test_an_error_is_acknowledged_first(line):
     assert run(line, read_status(1002)).error
     assert run(line, acknowledge(1002)) is INIT
     assert not run(line, read_status(1002)).error
-    line.segment.slaves[0].refuses[PREOP] = 0x8001
+    line.segment.slaves[0].refused_states[PREOP] = 0x8001
     with pytest.raises(AlStatusError, match="0x8001, code 0x8001 of the vendor"):
         run(line, change_state(1001, PREOP))
-    line.segment.slaves[0].refuses.clear()
+    line.segment.slaves[0].refused_states.clear()
     run(line, change_state(1001, PREOP))
 
 

@@ -111,10 +111,10 @@ def test_another_bus_is_left_in_init():
 
 def test_whoever_refuses_is_named():
     line = line_of(slave("a"), slave("b"), slave("c"))
-    line.segment.slaves[1].refuses[AlState.OP] = 0x1A
+    line.segment.slaves[1].refused_states[AlState.OP] = 0x1A
     with pytest.raises(AlStatusError, match="slave 1002: refuses OP"):
         line.wait(line.core.bring_up(line.now_ns))
-    line.segment.slaves[2].refuses[AlState.OP] = 0x19
+    line.segment.slaves[2].refused_states[AlState.OP] = 0x19
     with pytest.raises(BusError) as caught:
         line.wait(line.core.bring_up(line.now_ns))
     lines = str(caught.value).splitlines()
@@ -126,7 +126,7 @@ def test_whoever_refuses_is_named():
 def test_startup_slaves_that_fail_for_one_reason_are_one_line():
     line = line_of(*(slave(f"s{number}") for number in range(32)))
     for each in line.segment.slaves[3:]:
-        each.refuses[AlState.OP] = 0x19
+        each.refused_states[AlState.OP] = 0x19
     with pytest.raises(BusError) as caught:
         line.wait(line.core.bring_up(line.now_ns))
     assert str(caught.value) == (
@@ -137,24 +137,24 @@ def test_startup_slaves_that_fail_for_one_reason_are_one_line():
 
 def test_one_that_refuses_does_not_keep_the_others_from_running():
     line = line_of(slave("a"), slave("b"), slave("c"))
-    line.segment.slaves[1].refuses[AlState.OP] = 0x1A
+    line.segment.slaves[1].refused_states[AlState.OP] = 0x1A
     with pytest.raises(AlStatusError):
         line.wait(line.core.bring_up(line.now_ns))
     line.elapse(300 * MS)
     assert states(line) == [AlState.OP, AlState.SAFEOP, AlState.OP]
-    line.segment.slaves[1].refuses.clear()
+    line.segment.slaves[1].refused_states.clear()
     line.elapse(1500 * MS)
     assert set(states(line)) == {AlState.OP}
 
 
 def test_one_that_does_not_even_reach_preop_leaves_its_place_free():
     line = line_of(slave("a"), slave("b"), slave("c"))
-    line.segment.slaves[1].refuses[AlState.PREOP] = 0x16
+    line.segment.slaves[1].refused_states[AlState.PREOP] = 0x16
     with pytest.raises(AlStatusError, match="slave 1002: refuses PREOP"):
         line.wait(line.core.bring_up(line.now_ns))
     assert states(line) == [AlState.OP, AlState.INIT, AlState.OP]
     assert line.core.cycle.is_good
-    line.segment.slaves[1].refuses.clear()
+    line.segment.slaves[1].refused_states.clear()
     line.elapse(1500 * MS)
     assert set(states(line)) == {AlState.OP}
     line.core.image.write(1002, "out", True)
@@ -180,7 +180,7 @@ def test_one_with_more_process_data_than_can_be_is_left_out():
 
 def test_nobody_left_is_no_bus():
     line = line_of(slave("a"))
-    line.segment.slaves[0].refuses[AlState.PREOP] = 0x16
+    line.segment.slaves[0].refused_states[AlState.PREOP] = 0x16
     with pytest.raises(AlStatusError):
         line.wait(line.core.bring_up(line.now_ns))
     assert line.core.cycle is None
@@ -247,7 +247,7 @@ def test_a_bus_that_is_shut_down_stays_in_init():
 def test_a_bus_that_does_not_rest_is_told():
     line = line_of(slave("a"))
     line.wait(line.core.bring_up(line.now_ns))
-    line.segment.slaves[0].refuses[AlState.INIT] = 0x11
+    line.segment.slaves[0].refused_states[AlState.INIT] = 0x11
     with pytest.raises(StateTimeoutError, match="not in INIT within 5 s"):
         line.wait(line.core.shut_down(line.now_ns))
 

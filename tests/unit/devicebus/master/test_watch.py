@@ -224,7 +224,7 @@ def test_two_that_lost_their_addresses_get_their_own_again(line):
 def test_a_slave_that_cannot_come_back_is_tried_each_second(line):
     line.period_ns = 4 * MS
     slave_b = by_name(line)["b"]
-    slave_b.refuses[AlState.OP] = 0x1A
+    slave_b.refused_states[AlState.OP] = 0x1A
     slave_b.fail(0x1A)
     line.elapse(2500 * MS)
     events = line.events()
@@ -233,7 +233,7 @@ def test_a_slave_that_cannot_come_back_is_tried_each_second(line):
     assert len(events) == 1 + len(failures)
     assert 2 <= len(failures) <= 3
     assert "refuses OP" in failures[0].reason
-    slave_b.refuses.clear()
+    slave_b.refused_states.clear()
     line.elapse(1500 * MS)
     assert kinds(line.events()) == [("SlaveBack", 1003)]
 

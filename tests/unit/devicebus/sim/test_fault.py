@@ -335,7 +335,7 @@ def test_command_with_a_time_counts_from_now():
 def test_fault_inside_a_slave():
     faulty = make(fault("refuse", slave="a", state="PREOP", code=0x8000))
     faulty.handle_timeout(0)
-    assert faulty.segment.slaves[0].refuses == {AlState.PREOP: 0x8000}
+    assert faulty.segment.slaves[0].refused_states == {AlState.PREOP: 0x8000}
 
 
 @pytest.mark.parametrize(

@@ -267,7 +267,7 @@ def test_own_error_falls_out_of_op(bench):
 
 
 def test_refused_state_of_a_script(bench):
-    bench.slaves[0].refuses[AlState.PREOP] = 0x8000
+    bench.slaves[0].refused_states[AlState.PREOP] = 0x8000
     bench.set_channels(0, 0, 2)
     bench.ask(AlState.PREOP)
     assert bench.status() == (AlState.INIT | ERROR, 0x8000)

@@ -46,11 +46,11 @@ def test_without_slaves_there_is_nothing_to_bring():
 
 def test_those_that_fail_are_named():
     line = line_of(AlState.SAFEOP)
-    line.segment.slaves[0].refuses[AlState.OP] = 0x1A
+    line.segment.slaves[0].refused_states[AlState.OP] = 0x1A
     with pytest.raises(AlStatusError, match="slave 1001: refuses OP"):
         line.wait(bring_all(line.core, AlState.OP, line.now_ns))
     line.wait(bring_all(line.core, AlState.SAFEOP, line.now_ns))
-    line.segment.slaves[2].refuses[AlState.OP] = 0x19
+    line.segment.slaves[2].refused_states[AlState.OP] = 0x19
     with pytest.raises(BusError) as caught:
         line.wait(bring_all(line.core, AlState.OP, line.now_ns))
     assert str(caught.value).startswith("2 slaves have failed:\n  s0 (1001): refuses OP")

@@ -117,7 +117,7 @@ def test_slaves_get_to_op_and_rest_in_the_end(start):
 def test_slaves_that_do_not_rest_are_not_waited_for_long(start):
     running = start()
     running.run_until(lambda: running.station.image.read("bus0.state") == AlState.OP)
-    running.segment.segment.slaves[1].refuses[AlState.INIT] = 0x11
+    running.segment.segment.slaves[1].refused_states[AlState.INIT] = 0x11
     begun_ns = monotonic_ns()
     running.buses.rest()
     assert REST_NS <= monotonic_ns() - begun_ns < 4 * REST_NS

@@ -85,7 +85,7 @@ def test_files_go_in_packets_that_fill_the_mailbox(bus, tmp_path) -> None:
 def test_mailboxes_behind_virtual_addresses_are_as_large_as_it_is_said(gateway) -> None:
     with open_gateway("127.0.0.1", gateway.port, tcp=False, mailbox=16) as bus:
         begin = partial(foe_client.read, "firmware.bin", bytearray().extend)
-        with pytest.raises(MailboxSizeError, match="room for 4"):
+        with pytest.raises(MailboxSizeError, match="mailbox holds 4"):
             bus.converse(bus.find("0x9001"), begin, "x")
 
 
