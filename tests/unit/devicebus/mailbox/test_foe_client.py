@@ -180,9 +180,7 @@ def test_write_that_breaks_the_protocol(answers: list[str], reason: str) -> None
 
 
 def test_name_longer_than_the_mailbox_is_refused_at_once() -> None:
-    with pytest.raises(
-        MailboxSizeError, match="'abcde' has 5 bytes, the mailbox holds 4"
-    ):
+    with pytest.raises(MailboxSizeError, match="'abcde' has 5 bytes, the mailbox holds 4"):
         next(foe_client.read("abcde", bytearray().extend, SIZES))
 
 
