@@ -179,7 +179,7 @@ def test_a_station_whose_net_ids_begin_alike_is_reached_by_four_octets(index):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "loose"),
+    ("old", "new", "shared"),
     [
         ("net_id: 127.0.9.2.1.1", "net_id: 5.5.5.5.1.1", {"right"}),
         ("net_id: 127.0.9.1.2.1", "net_id: 127.0.9.2.9.9", {"left", "right"}),

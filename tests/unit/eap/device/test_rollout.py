@@ -48,16 +48,16 @@ def net_id(number: int) -> str:
 
 def plant(
     versions: Mapping[tuple[str, int], int],
-    received_by: Mapping[str, Sequence[tuple[str, int]]],
+    received: Mapping[str, Sequence[tuple[str, int]]],
     *,
     ignoring: bool = False,
 ) -> Plant:
     """Stations of one letter; *versions* of the PDs each sends by id, and what each receives."""
-    names = sorted({station for station, _ in versions} | set(received_by))
+    names = sorted({station for station, _ in versions} | set(received))
     found = {}
     for number, name in enumerate(names, 1):
         sent = {pd_id: version for (who, pd_id), version in versions.items() if who == name}
-        taken = [(who, pd_id, versions[who, pd_id]) for who, pd_id in received_by.get(name, ())]
+        taken = [(who, pd_id, versions[who, pd_id]) for who, pd_id in received.get(name, ())]
         found[name] = StationSpec(
             name, net_id(100 + number), 1000, (eap_port(net_id=net_id(number)),),
             variables=tuple(_variables(sent, taken)),
@@ -141,8 +141,8 @@ def test_nothing_changes_without_a_difference():
 
 
 def test_the_receiver_goes_first_and_once_more():
-    received_by = {"b": [("a", 1)], "c": []}
-    old, new = plant({("a", 1): 0}, received_by), plant({("a", 1): 1}, received_by)
+    received = {"b": [("a", 1)], "c": []}
+    old, new = plant({("a", 1): 0}, received), plant({("a", 1): 1}, received)
     way, running = follow(old, new)
     assert shown(way) == [
         "b runs the new configuration; accepts old layouts too",
@@ -157,8 +157,8 @@ def test_the_receiver_goes_first_and_once_more():
 
 
 def test_what_has_another_type_or_is_gone_has_no_place():
-    received_by = {"b": [("a", 1)]}
-    old, new = plant({("a", 1): 2}, received_by), plant({("a", 1): 3}, received_by)
+    received = {"b": [("a", 1)]}
+    old, new = plant({("a", 1): 2}, received), plant({("a", 1): 3}, received)
     first = steps(old, new)[0].spec.subscriptions[0]
     assert [(each.name, each.type) for each in first.alternates[0].variables] == [
         ("", "BOOL"),
@@ -168,9 +168,9 @@ def test_what_has_another_type_or_is_gone_has_no_place():
 
 
 def test_stations_that_send_and_receive_take_both_before_they_send_anew():
-    received_by = {"a": [("b", 2)], "b": [("a", 1)]}
+    received = {"a": [("b", 2)], "b": [("a", 1)]}
     versions = {("a", 1): 0, ("b", 2): 0}
-    old, new = plant(versions, received_by), plant(dict.fromkeys(versions, 1), received_by)
+    old, new = plant(versions, received), plant(dict.fromkeys(versions, 1), received)
     way, running = follow(old, new)
     assert shown(way) == [
         "a accepts old and new layouts; sends as before",
@@ -185,19 +185,17 @@ def test_stations_that_send_and_receive_take_both_before_they_send_anew():
 
 def test_in_a_line_senders_follow_each_other():
     versions = {("c", 1): 0, ("b", 2): 0, ("a", 3): 0}
-    received_by = {"b": [("c", 1)], "a": [("b", 2)], "d": [("a", 3)]}
-    way, running = follow(
-        plant(versions, received_by), plant(dict.fromkeys(versions, 1), received_by)
-    )
+    received = {"b": [("c", 1)], "a": [("b", 2)], "d": [("a", 3)]}
+    way, running = follow(plant(versions, received), plant(dict.fromkeys(versions, 1), received))
     assert [step.station for step in way] == ["a", "b", "d", "c", "b", "a", "d"]
-    assert running == plant(dict.fromkeys(versions, 1), received_by)
+    assert running == plant(dict.fromkeys(versions, 1), received)
 
 
 def test_who_does_not_change_what_it_sends_or_receives_has_one_step():
-    received_by = {"b": [("a", 1)], "c": [("a", 1)]}
+    received = {"b": [("a", 1)], "c": [("a", 1)]}
     old, new = (
-        plant({("a", 1): 0, ("c", 9): 0}, received_by),
-        plant({("a", 1): 1, ("c", 9): 0}, received_by),
+        plant({("a", 1): 0, ("c", 9): 0}, received),
+        plant({("a", 1): 1, ("c", 9): 0}, received),
     )
     old["d"], new["d"] = replace(new["c"], name="d", cycle_us=1), replace(new["c"], name="d")
     old["d"] = replace(old["d"], subscriptions=(), frames=())
@@ -222,16 +220,16 @@ def test_who_receives_it_no_longer_goes_first():
 
 
 def test_new_pds_are_taken_before_they_are_sent_and_old_ones_until_they_are_not():
-    received_by = {"a": [("b", 2)], "b": []}
-    old = plant({("b", 2): 0}, received_by)
+    received = {"a": [("b", 2)], "b": []}
+    old = plant({("b", 2): 0}, received)
     new = plant({("b", 2): 0, ("b", 3): 0}, {"a": [("b", 2), ("b", 3)]})
     assert [step.station for step in steps(old, new)] == ["a", "b"]
     assert [step.station for step in steps(new, old)] == ["b", "a"]
 
 
 def test_who_takes_both_while_one_pd_changes_and_another_ends_goes_last():
-    received_by = {"a": [("b", 2), ("b", 3)]}
-    old = plant({("b", 2): 0, ("b", 3): 0}, received_by)
+    received = {"a": [("b", 2), ("b", 3)]}
+    old = plant({("b", 2): 0, ("b", 3): 0}, received)
     new = plant({("b", 2): 1}, {"a": [("b", 2)]})
     way, _ = follow(old, new)
     assert shown(way) == [
@@ -278,10 +276,10 @@ def test_stations_that_are_in_one_plant_only_have_no_step():
 
 
 def test_any_publisher_takes_the_layouts_of_all():
-    received_by = {"d": [("a", 1), ("b", 1)]}
+    received = {"d": [("a", 1), ("b", 1)]}
     plants = []
     for versions in ({("a", 1): 0, ("b", 1): 0}, {("a", 1): 1, ("b", 1): 1}):
-        made = plant(versions, received_by)
+        made = plant(versions, received)
         first = replace(made["d"].subscriptions[0], publisher="")
         made["d"] = replace(made["d"], subscriptions=(first,))
         plants.append(made)
@@ -292,8 +290,8 @@ def test_any_publisher_takes_the_layouts_of_all():
 
 
 def test_a_version_that_is_ignored_needs_no_alternate():
-    received_by = {"b": [("a", 1)]}
-    old, new = (plant({("a", 1): 0}, received_by, ignoring=True) for _ in range(2))
+    received = {"b": [("a", 1)]}
+    old, new = (plant({("a", 1): 0}, received, ignoring=True) for _ in range(2))
     pd = replace(new["a"].frames[0].pds[0], version=9)
     new["a"] = replace(new["a"], frames=(replace(new["a"].frames[0], pds=(pd,)),))
     way, _ = follow(old, new)
@@ -321,11 +319,11 @@ wishes = st.fixed_dictionaries({name: st.sets(st.sampled_from(PDS)) for name in 
 @st.composite
 def plants(draw: st.DrawFn) -> Plant:
     versions = draw(versions_of_all)
-    received_by = {
+    received = {
         name: [key for key in PDS if key in wanted and key in versions and key[0] != name]
         for name, wanted in draw(wishes).items()
     }
-    return plant(versions, received_by)
+    return plant(versions, received)
 
 
 @given(plants(), plants())
@@ -348,16 +346,16 @@ def test_a_change_that_was_broken_off_can_be_finished_taken_back_or_followed_by_
 
 
 def test_who_receives_its_own_pd_changes_both_ends_at_once():
-    received_by = {"a": [("a", 1)]}
-    way = steps(plant({("a", 1): 0}, received_by), plant({("a", 1): 1}, received_by))
+    received = {"a": [("a", 1)]}
+    way = steps(plant({("a", 1): 0}, received), plant({("a", 1): 1}, received))
     assert shown(way) == ["a runs the new configuration"]
 
 
 def test_in_a_ring_only_the_first_needs_a_third_step():
     count = 100
     versions = {(f"s{n:03}", n): 0 for n in range(count)}
-    received_by = {f"s{n:03}": [(f"s{(n + 1) % count:03}", (n + 1) % count)] for n in range(count)}
-    old, new = plant(versions, received_by), plant(dict.fromkeys(versions, 1), received_by)
+    received = {f"s{n:03}": [(f"s{(n + 1) % count:03}", (n + 1) % count)] for n in range(count)}
+    old, new = plant(versions, received), plant(dict.fromkeys(versions, 1), received)
     assert len(steps(old, new)) == 2 * count + 1
 
 
