@@ -1,7 +1,7 @@
-"""Services' end of the pair on which the engine takes requests for its stations and buses.
+"""Link of services to the engine: requests for its stations and buses, and their replies.
 
-Replies are matched by number.  An engine that dies leaves the pair open and silent, so a reply has
-a time-out, and a request that waits for long pings the engine now and then.
+Replies are matched by number.  An engine that dies leaves the socket pair open and silent, so each
+reply has a time-out, and a request that waits longer pings the engine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from eap.runtime.bus_request import (
 )
 
 SILENCE_LIMIT_S = 1.0
-"""An engine that says nothing at all for this long, though it was asked, is gone."""
+"""Time without any message after a ping until the engine counts as gone."""
 
 _MAX_MESSAGE = 1 << 20
 _BATCH = 64
@@ -38,17 +38,17 @@ logger = logging.getLogger(__name__)
 
 
 class EngineLink:
-    """Sends requests to the engine; made inside the loop that serves it.
+    """Sends requests to the engine; constructed inside the loop that serves it.
 
     Args:
-        sock: This end of the pair; closed by :meth:`close`.
+        sock: Local end of the pair; closed by :meth:`close`.
         silence_limit_s: As SILENCE_LIMIT_S.
 
     Attributes:
-        on_restart: Called when another engine has taken its end of the pair.
-        on_unsolicited: Called with each message that a slave sent unasked.
+        on_restart: Called when another engine has connected to the pair.
+        on_unsolicited: Called with each unsolicited message of a slave.
         on_change: Called with each change of a bus.
-        received_s: Time of the loop at which the engine has sent something last.
+        received_s: Time of the loop at which the latest message of the engine came.
     """
 
     def __init__(self, sock: socket.socket, *, silence_limit_s: float = SILENCE_LIMIT_S) -> None:
@@ -60,7 +60,7 @@ class EngineLink:
         self._encoder = msgspec.msgpack.Encoder()
         self._decoder = msgspec.msgpack.Decoder(EngineMessage)
         self._waiting: dict[int, asyncio.Future[EngineReply]] = {}
-        # Numbers of a process before this one do not come again: late answers to it match nothing.
+        # Start above the numbers of the previous process: late answers to it match no request.
         self._last_id = monotonic_ns()
         self.received_s = 0.0
         self.on_restart: list[Callable[[], None]] = []
@@ -69,7 +69,7 @@ class EngineLink:
 
     @property
     def is_alive(self) -> bool:
-        """True if the engine has sent something in the time after which it counts as gone."""
+        """True if the latest message of the engine is younger than the silence limit."""
         return self._loop.time() < self.received_s + self._silence_limit_s
 
     async def request(self, make: Callable[[int], EngineRequest], timeout_s: float) -> EngineReply:
@@ -78,8 +78,8 @@ class EngineLink:
         When this is cancelled, the request is cancelled at the engine.
 
         Raises:
-            EngineGoneError: no engine answers, or it was started again meanwhile.
-            BusError, EngineRefusedError: it could not do it.
+            EngineGoneError: no engine answers, or it was restarted meanwhile.
+            BusError, EngineRefusedError: the request failed.
         """
         request = make(self._next_id())
         future: asyncio.Future[EngineReply] = self._loop.create_future()
@@ -105,15 +105,15 @@ class EngineLink:
         """Send one message.
 
         Raises:
-            EngineGoneError: there is no room, because the engine takes no messages.
+            EngineGoneError: the socket is full, because the engine reads no messages.
         """
         try:
             self._socket.send(self._encoder.encode(request))
         except OSError as exc:
-            raise EngineGoneError(f"the engine takes no requests: {exc.strerror}") from None
+            raise EngineGoneError(f"the engine accepts no requests: {exc.strerror}") from None
 
     def close(self) -> None:
-        """Let go of the pair; the loop may have ended."""
+        """Close the local end; the loop may have ended."""
         if not self._loop.is_closed():
             self._loop.remove_reader(self._socket)
         self._socket.close()
@@ -121,8 +121,8 @@ class EngineLink:
     async def _wait(self, future: asyncio.Future[EngineReply], end_s: float) -> EngineReply:
         pinged_s: float | None = None
         while True:
-            rest_s = min(self._silence_limit_s, end_s - self._loop.time())
-            await asyncio.wait({future}, timeout=max(0.0, rest_s))
+            wait_s = min(self._silence_limit_s, end_s - self._loop.time())
+            await asyncio.wait({future}, timeout=max(0.0, wait_s))
             now_s = self._loop.time()
             if future.done():
                 return future.result()
@@ -141,16 +141,16 @@ class EngineLink:
                 octets = self._socket.recv(_MAX_MESSAGE)
             except OSError:
                 return
-            if not octets:  # the supervisor has closed both ends: everything ends
+            if not octets:  # the supervisor has closed both ends: this process ends too
                 self._loop.remove_reader(self._socket)
                 return
-            self._take(octets)
+            self._handle(octets)
 
-    def _take(self, octets: bytes) -> None:
+    def _handle(self, octets: bytes) -> None:
         try:
             message = self._decoder.decode(octets)
         except msgspec.MsgspecError as exc:
-            logger.warning("an answer of the engine cannot be read: %s", exc)
+            logger.warning("message of the engine dropped: %s", exc)
             return
         self.received_s = self._loop.time()
         if isinstance(message, EngineStarted):

@@ -84,24 +84,24 @@ if TYPE_CHECKING:
 _LATELY_NS = 2_000_000_000
 
 
-class Devices:
-    """All devices, with what belongs to each.
+class StationDevices:
+    """EAP devices of all stations, with their routers and ADS services.
 
     Args:
         plant: Name of the plant.
-        stations: What the engine runs.
-        states: In which states, Op where none is given.
+        stations: Stations that the engine runs.
+        states: Initial states; Op for a station without one.
         images: The process image of each station.
-        engine: Who runs the stations.
+        engine: Runs the stations.
         release: Of this software.
-        routing: What the routers of the stations are told; nothing for one that is not there.
-        step: Is told which station is built next.
+        routing: Routing configuration by station; empty for a station without one.
+        step: Called with the next step of the start-up.
 
     Attributes:
         by_station: The devices.
-        routers: Of AMS packets, by station.
-        routing: What these routers are told, their routes among it.
-        ads: What they find at the NetIDs of routers and EAP ports, by station.
+        routers: AMS routers, by station.
+        routing: Routing configuration in force, by station.
+        ads: ADS services at the NetIDs of routers and EAP ports, by station.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class Devices:
             group.create_task(self._follow_restarts())
 
     def engine_has_restarted(self) -> None:
-        """Tell the new engine, soon, what it may have missed."""
+        """Synchronize the new engine with the devices, soon."""
         self._has_restarted.set()
 
     def _add(
@@ -159,7 +159,7 @@ class Devices:
     ) -> None:
         name, image = station.name, self._images[station.name]
         if _runs(image):
-            self._has_restarted.set()  # services before this one, in the middle of a change
+            self._has_restarted.set()  # the previous services process may have ended in a change
         player = SourcePlayer(station, image)
         keeper.on_change = player.change
         self._players.append(player)
@@ -185,33 +185,33 @@ class Devices:
             await self._has_restarted.wait()
             self._has_restarted.clear()
             for image in self._images.values():
-                with suppress(ImageError):  # whoever reads it is told
-                    image.catch_up()  # an engine that died may have retired nothing
+                with suppress(ImageError):  # its readers get the error
+                    image.catch_up()  # an engine that died may have retired no buffer
             for device in self.by_station.values():
                 await device.tell_again()
 
 
-def _set_access(station: StationSpec, router: StationRouter, told: RoutingSpec) -> None:
-    router.set_access(access_of(station, told))
+def _set_access(station: StationSpec, router: StationRouter, spec: RoutingSpec) -> None:
+    router.set_access(access_of(station, spec))
 
 
 def _runs(image: StationImage) -> bool:
-    """Tell whether an engine has run a cycle of the station just now."""
+    """Return whether an engine has run a cycle of the station just now."""
     ran_at_ns = image.image.words[StationWord.CYCLE_AT_NS]
     return bool(ran_at_ns) and monotonic_ns() - ran_at_ns < _LATELY_NS
 
 
 STATUS_TIMEOUT_S = 0.3
-"""How long ``status`` waits for what the engine says of its buses."""
+"""Time limit of ``status`` for the engine's report of its buses."""
 _IMAGE_PAUSE_S = 0.01
-_AGAIN_S = 1.0
-"""After an error of a socket."""
+_RETRY_S = 1.0
+"""Pause after an error of a socket."""
 
 logger = logging.getLogger(__name__)
 
 
 class Services:
-    """The objects of one services process, from its start to its end."""
+    """Objects of one services process, from its start to its end."""
 
     def __init__(
         self,
@@ -238,7 +238,7 @@ class Services:
     async def run(self) -> None:
         """Serve until SIGTERM."""
         images = {name: await self._open_image(name) for name in self._names}
-        # Not before: whoever waits for images of an engine that failed just ends.
+        # Not earlier: while it waits for images of a failed engine, SIGTERM must end the process.
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
         link = EngineLink(socket.socket(fileno=self._handover.bus_fd))
         self._resources.callback(link.close)
@@ -278,9 +278,9 @@ class Services:
                 task.cancel()
 
     async def _open_image(self, station: str) -> StationImage:
-        """Open one image; at the first start the engine is just making it.
+        """Open one image; at the first start the engine creates it meanwhile.
 
-        How long that may take is the supervisor's decision, by the progress of both.
+        The supervisor limits the time, by the progress of both processes.
         """
         while True:
             try:
@@ -294,10 +294,10 @@ class Services:
                 return image
             await asyncio.sleep(_IMAGE_PAUSE_S)
 
-    def _devices(self, images: dict[str, StationImage], link: EngineLink) -> Devices:
+    def _devices(self, images: dict[str, StationImage], link: EngineLink) -> StationDevices:
         handover = self._handover
         engine = EngineClient(link, Path(handover.folder))
-        devices = Devices(
+        devices = StationDevices(
             handover.plant,
             handover.stations,
             handover.states,
@@ -308,7 +308,7 @@ class Services:
             step=self._startup.step,
         )
         link.on_restart.append(devices.engine_has_restarted)
-        gc.freeze()  # what a collection would go through again and again, while clients wait
+        gc.freeze()  # each collection would scan these objects, while clients wait
         return devices
 
     def _gateways(
@@ -323,10 +323,10 @@ class Services:
 
     def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttTransport]:
         routing = self._handover.routing
-        if not any(told.mqtt for told in routing.values()):
+        if not any(spec.mqtt for spec in routing.values()):
             return ()
         from eap.services.transports.mqtt_transport import (
-            open_mqtt_transports,  # few plants have any
+            open_mqtt_transports,  # few plants have a broker
         )
 
         return open_mqtt_transports(routing, routers, self._counters)
@@ -335,7 +335,7 @@ class Services:
         self,
         images: dict[str, StationImage],
         buses: Buses,
-        devices: Devices,
+        devices: StationDevices,
         gateways: Mapping[PortName, MailboxGateway],
         audit: Audit,
     ) -> Methods:
@@ -370,7 +370,7 @@ class Services:
             more=self._more_methods(devices) | GatewayMethods(self._handover, gateways).table(),
         )
 
-    def _more_methods(self, devices: Devices) -> dict[str, Callable[[dict[str, Any]], Any]]:
+    def _more_methods(self, devices: StationDevices) -> dict[str, Callable[[dict[str, Any]], Any]]:
         views = {
             name: RouterView(router, devices.routing[name].routes)
             for name, router in devices.routers.items()
@@ -401,7 +401,7 @@ class Services:
         return audit
 
     def _ams_addresses(self) -> dict[str, str]:
-        """Return where stations are reached by AMS/TCP; the first of several addresses."""
+        """Return the first AMS/TCP address of each station."""
         found: dict[str, str] = {}
         for shared in self._handover.sockets:
             if shared.kind is SocketKind.AMS_TCP:
@@ -412,7 +412,7 @@ class Services:
     def _buses(
         self,
         clients: Mapping[PortName, BusClient],
-        devices: Devices,
+        devices: StationDevices,
         providers: Mapping[PortName, MasterDictionaryProvider],
     ) -> Buses:
         handover = self._handover
@@ -438,7 +438,7 @@ class Services:
 
 
 def main(handover_fd: int, startup: Startup) -> int:
-    """Return the exit code: 2 for what this machine or the specification lacks."""
+    """Run services; return the exit code, 2 for an error of the specification or of this host."""
     handover = Handover.from_descriptor(handover_fd)
     realtime.die_with_parent(handover.supervisor)
     if handover.options.realtime:
@@ -455,17 +455,17 @@ def main(handover_fd: int, startup: Startup) -> int:
 
 
 async def _keep_serving(serve: Callable[[], Awaitable[None]]) -> None:
-    """Call *serve* again after an error of a socket: that ends neither it nor this process."""
+    """Call *serve* again after an error of a socket, which must end neither it nor this process."""
     while True:
         try:
             await serve()
         except* OSError as group:
             error = group.exceptions[0]
             cause = caused_by(("socket", str(error)), "sockets")
-            logger.exception("an error of a socket: %s", error, extra=cause)
+            logger.exception("socket error, trying again: %s", error, extra=cause)
         else:
             return
-        await asyncio.sleep(_AGAIN_S)
+        await asyncio.sleep(_RETRY_S)
 
 
 async def _serve(

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TextIO
 
 
 class RateLimiter:
-    """Room for *burst* at once, which comes back at *per_s* a second."""
+    """Token bucket: *burst* at once, refilled with *per_s* a second."""
 
     def __init__(self, burst: int, per_s: float, now_s: float) -> None:
         self._burst = burst
@@ -26,7 +26,7 @@ class RateLimiter:
         self._at_s = now_s
 
     def take(self, now_s: float) -> bool:
-        """Say whether there is room for one more, and take it."""
+        """Take one token; return whether there was one."""
         passed_s = max(0.0, now_s - self._at_s)
         self._at_s = now_s
         self._left = min(self._burst, self._left + passed_s * self._per_s)
@@ -37,7 +37,7 @@ class RateLimiter:
 
 
 class Rate(NamedTuple):
-    """A rate limit: *burst* at once, and *per_s* a second for long."""
+    """Rate limit: *burst* at once, and *per_s* a second in the long run."""
 
     burst: int
     per_s: float
@@ -47,25 +47,25 @@ class SourceRates(NamedTuple):
     """Rates of a :class:`SourceRateLimiter`."""
 
     source: Rate
-    """Of each source by itself."""
+    """Limit of each source."""
     known: Rate
-    """Of all sources together that were seen before."""
+    """Limit of all sources together that are known."""
     new: Rate
-    """Of all sources together that were not: senders of datagrams can invent any number of them."""
+    """Limit of all new sources together: datagrams can come from any number of addresses."""
     local: Rate
-    """Of this host, which no other source takes anything from."""
+    """Limit of this host, which other sources do not use up."""
 
 
 class SourceRateLimiter:
-    """Rate limit by source address, within a limit for all.
+    """Rate limits by source address, and for all sources together.
 
-    A source that uses up its own rate, or all that known sources have together, leaves the rates of
+    A source that uses up its own rate, or the common rate of known sources, leaves the rates of
     new sources and of this host as they are.
 
     Args:
-        rates: Of one source and of all.
-        max_sources: Sources that are remembered; the one silent for longest is forgotten.
-        now_s: The time, in seconds.
+        rates: The limits.
+        max_sources: Number of known sources; the one silent for longest is forgotten.
+        now_s: Current time, in seconds.
     """
 
     def __init__(self, rates: SourceRates, max_sources: int, now_s: float) -> None:
@@ -77,11 +77,11 @@ class SourceRateLimiter:
         self._sources: OrderedDict[str, RateLimiter] = OrderedDict()
 
     def take_local(self, now_s: float) -> bool:
-        """Take one for this host; return whether its rate allows it."""
+        """Take a token of this host; return whether there was one."""
         return self._local.take(now_s)
 
     def take(self, source: str, now_s: float) -> bool:
-        """Take one for *source*; return whether its own rate and that of all allow it."""
+        """Take a token for *source*; return whether its own limit and the common one allow it."""
         own = self._sources.get(source)
         if own is not None:
             self._sources.move_to_end(source)
@@ -95,13 +95,13 @@ class SourceRateLimiter:
 
 
 PERIOD_S = 60.0
-"""Time for which lines of one cause are counted before they are told."""
+"""Time for which lines of one cause are counted before their number is written."""
 MAX_CAUSES = 256
 MAX_SOURCES = 256
 RATES = SourceRates(
     source=Rate(20, 2.0), known=Rate(100, 20.0), new=Rate(100, 20.0), local=Rate(100, 20.0)
 )
-"""Lines with different causes."""
+"""Limits of lines with different causes."""
 _FLUSH_S = 5.0
 
 
@@ -116,7 +116,7 @@ def caused_by(cause: Hashable, source: str) -> dict[str, Any]:
 
 
 class _Counted:
-    """Lines that were not written since *since_s*: their number, and the latest of them."""
+    """Lines since *since_s* that were not written: their number, and the latest of them."""
 
     def __init__(self, since_s: float) -> None:
         self.since_s = since_s
@@ -129,7 +129,7 @@ class _Counted:
 
 
 class LimitedLogHandler(logging.StreamHandler[TextIO]):
-    """Handler of a process that writes lines of one cause once for each period.
+    """Log handler that writes lines of one cause once for each period.
 
     Args:
         stream: Where lines go; None for stderr.
@@ -164,19 +164,19 @@ class LimitedLogHandler(logging.StreamHandler[TextIO]):
             self._left_out.add(record)
 
     async def serve(self) -> None:
-        """Write what was counted when its period is over, until cancelled."""
+        """Write counts at the end of their periods, until cancelled."""
         while True:
             await asyncio.sleep(_FLUSH_S)
             self.write_counted()
 
     def write_counted(self) -> None:
-        """Write what was counted and whose period is over."""
+        """Write the counts whose periods are over."""
         with self._locked():
             now_s = self._clock()
             self._write_counted(now_s - PERIOD_S, now_s)
 
     def close(self) -> None:
-        """Write all that was counted: no line follows."""
+        """Write all counts: no line follows."""
         with self._locked():
             now_s = self._clock()
             self._write_counted(now_s, now_s)
@@ -187,7 +187,7 @@ class LimitedLogHandler(logging.StreamHandler[TextIO]):
         return self.lock
 
     def _write_counted(self, until_s: float, now_s: float) -> None:
-        """Write what was counted since *until_s* or longer."""
+        """Write the counts that began at *until_s* or earlier."""
         while self._causes:
             cause, counted = next(iter(self._causes.items()))
             if counted.since_s > until_s:

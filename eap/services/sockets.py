@@ -29,7 +29,7 @@ from eap.pd.spec import StationSpec
 from eap.runtime.discards import DiscardCounters, Refusal
 from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
 from eap.services.gateway.gateway_transport import GatewayTransport
-from eap.services.routing.neighbours import RouterRequests
+from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.accepting import Listeners

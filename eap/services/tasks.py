@@ -73,7 +73,10 @@ ResultT = TypeVar("ResultT")
 
 
 class JobQueue:
-    """A row of jobs; *what* they are about is for the refusal when it is full."""
+    """Queue of jobs that run one at a time; *what* names them in messages.
+
+    A job that has begun is finished even if its client disconnects: no change stays half done.
+    """
 
     def __init__(self, what: str) -> None:
         self._what = what
@@ -81,13 +84,13 @@ class JobQueue:
         self._tasks = TaskSet(what)
         self._waiting = 0
 
-    async def do(self, job: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
-        """Wait for the turn and the end of *job*; return and raise what it does.
+    async def run(self, job: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
+        """Run *job* after those before it; return its result, or raise its exception.
 
-        Who leaves before its turn wants it no more.
+        A job is dropped if its client disconnects before it begins.
 
         Raises:
-            ControlError: too many wait already.
+            ControlError: too many jobs wait already.
         """
         if self._waiting >= MAX_WAITING:
             reason = f"{self._what}: {MAX_WAITING} requests wait already"
@@ -102,9 +105,9 @@ class JobQueue:
         try:
             return await asyncio.shield(task)
         except asyncio.CancelledError:
-            task.add_done_callback(self._tell_nobody)
+            task.add_done_callback(self._log_failure)
             raise
 
-    def _tell_nobody(self, task: asyncio.Task[Any]) -> None:
+    def _log_failure(self, task: asyncio.Task[Any]) -> None:
         if not task.cancelled() and (exc := task.exception()) is not None:
-            logger.warning("%s: a change nobody waits for failed: %s", self._what, exc)
+            logger.warning("%s: a change failed after its client disconnected: %s", self._what, exc)

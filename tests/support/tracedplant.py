@@ -58,7 +58,7 @@ class Station:
     def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
         return self.router.locate(header, endpoint)
 
-    async def ask(
+    async def request(
         self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
     ) -> AmsAnswer:
         del timeout_s

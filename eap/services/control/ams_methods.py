@@ -75,7 +75,7 @@ class AmsMethods:
         router, address = self._router(wanted.via), _found(find, wanted.target)
         timeout_s = wanted.timeout_ms / 1000
         data = to_octets(wanted.data)
-        answer = await router.ask(*address, wanted.command, data, timeout_s=timeout_s)
+        answer = await router.request(*address, wanted.command, data, timeout_s=timeout_s)
         return words.AmsReply(answer.error_code, answer.data.hex())
 
     def _router(self, via: str) -> StationRouter:

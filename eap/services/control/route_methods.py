@@ -18,7 +18,7 @@ from eap.control import routes as words
 from eap.control.protocol import ErrorCode, of_station, unless_unavailable
 from eap.errors import ControlError
 from eap.ids import NetId
-from eap.services.routing.neighbours import (
+from eap.services.routing.remote_routers import (
     FoundRouter,
     RemoteRouteRequest,
     add_remote_route,

@@ -120,7 +120,7 @@ class StationDevice:
 
     async def tell_again(self) -> None:
         """Tell the engine what it is to run, which it may have missed."""
-        await self._jobs.do(self._keeper.tell_again)
+        await self._jobs.run(self._keeper.tell_again)
 
     def upload(self, port: str, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Return an entry, or a whole object from *subindex* on; raise SdoAbortError."""
@@ -149,15 +149,15 @@ class StationDevice:
             SdoAbortError: it, or the engine, refuses; nothing has changed.
             ControlError: too many changes wait already.
         """
-        return await self._jobs.do(lambda: self._write(self.dictionaries[port], write))
+        return await self._jobs.run(lambda: self._write(self.dictionaries[port], write))
 
     async def request_state(self, wanted: int) -> StateResult:
         """Go to the state numbered *wanted* as far as possible."""
-        return await self._jobs.do(lambda: self._go(wanted))
+        return await self._jobs.run(lambda: self._go(wanted))
 
     async def plan(self, spec: StationSpec) -> Plan:
         """Return what it takes to run *spec*."""
-        return await self._jobs.do(lambda: asyncio.to_thread(self._plan, spec))
+        return await self._jobs.run(lambda: asyncio.to_thread(self._plan, spec))
 
     async def apply(
         self, spec: StationSpec, cause: str = "", *, of_plant_file: bool = False
@@ -168,7 +168,7 @@ class StationDevice:
         is to what the plant file of the appliance says now.
         """
         run = partial(self._keeper.change, cause=cause, applied=of_plant_file)
-        return await self._jobs.do(lambda: self._change(lambda: self._plan(spec), run))
+        return await self._jobs.run(lambda: self._change(lambda: self._plan(spec), run))
 
     async def roll_back(self, spec: StationSpec | None = None) -> tuple[Plan, DeviceFault | None]:
         """Run again what ran before the last change; returns as :meth:`apply` does.
@@ -179,7 +179,7 @@ class StationDevice:
         def plan() -> Plan:
             return make_rollback(self.spec, self.dictionaries, self._keeper.previous, spec)
 
-        return await self._jobs.do(lambda: self._change(plan, self._keeper.take_back))
+        return await self._jobs.run(lambda: self._change(plan, self._keeper.take_back))
 
     def _plan(self, spec: StationSpec) -> Plan:
         return make_plan(self.spec, self.dictionaries, spec, {})

@@ -93,7 +93,7 @@ def _access_of(router: StationRouter) -> AccessList:
 
 
 def _open_remote(router: StationRouter, settings: Settings, slave: RemoteAddress) -> RemoteSlave:
-    return RemoteSlave(partial(router.ask, slave.net_id), slave.port, settings.answer_s)
+    return RemoteSlave(partial(router.request, slave.net_id), slave.port, settings.answer_s)
 
 
 def _destination(address: GatewayAddress) -> SlaveAddress | RemoteAddress | GroupAddress:

@@ -1,6 +1,6 @@
-"""The router of a station as the control protocol tells it: routes, connections, requests.
+"""Records of the control protocol about a router: routes, connections, requests.
 
-Only figures that routers keep anyway are read here; 10,000 routes are told in pages.
+Only figures that routers keep anyway are read here; 10,000 routes are sent in pages.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
 
 MAX_LOOPS = 5
-"""Circles that are told of; each as it was seen last."""
+"""Limit of the reported loops; each is shown with its latest packet."""
 MAX_WARNINGS = 100
 _S = 1_000_000_000
 _ORIGINS: dict[Origin, OriginName] = {
@@ -40,7 +40,7 @@ _ORIGINS: dict[Origin, OriginName] = {
 
 
 class RouterView:
-    """The router of one station, to be looked at again and again."""
+    """Router of one station, as lists of the control protocol show it."""
 
     def __init__(self, router: StationRouter, routes: StationRoutes) -> None:
         self.router = router
@@ -49,7 +49,7 @@ class RouterView:
         self._version = -1
 
     def row(self, wanted: RoutesListParameters) -> RouterRow:
-        """Return what is *wanted* of it now."""
+        """Return the part of its state that is *wanted*."""
         now_ns = monotonic_ns()
         found = list(self.router.table)
         if text := wanted.match.lower():
@@ -73,14 +73,14 @@ class RouterView:
         return route_row(self.router.report(route), now_ns, is_derived=is_derived)
 
     def warnings(self) -> list[str]:
-        """Return what there is to say against the routes."""
+        """Return the warnings about the routes."""
         if self._version != self.router.table.version:
             self._version = self.router.table.version
             self._warnings = self.router.table.warnings(self.router.net_ids)[:MAX_WARNINGS]
         return self._warnings
 
     def _words(self, route: Route) -> str:
-        """Return all that a filter looks at."""
+        """Return all texts that a filter matches."""
         report = self.router.report(route)
         origin = "derived" if self.routes.is_derived(route) else _ORIGINS[route.origin]
         words = (route.name, str(route.net_id), *route.hop, origin, report.state, report.why)
@@ -88,7 +88,7 @@ class RouterView:
 
 
 def interruption_row(found: Interruption, now_ns: int) -> InterruptionRow:
-    """Return in plain values what is interrupted for one client."""
+    """Return the record of the interrupted subscriptions of one client."""
     target, port, source, source_port = ADDRESSES.unpack(found.asked)
     return InterruptionRow(
         client=str(found.endpoint),
@@ -101,7 +101,7 @@ def interruption_row(found: Interruption, now_ns: int) -> InterruptionRow:
 
 
 def interruption_findings(routers: Iterable[StationRouter], now_s: float) -> list[dict[str, Any]]:
-    """Return what is interrupted as findings of ``status``."""
+    """Return the interrupted subscriptions as findings of ``status``."""
     now_ns = monotonic_ns()
     found = []
     for router in routers:
@@ -112,7 +112,7 @@ def interruption_findings(routers: Iterable[StationRouter], now_s: float) -> lis
                     "severity": "warning",
                     "where": router.name,
                     "what": interruption_text(row),
-                    "advice": "they are restored when the way is back: see 'eapctl trace'",
+                    "advice": "they are restored when the path is up again: see 'eapctl trace'",
                     "since": now_s - (now_ns - each.since_ns) / _S,
                 }
             )
@@ -120,7 +120,7 @@ def interruption_findings(routers: Iterable[StationRouter], now_s: float) -> lis
 
 
 def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow:
-    """Return a route in plain values."""
+    """Return the record of a route."""
     route, traffic = report.route, report.traffic
     trip_ns, end_ns = report.round_trip_ns, route.expires_at_ns
     return RouteRow(
@@ -149,7 +149,7 @@ def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow
 
 
 def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
-    """Return a connection in plain values."""
+    """Return the record of a connection."""
     endpoint, traffic = report
     return ConnectionRow(
         transport=endpoint.transport,
@@ -167,7 +167,7 @@ def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
 
 
 def request_row(trace: Trace, now_ns: int) -> RequestRow:
-    """Return what became of a packet in plain values."""
+    """Return the record of a packet."""
     header, hop = trace.header, trace.hop
     known = {} if header is None else {
         "service": AmsCommand.name_of(header.command),
@@ -188,7 +188,7 @@ def request_row(trace: Trace, now_ns: int) -> RequestRow:
 
 
 def _loops(latest: list[Trace]) -> list[str]:
-    """Return circles that were seen lately, the newest first."""
+    """Return the loops that were detected lately, the newest first."""
     texts = (f"loop: {each.text}" for each in reversed(latest) if each.outcome is Outcome.LOOP)
     return list(dict.fromkeys(texts))[:MAX_LOOPS]
 

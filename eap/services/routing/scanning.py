@@ -1,7 +1,8 @@
-"""Everything behind one connection: the stations that routes lead to, their ports and slaves.
+"""Scan of the plant through one connection: stations that routes lead to, their ports and slaves.
 
-Each station is asked by ADS, also those of this appliance: its list of devices at AMS port 300, and
-each master for its slaves.  Who does not answer is there with what the plant file says, and why.
+Each station is read by ADS, also the local ones: its list of devices at AMS port 300, and the
+slaves at each master.  A station that does not answer is listed as in the plant file, with the
+reason.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from eap.ids import STATION_OCTETS, NetId
 from eap.services.routing.tracing import TracedStation, find_fault, run_operation
 
 ANSWER_TIMEOUT_S = 3.0
-"""For one answer."""
+"""Time limit for one answer."""
 STATION_TIMEOUT_S = 20.0
-"""For all answers of a station."""
+"""Time limit for all answers of a station."""
 _MAX_CONCURRENT = 8
-"""Stations that are asked."""
+"""Stations that are scanned at a time."""
 _MAX_PORTS = 64
 _MAX_SIZE = 4096
 _NAME = 0x1008_0000
@@ -35,17 +36,17 @@ _INTERFACE = 0x8000_0003
 _INTERFACE_STEP = 0x1_0000
 _KINDS: dict[int, str] = {IoDeviceType.MASTER: "bus", IoDeviceType.EAP: "eap"}
 _STATUS = 0x1F
-"""AL state, and the bit of an error."""
+"""Mask of the AL state with its error bit."""
 _LIST_OFFSETS = {"ids": 1, "name": 1, "net_id": 5, "type": 7}
-"""Offsets of the list of devices."""
+"""Index offsets in the list of devices."""
 
 
 class _FailedError(Exception):
-    """Why somebody did not say what he was asked; in words."""
+    """Request without a usable answer; the text is the reason."""
 
 
 class ScanTarget(NamedTuple):
-    """A station that a scan asks."""
+    """Station that a scan reads."""
 
     name: str
     net_id: NetId
@@ -53,7 +54,7 @@ class ScanTarget(NamedTuple):
 
 
 def scan_targets(directory: Directory, routes: Iterable[Route]) -> list[ScanTarget]:
-    """Return the stations of the plant, then those that only routes tell of."""
+    """Return the stations of the plant, then those that only routes lead to."""
     found = {
         each.net_id: ScanTarget(each.name, each.net_id, each)
         for each in directory.stations.values()
@@ -66,28 +67,28 @@ def scan_targets(directory: Directory, routes: Iterable[Route]) -> list[ScanTarg
 
 
 async def scan(station: TracedStation, known: Sequence[ScanTarget]) -> list[StationEntry]:
-    """Ask all stations; return an entry for each, in their order.
+    """Scan all stations; return an entry for each, in their order.
 
     Args:
-        station: Whose router asks.
-        known: Whom.
+        station: Router that sends the requests.
+        known: Stations to scan.
     """
-    turns = asyncio.Semaphore(_MAX_CONCURRENT)
+    slots = asyncio.Semaphore(_MAX_CONCURRENT)
 
-    async def look(each: ScanTarget) -> StationEntry:
-        async with turns:
+    async def scan_one(each: ScanTarget) -> StationEntry:
+        async with slots:
             return await _StationScan(station, each).station()
 
     async with asyncio.TaskGroup() as group:
-        tasks = [group.create_task(look(each)) for each in known]
+        tasks = [group.create_task(scan_one(each)) for each in known]
     return [task.result() for task in tasks]
 
 
 class _StationScan:
-    """A look at one station."""
+    """Scan of one station."""
 
-    def __init__(self, asker: TracedStation, known: ScanTarget) -> None:
-        self._asker = asker
+    def __init__(self, router: TracedStation, known: ScanTarget) -> None:
+        self._router = router
         self._known = known
         ports = known.planned.ports if known.planned else ()
         self._planned = {port.net_id: port for port in ports}
@@ -101,15 +102,15 @@ class _StationScan:
                 numbers = _numbers(ids)[1 : _MAX_PORTS + 1]
                 ports = [await self._port(place, number) for place, number in enumerate(numbers)]
         except (_FailedError, TimeoutError) as exc:
-            reason = str(exc) or f"not all was said within {STATION_TIMEOUT_S:g} s"
-            reason = await find_fault(self._asker, self._known.net_id, IO_PORT) or reason
+            reason = str(exc) or f"no complete answer within {STATION_TIMEOUT_S:g} s"
+            reason = await find_fault(self._router, self._known.net_id, IO_PORT) or reason
             planned = [_planned_port(port) for port in self._planned.values()]
             return StationEntry(name, net_id, planned, reason)
         ports.sort(key=lambda port: port.kind != "eap")
         return StationEntry(name, net_id, ports, "")
 
     async def _port(self, place: int, number: int) -> ScannedPort:
-        """Return a port; *place* is where it stands in the list."""
+        """Return a port; *place* is its position in the list."""
         octets = await self._read_io(number, "net_id")
         type_number = int.from_bytes(await self._read_io(number, "type"), "little")
         kind = _KINDS.get(type_number, "other")
@@ -127,7 +128,7 @@ class _StationScan:
         return ScannedPort(name, kind, str(net_id), interface, slaves, error)
 
     async def _interface(self, place: int) -> str:
-        """Return what a port is attached to, as the dictionary of the router says."""
+        """Return the interface of a port from the dictionary of the router."""
         offset = _INTERFACE + place * _INTERFACE_STEP
         address = AmsAddress(self._known.net_id, DEVICE_PORT)
         try:
@@ -151,9 +152,9 @@ class _StationScan:
 
     async def _slave_name(self, net_id: NetId, address: int) -> str:
         slave = AmsAddress(net_id, address)
-        told = await self._ask(slave, ReadDeviceInfo())
-        if not told.result:
-            return _text(told.data[4:])
+        info = await self._request(slave, ReadDeviceInfo())
+        if not info.result:
+            return _text(info.data[4:])
         try:
             return _text(await self._read(slave, IndexGroup.SDO, _NAME))
         except _FailedError:
@@ -164,13 +165,15 @@ class _StationScan:
         return await self._read(address, IndexGroup.IO_DEVICES + number, _LIST_OFFSETS[what])
 
     async def _read(self, address: AmsAddress, group: int, offset: int) -> bytes:
-        found = await self._ask(address, Read(group, offset, _MAX_SIZE))
+        found = await self._request(address, Read(group, offset, _MAX_SIZE))
         if found.result:
             raise _FailedError(f"{address}: {AdsError.words_of(found.result)}")
         return found.data
 
-    async def _ask(self, address: AmsAddress, operation: Read | ReadDeviceInfo) -> OperationOutcome:
-        return await run_operation(self._asker, *address, operation, ANSWER_TIMEOUT_S)
+    async def _request(
+        self, address: AmsAddress, operation: Read | ReadDeviceInfo
+    ) -> OperationOutcome:
+        return await run_operation(self._router, *address, operation, ANSWER_TIMEOUT_S)
 
 
 def _planned_port(port: DirectoryPort) -> ScannedPort:
@@ -192,7 +195,9 @@ def _state(octet: bytes) -> str | None:
 
 def _text(octets: bytes) -> str:
     text = octets.partition(b"\0")[0].decode("utf-8", "replace")
-    return "".join(each if each.isprintable() else "?" for each in text)  # it goes to terminals
+    return "".join(
+        each if each.isprintable() else "?" for each in text
+    )  # control characters would reach terminals
 
 
 def _numbers(octets: bytes) -> list[int]:

@@ -29,10 +29,10 @@ from eap.services.tasks import TaskSet
 
 
 class LocalRequest(NamedTuple):
-    """A request for a service of this station; who asks may have it done.
+    """Request for a service of this station, admitted by the access rules.
 
-    Access rules were applied before: what they refuse of a sum command is not in *body* any more.
-    Notifications go to *came_by* by ``StationRouter.send_notification``.
+    Parts of a sum command that the rules deny are not in *body* any more.  Notifications go to
+    *came_by* by ``StationRouter.send_notification``.
     """
 
     header: AmsHeader
@@ -41,14 +41,14 @@ class LocalRequest(NamedTuple):
 
 
 AnswerNow: TypeAlias = Callable[[AmsHeader, bytes], AmsAnswer | None]
-"""Returns the answer to a request, with its header and body, or None for "in the usual way"."""
+"""Returns the answer to a request, with its header and body; None if it needs a queue."""
 
 
 class Service(Protocol):
-    """Whoever answers behind a NetID.
+    """Service behind a NetID.
 
-    One that has a method ``answer_now``, an :data:`AnswerNow`, is asked by that first: what it says
-    there goes back without anything being kept for the request.  It has to change nothing.
+    The router first calls a method ``answer_now``, an :data:`AnswerNow`, where there is one: its
+    answer goes back without any record of the request.  It must not change anything.
     """
 
     @property
@@ -56,39 +56,39 @@ class Service(Protocol):
         """AMS ports that it has now; they may change at any time."""
 
     def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
-        """Answer a request: at once, or later by what is returned to be awaited.
+        """Answer a request: at once, or later by an awaitable.
 
-        A method of ``async def`` will do; what is at hand is better returned as it is, without a
-        task.  Of one client and target port only one request is under way at a time, others are
-        at the same time.  An exception is logged and answered with ``AdsError.INTERNAL``; the
-        router answers in its place what takes longer than its limit, and drops what comes then.
+        The method may be ``async def``; an answer that is available is better returned as it is,
+        which saves a task.  Requests of one client to one port run one at a time, all others
+        concurrently.  An exception is logged and answered with ``AdsError.INTERNAL``.  After its
+        time limit the router answers with an error, and drops a later answer.
         """
 
     def client_gone(self, endpoint: Endpoint) -> None:
-        """End what belongs to the clients of a connection that is closed: notifications, handles.
+        """End what belongs to the clients of a closed connection: notifications, handles.
 
         An address without connections (a datagram's sender) is never closed.
         """
 
 
 class TransportSender(Protocol):
-    """The sending half of a door."""
+    """Sending half of a transport."""
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
-        """Send AMS packets, which are one or its fragments, without waiting.
+        """Send AMS packets, one or its fragments, without waiting.
 
         Args:
-            connection: Name of a connection that came in, the sender's address where there are
-                none, or the address of a hop that a route names.
-            packets: With their headers, none longer than the room of the door.
+            connection: Name of an accepted connection, address of a sender without connection, or
+                address of a hop that a route names.
+            packets: With their headers, none longer than the maximum size of the transport.
 
         Returns:
-            None, or why they cannot be sent; a request is answered with 0x1B then.
+            None, or the reason of a failure; a request is answered with 0x1B then.
         """
 
 
 class ServiceTable:
-    """The services of one station.
+    """Services of one station.
 
     Args:
         net_ids: All NetIDs that the station has.
@@ -103,7 +103,7 @@ class ServiceTable:
         return self._services.keys()
 
     def add(self, net_id: NetId, service: Service) -> None:
-        """Let *service* answer for *net_id*; raise KeyError if the station has no such NetID."""
+        """Add *service* behind *net_id*; raise KeyError if the station has no such NetID."""
         self._services[net_id].append(service)
 
     def ports(self, net_id: NetId) -> Container[int]:
@@ -111,14 +111,14 @@ class ServiceTable:
         return _Ports(self._services[net_id])
 
     def find(self, header: AmsHeader) -> Service | None:
-        """Return the first that has the port which a request is for."""
+        """Return the first service with the target port of a request."""
         for service in self._services[header.target]:
             if header.target_port in service.ports:
                 return service
         return None
 
     def answer_now(self, header: AmsHeader, body: bytes) -> tuple[AmsAnswer, int] | None:
-        """Return what a service has at hand for a request, and how many nanoseconds that took."""
+        """Return the immediate answer to a request and its time in nanoseconds, None if none."""
         answer_now: AnswerNow | None = getattr(self.find(header), "answer_now", None)
         if answer_now is None:
             return None
@@ -130,14 +130,14 @@ class ServiceTable:
         return None if answer is None else (answer, monotonic_ns() - began_ns)
 
     def client_gone(self, endpoint: Endpoint) -> None:
-        """Tell all of them that a connection is closed."""
+        """Notify all services that a connection is closed."""
         for services in self._services.values():
             for service in services:
                 service.client_gone(endpoint)
 
 
 class _Ports:
-    """The AMS ports that some services have now."""
+    """AMS ports that some services have now."""
 
     def __init__(self, services: Collection[Service]) -> None:
         self._services = services
@@ -152,12 +152,12 @@ class _Ports:
 MAX_WAITING = 64
 """Requests of one client to one port that wait for their turn."""
 MAX_OCTETS = 16 << 20
-"""Octets of all requests of a station that are under way or wait."""
+"""Bytes of all requests of a station that are running or wait."""
 _FAILED = AmsAnswer(error_code=AdsError.INTERNAL)
 _FULL = AmsAnswer(error_code=AdsError.MAILBOX_FULL)
 
 Finish: TypeAlias = Callable[[int, AmsAnswer], None]
-"""Takes the answer to the request with a ticket."""
+"""Called with the answer to the request with a ticket."""
 _Key: TypeAlias = tuple[Endpoint, bytes]
 
 logger = logging.getLogger(__name__)
@@ -170,7 +170,7 @@ class _QueuedRequest(NamedTuple):
 
 
 class SerialQueues:
-    """All requests of one station's services; *finish* gets their answers."""
+    """Queues of the requests to one station's services; *finish* gets their answers."""
 
     def __init__(self, finish: Finish) -> None:
         self._finish = finish
@@ -179,11 +179,11 @@ class SerialQueues:
         self._octets = 0
 
     def has_work(self, endpoint: Endpoint, header: AmsHeader) -> bool:
-        """Say whether something is under way, or waits, of the client and port of a request."""
+        """Return whether a request of the same client and port is running or waits."""
         return bool(self._queues) and (endpoint, _addresses(header)) in self._queues
 
     def put(self, ticket: int, service: Service, request: LocalRequest) -> None:
-        """Have *service* answer a request when its turn comes."""
+        """Queue a request for *service*, or begin it."""
         key = request.came_by, _addresses(request.header)
         waiting = _QueuedRequest(ticket, service, request)
         queue = self._queues.get(key)
@@ -202,14 +202,14 @@ class SerialQueues:
             queue.append(waiting)
 
     def forget(self, endpoint: Endpoint) -> None:
-        """Leave out what waits for its turn and came by *endpoint*; what has begun goes on."""
+        """Drop requests from *endpoint* that wait for their turn; those that run continue."""
         for key, queue in self._queues.items():
             if key[0] == endpoint:
                 self._octets -= sum(len(each.request.body) for each in queue)
                 queue.clear()
 
     async def close(self) -> None:
-        """Give up what is under way."""
+        """Cancel the running requests."""
         await self._tasks.close()
 
     async def _run(
@@ -219,7 +219,7 @@ class SerialQueues:
         first: _QueuedRequest,
         answer: Awaitable[AmsAnswer],
     ) -> None:
-        """Answer what is in *queue* until nothing is."""
+        """Answer the requests in *queue* until it is empty."""
         waiting: _QueuedRequest = first
         outcome: AmsAnswer | Awaitable[AmsAnswer] = answer
         try:
@@ -258,9 +258,9 @@ def _addresses(header: AmsHeader) -> bytes:
 
 
 LOCAL_TRANSPORT = Transport(TransportKind.LOCAL, is_stream=True, is_hub=True)
-"""By which a station's own requests come into its router."""
+"""Transport of the station's own requests."""
 _FIRST_PORT = 0x8000
-"""As clients of AMS routers have them."""
+"""First source port, in the range that AMS routers give to clients."""
 
 
 class _Station(Protocol):
@@ -273,9 +273,9 @@ class _Station(Protocol):
 
 
 class LocalClient:
-    """The client of one station, and the carrier that brings the answers back to it.
+    """Client of one station, and the sender that its answers return to.
 
-    Each request is a connection of its own, so that all may be under way at a time.
+    Each request is a connection of its own, so that any number may run at a time.
     """
 
     def __init__(self, station: _Station) -> None:
@@ -283,10 +283,10 @@ class LocalClient:
         self._numbers = count(1)
         self._waiting: dict[str, asyncio.Future[AmsAnswer]] = {}
 
-    async def ask(
+    async def request(
         self, target: NetId, target_port: int, command: int, body: bytes, *, timeout_s: float
     ) -> AmsAnswer:
-        """Ask, and return the answer, or the error that there is instead of one."""
+        """Send a request; return the answer, or the error in its place."""
         number = next(self._numbers)
         connection = str(number)
         answer: asyncio.Future[AmsAnswer] = asyncio.get_running_loop().create_future()
@@ -307,7 +307,7 @@ class LocalClient:
             self._station.connection_closed(LOCAL_TRANSPORT.name, connection)
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
-        """Take an answer."""
+        """Complete the request of an answer (TransportSender)."""
         answer = self._waiting.get(connection)
         if answer is not None and not answer.done():
             header, body = decode_packet(packets[0])

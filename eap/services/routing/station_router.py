@@ -1,17 +1,15 @@
-"""The router of one station, with its doors, its services and the running loop around it.
-
-How the parts meet:
+"""Router of one station in the running loop, with its transports and services.
 
 - A **transport** receives and sends packets.  Its receiver calls :meth:`StationRouter.receive`
   with the transport's name and the connection or the sender's address.  Answers, and packets for
   the next hop, leave by the :class:`~.service.TransportSender` of the transport.  Where several
   stations share a socket, a demultiplexer finds the station of a packet.
 - A **service** answers for one NetID and its AMS ports, see :class:`~.service.Service`.
-- **Routes** are in :attr:`StationRouter.table`; they are added and removed by the methods here, so
-  that hops are asked for life from then on.
-- A **client** of this process asks by :meth:`StationRouter.ask`, and needs no door.
+- **Routes** are in :attr:`StationRouter.table`; the methods here add and remove them, so that their
+  hops are probed from then on.
+- A **client** of this process sends by :meth:`StationRouter.request`, and needs no transport.
 
-Everything is called from the running loop; nothing that a peer sends raises.
+All methods are called from the running loop; no packet of a peer raises an exception.
 """
 
 from __future__ import annotations
@@ -48,16 +46,16 @@ from eap.services.routing.service import (
 
 _SHORTEST_WAIT_S = 0.001
 _MOMENT_S = 0.02
-"""How late a time-out may be noticed."""
+"""Delay with which a time-out may be noticed."""
 
 
 class RouterTimer:
-    """Has something handled in time, from :meth:`start` to :meth:`stop`.
+    """Timer for the next time-out, from :meth:`start` to :meth:`stop`.
 
     Args:
-        next_timeout: Returns when the next thing is due, in nanoseconds of the monotonic clock, or
-            None for never.
-        handle: Called then, or a bit earlier or later; it has the timer set again.
+        next_timeout: Returns the next due time, in nanoseconds of the monotonic clock, or None for
+            never.
+        handle: Called at about that time; it sets the timer again.
     """
 
     def __init__(self, next_timeout: Callable[[], int | None], handle: Callable[[], None]) -> None:
@@ -68,18 +66,18 @@ class RouterTimer:
         self._is_soon = False
 
     def start(self) -> None:
-        """Begin, in the running loop."""
+        """Start the timer in the running loop."""
         self._loop = asyncio.get_running_loop()
         self.set()
 
     def stop(self) -> None:
-        """Call nobody any more."""
+        """Stop the timer."""
         self._loop = None
         if self._timer is not None:
             self._timer.cancel()
 
     def set(self) -> None:
-        """Call when the next thing is due."""
+        """Set the timer to the next due time."""
         at_ns = self._next_timeout()
         if at_ns is None or self._loop is None:
             return
@@ -91,9 +89,9 @@ class RouterTimer:
         self._timer = self._loop.call_at(at_s, self._expire)
 
     def set_soon(self) -> None:
-        """Call after a moment, as something may be due earlier than it was.
+        """Set the timer to a moment from now, because something may be due earlier than before.
 
-        That is cheap; when exactly it is due is looked up then, and not for each packet.
+        This is cheap: the exact due time is looked up then, and not for each packet.
         """
         if self._is_soon or self._loop is None:
             return
@@ -123,19 +121,19 @@ logger = logging.getLogger(__name__)
 
 
 class TraceLog:
-    """The lines of one *station*."""
+    """Log lines about the packets of one station."""
 
     def __init__(self, station: str) -> None:
         self._station = station
 
     def write(self, trace: Trace) -> None:
-        """Log what became of a packet."""
+        """Log the outcome of a packet."""
         level = _LEVELS[trace.outcome]
         if not logger.isEnabledFor(level):
             return
         host = "" if trace.came_by is None else host_of(trace.came_by)
         transport = "" if trace.came_by is None else trace.came_by.transport
-        # Results inside an answer are in the text.
+        # The text has the results inside an answer already.
         code = f" (0x{trace.error_code:x})" if trace.error_code else ""
         extra = caused_by(
             (self._station, *_cause(trace, host)), f"{self._station} {transport} {host}"
@@ -144,10 +142,10 @@ class TraceLog:
 
 
 def _cause(trace: Trace, host: str) -> tuple[Hashable, ...]:
-    """Return what is equal for packets that met the same obstacle.
+    """Return a key that is equal for packets with the same obstacle.
 
-    A hop that is down is one cause, whatever is asked by it, and by whom.  Elsewhere clients and
-    targets are told apart, and connections and AMS ports of clients are not.
+    A hop that is down is one cause for all requests and clients.  Otherwise each client and target
+    has causes of its own, whatever the connection and the AMS port of the client.
     """
     reason = reason_of(trace)
     if trace.outcome is Outcome.FAILED and trace.hop is not None:
@@ -158,22 +156,22 @@ def _cause(trace: Trace, host: str) -> tuple[Hashable, ...]:
 
 
 class StationRouter:
-    """What becomes of the AMS packets of one station.
+    """Router of the AMS packets of one station.
 
     Args:
-        name: Of the station.
-        net_id: Of the router itself.
-        net_ids: Of the station's ports; a request to a port that none of its services has is
+        name: Name of the station.
+        net_id: NetID of the router itself.
+        net_ids: NetIDs of the station's ports; a request to a port that none of its services has is
             answered with error 6, one to another NetID of the station with error 7.
-        access: The access rules; without any others than this host only read.
-        limits: How much it takes on.
+        access: The access rules; without them other hosts only read.
+        limits: Limits of requests and connections.
 
     Attributes:
-        name: Of the station.
-        net_id: Of the router itself.
-        table: The routes, to be read; changed by :meth:`add_route` and :meth:`remove_route`.
-        on_trace: Called with each trace of what was not simply answered.
-        on_audit: Called with each entry of the audit: what was changed, and what was refused.
+        name: Name of the station.
+        net_id: NetID of the router itself.
+        table: The routes, read-only; changed by :meth:`add_route` and :meth:`remove_route`.
+        on_trace: Called with each trace, except that of a request that was simply answered.
+        on_audit: Called with each entry of the audit: changes, and denied requests.
         on_routes: Called with the hop of each route that was added or removed.
     """
 
@@ -219,19 +217,19 @@ class StationRouter:
 
     @property
     def record(self) -> Record:
-        """What was done: traffic by connection and hop, and the latest traces."""
+        """Traffic by connection and hop, and the latest traces."""
         return self._router.record
 
     def report(self, route: Route) -> RouteReport:
-        """Return what is known of one of the routes."""
+        """Return the state and the traffic of one of the routes."""
         return self._router.report(route)
 
     def connections(self) -> list[ConnectionReport]:
-        """Return who asks, or asked and is still connected."""
+        """Return the clients that are connected or sent requests."""
         return self._router.connections()
 
     def interruptions(self) -> list[Interruption]:
-        """Return the subscriptions to which nothing comes, by client and server."""
+        """Return the interrupted subscriptions, by client and server."""
         return self._router.interruptions()
 
     @property
@@ -240,24 +238,24 @@ class StationRouter:
         return self._router.access_filter.access
 
     def set_access(self, access: AccessList) -> None:
-        """Judge requests by other rules from now on."""
+        """Apply other access rules from now on."""
         self._router.access_filter.access = access
 
     def require_record(self, record: Callable[[AuditEntry], str]) -> None:
-        """Refuse changes that cannot be recorded: *record* returns why, empty for one that was."""
+        """Deny changes that cannot be recorded: *record* returns the reason, or an empty text."""
         self._router.access_filter.before_change = record
 
     def why_not_recorded(self, entry: AuditEntry) -> str:
-        """Record a change before it is done, where that is required; return why it cannot be."""
+        """Record a change before it is made, where that is required; return why it failed."""
         record = self._router.access_filter.before_change
         return record(entry) if record is not None else ""
 
     def stats(self) -> Stats:
-        """Return what is going on, and what was."""
+        """Return the current and total figures."""
         return self._router.stats()
 
     async def serve(self) -> None:
-        """Look after time-outs and hops until cancelled."""
+        """Handle time-outs and probe hops until cancelled."""
         self._timer.start()
         try:
             await asyncio.Event().wait()
@@ -266,17 +264,17 @@ class StationRouter:
             await self._queues.close()
 
     def add_transport(self, transport: Transport, sender: TransportSender) -> None:
-        """Let packets come and go by *transport*; raises ValueError if there is one of its name."""
+        """Add a transport with its sender; raise ValueError if its name exists already."""
         self._router.add_transport(transport)
         self._senders[transport.name] = sender
 
     def remove_transport(self, name: str) -> None:
-        """Forget a door; what waits for those behind it is answered with 0x1B."""
+        """Remove a transport; requests that wait for answers by it are answered with 0x1B."""
         self._act(self._router.remove_transport(name, monotonic_ns()))
         del self._senders[name]
 
     def add_service(self, net_id: NetId, service: Service) -> None:
-        """Let *service* answer for *net_id*, one of the station; the first that has a port does.
+        """Add *service* behind *net_id* of the station; the first with a port answers.
 
         Raises:
             KeyError: the station has no such NetID.
@@ -284,7 +282,7 @@ class StationRouter:
         self._services.add(net_id, service)
 
     def add_route(self, route: Route) -> bool:
-        """Take *route* into the table; return whether it was taken."""
+        """Add *route* to the table; return whether it was accepted."""
         is_taken = self.table.add(route)
         for follow in self.on_routes:
             follow(route.hop)
@@ -292,7 +290,7 @@ class StationRouter:
         return is_taken
 
     def remove_route(self, net_id: NetId, hop: Endpoint) -> bool:
-        """Forget a route; return whether there was one."""
+        """Remove a route; return whether there was one."""
         was_there = self.table.remove(net_id, hop)
         for follow in self.on_routes:
             follow(hop)
@@ -300,40 +298,40 @@ class StationRouter:
         return was_there
 
     def is_down(self, hop: Endpoint) -> bool:
-        """Say whether a hop is known not to answer now."""
+        """Return whether a hop is down."""
         return self._router.is_down(hop)
 
     def hop_is_at(self, transport: str, address: str, connection: str) -> None:
-        """Take what comes by *connection* for what comes from the hop that is named *address*."""
+        """Treat packets from *connection* as packets from the hop named *address*."""
         self._router.hop_is_at(transport, address, connection)
 
     def has_route_to(self, hop: Endpoint) -> bool:
-        """Say whether a route leads to a hop."""
+        """Return whether a route leads to a hop."""
         return any(route.hop == hop for route in self.table)
 
     def is_awaited(self, hop: Endpoint) -> bool:
-        """Say whether an answer from a hop is waited for, or subscriptions come from it."""
+        """Return whether an answer from a hop is pending, or subscriptions receive from it."""
         return self._router.is_awaited(hop)
 
     def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
-        """Say where a request would go that came by *endpoint*."""
+        """Return the next hop of a request received from *endpoint*."""
         return self._router.locate(header, endpoint)
 
     def is_waiting_for(self, header: AmsHeader, body: bytes, transport: str) -> bool:
-        """Say whether a client of this router waits for a packet."""
+        """Return whether a request of this router waits for a packet."""
         return self._router.is_waiting_for(header, body, transport)
 
     def receive(
         self, data: bytes, transport: str, connection: str, *, for_all: bool = False
     ) -> None:
-        """Act on an AMS packet, or on the fragment of one.
+        """Handle an AMS packet, or a fragment of one.
 
         Args:
-            data: Header and what follows it.
-            transport: Name of the door that it came by.
-            connection: That it came by, or its sender's address; where that is of IP, the name
-                begins with ``ADDRESS:``, for the access rules.
-            for_all: Whether others got it too: who is not meant says nothing.
+            data: The packet with its header.
+            transport: Name of its transport.
+            connection: Its connection, or its sender's address; an IP address is followed by a
+                colon, for the access rules.
+            for_all: Whether other stations got it too: only its target answers then.
         """
         self._act(
             self._router.receive_packet(
@@ -342,50 +340,50 @@ class StationRouter:
         )
 
     def connection_closed(self, transport: str, connection: str) -> None:
-        """Forget whom nobody can answer any more, and tell the services."""
+        """Drop what is pending for the clients of a closed connection, and notify the services."""
         endpoint = Endpoint(transport, connection)
         self._queues.forget(endpoint)
         self._services.client_gone(endpoint)
         self._act(self._router.connection_closed(transport, connection, monotonic_ns()))
 
     def hop_down(self, transport: str, address: str | None, text: str) -> None:
-        """Answer what waits for a hop, and what will be for it, with 0x1B.
+        """Mark a hop as down: pending and later requests to it are answered with 0x1B.
 
         Args:
-            transport: By which it is reached.
-            address: None for all that are reached by the door.
-            text: Why, for people.
+            transport: Transport of the hop.
+            address: Address of the hop; None for all hops of the transport.
+            text: Reason, for people.
         """
         self._act(self._router.hop_down(transport, address, text, monotonic_ns()))
 
     def hop_up(self, transport: str, address: str | None) -> None:
-        """Pass requests on again; the arguments are those of :meth:`hop_down`."""
+        """Mark a hop as up; the arguments are those of :meth:`hop_down`."""
         self._router.hop_up(transport, address)
         self._timer.set()
 
     def send_notification(self, endpoint: Endpoint, packet: bytes) -> None:
-        """Send what a service has for a client of it, in fragments where they are needed."""
+        """Send a notification of a service to a client, in fragments where needed."""
         self._act(self._router.notify(endpoint, packet))
 
-    async def ask(
+    async def request(
         self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
     ) -> AmsAnswer:
-        """Ask whoever has *target*, near or far, as a program of this station.
+        """Send a request to a local or remote *target* as a client of this station.
 
         Returns:
-            The data of the answer; every failure is an error code of the AMS header: of the router
-            that found it, 0x719 too when *timeout_s* is over.
+            The data of the answer.  A failure is the error code of the AMS header, set by the
+            router that detected it; 0x719 also stands for the end of *timeout_s*.
         """
-        return await self._client.ask(target, target_port, command, body, timeout_s=timeout_s)
+        return await self._client.request(target, target_port, command, body, timeout_s=timeout_s)
 
     def waiting(self, endpoint: Endpoint) -> int:
-        """Return how many requests that came by *endpoint* wait for their answers."""
+        """Return the number of pending requests from *endpoint*."""
         return self._router.waiting(endpoint)
 
     async def wait_below(self, transport: str, connection: str, count: int) -> None:
-        """Wait until fewer than *count* requests of a connection wait for their answers.
+        """Wait until fewer than *count* requests of a connection are pending.
 
-        Only its reader calls this: by waiting here it takes no more than it can answer.
+        Only its reader calls this: while it waits, the flow control of TCP slows the client.
         """
         endpoint = Endpoint(transport, connection)
         if self._router.waiting(endpoint) < count:
@@ -399,8 +397,8 @@ class StationRouter:
 
     def _act(self, actions: list[Action]) -> None:
         if self._router.has_news:
-            self._tell()  # first: what is audited is written before it is answered
-        for action in actions:  # told apart by class, which is faster than by pattern
+            self._publish_events()  # first: the audit is written before the answer is sent
+        for action in actions:  # comparing classes is faster than match
             kind = type(action)
             if kind is Reply:
                 self._reply(*action)
@@ -413,10 +411,10 @@ class StationRouter:
                 event.set()
         self._timer.set_soon()
 
-    def _tell(self) -> None:
+    def _publish_events(self) -> None:
         while (trace := self._router.next_event()) is not None:
-            for tell in self.on_trace:
-                tell(trace)
+            for notify in self.on_trace:
+                notify(trace)
         while (entry := self._router.access_filter.next_entry()) is not None:
             for write in self.on_audit:
                 write(entry)
@@ -432,7 +430,7 @@ class StationRouter:
     def _answer_now(
         self, header: AmsHeader, body: bytes, endpoint: Endpoint
     ) -> tuple[AmsAnswer, int] | None:
-        """Return what a service has at hand, unless its client waits there for something else."""
+        """Return the immediate answer of a service, unless the client has pending requests."""
         if self._queues.has_work(endpoint, header):
             return None
         return self._services.answer_now(header, body)
@@ -448,7 +446,7 @@ class StationRouter:
     def _handle_timeout(self) -> None:
         actions = self._router.handle_timeout(monotonic_ns())
         for hop in self._router.take_gone_hops():
-            self.connection_closed(*hop)  # a datagram door has no other end of a connection
+            self.connection_closed(*hop)  # a datagram transport has no end of a connection
         if actions:
             self._act(actions)
         else:

@@ -1,9 +1,9 @@
-"""The routes of one station: those of the plant file, those that were added, and what is learned.
+"""Routes of one station: configured in the plant file, added at run time, and learned.
 
-Rule: what the plant file says goes before everything else; what was added is kept over restarts,
-what was learned is not.
-Rule: what is added or removed is on the disk before it is in force, and whoever asked is told after
-that.  Packets do not wait for the disk, which takes milliseconds, but the next change does.
+Rule: a configured route has precedence over all others.  An added route is stored over restarts, a
+learned one is not.
+Rule: a change is stored before it is in force, and reported after that.  Packets do not wait for
+the disk, which takes milliseconds; the next change does.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from eap.ids import STATION_OCTETS, Destination, DestinationKind, InterfaceUri, 
 from eap.net.interface import own_addresses
 from eap.pd.spec import StationSpec
 from eap.runtime.store import StationFile
-from eap.services.routing.neighbours import NeighbourScanner
+from eap.services.routing.remote_routers import NeighbourScanner
 from eap.services.routing.station_router import StationRouter
 from eap.services.tasks import JobQueue
 
@@ -49,7 +49,7 @@ def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
 
 
 def to_route(spec: RouteSpec, hop: Endpoint, origin: Origin) -> Route:
-    """Return the route that *spec* describes, by *hop*; raise ValueError if there can be none."""
+    """Return the route of *spec* by *hop*; raise ValueError if its values are impossible."""
     net_id = NetId.parse(spec.net_id)
     return Route(
         NetId.parse(spec.virtual) if spec.virtual else net_id,
@@ -67,10 +67,10 @@ def to_route(spec: RouteSpec, hop: Endpoint, origin: Origin) -> Route:
 
 
 def to_endpoint(hop: HopSpec) -> Endpoint:
-    """Return door and address of a hop; each AMS/TCP connection to others is a door of its own.
+    """Return transport and address of a hop; each AMS/TCP uplink is a transport of its own.
 
     Raises:
-        ValueError: the address is none of one station, or none for this door.
+        ValueError: the address is not that of one station, or does not fit the transport.
     """
     if hop.kind is TransportKind.AMS_TCP:
         return Endpoint(f"{hop.kind}:{hop.address}", hop.address)
@@ -86,7 +86,7 @@ def to_endpoint(hop: HopSpec) -> Endpoint:
 
 
 def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
-    """Return the access rules of a station; first those of networks that may ask nothing."""
+    """Return the access rules of a station; first those that close unidirectional networks."""
     closed = tuple(
         AccessRule(
             f"unidirectional of {spec.network}",
@@ -100,7 +100,7 @@ def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
 
 
 def mqtt_transport_name(spec: MqttSpec) -> str:
-    """Return the name of the door to a network."""
+    """Return the name of the transport of a network."""
     return f"{TransportKind.MQTT}:{spec.network}"
 
 
@@ -117,54 +117,54 @@ def _own_addresses(station: StationSpec) -> Iterator[IPv4Address]:
 
 
 MAX_ADDED = 1000
-"""Routes that can be added to one station."""
+"""Limit of the routes that can be added to one station."""
 MAX_NAME = 80
 LEARNED_NS = 600_000_000_000
-"""After which a learned route is forgotten, unless its router answers again."""
+"""Lifetime of a learned route, unless its router answers again."""
 
 logger = logging.getLogger(__name__)
 
 
 class RoutedStation(Protocol):
-    """What is needed of the router of a station."""
+    """Router of a station, as its routes use it."""
 
     on_audit: list[Callable[[AuditEntry], None]]
-    """Called with what was changed, or refused."""
+    """Called with each change, and each denied one."""
 
     def why_not_recorded(self, entry: AuditEntry) -> str:
-        """Record a change before it is done, where that is required; return why it cannot be."""
+        """Record a change before it is made, where that is required; return why it failed."""
 
     @property
     def table(self) -> RouteTable:
-        """Its routes, to be read."""
+        """Its routes, read-only."""
 
     @property
     def net_id(self) -> NetId:
-        """Of the router itself."""
+        """NetID of the router itself."""
 
     @property
     def net_ids(self) -> Collection[NetId]:
         """All NetIDs of the station."""
 
     def add_route(self, route: Route) -> bool:
-        """Take a route into the table; return whether it was taken."""
+        """Add a route to the table; return whether it was accepted."""
 
     def remove_route(self, net_id: NetId, hop: Endpoint) -> bool:
-        """Forget a route; return whether there was one."""
+        """Remove a route; return whether there was one."""
 
 
 class StationRoutes:
-    """Which routes the router of a station has.
+    """Routes of the router of a station.
 
     Args:
-        router: Of the station.
-        spec: What the plant file says.
-        store: Of the added routes.
-        open_hop: Returns door and address of a hop; raises ValueError if there is no such door.
+        router: Router of the station.
+        spec: Routing configuration of the plant file.
+        store: Stores the added routes.
+        open_hop: Returns the endpoint of a hop; raises ValueError if there is no such transport.
 
     Attributes:
-        router: Of the station.
-        scanners: Who asks for the routers of other hosts, one for each address of the station.
+        router: Router of the station.
+        scanners: Send requests to routers of other hosts, one for each address of the station.
     """
 
     def __init__(
@@ -181,13 +181,13 @@ class StationRoutes:
         self._store = store
         self._open_hop = open_hop
         self._added: dict[RouteSpec, bool] = {}
-        """With whether it is kept over restarts."""
+        """With whether it is stored."""
         self._configured: dict[tuple[NetId, Endpoint], RouteSpec] = {}
         self._jobs = JobQueue("routes")
 
     @property
     def spec(self) -> RoutingSpec:
-        """What the plant file says."""
+        """Routing configuration in force."""
         return self._spec
 
     @property
@@ -196,52 +196,52 @@ class StationRoutes:
         return tuple(self._added)
 
     def start(self, spec: RoutingSpec | None = None) -> None:
-        """Take the routes of the plant file, or of *spec*, then those that were added before."""
+        """Add the routes of the plant file, or of *spec*, then those that were added before."""
         self._spec = spec or self._spec
         self._apply_spec()
         for added in self._store.read() or ():
-            self._take(added)
-            self._added[added] = True  # what cannot be today may be one after the next start
+            self._add_to_table(added)
+            self._added[added] = True  # it may be possible after the next start
 
     def replace_spec(self, spec: RoutingSpec) -> None:
-        """Go on with what another plant file says; added and learned routes stay."""
+        """Apply another configuration; added and learned routes stay."""
         self._spec = spec
         self._apply_spec()
-        for each in self._added:  # one of them may have been hidden by a route of the same hop
-            self._take(each)
+        for each in self._added:  # a configured route of the same hop may have hidden one of them
+            self._add_to_table(each)
 
     def is_derived(self, route: Route) -> bool:
-        """Tell whether a route follows from the ports of the plant."""
+        """Return whether a route follows from the ports of the plant."""
         spec = self._configured.get(route.key)
         return spec is not None and spec.is_derived
 
     def has(self, prefix: bytes) -> bool:
-        """Say whether a NetID of the station itself begins with *prefix*."""
+        """Return whether a NetID of the station itself begins with *prefix*."""
         return any(own.startswith(prefix) for own in self.router.net_ids)
 
     def check(self, spec: RouteSpec) -> None:
-        """Say whether a route could be added; raise ControlError with the reason if not."""
+        """Raise ControlError with the reason if a route cannot be added."""
         self._validated(spec, "")
 
     async def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> Route:
-        """Add a route, in place of the added one of its name, or to its NetID.
+        """Add a route; it replaces added ones with its name or NetID.
 
         Args:
             spec: The route.
-            replaces: Name or NetID of one more that it takes the place of.
-            is_kept: Whether it is there again after a new start.
+            replaces: Name or NetID of another one that it replaces.
+            is_kept: Whether it is stored over restarts.
 
         Raises:
-            ControlError: there cannot be such a route, a route of the plant file is before it, or
-                too many changes wait already.
-            EnvironmentalError: it cannot be kept.
+            ControlError: the route is impossible, a configured route has precedence, or too many
+                changes wait already.
+            EnvironmentalError: it cannot be stored.
         """
-        return await self._jobs.do(partial(self._add, spec, replaces, is_kept=is_kept))
+        return await self._jobs.run(partial(self._add, spec, replaces, is_kept=is_kept))
 
     def learn(self, net_id: NetId, name: str, address: str, now_ns: int) -> bool:
-        """Take a route to a router that answered, by AMS/TCP; tell whether it was taken.
+        """Learn a route by AMS/TCP to a router that answered; return whether it was accepted.
 
-        It is gone after ten minutes, and never before a route that somebody wrote or added.
+        It expires after ten minutes, and configured or added routes have precedence.
         """
         found = self.router.table.find(net_id)
         if not self._spec.learns_from(address) or self.has(net_id.station):
@@ -264,13 +264,13 @@ class StationRoutes:
     async def remove(self, text: str, *, transport: str = "", address: str = "") -> RouteSpec:
         """Remove an added route by its name or NetID, and return it.
 
-        *transport* and *address* choose where there are several.
+        *transport* and *address* select one of several.
 
         Raises:
-            ControlError: there is none that can be removed, or too many changes wait already.
-            EnvironmentalError: that cannot be kept.
+            ControlError: no such route was added, or too many changes wait already.
+            EnvironmentalError: the change cannot be stored.
         """
-        return await self._jobs.do(partial(self._remove, text, transport, address))
+        return await self._jobs.run(partial(self._remove, text, transport, address))
 
     async def _add(self, spec: RouteSpec, replaces: str, *, is_kept: bool) -> Route:
         spec, old = self._validated(spec, replaces)
@@ -295,7 +295,7 @@ class StationRoutes:
         return found[0]
 
     def _validated(self, spec: RouteSpec, replaces: str) -> tuple[RouteSpec, list[RouteSpec]]:
-        """Return a route as it is kept, and the added ones that it takes the place of."""
+        """Return a route as it is stored, and the added ones that it replaces."""
         spec = replace(spec, name=_plain(spec.name), is_derived=False)
         known_as = {spec.name, spec.virtual or spec.net_id, replaces} - {""}
         old = [each for each in self._added if _names(each) & known_as]
@@ -310,9 +310,9 @@ class StationRoutes:
             self._forget(each)
 
     def _apply_spec(self) -> None:
-        """Have the routes of the plant file; those that are the same as before are not touched.
+        """Apply the routes of the configuration; unchanged ones stay as they are.
 
-        A connection to the next hop is closed when its last route goes.
+        A connection to a next hop is closed when its last route is removed.
         """
         before, self._configured = self._configured, {}
         for spec in self._spec.routes:
@@ -327,8 +327,8 @@ class StationRoutes:
         for key in before.keys() - self._configured.keys():
             self.router.remove_route(*key)
 
-    def _take(self, spec: RouteSpec) -> None:
-        """Have an added route."""
+    def _add_to_table(self, spec: RouteSpec) -> None:
+        """Put an added route in force."""
         try:
             self.router.add_route(self._route(spec, Origin.ADDED))
         except ControlError as exc:
@@ -341,7 +341,7 @@ class StationRoutes:
             raise ControlError(f"route {spec.name!r}: {exc}") from None
 
     def _forget(self, spec: RouteSpec) -> None:
-        """Take an added route out of the table, unless one of the plant file has its place."""
+        """Remove an added route from the table, unless a configured one has replaced it there."""
         for route in list(self.router.table):
             same = route.origin is Origin.ADDED and route.name == spec.name
             if same and str(route.net_id) == (spec.virtual or spec.net_id):
@@ -357,12 +357,12 @@ class StationRoutes:
         except ValueError as exc:
             raise ControlError(f"route {spec.name!r}: {exc}") from None
         if not any(net_id) and spec.octets:
-            raise ControlError(f"NetID {net_id} stands for any; a default route matches 0 octets")
+            raise ControlError(f"NetID {net_id} is the default route; it matches 0 octets")
         prefix = net_id[: spec.octets]
         if spec.octets and self.has(prefix):
             raise ControlError(f"NetID {prefix_text(prefix)} is one of this station itself")
         for route in self.router.table:
-            if route.origin is Origin.STATIC and _takes(route, net_id, spec.octets):
+            if route.origin is Origin.STATIC and _covers(route, net_id, spec.octets):
                 raise ControlError(_hidden_by(route.name))
 
     def _is_at(self, spec: RouteSpec, transport: str, address: str) -> bool:
@@ -375,16 +375,18 @@ class StationRoutes:
         for route in self.router.table:
             if text in {route.name, str(route.net_id)}:
                 if route.origin is Origin.STATIC:
-                    where = "follows from the ports" if self.is_derived(route) else "is"
-                    return f"route {route.name!r} {where} of the plant file; change it there"
+                    where = "follows from the ports in" if self.is_derived(route) else "is in"
+                    return f"route {route.name!r} {where} the plant file; change it there"
                 if route.origin is Origin.LEARNED:
-                    return f"route {route.name!r} is learned: it goes by itself, or learn: false"
+                    return (
+                        f"route {route.name!r} is learned: it expires; 'learn: false' prevents it"
+                    )
         names = ", ".join(spec.name for spec in self._added) or "none"
-        return f"no route {text!r} was added; there are: {names}"
+        return f"no route {text!r} was added; added routes: {names}"
 
 
-def _takes(route: Route, net_id: NetId, octets: int) -> bool:
-    """Tell whether a route of the plant file is for all that another one would be for."""
+def _covers(route: Route, net_id: NetId, octets: int) -> bool:
+    """Return whether a configured route covers all NetIDs of another one."""
     if not octets:
         return not route.octets
     return 0 < route.octets <= octets and net_id.startswith(route.net_id[: route.octets])
@@ -392,8 +394,8 @@ def _takes(route: Route, net_id: NetId, octets: int) -> bool:
 
 def _hidden_by(name: str) -> str:
     return (
-        f"route {name!r} of the plant file is for the same NetIDs and goes before one that is"
-        " added; change the plant file"
+        f"route {name!r} of the plant file covers the same NetIDs and has precedence; change the"
+        " plant file"
     )
 
 

@@ -1,7 +1,7 @@
-"""What the router of a station is told: by the plant file at its start, by another one later.
+"""Routing configuration of one station: from the plant file, or applied while the station runs.
 
-What was applied while the station ran is kept, and runs until the plant file is edited that the
-appliance is started with.
+An applied configuration is stored, and in force until the plant file that the appliance is started
+with is edited.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 class RoutingPlan(NamedTuple):
-    """What another specification would change, and why it cannot be, a line for each thing."""
+    """Changes that another specification makes, and reasons against it, one line each."""
 
     changes: list[str]
     refused: list[str]
@@ -36,7 +36,7 @@ class StationRouting:
     Args:
         name: Of the station.
         routes: Of the station, not started yet.
-        store: What was applied.
+        store: Of the applied configuration.
         set_access: Puts the access rules in force.
     """
 
@@ -57,11 +57,11 @@ class StationRouting:
 
     @property
     def applied(self) -> AppliedRouting | None:
-        """What was applied last, None if nothing was since the plant file was edited."""
+        """Configuration that was applied last; None if none was since the plant file was edited."""
         return self._applied
 
     def start(self) -> None:
-        """Let the station have what was applied last, or what the plant file says."""
+        """Start with the configuration that was applied last, or with that of the plant file."""
         if self._applied is None:
             self.routes.start()
         else:
@@ -75,27 +75,27 @@ class StationRouting:
         self._set_access(self.routes.spec)
 
     def plan(self, spec: RoutingSpec) -> RoutingPlan:
-        """Return what *spec* would change."""
+        """Return the changes that *spec* makes."""
         now = self.routes.spec
         return RoutingPlan(describe_routing(now, spec), routing_needs_new_start(now, spec))
 
     async def apply(self, spec: RoutingSpec, cause: str) -> list[str]:
-        """Keep *spec*, then go on with it; return what that changed.
+        """Store *spec*, then put it in force; return the changes.
 
         Raises:
-            ControlError: it cannot be while the station runs, or too many changes wait already.
-            EnvironmentalError: it cannot be kept.
+            ControlError: the change needs a restart, or too many changes wait already.
+            EnvironmentalError: it cannot be stored.
         """
-        return await self._jobs.do(partial(self._apply, spec, cause))
+        return await self._jobs.run(partial(self._apply, spec, cause))
 
     async def roll_back(self) -> list[str]:
-        """Take the last change back, or make it again; return what that changed.
+        """Undo the last change, or redo it; return the changes.
 
         Raises:
-            ControlError: there was none, or too many changes wait already.
-            EnvironmentalError: it cannot be kept.
+            ControlError: there was no change, or too many changes wait already.
+            EnvironmentalError: it cannot be stored.
         """
-        return await self._jobs.do(self._roll_back)
+        return await self._jobs.run(self._roll_back)
 
     async def _apply(self, spec: RoutingSpec, cause: str) -> list[str]:
         plan = self.plan(spec)
@@ -104,7 +104,9 @@ class StationRouting:
         if spec != self.routes.spec:
             before = self.routes.spec
             if self._applied is not None and self._applied.cause == cause:
-                before = self._applied.previous  # another step of the same change
+                before = (
+                    self._applied.previous
+                )  # one change in several steps: the state before the first
             await self._change(
                 AppliedRouting(base=self._base, spec=spec, previous=before, cause=cause)
             )
@@ -121,7 +123,7 @@ class StationRouting:
         return changes
 
     def _usable(self, kept: AppliedRouting | None) -> AppliedRouting | None:
-        """Return what was applied, unless the plant file was edited since."""
+        """Return the stored configuration, unless the plant file was edited since."""
         if kept is None or kept.base == self._base:
             return kept
         if kept.spec != self.routes.spec:
@@ -137,7 +139,7 @@ class StationRouting:
         return None
 
     async def _change(self, applied: AppliedRouting) -> None:
-        await asyncio.to_thread(self._store.save, applied)  # packets do not wait for the disk
+        await asyncio.to_thread(self._store.save, applied)  # packets must not wait for the disk
         self._applied = applied
         self.routes.replace_spec(applied.spec)
         self._set_access(applied.spec)

@@ -44,12 +44,12 @@ from eap.services.routing.station_router import StationRouter
 
 HERE = Endpoint(TransportKind.LOCAL, "trace")
 TARGET_TIMEOUT_S = 5.0
-"""For the target itself: a router gives up before."""
+"""For the target itself; routers before it time out earlier."""
 SUSPECT_TIMEOUT_S = 2.0
-"""For a target behind a router that said nothing."""
+"""For a target behind a router that did not answer."""
 _HOP_TIMEOUT_S = 1.0
 _TIMEOUT_PER_HOP_S = 0.25
-"""For each router that hands a question on: who is nearer waits longer."""
+"""For each router that forwards a query: the router nearest to the start waits longest."""
 _ON_THE_WAY = frozenset(
     (
         AdsError.TARGET_MACHINE,
@@ -60,35 +60,35 @@ _ON_THE_WAY = frozenset(
         AdsError.ACCESS_DENIED,
     )
 )
-"""What is not said by the target."""
+"""Errors that a router before the target reports."""
 _NO_ANSWER = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsError.TIMEOUT))
-"""What is not said by the router that was asked."""
+"""Errors that another router reports in place of the queried one."""
 
 
 class TracedStation(Protocol):
-    """A router, as tracing and scanning need it."""
+    """Router of a station, as tracing and scanning use it."""
 
     @property
     def name(self) -> str:
-        """Of its station."""
+        """Name of the station."""
 
     @property
     def net_id(self) -> NetId:
-        """Its own."""
+        """NetID of the router itself."""
 
     def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
-        """Say where a request would go that came by *endpoint*."""
+        """Return the next hop of a request received from *endpoint*."""
 
-    async def ask(
+    async def request(
         self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
     ) -> AmsAnswer:
-        """Ask whoever has *target*, near or far."""
+        """Send a request to a local or remote *target*, and return its answer."""
 
 
 class Hop(NamedTuple):
-    """One router on the way.
+    """One router on the path.
 
-    *took_ns* is how long it took to hear of it, *is_opaque* says that it tells nothing.
+    *took_ns* is the time until its report came; *is_opaque* marks a router that sends no reports.
     """
 
     report: HopReport
@@ -97,10 +97,10 @@ class Hop(NamedTuple):
 
 
 class TraceResult(NamedTuple):
-    """A way.
+    """Path to a target, and the answer of the target.
 
-    *answer* is what the target says to ReadState, None if nobody asked it, for the way ends before.
-    *why* says why there is no answer, and begins with the hop that it is about; empty if there is.
+    *answer* is that to ReadState, None if no request was sent because the path ends before the
+    target.  *why* is the reason of a missing answer and begins with the hop; empty with an answer.
     """
 
     hops: tuple[Hop, ...]
@@ -110,7 +110,7 @@ class TraceResult(NamedTuple):
 
     @property
     def states(self) -> AdsStates | None:
-        """The states of the target."""
+        """States of the target; None without an answer."""
         if self.answer is None or self.answer.result:
             return None
         try:
@@ -126,22 +126,22 @@ async def run_operation(
     operation: Operation,
     timeout_s: float,
 ) -> OperationOutcome:
-    """Return how one operation came out."""
+    """Send one ADS operation, and return its outcome."""
     command, body = encode_query(operation)
-    answer = await station.ask(target, port, command, body, timeout_s=timeout_s)
+    answer = await station.request(target, port, command, body, timeout_s=timeout_s)
     return decode_outcome(command, answer.error_code, answer.data)
 
 
 async def answer_hop_query(
     station: TracedStation, question: HopQuestion, endpoint: Endpoint, source: NetId
 ) -> HopReport:
-    """Return what a router says of an address, or what the routers behind it do.
+    """Return the report of a router about an address, or that of a router further on.
 
     Args:
-        station: Whose router it is.
-        question: What somebody wants to know.
-        endpoint: That the question came by.
-        source: NetID of who asks.
+        station: Router that answers.
+        question: The query.
+        endpoint: Endpoint that the query came from.
+        source: NetID of the sender.
     """
     header = AmsHeader(question.target, question.port, source, 0, 0)
     location = station.locate(header, endpoint)
@@ -150,10 +150,10 @@ async def answer_hop_query(
         return report
     further = min(question.further, MAX_FURTHER) - 1
     onward = HopQuestion(NetId.parse(report.target), question.port, further)
-    asked = ReadWrite(IndexGroup.WHEREABOUTS, 0, MAX_REPORT, onward.encode())
+    operation = ReadWrite(IndexGroup.WHEREABOUTS, 0, MAX_REPORT, onward.encode())
     next_router = NetId.parse(report.next_net_id)
     timeout_s = _HOP_TIMEOUT_S + _TIMEOUT_PER_HOP_S * further
-    outcome = await run_operation(station, next_router, SYSTEM_PORT, asked, timeout_s)
+    outcome = await run_operation(station, next_router, SYSTEM_PORT, operation, timeout_s)
     if outcome.result:
         return replace(report, error=outcome.result)
     try:
@@ -165,12 +165,12 @@ async def answer_hop_query(
 async def trace(
     station: TracedStation, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
 ) -> TraceResult:
-    """Follow the way from *station* to *target*, and ask that for its state."""
+    """Follow the path from *station* to *target*, and read the state of the target."""
     hops, why = await _follow(station, target, port, clock)
     last = hops[-1]
     if why and not last.is_opaque:
         return TraceResult(tuple(hops), None, 0, why)
-    # Who does not answer a question that is ours alone may pass requests on all the same.
+    # A router of another make does not support the query (own format), and forwards requests.
     timeout_s = SUSPECT_TIMEOUT_S if why else TARGET_TIMEOUT_S
     began_ns = clock()
     answer = await run_operation(station, target, port, ReadState(), timeout_s)
@@ -185,10 +185,10 @@ async def trace(
 
 
 async def find_fault(station: TracedStation, target: NetId, port: int) -> str:
-    """Return at which router the way to *target* ends, and why; empty if it ends at none.
+    """Return the router at which the path to *target* ends, and the reason; empty if it has no end.
 
-    For a request that was not answered: the router that refused it may not know which one of those
-    behind it is the cause.
+    This is for a request without an answer: the router that reported the error may not know which
+    of those behind it is the cause.
     """
     _, why = await _follow(station, target, port, monotonic_ns)
     return why
@@ -197,7 +197,7 @@ async def find_fault(station: TracedStation, target: NetId, port: int) -> str:
 async def _follow(
     station: TracedStation, target: NetId, port: int, clock: Callable[[], int]
 ) -> tuple[list[Hop], str]:
-    """Return the routers on the way, and why it goes no further than the last one."""
+    """Return the routers on the path, and the reason why it ends at the last one."""
     hops: list[Hop] = []
     why = ""
     while not why and (not hops or _goes_on(hops[-1])):
@@ -210,7 +210,7 @@ async def _follow(
             opaque = HopReport(station=_next_name(report), net_id=report.next_net_id)
             hops.append(Hop(opaque, took_ns, is_opaque=True))
         elif report.why and hops and report.net_id == hops[-1].report.net_id:
-            # It handed the question before this one on, and has lost its next hop since.
+            # It forwarded the previous query, and has lost its next hop since.
             why = f"{report.station}: {report.why}"
             hops[-1] = Hop(report, took_ns)
         elif any(report.net_id == each.report.net_id for each in hops):
@@ -224,12 +224,12 @@ async def _follow(
 
 
 def _goes_on(hop: Hop) -> bool:
-    """Say whether there is somebody to ask behind *hop*."""
+    """Return whether there is a router behind *hop* to query."""
     return not (hop.is_opaque or hop.report.is_here) and bool(hop.report.next_net_id)
 
 
 def _explain(report: HopReport) -> str:
-    """Return why the router behind *report* says nothing; empty if it only does not know how."""
+    """Return why the router behind *report* sent none; empty if it just lacks support."""
     if report.error in _NO_ANSWER:
         where = f"{report.address} by {report.transport}"
         text = AdsError.words_of(report.error)
@@ -240,16 +240,16 @@ def _explain(report: HopReport) -> str:
 
 
 def _next_name(report: HopReport) -> str:
-    """Return the name of the next router; an older router tells that of its route only."""
+    """Return the name of the next router; an older router reports only that of its route."""
     return report.next_name or report.route
 
 
 class RouteQuery:
-    """Stands before the system service of *station*, and answers questions of traces.
+    """Answers to hop queries, in front of the system service of *station*.
 
     Args:
-        station: Whose router it is.
-        rest: Answers everything else.
+        station: Router that is traced.
+        rest: Service for all other requests.
     """
 
     def __init__(self, station: TracedStation, rest: Service) -> None:
@@ -258,34 +258,36 @@ class RouteQuery:
 
     @property
     def ports(self) -> Container[int]:
-        """Those of the system service."""
+        """Ports of the system service."""
         return self._rest.ports
 
     def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
-        """Answer a request."""
-        asked = _asked(request)
-        return self._rest.answer(request) if asked is None else self._tell(request, asked)
+        """Answer a hop query, or let the system service answer."""
+        operation = _hop_query(request)
+        if operation is None:
+            return self._rest.answer(request)
+        return self._report(request, operation)
 
     def client_gone(self, endpoint: Endpoint) -> None:
-        """Pass it on."""
+        """End what belongs to a closed connection (Service)."""
         self._rest.client_gone(endpoint)
 
-    async def _tell(self, request: LocalRequest, asked: ReadWrite) -> AmsAnswer:
+    async def _report(self, request: LocalRequest, operation: ReadWrite) -> AmsAnswer:
         try:
-            question = HopQuestion.decode(asked.data)
+            question = HopQuestion.decode(operation.data)
         except CodecError:
             outcome = OperationOutcome(AdsError.SIZE)
         else:
             source = request.header.source
             report = await answer_hop_query(self._station, question, request.came_by, source)
             data = encode_report(report)
-            fits = len(data) <= asked.length
+            fits = len(data) <= operation.length
             outcome = OperationOutcome(data=data) if fits else OperationOutcome(AdsError.SIZE)
         return AmsAnswer(encode_outcome(AmsCommand.READ_WRITE, outcome))
 
 
-def _asked(request: LocalRequest) -> ReadWrite | None:
-    """Return the operation of a trace, None for any other request."""
+def _hop_query(request: LocalRequest) -> ReadWrite | None:
+    """Return the operation of a hop query, None for any other request."""
     if request.header.command != AmsCommand.READ_WRITE:
         return None
     try:
@@ -298,19 +300,19 @@ def _asked(request: LocalRequest) -> ReadWrite | None:
 
 
 FAULT_SEARCH_S = 3.0
-"""Limit for finding the router at which the way ends."""
+"""Time limit for finding the router at which the path ends."""
 _NO_FURTHER = frozenset((RouteState.DOWN, RouteState.CLIENT))
-"""States of a route whose own next hop is at fault."""
+"""States of a route in which its own next hop is the cause."""
 _TRACE_HINT = "'eapctl trace' shows the routers before it"
 _RESULT_SIZE = 4
-"""Octets of an ADS answer before its data."""
+"""Bytes of an ADS answer before its data."""
 
 
 def find_target(router: StationRouter, directory: Directory, text: str) -> AmsAddress:
-    """Return whom *text* names: a route, a NetID with or without a port, or a name of the plant.
+    """Return the address of a route's name, a NetID with or without port, or a name of the plant.
 
     Raises:
-        ControlError: nobody.
+        ControlError: *text* is none of these.
     """
     for route in router.table:
         if text == route.name and route.octets:
@@ -325,12 +327,12 @@ def find_target(router: StationRouter, directory: Directory, text: str) -> AmsAd
 
 
 async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: float) -> TestResult:
-    """Ask *target* for its ADS state by way of *router*, and say what came of it."""
+    """Read the ADS state of *target* through *router*; return the result in words."""
     found = router.table.find(target.net_id)
     is_own = target.net_id in router.net_ids
     route = None if found is None or is_own else found[0]
     began_ns = monotonic_ns()
-    answer = await router.ask(*target, AmsCommand.READ_STATE, timeout_s=timeout_s)
+    answer = await router.request(*target, AmsCommand.READ_STATE, timeout_s=timeout_s)
     took_us = (monotonic_ns() - began_ns) // 1000
     report = None if route is None else router.report(route)
     advice = advise(answer.error_code, target.net_id, report, router.net_id, is_own=is_own)
@@ -350,12 +352,12 @@ async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: flo
 
 
 def _leads_further(report: RouteReport) -> bool:
-    """Say whether a router behind the next hop of a route may be at fault."""
+    """Return whether a router behind the next hop of a route may be the cause."""
     return report.next_name != report.route.name and report.state not in _NO_FURTHER
 
 
 async def _with_fault(router: StationRouter, target: AmsAddress, advice: Advice) -> Advice:
-    """Return *advice* about the router at which the way to *target* ends, if one is found."""
+    """Return *advice* about the router at which the path to *target* ends, if there is one."""
     try:
         async with asyncio.timeout(FAULT_SEARCH_S):
             why = await find_fault(router, *target)
@@ -365,7 +367,7 @@ async def _with_fault(router: StationRouter, target: AmsAddress, advice: Advice)
 
 
 def _state(data: bytes) -> str:
-    """Return the ADS state in the answer to ReadState; empty if it tells none."""
+    """Return the ADS state in the answer to ReadState; empty if it has none."""
     try:
         state = AdsStates.decode(data, _RESULT_SIZE).ads_state
     except CodecError:

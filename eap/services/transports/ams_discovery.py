@@ -46,7 +46,7 @@ from eap.net.host import read_password
 from eap.release import RELEASE
 from eap.runtime.discards import Refusal
 from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates, caused_by
-from eap.services.routing.neighbours import RouterRequests
+from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.tasks import TaskSet
 
@@ -304,7 +304,7 @@ class AmsDiscovery:
                 return
             except OSError:
                 continue  # what ICMP says of an answer that went before
-            if self._questions.take(data, sender[0]):
+            if self._questions.receive(data, sender[0]):
                 continue
             self._tasks.start(self._answer(data, sender))
 

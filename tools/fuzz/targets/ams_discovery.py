@@ -23,7 +23,7 @@ from eap.errors import CodecError
 from eap.ids import NetId
 from eap.runtime.discards import Refusal
 from eap.runtime.store import StationFile
-from eap.services.routing.neighbours import RouterRequests
+from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.ams_discovery import AmsDiscovery, RouteAdmin, RouterName
 
@@ -89,7 +89,7 @@ async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         desk = RouteAdmin([routes])
         questions = RouterRequests(sock, [OWN])
-        if questions.take(data, "127.0.0.1"):
+        if questions.receive(data, "127.0.0.1"):
             raise AssertionError("the answer to a question that was not asked")
         routers = [RouterName("left", OWN)]
         discovery = AmsDiscovery(sock, routers, desk, questions, refused.append)

@@ -16,7 +16,7 @@ from eap.pd.device import DeviceState
 from eap.pd.layout import plan_layout
 from eap.pd.spec import HostSource, Measure, VariableSpec
 from eap.pd.words import StationWord
-from eap.services.process import Devices
+from eap.services.process import StationDevices
 from tests.support import aoe
 from tests.support.eventually import eventually
 from tests.support.stationengine import StationEngine
@@ -30,7 +30,7 @@ def engine(stations):
 @pytest.fixture
 def devices(stations, images, engine):
     states = {"right": DeviceState.PREOP}
-    return Devices("demo", stations, states, images, engine, "1.2")
+    return StationDevices("demo", stations, states, images, engine, "1.2")
 
 
 def play(devices, script):
@@ -71,7 +71,7 @@ def test_port_answers_by_its_net_id_and_the_router_by_its_own(devices, stations)
 
     async def script():
         for net_id, *more in asked:
-            answers.append(await left.ask(NetId.parse(net_id), *more, timeout_s=1))
+            answers.append(await left.request(NetId.parse(net_id), *more, timeout_s=1))
 
     play(devices, script)
     assert [each.error_code for each in answers] == [0, 0, 6, 7]
@@ -90,7 +90,7 @@ def test_sources_follow_the_configuration(devices, files, stations):
 
 
 def test_engine_that_was_started_again_is_told(images, engine, stations):
-    devices = Devices("demo", stations[:1], {}, images, engine, "1.2")
+    devices = StationDevices("demo", stations[:1], {}, images, engine, "1.2")
 
     async def script():
         engine.failure = EngineGoneError("gone")
@@ -108,7 +108,7 @@ def test_engine_that_runs_already_is_told_what_it_may_have_missed(stations, imag
     files["left"].image.words[StationWord.CYCLE_AT_NS] = monotonic_ns()
     spec = replace(stations[0], cycle_us=20_000)
     states = {"left": DeviceState.SAFEOP}
-    devices = Devices("demo", (spec,), states, images, engine, "1.2")
+    devices = StationDevices("demo", (spec,), states, images, engine, "1.2")
 
     async def script():
         await eventually(lambda: engine.state is DeviceState.SAFEOP)

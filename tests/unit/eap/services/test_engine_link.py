@@ -134,7 +134,7 @@ def test_who_leaves_cancels():
 def test_nobody_takes_messages():
     async def scene(engine, link):
         asyncio.get_running_loop().remove_reader(engine._sock)
-        with pytest.raises(EngineGoneError, match="takes no requests"):
+        with pytest.raises(EngineGoneError, match="accepts no requests"):
             tell_often(link)
 
     play(scene)
@@ -145,7 +145,7 @@ def test_octets_that_are_no_answer(caplog):
         engine._sock.send(b"what")
         engine._send(EngineStarted(2))
         await settle()
-        assert "cannot be read" in caplog.text
+        assert "message of the engine dropped" in caplog.text
 
     play(scene)
 

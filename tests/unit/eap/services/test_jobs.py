@@ -29,7 +29,7 @@ def test_one_after_the_other():
         return number
 
     async def script(jobs):
-        return await asyncio.gather(*(jobs.do(lambda n=n: job(n)) for n in range(3)))
+        return await asyncio.gather(*(jobs.run(lambda n=n: job(n)) for n in range(3)))
 
     assert play(script) == [0, 1, 2]
     assert order == [(word, n) for n in range(3) for word in ("begin", "end")]
@@ -41,8 +41,8 @@ def test_failure_is_told_to_who_waits():
 
     async def script(jobs):
         with pytest.raises(ZeroDivisionError):
-            await jobs.do(fail)
-        return await jobs.do(lambda: asyncio.sleep(0, "next"))
+            await jobs.run(fail)
+        return await jobs.run(lambda: asyncio.sleep(0, "next"))
 
     assert play(script) == "next"
 
@@ -61,16 +61,16 @@ def test_what_has_begun_is_finished_though_nobody_waits(caplog, fails):
             if fails:
                 raise ValueError("too late")
 
-        waiting = asyncio.ensure_future(jobs.do(job))
+        waiting = asyncio.ensure_future(jobs.run(job))
         await begun.wait()
         waiting.cancel()
         go_on.set()
-        await jobs.do(lambda: asyncio.sleep(0))
+        await jobs.run(lambda: asyncio.sleep(0))
         assert waiting.cancelled()
 
     play(script)
     assert done == [1]
-    said = "station a: a change nobody waits for failed: too late" in caplog.text
+    said = "station a: a change failed after its client disconnected: too late" in caplog.text
     assert said is fails
 
 
@@ -78,13 +78,13 @@ def test_what_has_not_begun_is_left_out_when_nobody_waits():
     async def script(jobs):
         done = []
         go_on = asyncio.Event()
-        first = asyncio.ensure_future(jobs.do(go_on.wait))
-        second = asyncio.ensure_future(jobs.do(lambda: asyncio.sleep(0, done.append(1))))
+        first = asyncio.ensure_future(jobs.run(go_on.wait))
+        second = asyncio.ensure_future(jobs.run(lambda: asyncio.sleep(0, done.append(1))))
         await asyncio.sleep(0)
         second.cancel()
         go_on.set()
         await first
-        await jobs.do(lambda: asyncio.sleep(0))
+        await jobs.run(lambda: asyncio.sleep(0))
         return done
 
     assert play(script) == []
@@ -94,12 +94,12 @@ def test_there_is_a_limit(monkeypatch):
     monkeypatch.setattr(module, "MAX_WAITING", 1)
 
     async def script(jobs):
-        begun = asyncio.ensure_future(jobs.do(asyncio.Event().wait))
+        begun = asyncio.ensure_future(jobs.run(asyncio.Event().wait))
         await asyncio.sleep(0)
-        waiting = asyncio.ensure_future(jobs.do(lambda: asyncio.sleep(0)))
+        waiting = asyncio.ensure_future(jobs.run(lambda: asyncio.sleep(0)))
         await asyncio.sleep(0)
         with pytest.raises(ControlError, match="station a: 1 requests wait") as caught:
-            await jobs.do(lambda: asyncio.sleep(0))
+            await jobs.run(lambda: asyncio.sleep(0))
         assert caught.value.code == ErrorCode.BUSY
         for each in (begun, waiting):
             each.cancel()

@@ -164,7 +164,7 @@ def test_services_waits_for_images_as_long_as_the_supervisor_lets_it(tmp_path, s
 
 
 def test_keep_serving_begins_again_after_an_error_of_a_socket(monkeypatch, caplog):
-    monkeypatch.setattr(process, "_AGAIN_S", 0.0)
+    monkeypatch.setattr(process, "_RETRY_S", 0.0)
     outcomes = [OSError(24, "Too many open files"), None]
 
     async def serve():

@@ -13,7 +13,7 @@ from eap.codec.staticroutes import StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
 from eap.ids import NetId
 from eap.services.control.route_methods import RouteMethods
-from eap.services.routing.neighbours import RemoteRouter
+from eap.services.routing.remote_routers import RemoteRouter
 from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 
@@ -105,7 +105,7 @@ def test_what_speaks_against_a_route_is_told(ask, left):
         ({"via": "nowhere"}, "neither a station of the plant nor one of"),
         ({"via": "ethernet:02:00:00:00:00:09"}, "no EAP port here is on ethernet"),
         ({"net_id": "127.0.9.1.1.1"}, "is one of this station itself"),
-        ({"net_id": "127.0.9.2.1.1"}, "of the plant file is for the same NetIDs"),
+        ({"net_id": "127.0.9.2.1.1"}, "of the plant file covers the same NetIDs"),
         ({"virtual": "x"}, "is not an AMS NetID"),
         ({"via": "mqtt:line"}, "has no door mqtt:line"),
     ],

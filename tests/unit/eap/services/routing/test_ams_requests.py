@@ -16,8 +16,8 @@ from eap.codec.amsdiscovery import (
 )
 from eap.errors import EnvironmentalError
 from eap.ids import NetId
-from eap.services.routing import neighbours as module
-from eap.services.routing.neighbours import (
+from eap.services.routing import remote_routers as module
+from eap.services.routing.remote_routers import (
     RemoteRouter,
     RemoteRouteRequest,
     RouterRequests,
@@ -64,7 +64,7 @@ def play(questions, ask, answers, sender=THERE):
             data = await asyncio.wait_for(loop.sock_recv(other, 300), 5)
             question = decode_discovery(data)
             number = question.header.invoke_id
-            taken = [questions.take(each, sender) for each in answers(number)]
+            taken = [questions.receive(each, sender) for each in answers(number)]
             return question, await asking, taken
 
     return asyncio.run(run())
@@ -108,11 +108,11 @@ def test_what_nobody_asked_for_is_not_taken(questions):
 
     _, found, taken = scan(questions, answers)
     assert (found, taken) == ([], [False] * 4)
-    assert not questions.take(answer(0, MILL), THERE)  # too late
+    assert not questions.receive(answer(0, MILL), THERE)  # too late
 
 
 def test_there_are_not_more_than_so_many(questions, monkeypatch):
-    monkeypatch.setattr(module, "MAX_NEIGHBOURS", 1)
+    monkeypatch.setattr(module, "MAX_ROUTERS", 1)
     _, found, _ = scan(questions, lambda number: [answer(number, MILL), answer(number, SAW)])
     assert [each.net_id for each in found] == [MILL]
 
@@ -157,5 +157,5 @@ def test_a_network_is_asked_at_its_broadcast_address(monkeypatch):
 
 
 def test_who_cannot_be_asked_is_named(questions):
-    with pytest.raises(EnvironmentalError, match=r"203\.0\.113\.1 cannot be asked from 127\.0\.0"):
+    with pytest.raises(EnvironmentalError, match=r"no request to 203\.0\.113\.1 from 127\.0\.0"):
         asyncio.run(questions.scan("203.0.113.1", wait_s=0))

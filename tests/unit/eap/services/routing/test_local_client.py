@@ -23,7 +23,7 @@ def test_requests_side_by_side_get_their_own_answers():
 
     async def script():
         return await asyncio.gather(
-            *(there.ask(TARGET, 0xFFFF, aoe.READ, bytes([n]), timeout_s=1) for n in (9, 5, 1))
+            *(there.request(TARGET, 0xFFFF, aoe.READ, bytes([n]), timeout_s=1) for n in (9, 5, 1))
         )
 
     answers = asyncio.run(while_serving(script(), there))
@@ -36,8 +36,8 @@ def test_errors_are_answers():
 
     async def script():
         return [
-            await there.ask(TARGET, 1, aoe.READ, timeout_s=1),
-            await there.ask(NetId.parse("9.9.9.9.9.9"), 1, aoe.READ, timeout_s=1),
+            await there.request(TARGET, 1, aoe.READ, timeout_s=1),
+            await there.request(NetId.parse("9.9.9.9.9.9"), 1, aoe.READ, timeout_s=1),
         ]
 
     answers = asyncio.run(while_serving(script(), there))
@@ -54,7 +54,7 @@ def test_whoever_waits_no_longer_is_told_so_and_a_late_answer_is_dropped():
     there = station(reply=slow)
 
     async def script():
-        answer = await there.ask(TARGET, 0xFFFF, aoe.READ, timeout_s=0.01)
+        answer = await there.request(TARGET, 0xFFFF, aoe.READ, timeout_s=0.01)
         access_filter.set()
         await asyncio.sleep(0)
         return answer

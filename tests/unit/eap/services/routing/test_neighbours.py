@@ -7,7 +7,7 @@ import pytest
 
 from eap.errors import EnvironmentalError
 from eap.ids import NetId
-from eap.services.routing.neighbours import (
+from eap.services.routing.remote_routers import (
     FoundRouter,
     RemoteRouter,
     RemoteRouteRequest,

@@ -190,14 +190,14 @@ def test_a_station_that_takes_its_time_is_given_up(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(scanning, "STATION_TIMEOUT_S", 0.05)
 
     class Slow(Station):
-        async def ask(self, *args: Any, **more: Any) -> AmsAnswer:
+        async def request(self, *args: Any, **more: Any) -> AmsAnswer:
             await elapse(0.02)
-            return await super().ask(*args, **more)
+            return await super().request(*args, **more)
 
     line = Line()
     slow = Slow(line, 1, [], Devices(1))
     (row, _) = look(slow)
-    assert row["error"] == "not all was said within 0.05 s"
+    assert row["error"] == "no complete answer within 0.05 s"
     assert [port["name"] for port in row["ports"]] == ["eap0", "bus0"]
 
 

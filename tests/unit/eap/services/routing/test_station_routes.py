@@ -97,10 +97,10 @@ def test_a_route_takes_the_place_of_the_one_of_its_name_or_net_id(change, replac
     [
         ({"name": " \n"}, "a route needs a name"),
         ({"net_id": "1.2.3"}, "'1.2.3' is not an AMS NetID"),
-        ({"net_id": "0.0.0.0.0.0"}, "NetID 0.0.0.0.0.0 stands for any; a default route matches 0"),
+        ({"net_id": "0.0.0.0.0.0"}, "NetID 0.0.0.0.0.0 is the default route; it matches 0 octets"),
         ({"net_id": "10.0.0.1.9.9"}, "NetID 10.0.0.1.x.x is one of this station itself"),
-        ({"net_id": "10.0.0.2.9.9"}, "route 'mill' of the plant file is for the same NetIDs and"),
-        ({"net_id": STATIC.net_id, "octets": 6}, "route 'mill' of the plant file is for the same"),
+        ({"net_id": "10.0.0.2.9.9"}, "route 'mill' of the plant file covers the same NetIDs and"),
+        ({"net_id": STATIC.net_id, "octets": 6}, "route 'mill' of the plant file covers the same"),
         ({"octets": 3}, "3 octets to match, expected 6, 5, 4 or 0"),
         ({"hop": HopSpec(TransportKind.UDP, "gone", "1.1.1.1:1")}, "there is no door udp:gone"),
     ],
@@ -142,11 +142,11 @@ def test_a_name_is_text_that_can_be_shown():
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("mill", "route 'mill' follows from the ports of the plant file; change it there"),
-        ("10.0.0.2.1.1", "route 'mill' follows from the ports of the plant file; change it there"),
-        ("written", "route 'written' is of the plant file; change it there"),
-        ("seen", "route 'seen' is learned: it goes by itself, or learn: false"),
-        ("nothing", "no route 'nothing' was added; there are: plc"),
+        ("mill", "route 'mill' follows from the ports in the plant file; change it there"),
+        ("10.0.0.2.1.1", "route 'mill' follows from the ports in the plant file; change it there"),
+        ("written", "route 'written' is in the plant file; change it there"),
+        ("seen", "route 'seen' is learned: it expires; 'learn: false' prevents it"),
+        ("nothing", "no route 'nothing' was added; added routes: plc"),
     ],
 )
 def test_only_added_routes_are_removed(text, reason):

@@ -122,14 +122,14 @@ def test_trace_several_stations_known_to_be_dead_names_the_first() -> None:
 def test_trace_hop_that_is_lost_meanwhile_is_named_and_no_circle() -> None:
     line, first = line_of_three()
     second = line.stations["island-02"]
-    ask, asked = first.ask, count()
+    request, sent = first.request, count()
 
-    async def ask_while_it_is_lost(*words: Any, **more: float) -> AmsAnswer:
-        if next(asked):
+    async def request_while_hop_is_lost(*words: Any, **more: float) -> AmsAnswer:
+        if next(sent):
             second.router.hop_down("link", "island-03", "it does not answer", 1)
-        return await ask(*words, **more)
+        return await request(*words, **more)
 
-    first.ask = ask_while_it_is_lost  # type: ignore[method-assign]
+    first.request = request_while_hop_is_lost  # type: ignore[method-assign]
     traced = follow(first)
     assert names(traced) == ["island-01", "island-02"]
     assert traced.hops[-1].report.state == "down"

@@ -18,7 +18,7 @@ from eap.codec.amsdiscovery import (
 )
 from eap.ids import NetId
 from eap.runtime.discards import Refusal
-from eap.services.routing.neighbours import RouterRequests
+from eap.services.routing.remote_routers import RouterRequests
 from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
 from tests.support.vectors import load
 

@@ -142,13 +142,15 @@ def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
             here.add_route(
                 Route(NetId.parse(TARGET), "there", Endpoint("link", hop), is_probed=False)
             )
-            asking = asyncio.ensure_future(here.ask(NetId.parse(TARGET), 0xFFFF, 4, timeout_s=5))
+            asking = asyncio.ensure_future(
+                here.request(NetId.parse(TARGET), 0xFFFF, 4, timeout_s=5)
+            )
             connection, _ = await asyncio.get_running_loop().sock_accept(listener)
             stream = asyncio.ensure_future(far.serve(StreamConnection(OWN_HOST), connection))
             answer = await asking
             (name,) = there.record.connections.snapshot()
             there.add_route(Route(NetId.parse("2.2.2.2.2.1"), "here", name, is_probed=False))
-            back = await there.ask(NetId.parse("2.2.2.2.2.1"), 0xFFFF, 4, timeout_s=5)
+            back = await there.request(NetId.parse("2.2.2.2.2.1"), 0xFFFF, 4, timeout_s=5)
             await near.close()
             await stream
             return answer, back

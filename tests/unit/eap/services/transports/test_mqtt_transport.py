@@ -55,7 +55,7 @@ class Place:
         return self.router.table.find(net_id) is not None
 
     async def read(self, target: NetId, body: bytes = b"abc", timeout_s: float = 3) -> AmsAnswer:
-        return await self.router.ask(target, DEVICE, AmsCommand.READ, body, timeout_s=timeout_s)
+        return await self.router.request(target, DEVICE, AmsCommand.READ, body, timeout_s=timeout_s)
 
 
 @asynccontextmanager

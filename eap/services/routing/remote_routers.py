@@ -34,70 +34,70 @@ from eap.net.interface import broadcast_of
 
 
 class RemoteRouter(NamedTuple):
-    """A router of another host that answered."""
+    """Router of another host that answered a scan."""
 
     name: str
     net_id: NetId
     address: str
     """IPv4 address of its host."""
     version: str
-    """Of its software, empty if it does not tell."""
+    """Of its software; empty if it sends none."""
 
 
 class RemoteRouteRequest(NamedTuple):
-    """A route that another router is asked for: to a router here."""
+    """Route that another router is requested to add: to a router of this host."""
 
     name: str
     net_id: NetId
     user: str
     password: str
-    """It is sent in clear."""
+    """Sent in clear text."""
 
 
 class NeighbourScanner(Protocol):
-    """Asks for the routers of other hosts."""
+    """Sender of requests to routers of other hosts."""
 
     @property
     def address(self) -> IPv4Address:
-        """That it asks from."""
+        """IPv4 address that the requests are sent from."""
 
     async def scan(self, address: str = "", *, wait_s: float) -> list[RemoteRouter]:
-        """Ask at *address*, or in a network, and return who answered in time."""
+        """Scan a host or a network at *address*; return the routers that answered in time."""
 
     async def add_remote_route(
         self, wanted: RemoteRouteRequest, address: str, *, wait_s: float
     ) -> int | None:
-        """Ask the router at *address* for a route; return its result, None if it says nothing."""
+        """Request a route at the router of *address*; return the result, None if unanswered."""
 
 
 class LearningStation(Protocol):
-    """Takes routes to those who answered."""
+    """Routes of a station, which take up the routers that a scan found."""
 
     @property
     def scanners(self) -> Sequence[NeighbourScanner]:
         """One for each address of the station."""
 
     def learn(self, net_id: NetId, name: str, address: str, now_ns: int) -> bool:
-        """Take a route; tell whether it was taken."""
+        """Learn a route; return whether the table accepted it."""
 
 
 class FoundRouter(NamedTuple):
-    """Who answered, and whether a route there was learned of it."""
+    """Router that answered, and whether a route to it was learned."""
 
     neighbour: RemoteRouter
     is_learned: bool
 
 
 async def scan_routers(station: LearningStation, address: str, wait_s: float) -> list[FoundRouter]:
-    """Ask who else is there, and learn routes to them.
+    """Scan for routers of other hosts, and learn routes to them.
 
     Args:
-        station: The routes of a station.
-        address: Of a host or a network to ask; the networks of the station if empty.
-        wait_s: How long to wait for answers.
+        station: Routes of the scanning station.
+        address: Host or network to scan; empty for the networks of the station.
+        wait_s: Time limit for answers.
 
     Raises:
-        EnvironmentalError: nobody can be asked.
+        EnvironmentalError: the station has no address to scan from, or sending failed.
     """
     _check(station.scanners)
     scans = [scanner.scan(address, wait_s=wait_s) for scanner in station.scanners]
@@ -115,13 +115,13 @@ async def scan_routers(station: LearningStation, address: str, wait_s: float) ->
 async def add_remote_route(
     station: LearningStation, wanted: RemoteRouteRequest, address: IPv4Address, wait_s: float
 ) -> int | None:
-    """Ask the router at *address* for the route *wanted*, from the station's nearest address.
+    """Request the route *wanted* at the router of *address*, from the station's nearest address.
 
     Returns:
-        What it says, an ADS result; None if it says nothing.
+        The ADS result; None without answer.
 
     Raises:
-        EnvironmentalError: it cannot be asked.
+        EnvironmentalError: the station has no address to send from, or sending failed.
     """
     _check(station.scanners)
     nearest = min(station.scanners, key=lambda each: int(each.address) ^ int(address))
@@ -133,28 +133,30 @@ def _check(scanners: Sequence[NeighbourScanner]) -> None:
         raise EnvironmentalError("the station has no IP address at which it serves AMS")
 
 
-MAX_NEIGHBOURS = 1024
-"""Answers to one question that are taken."""
+MAX_ROUTERS = 1024
+"""Limit of the answers to one scan."""
 BROADCAST = "255.255.255.255"
 _MAX_NAME = 80
 
 
 class _PendingRequest:
-    """One question on its way; *wanted* is how many answers end the waiting, 0 for none."""
+    """Pending request; *wanted* is the number of answers that completes it, 0 for none."""
 
-    def __init__(self, service: int, take: Callable[[Discovery, str], None], wanted: int) -> None:
+    def __init__(
+        self, service: int, receive: Callable[[Discovery, str], None], wanted: int
+    ) -> None:
         self.service = service
-        self.take = take
+        self.receive = receive
         self.wanted = wanted
         self.is_answered = asyncio.Event()
 
 
 class RouterRequests:
-    """Asks from one address.
+    """Requests from one address, with their answers.
 
     Args:
-        sock: Bound to that address; somebody else reads it.
-        own: NetIDs of the routers there, the first of them asks.
+        sock: Bound to that address; its reader calls :meth:`receive`.
+        own: NetIDs of the local routers; the first of them is the source.
     """
 
     def __init__(self, sock: socket.socket, own: Sequence[NetId]) -> None:
@@ -167,49 +169,49 @@ class RouterRequests:
     async def scan(
         self, address: str = "", *, wait_s: float, port: int = AMS_UDP_PORT
     ) -> list[RemoteRouter]:
-        """Ask who is there, and return who answered in time.
+        """Request server info, and return the routers that answered in time.
 
         Args:
-            address: Of a host or a network; the network of this address if empty.
-            wait_s: How long to wait for answers.
+            address: Host or network to scan; empty for the network of this address.
+            wait_s: Time limit for answers.
             port: UDP port of the routers.
 
         Raises:
-            EnvironmentalError: the question cannot be sent.
+            EnvironmentalError: sending failed.
         """
         found: dict[NetId, RemoteRouter] = {}
 
-        def take(answer: Discovery, sender: str) -> None:
+        def receive(answer: Discovery, sender: str) -> None:
             net_id = answer.header.net_id
-            if any(net_id) and net_id not in self._own and len(found) < MAX_NEIGHBOURS:
-                # Who answers for somebody else comes later than that one.
-                found.setdefault(net_id, _neighbour(answer, sender))
+            if any(net_id) and net_id not in self._own and len(found) < MAX_ROUTERS:
+                # The router itself answers first; later ones answer in its place.
+                found.setdefault(net_id, _router_of(answer, sender))
 
-        question = _PendingRequest(DiscoveryService.SERVER_INFO, take, 0)
+        request = _PendingRequest(DiscoveryService.SERVER_INFO, receive, 0)
         target = address or network_of(str(self.address))
-        await self._ask(question, [], (target, port), wait_s)
+        await self._send(request, [], (target, port), wait_s)
         return list(found.values())
 
     async def add_remote_route(
         self, wanted: RemoteRouteRequest, address: str, *, wait_s: float, port: int = AMS_UDP_PORT
     ) -> int | None:
-        """Ask the router at *address* for a route to one here.
+        """Request a route to a local router at the router of *address*.
 
         Args:
-            wanted: The route, and who asks.
+            wanted: The route, with the user and the password.
             address: IPv4 address of the other router.
-            wait_s: How long to wait.
+            wait_s: Time limit for the answer.
             port: Its UDP port.
 
         Returns:
-            What it says, an ADS result; None if it says nothing.
+            The ADS result; None without answer.
 
         Raises:
-            EnvironmentalError: the question cannot be sent.
+            EnvironmentalError: sending failed.
         """
         results: list[int] = []
 
-        def take(answer: Discovery, sender: str) -> None:
+        def receive(answer: Discovery, sender: str) -> None:
             if sender == address:
                 results.append(int.from_bytes((answer.find(Tag.RESULT) or b"")[:4], "little"))
 
@@ -220,12 +222,12 @@ class RouterRequests:
             (Tag.PASSWORD, encode_text(wanted.password)),
             (Tag.HOST, encode_text(str(self._seen_from(address)))),
         ]
-        question = _PendingRequest(DiscoveryService.ADD_ROUTE, take, 1)
-        await self._ask(question, tags, (address, port), wait_s)
+        request = _PendingRequest(DiscoveryService.ADD_ROUTE, receive, 1)
+        await self._send(request, tags, (address, port), wait_s)
         return results[0] if results else None
 
-    def take(self, data: bytes, sender: str) -> bool:
-        """Take *data* for an answer to a question; tell whether it is one."""
+    def receive(self, data: bytes, sender: str) -> bool:
+        """Match a received datagram with the pending requests; return whether it answers one."""
         if not self._waiting:
             return False
         try:
@@ -233,57 +235,57 @@ class RouterRequests:
         except CodecError:
             return False
         number = answer.header.invoke_id
-        asked = [self._waiting.get(number)] if number else [*self._waiting.values()]
+        pending = [self._waiting.get(number)] if number else [*self._waiting.values()]
         found = [
             each
-            for each in asked
+            for each in pending
             if each is not None and answer.header.service == each.service | RESPONSE
         ]
-        for question in found:
-            question.take(answer, sender)
-            question.wanted -= 1
-            if not question.wanted:
-                question.is_answered.set()
+        for request in found:
+            request.receive(answer, sender)
+            request.wanted -= 1
+            if not request.wanted:
+                request.is_answered.set()
         return bool(found)
 
-    async def _ask(
+    async def _send(
         self,
-        question: _PendingRequest,
+        request: _PendingRequest,
         tags: Sequence[tuple[int, bytes]],
         target: tuple[str, int],
         wait_s: float,
     ) -> None:
         number = secrets.randbits(32) or 1
-        header = DiscoveryHeader(0, number, question.service, self._net_id, SYSTEM_PORT)
-        self._waiting[number] = question
+        header = DiscoveryHeader(0, number, request.service, self._net_id, SYSTEM_PORT)
+        self._waiting[number] = request
         try:
             self._sock.sendto(encode_discovery(header, tags), target)
             async with asyncio.timeout(wait_s):
-                await question.is_answered.wait()
+                await request.is_answered.wait()
         except TimeoutError:
             pass
         except OSError as exc:
-            reason = f"{target[0]} cannot be asked from {self.address}: {exc.strerror or exc}"
+            reason = f"no request to {target[0]} from {self.address}: {exc.strerror or exc}"
             raise EnvironmentalError(reason) from None
         finally:
             del self._waiting[number]
 
     def _seen_from(self, address: str) -> IPv4Address:
-        """Return by which address of this host the one at *address* reaches it."""
+        """Return the address of this host from which packets to *address* are sent."""
         if not self.address.is_unspecified:
             return self.address
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
-            trial.connect((address, AMS_UDP_PORT))  # which sends nothing
+            trial.connect((address, AMS_UDP_PORT))  # connect() of a datagram socket sends no packet
             return IPv4Address(trial.getsockname()[0])
 
 
 def network_of(address: str) -> str:
-    """Return where all hosts beside *address* of this machine are asked."""
-    is_any = IPv4Address(address).is_unspecified  # whatever network is there then
+    """Return the broadcast address of the network of a local *address*."""
+    is_any = IPv4Address(address).is_unspecified  # its networks may change later
     return BROADCAST if is_any else broadcast_of(address) or BROADCAST
 
 
-def _neighbour(answer: Discovery, sender: str) -> RemoteRouter:
+def _router_of(answer: Discovery, sender: str) -> RemoteRouter:
     name = "".join(filter(str.isprintable, decode_text(answer.find(Tag.HOST) or b"")))
     version = decode_version(answer.find(Tag.VERSION) or b"")
     return RemoteRouter(name[:_MAX_NAME], answer.header.net_id, sender, version)
