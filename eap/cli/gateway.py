@@ -29,7 +29,7 @@ from eap.cli.params import (
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from eap.control.gateway import GatewayRow
+    from eap.control.bus import GatewayRow
     from eap.ops.bus_objects import SdoDumpEntry
 
 
@@ -88,7 +88,7 @@ def status(target: str, plant: str | None, output: Renderer) -> None:
 def _call(
     action: Literal["start", "stop", "status"], target: str, plant: str | None
 ) -> list[GatewayRow]:
-    from eap.control import gateway as control_gateway
+    from eap.control import bus as control_gateway
     from eap.ops.client import connect_station
 
     station, slash, port = target.partition("/")
@@ -107,7 +107,7 @@ def _all_rows(plant: str | None) -> list[GatewayRow]:
     """Return the gateways of all stations of the running appliances."""
     from contextlib import ExitStack
 
-    from eap.control.gateway import GATEWAY_STATUS
+    from eap.control.bus import GATEWAY_STATUS
     from eap.control.protocol import ErrorCode
     from eap.errors import ControlError
     from eap.ops.client import connect

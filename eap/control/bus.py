@@ -1,6 +1,6 @@
-"""Methods of the control protocol for buses; docs/control.md is their description.
+"""Methods of the control protocol for buses and gateways; docs/control.md is their description.
 
-The records of requests and replies are those of ``devicebus``; JSON has their octets as hexadecimal
+The records of requests and replies are those of ``devicebus``; JSON has their bytes as hexadecimal
 digits and times in milliseconds.  Slaves are station addresses.
 """
 
@@ -16,7 +16,7 @@ from devicebus.errors import BusError
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, MailboxRequest
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
-from eap.control.protocol import ErrorCode, Method, Parameters
+from eap.control.protocol import Document, ErrorCode, Method, Parameters
 from eap.errors import ControlError
 from eap.runtime.bus_request import BusReport
 
@@ -239,3 +239,71 @@ def to_octets(text: str) -> bytes:
 
 def _to_ms(ns: int) -> int:
     return -(-ns // MS)
+
+
+class GatewayParameters(Parameters, frozen=True, kw_only=True):
+    """``gateway_start``, ``gateway_stop`` and ``gateway_status``."""
+
+    station: str
+    port: str = ""
+    """A bus port; empty for all of the station."""
+
+
+class GatewaySettings(Document, frozen=True):
+    """Settings of the plant file."""
+
+    answer_ms: int
+    silent: bool
+    in_flight: int
+    rate: int
+    clients: int
+
+
+class TransferRow(Document, frozen=True):
+    """Transfer under way: address of the slave, and protocol."""
+
+    address: int
+    protocol: str
+
+
+class GatewayClientRow(Document, frozen=True, kw_only=True):
+    """Client of a gateway."""
+
+    transport: str
+    address: str
+    requests: int
+    repeated: int
+    errors: int
+    waiting: int
+    transfers: list[TransferRow]
+
+
+class MailboxFigures(Document, frozen=True, kw_only=True):
+    """Requests to one mailbox in one protocol; address 0 is the master."""
+
+    address: int
+    protocol: str
+    requests: int
+    replies: int
+    errors: dict[str, int]
+    last_error: str
+    mean_us: float | None
+    slowest_us: float
+
+
+class GatewayRow(Document, frozen=True, kw_only=True):
+    """One gateway of an answer to all three methods."""
+
+    station: str
+    port: str
+    served: list[str]
+    state: Literal["running", "stopped"]
+    turned_away: int
+    settings: GatewaySettings
+    clients: list[GatewayClientRow]
+    slaves: list[MailboxFigures]
+
+
+GATEWAY_START = Method("gateway_start", GatewayParameters, list[GatewayRow])
+GATEWAY_STOP = Method("gateway_stop", GatewayParameters, list[GatewayRow])
+GATEWAY_STATUS = Method("gateway_status", GatewayParameters, list[GatewayRow])

@@ -1,5 +1,7 @@
-"""Mailbox gateways (ETG.8200): mailbox messages from Ethernet to slaves and to the master.
+"""Core of the mailbox gateway (ETG.8200), its high-nibble dialect, and its clients.
 
-What a gateway decides stands here without sockets and clocks: what a message is, whom it is for,
-whether it may pass and what goes back.  Beside it are the clients of any gateway, which have both.
+``requests`` decodes destinations and operations of requests and encodes error answers;
+``error_table`` relates the error codes of all protocols; ``request_tracker`` limits clients;
+``dialect`` is the codec of the dialect.  ``client`` and ``async_client`` are clients of any
+gateway, with ``conversations`` as their common core and ``slaves`` to read the slaves of a master.
 """

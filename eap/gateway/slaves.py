@@ -10,7 +10,7 @@ from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.gateway.address import VIRTUAL_BIT
+from eap.gateway.requests import VIRTUAL_BIT
 from eap.od.abort import SdoAbortError
 
 NOT_TOLD = (SdoAbortError, MailboxRefusedError, MailboxTimeoutError)

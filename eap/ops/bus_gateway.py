@@ -19,8 +19,8 @@ from devicebus.wire.register import AlStatus
 from eap.codec.mailbox import MailboxError
 from eap.codec.soe import SoeErrorCode
 from eap.errors import ConfigError, EapError
-from eap.gateway.address import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.client import GatewayClient
+from eap.gateway.requests import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.slaves import NOT_TOLD, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.ops.bus_session import Begin, Slave, choose, no_mailbox

@@ -42,28 +42,23 @@ from eap.runtime.startup import Startup, Step, no_step
 from eap.runtime.station_image import StationImage
 from eap.runtime.store import StationStore, plant_folder
 from eap.services.ads.station_ads import StationAds
-from eap.services.control.ams_methods import AmsMethods
-from eap.services.control.audit import Audit
-from eap.services.control.audit_file import AuditFile
-from eap.services.control.bus_methods import Buses
+from eap.services.control.audit import Audit, AuditFile
+from eap.services.control.bus_methods import Buses, GatewayMethods
 from eap.services.control.control_server import ControlServer
 from eap.services.control.device_methods import DeviceMethods
-from eap.services.control.gateway_methods import GatewayMethods
 from eap.services.control.methods import Methods
-from eap.services.control.route_methods import RouteMethods
-from eap.services.control.routing_methods import RoutingMethods
+from eap.services.control.route_methods import AmsMethods, RouteMethods, RoutingMethods
 from eap.services.control.status import (
     ProcessMeter,
     SharedAnswer,
     appliance_status,
     take_snapshot,
 )
-from eap.services.device.engine_client import EngineClient
 from eap.services.device.image_values import ImageValues
 from eap.services.device.monitoring import SubscriberWatch, open_subscriber_probes
 from eap.services.device.sources import SourcePlayer
 from eap.services.device.station_device import StationDevice
-from eap.services.device.station_keeper import StationEngine, StationKeeper
+from eap.services.device.station_keeper import EngineClient, StationEngine, StationKeeper
 from eap.services.engine_link import EngineLink
 from eap.services.rate_limits import LimitedLogHandler, caused_by
 from eap.services.routing.route_rows import RouterView, interruption_findings

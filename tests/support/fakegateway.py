@@ -25,7 +25,7 @@ from eap.codec.soe import SoeAttribute
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import MasterDictionary
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import refuse
+from eap.gateway.requests import refuse
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.od.profiles.master1100 import MasterLive

@@ -16,10 +16,9 @@ from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
 from eap.runtime.bus_request import SlaveDescription
-from eap.services.gateway.client_session import SessionCodec
-from eap.services.slaves.bus_client import BusClient
-from eap.services.slaves.local_slave import LocalSlave
-from eap.services.slaves.mailbox_queue import MailboxTurn
+from eap.services.gateway.sessions import SessionCodec
+from eap.services.slaves.access import LocalSlave
+from eap.services.slaves.bus_client import BusClient, MailboxTurn
 from tests.support.mailbox import Line, open_line
 
 T = TypeVar("T")

@@ -1,22 +1,92 @@
-"""What the ADS services of a station have in common: ports, whom they tell, one state for all."""
+"""Execution of ADS requests, and the base of the ADS services of a station.
+
+The operations of a sum command are executed one after the other.  An operation that does not wait
+is answered without a task.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Mapping, Sequence
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from secrets import randbelow
 from time import monotonic_ns
+from typing import TypeAlias
 
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import Client, NotificationTable
-from eap.ads.operation import Operation, OperationOutcome, WriteControl
-from eap.ads.space import AdsSpace, states_of
-from eap.codec.ads import AdsDeviceInfo, AdsStates
-from eap.services.ads.ads_requests import begin_answer
-from eap.services.ads.state_control import control_state
+from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome, WriteControl
+from eap.ads.request import Outcomes, encode_outcome, take_request
+from eap.ads.space import AdsSpace, al_state_for, states_of
+from eap.codec.ads import AdsDeviceInfo, AdsError, AdsStates, device_name
+from eap.errors import ControlError
 from eap.services.device.station_device import StationDevice
 from eap.services.routing.service import LocalRequest
+from eap.services.slaves.bus_client import BusDescription
+
+_AT_ONCE = 64
+"""Operations of a sum command after which others have a turn."""
+
+Perform: TypeAlias = Callable[[Operation], OperationOutcome | Awaitable[OperationOutcome]]
+"""Does one operation, at once or by the end of what it returns."""
+
+
+def begin_answer(command: int, body: bytes, perform: Perform) -> AmsAnswer | Awaitable[AmsAnswer]:
+    """Have *perform* do what a request asks for; return the answer, or what is to be awaited.
+
+    Args:
+        command: Of the AMS header.
+        body: What follows the header.
+        perform: Does one operation.
+    """
+    request = take_request(command, body)
+    if isinstance(request, AmsAnswer):
+        return request
+    if request.sum_group:
+        return _go_through(Outcomes(request), request.operations, perform)
+    outcome = perform(request.operations[0])
+    if isinstance(outcome, OperationOutcome):
+        return _encode(command, outcome)
+    return _finish(command, outcome)
+
+
+async def answer_request(command: int, body: bytes, perform: Perform) -> AmsAnswer:
+    """Return the answer to a request; the arguments are those of :func:`begin_answer`."""
+    answer = begin_answer(command, body, perform)
+    return answer if isinstance(answer, AmsAnswer) else await answer
+
+
+async def _finish(command: int, outcome: Awaitable[OperationOutcome]) -> AmsAnswer:
+    return _encode(command, await outcome)
+
+
+def _encode(command: int, outcome: OperationOutcome) -> AmsAnswer:
+    return AmsAnswer(encode_outcome(command, outcome), why=outcome.why)
+
+
+async def _go_through(
+    outcomes: Outcomes, operations: Sequence[Operation], perform: Perform
+) -> AmsAnswer:
+    for number, operation in enumerate(operations, start=1):
+        outcome = perform(operation)
+        outcomes.add(outcome if isinstance(outcome, OperationOutcome) else await outcome)
+        if not number % _AT_ONCE:
+            await asyncio.sleep(0)
+    return outcomes.answer()
+
+
+async def control_state(device: StationDevice, request: WriteControl) -> OperationOutcome:
+    """Bring *device* to a state; the outcome says why it is not there."""
+    try:
+        fault = (await device.request_state(al_state_for(request.ads_state))).fault
+    except AdsRefusedError as exc:
+        return OperationOutcome(
+            exc.result, why=f"no state belongs to ADS state {request.ads_state}"
+        )
+    except ControlError as exc:
+        return OperationOutcome(AdsError.BUSY, why=str(exc))
+    return OperationOutcome() if fault is None else OperationOutcome(AdsError.STATE, why=fault.text)
 
 
 def first_handle() -> int:
@@ -76,3 +146,17 @@ class AdsService:
     def states(self) -> AdsStates:
         """Return what ReadState tells."""
         return states_of(self.device.status.state)
+
+
+def device_info(name: str, release: str) -> AdsDeviceInfo:
+    """Return what a device of this software tells of itself; *release* is such as ``0.1.0``."""
+    numbers = [int(part) if part.isdecimal() else 0 for part in release.split(".")]
+    major, minor, build = (*numbers, 0, 0, 0)[:3]
+    return AdsDeviceInfo(major & 0xFF, minor & 0xFF, build & 0xFFFF, device_name(name))
+
+
+def check_up(name: str, bus: BusDescription) -> None:
+    """Raise AdsRefusedError if a bus is not up."""
+    if not bus.is_up:
+        why = f"{name} is not up: {bus.fault or 'it begins'}"
+        raise AdsRefusedError(AdsError.HOST_UNREACHABLE, why)

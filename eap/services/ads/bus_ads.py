@@ -1,8 +1,12 @@
-"""ADS service behind the NetID of a bus port: the master at port 0xFFFF, slaves at their address.
+"""ADS services of one bus port: the master at port 0xFFFF, slaves at their station addresses.
 
-Rule 1: the operations of a request are done one after the other, and one that cannot be done by the
-end of the request's time is answered so: an answer comes before routers and clients give up.
-Rule 2: requests do not wait for each other here; turns at a slave's mailbox are the bus client's.
+Index groups are those of ETG.1020 (AoE) and of Ads.h of the TwinCAT SDK.  A group goes to the slave
+by the mailbox protocol that serves it.  A group that no other protocol serves, or whose protocol
+the slave does not support, is forwarded by AoE.
+
+Rule 1: the operations of a request are executed one after the other.  An operation that does not
+fit into the time of the request is answered with a timeout: routers and clients wait longer.
+Rule 2: requests do not wait for each other here; the bus client queues them for the mailboxes.
 """
 
 from __future__ import annotations
@@ -10,29 +14,343 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Container
 from functools import partial
-from itertools import islice
-from typing import TypeAlias
+from itertools import count, islice
+from typing import NamedTuple, TypeAlias
 
+from devicebus.errors import MailboxTimeoutError, SoeError
+from devicebus.wire.sii import SiiProtocol
 from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import Client
 from eap.ads.operation import (
     AdsRefusedError,
     Operation,
     OperationOutcome,
+    Read,
     ReadDeviceInfo,
     ReadState,
+    ReadWrite,
+    Write,
+    WriteControl,
 )
-from eap.codec.ads import AdsError
-from eap.codec.ams import DEVICE_PORT
-from eap.errors import EapError
+from eap.ads.request import decode_outcome, encode_query
+from eap.ads.space import DeviceDataSpace, al_state_for, states_of
+from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoPlace, SoePlace, device_name
+from eap.codec.ams import DEVICE_PORT, AmsHeader, decode_packet
+from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
+from eap.codec.mailbox import VoeHeader
+from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Element, Idn, SoeErrorCode
+from eap.errors import EapError, TruncatedError
 from eap.gateway.error_table import ads_result
 from eap.ids import NetId
-from eap.services.ads.ads_requests import answer_request
-from eap.services.ads.master_ads import MasterAds, Send, StateRequests, check_up
-from eap.services.ads.slave_ads import SlaveAds
+from eap.runtime.bus_request import SlaveDescription, no_mailbox
+from eap.services.ads.ads_service import answer_request, check_up
+from eap.services.ads.master_ads import MasterAds, Send, StateRequests
+from eap.services.ads.slave_files import SlaveFiles
 from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.routing.service import LocalRequest
+from eap.services.slaves.access import LocalSlave
 from eap.services.slaves.bus_client import BusClient
+from eap.services.tasks import TaskSet
+
+COMMAND_ANSWER_S = 3.0
+"""How long one request waits for a procedure command to end."""
+EXECUTION_S = 60.0
+"""How long a procedure command may take."""
+KEEP_S = 30.0
+"""How long the result of a procedure command is kept for a repeated request."""
+MAX_COMMANDS = 64
+"""Procedure commands that go on or are kept at a time, of all drives."""
+_POLL_S = 0.02
+_START = COMMAND_START.to_bytes(2, "little")
+_CLEAR = COMMAND_CLEAR.to_bytes(2, "little")
+_OCTET = 0xFF
+_NET_ID_OFFSET = 3
+_OTHER_ADDRESS = frozenset((AdsError.TARGET_MACHINE, AdsError.TARGET_PORT))
+_PROTOCOLS: dict[int, SiiProtocol] = {
+    IndexGroup.SDO: SiiProtocol.COE,
+    IndexGroup.OBJECT_LIST: SiiProtocol.COE,
+    IndexGroup.OBJECT_DESCRIPTION: SiiProtocol.COE,
+    IndexGroup.ENTRY_DESCRIPTION: SiiProtocol.COE,
+    IndexGroup.SOE: SiiProtocol.SOE,
+    IndexGroup.VOE: SiiProtocol.VOE,
+} | dict.fromkeys(SlaveFiles.groups, SiiProtocol.FOE)
+
+
+class SlaveTarget(NamedTuple):
+    """A slave, and the client that wants something from it."""
+
+    slave: SlaveDescription
+    client: Client
+    access: LocalSlave
+
+
+class SlaveAds:
+    """All slaves of a bus port.
+
+    Args:
+        bus: With these slaves.
+        net_id: Of the bus port.
+        states: Takes requests for states.
+    """
+
+    def __init__(self, bus: BusClient, net_id: NetId, states: StateRequests) -> None:
+        self._bus = bus
+        self._states = states
+        self._files = SlaveFiles()
+        self._commands = ProcedureCommands()
+        self._forwarder = AoeForwarder(net_id)
+
+    async def perform(
+        self, slave: SlaveDescription, client: Client, operation: Operation
+    ) -> OperationOutcome:
+        """Do one operation; raise AdsRefusedError, or the errors of a SlaveAccess."""
+        match operation:
+            case ReadState():
+                data = states_of(slave.state).encode()
+            case ReadDeviceInfo():
+                data = _device_info(slave).encode()
+            case WriteControl(ads_state):
+                data = b""
+                self._states.request(slave.station, al_state_for(ads_state))
+            case Read(IndexGroup.DEVICE_DATA, offset, length):
+                states = DeviceDataSpace(lambda: states_of(slave.state))
+                data = states.read(IndexGroup.DEVICE_DATA, offset, length)
+            case Read() | Write() | ReadWrite():
+                target = SlaveTarget(slave, client, LocalSlave(self._bus, slave, client))
+                protocol = _protocol(slave, operation.group)
+                if protocol is SiiProtocol.AOE:
+                    return await self._forwarder.perform(target, operation)
+                data = await self._exchange(protocol, target, operation)
+            case _:
+                why = "slaves give no notifications here: read what they have, again and again"
+                raise AdsRefusedError(AdsError.SERVICE, why)
+        return OperationOutcome(data=data)
+
+    async def _exchange(
+        self, protocol: SiiProtocol, target: SlaveTarget, operation: Read | Write | ReadWrite
+    ) -> bytes:
+        length = 0 if isinstance(operation, Write) else operation.length
+        match protocol:
+            case SiiProtocol.FOE:
+                found = await self._files.perform(
+                    target.access, target.slave.station, target.client, operation
+                )
+            case SiiProtocol.VOE:
+                found = await _exchange_vendor(target.access, operation)
+            case _:
+                group, offset = operation.group, operation.offset
+                if isinstance(operation, Write) or (
+                    isinstance(operation, ReadWrite) and operation.data
+                ):
+                    await self._write(target, group, offset, operation.data)
+                if isinstance(operation, Write):
+                    return b""
+                found = await self._read(target, group, offset)
+        if len(found) > length:
+            why = f"{len(found)} octets, the client has room for {length}"
+            raise AdsRefusedError(AdsError.SIZE, why)
+        return found
+
+    async def _read(self, target: SlaveTarget, group: int, offset: int) -> bytes:
+        """Return an entry, an object, a list or a description, or elements of an IDN."""
+        access, index, low = target.access, offset >> 16, offset & 0xFFFF
+        match group:
+            case IndexGroup.SOE:
+                place = _soe_place(offset)
+                elements = Element.DATA_STATE if place.is_command else place.elements
+                return await access.read_elements(place.idn, elements, drive=place.drive)
+            case IndexGroup.SDO:
+                entry = _sdo_place(offset)
+                return await access.read_object(
+                    index, entry.subindex, complete=bool(entry.is_complete)
+                )
+            case IndexGroup.OBJECT_LIST:
+                return await access.read_info(
+                    SdoInfoOpcode.LIST_REQUEST, ListRequest(index).encode()
+                )
+            case IndexGroup.OBJECT_DESCRIPTION:
+                return await access.read_info(
+                    SdoInfoOpcode.OBJECT_REQUEST, ObjectRequest(index).encode()
+                )
+        request = EntryRequest(index, low & 0xFF, low >> 8).encode()
+        return await access.read_info(SdoInfoOpcode.ENTRY_REQUEST, request)
+
+    async def _write(self, target: SlaveTarget, group: int, offset: int, data: bytes) -> None:
+        """Write an entry, an object or an element, or execute a procedure command."""
+        access = target.access
+        if group == IndexGroup.SDO:
+            entry = _sdo_place(offset)
+            await access.write_object(
+                entry.index, entry.subindex, data, complete=bool(entry.is_complete)
+            )
+            return
+        if group != IndexGroup.SOE:
+            raise AdsRefusedError(AdsError.INDEX_GROUP)
+        place = _soe_place(offset)
+        if not place.is_command:
+            await access.write_elements(place.idn, place.elements, data, drive=place.drive)
+        elif data in (b"", _START):
+            await self._commands.execute(access, target.slave.station, place)
+        else:
+            raise AdsRefusedError(AdsError.VALUE, "a command is started by 3, or by no data")
+
+
+class ProcedureCommands:
+    """Procedure commands of drives, from their start to their clearing (IEC 61800-7-300).
+
+    Own format: a request is answered BUSY while the command takes longer than an answer may, and
+    the same request finds its result.
+    """
+
+    def __init__(self) -> None:
+        self._tasks: dict[tuple[int, int, int], asyncio.Task[None]] = {}
+        self._running = TaskSet("procedure commands")
+
+    async def execute(self, access: LocalSlave, station: int, place: SoePlace) -> None:
+        """Execute a command, or wait on for one that goes on."""
+        key = station, place.drive, place.idn
+        task = self._tasks.get(key)
+        if task is None:
+            if len(self._tasks) >= MAX_COMMANDS:
+                raise AdsRefusedError(AdsError.NO_MEMORY, f"{MAX_COMMANDS} commands go on already")
+            task = self._running.start_awaited(_execute(access, place))
+            self._tasks[key] = task
+            task.add_done_callback(lambda task: self._forget_later(key, task))
+        await asyncio.wait({task}, timeout=COMMAND_ANSWER_S)
+        if not task.done():
+            idn = Idn.of(place.idn)
+            raise AdsRefusedError(AdsError.BUSY, f"{idn} is being executed: ask again")
+        self._forget(key, task)
+        task.result()
+
+    def _forget_later(self, key: tuple[int, int, int], task: asyncio.Task[None]) -> None:
+        if not task.cancelled():
+            task.exception()  # the client may never ask again
+            asyncio.get_running_loop().call_later(KEEP_S, self._forget, key, task)
+
+    def _forget(self, key: tuple[int, int, int], task: asyncio.Task[None]) -> None:
+        if self._tasks.get(key) is task:
+            del self._tasks[key]
+
+
+async def _execute(access: LocalSlave, place: SoePlace) -> None:
+    """Execute a command; between two looks at its state the drive serves other clients."""
+    what = f"procedure command {Idn.of(place.idn)} at drive {place.drive}"
+    loop = asyncio.get_running_loop()
+    await access.write_elements(place.idn, Element.VALUE, _START, drive=place.drive)
+    end_s = loop.time() + EXECUTION_S
+    state = DataState.BUSY
+    while state & DataState.EXECUTING and not state & DataState.ERROR and loop.time() <= end_s:
+        await asyncio.sleep(_POLL_S)
+        octets = await access.read_elements(place.idn, Element.DATA_STATE, drive=place.drive)
+        state = DataState(int.from_bytes(octets[:2], "little") & DataState.FAILED)
+    await access.write_elements(place.idn, Element.VALUE, _CLEAR, drive=place.drive)
+    if state & DataState.ERROR:
+        raise SoeError(f"{what}: failed", code=SoeErrorCode.GENERAL)
+    if state & DataState.EXECUTING:
+        raise MailboxTimeoutError(f"{what}: not done after {EXECUTION_S:g} s")
+
+
+class AoeForwarder:
+    """Requests for slaves that have ADS services themselves, passed on by AoE (ETG.1020).
+
+    A slave gets the NetID of its bus port and its station address as its own address before the
+    first request, and again when it answers that it has another one: it forgets it in a restart.
+
+    Args:
+        net_id: Of the bus port.
+    """
+
+    def __init__(self, net_id: NetId) -> None:
+        self._net_id = net_id
+        self._addressed: set[int] = set()
+        self._numbers = count(1)
+
+    async def perform(self, target: SlaveTarget, operation: Operation) -> OperationOutcome:
+        """Have the slave do an operation; return its outcome."""
+        client, station = target.client, target.slave.station
+        source = client.net_id, client.port
+        if station not in self._addressed:
+            await self._set_address(target)
+            self._addressed.add(station)
+        outcome = await self._exchange(target, operation, source)
+        if outcome.result in _OTHER_ADDRESS:
+            await self._set_address(target)
+            outcome = await self._exchange(target, operation, source)
+        return outcome
+
+    async def _set_address(self, target: SlaveTarget) -> None:
+        """Give a slave its address; its refusal changes nothing."""
+        write = Write(IndexGroup.ADDRESS, _NET_ID_OFFSET, bytes(self._net_id))
+        await self._exchange(target, write, (self._net_id, target.slave.station))
+
+    async def _exchange(
+        self, target: SlaveTarget, operation: Operation, source: tuple[NetId, int]
+    ) -> OperationOutcome:
+        command, body = encode_query(operation)
+        # Clients use the same invoke ids, and a late answer is recognised by its own.
+        number = next(self._numbers) & 0xFFFF_FFFF
+        header = AmsHeader(
+            self._net_id, target.slave.station, *source, command, length=len(body), invoke_id=number
+        )
+        answer, data = decode_packet(await target.access.exchange_ads(header, body))
+        return decode_outcome(command, answer.error_code, bytes(data))
+
+
+def _protocol(slave: SlaveDescription, group: int) -> SiiProtocol:
+    """Return the protocol by which a slave serves a group; raise AdsRefusedError for none."""
+    protocol = _PROTOCOLS.get(group, SiiProtocol.AOE)
+    if not slave.protocols & (protocol | SiiProtocol.AOE):
+        if protocol is SiiProtocol.AOE:
+            raise AdsRefusedError(AdsError.INDEX_GROUP)
+        name = str(protocol.name).replace("OE", "oE")
+        why = f"slave {slave.station} does not speak {name}"
+        raise AdsRefusedError(AdsError.SERVICE, why)
+    if not slave.state:
+        raise AdsRefusedError(AdsError.TIMEOUT, f"slave {slave.station} does not answer")
+    if not slave.to_slave:
+        raise no_mailbox(slave)
+    return protocol if slave.protocols & protocol else SiiProtocol.AOE
+
+
+async def _exchange_vendor(access: LocalSlave, operation: Read | Write | ReadWrite) -> bytes:
+    """Send a message with its VoE header; ReadWrite, own format, returns the one that answers it.
+
+    Ads.h of the TwinCAT SDK names the group, and that a Write is a message to the mailbox.
+    """
+    if isinstance(operation, Read):
+        raise AdsRefusedError(AdsError.SERVICE)
+    try:
+        VoeHeader.decode(operation.data)
+    except TruncatedError as exc:
+        raise AdsRefusedError(AdsError.SIZE, str(exc)) from None
+    if isinstance(operation, ReadWrite):
+        return await access.exchange_vendor(operation.data)
+    await access.send_vendor(operation.data)
+    return b""
+
+
+def _sdo_place(offset: int) -> SdoPlace:
+    """Take the offset apart; the subindex means nothing with complete access."""
+    place = SdoPlace.decode(offset.to_bytes(4, "little"))
+    if place.reserved:
+        raise AdsRefusedError(AdsError.INDEX_OFFSET)
+    return SdoPlace(0, 1, index=place.index) if place.is_complete else place
+
+
+def _soe_place(offset: int) -> SoePlace:
+    place = SoePlace.decode(offset.to_bytes(4, "little"))
+    if place.reserved:
+        raise AdsRefusedError(AdsError.INDEX_OFFSET)
+    return place
+
+
+def _device_info(slave: SlaveDescription) -> AdsDeviceInfo:
+    """Name the slave as its bus does; the version is its revision, from the highest octet down."""
+    revision = slave.revision
+    high, middle = revision >> 24 & _OCTET, revision >> 16 & _OCTET
+    return AdsDeviceInfo(high, middle, revision & 0xFFFF, device_name(slave.name))
+
 
 ANSWER_S = 4.0
 """How long a request may take; routers give up after 4.5 s, clients after 5 s."""

@@ -43,10 +43,9 @@ from eap.errors import EapError, MalformedError, TruncatedError
 from eap.gateway.error_table import ads_result
 from eap.ids import NetId
 from eap.od.model import OdState
-from eap.services.ads.eap_ads import device_info
+from eap.services.ads.ads_service import check_up, device_info
 from eap.services.device.master_values import MasterDictionaryProvider
-from eap.services.slaves.bus_client import BusClient
-from eap.services.slaves.bus_view import BusDescription, BusView
+from eap.services.slaves.bus_client import BusClient, BusView
 from eap.services.tasks import TaskSet
 
 LOOK_S = 0.05
@@ -308,13 +307,6 @@ class RawCommands:
             _behind_slaves(head, slaves).encode() + reply.data + WorkingCounter(reply.wkc).encode()
             for head, reply in zip(self._heads, replies[1:], strict=True)
         )
-
-
-def check_up(name: str, bus: BusDescription) -> None:
-    """Raise AdsRefusedError if a bus is not up."""
-    if not bus.is_up:
-        why = f"{name} is not up: {bus.fault or 'it begins'}"
-        raise AdsRefusedError(AdsError.HOST_UNREACHABLE, why)
 
 
 def _behind_slaves(head: DatagramHeader, slaves: int) -> DatagramHeader:

@@ -1,22 +1,341 @@
-"""All ADS services of a station, but those of its buses: given to its router, and kept going."""
+"""ADS services of a station: system service, router and EAP ports.
+
+The system service is at the NetID of the router and at those of the EAP ports: a TwinCAT system has
+one NetID for all, and clients use the one that they were given.
+
+An EAP port serves its dictionary, its state and the variables of its station.  Requests that change
+a dictionary or a state go through the job queue of the device, since the engine has to agree; all
+others are answered at once.
+"""
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from secrets import randbelow
+from time import monotonic_ns
+from typing import Any, Protocol
+
+from eap.ads.endpoint import AmsAnswer
+from eap.ads.io import IoDevice, IoDeviceType, IoSpace, NoSegmentSpace
+from eap.ads.notifications import Client
+from eap.ads.objects import ObjectSpace
+from eap.ads.operation import (
+    AdsRefusedError,
+    Operation,
+    OperationOutcome,
+    ReadWrite,
+    Write,
+    WriteControl,
+)
+from eap.ads.space import SystemSpace
+from eap.ams.record import Outcome, Stats
+from eap.ams.report import ConnectionReport, RouteReport, RouteState
+from eap.ams.routes import Route, RouteTable
+from eap.codec.ads import (
+    AdsDeviceInfo,
+    AdsError,
+    AdsRange,
+    AdsState,
+    AdsSystemState,
+    IndexGroup,
+    encode_result,
+)
+from eap.codec.ams import DEVICE_PORT, IO_PORT, SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
-from eap.ids import NetId
-from eap.pd.spec import StationSpec
+from eap.errors import ControlError, ImageError
+from eap.gateway.error_table import ads_result
+from eap.ids import InterfaceUri, MacAddr, NetId
+from eap.od.abort import SdoAbortError
+from eap.od.model import OdState
+from eap.od.profiles.router9000 import RouterLive
+from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.runtime.station_image import StationImage
-from eap.services.ads.ads_service import AdsService
-from eap.services.ads.eap_ads import EapAds, device_info
-from eap.services.ads.image_variables import StationSymbols
-from eap.services.ads.notification_pump import NotificationPump
-from eap.services.ads.router_ads import RouterAds
-from eap.services.ads.router_values import LiveRouter
-from eap.services.ads.system_ads import SystemAds
+from eap.services.ads.ads_service import AdsService, device_info
+from eap.services.ads.station_symbols import NotificationPump, StationSymbols
 from eap.services.device.station_device import StationDevice
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.tracing import RouteQuery
+
+_RESTART_INDEX = randbelow(0xFFFF) + 1
+"""Another one at each start of this process, by which others know that subscriptions are gone."""
+
+
+class SystemAds(AdsService):
+    """The system service behind one NetID.
+
+    Args:
+        device: The EAP device of the station, whose state is that of the whole.
+        info: What ReadDeviceInfo tells.
+    """
+
+    def __init__(self, device: StationDevice, info: AdsDeviceInfo) -> None:
+        super().__init__(device, info, {SYSTEM_PORT: [SystemSpace(self._system_state)]})
+        self._info = info
+
+    def perform(
+        self, port: int, client: Client, operation: Operation
+    ) -> OperationOutcome | Awaitable[OperationOutcome]:
+        """Do one operation; another state is waited for."""
+        if isinstance(operation, WriteControl) and operation.ads_state == AdsState.RESET:
+            # TwinCAT's system service goes to RUN by it; ads-client knows no other way.
+            operation = operation._replace(ads_state=AdsState.RUN)
+        return super().perform(port, client, operation)
+
+    def _system_state(self) -> AdsSystemState:
+        states, info = self.states(), self._info
+        return AdsSystemState(
+            states.ads_state,
+            states.device_state,
+            restart_index=_RESTART_INDEX,
+            version=info.major,
+            revision=info.minor,
+            build=info.build,
+        )
+
+
+_INTERFACES = Path("/sys/class/net")
+_BUS_STATE = "state"
+"""Variable of a bus port."""
+
+
+class ReportingRouter(Protocol):
+    """What is needed of the router of a station."""
+
+    @property
+    def table(self) -> RouteTable:
+        """Its routes."""
+
+    def report(self, route: Route) -> RouteReport:
+        """Return what is known of a route."""
+
+    def connections(self) -> list[ConnectionReport]:
+        """Return who asks."""
+
+    def stats(self) -> Stats:
+        """Return what is going on, and what was."""
+
+
+class LiveRouter:
+    """The values of one station's router.
+
+    Args:
+        router: That runs.
+        device: The EAP device of the station.
+        image: Where the states of buses are.
+        ports: Of the station.
+    """
+
+    def __init__(
+        self,
+        router: ReportingRouter,
+        device: StationDevice,
+        image: StationImage,
+        ports: Sequence[PortSpec],
+    ) -> None:
+        self._router = router
+        self._device = device
+        self._image = image
+        self._ports: Mapping[str, PortSpec] = {port.name: port for port in ports}
+        self._routes: tuple[Route, ...] = ()
+        self._version = -1
+
+    def number(self, key: RouterLive) -> int:
+        """Return what *key* stands for, of the router as a whole."""
+        if key is RouterLive.STATE:
+            return int(self._device.status.state)
+        if key is RouterLive.CONNECTIONS:
+            return len(self._router.connections())
+        stats = self._router.stats()
+        if key in _OUTCOMES:
+            return stats.counts[_OUTCOMES[key]]
+        return _FIGURES[key](stats)
+
+    def state_of(self, port: str) -> int:
+        """Return the state of a port; of a bus without described slaves it is not known."""
+        if self._ports[port].kind is PortKind.EAP:
+            return int(self._device.status.state)
+        with suppress(ImageError):
+            return int(self._image.image.read(f"{port}.{_BUS_STATE}"))
+        return 0
+
+    def mac_of(self, port: str) -> bytes:
+        """Return the MAC address of the Ethernet interface that a port is bound to, if any."""
+        uri = InterfaceUri.parse(self._ports[port].interface)
+        if uri.scheme == "ethernet":
+            with suppress(OSError, ValueError):
+                text = (_INTERFACES / uri.host / "address").read_text().strip()
+                return bytes(MacAddr.parse(text))
+        return bytes(6)
+
+    def routes(self) -> Sequence[Route]:
+        """Return all routes in their order."""
+        table = self._router.table
+        if table.version != self._version:
+            self._version = table.version
+            self._routes = tuple(table)
+        return self._routes
+
+    def of_route(self, key: RouterLive, route: object) -> Any:
+        """Return what *key* stands for, of one of the routes."""
+        assert isinstance(route, Route)  # noqa: S101  they come from here
+        reader = _OF_ROUTE.get(key)
+        return _OF_REPORT[key](self._router.report(route)) if reader is None else reader(route)
+
+
+_OUTCOMES = {
+    RouterLive.ANSWERED: Outcome.ANSWERED,
+    RouterLive.FAILED: Outcome.FAILED,
+    RouterLive.DENIED: Outcome.DENIED,
+    RouterLive.LOOPS: Outcome.LOOP,
+    RouterLive.LATE: Outcome.LATE,
+    RouterLive.DROPPED: Outcome.DROPPED,
+}
+_FIGURES: dict[RouterLive, Callable[[Stats], int]] = {
+    RouterLive.WAITING: lambda stats: stats.in_flight,
+    RouterLive.ROUTES: lambda stats: stats.routes,
+    RouterLive.SUBSCRIPTIONS: lambda stats: stats.subscriptions,
+}
+_STATES = {
+    RouteState.UNKNOWN: 0,
+    RouteState.UP: 1,
+    RouteState.DOWN: 2,
+    RouteState.CLIENT: 3,
+}
+_OF_ROUTE: dict[RouterLive, Callable[[Route], Any]] = {
+    RouterLive.ROUTE_NET_ID: lambda route: route.net_id,
+    RouterLive.ROUTE_OCTETS: lambda route: route.octets,
+    RouterLive.ROUTE_NAME: lambda route: route.name,
+    RouterLive.ROUTE_TRANSPORT: lambda route: route.hop.transport,
+    RouterLive.ROUTE_ADDRESS: lambda route: route.hop.connection,
+    RouterLive.ROUTE_ORIGIN: lambda route: int(route.origin),
+}
+_OF_REPORT: dict[RouterLive, Callable[[RouteReport], Any]] = {
+    RouterLive.ROUTE_STATE: lambda report: _STATES[report.state],
+    RouterLive.ROUTE_ROUND_TRIP: lambda report: (report.round_trip_ns or 0) // 1000,
+    RouterLive.ROUTE_REQUESTS: lambda report: report.traffic.requests,
+    RouterLive.ROUTE_ERRORS: lambda report: report.traffic.errors,
+    RouterLive.ROUTE_LAST_ERROR: lambda report: report.why or report.traffic.last_error,
+}
+
+
+_TYPES = {PortKind.EAP: IoDeviceType.EAP, PortKind.BUS: IoDeviceType.MASTER}
+
+
+class RouterAds(AdsService):
+    """What clients reach at the NetID of a station.
+
+    Args:
+        station: Whose router it is.
+        device: The EAP device of the station, whose state is that of the whole.
+        dictionary: Of the router.
+        info: What ReadDeviceInfo tells.
+    """
+
+    def __init__(
+        self,
+        station: StationSpec,
+        device: StationDevice,
+        dictionary: RouterDictionary,
+        info: AdsDeviceInfo,
+    ) -> None:
+        io = IoSpace(_io_devices(station))
+        objects = ObjectSpace(dictionary, lambda: OdState.OP, ads_result)
+        super().__init__(device, info, {IO_PORT: [io], DEVICE_PORT: [objects]})
+
+    def perform(
+        self, port: int, client: Client, operation: Operation
+    ) -> OperationOutcome | Awaitable[OperationOutcome]:
+        """Do one operation at an AMS port; the I/O server has no state to go to."""
+        if port == IO_PORT:
+            return self.devices[port].perform(operation, client, monotonic_ns())
+        return super().perform(port, client, operation)
+
+
+def _io_devices(station: StationSpec) -> Iterator[IoDevice]:
+    for number, port in enumerate(station.ports, start=1):
+        yield IoDevice(number, port.name, _TYPES[port.kind], NetId.parse(port.net_id))
+
+
+_READ, _DONE = AmsCommand.READ.value, AdsError.NONE.value  # members of enums are slow
+_BUSY_PAUSE_S = 0.005
+_BUSY_PAUSES = 20
+"""Before a client is told that a writer has stopped in the middle of writing."""
+
+
+class EapAds(AdsService):
+    """What clients reach at the NetID of one EAP port.
+
+    Args:
+        device: Of the station.
+        port: Name of the port.
+        symbols: The station's variables.
+        info: What ReadDeviceInfo tells.
+    """
+
+    def __init__(
+        self, device: StationDevice, port: str, symbols: StationSymbols, info: AdsDeviceInfo
+    ) -> None:
+        objects = ObjectSpace(device.dictionaries[port], device.od_state, ads_result)
+        super().__init__(device, info, {DEVICE_PORT: [objects, symbols, NoSegmentSpace()]})
+        self._port = port
+        self._ads = self.devices[DEVICE_PORT]
+
+    def answer_now(self, header: AmsHeader, body: bytes) -> AmsAnswer | None:
+        """Answer a Read that nothing speaks against; None for all else, which :meth:`answer` does.
+
+        Most requests are such.
+        """
+        if header.command != _READ or len(body) != AdsRange.SIZE:
+            return None
+        asked = AdsRange.decode(body)
+        try:
+            data = self._ads.read(asked.group, asked.offset, asked.length)
+        except AdsRefusedError:
+            return None
+        return AmsAnswer(encode_result(_DONE, data))
+
+    def perform(
+        self, port: int, client: Client, operation: Operation
+    ) -> OperationOutcome | Awaitable[OperationOutcome]:
+        """Do one operation; what changes objects or the state, or finds a writer, takes time."""
+        if isinstance(operation, WriteControl):
+            return super().perform(port, client, operation)
+        perform = partial(self._ads.perform, operation, client, monotonic_ns())
+        if _changes_objects(operation):
+            return self._change(perform)
+        outcome = perform()
+        if outcome.result == AdsError.BUSY and not isinstance(operation, Write):
+            return _try_again(perform)
+        return outcome
+
+    async def _change(self, perform: Callable[[], OperationOutcome]) -> OperationOutcome:
+        try:
+            return await self.device.change(self._port, perform)
+        except SdoAbortError as exc:
+            return OperationOutcome(ads_result(exc), why=str(exc))
+        except ControlError as exc:
+            return OperationOutcome(AdsError.BUSY, why=str(exc))
+
+
+async def _try_again(perform: Callable[[], OperationOutcome]) -> OperationOutcome:
+    """Wait for a writer in the middle of writing; one that died there is told."""
+    for _ in range(_BUSY_PAUSES):
+        await asyncio.sleep(_BUSY_PAUSE_S)
+        outcome = perform()
+        if outcome.result != AdsError.BUSY:
+            break
+    return outcome
+
+
+def _changes_objects(operation: Operation) -> bool:
+    if isinstance(operation, ReadWrite):
+        return operation.group == IndexGroup.SDO and bool(operation.data)
+    return isinstance(operation, Write) and operation.group == IndexGroup.SDO
 
 
 class StationAds:

@@ -1,29 +1,35 @@
-"""Methods of the control protocol for buses, with the state of one connection.
+"""Methods of the control protocol for buses, with the state of one connection, and for gateways.
 
-These methods wait for slaves and for turns, and with them only the connection that called.  When it
-ends, its requests are cancelled, and its open conversations are ended at the slaves too.
+Methods for buses wait for slaves and for turns, and block only the connection that called.  When
+the connection ends, its requests are cancelled, and its open conversations are ended at the slaves
+too.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import isawaitable
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import msgspec
 
 from devicebus.sim.spec import FaultKind
 from devicebus.wire.alstatus import AlState
 from eap.codec.mailbox import MailboxType
-from eap.control import bus as words
+from eap.control import bus as records
+from eap.control.bus import GatewayParameters, GatewayRow
 from eap.control.protocol import ErrorCode, of_station
 from eap.errors import ControlError, EapError
 from eap.pd.spec import PortKind, StationSpec
 from eap.runtime.bus_request import BusReport
-from eap.runtime.handover import PortName
-from eap.services.slaves.bus_client import BusClient
-from eap.services.slaves.mailbox_queue import MailboxTurn
+from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.services.slaves.bus_client import BusClient, MailboxTurn
 from eap.services.slaves.segment_link import SegmentLink
 from eap.suggest import suggest
+
+if TYPE_CHECKING:
+    from eap.services.gateway.gateway import MailboxGateway
 
 
 class Buses:
@@ -59,7 +65,7 @@ class Buses:
                 raise answer
         return found
 
-    def find(self, wanted: words.BusParameters) -> BusClient:
+    def find(self, wanted: records.BusParameters) -> BusClient:
         """Return the bus that parameters name; raise ControlError with the names there are."""
         station = of_station(wanted.station, self._stations)
         buses = [port.name for port in station.ports if port.kind is PortKind.BUS]
@@ -85,7 +91,7 @@ class _Held:
     """A conversation that a connection has open, with its turn."""
 
     def __init__(
-        self, turn: MailboxTurn, kind: MailboxType, opened: words.BusOpenParameters
+        self, turn: MailboxTurn, kind: MailboxType, opened: records.BusOpenParameters
     ) -> None:
         self.turn = turn
         self.kind = kind
@@ -102,14 +108,14 @@ class BusConnection:
         self._last = 0
         self._methods = dict(
             (
-                words.BUS_DESCRIBE.served_by(self._describe),
-                words.BUS_OPEN.served_by(self._open),
-                words.BUS_ASK.served_by(self._ask),
-                words.BUS_CLOSE.served_by(self._close),
-                words.BUS_TRANSFER.served_by(self._transfer),
-                words.BUS_BRING.served_by(self._bring),
-                words.BUS_FAULT.served_by(self._fault),
-                words.BUS_FORGET.served_by(self._forget),
+                records.BUS_DESCRIBE.served_by(self._describe),
+                records.BUS_OPEN.served_by(self._open),
+                records.BUS_ASK.served_by(self._ask),
+                records.BUS_CLOSE.served_by(self._close),
+                records.BUS_TRANSFER.served_by(self._transfer),
+                records.BUS_BRING.served_by(self._bring),
+                records.BUS_FAULT.served_by(self._fault),
+                records.BUS_FORGET.served_by(self._forget),
             )
         )
 
@@ -124,7 +130,7 @@ class BusConnection:
         result = self._methods[method](params)
         return await result if isawaitable(result) else result
 
-    def opened(self, number: int) -> words.BusOpenParameters | None:
+    def opened(self, number: int) -> records.BusOpenParameters | None:
         """Return how a conversation was opened, None if it is not open."""
         held = self._held.get(number)
         return held.opened if held is not None else None
@@ -134,18 +140,18 @@ class BusConnection:
         for number in list(self._held):
             self._abandon(number)
 
-    async def _describe(self, wanted: words.BusDescribeParameters) -> BusReport:
+    async def _describe(self, wanted: records.BusDescribeParameters) -> BusReport:
         client = self._buses.find(wanted)
         return await (client.wait_up() if wanted.wait else client.describe())
 
-    async def _open(self, wanted: words.BusOpenParameters) -> words.OpenConversation:
+    async def _open(self, wanted: records.BusOpenParameters) -> records.OpenConversation:
         client = self._buses.find(wanted)
-        if len(self._held) >= words.MAX_CONVERSATIONS:
-            reason = f"this connection has {words.MAX_CONVERSATIONS} conversations open"
+        if len(self._held) >= records.MAX_CONVERSATIONS:
+            reason = f"this connection has {records.MAX_CONVERSATIONS} conversations open"
             raise ControlError(f"{reason}, which is the limit", code=ErrorCode.BUSY)
-        kind = words.kind_of(wanted.protocol)
+        kind = records.kind_of(wanted.protocol)
         try:
-            async with asyncio.timeout(words.TURN_S):
+            async with asyncio.timeout(records.TURN_S):
                 turn = await client.open_turn(wanted.slave, kind, id(self))
         except TimeoutError:
             reason = f"slave {wanted.slave}: others talk {kind.name} with it all the while"
@@ -153,44 +159,44 @@ class BusConnection:
         self._last += 1
         self._held[self._last] = _Held(turn, kind, wanted)
         self._begin_idle(self._last)
-        return words.OpenConversation(self._last)
+        return records.OpenConversation(self._last)
 
-    async def _ask(self, wanted: words.BusAskParameters) -> words.MailboxData:
+    async def _ask(self, wanted: records.BusAskParameters) -> records.MailboxData:
         held = self._of(wanted.conversation)
-        request = words.to_request(held.kind, wanted)
+        request = records.to_request(held.kind, wanted)
         self._end_idle(held)
         try:
             message = await held.turn.exchange(request)
         finally:
             self._begin_idle(wanted.conversation)
-        return words.MailboxData(message.data.hex())
+        return records.MailboxData(message.data.hex())
 
-    def _close(self, wanted: words.BusCloseParameters) -> words.ClosedConversation:
+    def _close(self, wanted: records.BusCloseParameters) -> records.ClosedConversation:
         self._of(wanted.conversation)
         self._drop(wanted.conversation).turn.close()
-        return words.ClosedConversation(wanted.conversation)
+        return records.ClosedConversation(wanted.conversation)
 
-    async def _transfer(self, wanted: words.BusTransferParameters) -> words.DatagramReplies:
+    async def _transfer(self, wanted: records.BusTransferParameters) -> records.DatagramReplies:
         client = self._buses.find(wanted)
-        replies = await client.transfer([words.to_datagram(row) for row in wanted.datagrams])
-        return words.DatagramReplies([words.reply_row(reply) for reply in replies])
+        replies = await client.transfer([records.to_datagram(row) for row in wanted.datagrams])
+        return records.DatagramReplies([records.reply_row(reply) for reply in replies])
 
-    async def _bring(self, wanted: words.BusBringParameters) -> words.ReachedState:
+    async def _bring(self, wanted: records.BusBringParameters) -> records.ReachedState:
         await self._buses.find(wanted).bring(wanted.slave, AlState[wanted.state])
-        return words.ReachedState(wanted.state)
+        return records.ReachedState(wanted.state)
 
-    async def _fault(self, wanted: words.BusFaultParameters) -> words.Done:
+    async def _fault(self, wanted: records.BusFaultParameters) -> records.Done:
         segment = self._buses.segment(self._buses.find(wanted).port)
         _check_kind(wanted.command)
         try:
             await segment.command(wanted.command)
         except ValueError as exc:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
-        return words.Done()
+        return records.Done()
 
-    async def _forget(self, wanted: words.BusForgetParameters) -> words.Done:
+    async def _forget(self, wanted: records.BusForgetParameters) -> records.Done:
         await self._buses.find(wanted).forget()
-        return words.Done()
+        return records.Done()
 
     def _of(self, number: int) -> _Held:
         try:
@@ -198,12 +204,12 @@ class BusConnection:
         except KeyError:
             raise _unknown(
                 f"no conversation {number} is open on this connection; one in which nothing is"
-                f" asked for {words.IDLE_S:.0f} s is ended"
+                f" asked for {records.IDLE_S:.0f} s is ended"
             ) from None
 
     def _begin_idle(self, number: int) -> None:
         loop = asyncio.get_running_loop()
-        self._held[number].idle = loop.call_later(words.IDLE_S, self._abandon, number)
+        self._held[number].idle = loop.call_later(records.IDLE_S, self._abandon, number)
 
     def _end_idle(self, held: _Held) -> None:
         if held.idle is not None:
@@ -229,3 +235,126 @@ def _check_kind(command: Mapping[str, Any]) -> None:
 
 def _unknown(reason: str) -> ControlError:
     return ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+
+
+_OWN = {SocketKind.GATEWAY_UDP: "udp", SocketKind.GATEWAY_TCP: "tcp"}
+_SHARED = {SocketKind.UDP: "udp", SocketKind.TCP: "tcp", SocketKind.PACKET: "ethernet"}
+
+
+class GatewayMethods:
+    """Starts and stops gateways, and tells what they do.
+
+    Args:
+        handover: Where they are served.
+        gateways: All of them, in the order of the buses.
+    """
+
+    def __init__(self, handover: Handover, gateways: Mapping[PortName, MailboxGateway]) -> None:
+        self._handover = handover
+        self._gateways = gateways
+
+    def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the methods by name."""
+        return dict(
+            (
+                records.GATEWAY_START.served_by(self._start),
+                records.GATEWAY_STOP.served_by(self._stop),
+                records.GATEWAY_STATUS.served_by(self._status),
+            )
+        )
+
+    def _start(self, wanted: GatewayParameters) -> list[GatewayRow]:
+        found = self._find(wanted)
+        for owner in found:
+            self._gateways[owner].start()
+        return self._rows(found)
+
+    async def _stop(self, wanted: GatewayParameters) -> list[GatewayRow]:
+        found = self._find(wanted)
+        for owner in found:
+            await self._gateways[owner].stop()
+        return self._rows(found)
+
+    def _status(self, wanted: GatewayParameters) -> list[GatewayRow]:
+        return self._rows(self._find(wanted))
+
+    def _find(self, wanted: GatewayParameters) -> list[PortName]:
+        names = [station.name for station in self._handover.stations]
+        if wanted.station not in names:
+            reason = f"no station {wanted.station!r} here{suggest(wanted.station, names)}"
+            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+        buses = [owner for owner in self._gateways if owner.station == wanted.station]
+        found = [owner for owner in buses if wanted.port in {"", owner.port}]
+        if not found:
+            known = [owner.port for owner in buses]
+            ports = f"its bus ports are {', '.join(known)}" if known else "it has no bus ports"
+            which = f"no bus port {wanted.port!r}" if wanted.port else "no gateway"
+            reason = f"station {wanted.station} has {which}; {ports}{suggest(wanted.port, known)}"
+            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+        return found
+
+    def _rows(self, owners: list[PortName]) -> list[GatewayRow]:
+        return [gateway_row(owner, self._gateways[owner], self._served(owner)) for owner in owners]
+
+    def _served(self, owner: PortName) -> list[str]:
+        """Return the sockets behind which a gateway is."""
+        first = next(each for each in self._gateways if each.station == owner.station)
+        found = []
+        for shared in self._handover.sockets:
+            if shared.kind in _OWN and owner in shared.owners:
+                found.append(_place(_OWN[shared.kind], shared))
+            elif shared.kind in _SHARED and first == owner:
+                # Of several stations at a socket, the first that has a gateway.
+                stations = [each.station for each in shared.owners]
+                known = {each.station for each in self._gateways}
+                if next((name for name in stations if name in known), "") == owner.station:
+                    found.append(_place(_SHARED[shared.kind], shared))
+        return found
+
+
+def gateway_row(owner: PortName, gateway: MailboxGateway, served: list[str]) -> GatewayRow:
+    """Return state, settings and counters of a gateway.
+
+    Args:
+        owner: Its bus port.
+        gateway: The gateway.
+        served: Sockets behind which it is.
+    """
+    settings = gateway.settings
+    transfers = gateway.transfers()
+    return GatewayRow(
+        station=owner.station,
+        port=owner.port,
+        served=served,
+        state="running" if gateway.is_open else "stopped",
+        turned_away=gateway.turned_away,
+        settings=records.GatewaySettings(
+            round(settings.answer_s * 1000),
+            settings.is_silent,
+            settings.limits.in_flight,
+            settings.limits.rate,
+            settings.limits.clients,
+        ),
+        clients=[
+            records.GatewayClientRow(
+                transport=endpoint.transport,
+                address=endpoint.connection,
+                requests=counts.requests,
+                repeated=counts.repeated,
+                errors=counts.errors,
+                waiting=gateway.tracker.waiting(endpoint),
+                transfers=[
+                    records.TransferRow(key.address, key.kind.name)
+                    for key in transfers
+                    if key.endpoint == endpoint
+                ],
+            )
+            for endpoint, counts in gateway.tracker.table().items()
+        ],
+        slaves=msgspec.convert(gateway.statistics.report(), list[records.MailboxFigures]),
+    )
+
+
+def _place(scheme: str, shared: SharedSocket) -> str:
+    number = f":{shared.port}" if shared.port else ""
+    return f"{scheme}://{shared.address}{number}"

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from eap.control import device as words
+from eap.control import device as records
 from eap.control.bus import to_octets
 from eap.control.protocol import ErrorCode, of_station
 from eap.device.eap_dictionary import EapDictionary
@@ -57,21 +57,21 @@ class DeviceMethods:
         """
         return dict(
             (
-                words.OD_LIST.served_by(self._list),
-                words.OD_DESCRIBE.served_by(self._describe),
-                words.OD_READ.served_by(self._read),
-                words.OD_WRITE.served_by(self._write),
-                words.OD_DUMP.served_by(self._dump),
-                words.STATE.served_by(self._state),
-                words.REQUEST_STATE.served_by(self._request_state),
-                words.EXPORT.served_by(self._export),
-                words.PLAN.served_by(self._plan),
-                words.APPLY.served_by(self._apply),
-                words.ROLLBACK.served_by(self._roll_back),
+                records.OD_LIST.served_by(self._list),
+                records.OD_DESCRIBE.served_by(self._describe),
+                records.OD_READ.served_by(self._read),
+                records.OD_WRITE.served_by(self._write),
+                records.OD_DUMP.served_by(self._dump),
+                records.STATE.served_by(self._state),
+                records.REQUEST_STATE.served_by(self._request_state),
+                records.EXPORT.served_by(self._export),
+                records.PLAN.served_by(self._plan),
+                records.APPLY.served_by(self._apply),
+                records.ROLLBACK.served_by(self._roll_back),
             )
         )
 
-    def _list(self, wanted: words.OdListParameters) -> words.ObjectPage:
+    def _list(self, wanted: records.OdListParameters) -> records.ObjectPage:
         dictionary = self._find(wanted.target).dictionary
         flag = _FLAGS.get(wanted.list)
         chosen = (
@@ -79,68 +79,68 @@ class DeviceMethods:
             for item in dictionary
             if flag is None or any(each.access & flag for each in item.entries.values())
         )
-        return words.ObjectPage(
+        return records.ObjectPage(
             *_page(
                 chosen,
                 wanted.first,
-                lambda item: words.object_row(item, _label(dictionary, item)),
+                lambda item: records.object_row(item, _label(dictionary, item)),
             )
         )
 
-    def _describe(self, wanted: words.OdDescribeParameters) -> words.DescribedObject:
+    def _describe(self, wanted: records.OdDescribeParameters) -> records.DescribedObject:
         dictionary = self._find(wanted.target).dictionary
         if isinstance(dictionary, EapDictionary):
             item = _existing_or_new(dictionary, wanted.index, wanted.subindex)
         else:
             item = dictionary[wanted.index]
-        return words.described_object(item, _label(dictionary, item))
+        return records.described_object(item, _label(dictionary, item))
 
-    def _read(self, wanted: words.OdReadParameters) -> words.EntryData:
+    def _read(self, wanted: records.OdReadParameters) -> records.EntryData:
         found = self._find(wanted.target)
         read = found.dictionary.upload_complete if wanted.complete else found.dictionary.upload
-        return words.EntryData(read(wanted.index, wanted.subindex, found.device.od_state()).hex())
+        return records.EntryData(read(wanted.index, wanted.subindex, found.device.od_state()).hex())
 
-    async def _write(self, wanted: words.OdWriteParameters) -> words.EmptyAnswer:
+    async def _write(self, wanted: records.OdWriteParameters) -> records.EmptyAnswer:
         found = self._find(wanted.target)
         place, data = (wanted.index, wanted.subindex), to_octets(wanted.data)
         if isinstance(found.dictionary, EapDictionary):
             await found.device.download(found.port, *place, data, complete=wanted.complete)
         else:
             found.dictionary.download(*place, data, found.device.od_state())
-        return words.EmptyAnswer()
+        return records.EmptyAnswer()
 
-    def _dump(self, wanted: words.OdDumpParameters) -> words.DumpPage:
+    def _dump(self, wanted: records.OdDumpParameters) -> records.DumpPage:
         found = self._find(wanted.target)
         dictionary, right = found.dictionary, found.device.od_state().read_right
-        return words.DumpPage(
+        return records.DumpPage(
             *_page(
                 dictionary,
                 wanted.first,
-                lambda item: words.dumped_object(item, _label(dictionary, item), right),
+                lambda item: records.dumped_object(item, _label(dictionary, item), right),
             )
         )
 
-    def _state(self, wanted: words.TargetParameters) -> words.StateAnswer:
-        return words.state_answer(self._find(wanted.target).device.status)
+    def _state(self, wanted: records.TargetParameters) -> records.StateAnswer:
+        return records.state_answer(self._find(wanted.target).device.status)
 
-    async def _request_state(self, wanted: words.RequestStateParameters) -> words.StateAnswer:
+    async def _request_state(self, wanted: records.RequestStateParameters) -> records.StateAnswer:
         device = self._find(wanted.target).device
-        return words.state_answer(await device.request_state(words.state_of(wanted.state)))
+        return records.state_answer(await device.request_state(records.state_of(wanted.state)))
 
-    def _export(self, wanted: words.StationParameters) -> words.RunningSpec:
+    def _export(self, wanted: records.StationParameters) -> records.RunningSpec:
         device = self._device(wanted.station)
-        return words.running_spec(device.spec, *device.last_change)
+        return records.running_spec(device.spec, *device.last_change)
 
-    async def _plan(self, wanted: words.SpecParameters) -> words.PlanAnswer:
-        return words.plan_answer(await self._device(wanted.station).plan(wanted.spec))
+    async def _plan(self, wanted: records.SpecParameters) -> records.PlanAnswer:
+        return records.plan_answer(await self._device(wanted.station).plan(wanted.spec))
 
-    async def _apply(self, wanted: words.ApplyParameters) -> words.ApplyAnswer:
+    async def _apply(self, wanted: records.ApplyParameters) -> records.ApplyAnswer:
         is_own = bool(wanted.file) and wanted.file == self._plant_file
         change = self._device(wanted.station).apply(wanted.spec, wanted.cause, of_plant_file=is_own)
-        return words.apply_answer(*await change)
+        return records.apply_answer(*await change)
 
-    async def _roll_back(self, wanted: words.RollbackParameters) -> words.ApplyAnswer:
-        return words.apply_answer(*await self._device(wanted.station).roll_back(wanted.spec))
+    async def _roll_back(self, wanted: records.RollbackParameters) -> records.ApplyAnswer:
+        return records.apply_answer(*await self._device(wanted.station).roll_back(wanted.spec))
 
     def _device(self, station: str) -> StationDevice:
         return of_station(station, self._devices)
@@ -179,7 +179,7 @@ def _page(
 ) -> tuple[list[RowT], int | None]:
     """Return as many rows as one answer may have, and the index at which it goes on."""
     rows: list[RowT] = []
-    room = words.PAGE
+    room = records.PAGE
     for item in items:
         if item.index < first:
             continue

@@ -1,4 +1,4 @@
-"""Methods of the control protocol about routes."""
+"""Methods of the control protocol for routes, AMS requests and the configuration of routers."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import Any
 
-from eap.ams.directory import Directory, parse_via
+from eap.ams.directory import AmsAddress, Directory, parse_via
 from eap.ams.spec import RouteSpec, TransportKind
 from eap.codec import staticroutes
 from eap.codec.ads import AdsError
 from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.staticroutes import TCP_IP, StaticRoute
-from eap.control import routes as words
+from eap.control import device as device_records
+from eap.control import routes as records
+from eap.control.bus import to_octets
+from eap.control.device import RoutingDifference
 from eap.control.protocol import ErrorCode, of_station, unless_unavailable
 from eap.errors import ControlError
 from eap.ids import NetId
@@ -25,8 +28,112 @@ from eap.services.routing.remote_routers import (
     scan_routers,
 )
 from eap.services.routing.route_rows import RouterView, route_row
-from eap.services.routing.tracing import find_target, probe_target
+from eap.services.routing.scanning import scan, scan_targets
+from eap.services.routing.station_router import StationRouter
+from eap.services.routing.station_routing import StationRouting
+from eap.services.routing.tracing import TraceResult, find_target, probe_target, trace
 from eap.suggest import suggest
+
+_NS_PER_US = 1000
+
+
+class AmsMethods:
+    """Answers by the routers of all stations of the appliance.
+
+    Args:
+        routers: By station.
+        directory: Names of the plant.
+        addresses: Where each station is reached by AMS/TCP, if it is.
+    """
+
+    def __init__(
+        self,
+        routers: Mapping[str, StationRouter],
+        directory: Directory,
+        addresses: Mapping[str, str],
+    ) -> None:
+        self._routers = routers
+        self._directory = directory
+        self._addresses = addresses
+
+    def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the methods by name; all have to be waited for.
+
+        Raises:
+            ControlError: (every method) there is no such station or target.
+        """
+        return dict(
+            (
+                records.SCAN.served_by(self._scan),
+                records.TRACE.served_by(self._trace),
+                records.AMS_ASK.served_by(self._ask),
+            )
+        )
+
+    async def _scan(self, wanted: records.ScanParameters) -> records.PlantScan:
+        router = self._router(wanted.via)
+        stations = await scan(router, scan_targets(self._directory, router.table))
+        via = records.ScanVia(router.name, self._addresses.get(router.name, ""))
+        return records.PlantScan(stations, via)
+
+    async def _trace(self, wanted: records.TraceParameters) -> records.TracedPath:
+        router, address = self._router(wanted.via), _found(self._directory.find, wanted.target)
+        found = await trace(router, *address)
+        return records.TracedPath(
+            wanted.target,
+            str(address),
+            self._directory.name_of(*address),
+            not found.why,
+            found.why,
+            _hop_rows(found),
+            _target_answer(found),
+        )
+
+    async def _ask(self, wanted: records.AskParameters) -> records.AmsReply:
+        find = self._directory.find_device if wanted.device else self._directory.find
+        router, address = self._router(wanted.via), _found(find, wanted.target)
+        timeout_s = wanted.timeout_ms / 1000
+        data = to_octets(wanted.data)
+        answer = await router.request(*address, wanted.command, data, timeout_s=timeout_s)
+        return records.AmsReply(answer.error_code, answer.data.hex())
+
+    def _router(self, via: str) -> StationRouter:
+        return of_station(via or next(iter(self._routers)), self._routers)
+
+
+def _found(find: Callable[[str], AmsAddress], target: str) -> AmsAddress:
+    try:
+        return find(target)
+    except ValueError as exc:
+        raise _unknown_target(str(exc)) from None
+
+
+def _hop_rows(found: TraceResult) -> list[records.HopRow]:
+    rows, before_us = [], 0
+    for hop in found.hops:
+        took_us = hop.took_ns // _NS_PER_US
+        spent_us = max(0, took_us - before_us)
+        rows.append(records.hop_row(hop.report, took_us, spent_us, is_opaque=hop.is_opaque))
+        before_us = took_us
+    return rows
+
+
+def _target_answer(found: TraceResult) -> records.TargetAnswer | None:
+    if found.answer is None:
+        return None
+    states, result = found.states, found.answer.result
+    return records.TargetAnswer(
+        result,
+        AdsError.words_of(result) if result else "",
+        None if states is None else states.ads_state,
+        None if states is None else states.device_state,
+        found.took_ns // _NS_PER_US,
+    )
+
+
+def _unknown_target(reason: str) -> ControlError:
+    return ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+
 
 _ANY = NetId(bytes(6))
 """Stands in a default route."""
@@ -49,41 +156,41 @@ class RouteMethods:
         """Return the methods by name."""
         return dict(
             (
-                words.ROUTES_LIST.served_by(self._list),
-                words.ROUTES_ADD.served_by(self._add),
-                words.ROUTES_REMOVE.served_by(self._remove),
-                words.ROUTES_ADD_REMOTE.served_by(self._add_remote),
-                words.ROUTES_SCAN.served_by(self._scan),
-                words.ROUTES_TEST.served_by(self._test),
-                words.ROUTES_IMPORT.served_by(self._import),
-                words.ROUTES_EXPORT.served_by(self._export),
+                records.ROUTES_LIST.served_by(self._list),
+                records.ROUTES_ADD.served_by(self._add),
+                records.ROUTES_REMOVE.served_by(self._remove),
+                records.ROUTES_ADD_REMOTE.served_by(self._add_remote),
+                records.ROUTES_SCAN.served_by(self._scan),
+                records.ROUTES_TEST.served_by(self._test),
+                records.ROUTES_IMPORT.served_by(self._import),
+                records.ROUTES_EXPORT.served_by(self._export),
             )
         )
 
-    def _list(self, wanted: words.RoutesListParameters) -> list[words.RouterRow]:
+    def _list(self, wanted: records.RoutesListParameters) -> list[records.RouterRow]:
         views = [self._view(wanted.station)] if wanted.station else self._views.values()
         return [view.row(wanted) for view in views]
 
-    async def _add(self, wanted: words.RoutesAddParameters) -> words.AddedRoute:
+    async def _add(self, wanted: records.RoutesAddParameters) -> records.AddedRoute:
         view = self._view(wanted.station)
         row = await self._take(view, wanted)
         warnings = [text for text in view.warnings() if f"route {row.name} " in text]
-        return words.AddedRoute(route=row, warnings=warnings)
+        return records.AddedRoute(route=row, warnings=warnings)
 
-    async def _remove(self, wanted: words.RoutesRemoveParameters) -> words.RouteAnswer:
+    async def _remove(self, wanted: records.RoutesRemoveParameters) -> records.RouteAnswer:
         routes = self._view(wanted.station).routes
         with unless_unavailable():
             spec = await routes.remove(
                 wanted.route, transport=wanted.transport, address=wanted.address
             )
-        return words.RouteAnswer(route=_removed(spec))
+        return records.RouteAnswer(route=_removed(spec))
 
-    async def _test(self, wanted: words.RoutesTestParameters) -> words.TestResult:
+    async def _test(self, wanted: records.RoutesTestParameters) -> records.TestResult:
         router = self._view(wanted.station).router
         target = find_target(router, self._directory, wanted.target)
         return await probe_target(router, target, wanted.timeout_ms / 1000)
 
-    async def _scan(self, wanted: words.RoutesScanParameters) -> list[words.NeighbourRow]:
+    async def _scan(self, wanted: records.RoutesScanParameters) -> list[records.NeighbourRow]:
         if wanted.address:
             _address(wanted.address)
         if wanted.station:
@@ -92,7 +199,9 @@ class RouteMethods:
         rows = await asyncio.gather(*(self._scan_from(view, wanted) for view in views))
         return [row for each in rows for row in each]
 
-    async def _add_remote(self, wanted: words.RoutesAddRemoteParameters) -> words.RemoteRouteResult:
+    async def _add_remote(
+        self, wanted: records.RoutesAddRemoteParameters
+    ) -> records.RemoteRouteResult:
         view, address = self._view(wanted.station), _address(wanted.address)
         name = wanted.name or view.router.name
         if "\0" in name + wanted.user + wanted.password:
@@ -101,18 +210,18 @@ class RouteMethods:
         with unless_unavailable():
             result = await add_remote_route(view.routes, route, address, wanted.wait_ms / 1000)
         if result is None:
-            return words.RemoteRouteResult(ok=False, result=None, text="no answer by UDP 48899")
+            return records.RemoteRouteResult(ok=False, result=None, text="no answer by UDP 48899")
         text = "added" if result == AdsError.NONE else AdsError.words_of(result)
-        return words.RemoteRouteResult(ok=result == AdsError.NONE, result=result, text=text)
+        return records.RemoteRouteResult(ok=result == AdsError.NONE, result=result, text=text)
 
     async def _scan_from(
-        self, view: RouterView, wanted: words.RoutesScanParameters
-    ) -> list[words.NeighbourRow]:
+        self, view: RouterView, wanted: records.RoutesScanParameters
+    ) -> list[records.NeighbourRow]:
         with unless_unavailable():
             found = await scan_routers(view.routes, wanted.address, wanted.wait_ms / 1000)
         return [_neighbour_row(view, each) for each in found]
 
-    async def _import(self, wanted: words.RoutesImportParameters) -> list[words.ImportRow]:
+    async def _import(self, wanted: records.RoutesImportParameters) -> list[records.ImportRow]:
         view = self._view(wanted.station)
         try:
             found = staticroutes.parse(wanted.xml)
@@ -124,7 +233,7 @@ class RouteMethods:
             await asyncio.sleep(0)  # others have their turns between
         return rows
 
-    def _export(self, wanted: words.RoutesExportParameters) -> words.Export:
+    def _export(self, wanted: records.RoutesExportParameters) -> records.Export:
         view = self._view(wanted.station)
         routes, left_out = [], []
         for route in view.router.table:
@@ -136,13 +245,13 @@ class RouteMethods:
                 left_out.append(route.name)
         router = view.router
         xml = staticroutes.dump(router.name, str(router.net_id), routes, tcp_port=AMS_TCP_PORT)
-        return words.Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
+        return records.Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
 
     async def _import_one(
         self, view: RouterView, route: StaticRoute, *, dry_run: bool
-    ) -> words.ImportRow:
+    ) -> records.ImportRow:
         via, reason = f"{TransportKind.AMS_TCP}:{route.address}", ""
-        wanted = words.RoutesAddParameters(
+        wanted = records.RoutesAddParameters(
             station=view.router.name, name=route.name, net_id=route.net_id, via=via
         )
         if route.type != TCP_IP:
@@ -157,15 +266,17 @@ class RouteMethods:
                     await self._take(view, wanted)
             except ControlError as exc:
                 reason = str(exc)
-        return words.ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
+        return records.ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
 
-    async def _take(self, view: RouterView, wanted: words.RoutesAddParameters) -> words.RouteRow:
+    async def _take(
+        self, view: RouterView, wanted: records.RoutesAddParameters
+    ) -> records.RouteRow:
         spec = self._spec(wanted)
         with unless_unavailable():
             route = await view.routes.add(spec, replaces=wanted.replaces)
         return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
 
-    def _spec(self, wanted: words.RoutesAddParameters) -> RouteSpec:
+    def _spec(self, wanted: records.RoutesAddParameters) -> RouteSpec:
         """Return the route that is wanted; raise ControlError if there cannot be one."""
         try:
             net_id = self._net_id(wanted)
@@ -188,7 +299,7 @@ class RouteMethods:
             is_probed=wanted.probed,
         )
 
-    def _net_id(self, wanted: words.RoutesAddParameters) -> str:
+    def _net_id(self, wanted: records.RoutesAddParameters) -> str:
         """Return the NetID of a route; raise ValueError if there is none."""
         stations = self._directory.stations
         if wanted.net_id:
@@ -206,11 +317,11 @@ class RouteMethods:
         return of_station(station, self._views)
 
 
-def _neighbour_row(view: RouterView, found: FoundRouter) -> words.NeighbourRow:
+def _neighbour_row(view: RouterView, found: FoundRouter) -> records.NeighbourRow:
     name, net_id, address, version = found.neighbour
     route = view.router.table.find(net_id)
     is_own = route is not None and route[1] > 0  # a default route leads anywhere
-    return words.NeighbourRow(
+    return records.NeighbourRow(
         station=view.router.name,
         name=name,
         net_id=str(net_id),
@@ -228,9 +339,9 @@ def _address(text: str) -> IPv4Address:
         raise ControlError(f"address: {exc}", code=ErrorCode.VALUE) from None
 
 
-def _removed(spec: RouteSpec) -> words.RouteRow:
+def _removed(spec: RouteSpec) -> records.RouteRow:
     kind, port, address = spec.hop.kind, spec.hop.port, spec.hop.address
-    return words.RouteRow(
+    return records.RouteRow(
         name=spec.name,
         net_id=spec.virtual or spec.net_id,
         octets=spec.octets,
@@ -245,3 +356,51 @@ def _removed(spec: RouteSpec) -> words.RouteRow:
         timeout_ms=spec.timeout_ms,
         probed=spec.is_probed,
     )
+
+
+class RoutingMethods:
+    """Answers for the routers of all stations here, by the names of the stations."""
+
+    def __init__(self, stations: Mapping[str, StationRouting]) -> None:
+        self._stations = stations
+
+    def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the methods by name."""
+        return dict(
+            (
+                device_records.ROUTING_EXPORT.served_by(self._export),
+                device_records.ROUTING_PLAN.served_by(self._plan),
+                device_records.ROUTING_APPLY.served_by(self._apply),
+                device_records.ROUTING_ROLLBACK.served_by(self._roll_back),
+            )
+        )
+
+    def _export(self, wanted: device_records.StationParameters) -> device_records.RunningRouting:
+        station = self._station(wanted.station)
+        last = station.applied
+        if last is None:
+            return device_records.RunningRouting(routing=station.routes.spec)
+        return device_records.RunningRouting(
+            routing=last.spec, previous=last.previous, cause=last.cause, undone=last.undone
+        )
+
+    def _plan(self, wanted: device_records.RoutingPlanParameters) -> RoutingDifference:
+        plan = self._station(wanted.station).plan(wanted.routing)
+        return RoutingDifference(changes=plan.changes, refused=plan.refused)
+
+    async def _apply(self, wanted: device_records.RoutingApplyParameters) -> RoutingDifference:
+        station = self._station(wanted.station)
+        plan = station.plan(wanted.routing)
+        if plan.refused:
+            return RoutingDifference(changes=[], refused=plan.refused)
+        with unless_unavailable():
+            changes = await station.apply(wanted.routing, wanted.cause)
+        return RoutingDifference(changes=changes, refused=[])
+
+    async def _roll_back(self, wanted: device_records.StationParameters) -> RoutingDifference:
+        station = self._station(wanted.station)
+        with unless_unavailable():
+            return RoutingDifference(changes=await station.roll_back(), refused=[])
+
+    def _station(self, name: str) -> StationRouting:
+        return of_station(name, self._stations)

@@ -1,16 +1,20 @@
-"""What a station runs, and what is kept of it for the next start: both change together.
+"""Configuration that a station runs, and its stored copy for the next start: both change together.
 
-Rule 1: what is to run is kept first, then the engine is asked; what it refuses is kept no longer.
-So a kill at any moment leaves a whole configuration, the old or the new one.
-Rule 2: an engine that goes away in the middle is not trusted to have taken anything: what ran
-before is kept, and told again to the engine that comes after.
+Rule 1: a new configuration is stored first, then requested from the engine; one that the engine
+refuses is removed again.  A kill at any moment leaves a whole configuration, the old or the new
+one.
+Rule 2: an engine that goes away in the middle may have applied nothing: the previous configuration
+is stored again, and sent to the next engine.
 """
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
+import os
 from collections.abc import Callable
+from pathlib import Path
 from time import time
 from typing import Any, NamedTuple, Protocol
 
@@ -18,9 +22,58 @@ from msgspec.structs import replace
 
 from eap.device.rollout import without_alternates
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
+from eap.pd import pieces
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import StationSpec
+from eap.runtime.station_request import Configure, SetState
 from eap.runtime.store import Configuration, StationFile, Stored, digest_of, new_cause
+from eap.services.engine_link import EngineLink
+
+CONFIGURE_S = 60.0
+STATE_S = 5.0
+
+
+class EngineClient:
+    """Asks for changes of running stations.
+
+    Args:
+        link: Services' end of the pair with the engine.
+        folder: Where both may read and write: the appliance's runtime folder.
+    """
+
+    def __init__(self, link: EngineLink, folder: Path) -> None:
+        self._link = link
+        self._folder = folder
+        self._numbers = itertools.count(1)
+
+    async def configure(self, station: str, spec: StationSpec) -> None:
+        """Have *station* run *spec* from its next cycle on.
+
+        Raises:
+            EngineRefusedError: it goes on with what it ran before; the text says why.
+            EngineGoneError: no engine answers, or it was started again meanwhile; one that is
+                started runs what has been stored.
+            EnvironmentalError: the runtime folder cannot be written.
+        """
+        path = self._folder / f".{os.getpid()}-{next(self._numbers)}.spec"
+        try:
+            path.write_bytes(pieces.to_lines(spec))
+        except OSError as exc:
+            path.unlink(missing_ok=True)
+            raise EnvironmentalError(f"{path}: {exc.strerror}") from None
+        try:
+            await self._link.request(
+                lambda number: Configure(id=number, station=station, path=str(path)), CONFIGURE_S
+            )
+        finally:
+            path.unlink(missing_ok=True)
+
+    async def set_state(self, station: str, state: DeviceState) -> None:
+        """Bring *station* to PreOp, SafeOp or Op; raises as :meth:`configure` does."""
+        await self._link.request(
+            lambda number: SetState(id=number, station=station, state=state), STATE_S
+        )
+
 
 logger = logging.getLogger(__name__)
 

@@ -31,12 +31,10 @@ from eap.gateway.dialect import (
     encode_failure,
 )
 from eap.gateway.error_table import Cause, cause_of_result
-from eap.gateway.refusal import GatewayError
-from eap.gateway.rights import idn, sdo
+from eap.gateway.requests import GatewayError, idn, sdo
 from eap.od.abort import SdoAbortError
-from eap.services.gateway.client_session import cause_of, text_of
-from eap.services.gateway.guard import Guard, RuleTarget, reason_of_refusal
-from eap.services.gateway.master_session import MasterSession
+from eap.services.gateway.admission import Guard, RuleTarget, reason_of_refusal
+from eap.services.gateway.sessions import MasterSession, cause_of, text_of
 from eap.services.slaves.access import RemoteAccessError, SlaveAccess
 
 DialectTarget: TypeAlias = SlaveAccess | MasterSession

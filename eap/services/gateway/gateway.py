@@ -27,15 +27,6 @@ from eap.ams.spec import TransportKind
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.errors import EngineGoneError
 from eap.gateway import dialect
-from eap.gateway.address import (
-    MASTER_ADDRESS,
-    AddressMap,
-    Destination,
-    GroupAddress,
-    MasterAddress,
-    RemoteAddress,
-    SlaveAddress,
-)
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import (
     ClientLimits,
@@ -45,20 +36,19 @@ from eap.gateway.request_tracker import (
     RequestTracker,
     Ticket,
 )
-from eap.gateway.rights import operation_of
+from eap.gateway.requests import (
+    MASTER_ADDRESS,
+    AddressMap,
+    Destination,
+    GroupAddress,
+    MasterAddress,
+    RemoteAddress,
+    SlaveAddress,
+    operation_of,
+)
 from eap.ids import NetId
 from eap.runtime.bus_request import SlaveDescription, no_mailbox
-from eap.services.gateway.client_session import (
-    ClientSession,
-    GatewayReply,
-    SessionKey,
-    SessionTable,
-    cause_of,
-    refusals,
-)
-from eap.services.gateway.dialect_handler import DialectHandler, DialectTarget
-from eap.services.gateway.file_codec import FileCodec
-from eap.services.gateway.guard import (
+from eap.services.gateway.admission import (
     MASTER_PORT,
     Guard,
     RequestDecision,
@@ -66,12 +56,21 @@ from eap.services.gateway.guard import (
     reason_of_refusal,
     result_of,
 )
-from eap.services.gateway.master_session import MasterSession
+from eap.services.gateway.dialect_handler import DialectHandler, DialectTarget
 from eap.services.gateway.message_codecs import EoeListeners, codec_for
 from eap.services.gateway.reply_encoder import GatewayRequest, ReplyEncoder, Send
-from eap.services.slaves.access import SlaveAccess
+from eap.services.gateway.sessions import (
+    ClientSession,
+    GatewayReply,
+    MasterSession,
+    SessionKey,
+    SessionTable,
+    cause_of,
+    refusals,
+)
+from eap.services.gateway.transfer_codecs import FileCodec
+from eap.services.slaves.access import LocalSlave, SlaveAccess
 from eap.services.slaves.bus_client import BusClient
-from eap.services.slaves.local_slave import LocalSlave
 from eap.services.tasks import TaskSet
 
 ANSWER_S = 0.9

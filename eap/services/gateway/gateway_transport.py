@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxError, encode_plain_frame
 from eap.errors import MalformedError, TruncatedError
-from eap.gateway.refusal import mailbox_error
+from eap.gateway.requests import mailbox_error
 from eap.runtime.discards import Refusal
 from eap.services.transports.mailbox_frames import refusal_of
 

@@ -21,11 +21,10 @@ from eap.codec.eoe import EoeType
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import SoeHeader, SoeOpcode, encode_fragments
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import GatewayError
 from eap.gateway.request_tracker import MemoryShare
-from eap.services.gateway.client_session import SessionCodec
-from eap.services.gateway.file_codec import FileCodec
-from eap.services.gateway.object_codec import ObjectCodec
+from eap.gateway.requests import GatewayError
+from eap.services.gateway.sessions import SessionCodec
+from eap.services.gateway.transfer_codecs import FileCodec, ObjectCodec
 from eap.services.slaves.access import RemoteAccessError, SlaveAccess
 
 _INCOMPLETE = 0x08

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from functools import partial
 
 from eap.ams.access import AccessList
-from eap.gateway.address import AddressMap, GroupAddress, RemoteAddress, SlaveAddress
 from eap.gateway.request_tracker import ClientLimits
+from eap.gateway.requests import AddressMap, GroupAddress, RemoteAddress, SlaveAddress
 from eap.ids import NetId
 from eap.pd.spec import GatewayAddress, GatewaySpec
 from eap.runtime.handover import Handover, PortName
 from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.gateway.gateway import MailboxGateway, Settings
-from eap.services.gateway.master_session import MasterSession
+from eap.services.gateway.sessions import MasterSession
 from eap.services.routing.station_router import StationRouter
 from eap.services.slaves.bus_client import BusClient
 from eap.services.slaves.remote_slave import RemoteSlave

@@ -15,7 +15,7 @@ from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_p
 from eap.gateway import dialect
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker, Ticket
-from eap.services.gateway.client_session import GatewayReply, refusals
+from eap.services.gateway.sessions import GatewayReply, refusals
 from eap.services.rate_limits import caused_by
 
 Send: TypeAlias = Callable[[bytes], None]

@@ -1,38 +1,229 @@
-"""Client of the engine for one bus: conversations, procedures and states, step by step.
+"""Client of the engine for one bus: its description, its mailbox queues, its datagrams and states.
 
-Rule: the engine does single steps only.  Whole transfers, their order and their errors are handled
-here, so that the engine never waits for a file or for a client.
+The description is cached.  The engine sends a change before the answer to any request that it
+handles after it, so a client that requested a state and got its answer finds that state here. Other
+changes come within the engine's pause between two polls of its sockets, 20 ms.
+
+Rule 1: the engine executes single steps only.  Whole transfers, their order and their errors are
+handled here, so the engine never waits for a file or a client.
+Rule 2: at each mailbox one conversation goes on at a time in each protocol; clients take turns.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Hashable, Sequence
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from time import monotonic_ns
-from typing import TypeVar
+from types import MappingProxyType
+from typing import NamedTuple, TypeVar
 
 from devicebus.drive import drive_async
 from devicebus.errors import BusError, MailboxBusyError
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.mailbox.conversation import (
+    ABORT_MESSAGES,
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+)
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
-from eap.control.bus import BRING_S, PATIENCE_S, TRANSFER_S
+from eap.control.bus import BRING_S, MARGIN_S, PATIENCE_S, TRANSFER_S
 from eap.errors import EapError, EngineGoneError
 from eap.runtime.bus_request import (
     BringSlaves,
+    BusChange,
     BusReport,
     DescribeBus,
     ExchangeDatagrams,
+    ExchangeMailbox,
     ForgetFaults,
+    Ping,
+    Republish,
+    SlaveDescription,
     UnsolicitedMessage,
 )
 from eap.runtime.handover import PortName
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.bus_view import BusView
-from eap.services.slaves.mailbox_queue import MailboxQueues, MailboxTurn
+
+ANSWER_S = 1.0
+
+
+class BusDescription(NamedTuple):
+    """A bus without counters and times, which only an explicit request brings."""
+
+    is_up: bool = False
+    """Whether it has been brought up, wherever its slaves are now."""
+    fault: str = "nothing is known about it yet"
+    slaves: Mapping[int, SlaveDescription] = MappingProxyType({})
+    """By station address, in the order of the bus; while it is not up those that are expected."""
+
+
+class BusView:
+    """The description of one bus.
+
+    Args:
+        link: To the engine.
+        number: Of the bus in messages.
+
+    Attributes:
+        latest: As it was received last; empty from a restart of the engine to its first message.
+        on_change: Called after each change.
+    """
+
+    def __init__(self, link: EngineLink, number: int) -> None:
+        self.latest = BusDescription()
+        self.on_change: list[Callable[[], None]] = []
+        self._link = link
+        self._number = number
+        self._is_complete = False
+        link.on_change.append(self._take)
+        link.on_restart.append(self._forget)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether :meth:`current` returns without waiting."""
+        return self._is_complete and self._link.is_alive
+
+    async def current(self) -> BusDescription:
+        """Return the description, as a rule without waiting; raise EngineGoneError.
+
+        A request goes to the engine only if it has sent nothing for a second, or nothing about
+        this bus: a dead engine says nothing, and must not leave an old state here for long.
+        """
+        if self.is_current:
+            return self.latest
+        return await self.confirm()
+
+    async def confirm(self) -> BusDescription:
+        """Return the description as the engine has it now; raise EngineGoneError.
+
+        For a request that would be refused because of it: its client may know more, from the
+        process image or from the slave itself, than has come here.
+        """
+        if self._is_complete:
+            await self._link.request(lambda number: Ping(id=number), ANSWER_S)
+        else:
+            await self._link.request(
+                lambda number: Republish(id=number, bus=self._number), ANSWER_S
+            )
+        if not self._is_complete:
+            raise EngineGoneError("the engine says nothing about the bus")
+        return self.latest
+
+    def _take(self, change: BusChange) -> None:
+        if change.bus != self._number:
+            return
+        known = {**self.latest.slaves, **{slave.station: slave for slave in change.slaves}}
+        # Without the messages before, which another process has read, some slaves are not known.
+        self._is_complete = all(station in known for station in change.stations)
+        slaves = {station: known[station] for station in change.stations if self._is_complete}
+        self.latest = BusDescription(change.is_up, change.fault, slaves)
+        for notify in self.on_change:
+            notify()
+
+    def _forget(self) -> None:
+        self.latest = BusDescription()
+        self._is_complete = False
+        for notify in self.on_change:
+            notify()
+
+
+class MailboxQueues:
+    """The queues of all mailboxes.
+
+    A client with many requests does not keep out one with few: behind each turn comes the next
+    client, not the next request.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[Hashable, dict[Hashable, deque[asyncio.Future[None]]]] = {}
+
+    def is_free(self, mailbox: Hashable) -> bool:
+        """Return whether a turn begins without waiting."""
+        return mailbox not in self._waiting
+
+    async def take(self, mailbox: Hashable, client: Hashable) -> None:
+        """Wait for a turn, which lasts until :meth:`release`; cancelling it gives up the wait."""
+        if self.is_free(mailbox):
+            self._waiting[mailbox] = {}
+            return
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting[mailbox].setdefault(client, deque()).append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled():  # it came in the same moment
+                self.release(mailbox)
+            raise
+
+    def release(self, mailbox: Hashable) -> None:
+        """End a turn; the next client has the next one."""
+        clients = self._waiting[mailbox]
+        while clients:
+            client = next(iter(clients))
+            turns = clients.pop(client)
+            turn = turns.popleft()
+            if turns:
+                clients[client] = turns
+            if not turn.done():
+                turn.set_result(None)
+                return
+        del self._waiting[mailbox]
+
+
+class MailboxTurn:
+    """A turn at the mailbox of one slave in one protocol; :meth:`close` ends it."""
+
+    def __init__(
+        self,
+        link: EngineLink,
+        bus: int,
+        station: int,
+        kind: MailboxType,
+        release: Callable[[], None],
+    ) -> None:
+        self._link = link
+        self._bus = bus
+        self._station = station
+        self._kind = kind
+        self._release = release
+        self._is_open = True
+        self._is_unused = True
+
+    async def exchange(self, request: MailboxRequest) -> MailboxMessage:
+        """Do one step of a conversation.
+
+        Raises:
+            BusError: as the engine's master says.
+            EngineGoneError: there is no engine, or not the one with which it began.
+        """
+        self._is_unused = False
+        limit_s = (request.delay_ns + request.timeout_ns) / _S + MARGIN_S
+        reply = await self._link.request(lambda number: self._step(number, request), limit_s)
+        return reply.message or MailboxMessage(self._kind, b"")
+
+    def abandon(self) -> None:
+        """Close it in the middle, and have the slave end the transfer that was begun."""
+        farewell = ABORT_MESSAGES.get(self._kind)
+        if self._is_open and not self._is_unused and farewell is not None:
+            with suppress(EngineGoneError):
+                self._link.send(lambda number: self._step(number, farewell))
+        self.close()
+
+    def close(self) -> None:
+        """Give the next client its turn; harmless when it is closed."""
+        if self._is_open:
+            self._is_open = False
+            self._release()
+
+    def _step(self, number: int, request: MailboxRequest) -> ExchangeMailbox:
+        return ExchangeMailbox(id=number, bus=self._bus, station=self._station, request=request)
+
 
 T = TypeVar("T")
 

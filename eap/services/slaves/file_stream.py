@@ -22,7 +22,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import DATA_OVERHEAD, FoeOpcode
 from eap.errors import EapError
 from eap.runtime.foe_restart import PAUSE_S, Restarts
-from eap.services.slaves.mailbox_queue import MailboxTurn
+from eap.services.slaves.bus_client import MailboxTurn
 from eap.services.tasks import TaskSet
 
 AHEAD = 64 << 10

@@ -28,9 +28,8 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.soe import SoeErrorCode, name_of
 from eap.gateway.error_table import cause_of_result
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.services.slaves.access import RemoteAccessError
+from eap.services.slaves.access import ObjectStream, RemoteAccessError
 from eap.services.slaves.file_stream import AHEAD, FileStream
-from eap.services.slaves.object_stream import ObjectStream
 
 BLOCK = 16 << 10
 """Octets of the longest block; where there are only datagrams, one that is lost costs all of it."""

@@ -30,18 +30,16 @@ from eap.codec.mailbox import (
     encode_frame,
     encode_message,
 )
-from eap.gateway.address import AddressMap, RemoteAddress
 from eap.gateway.request_tracker import ClientLimits
+from eap.gateway.requests import AddressMap, RemoteAddress
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.runtime.bus_request import SlaveDescription
 from eap.services.gateway.gateway import MailboxGateway, Settings
 from eap.services.gateway.gateway_transport import GatewayTransport
-from eap.services.gateway.master_session import MasterSession
-from eap.services.slaves.bus_client import BusClient
-from eap.services.slaves.bus_view import BusDescription
-from eap.services.slaves.mailbox_queue import MailboxTurn
+from eap.services.gateway.sessions import MasterSession
+from eap.services.slaves.bus_client import BusClient, BusDescription, MailboxTurn
 from eap.services.slaves.remote_slave import RemoteSlave
 from tools.fuzz.messages import cut
 

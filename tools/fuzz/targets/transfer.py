@@ -5,9 +5,8 @@ from __future__ import annotations
 from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import refuse
 from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestTracker
-from eap.gateway.rights import operation_of
+from eap.gateway.requests import operation_of, refuse
 from tools.fuzz.messages import cut
 
 _WAYS = tuple(Endpoint("door", str(number)) for number in range(5))

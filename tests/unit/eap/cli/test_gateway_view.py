@@ -4,7 +4,7 @@ import msgspec
 from rich.console import Console
 
 from eap.cli.gateway import gateway_view
-from eap.control.gateway import GatewayRow
+from eap.control.bus import GatewayRow
 
 ROW = {
     "station": "mixer",

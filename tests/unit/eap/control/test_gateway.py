@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.control.gateway import GatewayParameters
+from eap.control.bus import GatewayParameters
 from eap.control.protocol import parameters
 from eap.errors import ControlError
 

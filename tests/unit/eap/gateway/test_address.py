@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from eap.gateway.address import AddressMap, GroupAddress, MasterAddress, RemoteAddress, SlaveAddress
+from eap.gateway.requests import (
+    AddressMap,
+    GroupAddress,
+    MasterAddress,
+    RemoteAddress,
+    SlaveAddress,
+)
 from eap.ids import NetId
 
 THERE = (1001, 1002, 0x8005)

@@ -13,7 +13,7 @@ from eap.codec.foe import Busy, FoeErrorCode, FoeOpcode, decode_message, text_of
 from eap.codec.mailbox import MailboxError, MailboxType
 from eap.codec.soe import SoeErrorCode, SoeHeader, error_code_of
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import refuse
+from eap.gateway.requests import refuse
 from eap.ids import NetId
 
 COE, FOE, SOE, VOE, EOE, AOE = (

@@ -7,7 +7,7 @@ import pytest
 from eap.ams.access import objects_of, service_of
 from eap.ams.spec import AccessService, ObjectRange
 from eap.codec.mailbox import MailboxType
-from eap.gateway.rights import operation_of
+from eap.gateway.requests import operation_of
 
 COE, FOE, SOE = (MailboxType[name] for name in ("COE", "FOE", "SOE"))
 VOE, EOE, AOE = (MailboxType[name] for name in ("VOE", "EOE", "AOE"))

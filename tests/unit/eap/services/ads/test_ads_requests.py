@@ -9,7 +9,7 @@ from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import OperationOutcome
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
-from eap.services.ads.ads_requests import answer_request, begin_answer
+from eap.services.ads.ads_service import answer_request, begin_answer
 
 OK = bytes(4)
 

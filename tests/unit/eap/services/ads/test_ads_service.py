@@ -15,8 +15,7 @@ from eap.codec.adsnotification import TransMode
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.pd.device import DeviceState
-from eap.services.ads.ads_service import AdsService
-from eap.services.ads.eap_ads import device_info
+from eap.services.ads.ads_service import AdsService, device_info
 from eap.services.routing.service import LocalRequest
 from tests.support import aoe
 from tests.support.stationengine import make_device

@@ -31,7 +31,7 @@ from eap.codec.ams import AmsCommand
 from eap.codec.mailbox import MailboxType
 from eap.runtime.bus_request import ExchangeMailbox
 from eap.services.ads import bus_ads as service
-from eap.services.ads import slave_ads, slave_files
+from eap.services.ads import slave_files
 from eap.services.device.master_values import MasterDictionaryProvider
 from tests.support.busads import DRIVE, MASTER, play, until
 
@@ -277,7 +277,7 @@ def test_answer_longer_than_the_room_of_the_client_is_refused(length):
 
 def test_request_of_any_content_is_answered(monkeypatch):
     monkeypatch.setattr(slave_files, "ANSWER_S", 0.01)
-    monkeypatch.setattr(slave_ads, "COMMAND_ANSWER_S", 0.01)
+    monkeypatch.setattr(service, "COMMAND_ANSWER_S", 0.01)
     pick = random.Random(7)
     groups = [*IndexGroup, 0, 0x8000_0000]
     offsets = [0, 1, 0x1018_0001, 0x1018_0100, 0x0040_0020, 0x0800_0063, 0xFFFF_FFFF]

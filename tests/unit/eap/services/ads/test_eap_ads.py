@@ -17,8 +17,9 @@ from eap.ids import NetId
 from eap.od.profiles.eap1000 import Tx
 from eap.pd.device import DeviceState, FaultCode
 from eap.pd.words import StationWord
-from eap.services.ads.eap_ads import EapAds, device_info
-from eap.services.ads.image_variables import StationSymbols
+from eap.services.ads.ads_service import device_info
+from eap.services.ads.station_ads import EapAds
+from eap.services.ads.station_symbols import StationSymbols
 from eap.services.routing.service import LocalRequest
 from eap.services.tasks import MAX_WAITING
 from tests.support import aoe

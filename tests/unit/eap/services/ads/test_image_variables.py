@@ -12,7 +12,7 @@ from eap.net.image_file import create_image, open_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
-from eap.services.ads.image_variables import StationSymbols
+from eap.services.ads.station_symbols import StationSymbols
 
 BIG = 0xFFFF
 

@@ -15,7 +15,7 @@ from eap.codec.ams import AmsCommand, decode_packet
 from eap.runtime.bus_request import BringSlaves, Cancel, Ping, SlaveDescription
 from eap.services.ads import master_ads
 from eap.services.ads.master_ads import MasterStates, RawCommands, StateRequests
-from eap.services.slaves.bus_view import BusDescription
+from eap.services.slaves.bus_client import BusDescription
 from tests.support.busads import BUS, DRIVE, MASTER, play, until
 from tests.support.eventually import elapse, settle
 

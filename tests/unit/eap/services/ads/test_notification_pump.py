@@ -21,8 +21,7 @@ from eap.pd.layout import plan_layout
 from eap.pd.samples import ImageSamples, Sampler
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
-from eap.services.ads.image_variables import StationSymbols
-from eap.services.ads.notification_pump import NotificationPump
+from eap.services.ads.station_symbols import NotificationPump, StationSymbols
 from tests.support.eventually import eventually
 
 MS = 1_000_000

@@ -17,9 +17,8 @@ from eap.device.live_dictionaries import RouterDictionary
 from eap.ids import NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortKind, PortSpec
-from eap.services.ads.eap_ads import device_info
-from eap.services.ads.router_ads import RouterAds
-from eap.services.ads.router_values import LiveRouter
+from eap.services.ads.ads_service import device_info
+from eap.services.ads.station_ads import LiveRouter, RouterAds
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
 from tests.support import aoe

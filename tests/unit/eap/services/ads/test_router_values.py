@@ -17,7 +17,7 @@ from eap.net.image_file import create_image
 from eap.od.profiles.router9000 import RouterLive
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec, VariableSpec, Writer
-from eap.services.ads.router_values import LiveRouter
+from eap.services.ads.station_ads import LiveRouter
 from eap.services.routing.station_router import StationRouter
 from tests.support.routing import RecordingSender
 from tests.support.stationengine import make_device
@@ -71,7 +71,7 @@ def test_interfaces_have_addresses_or_none(values):
 def test_interface_tells_its_address(values, tmp_path, monkeypatch):
     (tmp_path / "lo").mkdir()
     (tmp_path / "lo" / "address").write_text("02:00:00:00:00:05\n")
-    monkeypatch.setattr("eap.services.ads.router_values._INTERFACES", tmp_path)
+    monkeypatch.setattr("eap.services.ads.station_ads._INTERFACES", tmp_path)
     assert values.mac_of("eap1") == bytes.fromhex("020000000005")
 
 

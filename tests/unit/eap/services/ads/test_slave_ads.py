@@ -14,7 +14,7 @@ from eap.codec.coe import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.ids import NetId
 from eap.runtime.bus_request import ExchangeMailbox
-from eap.services.ads import slave_ads
+from eap.services.ads import bus_ads
 from tests.support.busads import BUS, DRIVE, TOOL, play, until
 
 TALKER, MUTE, OTHER_SLAVE = 1001, 1002, 1002
@@ -229,7 +229,7 @@ def test_procedure_command_is_executed_and_cleared():
 
 
 def test_procedure_command_that_takes_long_is_busy_until_it_is_done(monkeypatch):
-    monkeypatch.setattr(slave_ads, "COMMAND_ANSWER_S", 0.001)
+    monkeypatch.setattr(bus_ads, "COMMAND_ANSWER_S", 0.001)
 
     async def scene(client, engine):
         command = Write(IndexGroup.SOE, place(COMMAND, is_command=1), b"")
@@ -259,7 +259,7 @@ def test_procedure_command_refused_by_the_drive_leaves_nothing_behind():
 
 
 def test_procedure_commands_are_limited_in_number(monkeypatch):
-    monkeypatch.setattr(slave_ads, "MAX_COMMANDS", 0)
+    monkeypatch.setattr(bus_ads, "MAX_COMMANDS", 0)
 
     async def scene(client, engine):
         command = Write(IndexGroup.SOE, place(COMMAND, is_command=1), b"")

@@ -10,7 +10,7 @@ from eap.ads.operation import OperationOutcome, WriteControl
 from eap.codec.ads import AdsError, AdsState
 from eap.errors import EngineRefusedError
 from eap.pd.device import DeviceState
-from eap.services.ads.state_control import control_state
+from eap.services.ads.ads_service import control_state
 from tests.support.stationengine import make_device
 
 

@@ -13,8 +13,8 @@ from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.pd.device import DeviceState
-from eap.services.ads.eap_ads import device_info
-from eap.services.ads.system_ads import SystemAds
+from eap.services.ads.ads_service import device_info
+from eap.services.ads.station_ads import SystemAds
 from eap.services.routing.service import LocalRequest
 from tests.support import aoe
 from tests.support.stationengine import make_device

@@ -12,7 +12,7 @@ from eap.ams.routes import Route
 from eap.ams.spec import DirectoryStation
 from eap.errors import ControlError
 from eap.ids import NetId
-from eap.services.control.ams_methods import AmsMethods
+from eap.services.control.route_methods import AmsMethods
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.tracing import RouteQuery
 from tests.support.routing import StubService

@@ -17,9 +17,7 @@ from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.services.control import audit as module
-from eap.services.control import audit_file
-from eap.services.control.audit import BURST, Audit
-from eap.services.control.audit_file import KEPT, AuditFile
+from eap.services.control.audit import BURST, KEPT, Audit, AuditFile
 
 LAPTOP = Endpoint("ams-tcp", "10.0.0.5:49152")
 HEADER = AmsHeader(
@@ -209,7 +207,7 @@ def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None
 
 
 def test_old_files_go(audit: Audit, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(audit_file, "MAX_BYTES", 1000)
+    monkeypatch.setattr(module, "MAX_BYTES", 1000)
     for number in range(20):
         audit.write(f"island-{number}", entry())
     names = sorted(path.name for path in audit.path.parent.iterdir())

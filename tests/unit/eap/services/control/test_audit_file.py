@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from eap.services.control import audit_file as module
-from eap.services.control.audit_file import AuditFile
+from eap.services.control import audit as module
+from eap.services.control.audit import AuditFile
 from tests.support.limits import largest_file
 
 

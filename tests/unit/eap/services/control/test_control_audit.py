@@ -11,7 +11,7 @@ import pytest
 from eap.control.bus import BusOpenParameters, MailboxData
 from eap.control.device import ApplyAnswer, StateAnswer, StateError
 from eap.control.protocol import Request
-from eap.services.control.control_audit import change_of, peer_of, refusal_in
+from eap.services.control.control_server import change_of, peer_of, refusal_in
 
 
 def opened(protocol: str = "coe") -> BusOpenParameters:

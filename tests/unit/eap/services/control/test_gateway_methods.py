@@ -15,10 +15,10 @@ from eap.errors import ControlError
 from eap.gateway.request_tracker import RequestTracker
 from eap.ids import NetId
 from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
-from eap.services.control.gateway_methods import GatewayMethods
-from eap.services.gateway.client_session import SessionKey
+from eap.services.control.bus_methods import GatewayMethods
 from eap.services.gateway.gateway import Settings
 from eap.services.gateway.reply_encoder import GatewayStatistics
+from eap.services.gateway.sessions import SessionKey
 from tests.support.cyclic import station
 
 HERE = Endpoint("udp:eap0", "127.0.0.1:9")

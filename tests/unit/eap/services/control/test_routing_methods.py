@@ -10,7 +10,7 @@ from eap.ams.spec import HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKin
 from eap.control.device import RoutingDifference, RunningRouting
 from eap.errors import ControlError
 from eap.runtime.store import StationStore
-from eap.services.control.routing_methods import RoutingMethods
+from eap.services.control.route_methods import RoutingMethods
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.routing.station_routing import StationRouting
 from tests.support.routing import station

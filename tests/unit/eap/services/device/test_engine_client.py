@@ -16,7 +16,7 @@ from eap.pd.spec import StationSpec
 from eap.runtime.bus_errors import ErrorRecord
 from eap.runtime.bus_request import EngineReply, EngineRequest, EngineStarted
 from eap.runtime.station_request import Configure, SetState
-from eap.services.device.engine_client import EngineClient
+from eap.services.device.station_keeper import EngineClient
 from eap.services.engine_link import EngineLink
 from tests.unit.eap.conftest import left
 

@@ -33,9 +33,8 @@ from eap.services.device.master_values import (
     link_status,
 )
 from eap.services.engine_link import EngineLink
-from eap.services.gateway.master_session import MasterSession
-from eap.services.slaves.bus_client import BusClient
-from eap.services.slaves.bus_view import BusDescription
+from eap.services.gateway.sessions import MasterSession
+from eap.services.slaves.bus_client import BusClient, BusDescription
 from tests.support.eventually import elapse, eventually, settle
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus

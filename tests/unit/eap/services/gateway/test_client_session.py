@@ -26,17 +26,17 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError, EngineGoneError
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import GatewayError
+from eap.gateway.requests import GatewayError
 from eap.runtime.bus_request import SlaveDescription
-from eap.services.gateway import client_session as module
-from eap.services.gateway.client_session import (
+from eap.services.gateway import sessions as module
+from eap.services.gateway.gateway import find_refusal
+from eap.services.gateway.message_codecs import codec_for
+from eap.services.gateway.sessions import (
     ClientSession,
     SessionKey,
     SessionTable,
     cause_of,
 )
-from eap.services.gateway.gateway import find_refusal
-from eap.services.gateway.message_codecs import codec_for
 from eap.services.slaves.access import RemoteAccessError
 from tests.support.elsewhere import Station
 from tests.support.eventually import elapse, eventually

@@ -38,14 +38,14 @@ from eap.ids import NetId
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, variable
+from eap.services.gateway.admission import Guard, RuleTarget
 from eap.services.gateway.dialect_handler import (
     DialectError,
     DialectHandler,
     DialectTarget,
     operation_of,
 )
-from eap.services.gateway.guard import Guard, RuleTarget
-from eap.services.gateway.master_session import MasterSession
+from eap.services.gateway.sessions import MasterSession
 from eap.services.slaves.access import SlaveAccess
 from eap.services.slaves.remote_slave import LONGEST_ANSWER
 from tests.support import busads

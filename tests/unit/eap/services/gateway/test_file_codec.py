@@ -11,9 +11,9 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ads import AdsError
 from eap.codec.foe import FoeErrorCode, FoeOpcode, decode_message, encode_message
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import GatewayError
+from eap.gateway.requests import GatewayError
 from eap.runtime.bus_request import ExchangeMailbox
-from eap.services.gateway.file_codec import FileCodec
+from eap.services.gateway.transfer_codecs import FileCodec
 from eap.services.slaves.access import RemoteAccessError
 from tests.support import busads
 from tests.support.elsewhere import Bus

@@ -22,14 +22,14 @@ from eap.codec.mailbox import (
     decode_frame,
     encode_frame,
 )
-from eap.gateway.address import AddressMap, RemoteAddress, SlaveAddress
+from eap.gateway.requests import AddressMap, RemoteAddress, SlaveAddress
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, array, variable
 from eap.runtime.bus_request import UnsolicitedMessage
 from eap.services.engine_link import EngineLink
 from eap.services.gateway.gateway import MailboxGateway, Settings
-from eap.services.gateway.master_session import MasterSession
+from eap.services.gateway.sessions import MasterSession
 from eap.services.slaves.access import SlaveAccess
 from eap.services.slaves.bus_client import BusClient
 from eap.services.slaves.remote_slave import LONGEST_ANSWER

@@ -12,10 +12,10 @@ from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import refuse
+from eap.gateway.requests import refuse
 from eap.ids import NetId
-from eap.services.gateway.client_session import GatewayReply
-from eap.services.gateway.guard import Guard, RuleTarget, reason_of_refusal, result_of
+from eap.services.gateway.admission import Guard, RuleTarget, reason_of_refusal, result_of
+from eap.services.gateway.sessions import GatewayReply
 
 TARGET = RuleTarget(NetId.parse("5.1.1.1.3.1"), 1001)
 HERE, ELSEWHERE = Endpoint("udp:eap0", "127.0.0.1:1"), Endpoint("udp:eap0", "10.0.0.9:1")

@@ -11,7 +11,7 @@ from eap.gateway.error_table import Cause
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, variable
-from eap.services.gateway.master_session import MasterSession
+from eap.services.gateway.sessions import MasterSession
 
 COE = MailboxType.COE
 

@@ -21,17 +21,17 @@ from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, enco
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Display, Element, Idn, SoeAttribute, encode_list
 from eap.gateway.error_table import Cause
-from eap.gateway.refusal import GatewayError
+from eap.gateway.requests import GatewayError
 from eap.ids import NetId
 from eap.od.model import OdState
 from eap.services.gateway import message_codecs
-from eap.services.gateway.client_session import SessionCodec
 from eap.services.gateway.message_codecs import (
     AdsCodec,
     ElementCodec,
     EthernetCodec,
     VendorCodec,
 )
+from eap.services.gateway.sessions import SessionCodec
 from eap.services.slaves.access import RemoteAccessError
 from eap.services.slaves.remote_slave import LONGEST_ANSWER
 from tests.support.elsewhere import Station

@@ -16,7 +16,7 @@ from eap.codec.mailbox import MailboxType
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
-from eap.services.gateway.object_codec import ObjectCodec
+from eap.services.gateway.transfer_codecs import ObjectCodec
 from tests.support.elsewhere import Station
 from tests.support.eventually import eventually
 from tests.support.memoryslave import MemoryMailbox, lead, memory_share, memory_slave

@@ -8,13 +8,13 @@ from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker
-from eap.services.gateway.client_session import GatewayReply, refusals
 from eap.services.gateway.reply_encoder import (
     GatewayRequest,
     GatewayStatistics,
     RefusalLog,
     ReplyEncoder,
 )
+from eap.services.gateway.sessions import GatewayReply, refusals
 
 HERE = Endpoint("udp:eap0", "127.0.0.1:1")
 NEAR, THERE = Endpoint("udp:eap0", "10.0.0.8:1"), Endpoint("udp:eap0", "10.0.0.9:1")

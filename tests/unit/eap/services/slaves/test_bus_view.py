@@ -19,7 +19,7 @@ from eap.runtime.bus_request import (
     SlaveDescription,
 )
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.bus_view import BusView
+from eap.services.slaves.bus_client import BusView
 from tests.support.eventually import elapse
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus

@@ -17,9 +17,8 @@ from eap.errors import EngineGoneError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.runtime.bus_request import ExchangeMailbox
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.access import SlaveAccess
+from eap.services.slaves.access import LocalSlave, SlaveAccess
 from eap.services.slaves.bus_client import BusClient
-from eap.services.slaves.local_slave import LocalSlave
 from tests.support.eventually import eventually
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus

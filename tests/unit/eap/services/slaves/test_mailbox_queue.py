@@ -14,7 +14,7 @@ from devicebus.mailbox.conversation import MailboxRequest
 from eap.codec.mailbox import MailboxType
 from eap.runtime.bus_request import ExchangeMailbox
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.mailbox_queue import MailboxQueues, MailboxTurn
+from eap.services.slaves.bus_client import MailboxQueues, MailboxTurn
 from tests.support.eventually import settle
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus

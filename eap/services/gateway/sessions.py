@@ -1,28 +1,33 @@
-"""One client's session with one slave in one mailbox protocol.
+"""Sessions of one client: with one slave in one mailbox protocol, and with the master's dictionary.
 
-Rule 1: a request is answered within a time, by the slave or by the gateway.
-Rule 2: a step of a transfer that comes again gets its answer again, and changes nothing.
-Rule 3: a transfer without a next step is given up, and what it holds is freed.
+Rule 1: a request is answered within a time limit, by the slave or by the gateway.
+Rule 2: a repeated step of a transfer gets the same answer again, and changes nothing.
+Rule 3: a transfer without a next step is aborted, and its memory is freed.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 from msgspec.structs import replace
 
 from devicebus.errors import MailboxRefusedError
+from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.endpoint import Endpoint
+from eap.ads.operation import Operation
+from eap.ams.access import place_of
 from eap.codec.foe import FoeOpcode
-from eap.codec.mailbox import MailboxType
+from eap.codec.mailbox import MailboxError, MailboxType
 from eap.errors import CodecError, EapError, TruncatedError
 from eap.gateway import error_table
 from eap.gateway.error_table import Cause, cause_of_result
-from eap.gateway.refusal import GatewayError, mailbox_error, refuse
+from eap.gateway.requests import GatewayError, mailbox_error, operation_of, refuse
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import OdState
 from eap.services.slaves.access import RemoteAccessError
 
 IDLE_S = 5.0
@@ -282,3 +287,71 @@ class SessionTable(Generic[S]):
     def _drop_oldest(self) -> None:
         idle = (key for key, each in self._open.items() if not each.is_running)
         self.drop(next(idle, next(iter(self._open))))
+
+
+class MasterSession:
+    """Session of one client with the master: segmented transfers of two clients do not meet.
+
+    Args:
+        dictionary: Of the master.
+        room: Octets of the longest answer behind its mailbox header.
+        refresh: Sees to it that what an object shows is not old; it gets the object's index.
+        is_fresh: Says whether that is so already.
+    """
+
+    is_running = False
+
+    def __init__(
+        self,
+        dictionary: ObjectDictionary,
+        room: int,
+        refresh: Callable[[int], Awaitable[None]],
+        is_fresh: Callable[[int], bool],
+    ) -> None:
+        self._dictionary = dictionary
+        self._refresh = refresh
+        self._is_fresh = is_fresh
+        self._server = CoeServer(dictionary, _op, MailboxSizes.of_data(room))
+
+    async def ask(self, kind: MailboxType, body: bytes) -> list[GatewayReply]:
+        """Return the answers to a request."""
+        if kind is not MailboxType.COE:
+            return refusals(kind, body, Cause.NO_PROTOCOL)
+        await self._refresh(_index_of(operation_of(kind, body)))
+        return self.ask_now(body)
+
+    def is_ready(self, operation: Operation | None) -> bool:
+        """Say whether the answer to a request by CoE, which does *operation*, need not wait."""
+        return self._is_fresh(_index_of(operation))
+
+    def ask_now(self, body: bytes) -> list[GatewayReply]:
+        """Return the answers to a request by CoE that is ready."""
+        try:
+            answers = self._server.receive_message(body, 0)
+        except MailboxRefusedError as exc:
+            if exc.detail == MailboxError.SIZE_TOO_SHORT:
+                return [GatewayReply(*refuse(MailboxType.COE, body, Cause.TOO_SHORT))]
+            return [GatewayReply(*mailbox_error(exc.detail))]
+        return [GatewayReply(MailboxType.COE, answer) for answer in answers]
+
+    async def read(self, index: int, subindex: int, *, complete: bool) -> bytes:
+        """Return an entry or an object as it is now; raise SdoAbortError."""
+        await self._refresh(index)
+        read = self._dictionary.upload_complete if complete else self._dictionary.upload
+        return read(index, subindex, OdState.OP)
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Write an entry; raise SdoAbortError."""
+        self._dictionary.download(index, subindex, data, OdState.OP)
+
+    def close(self) -> None:
+        """Forget what is under way."""
+        self._server.reset()
+
+
+def _index_of(operation: Operation | None) -> int:
+    return place_of(operation)[1] >> 16 if operation else 0
+
+
+def _op() -> OdState:
+    return OdState.OP

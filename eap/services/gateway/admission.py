@@ -25,7 +25,7 @@ from eap.codec.soe import SoeHeader
 from eap.gateway.error_table import Cause, ads_result
 from eap.ids import NetId
 from eap.od.abort import SdoAbortError
-from eap.services.gateway.client_session import GatewayReply
+from eap.services.gateway.sessions import GatewayReply
 
 NOBODY = NetId(bytes(6))
 """Source NetID of clients, which have none here."""

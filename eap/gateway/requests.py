@@ -1,0 +1,321 @@
+"""Mailbox requests of gateway clients: destination, operation for access rules, and error answer.
+
+ETG.8200 has station addresses and 0 for the master.  Its implementations add: bit 15 marks an
+address as that of a slave, 0xFFFF addresses all of them, and virtual addresses of the plant file
+lead to slaves of any station.
+
+Access rules are one list for clients of every transport: a request becomes the operation by which
+an ADS client would do the same (ETG.1020).
+
+An error is answered in the protocol of the request, since a tool understands those best: an SDO is
+aborted, an IDN refused, a file transfer ended with a text, also for a master or slave that does not
+support the protocol.  A mailbox error answers protocols without an error of their own (VoE, EoE),
+and messages that are no request.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
+
+from eap.ads.endpoint import AmsAnswer, response_to
+from eap.ads.operation import AdsRefusedError, Operation, Read, ReadWrite, Write
+from eap.ads.request import parse_request
+from eap.codec.ads import IndexGroup
+from eap.codec.ams import AmsHeader, StateFlags, decode_packet
+from eap.codec.coe import (
+    CoeHeader,
+    CoeService,
+    InfoError,
+    SdoHeader,
+    SdoInfoHeader,
+    SdoInfoOpcode,
+    SdoRequest,
+    encode_abort,
+)
+from eap.codec.coe import encode_message as encode_coe
+from eap.codec.eoe import EoeType
+from eap.codec.foe import Busy, FoeOpcode
+from eap.codec.foe import encode_message as encode_foe
+from eap.codec.mailbox import MailboxErrorReply, MailboxType
+from eap.codec.soe import SoeHeader, SoeOpcode
+from eap.codec.soe import encode_message as encode_soe
+from eap.errors import CodecError, EapError
+from eap.gateway.error_table import Cause
+from eap.ids import NetId
+
+MASTER_ADDRESS = 0
+ALL_SLAVES = 0xFFFF
+VIRTUAL_BIT = 0x8000
+
+
+class MasterAddress(NamedTuple):
+    """The dictionary of the master itself."""
+
+
+class SlaveAddress(NamedTuple):
+    """A slave on the gateway's own bus."""
+
+    station: int
+    """Its station address."""
+
+
+class RemoteAddress(NamedTuple):
+    """A slave, or with port 0xFFFF the master, of another bus; reached by AoE."""
+
+    net_id: NetId
+    port: int
+
+
+class GroupAddress(NamedTuple):
+    """Several slaves that each answer for themselves."""
+
+    members: tuple[int, ...]
+    """Station addresses, or virtual ones."""
+
+
+Destination: TypeAlias = MasterAddress | SlaveAddress | RemoteAddress | GroupAddress
+
+
+class AddressMap:
+    """What the addresses of a gateway mean.
+
+    Args:
+        virtual: Addresses of the plant file.  They go before station addresses, so that a slave
+            that was exchanged can be found where tools look for it; 0 and 0xFFFF stay what they
+            are.
+    """
+
+    def __init__(
+        self, virtual: Mapping[int, SlaveAddress | RemoteAddress | GroupAddress] | None = None
+    ) -> None:
+        self._virtual = dict(virtual or {})
+
+    def resolve(self, address: int, stations: tuple[int, ...]) -> Destination:
+        """Return the meaning of *address*; *stations* are the slaves of the bus.
+
+        A station address without a slave is returned as such; the access to it is what fails.
+        """
+        if address == MASTER_ADDRESS:
+            return MasterAddress()
+        if address == ALL_SLAVES:
+            return GroupAddress(stations)
+        found = self._virtual.get(address)
+        if found is not None:
+            return found
+        if address & VIRTUAL_BIT and address not in stations:
+            return SlaveAddress(address & ~VIRTUAL_BIT)
+        return SlaveAddress(address)
+
+
+_COMPLETE = 0x100
+_RAW = ReadWrite(IndexGroup.VOE, 0, 0, b"")
+"""What cannot be looked into."""
+# Members of enums are slow to reach.
+_SDO_GROUP = IndexGroup.SDO
+_INFORMATION, _REQUEST = CoeService.SDO_INFORMATION, CoeService.SDO_REQUEST
+_UPLOAD, _DOWNLOAD = SdoRequest.UPLOAD, SdoRequest.DOWNLOAD
+_EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
+
+
+@lru_cache(1024)  # clients ask for the same again and again
+def operation_of(kind: MailboxType, body: bytes) -> Operation | None:
+    """Return what a request does; None for a step of a transfer that was judged at its start."""
+    find = _BY_KIND.get(kind)
+    return find(body) if find is not None else _RAW
+
+
+def sdo(index: int, subindex: int, *, complete: bool, data: bytes | None = None) -> Operation:
+    """Return the upload of an entry or object, or with *data* its download."""
+    offset = index << 16 | (_COMPLETE if complete else subindex)
+    if data is None:
+        return Read(_SDO_GROUP, offset, 0)
+    return Write(_SDO_GROUP, offset, data)
+
+
+def idn(number: int, drive: int, data: bytes | None = None) -> Operation:
+    """Return reading an element of an IDN, or with *data* writing it."""
+    offset = drive << 24 | number
+    if data is None:
+        return Read(IndexGroup.SOE, offset, 0)
+    return Write(IndexGroup.SOE, offset, data)
+
+
+def _of_coe(body: bytes) -> Operation | None:
+    service = body[1] >> 4 if len(body) >= CoeHeader.SIZE else 0
+    if service == _INFORMATION and len(body) > CoeHeader.SIZE:
+        return _of_info(body)
+    if service != _REQUEST:
+        return _RAW
+    if len(body) < CoeHeader.SIZE + 4:
+        return None
+    command, index, subindex = body[2], body[3] | body[4] << 8, body[5]
+    specifier, complete = command >> 5, bool(command & 0x10)
+    if specifier == _UPLOAD:
+        return sdo(index, subindex, complete=complete)
+    if specifier == _DOWNLOAD:
+        return sdo(index, subindex, complete=complete, data=_written(body))
+    return None
+
+
+def _written(body: bytes) -> bytes:
+    """Return what a download writes, as far as its first message has it."""
+    start = CoeHeader.SIZE + SdoHeader.SIZE
+    if len(body) < start:
+        return b""
+    head = SdoHeader.decode(body, CoeHeader.SIZE)
+    return head.data if head.expedited else body[start:]
+
+
+def _of_info(body: bytes) -> Operation:
+    opcode = body[2] & 0x7F
+    index = int.from_bytes(body[6:8], "little") << 16
+    if opcode == SdoInfoOpcode.OBJECT_REQUEST:
+        return Read(IndexGroup.OBJECT_DESCRIPTION, index, 0)
+    if opcode == SdoInfoOpcode.ENTRY_REQUEST:
+        return Read(IndexGroup.ENTRY_DESCRIPTION, index | int.from_bytes(body[8:9], "little"), 0)
+    return Read(IndexGroup.OBJECT_LIST, index, 0)
+
+
+def _of_soe(body: bytes) -> Operation:
+    if len(body) < SoeHeader.SIZE:
+        return _RAW
+    opcode, drive, number = body[0] & 0x07, body[0] >> 5, int.from_bytes(body[2:4], "little")
+    if opcode == SoeOpcode.READ_REQUEST:
+        return idn(number, drive)
+    if opcode == SoeOpcode.WRITE_REQUEST:
+        return idn(number, drive, body[SoeHeader.SIZE :])
+    return _RAW
+
+
+def _of_foe(body: bytes) -> Operation | None:
+    opcode = body[0] if body else 0
+    if opcode == FoeOpcode.READ:
+        return ReadWrite(IndexGroup.FOE_OPEN_READ, 0, 0, body[6:])
+    if opcode == FoeOpcode.WRITE:
+        return ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 0, body[6:])
+    return None
+
+
+def _of_eoe(body: bytes) -> Operation:
+    is_read = bool(body) and body[0] & 0x0F in _EOE_READS
+    return Read(IndexGroup.OBJECT_LIST, 0, 0) if is_read else _RAW
+
+
+def _of_aoe(body: bytes) -> Operation:
+    """Return the only operation of a packet in one piece; others cannot be looked into."""
+    try:
+        header, data = decode_packet(body)
+        operations = parse_request(header.command, bytes(data)).operations
+    except (CodecError, AdsRefusedError):
+        return _RAW
+    is_answer = header.state_flags & StateFlags.RESPONSE
+    return operations[0] if len(operations) == 1 and not is_answer else _RAW
+
+
+_BY_KIND: dict[MailboxType, Callable[[bytes], Operation | None]] = {
+    MailboxType.COE: _of_coe,
+    MailboxType.SOE: _of_soe,
+    MailboxType.FOE: _of_foe,
+    MailboxType.EOE: _of_eoe,
+    MailboxType.AOE: _of_aoe,
+}
+
+
+_NOT_BEGUN = Busy(0, 100)
+_SUBINDEX = 5
+"""Where it stands in an SDO request, CoE header included."""
+
+_ASK_AGAIN = frozenset((Cause.BUSY, Cause.TOO_FAST))
+
+
+class GatewayError(EapError):
+    """A request that the gateway itself refuses."""
+
+    def __init__(self, cause: Cause) -> None:
+        super().__init__(cause.text)
+        self.cause = cause
+
+
+class Answer(NamedTuple):
+    """A message that goes back."""
+
+    type: MailboxType
+    body: bytes
+
+
+def refuse(kind: MailboxType, request: bytes, cause: Cause, text: str = "") -> Answer:
+    """Return the error that answers a request.
+
+    Args:
+        kind: Its protocol.
+        request: What it holds behind the mailbox header.
+        cause: Why it is refused.
+        text: More than *cause* says, where the protocol has room for words.
+    """
+    error_replier = _REFUSERS.get(kind)
+    if error_replier is None:
+        return mailbox_error(cause.mailbox)
+    body = error_replier(request, cause, text or cause.text)
+    return mailbox_error(cause.mailbox) if body is None else Answer(kind, body)
+
+
+def mailbox_error(detail: int) -> Answer:
+    """Return an error of the mailbox itself."""
+    return Answer(MailboxType.ERR, MailboxErrorReply(detail=detail).encode())
+
+
+def _refuse_coe(request: bytes, cause: Cause, text: str) -> bytes | None:
+    del text
+    if len(request) < CoeHeader.SIZE:
+        return None
+    code, service = cause.sdo, request[1] >> 4
+    if service == CoeService.SDO_INFORMATION:
+        body = SdoInfoHeader(SdoInfoOpcode.ERROR).encode() + InfoError(code).encode()
+        return encode_coe(CoeService.SDO_INFORMATION, body)
+    if service != CoeService.SDO_REQUEST:
+        return None
+    subindex = request[_SUBINDEX] if len(request) > _SUBINDEX else 0
+    return encode_abort(int.from_bytes(request[3:_SUBINDEX], "little"), subindex, code)
+
+
+def _refuse_foe(request: bytes, cause: Cause, text: str) -> bytes | None:
+    words = text.encode() + b"\0"
+    if not request:
+        return None
+    if cause in _ASK_AGAIN:  # no end of the transfer, only of patience
+        return encode_foe(FoeOpcode.BUSY, _NOT_BEGUN.number, words)
+    return encode_foe(FoeOpcode.ERROR, cause.foe, words)
+
+
+def _refuse_soe(request: bytes, cause: Cause, text: str) -> bytes | None:
+    del text
+    opcode = request[0] & 0x07 if len(request) >= SoeHeader.SIZE else 0
+    if opcode not in {SoeOpcode.READ_REQUEST, SoeOpcode.WRITE_REQUEST}:
+        return None
+    return encode_soe(
+        SoeOpcode(opcode + 1),
+        int.from_bytes(request[2:4], "little"),
+        cause.soe.to_bytes(2, "little"),
+        drive=request[0] >> 5,
+        elements=request[1],
+        error=True,
+    )
+
+
+def _refuse_aoe(request: bytes, cause: Cause, text: str) -> bytes | None:
+    del text
+    try:
+        asked = AmsHeader.decode(request)
+    except CodecError:
+        return None
+    return response_to(asked, AmsAnswer(error_code=cause.ads))
+
+
+_REFUSERS = {
+    MailboxType.AOE: _refuse_aoe,
+    MailboxType.COE: _refuse_coe,
+    MailboxType.FOE: _refuse_foe,
+    MailboxType.SOE: _refuse_soe,
+}
