@@ -171,7 +171,7 @@ def show(
     if is_terminal:
         print(CLEAR_SCREEN, end="")
     while goes_on(appliance, end, REFRESH_S if is_terminal else LINE_S):
-        look = take_look(stations, monotonic() - start)
+        look = read_snapshot(stations, monotonic() - start)
         rates = meter.rates(look)
         if is_terminal:
             repaint([as_screen(look, rates)])
@@ -190,7 +190,7 @@ def goes_on(appliance: subprocess.Popen[str], end: float, pause_s: float) -> boo
     return False
 
 
-def take_look(stations: list[AttachedStation], at_s: float) -> Look:
+def read_snapshot(stations: list[AttachedStation], at_s: float) -> Look:
     """Read all values and counters."""
     values = {station.name: station.read_all() for station in stations}
     received = {

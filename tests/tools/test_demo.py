@@ -30,7 +30,7 @@ def lines(at: Look, rates: dict[Endpoint, float], width: int = 80) -> list[str]:
     return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 
-def test_demo_shows_variables_and_ways_that_its_plant_has() -> None:
+def test_demo_shows_variables_and_paths_of_its_plant() -> None:
     plant = load(PLANT, describe).plant
     assert plant is not None
     stations = {each.name: each for each in plant.stations}
@@ -56,7 +56,7 @@ def test_demo_screen_fits_80x24_and_does_not_move_with_its_values() -> None:
     assert [line.find("►") for line in small] == [line.find("►") for line in large]
 
 
-def test_demo_screen_shows_an_interrupted_way() -> None:
+def test_demo_screen_shows_an_interrupted_path() -> None:
     assert sum("── x ──" in line for line in lines(look(1, 0, state="stale", age_us=None), {})) == 5
 
 

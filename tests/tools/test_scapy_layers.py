@@ -62,7 +62,7 @@ def test_stream_waits_for_a_whole_frame() -> None:
     assert EtherCatFrame.tcp_reassemble(PD_FRAME + b"x", {}, {})[Padding].load == b"x"
 
 
-def test_referee_knows_nothing_of_our_codec() -> None:
+def test_scapy_layers_do_not_import_the_codec() -> None:
     code = "import sys, tools.scapy_layers; print([m for m in sys.modules if m[:3] == 'eap'])"
     root = Path(__file__).parents[2]
     done = subprocess.run(

@@ -38,7 +38,7 @@ BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"
 
 
 class Section(msgspec.Struct, frozen=True):
-    """What one benchmark found."""
+    """Result of one benchmark."""
 
     name: str
     title: str
@@ -46,7 +46,7 @@ class Section(msgspec.Struct, frozen=True):
 
 
 def main(arguments: list[str]) -> int:
-    """Run the benchmarks that were asked for; return 0 even when a target was missed."""
+    """Run the selected benchmarks; return 0 even when a target was missed."""
     options = _parse(arguments)
     settings = quick() if options.quick else Settings()
     about = machine.describe()
@@ -61,7 +61,7 @@ def main(arguments: list[str]) -> int:
         Path(options.json).write_bytes(msgspec.json.format(msgspec.json.encode(data)) + b"\n")
     if options.markdown:
         _write_page(about, sections)
-    missed = [f.name for s in sections for f in s.figures if f.verdict is Decision.MISSED]
+    missed = [f.name for s in sections for f in s.figures if f.decision is Decision.MISSED]
     print(f"\n{len(missed)} targets missed" + "".join(f"\n  {name}" for name in missed))
     return 0
 
@@ -88,7 +88,7 @@ def _run(name: str, settings: Settings) -> Section:
     except SkippedError as reason:
         figures = [skipped(name, reason)]
     except (RuntimeError, subprocess.SubprocessError) as error:
-        figures = [Figure(name, f"failed: {error}", verdict=Decision.MISSED)]
+        figures = [Figure(name, f"failed: {error}", decision=Decision.MISSED)]
     return Section(name, module.TITLE, figures)
 
 

@@ -31,7 +31,7 @@ _GATEWAY: dict[str, Any] = {"address": NEAR, "port": GATEWAY_PORT}
 _UP_WITHIN_S = 30
 OURS, THEIRS = "ads_roles.pyads_reads", "ads_roles.pyads_server"
 HOPS = {"type 5 over UDP": "", "AMS/TCP": "ams_tcp: far/eap0"}
-"""What the route to the far station says."""
+"""Hop of the route to the remote station."""
 
 
 def run(settings: Settings) -> list[Figure]:

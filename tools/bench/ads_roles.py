@@ -149,7 +149,7 @@ def _trips(sock: socket.socket, request: bytes, count: int) -> _Trips:
 
 
 def request_failed(octets: bytes) -> bool:
-    """Tell whether an answer has an error in its AMS header, or is none."""
+    """Return whether an answer is invalid or has an error in its AMS header."""
     return len(octets) <= _ERROR_AT or octets[_ERROR_AT : _ERROR_AT + 4] != bytes(4)
 
 

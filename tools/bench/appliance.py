@@ -1,4 +1,4 @@
-"""A whole appliance under measurement: ``eapctl run`` in a namespace, asked through ``status``."""
+"""A whole appliance under measurement: ``eapctl run`` in a namespace, read by ``status``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _EAPCTL = (sys.executable, "-m", "eap")
 
 
 class Observation(msgspec.Struct, frozen=True):
-    """What an appliance did in *seconds*.
+    """Counters of an appliance over *seconds*.
 
     Attributes:
         cpu: Share of one core of each process.

@@ -1,4 +1,4 @@
-"""What it costs to change a station while it runs: the swap, and how late cycles are meanwhile."""
+"""Cost of a change of a running station: the swap, and the lateness of cycles meanwhile."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tools.bench.settings import Settings
 TITLE = "Changing a running station: as many PDs sent as received, one PD more and one less"
 PRIORITY = 50
 _SWAP_MS = {30: 0.3, 1000: 3.0}
-"""How long a swap of so many PDs each way may take."""
+"""Longest swap of that many PDs in each direction."""
 _LATENESS_PDS = 30
 _ROUNDS = 12
 

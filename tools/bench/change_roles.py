@@ -40,7 +40,7 @@ _QUIET_NS = 100_000_000
 
 
 def station(pds: int, more: int = 0, interface: str = f"udp://{_ADDRESS}") -> StationSpec:
-    """Return one that sends *pds* PDs of three values to itself, and *more* that nobody takes."""
+    """Return a station that sends *pds* PDs of three values to itself, and *more* unreceived."""
     names = [f"pd{number}" for number in range(pds)]
     frames = [
         TxFrameSpec(
@@ -92,7 +92,7 @@ def _variables(pd: str) -> tuple[str, ...]:
 
 
 class Changer(Recorder):
-    """Asks for one specification after the other, and notes which cycles ran meanwhile."""
+    """Requests one specification after the other, and records the cycles in between."""
 
     def __init__(
         self, plant: EnginePlant, end_ns: int, stop: StopFlag, folder: Path, pds: int

@@ -15,9 +15,9 @@ SLAVES = 16
 OCTETS = 512
 CYCLE_US = 1000
 ACYCLIC_OCTETS = 3000
-"""What a plant gives a bus of 1 ms: three octets for each microsecond."""
+"""Acyclic budget that a plant gives a bus of 1 ms: three bytes for each microsecond."""
 TIMEOUT_MS = 5
-"""How long a plant waits for a frame."""
+"""Frame timeout of a plant."""
 PRIORITY = 50
 
 

@@ -73,7 +73,7 @@ class Traffic:
 
     @property
     def octets(self) -> int:
-        """How many octets of files the slave has taken."""
+        """Bytes of files that the slave has received."""
         return self._octets + self.progress.done
 
     def _read(self, station: int) -> None:
@@ -99,7 +99,7 @@ class Traffic:
         self._start(_FIRST_STATION, writing).watch(done)
 
     def _is_well(self, task: Task[Any]) -> bool:
-        """Note what went wrong; the slave is asked for nothing more then."""
+        """Record the error of a slave and send it no further request."""
         if task.error is not None:
             self.errors.append(str(task.error))
         return task.error is None
@@ -155,7 +155,7 @@ class Loop:
         self.run(lambda now_ns: now_ns >= end_ns)
 
     def run(self, is_over: Callable[[int], bool]) -> None:
-        """Run until *is_over*, which is asked once a cycle."""
+        """Run until *is_over*, called once a cycle."""
         master, wait = self.master, self._ticker.wait
         while True:
             timeout_ns = master.next_timeout()

@@ -1,4 +1,4 @@
-"""What a benchmark found: figures with their targets, and the tables that show them."""
+"""Results of benchmarks: figures with their targets, and the tables that show them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import msgspec
 
 
 class Decision(StrEnum):
-    """What became of a target."""
+    """Result of a comparison with a target."""
 
     OK = "ok"
     MISSED = "missed"
@@ -26,7 +26,7 @@ class Figure(msgspec.Struct, frozen=True):
     name: str
     measured: str
     target: str = ""
-    verdict: Decision = Decision.REPORTED
+    decision: Decision = Decision.REPORTED
     value: float | None = None
 
 
@@ -36,15 +36,15 @@ class SkippedError(Exception):
 
 def at_least(name: str, value: float, target: float, detail: str = "") -> Figure:
     """Return a ratio that should not be smaller than *target*."""
-    verdict = Decision.OK if value >= target else Decision.MISSED
-    return Figure(name, _with(f"{value:.2f}", detail), f"≥ {target:g}", verdict, value)
+    decision = Decision.OK if value >= target else Decision.MISSED
+    return Figure(name, _with(f"{value:.2f}", detail), f"≥ {target:g}", decision, value)
 
 
 def at_most(name: str, value: float, target: float, unit: str = "", detail: str = "") -> Figure:
     """Return a figure that should not be larger than *target*."""
-    verdict = Decision.OK if value <= target else Decision.MISSED
+    decision = Decision.OK if value <= target else Decision.MISSED
     shown = f"{value:.2f}" if not unit else f"{value:.3g}{unit}"
-    return Figure(name, _with(shown, detail), f"≤ {target:g}{unit}", verdict, value)
+    return Figure(name, _with(shown, detail), f"≤ {target:g}{unit}", decision, value)
 
 
 def report(name: str, measured: str, value: float | None = None) -> Figure:
@@ -53,8 +53,8 @@ def report(name: str, measured: str, value: float | None = None) -> Figure:
 
 
 def skipped(name: str, reason: object) -> Figure:
-    """Return what stands in the table for a benchmark that could not run."""
-    return Figure(name, str(reason), verdict=Decision.SKIPPED)
+    """Return the row of a benchmark that could not run."""
+    return Figure(name, str(reason), decision=Decision.SKIPPED)
 
 
 def percentile(values: Sequence[int], share: float) -> int:
@@ -71,7 +71,7 @@ def median_ratio(pairs: Iterable[tuple[float, float]]) -> float:
 def text_table(figures: Sequence[Figure]) -> str:
     """Return *figures* in aligned columns."""
     rows = [("figure", "target", "measured", "verdict")]
-    rows += [(f.name, f.target, f.measured, f.verdict.value) for f in figures]
+    rows += [(f.name, f.target, f.measured, f.decision.value) for f in figures]
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows]
     lines.insert(1, "  ".join("-" * width for width in widths))
@@ -81,7 +81,7 @@ def text_table(figures: Sequence[Figure]) -> str:
 def markdown_table(figures: Sequence[Figure]) -> str:
     """Return *figures* as a table of Markdown."""
     rows = ["| figure | target | measured | verdict |", "|---|---|---|---|"]
-    rows += [f"| {f.name} | {f.target} | {f.measured} | {f.verdict.value} |" for f in figures]
+    rows += [f"| {f.name} | {f.target} | {f.measured} | {f.decision.value} |" for f in figures]
     return "\n".join(rows)
 
 

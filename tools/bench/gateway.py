@@ -90,7 +90,7 @@ def file_figures(way: str, rounds: Sequence[dict[str, float]]) -> list[Figure]:
 def late_figures(
     nobody: dict[str, int], echo: dict[str, int], gateway: dict[str, int]
 ) -> list[Figure]:
-    """Compare how late cycles were while a crowd asked the gateway, a bare echo, and nobody.
+    """Compare the lateness of cycles with clients at the gateway, at a bare echo, and without any.
 
     What the echo adds, a machine adds that has no idle core any more, whoever keeps it busy.
     """

@@ -1,4 +1,4 @@
-"""How late cycles are, beside cyclictest: same time, same priority, a core each."""
+"""Lateness of cycles beside cyclictest: same time, same priority, a core each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far one engine goes: the shortest cycle, and the most stations, that lose nothing."""
+"""Limits of one engine: the shortest cycle, and the most stations, without a loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What reads of the object dictionary cost, how large one is, how long 1,000 PDs take to plan."""
+"""Cost of object dictionaries: reads, memory, and the time to plan 1,000 PDs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the processes of a measurement have in common: answers, waits, and the sender's window."""
+"""Parts that all processes of a measurement share: answers, waits, and the window of the sender."""
 
 from __future__ import annotations
 

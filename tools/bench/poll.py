@@ -1,4 +1,4 @@
-"""How many cycles lie between a request and its answer, for a server anywhere in the cycle."""
+"""Cycles between a request and its answer, for a server at any phase of the cycle."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tools.bench.settings import Settings
 
 TITLE = "Poll round trip, client and server at 1 ms over EtherType, two PDs a request"
 PHASES_US = (500, 0, 750)
-"""When the server's cycle begins after the client's: half a cycle later, together, and late."""
+"""Phases of the server after the client: half a cycle, none, and almost a cycle."""
 PRIORITY = 50
 _COLD = 20
 """Answers left out: they find cold caches."""

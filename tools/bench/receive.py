@@ -1,4 +1,4 @@
-"""What one frame and one record cost inside the process, without any socket."""
+"""Cost of one frame and one record inside the process, without a socket."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _RECORDS: tuple[WireStruct, ...] = (
 
 
 class _Nowhere:
-    """An origin that nobody asks."""
+    """An origin that is never used."""
 
     def source_of(self, data: memoryview) -> bytes:
         """Return an address, as a socket does."""
@@ -71,7 +71,7 @@ def _frame(shape: Shape, repeats: int) -> Figure:
         with create_image(Path(folder) / "image", plan_layout(spec)) as file:
             station = Station(spec, file.image, file.wake_waiters)
             station.start(monotonic_ns())
-            learned = _best(_taking(station.takers["eap0"], data, shape), repeats)
+            learned = _best(_receiving(station.takers["eap0"], data, shape), repeats)
             naive = _best(_walking(file.image.memory, data[: shape.frame_size], shape), repeats)
     name = f"{shape.pds} PDs in a frame: learned layout, ratio to a naive walk that only copies"
     detail = f"{learned:.0f} to {naive:.0f} ns"
@@ -80,7 +80,7 @@ def _frame(shape: Shape, repeats: int) -> Figure:
     return at_most(name, learned / naive, 1, "", detail)
 
 
-def _taking(take: Taker, data: bytearray, shape: Shape) -> Callable[[], int]:
+def _receiving(take: Taker, data: bytearray, shape: Shape) -> Callable[[], int]:
     """Return a run of the product's receive path: match, check, copy, counters."""
     view, put, size = memoryview(data), _CYCLE.pack_into, shape.frame_size
     cycle = 0

@@ -86,7 +86,7 @@ def figure(name: str, times: Sequence[Times]) -> Figure:
 
 
 class _Bench:
-    """A plant that runs, asked as a user program and as a command do."""
+    """A running plant, read like a user program and like a command."""
 
     def __init__(self, plant: Path, stack: ExitStack) -> None:
         environment = stack.enter_context(running(plant, None))

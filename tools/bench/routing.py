@@ -1,4 +1,4 @@
-"""What an AoE router costs: a look-up among few and many routes, and a packet that passes."""
+"""Cost of an AoE router: a look-up among few and many routes, and a forwarded packet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that use the bus of a running plant, until they are told to end."""
+"""Commands that use the bus of a running plant until the benchmark ends them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long and how often everything is measured."""
+"""Duration and number of measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long a person, or a plant that lost its engine, waits for a process to begin."""
+"""Start-up time of processes, for users and for a plant that lost its engine."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ PD_HEADER = 8
 
 
 class Shape(msgspec.Struct, frozen=True):
-    """What is sent in each cycle: *frames* frames of *pds* PDs of *size* octets each."""
+    """Frames of each cycle: *frames* frames of *pds* PDs of *size* bytes each."""
 
     frames: int
     pds: int
@@ -51,7 +51,7 @@ class Shape(msgspec.Struct, frozen=True):
         return FRAME_HEADERS + self.pds * (PD_HEADER + self.size)
 
     def variables(self) -> list[list[VariableSpec]]:
-        """Return the variables of each frame, one a PD; nobody but the engine writes them."""
+        """Return the variables of each frame, one a PD; only the engine writes them."""
         kind = f"BLOCK({self.size})"
         return [
             [VariableSpec(f"v{frame}-{pd}", kind, Writer.ENGINE) for pd in range(self.pds)]

@@ -24,7 +24,7 @@ TITLE = "Throughput: frames received per second, publisher and subscriber on a c
 
 
 class Case(NamedTuple):
-    """What is sent, and how fast it has to be."""
+    """Frames to send, and the required rate."""
 
     name: str
     shape: Shape

@@ -25,7 +25,7 @@ T = TypeVar("T")
 US, MS = 1_000, 1_000_000
 CYCLE_NS = MS
 TRIP_NS = 20 * US
-"""How long a frame is under way."""
+"""Delay of a frame on the line."""
 WATCHDOG_MS = 100
 STATIONS = (1001, 1002, 1003, 1004)
 _STEP_NS = 10 * US

@@ -1,4 +1,4 @@
-"""The faults that are tried: what happens, for how long, and who asks for what meanwhile."""
+"""Faults to try: the event, its duration, and the requests of clients meanwhile."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FILE_SIZE = 20_000
 
 
 class Request(NamedTuple):
-    """What somebody asks of a slave while the fault lasts."""
+    """Request of a client to a slave during the fault."""
 
     what: str
     station: int
@@ -50,7 +50,7 @@ class Case(NamedTuple):
 
     @property
     def duration_ms(self) -> int:
-        """How long it lasts."""
+        """Duration of the fault."""
         return max(fault.at_ms + (fault.for_ms or 0) for fault in self.faults)
 
 

@@ -18,7 +18,7 @@ from tools.faults.case import Case
 from tools.faults.wording import after, counters, describe_diagnosis, describe_events
 
 _DIAGNOSE_BEFORE_NS = 30 * MS
-"""So long before its end the master is asked where the fault is."""
+"""Time before the end of the fault at which the master locates it."""
 _QUANTUM_NS = 100_000
 _BACK_WITHIN_NS = 10_000 * MS
 _STAYS_NS = 150 * MS
@@ -26,11 +26,11 @@ _STAYS_NS = 150 * MS
 _OTHER_PRODUCT = 0x0BAD
 _OUT_NS = 200 * MS
 _SWAPPED_NS = 1_200 * MS
-"""How long the wrong device is plugged in."""
+"""Time for which the wrong device is connected."""
 
 
 class Row(msgspec.Struct, frozen=True):
-    """What the table says of one fault; each of *events*, *counters*, … may be empty."""
+    """Row of the table for one fault; each of *events*, *counters*, … may be empty."""
 
     kind: str
     what: str
@@ -39,7 +39,7 @@ class Row(msgspec.Struct, frozen=True):
     request: str
     diagnosis: str
     again: str
-    """How long after its end all slaves were in OP and process data was whole."""
+    """Time from its end until all slaves were in OP with complete process data."""
 
 
 class Trial:
@@ -93,7 +93,7 @@ class Trial:
         for fault in self._case.faults:
             self._bench.begin(fault)
         self._go_on(1 * MS)
-        self._ask()
+        self._send_requests()
         return self._last(self._start_ns + self._case.duration_ms * MS)
 
     def _swap(self) -> int:
@@ -131,7 +131,7 @@ class Trial:
                 bench.run_until(end_ns, lambda: bench.is_well)
                 self._unwell_ns = bench.now_ns
 
-    def _ask(self) -> None:
+    def _send_requests(self) -> None:
         request, bench = self._case.request, self._bench
         if request is None:
             return

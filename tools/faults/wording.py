@@ -1,4 +1,4 @@
-"""What a master tells, in words that fit into a cell of a table."""
+"""Reports of a master as text for a cell of a table."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ FuzzOne: TypeAlias = Callable[[bytes], None]
 VECTORS = Path(__file__).parents[2] / "tests" / "vectors"
 TARGETS = Path(__file__).parent / "targets"
 _HEADERS = (0, 14, 18, 42)
-"""Where an EtherCAT frame begins: at once, behind Ethernet, behind a VLAN tag, behind UDP."""
+"""Offsets of an EtherCAT frame: bare, behind Ethernet, behind a VLAN tag, behind UDP."""
 
 
 class Find(NamedTuple):

@@ -19,5 +19,5 @@ def test_ratio_is_that_of_the_same_round() -> None:
     soem = [round_of(100, 100, 50), round_of(200, 100, 50), round_of(10, 100, 50)]
     read, file, scan = figures(ours, soem)
     assert (read.value, file.value, scan.value) == (1.5, 3.0, 1.0)
-    assert (read.verdict, file.verdict) == (Decision.OK, Decision.MISSED)
+    assert (read.decision, file.decision) == (Decision.OK, Decision.MISSED)
     assert read.measured == "1.50 (150 to 100 µs)"

@@ -24,29 +24,29 @@ from tools.bench.figures import Decision
 
 def test_reads_are_compared_by_round() -> None:
     figure = reads_figure([(8000.0, 10_000.0), (4000.0, 4000.0), (8000.0, 10_000.0)])
-    assert (figure.value, figure.verdict) == (0.8, Decision.OK)
+    assert (figure.value, figure.decision) == (0.8, Decision.OK)
     assert figure.measured == "0.80 (8.0 to 10.0 thousand/s)"
 
 
 def test_hop_is_what_it_adds() -> None:
     raw, looped = hop_figures("mail", [Trips(200_000.0, 100_000.0, 40_000.0, 50_000.0)] * 3)
-    assert (raw.value, raw.verdict) == (2.5, Decision.MISSED)
+    assert (raw.value, raw.decision) == (2.5, Decision.MISSED)
     assert raw.measured == "2.50 (100 to 200 µs, an echo 40 µs)"
     assert (looped.value, looped.measured) == (2.0, "2.00 (50 µs)")
 
 
 def test_slowest_client_is_compared_with_the_median() -> None:
     figure = crowd_figure([50, 100, 101], 2.0)
-    assert (figure.value, figure.verdict) == (0.5, Decision.OK)
-    assert crowd_figure([0, 100, 101], 2.0).verdict is Decision.MISSED
-    assert crowd_figure([0, 0, 0], 2.0).verdict is Decision.MISSED
+    assert (figure.value, figure.decision) == (0.5, Decision.OK)
+    assert crowd_figure([0, 100, 101], 2.0).decision is Decision.MISSED
+    assert crowd_figure([0, 0, 0], 2.0).decision is Decision.MISSED
 
 
 def test_slave_reads_by_ads_are_compared_with_the_gateway() -> None:
     at_once, alone = slave_figures([SlaveReads(600.0, 1000.0, 1500.0, 1000.0)] * 3)
-    assert (at_once.value, at_once.verdict) == (0.6, Decision.MISSED)
+    assert (at_once.value, at_once.decision) == (0.6, Decision.MISSED)
     assert at_once.measured == "0.60 (600 to 1000 reads/s)"
-    assert (alone.value, alone.verdict) == (1.5, Decision.MISSED)
+    assert (alone.value, alone.decision) == (1.5, Decision.MISSED)
     assert alone.measured == "1.50 (1500 to 1000 µs)"
 
 

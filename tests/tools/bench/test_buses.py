@@ -9,7 +9,7 @@ from tools.bench.buses import bus, encode
 
 
 @pytest.mark.parametrize("slaves", [1, 4, 16, 32, 64])
-def test_any_number_of_slaves_shares_the_octets(tmp_path, slaves: int) -> None:
+def test_bus_of_any_size_has_the_same_process_data(tmp_path, slaves: int) -> None:
     path = tmp_path / "bus.yaml"
     path.write_bytes(encode(bus(slaves, 512)))
     segment = load_or_raise(path).build().segment

@@ -12,13 +12,13 @@ from tools.bench.figures import Decision
 def test_swaps_are_held_against_the_target():
     changes = [Change(2_000_000, swap, 30_000, 10_000) for swap in (100_000, 200_000, 900_000)]
     swap, build = swap_figures(1000, changes, 0.3)
-    assert (swap.name, swap.value, swap.verdict) == ("1,000 PDs each way: swap", 0.2, Decision.OK)
+    assert (swap.name, swap.value, swap.decision) == ("1,000 PDs each way: swap", 0.2, Decision.OK)
     assert "max 0.90 ms; the cycle after it 30 us, others 10 us" in swap.measured
     assert build.measured == "2.0 ms"
-    assert swap_figures(1000, changes, 0.1)[0].verdict is Decision.MISSED
+    assert swap_figures(1000, changes, 0.1)[0].decision is Decision.MISSED
 
 
-def test_lateness_is_told_apart():
+def test_lateness_is_split_by_cause():
     found = {"changes": 3, "lost": 0, "refused": "", "quiet_ns": [10_000], "disturbed_ns": [90_000]}
     quiet, changing = lateness_figures(found)
     assert quiet.measured == "p50 10 us, p99 10 us, max 10 us"
@@ -32,7 +32,7 @@ def test_a_measurement_that_went_wrong_is_none(field, value):
         lateness_figures(found | {field: value})
 
 
-def test_the_station_hears_itself():
+def test_station_receives_its_own_pd():
     spec = station(25, 1)
     assert [len(frame.pds) for frame in spec.frames] == [1, 10, 10, 5]
     sent = {pd.pd_id for frame in spec.frames for pd in frame.pds}

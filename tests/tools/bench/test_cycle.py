@@ -24,10 +24,10 @@ def shown(**busy: int) -> dict[str, Figure]:
     return {figure.name: figure for figure in figures(answer)}
 
 
-def test_cycles_skipped_by_the_master_itself_are_told_from_others() -> None:
+def test_cycles_skipped_by_master_are_counted_apart() -> None:
     found = shown(skipped=5, skipped_by_work=2)
     assert found["cycles skipped by mailbox work"].value == 2
-    assert found["cycles skipped by mailbox work"].verdict is Decision.MISSED
+    assert found["cycles skipped by mailbox work"].decision is Decision.MISSED
     others = "cycles skipped while others had the processor, with and without mailbox traffic"
     assert found[others].measured == "3 and 0"
 
@@ -36,9 +36,9 @@ def test_times_are_in_microseconds() -> None:
     assert shown()["lateness without"].measured == "p50 20 µs, p99 50 µs, max 200 µs"
 
 
-def test_a_request_that_failed_is_told() -> None:
+def test_failed_request_is_reported() -> None:
     found = shown()["requests that failed"]
-    assert (found.verdict, found.measured) == (Decision.MISSED, "1  (no)")
+    assert (found.decision, found.measured) == (Decision.MISSED, "1  (no)")
 
 
 def test_a_missing_slave_is_no_measurement() -> None:

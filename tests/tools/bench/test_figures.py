@@ -28,8 +28,8 @@ from tools.bench.figures import (
         (skipped("a", "needs root"), Decision.SKIPPED),
     ],
 )
-def test_verdict_follows_the_target(figure: Figure, verdict: Decision) -> None:
-    assert figure.verdict is verdict
+def test_decision_follows_the_target(figure: Figure, decision: Decision) -> None:
+    assert figure.decision is decision
 
 
 @pytest.mark.parametrize(

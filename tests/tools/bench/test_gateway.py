@@ -21,14 +21,14 @@ from tools.bench.gateway_roles import request
 
 def test_reads_are_compared_with_the_echo_and_with_cycles() -> None:
     master, slave = read_figures([Round(20_000, 9_000, 100, 3_100)] * 3)
-    assert (master.value, master.verdict) == (0.45, Decision.MISSED)
+    assert (master.value, master.decision) == (0.45, Decision.MISSED)
     assert master.measured == "0.45 (9.0 to 20.0 thousand/s)"
-    assert (slave.value, slave.verdict) == (1.5, Decision.OK)
+    assert (slave.value, slave.decision) == (1.5, Decision.OK)
 
 
 def test_slowest_client_is_compared_with_the_quickest() -> None:
-    assert crowd_figure([50, 70, 100], 2.0).verdict is Decision.OK
-    assert crowd_figure([49, 70, 100], 2.0).verdict is Decision.MISSED
+    assert crowd_figure([50, 70, 100], 2.0).decision is Decision.OK
+    assert crowd_figure([49, 70, 100], 2.0).decision is Decision.MISSED
     assert crowd_figure([0, 0], 2.0).value == 0
 
 
@@ -41,9 +41,9 @@ def test_lateness_is_compared_with_that_beside_an_echo() -> None:
     nobody, echo, gateway = ({"p50": us, "p99": 9 * us, "max": 20 * us} for us in (5, 10, 13))
     p50, p99, longest = late_figures(nobody, echo, gateway)
     assert p50.measured == "1.30 (13, 10 µs; 5 µs while nobody is asked)"
-    assert (p50.verdict, p99.verdict) == (Decision.OK, Decision.OK)
+    assert (p50.decision, p99.decision) == (Decision.OK, Decision.OK)
     assert longest.measured == "260, 200 and 100 µs"
-    assert late_figures(nobody, nobody, gateway)[0].verdict is Decision.MISSED
+    assert late_figures(nobody, nobody, gateway)[0].decision is Decision.MISSED
 
 
 def test_plant_and_request_are_what_they_should_be(tmp_path: Path) -> None:

@@ -24,5 +24,5 @@ def test_p99_is_the_median_of_windows_so_one_stall_does_not_decide() -> None:
     pair = Pair(engine=calm + stalled + calm, cyclictest=calm * 3)
     p50, p99, tails = figures_of("x", [pair], 10)
     assert (p50.value, p99.value) == (1.0, 1.0)
-    assert p99.verdict is Decision.OK
+    assert p99.decision is Decision.OK
     assert "max 5000.0 to 10.0 µs" in tails.measured

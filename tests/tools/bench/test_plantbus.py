@@ -16,6 +16,6 @@ SEEN: dict[str, Any] = {
 def test_requests_are_beside_a_run_without_them() -> None:
     busy = SEEN | {"overruns": 1, "wkc_errors": 2, "reads": 400, "octets": 1_500_000}
     found = {figure.name: figure for figure in figures(SEEN, busy)}
-    assert found["cycles with a wrong working counter"].verdict is Decision.MISSED
+    assert found["cycles with a wrong working counter"].decision is Decision.MISSED
     assert found["cycles left out, with and without requests"].measured == "1 and 3"
     assert found["requests meanwhile"].measured == "1.5 MB written, 400 objects read"

@@ -17,7 +17,7 @@ def found(*trips: int) -> dict[str, object]:
 
 def test_the_first_answers_are_left_out() -> None:
     trip, response = figures_of(500, found(1, 1, 1, 2))
-    assert (trip.value, trip.verdict) == (1, Decision.OK)
+    assert (trip.value, trip.decision) == (1, Decision.OK)
     assert trip.measured == "1 cycles (p99 2, max 2, of 4 answers)"
     assert response.measured == "p50 535 µs, p99 639 µs, max 1200 µs"
 
@@ -32,9 +32,9 @@ def test_the_first_answers_are_left_out() -> None:
     ],
 )
 def test_an_answer_waits_for_two_cycles_at_most(
-    phase_us: int, trips: tuple[int, ...], verdict: Decision
+    phase_us: int, trips: tuple[int, ...], decision: Decision
 ) -> None:
-    assert figures_of(phase_us, found(*trips))[0].verdict is verdict
+    assert figures_of(phase_us, found(*trips))[0].decision is decision
 
 
 def test_a_server_that_never_answers_is_a_failure() -> None:

@@ -26,7 +26,7 @@ def test_module_called_as_often_without_is_not_passed() -> None:
     assert find_passed([calls(cycle=10)], [calls(cycle=9)], [], 10) == []
 
 
-def test_processes_are_judged_apart_and_counted_together() -> None:
+def test_processes_are_rated_apart_and_counted_together() -> None:
     busy = [calls(codec=10), calls(codec=10, cycle=10, master=10)]
     idle = [calls(), calls(cycle=10)]
     assert find_passed(busy, idle, [], 10) == ["eap.codec", "eap.master"]

@@ -66,7 +66,7 @@ def _requests(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def fuzz_one(data: bytes) -> None:
-    """Have every request answered, and notifications told; nothing may be raised."""
+    """Answer every request and send notifications without an exception."""
     device = _device()
     for now_ns, (command, body) in enumerate(_requests(data)):
         answer = device.answer(command, body, _CLIENT, now_ns)

@@ -53,7 +53,7 @@ class _Transport(asyncio.Transport):
         return 0
 
 
-class _Taker:
+class _Receiver:
     def __init__(self) -> None:
         self.connection: AmsConnection
         self.waiting: deque[bytes] = deque()
@@ -100,7 +100,7 @@ def _octets(piece: bytes, first: int) -> bytes:
 
 
 async def _feed(data: bytes) -> None:
-    taker, transport = _Taker(), _Transport()
+    taker, transport = _Receiver(), _Transport()
     connection = AmsConnection("fuzz", "10.0.0.1", taker)
     connection.connection_made(transport)
     at, fed, is_blocked = 0, 0, False

@@ -1,4 +1,4 @@
-"""Datagrams of UDP port 48899, and routes that are asked for by them."""
+"""Datagrams of UDP port 48899, and the routes that they add."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def fuzz_one(data: bytes) -> None:
 
 
 async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
-    """Answer *data* as who is on this host, twice: the second time changes nothing any more."""
+    """Answer *data* from this host twice: the second time changes nothing."""
     routes = StationRoutes(_Router(), RoutingSpec(users=users), _Store())
     refused: list[Refusal] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:

@@ -14,7 +14,7 @@ _KINDS = (MailboxType.COE, MailboxType.SOE, MailboxType.FOE, MailboxType.VOE)
 
 
 def fuzz_one(data: bytes) -> None:
-    """Decode what may be asked; every request has an answer whose header says its protocol."""
+    """Decode a request; every request has an answer with its protocol in the header."""
     for kind, body in zip(cycle(_KINDS), cut(data), strict=False):
         try:
             task = dialect.decode(kind, body)

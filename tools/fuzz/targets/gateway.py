@@ -68,7 +68,7 @@ def _op() -> OdState:
     return OdState.OP
 
 
-class _Talk:
+class _Conversation:
     """One slave's mailbox, without a bus."""
 
     def __init__(self, box: MailboxServer) -> None:
@@ -88,7 +88,7 @@ class _Talk:
         return MailboxMessage(header.type, bytes(body), counter=header.counter)
 
     def abandon(self) -> None:
-        """Nobody is told."""
+        """Do nothing."""
 
     def close(self) -> None:
         """There is always a turn."""
@@ -126,7 +126,7 @@ class _Link:
     async def open_turn(
         self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
     ) -> MailboxTurn:
-        return cast("MailboxTurn", _Talk(self._box))
+        return cast("MailboxTurn", _Conversation(self._box))
 
     async def converse(
         self,
@@ -135,17 +135,17 @@ class _Link:
         requester: Hashable,
         turn_s: float | None = None,
     ) -> T:
-        return await drive_async(conversation, _Talk(self._box).exchange)
+        return await drive_async(conversation, _Conversation(self._box).exchange)
 
     def listen(self, heard: Callable[[Unsolicited], None]) -> None:
         """It says nothing unasked."""
 
 
 async def _nothing(index: int) -> None:
-    """What the master shows is never old."""
+    """The values of the master are always current."""
 
 
-async def _ask(port: int, command: int, body: bytes, *, timeout_s: float) -> AmsAnswer:
+async def _send_requests(port: int, command: int, body: bytes, *, timeout_s: float) -> AmsAnswer:
     """Read long values and a short file from another station, and take what is written there."""
     del port, timeout_s
     request = take_request(command, body)
@@ -182,7 +182,7 @@ async def _serve(data: bytes) -> None:
     dictionary = ObjectDictionary(
         [variable(0x1000, "A", "UDINT"), variable(0, "B", "BLOCK(90)", RW)]
     )
-    link = RemoteSlave(_ask, _STATION, answer_s=1)
+    link = RemoteSlave(_send_requests, _STATION, answer_s=1)
     gateway = MailboxGateway(
         cast("BusClient", _Link(dictionary)),
         lambda: MasterSession(dictionary, _SETTINGS.room, _nothing, lambda index: bool(index & 1)),

@@ -24,16 +24,16 @@ def fuzz_one(data: bytes) -> None:
     network = MqttNetwork(spec, _OWN, "fuzz", transport="mqtt:hall", table=RouteTable())
     network.connected(0)
     for topic in _TOPICS:
-        _give(network, topic, data)
-    _give(network, data[:40].decode(errors="replace"), data)
-    _give(network, _TOPICS[2], b"<info><online>" + data + b"</online></info>")
+        _feed(network, topic, data)
+    _feed(network, data[:40].decode(errors="replace"), data)
+    _feed(network, _TOPICS[2], b"<info><online>" + data + b"</online></info>")
     for message in cut(data):
         topic = _TOPICS[message[0] & 3] if message else _TOPICS[0]
-        _give(network, topic, message[1:])
+        _feed(network, topic, message[1:])
     network.handle_timeout(1 << 60)
 
 
-def _give(network: MqttNetwork, topic: str, payload: bytes) -> None:
+def _feed(network: MqttNetwork, topic: str, payload: bytes) -> None:
     for action in network.receive_message(topic, payload, 1):
         if isinstance(action, Publish) and "/ams" in action.topic:
             header = AmsHeader.decode(action.payload[-AmsHeader.SIZE :])

@@ -1,4 +1,4 @@
-"""Packets for a router: whatever comes, no exception and no answer to nobody."""
+"""Packets for a router: no exception, and no answer without a request."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def fuzz_one(data: bytes) -> None:
         access=AccessList([AccessRule("wide", transports=("tcp",)), _OBJECTS]),
     )
     router.add_device(_OWN, {1, 2, 3})
-    _give(router, data, _CLIENTS[0])
+    _feed(router, data, _CLIENTS[0])
     for message in cut(data):
         for endpoint in _CLIENTS:
-            _give(router, message, endpoint)
+            _feed(router, message, endpoint)
         if message:
-            _give(router, _addressed(message), _CLIENTS[message[0] >> 7])
+            _feed(router, _addressed(message), _CLIENTS[message[0] >> 7])
     router.handle_timeout(1 << 40)
     router.connection_closed(*_CLIENTS[0], 1 << 40)
     router.handle_timeout(1 << 41)
@@ -57,7 +57,7 @@ def _addressed(message: bytes) -> bytes:
     return header.encode() + body
 
 
-def _give(router: Router, data: bytes, endpoint: Endpoint) -> None:
+def _feed(router: Router, data: bytes, endpoint: Endpoint) -> None:
     for action in router.receive_packet(data, *endpoint, 0):
         if isinstance(action, Reply):
             if action.endpoint != endpoint:

@@ -23,7 +23,7 @@ from eap.pd.words import DISCARDS, FrameWord, RxWord, StationWord
 _SIZES = {1: 1, 2: 2, 0x03E9: 1, 0x1234: 4}
 """PDs to subscribe to, those of the golden vectors among them, and their octets."""
 _REQUEST, _ANSWER = 1, 2
-"""Those that ask the station for something, and that it asks for."""
+"""PD ids of a poll request and of its answer."""
 _CYCLE_INPUTS = 40
 """Inputs between two cycles."""
 

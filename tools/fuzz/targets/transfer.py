@@ -22,10 +22,10 @@ def fuzz_one(data: bytes) -> None:
             answer = refuse(kind, body, _CAUSES[number % len(_CAUSES)])
             if answer.type not in {kind, MailboxType.ERR} or not answer.body:
                 raise AssertionError(f"{kind.name}: {answer}")
-    _keep_books(messages)
+    _check_accounting(messages)
 
 
-def _keep_books(messages: list[bytes]) -> None:
+def _check_accounting(messages: list[bytes]) -> None:
     """Admit and answer requests of more clients than there is room for."""
     limits = ClientLimits(in_flight=2, rate=3, clients=3, in_flight_in_all=4)
     tracker = RequestTracker(limits)

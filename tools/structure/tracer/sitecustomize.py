@@ -26,7 +26,7 @@ def _profile(frame: FrameType, event: str, _: object) -> None:
 
 
 def _is_importing(frame: FrameType | None) -> bool:
-    """Tell whether *frame* runs because a module is imported."""
+    """Return whether *frame* runs because a module is imported."""
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             return True

@@ -47,7 +47,7 @@ def test_a_rule_says_what_its_texts_stand_for(index):
     ]
 
 
-def test_write_is_all_that_is_no_reading():
+def test_write_is_every_service_but_read():
     assert AccessService.READ not in parse_services(("write",))
     assert parse_services(("read", "files", "read")) == (AccessService.READ, AccessService.FILES)
     assert len(parse_services(("read", "write"))) == len(AccessService)
@@ -101,7 +101,7 @@ def test_a_station_without_a_prefix_is_all_its_net_ids(plant):
         ("5.1.2.3.4.5.6", "'5.1.2.3.4.5.6' is no NetID"),
     ],
 )
-def test_a_target_that_there_is_not_says_so(plant, text, message):
+def test_unknown_target_is_refused(plant, text, message):
     with pytest.raises(SectionError) as caught:
         parse_target(plant, text, set())
     assert str(caught.value).startswith(message)
@@ -134,7 +134,7 @@ def test_objects_are_one_or_many(text, objects):
         ("0x6000-0x5000", "'0x6000-0x5000' ends before it begins"),
     ],
 )
-def test_what_names_no_objects_says_so(text, message):
+def test_invalid_object_range_is_refused(text, message):
     with pytest.raises(SectionError, match=message):
         parse_objects(text)
 
@@ -147,7 +147,7 @@ def test_a_sender_is_a_network_or_a_mac_address():
         parse_sender("10.0.0.0/33")
 
 
-def test_access_that_there_is_not_is_told():
+def test_unknown_access_is_refused():
     with pytest.raises(SectionError, match=r"unknown access 'wirte', did you mean write\?"):
         parse_services(("wirte",))
 
@@ -197,7 +197,7 @@ def test_access_rule_with_former_key_doors_names_its_transports(index):
          "8: access rule never matches: files, raw does not access objects; a rule that can"),
     ],
 )  # fmt: skip
-def test_a_rule_that_cannot_be_is_one_finding(findings, items, finding):
+def test_invalid_rule_is_one_finding(findings, items, finding):
     [found] = findings(access(*items))
     assert found.startswith(finding)
 
@@ -222,7 +222,7 @@ NEVER = "9: access rule never applies: the rule in line 8 matches before it; thi
         ("deny: [all], objects: [0x6000-0x6FFF]", "allow: [read], objects: [0x6040:1]"),
     ],
 )
-def test_a_rule_behind_one_that_always_fits_is_a_finding(findings, first, second):
+def test_rule_after_one_that_always_matches_is_a_finding(findings, first, second):
     [found] = findings(access(first, second))
     assert found.startswith(NEVER)
 

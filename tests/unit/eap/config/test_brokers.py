@@ -51,7 +51,7 @@ def test_a_url_names_a_broker(text, broker):
         ("mqtt://", "'' is no name of a host"),
     ],
 )
-def test_what_is_no_broker_says_why(text, reason):
+def test_invalid_broker_url_is_refused_with_reason(text, reason):
     with pytest.raises(ValueError, match=reason):
         parse_url(text)
 
@@ -135,7 +135,7 @@ ONE = "mqtt: mqtt://b, network: n"
         ([f"{ONE}, client_id: {'a' * 65536}"], "8: client_id is too long; at most 65535 bytes"),
     ],
 )
-def test_a_broker_that_cannot_be_is_one_finding(findings, items, finding):
+def test_invalid_broker_is_one_finding(findings, items, finding):
     [found] = findings(brokers(*items))
     assert found.startswith(finding)
 
@@ -187,7 +187,7 @@ def learning(value: str, *brokers: str) -> tuple[str, str]:
         ("[{a: 1}]", "7: item 1 of learn is a mapping"),
     ],
 )
-def test_learn_source_that_is_none_is_one_finding(findings, value, finding):
+def test_invalid_learn_source_is_one_finding(findings, value, finding):
     [found] = findings(learning(value, LEARNING_ONE))
     assert found.startswith(finding)
 
@@ -201,7 +201,7 @@ def test_learn_source_that_is_none_is_one_finding(findings, value, finding):
         ("[mqtt:n, 10.0.0.7, 10.1.2.3/16]", ("mqtt:n", "10.0.0.7/32", "10.1.0.0/16")),
     ],
 )
-def test_learn_sources_are_told_to_the_router(load_plant, value, told):
+def test_learn_sources_are_part_of_routing(load_plant, value, told):
     assert load_plant(learning(value, LEARNING_ONE)).plant.routing["left"].learn == told
 
 
@@ -215,7 +215,7 @@ def warnings(load_plant):
     return of
 
 
-def test_broker_that_anybody_may_teach_by_is_a_warning_until_learn_names_it(warnings):
+def test_anonymous_broker_is_a_warning_until_learn_names_it(warnings):
     [warning] = warnings(*learning("true", LEARNING_ONE))
     assert warning == (
         "9: station left learns routes from any client of mqtt://b: the broker requires no user;"

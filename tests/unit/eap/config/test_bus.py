@@ -60,7 +60,7 @@ def test_slaves_keep_identity_order_and_padding():
     ]
 
 
-def test_what_cannot_be_in_a_name_is_replaced():
+def test_invalid_characters_of_names_are_replaced():
     assert names(entry("Status word/2 (°C)")) == ["Status_word_2___C_"]
     assert names(entry("")) == ["6000_01"]
 
@@ -165,7 +165,7 @@ def test_these_are_bus_ports(findings, interface, more):
         ("udp://127.0.9.1:34980", "", "udp://127.0.9.1:34980 is used twice (first in line 6)"),
     ],
 )
-def test_a_bus_port_that_cannot_be_is_one_finding(findings, tmp_path, interface, more, finding):
+def test_invalid_bus_port_is_one_finding(findings, tmp_path, interface, more, finding):
     found = findings(with_bus(f'"{interface}"', more))
     [only] = [each.replace(f"{tmp_path}/", "").replace(str(tmp_path), ".") for each in found]
     assert only.startswith(f"7: {finding}")
@@ -215,7 +215,7 @@ def test_an_eap_port_is_not_on_the_interface_of_a_bus(findings):
     ]
 
 
-def test_a_bus_variable_is_none_of_another_name(findings):
+def test_bus_variable_has_the_prefix_of_its_port(findings):
     twice = "count: UDINT\n      bus0.valves.valve: BOOL"
     assert findings(with_bus("sim://line.yaml"), ("count: UDINT", twice)) == [
         "7: variable 'bus0.valves.valve' exists already (line 11); a name of its own"

@@ -95,13 +95,13 @@ def test_merge_keys_give_way_to_own_keys_and_to_earlier_ones(tree):
         ("[" * 200_000, "p.yaml:1: nested too deeply"),
     ],
 )
-def test_what_is_no_document_is_one_finding_with_its_line(tree, content, finding):
+def test_invalid_document_is_one_finding_with_its_line(tree, content, finding):
     _, findings = tree(content)
     assert len(findings) == 1
     assert findings[0].startswith(finding)
 
 
-def test_a_bomb_of_aliases_is_defused(tree):
+def test_document_with_too_many_aliases_is_refused(tree):
     lines = ["a0: &a0 [x]", *(f"a{n}: &a{n} [{f'*a{n - 1}, ' * 10}]" for n in range(1, 12))]
     node, findings = tree("\n".join(lines))
     assert node is None
@@ -114,7 +114,7 @@ def test_a_byte_order_mark_is_no_part_of_the_first_key(tree):
     assert plain(tree(b"\xef\xbb\xbfa: 1")[0]) == {"a": 1}
 
 
-def test_a_file_that_is_none_is_a_finding(tmp_path):
+def test_document_of_invalid_file_is_a_finding(tmp_path):
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     (tmp_path / "huge").write_bytes(b"#" * (MAX_FILE + 1))
@@ -194,7 +194,7 @@ def test_document_with_tabs_that_yaml_takes_is_read(tree) -> None:
         ("plant: pair", "plant: pair\ny-note: 1", "2: unknown key 'y-note'; one of plant,"),
     ],
 )
-def test_what_does_not_fit_is_named_with_its_line(findings, old, new, finding):
+def test_document_type_error_has_its_line(findings, old, new, finding):
     found = findings((old, new))
     assert len(found) == 1
     assert found[0].startswith(finding)
@@ -217,7 +217,7 @@ def test_numbers_are_texts_where_a_text_is_wanted(load_plant):
     assert (speed.unit, speed.comment) == ("1", "2.50")
 
 
-def test_what_depends_on_an_item_that_cannot_be_read_is_not_blamed(findings):
+def test_reference_to_unreadable_item_is_no_finding(findings):
     assert findings(("id: 1,", "id: one,")) == ["15: id is 'one'; a whole number from 0 to 65535"]
 
 

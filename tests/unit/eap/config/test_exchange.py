@@ -91,7 +91,7 @@ def frame(text):
         ),
     ],
 )
-def test_what_cannot_be_sent_so_is_a_finding_of_its_line(findings, edits, finding):
+def test_invalid_publish_is_a_finding_of_its_line(findings, edits, finding):
     found = findings(*edits)
     assert found[0].startswith(finding)
 
@@ -198,7 +198,7 @@ def test_a_received_variable_may_be_sent_again(load_plant):
     assert taken_over.stations[1].frames[0].pds[0].variables == ("seen.count", "seen.speed")
 
 
-def test_what_is_on_a_bus_may_be_sent(findings):
+def test_bus_variable_can_be_published(findings):
     port = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
     bus = "{name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}"
 
@@ -326,7 +326,7 @@ def test_both_ends_of_a_poll_become_specifications(load_edited):
         ],
     ],
 )
-def test_what_goes_together_is_well(load_edited, edits):
+def test_matching_keys_have_no_findings(load_edited, edits):
     assert load_edited(*edits).findings == ()
 
 
@@ -387,7 +387,7 @@ def test_what_goes_together_is_well(load_edited, edits):
         ),
     ],
 )  # fmt: skip
-def test_what_does_not_go_together_is_one_finding(load_edited, edits, finding):
+def test_conflicting_keys_are_one_finding(load_edited, edits, finding):
     texts = [f"{f.line}: {f.message}; {f.expected}" for f in load_edited(*edits).findings]
     assert len(texts) == 1
     assert texts[0].startswith(finding)
@@ -400,7 +400,7 @@ def test_the_ports_of_question_and_answer_are_the_same(load_edited):
     assert finding.message == "'part' arrives at port eap0, but 'news' leaves eap1 (line 11)"
 
 
-def test_an_answer_is_no_request(load_edited):
+def test_poll_answer_cannot_be_a_request(load_edited):
     """Each line that makes a chain is named."""
     anybody = "from: {publisher: any, id: 71}, variables: {t: UDINT}"
     result = load_edited((NEWS, CHAIN.replace("from: mill/part, poll: cut", anybody)))
@@ -408,7 +408,7 @@ def test_an_answer_is_no_request(load_edited):
     assert messages == ["PD 'cut' answers mill/part, which is polled itself (line 26)"]
 
 
-def test_an_answer_is_no_request_although_nobody_knows_who_asked(load_edited):
+def test_poll_answer_of_unknown_requester_cannot_be_a_request(load_edited):
     (finding,) = load_edited(
         ("from: desk/request}", f"{FOREIGN} poll: news}}"),
         ("name: news, port: eap0, from: desk/news", "name: new, port: eap0, from: desk/news"),
@@ -419,14 +419,14 @@ def test_an_answer_is_no_request_although_nobody_knows_who_asked(load_edited):
     assert finding.message == "PD 'part' answers 'asked', which is an answer itself (line 30)"
 
 
-def test_a_question_is_no_answer(load_edited):
+def test_poll_request_cannot_be_an_answer(load_edited):
     more = f"{NEWS}      - {{name: saw, port: eap0, {FOREIGN} poll: part}}\n"
     (finding,) = load_edited((NEWS, more)).findings
     message = "'saw' is requested by 'part', which is polled itself (line 26)"
     assert (finding.line, finding.message) == (30, message)
 
 
-def test_polls_do_not_go_in_a_circle(load_edited):
+def test_polls_that_form_a_loop_are_a_finding(load_edited):
     result = load_edited(
         ("from: desk/request", "from: saw/cut, poll: part"),
         (CLIENT, f"{FOREIGN} poll: request,"),
@@ -439,7 +439,7 @@ def test_polls_do_not_go_in_a_circle(load_edited):
     ]
 
 
-def test_what_was_reported_already_is_not_blamed_again(load_edited):
+def test_reported_error_has_no_further_findings(load_edited):
     result = load_edited(("{name: asked, port: eap0,", "{name: asked, port: eap0, nonsense: 1, "))
     assert [f.message for f in result.findings] == ["unknown key 'nonsense'"]
     broken = load_edited(("from: desk/request}", "from: [1]}"))
@@ -523,7 +523,7 @@ VARIABLES = ", variables: {a: REAL, b: UDINT}}"
         ),
     ],
 )
-def test_what_would_receive_nothing_is_a_finding(findings, edits, finding):
+def test_subscription_without_sender_is_a_finding(findings, edits, finding):
     found = findings(*edits)
     assert len(found) == 1
     assert found[0].startswith(finding)
@@ -563,7 +563,7 @@ def test_names_of_subscriptions_are_unique(findings):
     assert found == ["22: subscription 'seen' exists already (line 21); a name of its own"]
 
 
-def test_an_error_of_the_publisher_is_told_once(findings):
+def test_error_of_publisher_is_reported_once(findings):
     assert len(findings(("to: 127.0.9.2", "to: nowhere"))) == 1
     assert len(findings(("frame: out", "frame: uot"))) == 1
     assert len(findings(("count: UDINT", "count: UDIMT"))) == 1

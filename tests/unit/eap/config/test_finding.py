@@ -21,7 +21,7 @@ def test_a_path_without_a_line_of_its_own_has_that_of_what_holds_it():
     assert report.line_of("defaults") == 1
 
 
-def test_findings_are_in_the_order_of_the_file_and_told_once():
+def test_findings_are_in_file_order_without_duplicates():
     report = FindingReport("p.yaml")
     report.add("b", "second", "x", line=5)
     report.add("a", "first", "x", line=2)
@@ -44,7 +44,7 @@ def test_findings_of_other_files_come_last():
     ]
 
 
-def test_a_report_knows_where_something_is_wrong():
+def test_report_has_finding_of_path():
     report = FindingReport("p.yaml")
     report.add("a.b", "first", "x", line=2)
     assert report.has("a.b")

@@ -7,7 +7,7 @@ from eap.pd.spec import GatewayAddress
 SAID = "{silent: true, answer_ms: 50, addresses: {0x9000: valves, 9: right/bus0/valves, 0xA: [9]}}"
 
 
-def test_what_a_gateway_is_told(load_plant):
+def test_gateway_specification_has_all_keys(load_plant):
     loaded = load_plant(with_gateway(SAID, bus(1)), (OTHER, OTHER + bus(0, station=2)))
     left, right = loaded.plant.stations
     _, first, second = left.ports
@@ -54,7 +54,7 @@ def with_gateway(gateway, *more):
         "{limits: {in_flight: 4, rate: 100, clients: 8}, port: 40000}",
     ],
 )
-def test_these_can_be(findings, gateway):
+def test_valid_gateways_have_no_findings(findings, gateway):
     assert findings(with_gateway(gateway), (OTHER, OTHER + bus(0, station=2))) == []
 
 

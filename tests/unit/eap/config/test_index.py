@@ -48,7 +48,7 @@ def test_variables_are_taken_over_with_the_name_of_the_subscription(index):
     assert plant.type_text(right, "count") is None
 
 
-def test_a_variable_taken_over_twice_keeps_its_type_and_a_circle_ends(index):
+def test_forwarded_variable_keeps_its_type_and_a_loop_ends(index):
     relay = """}
     frames: [{name: back, port: eap0, to: left/eap0}]
     publish: [{name: echo, frame: back, id: 1, variables: [seen.count, seen.back.x]}]"""
@@ -87,7 +87,7 @@ def test_types_are_all_or_none():
     assert parse_types(["UINT", "NUMBER"]) is None
 
 
-def test_variables_of_a_bus_have_types_wherever_they_are_taken_over(index):
+def test_forwarded_bus_variables_keep_their_types(index):
     plant = index(
         (PORT, f"{PORT}\n      - {BUS}"),
         (VARIABLES, "}"),
@@ -107,7 +107,7 @@ def test_variables_of_a_bus_have_types_wherever_they_are_taken_over(index):
     assert plant.unread_buses(left) == []
 
 
-def test_a_bus_that_cannot_be_read_is_known_as_such(index):
+def test_index_lists_buses_without_description(index):
     plant = index((PORT, f"{PORT}\n      - {BUS.replace('line', 'none')}"))
     assert plant.unread_buses(plant.stations["left"]) == ["bus0"]
     assert plant.unread_buses(plant.stations["right"]) == []

@@ -307,7 +307,7 @@ def test_a_subscription_knows_its_publisher(stations):
         ),
     ],
 )
-def test_what_is_known_of_a_publisher_by_numbers(stations, source, facts):
+def test_foreign_publisher_has_given_cycle_and_step(stations, source, facts):
     [rx] = stations((FROM, source))[1].subscriptions
     assert (rx.publisher, rx.pd_id, rx.version, rx.step, rx.sender_cycle_us) == facts
 
@@ -323,7 +323,7 @@ def test_what_is_known_of_a_publisher_by_numbers(stations, source, facts):
         ("from: {publisher: 9.9.9.9.9.9, id: 7}, foreign: true, source: 10.0.0.7", "10.0.0.7"),
     ],
 )
-def test_subscription_expects_the_publishers_address_unless_told_otherwise(stations, edit, source):
+def test_subscription_expects_the_address_of_its_publisher_by_default(stations, edit, source):
     assert stations((FROM, edit))[1].subscriptions[0].source == source
 
 
@@ -452,7 +452,7 @@ def test_links_are_complete_and_in_the_order_in_which_they_run(stations):
     )
 
 
-def test_bus_variables_are_taken_over_by_subscribers(stations):
+def test_subscribers_copy_bus_variables(stations):
     _, right = stations(
         bus_port(), (VARIABLES, "}"), ("[speed, count]", "[bus0.valves.limit, bus0.valves.speed]")
     )
@@ -561,7 +561,7 @@ def test_stations_that_share_but_a_network_reach_each_other_by_its_broker(plant)
     assert [each.host for each in told.mqtt] == ["b"]
 
 
-def test_rules_users_and_learning_are_told(plant, tmp_path):
+def test_rules_users_and_learning_are_part_of_routing(plant, tmp_path):
     more = """
     access: [{name: a, allow: [all]}]
     learn: false

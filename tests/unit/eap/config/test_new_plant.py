@@ -81,7 +81,7 @@ def test_addresses(tmp_path, address, second):
         ("line", 3, 'ethernet://e"0', "no interface name"),
     ],
 )
-def test_what_cannot_be_is_refused(name, count, address, reason):
+def test_invalid_plant_is_refused(name, count, address, reason):
     with pytest.raises(ConfigError, match=reason):
         plant_text(name, count, Shape.RING, address=address)
 

@@ -42,7 +42,7 @@ def left(uri, more=""):
         ([left("udp://127.0.9.1", ", wake: late")], "6: wake is 'late'; one of cycle, arrival"),
     ],
 )  # fmt: skip
-def test_a_port_that_cannot_be_is_one_finding(findings, edits, finding):
+def test_invalid_port_is_one_finding(findings, edits, finding):
     found = findings(*edits)
     assert any(each.startswith(finding) for each in found), found
 
@@ -154,7 +154,7 @@ def port(interface, **options):
         ("0.0.0.0.0.0", "ethernet://eth0", ValueError),
     ],
 )
-def test_what_may_be_written_becomes_an_address(index, text, interface, destination):
+def test_valid_destination_becomes_an_address(index, text, interface, destination):
     if destination is ValueError:
         with pytest.raises(ValueError, match=r"."):
             resolve_destination(text, InterfaceUri.parse(interface), index())
@@ -313,7 +313,7 @@ def test_net_id_on_udp_is_the_address_of_its_port(load_plant):
     assert result.plant.stations[0].frames[0].destination == "127.0.9.2"
 
 
-def test_net_id_that_nothing_tells(findings):
+def test_net_id_that_cannot_be_learned_is_a_finding(findings):
     (only,) = findings(*ETHERNET, to("127.0.9.2.2.1"))
     assert only.startswith(
         "13: frame 'out' goes to the NetID of right/eap0, whose MAC address cannot"
@@ -321,7 +321,7 @@ def test_net_id_that_nothing_tells(findings):
     assert only.endswith("; such a frame, or mac: on that port (line 19)")
 
 
-def test_two_that_wait_for_each_other(findings):
+def test_frames_that_need_each_other_to_learn_a_mac_are_findings(findings):
     assert len(findings(*ETHERNET, to("right/eap0"), back("left/eap0"))) == 2
     mac = "net_id: 127.0.9.1.2.1}", 'net_id: 127.0.9.1.2.1, mac: "02:00:00:00:00:01"}'
     assert findings(*ETHERNET, to("right/eap0"), back("left/eap0"), mac) == []
@@ -332,7 +332,7 @@ def test_frame_to_its_own_net_id(findings):
     assert "13: frame 'out' goes to the NetID of its own port; another port" in found
 
 
-def test_net_id_outside_the_plant_is_left_to_be_heard(load_plant):
+def test_net_id_outside_the_plant_is_learned(load_plant):
     result = load_plant(
         *ETHERNET, to("5.5.5.5.1.1"), ("timeout_ms: 50", "timeout_ms: 50, foreign: true"),
         ("from: left/state", "from: {publisher: 5.5.5.5.1.1, id: 4}"),
@@ -387,6 +387,6 @@ def test_monitoring(load_plant):
         ),
     ],
 )
-def test_what_cannot_be_monitored(findings, edits, finding):
+def test_invalid_monitoring_is_a_finding(findings, edits, finding):
     (only,) = findings(*edits)
     assert only.startswith(finding)

@@ -143,7 +143,7 @@ def test_a_route_leads_to_its_next_hop(follow, route, hop, router):
         ),
     ],
 )
-def test_a_way_that_there_is_not_says_why(follow, route, key, message):
+def test_unreachable_next_hop_is_refused_with_the_reason(follow, route, key, message):
     with pytest.raises(SectionError) as caught:
         follow(route)
     assert caught.value.key == key
@@ -248,7 +248,7 @@ def test_udp_ports_reach_each_other_at_their_addresses(hop):
     ("mine", "theirs"),
     [("udp", "tcp"), ("tcp", "udp"), ("tcp", "tcp")],
 )
-def test_where_one_has_no_udp_it_is_a_tcp_connection(hop, mine, theirs):
+def test_hop_without_udp_is_a_tcp_connection(hop, mine, theirs):
     found = hop(left(f"{mine}://127.0.9.1"), right(f"{theirs}://127.0.9.2"))
     assert found == HopSpec(TransportKind.TCP, "eap0", "127.0.9.2:34980")
 
@@ -272,16 +272,16 @@ def test_on_ethernet_a_port_is_its_mac_address_or_its_net_id(hop):
         ("udp://127.0.9.1", "udp://0.0.0.0", ""),
     ],
 )
-def test_what_is_not_shared_is_no_way(hop, mine, theirs, more):
+def test_stations_without_shared_interface_have_no_hop(hop, mine, theirs, more):
     assert hop(left(mine), right(theirs, more=more)) is None
 
 
-def test_interfaces_of_other_names_are_one_wire_if_somebody_says_so(hop):
+def test_named_port_of_another_interface_counts_as_shared(hop):
     found = hop(left("ethernet://eth0"), right("ethernet://eth1"), other="eap0")
     assert found == HopSpec(TransportKind.ETHERNET, "eap0", "127.0.9.2.2.1")
 
 
-def test_of_several_ways_the_one_in_the_same_network_is_taken_udp_before_others(hop):
+def test_hop_prefers_udp_and_the_same_network(hop):
     both = [left("udp://10.1.0.1", "udp://10.2.0.1"), right("udp://10.2.0.2", "udp://10.3.0.2")]
     assert hop(*both) == HopSpec(TransportKind.UDP, "eap1", "10.2.0.2:34980")
     mixed = [left("ethernet://eth0", "udp://10.2.0.1"), right("ethernet://eth0", "udp://10.9.0.2")]
@@ -346,7 +346,7 @@ PLC = "to: plc, net_id: 5.1.2.3.1.1, ams_tcp: plc"
         (["{to: right, virtual: 127.0.9.3.9.9}"], "8: NetID 127.0.9.3.x.x is one of station thir"),
     ],
 )  # fmt: skip
-def test_a_route_that_cannot_be_is_one_finding(findings, items, finding):
+def test_invalid_route_is_one_finding(findings, items, finding):
     [found] = findings(routes(*items), (LAST, LAST + THIRD))
     assert found.startswith(finding)
 
@@ -366,12 +366,12 @@ def test_routes_that_can_be_are_no_findings(findings, items):
     assert findings(routes(*items), (LAST, LAST + THIRD)) == []
 
 
-def test_everything_wrong_is_told_at_once(findings):
+def test_all_errors_are_reported_at_once(findings):
     found = findings(routes("{to: a}", "{to: right, via: x/y, virtual: 1}", "{mqtt: x}"))
     assert [each.partition(":")[0] for each in found] == ["8", "9", "9", "10", "10"], found
 
 
-def test_a_station_that_could_not_be_read_is_not_told_again(findings):
+def test_unreadable_station_is_reported_once(findings):
     found = findings(
         routes("{to: third}"), (LAST, LAST + THIRD.replace("net_id: 127.0.9.3.1", "x: 1"))
     )
@@ -423,7 +423,7 @@ def test_routes_that_get_there_or_may_do_so_are_no_warning(warnings, routes):
     assert warnings(**routes) == []
 
 
-def test_a_circle_is_named_at_each_route_of_it(warnings):
+def test_route_loop_is_reported_at_each_route(warnings):
     assert warnings(
         west=[f"{NORTH}, via: middle/eap0"],
         middle=[f"{NORTH}, via: east/eap0"],
@@ -435,18 +435,18 @@ def test_a_circle_is_named_at_each_route_of_it(warnings):
     ]
 
 
-def test_a_circle_by_a_default_route_is_one_too(warnings):
+def test_loop_by_default_route_is_reported(warnings):
     found = warnings(west=[f"{NORTH}, via: middle/eap0"], middle=["to: default, via: west/eap0"])
     assert found == ["7: the route to 'north' runs in a loop: west -> middle -> west"]
 
 
-def test_a_route_that_ends_on_the_way_is_named(warnings):
+def test_route_that_ends_before_its_target_is_reported(warnings):
     assert warnings(west=[f"{NORTH}, via: middle/eap0"]) == [
         "7: the route to 'north' ends at middle, which has no route to it"
     ]
 
 
-def test_who_learns_nothing_has_no_route_by_a_broker(warnings):
+def test_station_without_learning_has_no_route_by_a_broker(warnings):
     edit = "name: middle\n", "name: middle\n    learn: false\n"
     routes = {"west": [f"{NORTH}, via: middle/eap0"], "middle": ["mqtt: mqtt://b, network: n"]}
     assert len(warnings(*edit, **routes)) == 1

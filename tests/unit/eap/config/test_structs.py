@@ -79,7 +79,7 @@ def test_the_examples_of_the_reference_are_right(example, tmp_path):
     assert written or told.mqtt or told.access or told.users
 
 
-def test_there_are_examples_of_all_that_a_router_is_told():
+def test_examples_cover_all_keys_of_routing():
     assert len(examples("routes", "access", "users")) == 4
 
 

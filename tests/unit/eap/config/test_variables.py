@@ -68,7 +68,7 @@ def source(name, text):
         ),
     ],
 )
-def test_a_variable_that_cannot_be_is_one_finding(findings, edit, finding):
+def test_invalid_variable_is_one_finding(findings, edit, finding):
     found = findings(edit)
     assert len(found) == 1
     assert found[0].startswith(finding)
@@ -123,7 +123,7 @@ def test_a_csv_file_is_read_through(findings, tmp_path, content, finding):
     assert not found if finding is None else found[0].startswith(finding), found
 
 
-def test_what_is_on_a_bus_has_no_source(findings):
+def test_bus_variable_cannot_have_a_source(findings):
     port = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
     bus = "{name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}"
     more = f"{COUNTER}\n      bus0.valves.speed: {{kind: counter}}"
@@ -182,12 +182,12 @@ def test_other_bits_of_a_variable_are_no_reason_to_wait():
     assert execution_order([way("w", "x", start=3, bits=2), *links[1:]]) == [1, 0, 2]
 
 
-def test_a_shift_register_is_no_circle():
+def test_shift_register_is_not_a_loop():
     links = [way("w", "w", 1, 2, 1), way("w", "w", 0, 1, 1)]
     assert execution_order(links) == [1, 0]
 
 
-def test_circles_are_named_in_the_way_of_the_values():
+def test_link_loop_is_reported_in_direction_of_values():
     links = [way("behind", "end"), way("a", "b"), way("c", "a"), way("b", "c"), way("c", "behind")]
     assert execution_order(links) == []
     assert find_loops(links) == [[1, 3, 2]]
@@ -195,7 +195,7 @@ def test_circles_are_named_in_the_way_of_the_values():
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
-def test_links_are_in_order_or_in_a_circle(pairs):
+def test_links_are_in_order_or_in_a_loop(pairs):
     links = [way(str(source), str(target)) for source, target in pairs]
     order, loops = execution_order(links), find_loops(links)
     assert bool(loops) == (len(order) < len(links))
@@ -329,7 +329,7 @@ def test_these_links_run(findings, link):
         ("from: level, to: level", "links form a loop: level → level; one of them to be left"),
     ],
 )
-def test_a_link_that_cannot_run_is_one_finding(findings, link, finding):
+def test_invalid_link_is_one_finding(findings, link, finding):
     found = findings(*linked(link))
     assert len([each for each in found if each.startswith(f"21: {finding}")]) == 1, found
     assert len(found) == 1 or "unknown key" in finding
@@ -358,7 +358,7 @@ def test_a_variable_is_linked_once_or_bit_by_bit(findings):
     ]
 
 
-def test_circles_are_named(findings):
+def test_loops_are_reported(findings):
     links = ["from: word, to: level, scale: 1", "from: fault, to: bus0.valves.lamp"]
     back = "from: level, to: word, swap: true"
     assert findings(*linked(*links, back)) == [
@@ -366,6 +366,6 @@ def test_circles_are_named(findings):
     ]
 
 
-def test_variables_with_an_unknown_type_are_blamed_once(findings):
+def test_unknown_type_is_reported_once(findings):
     found = findings(*linked("from: heat, to: word"), ("heat: REAL", "heat: REEL"))
     assert [each[:12] for each in found] == ["14: heat: 'R"]

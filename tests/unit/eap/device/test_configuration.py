@@ -25,7 +25,7 @@ from tests.support.stations import BLANK, empty, filled, stations
 
 @examples(30)
 @given(stations())
-def test_what_is_dumped_comes_back_whole(station: StationSpec):
+def test_dumped_configuration_loads_unchanged(station: StationSpec):
     for name, each in filled(station).items():
         other = empty()[name]
         load_configuration(
@@ -107,7 +107,7 @@ def test_rights_that_the_configuration_grants_are_restored(udp):
         (AbortCode.VALUE, {0x8000: {0: b"\x20"}}),
     ],
 )
-def test_what_no_dictionary_has_is_refused_and_changes_nothing(udp, code, kept):
+def test_unknown_entries_are_refused_and_change_nothing(udp, code, kept):
     sender(udp)
     before = read_configuration(udp)
     with pytest.raises(SdoAbortError) as caught:
@@ -129,7 +129,7 @@ def test_what_no_dictionary_has_is_refused_and_changes_nothing(udp, code, kept):
         (b'{"version": 1, "profile": 1000, "objects": {}, "more": 1}', "no stored configuration"),
     ],
 )
-def test_what_is_no_configuration_is_refused_with_the_reason(udp, data, reason):
+def test_invalid_stored_configuration_is_refused_with_reason(udp, data, reason):
     sender(udp)
     before = dump_configuration(udp)
     with pytest.raises(StoredError, match=reason):
@@ -190,7 +190,7 @@ def _told(old, new) -> list[tuple[str, str, str, str, bool]]:
     return [(c.kind, c.name, c.old, c.new, c.interim) for c in compare(old, new)]
 
 
-def test_a_changed_entry_is_told_by_names_and_values(udp):
+def test_changed_entry_has_names_and_values(udp):
     sender(udp)
     new = copy(udp)
     write(new, 0xD000, Tx.CYCLE_TIME, 20_000)
@@ -218,7 +218,7 @@ def test_a_variable_more_in_a_pd_empties_its_mapping_first(udp):
     ]
 
 
-def test_what_is_no_longer_there_is_removed_from_the_outside_in(udp):
+def test_removed_objects_are_deleted_after_their_references(udp):
     sender(udp)
     assert _told(udp, udp.blank()) == [
         ("removed", "TxFrame 0 (frame0)", "16", "", False),
@@ -249,7 +249,7 @@ def test_pds_that_change_their_places_leave_the_frame_first(udp):
     ]
 
 
-def test_pds_that_refer_to_each_other_are_let_go_before_both_go(udp):
+def test_pds_that_refer_to_each_other_are_cleared_before_removal(udp):
     receiver(sender(udp))
     write(udp, 0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)
     write(udp, 0xE000, Rx.POLL_REQUEST_TXPD, 0xD000)

@@ -116,7 +116,7 @@ def test_a_list_grows_by_writing_behind_its_end_and_shrinks_by_its_count(udp):
         (AbortCode.VALUE, (0xF811, 1, "10.0.0.1")),
     ],
 )
-def test_what_cannot_be_written_is_refused_by_its_code(udp, code, where):
+def test_invalid_write_is_refused_with_abort_code(udp, code, where):
     sender(udp)
     write(udp, 0x1A00, 0, 0)
     write(udp, 0x1A00, 1, 0x6000_0110)
@@ -160,7 +160,7 @@ def test_configuration_is_written_in_preop_only(udp, state):
     assert caught.value.code == AbortCode.DEVICE_STATE
 
 
-def test_what_an_object_says_to_be_changeable_is_written_in_op(udp):
+def test_download_writes_changeable_entry_in_op(udp):
     sender(udp)
     told: list[tuple[int, int]] = []
     udp.on_change = lambda index, subindex: told.append((index, subindex))
@@ -185,7 +185,7 @@ def test_a_change_in_op_that_cannot_run_is_taken_back(udp):
     )
 
 
-def test_nobody_has_to_want_to_know(udp):
+def test_state_machine_works_without_callbacks(udp):
     sender(udp)
     write(udp, 0x8000, FrameSub.CHANGEABLE, 1)
     write(udp, 0x8000, FrameSub.PORT_NUMBER, 7, OP)
@@ -231,7 +231,7 @@ class TestInformation:
         )
 
 
-def test_a_state_is_asked_for_in_any_state(udp):
+def test_state_can_be_requested_in_any_state(udp):
     asked: list[int] = []
     udp.on_request = asked.append
     for state, wanted in ((PREOP, 4), (SAFEOP, 8), (OP, 2)):
@@ -292,7 +292,7 @@ def test_a_pd_that_grows_beyond_its_frame_is_refused_where_it_grows(udp):
     _refused(udp, AbortCode.PDO_LENGTH, 0xD001, Tx.PDO_INDEX, 0x1A00)
 
 
-def test_a_long_frame_stays_with_the_way_that_takes_it(udp):
+def test_long_frame_keeps_its_address_mode(udp):
     two_large_pds(udp)
     write(udp, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.TCP)
     for number in range(2):
@@ -333,7 +333,7 @@ class TestCompleteAccess:
         udp.download_complete(0x1A05, 0, struct.pack("<HI", 1, 0x6000_0110), PREOP)
         assert udp[0x1A05].max_subindex == 1
 
-    def test_what_is_refused_in_the_middle_changes_nothing(self, udp):
+    def test_partly_invalid_download_changes_nothing(self, udp):
         sender(udp)
         before = read_configuration(udp)
         data = struct.pack("<H2I", 2, 0x6000_0110, 0x6001_0110)
@@ -393,7 +393,7 @@ class TestCompleteAccess:
 
 
 class TestBeforeTheDataIsThere:
-    def test_a_download_that_may_come_is_let_by(self, udp):
+    def test_valid_download_is_accepted(self, udp):
         udp.check_download(0x1A00, 0, 2 + 4 * 254, PREOP, complete=True)
         udp.check_download(0x1A00, 254, 4, PREOP)
         udp.check_download(0x6000, Var.NAME, 255, PREOP)
@@ -412,13 +412,13 @@ class TestBeforeTheDataIsThere:
             (AbortCode.READ_ONLY, (0x1000, 0, 4), PREOP),
         ],
     )
-    def test_a_download_that_cannot_be_is_refused(self, udp, code, where, state):
+    def test_invalid_download_is_refused(self, udp, code, where, state):
         variable(udp, 0x6000, "level")
         with pytest.raises(SdoAbortError) as caught:
             udp.check_download(*where, state)
         assert caught.value.code == code
 
-    def test_what_an_object_says_to_be_changeable_is_let_by_in_op(self, udp):
+    def test_check_download_accepts_changeable_entry_in_op(self, udp):
         sender(udp)
         write(udp, 0x8000, FrameSub.CHANGEABLE, 1)
         udp.check_download(0x8000, FrameSub.DESTINATION_MAC, 6, OP)

@@ -58,7 +58,7 @@ def test_each_port_has_what_is_its_own(forwarding):
     assert not ports["eap0"].members(TX_FRAME, TX_PD)
 
 
-def test_what_has_the_same_name_keeps_its_index(forwarding):
+def test_object_of_same_name_keeps_its_index(forwarding):
     before = filled(forwarding)
     frame = forwarding.frames[0]
     more = (TxPdSpec("new", 2, ("got",)), *frame.pds)
@@ -124,7 +124,7 @@ def test_a_default_is_kept_as_the_type_has_it():
         ([VariableSpec(f"v{n}", "BIT1") for n in range(4097)], [], 0x6000, "at most 4096"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_its_object(variables, sent, index, reason):
+def test_specification_too_large_is_refused_with_its_object(variables, sent, index, reason):
     frames = (TxFrameSpec("f", "eap0", "10.0.0.2", (TxPdSpec("pd", 1, tuple(sent)),)),)
     station = replace(BLANK, variables=tuple(variables), frames=frames if sent else ())
     with pytest.raises(DeviceFault, match=reason) as caught:

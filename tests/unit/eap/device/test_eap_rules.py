@@ -74,7 +74,7 @@ def test_values_are_kept_in_their_usual_form(udp, row, subindex, data, kept):
         (CONTROL, 1, b"\x03\0", "3 cannot be requested"),
     ],
 )
-def test_what_an_entry_cannot_hold_is_refused_with_the_reason(udp, row, subindex, data, reason):
+def test_entry_refuses_invalid_value_with_reason(udp, row, subindex, data, reason):
     with pytest.raises(ValueError, match=reason):
         _checked(udp, row, subindex, data)
 
@@ -147,7 +147,7 @@ def test_a_mapping_has_254_entries_padding_included():
         (AbortCode.LENGTH, 0x6000_0120),
     ],
 )
-def test_what_cannot_be_mapped_is_refused_where_it_is_written(udp, code, word):
+def test_invalid_mapping_entry_is_refused_when_written(udp, code, word):
     variable(udp, 0x6000, "level")
     with pytest.raises(SdoAbortError) as caught:
         check_mapped(udp, word, Access.TX_MAPPABLE, 0x1A03, 4)

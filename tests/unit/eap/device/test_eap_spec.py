@@ -179,7 +179,7 @@ def test_a_frame_that_is_too_long_is_a_fault_of_the_frame(udp):
     assert _fault(udp) == (FaultCode.FRAME_TOO_LONG, 0x8000, FrameSub.FRAME_LENGTH)
 
 
-def test_what_is_not_enabled_is_left_out(udp):
+def test_disabled_objects_are_left_out(udp):
     receiver(sender(udp))
     write(udp, 0xD001, Tx.NAME, "later")
     write(udp, 0x8001, FrameSub.NAME, "later")
@@ -260,13 +260,13 @@ def test_subscribers_are_monitored_as_the_object_says():
 
 @examples(30)
 @given(stations())
-def test_what_was_filled_from_a_station_reads_back_as_that_station(station: StationSpec):
+def test_filled_dictionary_reads_back_as_its_station(station: StationSpec):
     assert read_back(station, filled(station)) == station
 
 
 @examples(30)
 @given(stations())
-def test_what_was_filled_reads_back_alike_into_a_blank_station(station: StationSpec):
+def test_filled_dictionary_reads_back_into_a_blank_station(station: StationSpec):
     bare = replace(station, variables=(), frames=(), subscriptions=(), sources=(), links=())
     spec = read_back(bare, filled(station))
     assert sorted(each.name for each in spec.variables) == sorted(
@@ -308,7 +308,7 @@ def test_downloads_make_a_station():
     )
 
 
-def test_what_stood_in_the_station_keeps_its_place_and_new_things_come_behind():
+def test_read_back_keeps_order_and_appends_new_records():
     before = replace(BLANK, variables=(VariableSpec("zebra", "UINT"), VariableSpec("ape", "UINT")))
     ports = filled(before)
     variable(ports["eap0"], 0x6002, "cat")
@@ -519,7 +519,7 @@ def test_names_are_given_once_in_the_station(ports):
     assert len(read_back(BLANK, ports).frames) == 3  # IDs are unique per publisher
 
 
-def test_polls_that_fit_are_taken(ports):
+def test_valid_polls_have_no_findings(ports):
     udp = ports["eap0"]
     write(udp, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER)
     write(udp, 0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)
@@ -529,7 +529,7 @@ def test_polls_that_fit_are_taken(ports):
     assert spec.subscriptions[1].poll_request == "txpd1"
 
 
-def test_old_and_new_version_of_a_pd_are_taken_side_by_side(ports):
+def test_old_and_new_version_of_a_pd_are_accepted_side_by_side(ports):
     udp = ports["eap0"]
     write(udp, 0xE001, Rx.PD_ID, 1)
     write(udp, 0xE001, Rx.VERSION, 1)
@@ -572,7 +572,7 @@ class TestWhatTheStationNeeds:
             read_back(self.STATION, ports)
         assert caught.value.code == code
 
-    def test_what_is_filled_is_not_received_too(self):
+    def test_variable_with_writer_cannot_be_received(self):
         ports = filled(self.STATION)
         udp = ports["eap0"]
         write(udp, 0x6003, 0, 0)

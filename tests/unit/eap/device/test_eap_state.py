@@ -110,7 +110,7 @@ def test_the_device_runs_what_was_checked(machine, actions):
     ("wanted", "code"),
     [(1, FaultCode.INVALID_REQUEST), (3, FaultCode.UNKNOWN_STATE), (0, FaultCode.UNKNOWN_STATE)],
 )
-def test_init_and_what_is_no_state_cannot_be_asked_for(machine, wanted, code):
+def test_init_and_unknown_states_cannot_be_requested(machine, wanted, code):
     machine.request(SAFE)
     result = machine.request(wanted)
     assert result.state is SAFE
@@ -118,7 +118,7 @@ def test_init_and_what_is_no_state_cannot_be_asked_for(machine, wanted, code):
     assert result.fault.code == code
 
 
-def test_nothing_can_be_asked_for_in_init(actions):
+def test_no_state_can_be_requested_in_init(actions):
     machine = EapStateMachine(lambda: BLANK, actions)
     result = machine.request(OPER)
     assert result.state is INIT
@@ -126,7 +126,7 @@ def test_nothing_can_be_asked_for_in_init(actions):
     assert result.fault.code == FaultCode.INVALID_REQUEST
 
 
-def test_a_refusal_leaves_the_last_state_reached_and_its_reason(machine, actions):
+def test_failed_request_keeps_last_state_and_fault(machine, actions):
     actions.refuse = "start receiving"
     result = machine.request(OPER)
     assert result.state is SAFE
@@ -139,7 +139,7 @@ def test_a_refusal_leaves_the_last_state_reached_and_its_reason(machine, actions
     assert machine.request(OPER).state is PRE
 
 
-def test_what_cannot_run_stays_in_preop_with_the_object_in_the_status(actions):
+def test_invalid_configuration_stays_in_preop_with_object_in_status(actions):
     ports = empty()
     udp = sender(ports["eap0"])
     machine = EapStateMachine(lambda: read_back(BLANK, ports), actions)
@@ -164,7 +164,7 @@ def test_what_cannot_run_stays_in_preop_with_the_object_in_the_status(actions):
 
 
 @given(st.lists(st.tuples(st.integers(0, 9), st.sampled_from(["", *"ab"])), max_size=20))
-def test_sending_and_receiving_are_on_in_their_states_whatever_is_asked(requests):
+def test_sending_and_receiving_follow_the_state(requests):
     actions = Actions()
     refusals: dict[str, str] = {"": "", "a": "start sending", "b": "start receiving"}
     machine = EapStateMachine(lambda: BLANK, actions)

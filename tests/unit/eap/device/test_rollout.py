@@ -156,7 +156,7 @@ def test_the_receiver_goes_first_and_once_more():
     )
 
 
-def test_what_has_another_type_or_is_gone_has_no_place():
+def test_changed_or_removed_variable_is_not_copied():
     received = {"b": [("a", 1)]}
     old, new = plant({("a", 1): 2}, received), plant({("a", 1): 3}, received)
     first = steps(old, new)[0].spec.subscriptions[0]
@@ -191,7 +191,7 @@ def test_in_a_line_senders_follow_each_other():
     assert running == plant(dict.fromkeys(versions, 1), received)
 
 
-def test_who_does_not_change_what_it_sends_or_receives_has_one_step():
+def test_station_with_unchanged_pds_has_one_step():
     received = {"b": [("a", 1)], "c": [("a", 1)]}
     old, new = (
         plant({("a", 1): 0, ("c", 9): 0}, received),
@@ -204,14 +204,14 @@ def test_who_does_not_change_what_it_sends_or_receives_has_one_step():
     assert [step.station for step in way].count("d") == 1
 
 
-def test_who_receives_a_changed_pd_from_now_on_waits_for_its_sender():
+def test_new_receiver_of_changed_pd_waits_for_its_sender():
     old = plant({("a", 1): 0}, {"b": []})
     new = plant({("a", 1): 1}, {"b": [("a", 1)]})
     way, _ = follow(old, new)
     assert shown(way) == ["a runs the new configuration", "b runs the new configuration"]
 
 
-def test_who_receives_it_no_longer_goes_first():
+def test_former_receiver_changes_first():
     old = plant({("a", 1): 0}, {"b": [("a", 1)]})
     new = plant({("a", 1): 1}, {"b": []})
     way, _ = follow(old, new)
@@ -219,7 +219,7 @@ def test_who_receives_it_no_longer_goes_first():
     assert way[0].spec == new["b"]
 
 
-def test_new_pds_are_taken_before_they_are_sent_and_old_ones_until_they_are_not():
+def test_new_pds_are_accepted_before_they_are_sent_and_old_ones_until_they_end():
     received = {"a": [("b", 2)], "b": []}
     old = plant({("b", 2): 0}, received)
     new = plant({("b", 2): 0, ("b", 3): 0}, {"a": [("b", 2), ("b", 3)]})
@@ -227,7 +227,7 @@ def test_new_pds_are_taken_before_they_are_sent_and_old_ones_until_they_are_not(
     assert [step.station for step in steps(new, old)] == ["b", "a"]
 
 
-def test_who_takes_both_while_one_pd_changes_and_another_ends_goes_last():
+def test_receiver_of_changing_and_ending_pds_changes_last():
     received = {"a": [("b", 2), ("b", 3)]}
     old = plant({("b", 2): 0, ("b", 3): 0}, received)
     new = plant({("b", 2): 1}, {"a": [("b", 2)]})
@@ -251,7 +251,7 @@ def paced(old: Plant, step: int, version: int = 0) -> Plant:
     }
 
 
-def test_who_receives_expects_the_smaller_of_two_rates():
+def test_receiver_expects_the_smaller_of_two_rates():
     line = plant({("a", 1): 0}, {"b": [("a", 1)]})
     often, seldom, unknown = paced(line, 1), paced(line, 2), paced(line, 0)
     for faster, slower in ((often, seldom), (seldom, unknown), (often, unknown)):
@@ -275,7 +275,7 @@ def test_stations_that_are_in_one_plant_only_have_no_step():
     assert [step.station for step in steps(old, new)] == ["a"]
 
 
-def test_any_publisher_takes_the_layouts_of_all():
+def test_any_publisher_accepts_all_layouts():
     received = {"d": [("a", 1), ("b", 1)]}
     plants = []
     for versions in ({("a", 1): 0, ("b", 1): 0}, {("a", 1): 1, ("b", 1): 1}):
@@ -298,7 +298,7 @@ def test_a_version_that_is_ignored_needs_no_alternate():
     assert shown(way) == ["a runs the new configuration"]
 
 
-def test_what_no_plant_sends_gets_no_alternate():
+def test_pd_without_sender_gets_no_alternate():
     old = plant({("a", 1): 0}, {"b": [("a", 1)]})
     new = plant({("a", 1): 1}, {"b": [("a", 1)]})
     for each in (old, new):  # b is for something that neither sends
@@ -327,7 +327,7 @@ def plants(draw: st.DrawFn) -> Plant:
 
 
 @given(plants(), plants())
-def test_whatever_changes_every_pd_that_is_sent_is_taken(old, new):
+def test_receivers_accept_every_pd_during_any_change(old, new):
     way, running = follow(old, new)
     assert running == new
     counts = {name: sum(step.station == name for step in way) for name in STATIONS}
@@ -345,7 +345,7 @@ def test_a_change_that_was_broken_off_can_be_finished_taken_back_or_followed_by_
         assert follow(broken_off, goal)[1] == goal
 
 
-def test_who_receives_its_own_pd_changes_both_ends_at_once():
+def test_receiver_of_its_own_pd_changes_both_ends_at_once():
     received = {"a": [("a", 1)]}
     way = steps(plant({("a", 1): 0}, received), plant({("a", 1): 1}, received))
     assert shown(way) == ["a runs the new configuration"]
@@ -396,7 +396,7 @@ def sending(version: int, *variables: str, pd_id: int = 7) -> StationSpec:
         (sending(1, "c:UINT", "a:UINT"), "keeps its size with other variables"),
     ],
 )
-def test_a_layout_that_changes_under_its_version_is_told(new, told):
+def test_changed_layout_with_same_version_is_reported(new, told):
     (line,) = kept_versions(sending(1, "a:UINT", "b:UINT"), new)
     assert line.startswith(f"PD 'report' (id 7) {told}")
     assert "its version stays 1" in line
@@ -412,5 +412,5 @@ def test_a_layout_that_changes_under_its_version_is_told(new, told):
         station(),
     ],
 )
-def test_what_every_subscriber_can_tell_is_not(new):
+def test_changed_layout_with_new_version_is_not_reported(new):
     assert kept_versions(sending(1, "a:UINT", "b:UINT"), new) == []

@@ -57,7 +57,7 @@ def plain(dictionary, index):
     return {sub: entry.value for sub, entry in dictionary[index].entries.items()}
 
 
-def test_it_says_who_it_is(dictionary):
+def test_dictionary_shows_identity(dictionary):
     assert dictionary.upload(0x1000, 0, OdState.OP) == (9000 << 16 | 5001).to_bytes(4, "little")
     assert dictionary.upload(0x1008, 0, OdState.OP) == b"EAP station tower"
     assert plain(dictionary, 0xF920) == {0: 1, 1: NetId.parse("1.2.3.4.1.1")}

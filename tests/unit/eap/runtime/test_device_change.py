@@ -136,7 +136,7 @@ def test_what_the_dictionaries_hold_is_not_told_here(plain):
     assert describe_rest(plain, changed) == []
 
 
-def test_layout_that_changes_under_its_version_is_told(plain):
+def test_plan_reports_changed_layout_with_same_version(plain):
     frame = plain.frames[0]
     shorter = replace(frame.pds[0], variables=frame.pds[0].variables[1:])
     changed = replace(plain, frames=(replace(frame, pds=(shorter,)),))
