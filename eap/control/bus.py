@@ -18,7 +18,7 @@ from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
 from eap.control.protocol import Document, ErrorCode, Method, Parameters
 from eap.errors import ControlError
-from eap.runtime.bus_request import BusReport
+from eap.runtime.engine_messages import BusReport
 
 MAX_CONVERSATIONS = 16
 """Open on one connection."""

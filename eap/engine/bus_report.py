@@ -11,7 +11,7 @@ from devicebus.master.findings import NO_ANSWER
 from devicebus.master.master import why_closed
 from eap.engine.engine_bus import WHOLE_BUS, EngineBus
 from eap.runtime.bus_errors import to_record
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BusChange,
     BusReport,
     PortErrorReport,

@@ -30,12 +30,13 @@ from eap.engine.bus_report import BusPublisher, report_bus
 from eap.engine.engine_bus import EngineBus
 from eap.errors import EapError, EngineRefusedError
 from eap.runtime.bus_errors import to_record
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BringSlaves,
     BusChange,
     BusReport,
     BusRequest,
     Cancel,
+    Configure,
     DescribeBus,
     EngineMessage,
     EngineReply,
@@ -46,9 +47,10 @@ from eap.runtime.bus_request import (
     ForgetFaults,
     Ping,
     Republish,
+    SetState,
+    StationRequest,
     UnsolicitedMessage,
 )
-from eap.runtime.station_request import Configure, SetState, StationRequest
 
 T = TypeVar("T")
 

@@ -1,9 +1,9 @@
-"""The engine process: the cycles of all stations of an appliance, and nothing beside them.
+"""The engine process: runs the cycles of all stations of an appliance.
 
 The supervisor starts it with the descriptor of its handover.  It reports that it runs when its
-stations have run a cycle.  From then on it does not log and waits for nobody.
-Its cycles make nothing that the garbage collector would look for; what requests to buses leave
-behind when they fail is collected between them.
+stations have run a cycle.  From then on it does not log, and waits for no other process.
+Its cycles allocate nothing that the garbage collector would look for.  What failed requests to
+buses leave behind is collected between cycles.
 """
 
 from __future__ import annotations
@@ -12,18 +12,67 @@ import gc
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from time import monotonic_ns
 
-from eap.engine.arrivals import Arrivals
 from eap.engine.build import EnginePlant
 from eap.errors import ConfigError, EapError, EnvironmentalError
 from eap.net import realtime
 from eap.net.ticker import Ticker
-from eap.runtime.handover import EngineOptions, Handover
-from eap.runtime.passing import take_connection
+from eap.runtime.handover import EngineOptions, Handover, take_connection
 from eap.runtime.startup import Startup
+
+WINDOW_NS = 20_000_000
+SHARE_NS = 12_000_000
+"""Of each window; then descriptors wait for the next one.  Cycles take frames all the while."""
+
+
+class Arrivals:
+    """Waits for cycles and serves *handlers* meanwhile; *ticker* is closed by its owner."""
+
+    def __init__(self, ticker: Ticker, handlers: Mapping[int, Callable[[int], object]]) -> None:
+        self._ticker = ticker
+        self._handlers = handlers
+        self._spent_ns = 0
+        self._window_end_ns = 0
+        self._is_open = False
+        self._open()
+
+    def wait(self, deadline_ns: int) -> bool:
+        """Return True once *deadline_ns* has passed, False if something else was done first."""
+        if self._is_open:
+            if self._ticker.wait(deadline_ns):
+                return True
+            self._serve()
+            return False
+        is_due = self._ticker.wait(min(deadline_ns, self._window_end_ns))
+        now_ns = monotonic_ns()
+        if now_ns >= self._window_end_ns:
+            self._open()
+        return is_due and now_ns >= deadline_ns
+
+    def _serve(self) -> None:
+        begun_ns = monotonic_ns()
+        if begun_ns >= self._window_end_ns:
+            self._window_end_ns = begun_ns + WINDOW_NS
+            self._spent_ns = 0
+        for fd in self._ticker.arrivals():
+            self._handlers[fd](monotonic_ns())
+        self._spent_ns += monotonic_ns() - begun_ns
+        if self._spent_ns > SHARE_NS:
+            self._close()
+
+    def _open(self) -> None:
+        self._is_open = True
+        for fd in self._handlers:
+            self._ticker.register(fd)
+
+    def _close(self) -> None:
+        self._is_open = False
+        for fd in self._handlers:
+            self._ticker.unregister(fd)
+
 
 LOOK_PERIOD_NS = 20_000_000
 """How often the engine looks beyond its cycles, and takes at most one connection from services."""

@@ -29,7 +29,6 @@ from eap.control.protocol import AnswerT, Method, ParametersT
 from eap.errors import ControlError
 from eap.ops.bus_session import Begin, Slave, choose
 from eap.ops.client import ControlClient, connect_station
-from eap.runtime.bus_request import BusReport, SlaveReport, no_mailbox
 from eap.runtime.bus_status import (
     FrameCounts,
     count_frames,
@@ -37,6 +36,7 @@ from eap.runtime.bus_status import (
     is_silent,
     report_findings,
 )
+from eap.runtime.engine_messages import BusReport, SlaveReport, no_mailbox
 
 T = TypeVar("T")
 

@@ -1,12 +1,16 @@
 """The process image of one station: every variable and every counter, in shared memory.
 
-Rule 1: each region of variables has one writer, who makes its sequence word odd while writing.
-Rule 2: a reader copies and looks whether the word was even and stayed the same; if not, it tries
-again, a bounded number of times, and then names the writer that stopped in the middle.
+Rule 1: each region of variables has one writer, which makes its sequence word odd while it writes.
+Rule 2: a reader copies, then checks that the word was even and is unchanged.  If not, it retries a
+bounded number of times, and then names the writer that stopped in the middle.
 Rule 3: counters are single words with a single writer; several of them that belong together are
 read from a snapshot, which is taken between two cycles.
 Rule 4: the engine waits for no writer.  Its :class:`Inputs` copy what others write at the start of
 a cycle, when a sequence word moved, and keep the last whole copy while a writer writes.
+Rule 5: the engine takes samples of all variables at the end of a cycle as long as a reader asks for
+them, and never waits for the reader: a slow reader finds that the slot of a sample holds a later
+one.  A sample is taken with the copies that the cycle itself has read, so that its values belong to
+one moment, for all writers.
 
 This module works on any writable buffer; ``eap.net.image_file`` maps one from a file.
 """
@@ -14,7 +18,7 @@ This module works on any writable buffer; ``eap.net.image_file`` maps one from a
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -23,7 +27,15 @@ import msgspec
 
 from eap.codec import datatypes
 from eap.errors import ImageError, TornReadError
-from eap.pd.layout import HEADER, LAYOUT_VERSION, MAGIC, WORDS_OFFSET, ImageLayout, VariableSlot
+from eap.pd.layout import (
+    HEADER,
+    LAYOUT_VERSION,
+    MAGIC,
+    SAMPLE_HEAD,
+    WORDS_OFFSET,
+    ImageLayout,
+    VariableSlot,
+)
 from eap.pd.spec import Writer
 from eap.pd.words import StationWord
 
@@ -350,3 +362,97 @@ class Inputs:
             self._seen[index] = before
             changed = True
         return changed
+
+
+_SAMPLED_UNTIL = int(StationWord.SAMPLED_UNTIL)
+_NO_CYCLE = 0
+"""In the head of a sample that is being taken: the first cycle of a station is 1."""
+
+
+class Sampler:
+    """The engine's side.
+
+    Args:
+        image: Where the variables and the samples are.
+        inputs: The cycle's copy of what others write, at the same offsets.
+    """
+
+    def __init__(self, image: Image, inputs: memoryview) -> None:
+        self._words = image.words
+        self._memory = image.memory
+        self._inputs = inputs
+        self._slot = slot = image.layout.samples
+        self._heads = _heads(image)
+        engine = image.layout.regions[Writer.ENGINE]
+        self._engine = slice(engine.offset, engine.offset + engine.size)
+        self._others = slice(engine.offset + engine.size, slot.last)
+
+    def end_cycle(self, cycle: int, now_ns: int) -> None:
+        """Keep the variables as they are after *cycle*, which ran at *now_ns*, if wanted."""
+        if cycle <= self._words[_SAMPLED_UNTIL]:
+            self._take(cycle, now_ns)
+
+    def _take(self, cycle: int, now_ns: int) -> None:
+        slot, memory = self._slot, self._memory
+        number = cycle % slot.count
+        head = number * (slot.size // 8)
+        self._heads[head] = _NO_CYCLE
+        self._heads[head + 1] = now_ns
+        start = slot.offset + number * slot.size + SAMPLE_HEAD
+        middle = start + self._engine.stop - self._engine.start
+        memory[start:middle] = memory[self._engine]
+        memory[middle : start - SAMPLE_HEAD + slot.size] = self._inputs[self._others]
+        self._heads[head] = cycle
+
+
+class ImageSamples:
+    """The side of those who read them; one in all may say what is wanted.
+
+    Args:
+        image: Where they are.
+
+    Attributes:
+        image: The same.
+    """
+
+    def __init__(self, image: Image) -> None:
+        self.image = image
+        self._slot = image.layout.samples
+        self._heads = _heads(image)
+
+    @property
+    def newest(self) -> int:
+        """The cycle that ran last, or runs right now."""
+        return int(self.image.words[_CYCLE])
+
+    def want(self, cycles: int) -> None:
+        """Have samples taken of so many cycles from now on."""
+        self.image.words[_SAMPLED_UNTIL] = self.newest + cycles
+
+    def since(self, cycle: int) -> Iterable[int]:
+        """Return the cycles behind *cycle* that there may be samples of, the oldest first."""
+        newest = self.newest
+        if self._heads[self._head(newest)] != newest:
+            newest -= 1  # it runs right now
+        return range(max(cycle, newest - self._slot.count) + 1, newest + 1)
+
+    def ran_at_ns(self, cycle: int) -> int | None:
+        """Return when *cycle* ran, on the monotonic clock; None if there is no sample of it."""
+        head = self._head(cycle)
+        at_ns = self._heads[head + 1]
+        return at_ns if self._heads[head] == cycle else None
+
+    def read(self, cycle: int) -> bytes | None:
+        """Return the variables at the end of *cycle*; None if there is no sample of it."""
+        start = self._slot.offset + cycle % self._slot.count * self._slot.size + SAMPLE_HEAD
+        data = bytes(self.image.memory[start : start - SAMPLE_HEAD + self._slot.size])
+        return data if self._heads[self._head(cycle)] == cycle else None
+
+    def _head(self, cycle: int) -> int:
+        return cycle % self._slot.count * (self._slot.size // 8)
+
+
+def _heads(image: Image) -> memoryview:
+    """Return the samples as words, which are stored and loaded whole."""
+    slot = image.layout.samples
+    return image.memory[slot.offset : slot.offset + slot.count * slot.size].cast("q")

@@ -25,7 +25,6 @@ from typing import NamedTuple
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.pd import PdHeader
-from eap.pd import pieces
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.spec import (
     BusEntrySpec,
@@ -37,6 +36,7 @@ from eap.pd.spec import (
     TxFrameSpec,
     VariableSpec,
     Writer,
+    encode_in_steps,
 )
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 
@@ -181,7 +181,7 @@ class ImageLayout(SpecRecord, frozen=True):
 
     def encode(self) -> bytes:
         """Return the directory as it stands in the image."""
-        return pieces.encode(self)
+        return encode_in_steps(self)
 
     @property
     def size(self) -> int:

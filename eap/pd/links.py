@@ -1,18 +1,23 @@
-"""Links: in each cycle variables of a station get the values of others of its variables.
+"""Variables that the engine computes in each cycle: links between variables, and generators.
 
 Rule 1: a link may read what an earlier one of the same cycle wrote; those that do not depend on
 each other are copied together.
 Rule 2: between numbers, a link with a scale or an offset, or from one type to another, computes its
 value, rounds it if the target holds whole numbers, and keeps it within the limits of its type.  A
-source that is infinite or no number says nothing then: the target keeps its value, and the
+source that is infinite or not a number gives no value: the target keeps the old one, and the
 station counts that.
 Rule 3: every other link copies bits, whatever they mean.
+Rule 4: a generated value is a function of the station's time alone: of the number of cycle times
+since the first cycle, whether or not a cycle ran in each of them.  So a late or skipped cycle slows
+nothing down, and a restarted engine continues as if it had not stopped.
 """
 
 from __future__ import annotations
 
+import math
+import random
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -21,7 +26,15 @@ from eap.codec.datatypes import DataType
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import VariableSlot
-from eap.pd.spec import LinkSpec, Writer
+from eap.pd.spec import (
+    CounterSource,
+    EngineSource,
+    LinkSpec,
+    RampSource,
+    RandomSource,
+    SineSource,
+    Writer,
+)
 from eap.pd.words import StationWord
 
 _HELD = int(StationWord.LINKS_HELD)
@@ -151,7 +164,7 @@ def _swapped(memory: memoryview, way: _Way) -> Callable[[], None]:
 
 def _computed(image: Image, way: _Way) -> Callable[[], None]:
     read = _reader(way.source, swap=way.link.swap)
-    value = _function(way.link, way.source.kind, way.target.kind)
+    value = _conversion(way.link, way.source.kind, way.target.kind)
     store = image.storer(way.target.slot.name)
     words = image.words
 
@@ -179,7 +192,7 @@ def _reader(source: _End, *, swap: bool) -> Callable[[], Any]:
     return lambda: kind.decode(octets, 0)
 
 
-def _function(link: LinkSpec, source: DataType, target: DataType) -> Callable[[Any], Any]:
+def _conversion(link: LinkSpec, source: DataType, target: DataType) -> Callable[[Any], Any]:
     """Return what computes the target's number from a finite one of the source."""
     low, high = target.scalar_range or (0, 0)
     rounds = isinstance(low, int)
@@ -200,3 +213,79 @@ def _function(link: LinkSpec, source: DataType, target: DataType) -> Callable[[A
 
 def _is_whole(kind: DataType) -> bool:
     return kind.scalar_range is not None and isinstance(kind.scalar_range[0], int)
+
+
+_POSITIONS = 65_537
+"""Values of a random variable before they repeat: a prime, so that every stride visits all."""
+_STRIDE = 40_503
+"""Between the positions of one cycle and the next: far enough that their bytes do not overlap."""
+
+
+class Generators:
+    """Computes all generated variables of one station."""
+
+    def __init__(self, image: Image, sources: Iterable[EngineSource]) -> None:
+        self._steps = [_generator_step(image, source) for source in sources]
+
+    def run(self, tick: int) -> None:
+        """Store the values of the time *tick*, in cycle times since the first cycle.
+
+        The engine's region is marked as changing.
+        """
+        for step in self._steps:
+            step(tick)
+
+
+def _generator_step(image: Image, source: EngineSource) -> Callable[[int], None]:
+    slot = image.slots[source.variable]
+    kind = datatypes.parse(slot.type)
+    if isinstance(source, RandomSource):
+        return _random_step(image, source, slot.bit_offset // 8, kind.size)
+    limits = kind.scalar_range
+    whole = limits is not None and isinstance(limits[0], int)
+    value = _generator_value(source, image.layout.cycle_us, finish=round if whole else float)
+    store = image.storer(slot.name)
+    if limits is None or not whole:
+        return lambda tick: store(value(tick))
+    low, span = int(limits[0]), int(limits[1]) - int(limits[0]) + 1
+    return lambda tick: store((value(tick) - low) % span + low)
+
+
+@lru_cache(maxsize=32)
+def _random_sequence(seed: int, size: int) -> bytes:
+    """Return the bytes of all variables with this seed and size: one copy, since it is large."""
+    return random.Random(seed).randbytes(_POSITIONS + size)  # noqa: S311  test data, not a secret
+
+
+def _random_step(
+    image: Image, source: RandomSource, offset: int, size: int
+) -> Callable[[int], None]:
+    """Store a piece of a fixed random sequence, at a position that follows from the time.
+
+    Drawing new bytes in each cycle would tie the values to the number of cycles that ran, and
+    takes longer for all but the smallest variables.
+    """
+    sequence = _random_sequence(source.seed, size)
+    memory = image.memory[offset : offset + size]
+
+    def fill(tick: int) -> None:
+        position = tick * _STRIDE % _POSITIONS
+        memory[:] = sequence[position : position + size]
+
+    return fill
+
+
+def _generator_value(
+    source: CounterSource | RampSource | SineSource,
+    cycle_us: int,
+    *,
+    finish: Callable[[float], Any],
+) -> Callable[[int], Any]:
+    if isinstance(source, CounterSource):
+        return lambda tick: finish(tick * source.step)
+    period = max(source.period_ms * 1000 / cycle_us, 1.0)
+    if isinstance(source, RampSource):
+        span = source.high - source.low
+        return lambda tick: finish(source.low + span * (tick % period) / period)
+    turn = 2 * math.pi / period
+    return lambda tick: finish(source.offset + source.amplitude * math.sin(turn * (tick % period)))

@@ -7,18 +7,61 @@ from typing import TypeAlias
 
 from eap.ids import NetId
 from eap.pd.address import from_word, net_id_of, to_word
-from eap.pd.frame_status import enter_refused, enter_sent, enter_skipped, enter_suppressed
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
 from eap.pd.poll import Requests
 from eap.pd.spec import TriggerSpec, TxFrameSpec
-from eap.pd.trigger import EVENT_BIT, SUPPRESS_BIT, Schedule, Trigger, plan_schedule
-from eap.pd.txframe import Gather, Selection, TxFrame, TxPd, build_frame
-from eap.pd.words import REASON_INDEX, FrameWord, Reason
+from eap.pd.txframe import (
+    EVENT_BIT,
+    SUPPRESS_BIT,
+    Gather,
+    Schedule,
+    Selection,
+    Trigger,
+    TxFrame,
+    TxPd,
+    build_frame,
+    plan_schedule,
+)
+from eap.pd.words import REASON_INDEX, FrameState, FrameWord, Reason, TxWord
 
 FrameRow: TypeAlias = tuple[TxFrameSpec, FrameSlot, tuple[TxSlot, ...]]
 """A TxFrame with its place and the places of its PDs."""
+
+
+# An unsent frame is entered with its time and never cleared, so that sending costs nothing more: a
+# reader compares that time with the time of the last frame sent.
+def enter_sent(words: memoryview, pd: TxSlot, reason: int, now_ns: int) -> None:
+    """Enter that *pd* was sent on its own, for *reason* (an index into REASONS)."""
+    first = pd.words
+    words[first + TxWord.REASON + reason] += 1
+    words[first + TxWord.LAST_REASON] = reason
+    words[first + TxWord.SENT_AT_NS] = now_ns
+
+
+def enter_skipped(words: memoryview, pds: Iterable[TxSlot], now_ns: int) -> None:
+    """Enter that *pds* were due and not sent."""
+    for pd in pds:
+        words[pd.words + TxWord.SKIPPED] += 1
+        words[pd.words + TxWord.UNSENT_AT_NS] = now_ns
+
+
+def enter_suppressed(words: memoryview, frame: FrameSlot, now_ns: int) -> None:
+    """Enter that *frame* was due and suppressed."""
+    _enter_unsent(words, frame, FrameState.NOT_SENT, now_ns)
+
+
+def enter_refused(words: memoryview, frame: FrameSlot, out: OutFrame, now_ns: int) -> None:
+    """Enter that a channel did not send *out*, which is *frame* or a part of it."""
+    oversized = FrameState.OVERSIZED if out.oversized else 0
+    _enter_unsent(words, frame, FrameState.NOT_SENT | oversized, now_ns)
+
+
+def _enter_unsent(words: memoryview, frame: FrameSlot, state: FrameState, now_ns: int) -> None:
+    words[frame.words + FrameWord.SKIPPED] += 1
+    words[frame.words + FrameWord.UNSENT] = state
+    words[frame.words + FrameWord.UNSENT_AT_NS] = now_ns
 
 
 class _Group:

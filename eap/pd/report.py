@@ -1,6 +1,6 @@
-"""Status and lists for people and programs, from the counters of a process image.
+"""Status and lists of a station, from the counters of its process image.
 
-The shapes are a contract: docs/control.md describes them.
+docs/control.md describes the JSON shapes, which are a contract.
 """
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from eap.codec.pd import PdHeader
-from eap.pd.address import source_text
+from eap.pd.address import from_word, source_text
 from eap.pd.device import DeviceState
-from eap.pd.frame_status import frame_state, frame_status, presence, tx_var_state
 from eap.pd.image import Image
-from eap.pd.layout import RxSlot, TxSlot
+from eap.pd.layout import FrameSlot, RxSlot, TxSlot
+from eap.pd.monitor import SubscriberPresence
 from eap.pd.words import (
     DISCARDS,
     HISTOGRAM_BINS,
     REASON_INDEX,
     REASONS,
+    FrameState,
     FrameWord,
     Reason,
     RxState,
@@ -235,3 +236,52 @@ def _seen(
         return None
     age_ns = now_ns - words[slot.words + at]
     return {"address": text, "age_us": max(age_ns, 0) // 1000}
+
+
+def unsent_state(words: memoryview, first_word: int) -> FrameState:
+    """Return why the frame whose first word is at index *first_word* was not sent, 0 if it was."""
+    if words[first_word + FrameWord.UNSENT_AT_NS] < words[first_word + FrameWord.SENT_AT_NS]:
+        return FrameState(0)
+    return FrameState(words[first_word + FrameWord.UNSENT])
+
+
+def tx_var_state(words: memoryview, pd: TxSlot) -> int:
+    """Return VarState of *pd*: bit 0 not sent when it was due last."""
+    unsent_at_ns = words[pd.words + TxWord.UNSENT_AT_NS]
+    sent_at_ns = words[pd.words + TxWord.SENT_AT_NS]
+    if words[pd.frame_words + FrameWord.WHOLE] and not pd.poll_request:
+        # Its frame has gone whole: then all PDs of it are due in the same cycles.
+        sent_at_ns = max(sent_at_ns, words[pd.frame_words + FrameWord.SENT_AT_NS])
+    return int(unsent_at_ns > 0 and unsent_at_ns >= sent_at_ns)
+
+
+def frame_state(image: Image, first_word: int) -> int:
+    """Return the FrameState of the frame whose first word is at index *first_word*."""
+    is_missing = image.words[first_word + FrameWord.PRESENCE] == SubscriberPresence.MISSING
+    missing = FrameState.SUBSCRIBER_MISSING if is_missing else 0
+    return int(unsent_state(image.words, first_word) | missing)
+
+
+def presence(image: Image, first_word: int) -> str:
+    """Return whether the subscriber of that frame is there; ``unknown`` too without monitoring."""
+    return SubscriberPresence(image.words[first_word + FrameWord.PRESENCE]).name.lower()
+
+
+def frame_status(image: Image, slot: FrameSlot) -> dict[str, Any]:
+    """Return one frame's entry of ``eapctl status``.
+
+    ``address`` is where it goes at present, null while the one behind a NetID is not known.
+    """
+    words, first = image.words, slot.words
+    address = from_word(words[first + FrameWord.ADDRESS])
+    return {
+        "name": slot.name,
+        "port": slot.port,
+        "destination": slot.destination,
+        "address": None if address is None else str(address),
+        "sent": words[first + FrameWord.WHOLE] + words[first + FrameWord.PARTIAL],
+        "skipped": words[first + FrameWord.SKIPPED],
+        "frame_state": frame_state(image, first),
+        "monitor_interval_ms": slot.monitor_interval_ms or None,
+        "subscriber": presence(image, first),
+    }

@@ -19,13 +19,11 @@ import msgspec
 from eap.ids import InterfaceUri, NetId
 from eap.pd.address import NetIdLearner, forget
 from eap.pd.device import DeviceState, EapDevice
-from eap.pd.generator import Generators
-from eap.pd.image import Image, Inputs
+from eap.pd.image import Image, Inputs, Sampler
 from eap.pd.link import CyclicBus, FrameChannel, StateChannel, Taker
-from eap.pd.links import Links
+from eap.pd.links import Generators, Links
 from eap.pd.poll import questions_of, requests_at
 from eap.pd.publisher import Answerer, FrameRow, Publisher
-from eap.pd.samples import Sampler
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin

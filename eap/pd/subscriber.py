@@ -14,14 +14,13 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
 from eap.pd.address import SourceWatch
-from eap.pd.frame_plan import FramePlan, RefusedPd, TakenPd, walk
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot
 from eap.pd.link import FrameOrigin
 from eap.pd.poll import PollQuestion, Requests
 from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import RxPdSpec
-from eap.pd.subscription import RxSubscription, SubstituteValue
+from eap.pd.subscription import FramePlan, RefusedPd, RxSubscription, SubstituteValue, TakenPd, walk
 from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
 
 _KEY = struct.Struct("<10s4x6s").unpack_from

@@ -1,10 +1,22 @@
-"""One RxPD at run time: what fits it, when its data is too old, and what replaces it then."""
+"""RxPDs at run time: expected header, substitute, and the plan that checks and copies a frame.
+
+Publishers repeat the layout of their frames.  The plan of a layout compares all PD headers in one
+step and copies PDs that lie side by side, both in the frame and in the image, in one piece.
+"""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeAlias
+
 from eap.codec import datatypes
-from eap.codec.pd import PdHeader
-from eap.pd.address import source_octets
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.pd import FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
+from eap.errors import TruncatedError
+from eap.ids import NetId
+from eap.pd.address import SourceWatch, source_octets
+from eap.pd.copyplan import CopyPlan
 from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxSlot
 from eap.pd.poll import PollAnswer, PollQuestion
@@ -104,3 +116,172 @@ def _octets(image: Image, slot: RxSlot) -> bytes | None:
         value = kind.encode(default_value(variable))
         put(octets, variable.bit_offset - start, kind.bit_length, value)
     return bytes(octets)
+
+
+Copy: TypeAlias = tuple[slice, slice]
+"""Octets of the frame and where they go in the image."""
+
+
+class TakenPd(NamedTuple):
+    """A PD of the frame that a subscription takes: offsets of its header here and there."""
+
+    tracker: SequenceTracker
+    words: int
+    """Index of the first word of the RxPD."""
+    source: int
+    target: int
+    size: int
+    """Octets, header included."""
+    alternate: CopyPlan | None = None
+    """What copies it, header included, if it is laid out otherwise than in the image."""
+
+
+class RefusedPd(NamedTuple):
+    """A PD that no subscription takes: counters to add one to, and VarState words to set."""
+
+    counters: tuple[int, ...]
+    mismatches: tuple[tuple[int, int], ...] = ()
+    """(first word of the RxPD, VarState)"""
+    wrong_source: tuple[int, ...] = ()
+    """First words of the RxPDs whose publisher has another address."""
+
+
+class FramePlan:
+    """The plan of one layout.
+
+    Attributes:
+        headers: Reads all PD headers but their quality from a frame, at offset FIRST_PD.
+        expected: What it must return for this plan to apply.
+        end: Octets of the frame by its Length.
+        is_single: Whether there is one PD in it.
+        parts: For each tracker that the frame concerns, the copies to make if it agrees.
+        taken_words: First words of the RxPDs that take one of its PDs.
+        has_more: Whether there is anything of the next four.
+        alternates: PDs that are laid out otherwise: tracker, offset in the frame, copy to make.
+        refused: The PDs that no subscription takes.
+        requests: RxPDs that ask this station for something, with their trackers.
+        answers: RxPDs that this station asked for, likewise.
+        roaming: Trackers that follow any publisher.
+        publisher: The frame's, as a number.
+        watch: The addresses that such frames come from; it belongs to this plan if they do.
+    """
+
+    __slots__ = (
+        "alternates",
+        "answers",
+        "end",
+        "expected",
+        "has_more",
+        "headers",
+        "is_single",
+        "parts",
+        "publisher",
+        "refused",
+        "requests",
+        "roaming",
+        "taken_words",
+        "watch",
+    )
+
+    def __init__(
+        self,
+        end: int,
+        pds: Iterable[tuple[bytes, int]],
+        taken: Iterable[TakenPd],
+        refused: Iterable[RefusedPd],
+        *,
+        watch: SourceWatch,
+        requests: Iterable[tuple[SequenceTracker, str]] = (),
+        answers: Iterable[tuple[SequenceTracker, PollAnswer]] = (),
+        roaming: Iterable[SequenceTracker] = (),
+        publisher: bytes = b"",
+    ) -> None:
+        """Build the plan from (header without quality, data length) of each PD and their fate."""
+        pds = tuple(pds)
+        layout = struct.Struct("<" + "".join(f"6s{2 + length}x" for _, length in pds))
+        self.headers: Callable[..., tuple[Any, ...]] = layout.unpack_from
+        self.expected: tuple[Any, ...] = tuple(header for header, _ in pds)
+        self.end = end
+        self.is_single = len(pds) == 1
+        taken = tuple(taken)
+        self.parts = _parts(taken)
+        self.alternates = tuple(
+            (pd.tracker, pd.source, pd.alternate) for pd in taken if pd.alternate is not None
+        )
+        self.taken_words = tuple(pd.words for pd in taken)
+        self.refused = tuple(refused)
+        self.requests = tuple(requests)
+        self.answers = tuple(answers)
+        self.has_more = bool(self.alternates or self.refused or self.requests or self.answers)
+        self.roaming = tuple(roaming)
+        self.publisher = int.from_bytes(publisher)
+        self.watch = watch
+
+    def copy_alternates(self, data: memoryview, cycle: int, memory: memoryview) -> None:
+        """Copy what is laid out otherwise from the frame *data* of *cycle*, if it was taken."""
+        for tracker, source, alternate in self.alternates:
+            if tracker.has_taken(cycle):
+                alternate.run(data[source:], memory)
+
+    def example(self) -> memoryview:
+        """Return a frame of this layout, without data."""
+        frame = bytearray(EtherCatHeader(self.end - PD_FRAME_START).encode())
+        publisher = NetId(self.publisher.to_bytes(6))
+        frame += PdFrameHeader(publisher, len(self.expected), 0).encode()
+        for header in self.expected:
+            frame += header + bytes(2)
+            frame += bytes(PdHeader.decode(header + bytes(2)).length)
+        return memoryview(frame.ljust(self.end, b"\0"))
+
+
+def _parts(taken: Iterable[TakenPd]) -> tuple[tuple[SequenceTracker, tuple[Copy, ...]], ...]:
+    runs: dict[SequenceTracker, list[TakenPd]] = {}
+    for pd in taken:
+        pieces = runs.setdefault(pd.tracker, [])
+        if pd.alternate is not None:
+            continue
+        if pieces and _continues(pieces[-1], pd):
+            pieces[-1] = pieces[-1]._replace(size=pieces[-1].size + pd.size)
+        else:
+            pieces.append(pd)
+    return tuple(
+        (
+            tracker,
+            tuple(
+                (slice(p.source, p.source + p.size), slice(p.target, p.target + p.size))
+                for p in pieces
+            ),
+        )
+        for tracker, pieces in runs.items()
+    )
+
+
+def _continues(run: TakenPd, pd: TakenPd) -> bool:
+    return run.source + run.size == pd.source and run.target + run.size == pd.target
+
+
+HEADER_KEY = struct.Struct("<6s2x")
+"""A PD header as plans compare it: everything but the quality."""
+assert HEADER_KEY.size == PdHeader.SIZE  # noqa: S101  the two must not drift apart
+
+
+def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | Discard:
+    """Return each PD header with its offset, or why the frame is dropped as a whole."""
+    try:
+        ethercat = EtherCatHeader.decode(data[:size])
+        if ethercat.type != FrameType.PROCESS_DATA:
+            return Discard.WRONG_TYPE
+        end = PD_FRAME_START + ethercat.length
+        frame = data[: min(end, size)]
+        count = PdFrameHeader.decode(frame, PD_FRAME_START).count
+        if FIRST_PD + count * PdHeader.SIZE > end:
+            return Discard.COUNT_TOO_LARGE
+        pds = []
+        offset = FIRST_PD
+        for _ in range(count):
+            header = PdHeader.decode(frame, offset)
+            pds.append((header, offset))
+            offset += PdHeader.SIZE + header.length
+    except TruncatedError:
+        return Discard.TRUNCATED
+    return pds if offset <= end <= size else Discard.TRUNCATED

@@ -19,14 +19,14 @@ from typing import Any
 
 from eap.closeable import Closeable
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
+from eap.net.image_file import StationImage
 from eap.pd.image import Image
 from eap.pd.layout import VAR_CTRL
 from eap.pd.report import station_status
 from eap.pd.spec import Writer
-from eap.pd.trigger import EVENT_BIT
+from eap.pd.txframe import EVENT_BIT
 from eap.pd.words import StationWord
 from eap.runtime.folder import describe_roots, find_running
-from eap.runtime.station_image import StationImage
 from eap.suggest import suggest
 
 _GONE_AFTER_S = 2.0

@@ -18,7 +18,7 @@ from devicebus.master.findings import (
 )
 from devicebus.master.link import LinkStats
 from devicebus.wire.alstatus import state_name
-from eap.runtime.bus_request import BusReport, SlaveReport
+from eap.runtime.engine_messages import BusReport, SlaveReport
 
 
 class NamedSlave(msgspec.Struct, frozen=True):

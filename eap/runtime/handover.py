@@ -1,12 +1,18 @@
-"""What the supervisor hands down to a process it starts: specifications, descriptors, options.
+"""Handover of the supervisor to its child processes, and of TCP connections to the engine.
 
-It travels as JSON in an anonymous file whose descriptor the child inherits, so that its size has no
-limit, nobody else can read it, and nothing is left behind.
+Specifications, descriptors and options travel as JSON in an anonymous file whose descriptor the
+child inherits.  So the size has no limit, no other process can read it, and nothing is left behind.
+
+Services passes a TCP connection as one message with one descriptor on a SOCK_SEQPACKET pair.  The
+pair outlives both processes, so the next engine takes a connection that was passed while the engine
+restarted.  Neither side ever waits for the other.
 """
 
 from __future__ import annotations
 
+import array
 import os
+import socket
 from enum import StrEnum
 from typing import Self
 
@@ -170,3 +176,43 @@ class Handover(Handed, frozen=True):
             for port in station.ports
             if port.name == name.port
         )
+
+
+_MAX_MESSAGE = 8192
+_DESCRIPTOR_SPACE = socket.CMSG_SPACE(array.array("i").itemsize)
+
+
+class PassedConnection(SpecRecord, frozen=True):
+    """A type-4 connection: the ports that its frames are for, and its peer."""
+
+    owners: tuple[PortName, ...]
+    host: str
+    """Address of the peer, as the policy counts it (eap.net.connections)."""
+
+
+def pass_connection(
+    link: socket.socket, connection: socket.socket, description: PassedConnection
+) -> bool:
+    """Send *connection*, which the caller then closes; return whether there was room for it."""
+    message = msgspec.json.encode(description)
+    rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [connection.fileno()]))
+    try:
+        # socket.send_fds() of Python 3.11 forgets its flags, and would wait here.
+        link.sendmsg([message], [rights], socket.MSG_DONTWAIT)
+    except OSError:
+        return False
+    return True
+
+
+def take_connection(link: socket.socket) -> tuple[socket.socket, PassedConnection] | None:
+    """Return the next connection that was passed, None if there is none now."""
+    flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
+    try:
+        message, ancillary, _, _ = link.recvmsg(_MAX_MESSAGE, _DESCRIPTOR_SPACE, flags)
+    except OSError:
+        return None
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            connection = socket.socket(fileno=array.array("i", data)[0])
+            return connection, msgspec.json.decode(message, type=PassedConnection)
+    return None

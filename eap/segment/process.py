@@ -28,8 +28,7 @@ from eap.net import realtime
 from eap.net.busport import SegmentSocket, open_segment
 from eap.runtime.busfile import Bus, load_or_raise
 from eap.runtime.handover import SegmentHandover
-from eap.runtime.signals import catch_end_signals
-from eap.runtime.startup import Startup
+from eap.runtime.startup import Startup, catch_end_signals
 
 _BATCH = 64
 _MS = 1_000_000

@@ -17,7 +17,7 @@ import msgspec
 
 from eap.errors import EngineGoneError
 from eap.runtime.bus_errors import to_error
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BusChange,
     Cancel,
     EngineMessage,

@@ -26,6 +26,7 @@ from eap.device.eap_dictionary import DeviceIdentity
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.ids import NetId
 from eap.net import realtime
+from eap.net.image_file import StationImage
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 from eap.pd.words import StationWord
@@ -39,7 +40,6 @@ from eap.runtime.handover import (
     SocketKind,
 )
 from eap.runtime.startup import Startup, Step, no_step
-from eap.runtime.station_image import StationImage
 from eap.runtime.store import StationStore, plant_folder
 from eap.services.ads.station_ads import StationAds
 from eap.services.control.audit import Audit, AuditFile

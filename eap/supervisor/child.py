@@ -1,25 +1,190 @@
-"""One process under the supervisor: its start, its output, its end, and when it comes back.
+"""Child processes of the supervisor: start, progress of the start, output, end and restart.
 
-The supervisor watches the descriptors that are given out here; nothing in this module waits.
+Nothing in this module waits: the supervisor watches the descriptors given out here, and lines for
+stderr are dropped and counted while their reader is slow.  A terminal can be held (Ctrl-S), and the
+reader of a pipe may sleep.  A supervisor that waited for it could not restart a process, and
+services, whose lines pass through the supervisor, would stop with it.
+
+A process that reports one step after the other may start without limit of time.  One that reports
+no new step is stuck after a limit, which doubles with each start that got stuck: where 20 s are too
+short, because the machine is slow or full, 40 s or 80 s are not.  A start that succeeds restores
+the first limit.
 """
 
 from __future__ import annotations
 
+import logging
 import os
+import select
 import signal
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterable
 from contextlib import ExitStack
+from enum import Enum
 from typing import Any
 
 import msgspec
 
 from eap.runtime.handover import Handover, SegmentHandover
 from eap.runtime.startup import Report
-from eap.supervisor.output import STDERR
-from eap.supervisor.progress import StartWatch
+
+FIRST_LIMIT_NS = 20_000_000_000
+"""Without progress, in the first start and behind one that succeeded."""
+LONGEST_LIMIT_NS = 640_000_000_000
+FIRST_NOTE_NS = 10_000_000_000
+"""From the beginning of a start to the first note that it takes long; the next come ever later."""
+
+
+class StartEvent(Enum):
+    """Outcome of the time that passed."""
+
+    SLOW = "slow"
+    """The start takes long, and goes on."""
+    STUCK = "stuck"
+    """There was no progress for the limit."""
+
+
+class StartWatch:
+    """Starts of one child process.
+
+    Attributes:
+        step: The last that it reported; empty when it runs, or is not being started.
+        limit_ns: How long it may be without progress.
+        has_run: Whether any start succeeded.
+        is_stuck: Whether the latest start was given up.
+    """
+
+    def __init__(self) -> None:
+        self.step = ""
+        self.limit_ns = FIRST_LIMIT_NS
+        self.has_run = False
+        self.is_stuck = False
+        self._began_ns: int | None = None
+        self._progress_ns = 0
+        self._note_ns = 0
+        self._waits_for = ""
+
+    def begin(self, now_ns: int) -> None:
+        """Take note that the process was started."""
+        self._began_ns = self._progress_ns = now_ns
+        self._note_ns = now_ns + FIRST_NOTE_NS
+        self._waits_for = ""
+        self.step = "starting Python"
+        self.is_stuck = False
+
+    def advance(self, step: str, now_ns: int, *, waits_for: str = "") -> None:
+        """Take note of a step; while it waits for another process, there is no limit."""
+        if step != self.step:
+            self._progress_ns = now_ns
+        self.step = step
+        self._waits_for = waits_for
+
+    def release(self, other: str, now_ns: int) -> None:
+        """Take note that the process *other* runs: who waited for it goes on."""
+        if self._waits_for == other:
+            self._waits_for = ""
+            self._progress_ns = now_ns
+
+    def succeed(self) -> None:
+        """Take note that the process runs."""
+        self.end()
+        self.has_run = True
+        self.limit_ns = FIRST_LIMIT_NS
+
+    def end(self) -> None:
+        """Take note that the process ended."""
+        self.step = self._waits_for = ""
+        self._began_ns = None
+
+    def took_ns(self, now_ns: int) -> int:
+        """Return how long the start has taken so far; 0 if there is none."""
+        return 0 if self._began_ns is None else now_ns - self._began_ns
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has something to do."""
+        if self._began_ns is None or self.is_stuck:
+            return None
+        return self._note_ns if self._waits_for else min(self._note_ns, self._deadline_ns)
+
+    def handle_timeout(self, now_ns: int) -> StartEvent | None:
+        """Return what has become of the start; early calls are harmless."""
+        due_ns = self.next_timeout()
+        if due_ns is None or now_ns < due_ns:
+            return None
+        if not self._waits_for and now_ns >= self._deadline_ns:
+            self.is_stuck = True
+            self.limit_ns = min(2 * self.limit_ns, LONGEST_LIMIT_NS)
+            return StartEvent.STUCK
+        self._note_ns = now_ns + self.took_ns(now_ns)
+        return StartEvent.SLOW
+
+    @property
+    def _deadline_ns(self) -> int:
+        return self._progress_ns + self.limit_ns
+
+
+_PIECE = select.PIPE_BUF
+"""Octets that whatever is ready to be written takes at once."""
+
+
+class Output:
+    """Lines to a descriptor; those that it does not take now are left out, and counted.
+
+    Args:
+        fd: Where lines go.
+
+    Attributes:
+        left_out: How many, since the last line that was taken.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self.left_out = 0
+        self._is_cut = False
+        self._fd = fd
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLOUT)
+
+    def write(self, line: str) -> None:
+        """Write a line, behind a note on those that were left out before it."""
+        if self.left_out:
+            line = f"({self.left_out} lines left out here, which nobody took)\n{line}"
+        if self._is_cut:  # a full pipe or disk took a part of the line before: it ends there
+            line = f"\n{line}"
+        octets = f"{line}\n".encode("utf-8", "replace")
+        for start in range(0, len(octets), _PIECE):
+            piece = octets[start : start + _PIECE]
+            taken = self._take(piece)
+            if taken < len(piece):
+                self.left_out += 1
+                if written := octets[: start + taken]:
+                    self._is_cut = not written.endswith(b"\n")
+                return
+        self.left_out = 0
+        self._is_cut = False
+
+    def _take(self, octets: bytes) -> int:
+        """Write what is taken at once; return how much that was."""
+        if not self._poll.poll(0):
+            return 0
+        try:
+            return os.write(self._fd, octets)
+        except OSError:  # the reader has gone, or the disk is full
+            return 0
+
+
+STDERR = Output(2)
+"""Of this process."""
+
+
+class OutputHandler(logging.Handler):
+    """Log lines of the supervisor itself."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one."""
+        STDERR.write(self.format(record))
+
 
 FIRST_BACKOFF_NS = 100_000_000
 LONGEST_BACKOFF_NS = 5_000_000_000

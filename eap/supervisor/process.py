@@ -21,21 +21,23 @@ from msgspec.structs import replace
 from eap.ams.spec import RoutingSpec
 from eap.config.load import Plant
 from eap.errors import ConfigError, EnvironmentalError
+from eap.ids import InterfaceUri
+from eap.net.loopback import LoopbackLines
 from eap.net.realtime import raise_descriptor_limit
 from eap.pd.device import DeviceState
-from eap.pd.spec import StationSpec
+from eap.pd.handover import needs_new_start
+from eap.pd.image import format_image
+from eap.pd.layout import plan_layout
+from eap.pd.spec import PortKind, StationSpec
+from eap.pd.station import Station
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.runtime.handover import EngineOptions, Handover, SegmentHandover
 from eap.runtime.plantfile import load_plant, require_own_buses
-from eap.runtime.signals import catch_end_signals
+from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, effective, settle
 from eap.suggest import suggest
-from eap.supervisor.bus_sockets import segments
-from eap.supervisor.child import Child, describe_end
-from eap.supervisor.output import OutputHandler
-from eap.supervisor.progress import StartEvent
-from eap.supervisor.sockets import SharedSockets
-from eap.supervisor.what_runs import what_runs_now
+from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
+from eap.supervisor.sockets import SharedSockets, segments
 
 GRACE_NS = 1_000_000_000
 """How long a process may take to end when asked; the whole appliance has two seconds."""
@@ -415,3 +417,42 @@ def _given_to_segments(
         child = children[name] = Child(f"segment {name}", "eap.segment.process", bytecode)
         given[child] = handover, [handover.frames_fd, handover.command_fd]
     return given
+
+
+def what_runs_now(handover: Handover) -> Handover:
+    """Return *handover* with each station as it was configured last, since the plant file or now.
+
+    A configuration that needs other sockets than those that were opened, or that no engine could
+    ever run, is none of this start.
+    """
+    specs = []
+    states = {}
+    stored = effective(handover.plant, handover.stations, handover.first_state)
+    for given, found in zip(handover.stations, stored, strict=True):
+        reasons = needs_new_start(given, found.spec)
+        if found.spec != given:
+            reasons = reasons or why_not_built(found.spec)
+        for reason in reasons:
+            logger.warning("station %s: the plant file runs: %s", given.name, reason)
+        specs.append(given if reasons else found.spec)
+        states[given.name] = found.state
+    return replace(handover, stations=tuple(specs), states=states)
+
+
+def why_not_built(spec: StationSpec) -> list[str]:
+    """Return what keeps a station from being built, nothing if it can be.
+
+    A configuration may have been kept that no engine ever ran: whoever kept it was killed before
+    the engine refused it.  Started with it, the engine would fail again and again.
+    """
+    try:
+        layout = plan_layout(spec)
+        image = format_image(memoryview(bytearray(layout.size)), layout, 1)
+        station = Station(spec, image, lambda: None)
+        lines = LoopbackLines()
+        for port in spec.ports:
+            if port.kind is PortKind.EAP:
+                station.connect(port.name, lines.open(InterfaceUri("loop", "trial")))
+    except Exception as exc:  # noqa: BLE001  whatever it is, an engine would fail with it too
+        return [f"it cannot be built: {type(exc).__name__}: {exc}"]
+    return []

@@ -10,8 +10,8 @@ import msgspec
 
 from devicebus.sim.spec import FaultSpec
 from devicebus.wire.alstatus import AlState
+from eap.engine.build import master_settings
 from eap.engine.engine_bus import EngineBus
-from eap.engine.engine_buses import master_settings
 from eap.errors import EnvironmentalError
 from eap.pd.spec import StationSpec, Writer
 from eap.runtime.busfile import load_or_raise

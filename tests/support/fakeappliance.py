@@ -14,7 +14,7 @@ import msgspec
 
 from devicebus.wire.alstatus import AlState
 from eap.control.protocol import encode_request
-from eap.net.image_file import ImageFile, create_image
+from eap.net.image_file import ImageFile, StationImage, create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
     PortKind,
@@ -29,7 +29,6 @@ from eap.pd.spec import (
 from eap.pd.words import RxWord, StationWord
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
 from eap.runtime.handover import PortName
-from eap.runtime.station_image import StationImage
 from eap.services.control.bus_methods import Buses
 from eap.services.control.control_server import ControlServer
 from eap.services.control.methods import Methods

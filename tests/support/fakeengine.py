@@ -23,7 +23,7 @@ from devicebus.wire.datagram import DatagramRequest
 from eap.engine.bus_requests import bring_all, bring_one
 from eap.errors import EapError
 from eap.runtime.bus_errors import ErrorRecord, to_record
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BringSlaves,
     BusChange,
     BusReport,

@@ -15,7 +15,7 @@ from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
-from eap.runtime.bus_request import SlaveDescription
+from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway.sessions import SessionCodec
 from eap.services.slaves.access import LocalSlave
 from eap.services.slaves.bus_client import BusClient, MailboxTurn

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter_ns
 from typing import Any, NamedTuple
 
-from eap.engine.successor import EngineStation, Successor
+from eap.engine.rebuild import EngineStation, Successor
 from eap.ids import InterfaceUri
 from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines

@@ -13,7 +13,6 @@ from eap.engine.build import EnginePlant
 from eap.engine.process import StopFlag, run_cycles
 from eap.errors import EapError
 from eap.net import realtime
-from eap.pd import pieces
 from eap.pd.report import station_status
 from eap.pd.spec import (
     PortKind,
@@ -24,9 +23,10 @@ from eap.pd.spec import (
     TxPdSpec,
     VariableSpec,
     Writer,
+    record_to_lines,
 )
+from eap.runtime.engine_messages import Configure
 from eap.runtime.handover import Handover
-from eap.runtime.station_request import Configure
 from eap.supervisor.sockets import SharedSockets
 from tools.bench.engine_roles import Recorder, own_sockets
 from tools.bench.pacing import answer
@@ -106,7 +106,7 @@ class Changer(Recorder):
         self._plant = plant
         self._paths = [folder / "0.spec", folder / "1.spec"]
         for more, path in enumerate(self._paths):
-            path.write_bytes(pieces.to_lines(station(pds, more)))
+            path.write_bytes(record_to_lines(station(pds, more)))
         self._begin_ns = monotonic_ns() + 5 * _QUIET_NS
 
     def handle_timeout(self, now_ns: int) -> None:

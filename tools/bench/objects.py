@@ -11,7 +11,7 @@ from time import monotonic_ns, perf_counter_ns
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill, read_back
 from eap.ids import InterfaceUri
-from eap.net.image_file import create_image
+from eap.net.image_file import StationImage, create_image
 from eap.net.loopback import LoopbackLines
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Entry, OdState, record
@@ -19,7 +19,6 @@ from eap.od.profiles.eap1000 import TX_VARIABLE, Var
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec, VariableSpec
 from eap.pd.station import Station
-from eap.runtime.station_image import StationImage
 from eap.services.device.image_values import ImageValues
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.machine import memory_folder

@@ -42,7 +42,7 @@ from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Element, Idn,
 from eap.errors import EapError, TruncatedError
 from eap.gateway.error_table import ads_result
 from eap.ids import NetId
-from eap.runtime.bus_request import SlaveDescription, no_mailbox
+from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.ads.ads_service import answer_request, check_up
 from eap.services.ads.master_ads import MasterAds, Send, StateRequests
 from eap.services.ads.slave_files import SlaveFiles

@@ -50,11 +50,11 @@ from eap.device.live_dictionaries import RouterDictionary
 from eap.errors import ControlError, ImageError
 from eap.gateway.error_table import ads_result
 from eap.ids import InterfaceUri, MacAddr, NetId
+from eap.net.image_file import StationImage
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.router9000 import RouterLive
 from eap.pd.spec import PortKind, PortSpec, StationSpec
-from eap.runtime.station_image import StationImage
 from eap.services.ads.ads_service import AdsService, device_info
 from eap.services.ads.station_symbols import NotificationPump, StationSymbols
 from eap.services.device.station_device import StationDevice

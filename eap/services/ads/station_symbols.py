@@ -30,12 +30,11 @@ from eap.codec.adsnotification import to_filetime
 from eap.codec.values import String
 from eap.errors import ImageError, TornReadError, WriterConflictError
 from eap.ids import NetId
-from eap.pd.image import Image, take
+from eap.net.image_file import StationImage
+from eap.pd.image import Image, ImageSamples, take
 from eap.pd.layout import VariableSlot
-from eap.pd.samples import ImageSamples
 from eap.pd.spec import Writer
 from eap.pd.words import StationWord
-from eap.runtime.station_image import StationImage
 
 _ATTEMPTS = 10
 """At a consistent copy, a tenth of a millisecond apart: a client may ask again, others wait."""

@@ -22,7 +22,7 @@ from eap.control.bus import GatewayParameters, GatewayRow
 from eap.control.protocol import ErrorCode, of_station
 from eap.errors import ControlError, EapError
 from eap.pd.spec import PortKind, StationSpec
-from eap.runtime.bus_request import BusReport
+from eap.runtime.engine_messages import BusReport
 from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.services.slaves.bus_client import BusClient, MailboxTurn
 from eap.services.slaves.segment_link import SegmentLink

@@ -16,12 +16,12 @@ from eap.control import protocol as control
 from eap.control.bus import BUS_METHODS
 from eap.control.protocol import VERSION, ErrorCode, of_station, parameters
 from eap.errors import ControlError, WriterConflictError
+from eap.net.image_file import StationImage
 from eap.pd.image import Image
 from eap.pd.layout import VariableSlot
 from eap.pd.report import PdRow, pd_list, quality, tracker_word
 from eap.pd.spec import Writer
 from eap.pd.words import RxWord, StationWord
-from eap.runtime.station_image import StationImage
 from eap.suggest import suggest
 
 MIN_PERIOD_MS = 10

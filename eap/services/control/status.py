@@ -18,8 +18,8 @@ from eap.pd.image import Image
 from eap.pd.report import station_status
 from eap.pd.spec import PortKind
 from eap.pd.words import StationWord
-from eap.runtime.bus_request import BusReport
 from eap.runtime.bus_status import bus_document, bus_link
+from eap.runtime.engine_messages import BusReport
 from eap.runtime.folder import ApplianceInfo, ProcessInfo
 from eap.runtime.handover import PortName
 from eap.services.tasks import TaskSet

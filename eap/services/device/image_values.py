@@ -13,9 +13,9 @@ from typing import Any
 from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.errors import ImageError
+from eap.net.image_file import StationImage
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import EapLive
-from eap.pd.frame_status import frame_state, tx_var_state
 from eap.pd.image import Image
 from eap.pd.layout import (
     FRAME_CTRL,
@@ -25,7 +25,7 @@ from eap.pd.layout import (
     RxSlot,
     TxSlot,
 )
-from eap.pd.report import quality, tracker_word, tx_status, var_state
+from eap.pd.report import frame_state, quality, tracker_word, tx_status, tx_var_state, var_state
 from eap.pd.words import (
     DISCARD_INDEX,
     REASON_INDEX,
@@ -36,7 +36,6 @@ from eap.pd.words import (
     StationWord,
     TxWord,
 )
-from eap.runtime.station_image import StationImage
 
 _NEVER = 0xFFFF
 """Quality of what has never been received: as old as can be told."""

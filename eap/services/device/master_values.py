@@ -28,7 +28,7 @@ from eap.device.live_dictionaries import MasterDictionary
 from eap.errors import EapError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.master1100 import CONFIGURED, DIAGNOSIS, MasterLive
-from eap.runtime.bus_request import BusReport, SlaveDescription
+from eap.runtime.engine_messages import BusReport, SlaveDescription
 from eap.services.device.master_registers import (
     LOOPS,
     PORTS,

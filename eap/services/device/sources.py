@@ -13,8 +13,8 @@ from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.errors import EnvironmentalError, ImageError
 from eap.net.host import Host, open_replay
+from eap.net.image_file import StationImage
 from eap.pd.spec import CsvSource, HostSource, Source, StationSpec, Writer
-from eap.runtime.station_image import StationImage
 
 logger = logging.getLogger(__name__)
 

@@ -22,10 +22,9 @@ from msgspec.structs import replace
 
 from eap.device.rollout import without_alternates
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
-from eap.pd import pieces
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
-from eap.pd.spec import StationSpec
-from eap.runtime.station_request import Configure, SetState
+from eap.pd.spec import StationSpec, record_to_lines
+from eap.runtime.engine_messages import Configure, SetState
 from eap.runtime.store import Configuration, StationFile, Stored, digest_of, new_cause
 from eap.services.engine_link import EngineLink
 
@@ -57,7 +56,7 @@ class EngineClient:
         """
         path = self._folder / f".{os.getpid()}-{next(self._numbers)}.spec"
         try:
-            path.write_bytes(pieces.to_lines(spec))
+            path.write_bytes(record_to_lines(spec))
         except OSError as exc:
             path.unlink(missing_ok=True)
             raise EnvironmentalError(f"{path}: {exc.strerror}") from None

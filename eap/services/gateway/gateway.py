@@ -47,7 +47,7 @@ from eap.gateway.requests import (
     operation_of,
 )
 from eap.ids import NetId
-from eap.runtime.bus_request import SlaveDescription, no_mailbox
+from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.gateway.admission import (
     MASTER_PORT,
     Guard,

@@ -23,7 +23,7 @@ from eap.codec.mailbox import MailboxType, VoeHeader
 from eap.codec.soe import Idn
 from eap.errors import EapError
 from eap.gateway.error_table import cause_of_result
-from eap.runtime.bus_request import SlaveDescription, no_mailbox
+from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.slaves.bus_client import BusClient, MailboxTurn
 from eap.services.slaves.file_stream import AHEAD, FileStream, LocalFile
 from eap.services.tasks import TaskSet

@@ -34,7 +34,7 @@ from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
 from eap.control.bus import BRING_S, MARGIN_S, PATIENCE_S, TRANSFER_S
 from eap.errors import EapError, EngineGoneError
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BringSlaves,
     BusChange,
     BusReport,

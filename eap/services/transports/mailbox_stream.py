@@ -26,8 +26,7 @@ from eap.net.connections import OWN_HOST, Activity, CloseReason, Limits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.discards import Refusal
-from eap.runtime.handover import PortName
-from eap.runtime.passing import PassedConnection, pass_connection
+from eap.runtime.handover import PassedConnection, PortName, pass_connection
 from eap.services.tasks import TaskSet
 from eap.services.transports.accepting import (
     Listeners,

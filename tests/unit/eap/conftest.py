@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.net.image_file import create_image
+from eap.net.image_file import StationImage, create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
     CounterSource,
@@ -17,7 +17,6 @@ from eap.pd.spec import (
     VariableSpec,
     Writer,
 )
-from eap.runtime.station_image import StationImage
 
 
 def eap_port(number: int, interface: str = "", **more) -> PortSpec:

@@ -35,7 +35,7 @@ from eap.gateway.requests import AddressMap, RemoteAddress
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
-from eap.runtime.bus_request import SlaveDescription
+from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway.gateway import MailboxGateway, Settings
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.gateway.sessions import MasterSession

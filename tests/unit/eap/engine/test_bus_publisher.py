@@ -9,7 +9,7 @@ from msgspec.structs import asdict
 
 from devicebus.wire.alstatus import AlState
 from eap.engine.bus_report import BusPublisher, report_bus
-from eap.runtime.bus_request import BusChange, SlaveDescription
+from eap.runtime.engine_messages import BusChange, SlaveDescription
 from tests.support.cyclic import MS
 from tests.support.enginebus import BusRig
 

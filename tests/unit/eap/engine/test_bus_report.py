@@ -5,8 +5,8 @@ import pytest
 from devicebus.master.findings import History
 from devicebus.wire.alstatus import AlState
 from eap.engine.bus_report import report_bus
-from eap.runtime.bus_request import SlaveReport
 from eap.runtime.bus_status import history_of, report_findings
+from eap.runtime.engine_messages import SlaveReport
 from tests.support import enginebus
 from tests.support.cyclic import MS
 from tests.support.enginebus import US, BusRig

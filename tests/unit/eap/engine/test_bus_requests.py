@@ -25,10 +25,11 @@ from eap.engine.bus_requests import (
 )
 from eap.errors import EngineRefusedError
 from eap.runtime.bus_errors import ErrorRecord
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BringSlaves,
     BusChange,
     Cancel,
+    Configure,
     DescribeBus,
     EngineMessage,
     EngineReply,
@@ -38,9 +39,9 @@ from eap.runtime.bus_request import (
     ForgetFaults,
     Ping,
     Republish,
+    SetState,
     UnsolicitedMessage,
 )
-from eap.runtime.station_request import Configure, SetState
 from tests.support.cyclic import MS
 from tests.support.enginebus import BusRig
 

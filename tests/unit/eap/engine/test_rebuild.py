@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 import select
+import socket
 
 import pytest
 from msgspec.structs import replace
 
+from eap.codec.pd import decode_frame_header
 from eap.engine.build import EnginePlant
-from eap.engine.rebuild import MOST_WAITING
+from eap.engine.rebuild import MOST_WAITING, EngineStation, Successor, has_tcp, sends_to
 from eap.errors import EngineRefusedError, EnvironmentalError
-from eap.net.image_file import ImageFile, open_image
-from eap.pd import pieces
+from eap.ids import InterfaceUri
+from eap.net.image_file import ImageFile, create_image, open_image
+from eap.net.loopback import LoopbackLines
 from eap.pd.device import DeviceState
+from eap.pd.engine import Engine
 from eap.pd.handover import ImageHandover
+from eap.pd.layout import plan_layout
 from eap.pd.report import station_status
-from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, VariableSpec, Writer
+from eap.pd.spec import (
+    REQUESTER,
+    RxPdSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+    record_to_lines,
+)
+from eap.pd.station import Station
 from eap.pd.words import StationWord
+from eap.runtime.engine_messages import Configure, SetState
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import Handover
-from eap.runtime.station_request import Configure, SetState
+from tests.support.cyclic import MS
 from tests.unit.eap.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
@@ -49,7 +64,7 @@ class Running:
         """Ask for *spec*; return the number of the request."""
         self.count += 1
         path = self.folder.path / f"{self.count}.spec"
-        path.write_bytes(pieces.to_lines(spec))
+        path.write_bytes(record_to_lines(spec))
         request = Configure(id=self.count, station=name or spec.name, path=str(path))
         return self.serve(request)
 
@@ -274,3 +289,142 @@ def test_an_engine_that_ends_waits_for_what_it_builds(tmp_path):
     running.plant.close()
     assert list(tmp_path.glob(".*")) == []
     assert running.answers == {}
+
+
+pytestmark = pytest.mark.net
+
+
+@pytest.fixture
+def place(tmp_path):
+    spec = left(eap_port(1, "loop://x"))
+    file = create_image(tmp_path / "left.image", plan_layout(spec))
+    made = EngineStation(Station(spec, file.image, file.wake_waiters), file)
+    yield made
+    made.file.close()
+
+
+def test_nothing_that_is_written_at_the_moment_is_lost(place, tmp_path):
+    """Who writes while the image is replaced finds it retired, or is carried over."""
+    engine = Engine([place.station])
+    engine.start(0)
+    engine.handle_timeout(10 * MS)
+    program = open_image(tmp_path / "left.image")
+    successor = Successor(place, replace(place.station.spec, frames=()))
+    with program.image.writing(Writer.APPLICATION):
+        program.image.write("running", True)
+    assert not program.retired
+    successor.take_over(engine, 20 * MS)
+    assert program.retired
+    assert place.file.image.read("running") is True
+    assert place.file.image.words[0] == 1
+    program.close()
+
+
+def test_a_program_that_stopped_in_the_middle_of_writing_leaves_what_it_had_written(
+    place, tmp_path
+):
+    engine = Engine([place.station])
+    engine.start(0)
+    engine.handle_timeout(10 * MS)
+    with open_image(tmp_path / "left.image") as program:
+        with program.image.writing(Writer.APPLICATION):
+            program.image.write("running", True)
+        engine.handle_timeout(20 * MS)
+        with program.image.writing(Writer.APPLICATION):
+            program.image.write("running", False)
+            before = Successor(place, replace(place.station.spec, frames=())).take_over(
+                engine, 20 * MS
+            )
+        assert before.inputs is not place.station.inputs
+    assert (
+        place.file.image.read("running") is True
+    )  # its program writes again: the image is retired
+
+
+def test_an_image_that_is_not_used_is_removed(place, tmp_path):
+    Successor(place, replace(place.station.spec, frames=())).discard()
+    with pytest.raises(EngineRefusedError):
+        Successor(place, replace(place.station.spec, ports=()))
+    with pytest.raises(KeyError):
+        Successor(place, replace(place.station.spec, variables=()))
+    assert [path.name for path in tmp_path.iterdir()] == ["left.image"]
+
+
+pytestmark = pytest.mark.net
+
+HERE = "127.9.2.31"
+
+
+def sending(*destinations):
+    frames = tuple(
+        TxFrameSpec(f"f{n}", "eap0", where, (TxPdSpec(f"p{n}", n, ("running",)),))
+        for n, where in enumerate(destinations)
+    )
+    return replace(left(eap_port(31)), frames=frames)
+
+
+def test_a_port_has_tcp_when_it_sends_takes_or_is_made_of_it():
+    udp = eap_port(31)
+    assert sends_to(sending("127.9.2.2", "tcp://127.9.2.3", REQUESTER), "eap0") == {
+        "tcp://127.9.2.3"
+    }
+    assert sends_to(sending("tcp://127.9.2.3"), "eap1") == set()
+    assert [has_tcp(sending("127.9.2.2"), port) for port in (udp, replace(udp, tcp=True))] == [
+        False,
+        True,
+    ]
+    assert has_tcp(sending("127.9.2.2"), eap_port(31, "tcp://127.9.2.31"))
+    assert has_tcp(sending("tcp://127.9.2.3"), udp)
+
+
+@pytest.fixture
+def listeners():
+    """Two that take connections."""
+    made = [socket.create_server(("127.9.2.32", 0)) for _ in range(2)]
+    yield made
+    for each in made:
+        each.close()
+
+
+def test_destinations_by_tcp_come_and_go_while_the_station_runs(tmp_path, listeners):
+    first, second = ("tcp://{}:{}".format(*listener.getsockname()) for listener in listeners)
+    spec = sending("127.9.2.2")
+    file = create_image(tmp_path / "left.image", plan_layout(spec))
+    station = Station(spec, file.image, file.wake_waiters)
+    station.connect("eap0", LoopbackLines().open(InterfaceUri.parse("loop://x")))
+    place = EngineStation(station, file)
+    engine = Engine([station])
+    engine.start(0)
+
+    def configure(*destinations):
+        Successor(place, sending(*destinations)).take_over(engine, engine.next_timeout())
+        place.settle_tcp()
+
+    def accept(listener):
+        while not select.select([listener], [], [], 0)[0]:
+            engine.handle_timeout(engine.next_timeout())
+        connection, _ = listener.accept()
+        connection.setblocking(False)
+        return connection
+
+    def receive(connection):
+        while not select.select([connection], [], [], 0)[0]:
+            engine.handle_timeout(engine.next_timeout())
+        return connection.recv(1 << 16)
+
+    configure("127.9.2.2", first)
+    with accept(listeners[0]) as one:
+        assert decode_frame_header(receive(one)).count == 1
+        configure(first, second)
+        with accept(listeners[1]) as two:
+            assert receive(two)
+            assert receive(one)  # still the same connection
+            configure(second)
+            while receive(one):
+                pass  # and then it has been closed
+            assert receive(two)
+            configure("127.9.2.2")
+            while receive(two):
+                pass
+    place.close()
+    assert file.path.name == "left.image"

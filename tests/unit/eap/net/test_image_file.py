@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from eap.errors import EnvironmentalError, ImageError, TornReadError, WriterConflictError
 from eap.net import image_file
-from eap.net.image_file import ImageFile, create_image, open_image
+from eap.net.image_file import ImageFile, StationImage, create_image, open_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
@@ -326,3 +327,123 @@ def test_defaults_reach_the_file(path):
     create_image(path, layout).close()
     with open_image(path) as file:
         assert file.image.read_all() == {"v": 2.5}
+
+
+@pytest.fixture
+def image_path(files):
+    return files["left"].path
+
+
+@pytest.fixture
+def station_image(image_path):
+    station_image = StationImage(image_path)
+    yield station_image
+    station_image.close()
+
+
+@pytest.fixture
+def move(image_path, stations):
+    """Give the station_image an image with a variable more, or fewer."""
+    opened = []
+
+    def move(count: int = 1, *, without: str = ""):
+        spec = stations[0]
+        kept = tuple(each for each in spec.variables if each.name != without)
+        more = tuple(VariableSpec(f"more{n}", "UINT") for n in range(count))
+        frames = () if without else spec.frames
+        spec = replace(spec, variables=kept + more, frames=frames)
+        opened.append(create_image(image_path, plan_layout(spec)))
+
+    yield move
+    for file in opened:
+        file.close()
+
+
+def test_missing_image(tmp_path):
+    with pytest.raises(ImageError, match="no process image"):
+        StationImage(tmp_path / "none.image")
+
+
+def test_moves_to_the_newest_image(station_image, move):
+    before = station_image.image
+    assert station_image.image is before
+    move()
+    assert "more0" in station_image.image.slots
+    assert station_image.file.generation == 2
+    before.read("setpoint")  # what somebody still holds stays as it was
+
+
+def test_newest_image_that_cannot_be_opened_is_told(station_image, move, image_path):
+    move()
+    image_path.unlink()
+    with pytest.raises(ImageError, match="no process image"):
+        _ = station_image.image
+
+
+def test_right_to_write_moves_too(station_image, move, image_path):
+    station_image.acquire_writer(Writer.SERVICES)
+    move()
+    assert "more0" in station_image.image.slots
+    with open_image(image_path) as other:
+        with pytest.raises(WriterConflictError):
+            other.acquire_writer(Writer.SERVICES)
+        station_image.release_writer(Writer.SERVICES)
+        other.acquire_writer(Writer.SERVICES)
+    move(2)
+    assert "more1" in station_image.image.slots
+
+
+def test_lost_right_to_write_is_told_and_the_old_image_kept(station_image, move, image_path):
+    station_image.acquire_writer(Writer.APPLICATION)
+    move()
+    with open_image(image_path) as other:
+        other.acquire_writer(Writer.APPLICATION)
+        with pytest.raises(WriterConflictError):
+            _ = station_image.image
+    assert "more0" in station_image.image.slots
+
+
+def test_values_are_written_at_once_or_not_at_all(station_image):
+    station_image.acquire_writer(Writer.APPLICATION)
+    station_image.write(Writer.APPLICATION, {"running": True, "name": "x"})
+    assert station_image.image.read("running") is True
+    with pytest.raises(ValueError, match="not a value"):
+        station_image.write(Writer.APPLICATION, {"running": False, "name": 1})
+    with pytest.raises(ImageError, match="no variable 'gone'"):
+        station_image.write(Writer.APPLICATION, {"running": False, "gone": 1})
+    assert station_image.image.read("running") is True
+
+
+def test_values_written_while_the_image_changes_are_in_the_new_one(
+    station_image, move, monkeypatch
+):
+    station_image.acquire_writer(Writer.APPLICATION)
+    store = station_image.image.store
+
+    def store_late(name, octets):
+        store(name, octets)
+        move()  # the engine has copied what there was before
+
+    monkeypatch.setattr(station_image.image, "store", store_late)
+    station_image.write(Writer.APPLICATION, {"running": True})
+    assert "more0" in station_image.image.slots
+    assert station_image.image.read("running") is True
+
+
+def test_variable_that_went_meanwhile_is_told(station_image, move):
+    station_image.acquire_writer(Writer.APPLICATION)
+    move(without="running")
+    with pytest.raises(ImageError, match="no variable 'running'"):
+        station_image.write(Writer.APPLICATION, {"running": True})
+
+
+def test_writer_for_one_write_leaves_the_place_to_others(station_image, image_path):
+    station_image.write_once(Writer.APPLICATION, {"running": True})
+    with open_image(image_path) as other:
+        assert other.image.read("running") is True
+        other.acquire_writer(Writer.APPLICATION)
+        with pytest.raises(WriterConflictError):
+            station_image.write_once(Writer.APPLICATION, {"running": False})
+    with pytest.raises(ValueError, match="BOOL"):
+        station_image.write_once(Writer.APPLICATION, {"running": 2})
+    station_image.acquire_writer(Writer.APPLICATION)

@@ -16,7 +16,7 @@ from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
 from eap.od.abort import SdoAbortError
 from eap.ops.bus_running import open_running
-from eap.runtime.bus_request import ExchangeMailbox
+from eap.runtime.engine_messages import ExchangeMailbox
 from tests.support.appliance import wait_until
 from tests.support.fakeappliance import Appliance
 

@@ -3,8 +3,10 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from eap.pd.layout import ImageLayout, plan_layout
 from eap.pd.spec import (
     INTERFACE_MEASURES,
+    RECORDS_PER_STEP,
     CounterSource,
     GatewayAddress,
     GatewaySpec,
@@ -21,8 +23,11 @@ from eap.pd.spec import (
     TxPdSpec,
     VariableSpec,
     Writer,
+    encode_in_steps,
+    record_from_lines,
+    record_to_lines,
 )
-from tests.support.cyclic import eap_port
+from tests.support.cyclic import PEER, eap_port, station
 
 STATION = StationSpec(
     "island-01",
@@ -77,3 +82,40 @@ def test_a_specification_crosses_as_json():
 def test_fields_that_nobody_knows_are_refused():
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(b'{"quiet": true}', type=GatewaySpec)
+
+
+def spec(count: int) -> StationSpec:
+    return station(
+        variables=tuple(VariableSpec(f"v{n}", "INT", Writer.ENGINE) for n in range(count)),
+        subscriptions=tuple(
+            RxPdSpec(f"p{n}", "eap0", n, (f"v{n}",), PEER, version=n) for n in range(count)
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    "count", [0, 1, RECORDS_PER_STEP, RECORDS_PER_STEP + 1, 3 * RECORDS_PER_STEP - 1]
+)
+def test_both_ways(count):
+    given = spec(count)
+    assert record_from_lines(record_to_lines(given), StationSpec) == given
+    layout = plan_layout(given)
+    assert msgspec.json.decode(encode_in_steps(layout), type=ImageLayout) == layout
+    assert encode_in_steps(layout) == msgspec.json.encode(layout)
+
+
+def test_no_line_is_long():
+    lines = record_to_lines(spec(10 * RECORDS_PER_STEP)).split(b"\n")
+    assert len(lines) == 1 + 1 + 20  # the rest, one port, ten times variables and subscriptions
+    assert max(map(len, lines)) < 300 * RECORDS_PER_STEP
+
+
+@pytest.mark.parametrize("octets", [b"", b"{}", b'{"name":1}', b"\xff"])
+def test_anything_else_is_no_record(octets):
+    with pytest.raises((msgspec.MsgspecError, UnicodeDecodeError)):
+        record_from_lines(octets, StationSpec)
+
+
+def test_a_line_of_no_field_is_told():
+    with pytest.raises(KeyError, match="wheels"):
+        record_from_lines(record_to_lines(spec(1)) + b"\nwheels []", StationSpec)

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 import eap
-from eap.engine.successor import EngineStation, Successor
+from eap.engine.rebuild import EngineStation, Successor
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.net.image_file import ImageFile, create_image, prepare_image
 from eap.pd.engine import Engine
@@ -32,7 +32,7 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import Station
-from eap.pd.trigger import EVENT_BIT
+from eap.pd.txframe import EVENT_BIT
 from eap.pd.words import StationWord
 from eap.runtime import attach as attach_module
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from eap.runtime.bus_request import BusReport, SlaveReport
 from eap.runtime.bus_status import bus_document, bus_link
+from eap.runtime.engine_messages import BusReport, SlaveReport
 
 
 def slave(state, station=1001, **more):

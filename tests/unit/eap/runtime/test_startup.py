@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import importlib
 import os
+import select
+import signal
 import sys
 from collections.abc import Iterator
 
 import pytest
 
 from eap.runtime import startup as module
-from eap.runtime.startup import Report, Startup
+from eap.runtime.startup import Report, Startup, catch_end_signals
 from tests.support.startup import read_reports
 
 
@@ -64,3 +66,15 @@ def test_imports_that_take_long_are_reported_with_their_number(
 
 def test_no_step_says_nothing() -> None:
     module.no_step("building station a")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_can_be_waited_for(number):
+    before = signal.getsignal(number)
+    with catch_end_signals() as fd:
+        assert select.select([fd], [], [], 0)[0] == []
+        os.kill(os.getpid(), number)
+        assert select.select([fd], [], [], 5)[0] == [fd]
+        assert os.read(fd, 8) == bytes([number])
+    assert signal.getsignal(number) is before
+    assert signal.set_wakeup_fd(-1) == -1

@@ -8,7 +8,7 @@ import pytest
 
 from devicebus.errors import BusError
 from eap.errors import EngineGoneError
-from eap.runtime.bus_request import Cancel, DescribeBus, EngineStarted
+from eap.runtime.engine_messages import Cancel, DescribeBus, EngineStarted
 from eap.services.engine_link import EngineLink
 from tests.support.eventually import elapse, settle
 from tests.support.fakeengine import FakeBus, FakeEngine

@@ -18,7 +18,7 @@ from eap.net.image_file import create_image
 from eap.ops.client import ControlClient
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec
-from eap.runtime.bus_request import BusReport, EngineReply, EngineRequest
+from eap.runtime.engine_messages import BusReport, EngineReply, EngineRequest
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo
 from eap.runtime.handover import Handover
 from eap.runtime.startup import Report

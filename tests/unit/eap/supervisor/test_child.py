@@ -13,7 +13,17 @@ import pytest
 
 from eap.runtime.handover import Handover
 from eap.supervisor import child as module
-from eap.supervisor.child import Child, RestartPolicy, describe_end
+from eap.supervisor.child import (
+    FIRST_LIMIT_NS,
+    LONGEST_LIMIT_NS,
+    Child,
+    Output,
+    RestartPolicy,
+    StartEvent,
+    StartWatch,
+    describe_end,
+)
+from tests.support.limits import largest_file
 
 SECOND_NS = 1_000_000_000
 HANDOVER = Handover(os.getpid(), "/nowhere", "demo", "demo.yaml", (), ())
@@ -137,3 +147,153 @@ def test_bytecode_that_python_may_not_write_is_kept_for_the_next_start(tmp_path,
     (kept,) = (tmp_path / "bytecode").rglob("eap_child_for_test.*.pyc")
     assert kept.read_bytes()
     assert not (tmp_path / "__pycache__").exists()
+
+
+@pytest.fixture
+def pipe():
+    reading, writing = os.pipe()
+    with os.fdopen(reading), os.fdopen(writing, "w"):
+        yield reading, writing
+
+
+def read(fd: int) -> str:
+    found = b""
+    while select.select([fd], [], [], 0)[0]:
+        found += os.read(fd, 65536)
+    return found.decode()
+
+
+def test_lines_go_where_somebody_reads(pipe):
+    output = Output(pipe[1])
+    for line in ("first", "second ä", "x" * 10_000):
+        output.write(line)
+    assert read(pipe[0]) == f"first\nsecond ä\n{'x' * 10_000}\n"
+    assert output.left_out == 0
+
+
+def test_what_nobody_takes_is_left_out_and_counted(pipe):
+    output = Output(pipe[1])
+    while not output.left_out:
+        output.write("y" * 1000)
+    output.write("nobody sees this")
+    read(pipe[0])
+    output.write("and this again")
+    assert read(pipe[0]) == "(2 lines left out here, which nobody took)\nand this again\n"
+
+
+def test_a_reader_that_has_gone_is_no_fault(pipe):
+    output = Output(pipe[1])
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, pipe[0])  # closes the reading end, and leaves a descriptor to close
+    os.close(null)
+    output.write("nobody sees this")
+    assert output.left_out == 1
+
+
+def test_line_after_one_that_a_full_disk_cut_begins_anew(tmp_path):
+    with (tmp_path / "log").open("wb") as file:
+        output = Output(file.fileno())
+        output.write("first")
+        with largest_file(10):
+            output.write("second is long")
+            output.write("third")
+        assert output.left_out == 2
+        output.write("fourth")
+        output.write("fifth")
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert lines == [
+        "first", "seco", "(2 lines left out here, which nobody took)", "fourth", "fifth",
+    ]  # fmt: skip
+
+
+def test_line_after_one_that_a_full_pipe_cut_begins_anew(pipe):
+    output = Output(pipe[1])
+    output.write("y" * 100_000)
+    found = read(pipe[0])
+    assert set(found) == {"y"}
+    output.write("next")
+    assert read(pipe[0]) == "\n(1 lines left out here, which nobody took)\nnext\n"
+
+
+PROGRESS_SECOND_NS = 1_000_000_000
+
+
+def events_until(watch: StartWatch, from_ns: int, until_ns: int) -> list[tuple[int, StartEvent]]:
+    """Return what the passing of time brings, with the second at which it does."""
+    found = []
+    now_ns = from_ns
+    while (due_ns := watch.next_timeout()) is not None and due_ns <= until_ns:
+        now_ns = max(now_ns, due_ns)
+        assert watch.handle_timeout(due_ns - 1) is None
+        event = watch.handle_timeout(now_ns)
+        assert event is not None
+        found.append((now_ns // PROGRESS_SECOND_NS, event))
+    return found
+
+
+def begun() -> StartWatch:
+    watch = StartWatch()
+    watch.begin(0)
+    return watch
+
+
+def test_start_without_progress_is_stuck_after_the_first_limit():
+    watch = begun()
+    assert events_until(watch, 0, 10**12) == [(10, StartEvent.SLOW), (20, StartEvent.STUCK)]
+    assert watch.is_stuck
+    assert watch.step == "starting Python"
+
+
+def test_start_that_goes_on_is_never_stuck():
+    watch, now_ns = begun(), 0
+    events = []
+    for number in range(100):
+        now_ns += FIRST_LIMIT_NS - PROGRESS_SECOND_NS
+        events += events_until(watch, now_ns, now_ns)
+        watch.advance(f"building station {number}", now_ns)
+    assert {event for _, event in events} == {StartEvent.SLOW}
+    assert len(events) < 10  # notes come ever later
+    watch.succeed()
+    assert watch.next_timeout() is None
+
+
+def test_start_that_repeats_a_step_makes_no_progress():
+    watch = begun()
+    watch.advance("waiting", 15 * PROGRESS_SECOND_NS)
+    watch.advance("waiting", 30 * PROGRESS_SECOND_NS)
+    assert (35, StartEvent.STUCK) in events_until(watch, 30 * PROGRESS_SECOND_NS, 10**12)
+
+
+def test_limit_doubles_with_each_start_that_is_stuck_until_one_succeeds():
+    watch, limits = begun(), []
+    for _ in range(8):
+        watch.begin(0)
+        limits.append(watch.limit_ns)
+        assert events_until(watch, 0, 10**13)[-1] == (
+            limits[-1] // PROGRESS_SECOND_NS,
+            StartEvent.STUCK,
+        )
+        watch.end()
+    assert limits[:3] == [FIRST_LIMIT_NS, 2 * FIRST_LIMIT_NS, 4 * FIRST_LIMIT_NS]
+    assert limits[-1] == LONGEST_LIMIT_NS
+    watch.begin(0)
+    watch.succeed()
+    assert watch.has_run
+    assert watch.limit_ns == FIRST_LIMIT_NS
+
+
+def test_start_that_waits_for_another_process_has_no_limit_until_that_runs():
+    watch = begun()
+    watch.advance("waiting for the engine", 0, waits_for="engine")
+    assert {event for _, event in events_until(watch, 0, 10**13)} == {StartEvent.SLOW}
+    watch.release("services", 10**13)
+    watch.release("engine", 10**13)
+    assert events_until(watch, 10**13, 10**14)[-1] == (10_020, StartEvent.STUCK)
+
+
+def test_process_that_ended_is_not_watched():
+    watch = begun()
+    watch.end()
+    assert watch.next_timeout() is None
+    assert watch.handle_timeout(10**15) is None
+    assert (watch.step, watch.took_ns(5)) == ("", 0)

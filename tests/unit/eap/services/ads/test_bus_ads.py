@@ -29,7 +29,7 @@ from eap.codec.ads import (
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand
 from eap.codec.mailbox import MailboxType
-from eap.runtime.bus_request import ExchangeMailbox
+from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.ads import bus_ads as service
 from eap.services.ads import slave_files
 from eap.services.device.master_values import MasterDictionaryProvider

@@ -12,7 +12,7 @@ from eap.ads.operation import AdsRefusedError, DeleteNotification, WriteControl
 from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
 from eap.codec.ams import AmsCommand, decode_packet
-from eap.runtime.bus_request import BringSlaves, Cancel, Ping, SlaveDescription
+from eap.runtime.engine_messages import BringSlaves, Cancel, Ping, SlaveDescription
 from eap.services.ads import master_ads
 from eap.services.ads.master_ads import MasterStates, RawCommands, StateRequests
 from eap.services.slaves.bus_client import BusDescription

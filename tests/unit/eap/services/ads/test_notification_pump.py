@@ -16,9 +16,8 @@ from eap.codec.adsnotification import AddNotification, TransMode, decode_notific
 from eap.codec.ams import AmsCommand, decode_packet
 from eap.ids import NetId
 from eap.net.image_file import create_image
-from eap.pd.image import Inputs
+from eap.pd.image import ImageSamples, Inputs, Sampler
 from eap.pd.layout import plan_layout
-from eap.pd.samples import ImageSamples, Sampler
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
 from eap.services.ads.station_symbols import NotificationPump, StationSymbols

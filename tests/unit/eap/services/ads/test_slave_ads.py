@@ -13,7 +13,7 @@ from eap.codec.ams import AmsCommand, AmsHeader
 from eap.codec.coe import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.ids import NetId
-from eap.runtime.bus_request import ExchangeMailbox
+from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.ads import bus_ads
 from tests.support.busads import BUS, DRIVE, TOOL, play, until
 

@@ -9,7 +9,7 @@ import pytest
 from eap.ads.operation import Read, ReadWrite, Write
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import NetId
-from eap.runtime.bus_request import ExchangeMailbox
+from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.ads import slave_files
 from eap.services.slaves.file_stream import BEHIND
 from tests.support.busads import Client, play

@@ -14,8 +14,7 @@ from eap.codec.adsnotification import TransMode, decode_notification
 from eap.codec.ams import AmsCommand
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.ids import NetId
-from eap.pd.image import Inputs
-from eap.pd.samples import Sampler
+from eap.pd.image import Inputs, Sampler
 from eap.pd.words import StationWord
 from eap.services.ads.station_ads import StationAds
 from eap.services.routing.station_router import StationRouter

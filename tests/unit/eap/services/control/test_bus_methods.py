@@ -13,7 +13,7 @@ from eap.control.bus import BUS_METHODS
 from eap.control.protocol import ErrorCode
 from eap.errors import ControlError, EngineGoneError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
-from eap.runtime.bus_request import Cancel, ExchangeMailbox
+from eap.runtime.engine_messages import Cancel, ExchangeMailbox
 from eap.runtime.handover import PortName
 from eap.services.control.bus_methods import BusConnection, Buses
 from eap.services.engine_link import EngineLink

@@ -16,7 +16,7 @@ from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec
 from eap.pd.words import StationWord
-from eap.runtime.bus_request import BusReport
+from eap.runtime.engine_messages import BusReport
 from eap.runtime.folder import ApplianceInfo, ProcessInfo
 from eap.runtime.handover import PortName
 from eap.services.control import status

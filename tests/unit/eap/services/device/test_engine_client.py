@@ -10,12 +10,16 @@ import msgspec
 import pytest
 
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
-from eap.pd import pieces
 from eap.pd.device import DeviceState
-from eap.pd.spec import StationSpec
+from eap.pd.spec import StationSpec, record_from_lines
 from eap.runtime.bus_errors import ErrorRecord
-from eap.runtime.bus_request import EngineReply, EngineRequest, EngineStarted
-from eap.runtime.station_request import Configure, SetState
+from eap.runtime.engine_messages import (
+    Configure,
+    EngineReply,
+    EngineRequest,
+    EngineStarted,
+    SetState,
+)
 from eap.services.device.station_keeper import EngineClient
 from eap.services.engine_link import EngineLink
 from tests.unit.eap.conftest import left
@@ -42,7 +46,7 @@ class Engine:
         request = msgspec.msgpack.decode(self._sock.recv(1 << 16), type=EngineRequest)
         self.asked.append(request)
         if isinstance(request, Configure):
-            self.specs.append(pieces.from_lines(Path(request.path).read_bytes(), StationSpec))
+            self.specs.append(record_from_lines(Path(request.path).read_bytes(), StationSpec))
         self._sock.send(msgspec.msgpack.encode(self._answer(request)))
 
 

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill
-from eap.net.image_file import create_image
+from eap.net.image_file import StationImage, create_image
 from eap.od.model import OdState
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import EapLive
@@ -23,7 +23,6 @@ from eap.pd.words import (
     StationWord,
     TxWord,
 )
-from eap.runtime.station_image import StationImage
 from eap.services.device.image_values import ImageValues
 
 

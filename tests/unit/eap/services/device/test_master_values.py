@@ -17,7 +17,7 @@ from eap.codec.mailbox import MailboxType
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.master1100 import MasterLive
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BringSlaves,
     ExchangeDatagrams,
     ExchangeMailbox,

@@ -18,8 +18,8 @@ from eap.ids import MacAddr
 from eap.net.neighbour import ArpProber, NeighbourTable
 from eap.net.packetsocket import open_arp
 from eap.pd.address import to_word
-from eap.pd.frame_status import frame_status
 from eap.pd.image import Image
+from eap.pd.report import frame_status
 from eap.pd.spec import TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord
 from eap.runtime.handover import PortName

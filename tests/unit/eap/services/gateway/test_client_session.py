@@ -27,7 +27,7 @@ from eap.codec.mailbox import MailboxType
 from eap.errors import EapError, EngineGoneError
 from eap.gateway.error_table import Cause
 from eap.gateway.requests import GatewayError
-from eap.runtime.bus_request import SlaveDescription
+from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway import sessions as module
 from eap.services.gateway.gateway import find_refusal
 from eap.services.gateway.message_codecs import codec_for

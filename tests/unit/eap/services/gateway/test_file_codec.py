@@ -12,7 +12,7 @@ from eap.codec.ads import AdsError
 from eap.codec.foe import FoeErrorCode, FoeOpcode, decode_message, encode_message
 from eap.gateway.error_table import Cause
 from eap.gateway.requests import GatewayError
-from eap.runtime.bus_request import ExchangeMailbox
+from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.gateway.transfer_codecs import FileCodec
 from eap.services.slaves.access import RemoteAccessError
 from tests.support import busads

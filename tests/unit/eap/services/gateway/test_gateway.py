@@ -26,7 +26,7 @@ from eap.gateway.requests import AddressMap, RemoteAddress, SlaveAddress
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, array, variable
-from eap.runtime.bus_request import UnsolicitedMessage
+from eap.runtime.engine_messages import UnsolicitedMessage
 from eap.services.engine_link import EngineLink
 from eap.services.gateway.gateway import MailboxGateway, Settings
 from eap.services.gateway.sessions import MasterSession

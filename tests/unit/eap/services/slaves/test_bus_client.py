@@ -18,7 +18,7 @@ from devicebus.wire.register import Register
 from eap.codec.mailbox import MailboxType
 from eap.errors import EngineGoneError
 from eap.od.abort import SdoAbortError
-from eap.runtime.bus_request import Cancel, ExchangeMailbox
+from eap.runtime.engine_messages import Cancel, ExchangeMailbox
 from eap.runtime.handover import PortName
 from eap.services.engine_link import EngineLink
 from eap.services.slaves import bus_client

@@ -10,7 +10,7 @@ import pytest
 
 from devicebus.wire.alstatus import AlState
 from eap.errors import EngineGoneError
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BringSlaves,
     BusChange,
     DescribeBus,

@@ -15,7 +15,7 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Element, Idn
 from eap.errors import EngineGoneError
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.runtime.bus_request import ExchangeMailbox
+from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.engine_link import EngineLink
 from eap.services.slaves.access import LocalSlave, SlaveAccess
 from eap.services.slaves.bus_client import BusClient

@@ -12,7 +12,7 @@ from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.conversation import MailboxRequest
 from eap.codec.mailbox import MailboxType
-from eap.runtime.bus_request import ExchangeMailbox
+from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.engine_link import EngineLink
 from eap.services.slaves.bus_client import MailboxQueues, MailboxTurn
 from tests.support.eventually import settle

@@ -14,8 +14,7 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.net import connections
 from eap.net.connections import OWN_HOST, Activity, Limits
 from eap.runtime.discards import Refusal
-from eap.runtime.handover import PortName
-from eap.runtime.passing import take_connection
+from eap.runtime.handover import PortName, take_connection
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import accepting
 from eap.services.transports import mailbox_stream as tcp_door

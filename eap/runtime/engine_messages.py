@@ -1,7 +1,7 @@
-"""Requests of services to the engine, its replies, and the description of a bus that they carry.
+"""Messages between services and the engine: requests, replies, changes of a bus, errors as records.
 
 They travel as MessagePack over a SOCK_SEQPACKET pair, one message each.  A request is a small step,
-such as one mailbox message: whole transfers, files and retries are the business of services.
+such as one mailbox message: services drives whole transfers, files and retries.
 """
 
 from __future__ import annotations
@@ -17,7 +17,31 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.errors import EapError
 from eap.runtime.bus_errors import ErrorRecord, to_error
-from eap.runtime.station_request import StationRequest
+
+
+class StationMessage(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
+    """Base of both; answered without anything, or with a failure."""
+
+    id: int
+    """Chosen by who asks; the answer repeats it."""
+    station: str
+
+
+class Configure(StationMessage, frozen=True, tag="configure"):
+    """Run another specification: answered when its first cycle is the next one."""
+
+    path: str
+    """A file with the StationSpec in lines (``record_to_lines``), there until the answer."""
+
+
+class SetState(StationMessage, frozen=True, tag="set_state"):
+    """Go to a device state, by all states between."""
+
+    state: int
+    """2 PreOp, 4 SafeOp, 8 Op."""
+
+
+StationRequest: TypeAlias = Configure | SetState
 
 
 class BusRequest(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):

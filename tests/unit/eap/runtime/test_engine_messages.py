@@ -10,10 +10,11 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
 from eap.runtime.bus_errors import ErrorRecord
-from eap.runtime.bus_request import (
+from eap.runtime.engine_messages import (
     BringSlaves,
     BusReport,
     Cancel,
+    Configure,
     DescribeBus,
     EngineMessage,
     EngineReply,
@@ -22,9 +23,10 @@ from eap.runtime.bus_request import (
     ExchangeDatagrams,
     ExchangeMailbox,
     Ping,
+    SetState,
     SlaveReport,
+    StationRequest,
 )
-from eap.runtime.station_request import Configure, SetState
 
 READ = DatagramRequest(Command.FPRD, 1001, 0x130, bytes(6), 3)
 COE, FOE = MailboxType.COE, MailboxType.FOE
@@ -64,3 +66,16 @@ def test_requests(request_):
 )
 def test_answers(message):
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=EngineMessage) == message
+
+
+def test_requests_are_told_apart_by_what_to_do():
+    octets = msgspec.msgpack.encode(Configure(id=1, station="a", path="/x"))
+    assert msgspec.msgpack.decode(octets) == {
+        "do": "configure",
+        "id": 1,
+        "station": "a",
+        "path": "/x",
+    }
+    octets = msgspec.msgpack.encode(SetState(id=2, station="a", state=4))
+    decoded = msgspec.msgpack.decode(octets, type=StationRequest)
+    assert decoded == SetState(id=2, station="a", state=4)
