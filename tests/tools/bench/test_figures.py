@@ -19,7 +19,7 @@ from tools.bench.figures import (
 
 
 @pytest.mark.parametrize(
-    ("figure", "verdict"),
+    ("figure", "decision"),
     [
         (at_least("a", 0.7, 0.7), Decision.OK),
         (at_least("a", 0.69, 0.7), Decision.MISSED),

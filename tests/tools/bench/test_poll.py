@@ -23,7 +23,7 @@ def test_the_first_answers_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase_us", "trips", "verdict"),
+    ("phase_us", "trips", "decision"),
     [
         (500, (2, 2, 2), Decision.MISSED),
         (0, (2, 2, 2), Decision.OK),
