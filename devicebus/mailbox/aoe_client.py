@@ -17,7 +17,7 @@ from devicebus.mailbox.conversation import (
 )
 from devicebus.mailbox.match import answers, is_aoe_fragment
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ams.reassembly import Assembler, iter_fragments
+from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ams import AmsHeader, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxHeader, MailboxType
 
@@ -79,7 +79,7 @@ def _send_fragments(packet: bytes, number: int, sizes: MailboxSizes) -> Conversa
 
 def _reassemble(what: str, first: bytes, more: MailboxRequest) -> Conversation[bytes]:
     """Reassemble the answer that begins with *first*; *more* listens for its other fragments."""
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     message = first
     is_begun = False
     late = 0

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from devicebus.mailbox.protocol import MailboxSizes, raise_mailbox_error
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ads.objects import ObjectSpace
-from eap.ams.reassembly import Assembler, iter_fragments
+from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,
@@ -36,7 +36,7 @@ _NET_ID_SIZE = 6
 _SERVICES = frozenset((AmsCommand.READ_DEVICE_INFO, AmsCommand.READ_STATE, AmsCommand.READ,
                        AmsCommand.WRITE, AmsCommand.READ_WRITE))  # fmt: skip
 # Only notifications belong to a client, and AoE of a slave has none: one client does for all.
-_MASTER = Client(Endpoint("", ""), NetId(bytes(_NET_ID_SIZE)), 0)
+_MASTER = AdsClient(Endpoint("", ""), NetId(bytes(_NET_ID_SIZE)), 0)
 
 
 class AdsServer:
@@ -109,7 +109,7 @@ class AoeServer:
         *,
         reset_handler: Callable[[], None] | None = None,
     ) -> None:
-        self.assembler = Assembler()
+        self.assembler = FragmentAssembler()
         self._reset_handler = reset_handler
         self._handler = handler
         self._sizes = sizes

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 from eap.ads.endpoint import AmsAnswer
-from eap.ads.notifications import Client, NotificationTable
+from eap.ads.notifications import AdsClient, NotificationTable
 from eap.ads.operation import (
     AdsRefusedError,
     Operation,
@@ -18,7 +18,7 @@ from eap.ads.operation import (
     Write,
     WriteControl,
 )
-from eap.ads.request import Outcomes, take_request
+from eap.ads.request import Outcomes, accept_request
 from eap.ads.space import AdsSpace, DeviceDataSpace, States
 from eap.codec.ads import AdsDeviceInfo, AdsError
 from eap.codec.adsnotification import AddNotification
@@ -66,7 +66,7 @@ class AdsDevice:
         self._spaces = (*spaces, DeviceDataSpace(states))
         self._control = control
 
-    def answer(self, command: int, body: bytes, client: Client, now_ns: int) -> AmsAnswer:
+    def answer(self, command: int, body: bytes, client: AdsClient, now_ns: int) -> AmsAnswer:
         """Do what a request asks for.
 
         Args:
@@ -75,7 +75,7 @@ class AdsDevice:
             client: Whom notifications belong to.
             now_ns: The time on the monotonic clock.
         """
-        request = take_request(command, body)
+        request = accept_request(command, body)
         if isinstance(request, AmsAnswer):
             return request
         outcomes = Outcomes(request)
@@ -87,14 +87,14 @@ class AdsDevice:
         """Return what a Read reads; raise AdsRefusedError."""
         return _fitting(self._space(group).read(group, offset, length), length)
 
-    def perform(self, operation: Operation, client: Client, now_ns: int) -> OperationOutcome:
+    def perform(self, operation: Operation, client: AdsClient, now_ns: int) -> OperationOutcome:
         """Do one operation."""
         try:
             return OperationOutcome(data=self._perform(operation, client, now_ns))
         except AdsRefusedError as exc:
             return OperationOutcome(exc.result, why=exc.why)
 
-    def _perform(self, operation: Operation, client: Client, now_ns: int) -> bytes:
+    def _perform(self, operation: Operation, client: AdsClient, now_ns: int) -> bytes:
         match operation:
             case Read(group, offset, length):
                 return self.read(group, offset, length)

@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.space import BOOT, INIT, OP, PREOP, SAFEOP, AdsSpace, Source, steady
+from eap.ads.space import BOOT, INIT, OP, PREOP, SAFEOP, AdsSpace, Source, fixed_size_source
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import encode_text
 from eap.ids import NetId
@@ -111,7 +111,7 @@ class SlaveState(NamedTuple):
     link: int
 
 
-class Master(Protocol):
+class MasterBus(Protocol):
     """The bus that is shown."""
 
     def state(self) -> int:
@@ -139,7 +139,7 @@ class MasterSpace(AdsSpace):
         )
     )
 
-    def __init__(self, master: Master) -> None:
+    def __init__(self, master: MasterBus) -> None:
         self._master = master
         self._readers: dict[tuple[int, int], Callable[[], bytes]] = {
             (IndexGroup.MASTER_STATE, _STATE_OFFSET): self._state,
@@ -173,7 +173,7 @@ class MasterSpace(AdsSpace):
 
     def watch(self, group: int, offset: int, length: int) -> Source:
         """Return what gives states; a list that gets shorter ends it."""
-        return steady(lambda: self.read(group, offset, length), length)
+        return fixed_size_source(lambda: self.read(group, offset, length), length)
 
     def _slave(self, address: int) -> SlaveState:
         for slave in self._master.slaves():

@@ -44,7 +44,7 @@ _ON_CHANGE = frozenset((TransMode.SERVER_ON_CHANGE, TransMode.SERVER_ON_CHANGE_2
 _FOR_NOW = frozenset((AdsError.BUSY, AdsError.NOT_READY))
 
 
-class Client(NamedTuple):
+class AdsClient(NamedTuple):
     """Whoever asked: an AMS address, which programs of one computer share, and its connection."""
 
     endpoint: Endpoint
@@ -55,7 +55,7 @@ class Client(NamedTuple):
 class Notice(NamedTuple):
     """The data of a DeviceNotification for *client*."""
 
-    client: Client
+    client: AdsClient
     data: bytes
 
     def encode(self, net_id: NetId, port: int) -> bytes:
@@ -90,14 +90,19 @@ class _Notification:
     )
 
     def __init__(
-        self, client: Client, handle: int, asked: AddNotification, source: Source, first_ns: int
+        self,
+        client: AdsClient,
+        handle: int,
+        request: AddNotification,
+        source: Source,
+        first_ns: int,
     ) -> None:
         self.client = client
         self.handle = handle
         self.source = source
-        self.on_change = asked.mode in _ON_CHANGE
-        self.cycle_ns = asked.cycle * UNIT_NS
-        self.delay_ns = asked.max_delay * UNIT_NS
+        self.on_change = request.mode in _ON_CHANGE
+        self.cycle_ns = request.cycle * UNIT_NS
+        self.delay_ns = request.max_delay * UNIT_NS
         self.last: bytes | None = None
         self._due_ns = first_ns - 1
         self.next_ns = first_ns
@@ -111,7 +116,7 @@ class _Notification:
         self.next_ns = max(now_ns + 1, self._due_ns - self.cycle_ns // 8)
 
 
-class _Pending:
+class _Outbox:
     """What a client is still to be told of."""
 
     __slots__ = ("deadline_ns", "handles", "size", "stamps")
@@ -130,7 +135,7 @@ class _Pending:
         self.stamps[-1][1].append(sample)
         self.size += sample.size
 
-    def take(self) -> bytes:
+    def encode(self) -> bytes:
         data = encode_notification(Stamp(time, tuple(samples)) for time, samples in self.stamps)
         self.stamps = []
         self.size = 0
@@ -153,7 +158,7 @@ class NotificationTable:
         self._first_change_ns = first_change_ns
         self.on_add: Callable[[], None] | None = None
         self._notifications: dict[int, _Notification] = {}
-        self._clients: dict[Client, _Pending] = {}
+        self._clients: dict[AdsClient, _Outbox] = {}
         self._due: list[tuple[int, int]] = []
         self._next_handle = first_handle
         self._samples = 0
@@ -163,34 +168,34 @@ class NotificationTable:
     def __len__(self) -> int:
         return len(self._notifications)
 
-    def add(self, client: Client, asked: AddNotification, source: Source, now_ns: int) -> int:
+    def add(self, client: AdsClient, request: AddNotification, source: Source, now_ns: int) -> int:
         """Return the handle of a new notification; its first sample is due later.
 
         Raises:
             AdsRefusedError: TRANS_MODE, WATCH_SIZE or NO_MORE_HANDLES.
         """
-        if asked.mode not in _CYCLIC and asked.mode not in _ON_CHANGE:
+        if request.mode not in _CYCLIC and request.mode not in _ON_CHANGE:
             raise AdsRefusedError(AdsError.TRANS_MODE)
-        if not 0 < asked.length <= MAX_WATCHED:
+        if not 0 < request.length <= MAX_WATCHED:
             raise AdsRefusedError(AdsError.WATCH_SIZE)
         pending = self._clients.get(client)
         if pending is None:
             if len(self._clients) >= MAX_CLIENTS:
                 raise AdsRefusedError(AdsError.NO_MORE_HANDLES)
-            pending = self._clients[client] = _Pending()
+            pending = self._clients[client] = _Outbox()
         if len(pending.handles) >= MAX_HANDLES:
             raise AdsRefusedError(AdsError.NO_MORE_HANDLES)
         handle = self._take_handle()
         pending.handles.add(handle)
-        first_ns = now_ns + (self._first_change_ns if asked.mode in _ON_CHANGE else 1)
-        notification = _Notification(client, handle, asked, source, first_ns)
+        first_ns = now_ns + (self._first_change_ns if request.mode in _ON_CHANGE else 1)
+        notification = _Notification(client, handle, request, source, first_ns)
         self._notifications[handle] = notification
         heappush(self._due, (notification.next_ns, handle))
         if self.on_add is not None:
             self.on_add()
         return handle
 
-    def delete(self, client: Client, handle: int) -> None:
+    def delete(self, client: AdsClient, handle: int) -> None:
         """End a notification; raise AdsRefusedError if it is none of *client*'s."""
         notification = self._notifications.get(handle)
         if notification is None or notification.client != client:
@@ -289,9 +294,9 @@ class NotificationTable:
         self._remove(notification)
         return [*notices, Notice(client, data)]
 
-    def _send(self, client: Client, pending: _Pending) -> Notice:
+    def _send(self, client: AdsClient, pending: _Outbox) -> Notice:
         self._packets += 1
-        return Notice(client, pending.take())
+        return Notice(client, pending.encode())
 
     def _remove(self, notification: _Notification) -> None:
         del self._notifications[notification.handle]

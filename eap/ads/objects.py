@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.space import AdsSpace, Source, steady
+from eap.ads.space import AdsSpace, Source, fixed_size_source
 from eap.codec.ads import AdsError, IndexGroup
 from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError
@@ -89,7 +89,7 @@ class ObjectSpace(AdsSpace):
         """Return what gives an entry or an object; one of another length ends it."""
         if group != IndexGroup.SDO:
             raise AdsRefusedError(AdsError.ACCESS)
-        return steady(lambda: self.read(group, offset, length), length)
+        return fixed_size_source(lambda: self.read(group, offset, length), length)
 
     def _read(self, group: int, offset: int) -> bytes:
         index, low = offset >> 16, offset & 0xFFFF

@@ -24,7 +24,14 @@ from eap.ads.operation import (
     Write,
     WriteControl,
 )
-from eap.ads.sum import SUM_COMMANDS, asked_length, padded, parse_delete, parse_read, taken
+from eap.ads.sum import (
+    SUM_COMMANDS,
+    padded,
+    parse_delete,
+    parse_read,
+    read_exactly,
+    requested_length,
+)
 from eap.codec.ads import (
     AdsError,
     AdsRange,
@@ -84,15 +91,15 @@ class Outcomes:
 
     def __init__(self, request: AdsRequest) -> None:
         self._request = request
-        self._room = MAX_ANSWER - _HEAD_SIZE * len(request.operations)
+        self._space_left = MAX_ANSWER - _HEAD_SIZE * len(request.operations)
         self._outcomes: list[OperationOutcome] = []
         self._reasons: list[str] = []
 
     def add(self, outcome: OperationOutcome) -> None:
         """Take the outcome of the next operation."""
-        if len(outcome.data) > self._room:
+        if len(outcome.data) > self._space_left:
             outcome = OperationOutcome(AdsError.NO_MEMORY)
-        self._room -= len(outcome.data)
+        self._space_left -= len(outcome.data)
         self._outcomes.append(outcome)
         if outcome.why:
             self._reasons.append(outcome.why)
@@ -105,7 +112,7 @@ class Outcomes:
         return AmsAnswer(self._request.encode_answer(self._outcomes), why="; ".join(reasons))
 
 
-def take_request(command: int, body: bytes) -> AdsRequest | AmsAnswer:
+def accept_request(command: int, body: bytes) -> AdsRequest | AmsAnswer:
     """Take a request apart; return the answer to one that is none."""
     try:
         return parse_request(command, body)
@@ -162,18 +169,18 @@ _BEHIND_RESULT: dict[int, int] = {
 
 def _parse_write(body: bytes) -> Write:
     head = AdsRange.decode(body)
-    return Write(head.group, head.offset, taken(body, AdsRange.SIZE, head.length))
+    return Write(head.group, head.offset, read_exactly(body, AdsRange.SIZE, head.length))
 
 
 def _parse_control(body: bytes) -> WriteControl:
     head = AdsWriteControl.decode(body)
-    data = taken(body, AdsWriteControl.SIZE, head.length)
+    data = read_exactly(body, AdsWriteControl.SIZE, head.length)
     return WriteControl(head.ads_state, head.device_state, data)
 
 
 def _parse_read_write(body: bytes) -> ReadWrite:
     head = AdsReadWrite.decode(body)
-    data = taken(body, AdsReadWrite.SIZE, head.write_length)
+    data = read_exactly(body, AdsReadWrite.SIZE, head.write_length)
     return ReadWrite(head.group, head.offset, head.read_length, data)
 
 
@@ -199,7 +206,7 @@ def _parse_sum(request: ReadWrite) -> AdsRequest:
     if count > MAX_ITEMS:
         raise AdsRefusedError(AdsError.NO_MEMORY)
     operations = kind.split(count, request.data)
-    padding = sum(map(asked_length, operations)) if kind.is_padded else 0
+    padding = sum(map(requested_length, operations)) if kind.is_padded else 0
     if len(operations) * _HEAD_SIZE + padding > MAX_ANSWER:
         raise AdsRefusedError(AdsError.NO_MEMORY)
     return AdsRequest(
@@ -317,7 +324,7 @@ def split_answer(request: AdsRequest, body: bytes) -> list[OperationOutcome] | N
     for number, operation in enumerate(operations):
         head = data[number * size : (number + 1) * size]
         if group in _PADDED:
-            length = asked_length(operation)
+            length = requested_length(operation)
         else:
             length = int.from_bytes(head[_RESULT:], "little") if group in _RETURNED else 0
         found = data[at : at + length]

@@ -20,7 +20,7 @@ It raises AdsRefusedError: BUSY and NOT_READY for now, anything else for good.
 """
 
 
-def steady(read: Callable[[], bytes], length: int) -> Source:
+def fixed_size_source(read: Callable[[], bytes], length: int) -> Source:
     """Return what gives *length* octets whenever it is called; what gets longer or shorter ends it.
 
     Raises:
@@ -76,14 +76,14 @@ States: TypeAlias = Callable[[], AdsStates]
 
 INIT, PREOP, BOOT, SAFEOP, OP = 1, 2, 3, 4, 8
 """AL states (ETG.1000.6)."""
-_TOLD: dict[int, AdsState] = {
+_ADS_STATES: dict[int, AdsState] = {
     INIT: AdsState.INIT,
     PREOP: AdsState.CONFIG,
     BOOT: AdsState.LOAD_CONFIG,
     SAFEOP: AdsState.STOP,
     OP: AdsState.RUN,
 }
-_ASKED: dict[int, int] = {
+_REQUESTED: dict[int, int] = {
     AdsState.INIT: INIT,
     AdsState.RESET: INIT,
     AdsState.CONFIG: PREOP,
@@ -99,7 +99,7 @@ _ASKED: dict[int, int] = {
 
 def states_of(al_state: int) -> AdsStates:
     """Return what ReadState tells of a device in *al_state*."""
-    return AdsStates(_TOLD.get(al_state, AdsState.INVALID), al_state)
+    return AdsStates(_ADS_STATES.get(al_state, AdsState.INVALID), al_state)
 
 
 def al_state_for(ads_state: int) -> int:
@@ -108,7 +108,7 @@ def al_state_for(ads_state: int) -> int:
     The device state beside it says nothing: clients send back the one that they read before.
     """
     try:
-        return _ASKED[ads_state]
+        return _REQUESTED[ads_state]
     except KeyError:
         raise AdsRefusedError(AdsError.VALUE) from None
 

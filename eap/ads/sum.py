@@ -37,23 +37,23 @@ class SumCommand(NamedTuple):
 
 def parse_read(body: bytes) -> Read:
     """Return a Read; raise TruncatedError."""
-    asked = AdsRange.decode(body)
-    return Read(asked.group, asked.offset, asked.length)
+    head = AdsRange.decode(body)
+    return Read(head.group, head.offset, head.length)
 
 
 def parse_delete(body: bytes) -> DeleteNotification:
     """Return a DeleteNotification; refuse with SIZE if there is no handle."""
-    return DeleteNotification(int.from_bytes(taken(body, 0, _HANDLE_SIZE), "little"))
+    return DeleteNotification(int.from_bytes(read_exactly(body, 0, _HANDLE_SIZE), "little"))
 
 
-def taken(data: bytes, start: int, length: int) -> bytes:
+def read_exactly(data: bytes, start: int, length: int) -> bytes:
     """Return *length* octets from *start*; refuse with SIZE if there are fewer."""
     if len(data) - start < length:
         raise AdsRefusedError(AdsError.SIZE)
     return bytes(data[start : start + length])
 
 
-def asked_length(operation: Operation) -> int:
+def requested_length(operation: Operation) -> int:
     """Return how many octets a client has room for."""
     return operation.length if isinstance(operation, Read | ReadWrite) else 0
 
@@ -61,7 +61,7 @@ def asked_length(operation: Operation) -> int:
 def padded(operations: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     """Return what was read, each with the length that was asked for."""
     return b"".join(
-        outcome.data.ljust(asked_length(operation), b"\0")
+        outcome.data.ljust(requested_length(operation), b"\0")
         for operation, outcome in zip(operations, outcomes, strict=True)
     )
 
@@ -75,7 +75,7 @@ def _split_writes(count: int, data: bytes) -> list[Operation]:
     behind = count * AdsRange.SIZE
     for at in _starts(count, AdsRange.SIZE):
         head = AdsRange.decode(data, at)
-        items.append(Write(head.group, head.offset, taken(data, behind, head.length)))
+        items.append(Write(head.group, head.offset, read_exactly(data, behind, head.length)))
         behind += head.length
     return items
 
@@ -85,7 +85,7 @@ def _split_read_writes(count: int, data: bytes) -> list[Operation]:
     behind = count * AdsReadWrite.SIZE
     for at in _starts(count, AdsReadWrite.SIZE):
         head = AdsReadWrite.decode(data, at)
-        written = taken(data, behind, head.write_length)
+        written = read_exactly(data, behind, head.write_length)
         items.append(ReadWrite(head.group, head.offset, head.read_length, written))
         behind += head.write_length
     return items
@@ -116,9 +116,9 @@ def _join_results(_: Sequence[Operation], outcomes: Sequence[OperationOutcome]) 
     return _results(outcomes)
 
 
-def _join_asked(operations: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
+def _join_requested(operations: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     heads = b"".join(
-        encode_result(outcome.result) + asked_length(operation).to_bytes(4, "little")
+        encode_result(outcome.result) + requested_length(operation).to_bytes(4, "little")
         for operation, outcome in zip(operations, outcomes, strict=True)
     )
     return heads + padded(operations, outcomes)
@@ -141,7 +141,9 @@ SUM_COMMANDS: dict[int, SumCommand] = {
     IndexGroup.SUM_READ: SumCommand(AdsRange.SIZE, _split_reads, _join_reads, is_padded=True),
     IndexGroup.SUM_WRITE: SumCommand(AdsRange.SIZE, _split_writes, _join_results),
     IndexGroup.SUM_READ_WRITE: SumCommand(AdsReadWrite.SIZE, _split_read_writes, _join_returned),
-    IndexGroup.SUM_READ_EX: SumCommand(AdsRange.SIZE, _split_reads, _join_asked, is_padded=True),
+    IndexGroup.SUM_READ_EX: SumCommand(
+        AdsRange.SIZE, _split_reads, _join_requested, is_padded=True
+    ),
     IndexGroup.SUM_READ_EX_2: SumCommand(AdsRange.SIZE, _split_reads, _join_returned),
     IndexGroup.SUM_ADD_NOTIFICATION: SumCommand(AddNotification.SIZE, _split_adds, _join_handles),
     IndexGroup.SUM_DELETE_NOTIFICATION: SumCommand(_HANDLE_SIZE, _split_deletes, _join_results),

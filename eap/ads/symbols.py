@@ -22,9 +22,9 @@ from eap.codec.adssymbol import (
     AdsType,
     DataTypeEntry,
     HandleInfo,
+    SymbolAddress,
     SymbolEntry,
     SymbolFlag,
-    SymbolPlace,
     UploadInfo,
     decode_name,
     encode_data_type,
@@ -151,7 +151,7 @@ _ALIGNMENT = 8
 """Octets: no value of a client's lies across what its processor reads at once."""
 
 
-class Variable(NamedTuple):
+class SymbolVariable(NamedTuple):
     """What is known of one variable."""
 
     name: str
@@ -164,16 +164,16 @@ class Variable(NamedTuple):
 class Symbol(NamedTuple):
     """One variable, how clients know its type, and where they find it."""
 
-    variable: Variable
+    variable: SymbolVariable
     type: SymbolType
-    place: SymbolPlace
+    address: SymbolAddress
 
     def describe(self) -> bytes:
         """Return its entry."""
         flags = SymbolFlag.READ_ONLY if self.variable.read_only else 0
         return encode_entry(
             SymbolEntry(
-                self.place,
+                self.address,
                 self.type.id,
                 flags,
                 self.variable.name,
@@ -197,16 +197,16 @@ class SymbolTable:
         version: Counts configurations; 8 bits of it are told.
     """
 
-    def __init__(self, variables: Iterable[Variable], version: int) -> None:
+    def __init__(self, variables: Iterable[SymbolVariable], version: int) -> None:
         self.version = version & 0xFF
         self._symbols: list[Symbol] = []
         offset = 0
         for variable in variables:
             kind = symbol_type(variable.type)
-            place = SymbolPlace(IndexGroup.DATA, offset, kind.size)
-            self._symbols.append(Symbol(variable, kind, place))
+            address = SymbolAddress(IndexGroup.DATA, offset, kind.size)
+            self._symbols.append(Symbol(variable, kind, address))
             offset += kind.size + -kind.size % _ALIGNMENT
-        self._offsets = [symbol.place.offset for symbol in self._symbols]
+        self._offsets = [symbol.address.offset for symbol in self._symbols]
         self._indexes = {symbol.variable.name: n for n, symbol in enumerate(self._symbols)}
         self._folded: dict[str, int | None] = {}
         for name, index in self._indexes.items():
@@ -266,7 +266,7 @@ class SymbolTable:
     def at(self, offset: int) -> tuple[Symbol, int]:
         """Return the symbol that *offset* lies in, and how far; refuse with INDEX_OFFSET."""
         index = bisect_right(self._offsets, offset) - 1
-        if index < 0 or offset >= self._offsets[index] + self._symbols[index].place.size:
+        if index < 0 or offset >= self._offsets[index] + self._symbols[index].address.size:
             raise AdsRefusedError(AdsError.INDEX_OFFSET)
         return self._symbols[index], offset - self._offsets[index]
 
@@ -365,7 +365,7 @@ class SymbolSpace(AdsSpace):
             info = symbol.describe_handle(handle)
             return _whole(info if len(info) <= length else info[:4], length)
         if group == IndexGroup.SYMBOL_BY_NAME:
-            return _whole(symbol.place.encode(), length)
+            return _whole(symbol.address.encode(), length)
         return _whole(symbol.describe(), length)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
@@ -375,7 +375,7 @@ class SymbolSpace(AdsSpace):
                 raise AdsRefusedError(AdsError.SIZE)
             return partial(self.read, group, 0, length)
         symbol, start = self._find(group, offset)
-        if start + length > symbol.place.size:
+        if start + length > symbol.address.size:
             raise AdsRefusedError(AdsError.SIZE)
         table = self._table
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write, WriteControl
 from eap.ads.sum import SUM_COMMANDS
-from eap.ams.spec import IP_DOORS, AccessRule, AccessService, ObjectRange, TransportKind
+from eap.ams.spec import IP_TRANSPORTS, AccessRule, AccessService, ObjectRange, TransportKind
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.ids import MacAddr, NetId
@@ -40,13 +40,13 @@ LOOKUPS = frozenset(
         IndexGroup.FOE_CLOSE,
         IndexGroup.FOE_READ,
         IndexGroup.FOE_PROGRESS,
-        IndexGroup.WHEREABOUTS,
+        IndexGroup.ROUTE_QUERY,
     )
 )
 """Groups whose ReadWrite changes nothing but what a client keeps of its own."""
 
 
-_PLACED = (Read, Write, ReadWrite, AddNotification)
+_ADDRESSED = (Read, Write, ReadWrite, AddNotification)
 """Operations that say where.  A tuple: a union would be made anew at each question."""
 
 
@@ -66,16 +66,16 @@ def service_of(operation: Operation) -> AccessService:
     return AccessService.CONTROL if group in _STATES else AccessService.WRITE
 
 
-def place_of(operation: Operation) -> tuple[int | None, int]:
+def group_and_offset(operation: Operation) -> tuple[int | None, int]:
     """Return index group and offset, no group for what has none."""
-    if isinstance(operation, _PLACED):
+    if isinstance(operation, _ADDRESSED):
         return operation.group, operation.offset
     return None, 0
 
 
 def objects_of(operation: Operation) -> ObjectRange | None:
     """Return which entries of a dictionary an operation is about, None if it is about none."""
-    group, offset = place_of(operation)
+    group, offset = group_and_offset(operation)
     if group not in _OF_OBJECTS:
         return None
     index, subindex = offset >> 16, offset & 0xFF
@@ -115,12 +115,12 @@ class Grants:
         self._is_this_host = is_this_host
         self.may_read = self.may(AccessService.READ) is True
 
-    def admission(self, operation: Operation) -> Decision:
+    def decide(self, operation: Operation) -> Decision:
         """Decide on one operation."""
         service = service_of(operation)
-        touched = objects_of(operation)
+        accessed = objects_of(operation)
         for rule in self._by_service[service]:
-            if not rule.objects or (touched is not None and _is_about(rule, touched)):
+            if not rule.objects or (accessed is not None and _is_about(rule, accessed)):
                 verb = "allows" if rule.allow else "refuses"
                 return Decision(service, rule.allow, f"rule {rule.name} {verb} it", is_by_rule=True)
         if self._is_this_host:
@@ -169,7 +169,7 @@ class AccessList:
     def is_this_host(self, endpoint: Endpoint) -> bool:
         """Say whether only a program of this host can have come by *endpoint*."""
         kind = endpoint.kind
-        if kind not in IP_DOORS:
+        if kind not in IP_TRANSPORTS:
             return kind == TransportKind.LOCAL
         address = address_of(endpoint)
         return address is not None and (address.is_loopback or address in self._own)
@@ -186,7 +186,7 @@ class AccessList:
 
 def address_of(endpoint: Endpoint) -> IPv4Address | None:
     """Return the IPv4 address that somebody came from, None where there is none."""
-    if endpoint.kind not in IP_DOORS:
+    if endpoint.kind not in IP_TRANSPORTS:
         return None
     try:
         return IPv4Address(endpoint.connection.partition(":")[0])
@@ -197,7 +197,7 @@ def address_of(endpoint: Endpoint) -> IPv4Address | None:
 def host_of(endpoint: Endpoint) -> str:
     """Return who came by *endpoint*, whichever of his connections it is."""
     kind = endpoint.kind
-    if kind in IP_DOORS:
+    if kind in IP_TRANSPORTS:
         return endpoint.connection.partition(":")[0]
     return "" if kind == TransportKind.LOCAL else endpoint.connection
 
@@ -234,8 +234,8 @@ def _prefix(text: str) -> bytes:
     return bytes(map(int, text.split(".")))
 
 
-def _is_about(rule: AccessRule, touched: ObjectRange) -> bool:
-    """Say whether a rule grants all of *touched*, or refuses any of it."""
+def _is_about(rule: AccessRule, accessed: ObjectRange) -> bool:
+    """Say whether a rule grants all of *accessed*, or refuses any of it."""
     if rule.allow:
-        return any(each.contains(touched) for each in rule.objects)
-    return any(each.overlaps(touched) for each in rule.objects)
+        return any(each.contains(accessed) for each in rule.objects)
+    return any(each.overlaps(accessed) for each in rule.objects)

@@ -21,7 +21,7 @@ from eap.ads.request import (
     split_answer,
 )
 from eap.ams.access import LOOKUPS, AccessList, Decision
-from eap.ams.error_reply import Refusal
+from eap.ams.error_reply import RoutingError
 from eap.ams.record import Outcome, Record, Trace, describe
 from eap.ams.spec import AccessService
 from eap.codec.ads import AdsError, IndexGroup
@@ -49,7 +49,7 @@ class AuditedOperation(NamedTuple):
     """None if nobody knows: there was no answer, or none that can be read."""
 
     @property
-    def is_told(self) -> bool:
+    def is_audited(self) -> bool:
         """Whether an audit tells of it: it changed something, or was refused."""
         if not self.decision.is_allowed:
             return True
@@ -82,7 +82,7 @@ class AuthorizedRequest(NamedTuple):
     decisions: tuple[Decision, ...]
 
     @property
-    def refused(self) -> list[Decision]:
+    def denied(self) -> list[Decision]:
         """The verdicts on what may not be done."""
         return [each for each in self.decisions if not each.is_allowed]
 
@@ -93,7 +93,7 @@ class AuthorizedRequest(NamedTuple):
         allowed = tuple(each for each in entry.operations if each.decision.is_allowed)
         return entry._replace(operations=allowed)
 
-    def refuse_changes(self, why: str) -> AuthorizedRequest:
+    def deny_changes(self, why: str) -> AuthorizedRequest:
         """Return the request with all that changes something refused."""
         return self._replace(
             decisions=tuple(
@@ -108,7 +108,7 @@ class AuthorizedRequest(NamedTuple):
         """Return the body of a sum command with what may be done."""
         return encode_sum(self._part())
 
-    def take_answer(self, error_code: int, body: bytes) -> tuple[bytes, AuditEntry]:
+    def complete(self, error_code: int, body: bytes) -> tuple[bytes, AuditEntry]:
         """Return the answer to the whole of the request, and what the audit says of it.
 
         Args:
@@ -120,14 +120,14 @@ class AuthorizedRequest(NamedTuple):
         outcomes = split_answer(part, body) if part.sum_group and not error_code else None
         if outcomes is not None:
             results = [each.result for each in outcomes]
-            if self.refused:
+            if self.denied:
                 left = iter(outcomes)
                 body = self.request.encode_answer(
                     [next(left) if each.is_allowed else _DENIED for each in self.decisions]
                 )
         return body, self._entry(results)
 
-    def give_up(self, error_code: int | None) -> AuditEntry:
+    def abandon(self, error_code: int | None) -> AuditEntry:
         """Return what the audit says of a request that nothing came back for.
 
         Args:
@@ -136,7 +136,7 @@ class AuthorizedRequest(NamedTuple):
         return self._entry([error_code] * len(self.decisions))
 
     def _part(self) -> AdsRequest:
-        if not self.refused:
+        if not self.denied:
             return self.request
         pairs = zip(self.request.operations, self.decisions, strict=True)
         return part_of(self.request, [each for each, decision in pairs if decision.is_allowed])
@@ -150,8 +150,8 @@ class AuthorizedRequest(NamedTuple):
             )
             for operation, decision in zip(self.request.operations, self.decisions, strict=True)
         )
-        told = tuple(each for each in operations if each.is_told)
-        return AuditEntry(self.endpoint, self.header, self.route, told)
+        audited = tuple(each for each in operations if each.is_audited)
+        return AuditEntry(self.endpoint, self.header, self.route, audited)
 
 
 def _first_result(body: bytes) -> int | None:
@@ -225,9 +225,9 @@ class AccessFilter:
         """Say whether only a program of this host can have come by *endpoint*."""
         return self.access.is_this_host(endpoint)
 
-    def let_through(
+    def filter_request(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, route: str = ""
-    ) -> tuple[bytes, AuthorizedRequest | None] | Refusal:
+    ) -> tuple[bytes, AuthorizedRequest | None] | RoutingError:
         """Return a request as it goes in or on, and what to do with its answer, or refuse it.
 
         Args:
@@ -249,13 +249,13 @@ class AccessFilter:
             request = parse_request(header.command, data[AmsHeader.SIZE :])
         except AdsRefusedError as exc:
             is_recorded = self.before_change is not None
-            may_pass = grants.may(AccessService.RAW) and not is_recorded
-            return (data, None) if may_pass else _refuse_unreadable(header, exc)
-        decisions = tuple(map(grants.admission, request.operations))
+            is_allowed_unread = grants.may(AccessService.RAW) and not is_recorded
+            return (data, None) if is_allowed_unread else _refuse_unreadable(header, exc)
+        decisions = tuple(map(grants.decide, request.operations))
         authorized = AuthorizedRequest(endpoint, header, route, request, decisions)
-        if why := self._record_first(authorized):
-            authorized = authorized.refuse_changes(why)
-        if authorized.refused:
+        if why := self._record_changes(authorized):
+            authorized = authorized.deny_changes(why)
+        if authorized.denied:
             return self._refuse(authorized, now_ns) or (
                 exchange_body(data, authorized.encode_part()),
                 authorized,
@@ -263,37 +263,37 @@ class AccessFilter:
         is_read = all(each.service is AccessService.READ for each in decisions)
         return data, None if is_read else authorized
 
-    def take_answer(self, authorized: AuthorizedRequest, error_code: int, body: bytes) -> bytes:
+    def complete(self, authorized: AuthorizedRequest, error_code: int, body: bytes) -> bytes:
         """Return the body of the answer that the client gets to all it asked for."""
-        body, entry = authorized.take_answer(error_code, body)
+        body, entry = authorized.complete(error_code, body)
         self._enter(entry)
         return body
 
-    def give_up(self, authorized: AuthorizedRequest, error_code: int | None = None) -> None:
+    def abandon(self, authorized: AuthorizedRequest, error_code: int | None = None) -> None:
         """Take note that nothing came back; *error_code* is what the client got, if anything."""
-        self._enter(authorized.give_up(error_code))
+        self._enter(authorized.abandon(error_code))
 
-    def _record_first(self, authorized: AuthorizedRequest) -> str:
+    def _record_changes(self, authorized: AuthorizedRequest) -> str:
         """Record what a request is going to change, where that is required; return why not."""
         if self.before_change is None:
             return ""
         changes = authorized.changes
         return self.before_change(changes) if changes.operations else ""
 
-    def _refuse(self, authorized: AuthorizedRequest, now_ns: int) -> Refusal | None:
+    def _refuse(self, authorized: AuthorizedRequest, now_ns: int) -> RoutingError | None:
         """Refuse a request as a whole, unless some of its items may be done."""
         request, text = authorized.request, _describe(authorized)
         count = len(authorized.decisions)
-        if has_results(request) and len(authorized.refused) < count:
+        if has_results(request) and len(authorized.denied) < count:
             header, endpoint, code = authorized.header, authorized.endpoint, AdsError.ACCESS_DENIED
             text = f"{describe(header, endpoint)}: {text}"
-            self._record.enter(Trace(now_ns, Outcome.DENIED, endpoint, None, header, code, 0, text))
+            self._record.add(Trace(now_ns, Outcome.DENIED, endpoint, None, header, code, 0, text))
             return None
-        self.give_up(authorized, AdsError.ACCESS_DENIED)
+        self.abandon(authorized, AdsError.ACCESS_DENIED)
         body = b""
         if has_results(request):
             body = request.encode_answer([OperationOutcome(AdsError.ACCESS_DENIED)] * count)
-        return Refusal(AdsError.ACCESS_DENIED, text, outcome=Outcome.DENIED, body=body)
+        return RoutingError(AdsError.ACCESS_DENIED, text, outcome=Outcome.DENIED, body=body)
 
     def _enter(self, entry: AuditEntry) -> None:
         if entry.operations:
@@ -306,22 +306,22 @@ def exchange_body(data: bytes, body: bytes) -> bytes:
     return data[:_LENGTH] + length + data[_LENGTH + 4 : AmsHeader.SIZE] + body
 
 
-def _refuse_unreadable(header: AmsHeader, why: AdsRefusedError) -> Refusal:
+def _refuse_unreadable(header: AmsHeader, why: AdsRefusedError) -> RoutingError:
     """Return the refusal of a request that nobody here understands.
 
     Only clients that may send anything get it through, and nobody where changes are recorded.
     """
     text = "the request cannot be read"
     if why.result is AdsError.COMMAND:
-        return Refusal(why.result, text)
-    return Refusal(why.result, text, body=encode_refusal(header.command, why.result))
+        return RoutingError(why.result, text)
+    return RoutingError(why.result, text, body=encode_refusal(header.command, why.result))
 
 
 def _describe(authorized: AuthorizedRequest) -> str:
-    first = authorized.refused[0]
+    first = authorized.denied[0]
     text = f"{first.service} refused: {first.why}"
     if len(authorized.decisions) == 1:
         return text
     return (
-        f"{len(authorized.refused)} of {len(authorized.decisions)} items refused, the first: {text}"
+        f"{len(authorized.denied)} of {len(authorized.decisions)} items refused, the first: {text}"
     )

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.error_reply import Refusal
+from eap.ams.error_reply import RoutingError
 from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import InFlight
 from eap.ams.record import Outcome
@@ -22,7 +22,7 @@ from eap.codec.ams import AmsHeader
 from eap.ids import STATION_OCTETS, NetId
 
 
-class Limits(NamedTuple):
+class RouterLimits(NamedTuple):
     """How much a router takes on."""
 
     in_flight: int = 4096
@@ -56,7 +56,7 @@ class Admission:
         table: RouteTable,
         transports: Mapping[str, Transport],
         in_flight: InFlight,
-        limits: Limits,
+        limits: RouterLimits,
         hop_prober: HopProber | None = None,
     ) -> None:
         self._net_id = net_id
@@ -86,7 +86,7 @@ class Admission:
         else:
             self._down.pop(Endpoint(transport, address), None)
 
-    def door_removed(self, name: str) -> None:
+    def transport_removed(self, name: str) -> None:
         """Forget everything about a door."""
         self._opened.discard(name)
         self._closed.pop(name, None)
@@ -118,25 +118,25 @@ class Admission:
             return Obstacle(RouteState.CLIENT, f"not listening: {why}")
         return Obstacle(RouteState.DOWN, why)
 
-    def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | Refusal:
+    def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | RoutingError:
         """Return how a request goes on that is for nobody here."""
         found = self._table.find(header.target)
         if found is None:
-            return Refusal(AdsError.TARGET_MACHINE, f"no route to {header.target}")
+            return RoutingError(AdsError.TARGET_MACHINE, f"no route to {header.target}")
         route, octets = found
         if octets < STATION_OCTETS and header.target.station == self._net_id.station:
             # Whoever has a route for the station's NetIDs would send it back here.
             text = f"this station has no NetID {header.target}"
-            return Refusal(AdsError.TARGET_MACHINE, text)
+            return RoutingError(AdsError.TARGET_MACHINE, text)
         return self._find_obstacle(header, endpoint, route) or route
 
-    def is_again(self, header: AmsHeader, onward: bytes, endpoint: Endpoint) -> bool:
+    def is_duplicate(self, header: AmsHeader, onward: bytes, endpoint: Endpoint) -> bool:
         """Say whether it is a doubled packet, or asked again, while the first one waits."""
         if self._transports[endpoint.transport].is_stream:
             return False
-        return self._in_flight.is_asked(endpoint, onward, header.invoke_id)
+        return self._in_flight.has_request(endpoint, onward, header.invoke_id)
 
-    def find_circle(self, header: AmsHeader, onward: bytes, route: Route) -> Refusal | None:
+    def find_loop(self, header: AmsHeader, onward: bytes, route: Route) -> RoutingError | None:
         """Say whether a request was passed on from here already."""
         known = self._in_flight.get(header.invoke_id)
         if known is None or known.route is None:
@@ -144,39 +144,41 @@ class Admission:
         if known.onward != onward or known.header.command != header.command:
             return None
         text = f"it was passed on from here already: routes to {header.target} run in a circle"
-        return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
+        return RoutingError(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
 
-    def find_room(self, endpoint: Endpoint) -> Refusal | None:
+    def check_limits(self, endpoint: Endpoint) -> RoutingError | None:
         """Say whether too many requests wait for one more."""
         waiting = self._in_flight.count(endpoint)
-        of_door = self._in_flight.count_of_door(endpoint.transport)
+        of_transport = self._in_flight.count_of_transport(endpoint.transport)
         if waiting >= self._limits.per_connection:
             text = f"{self._limits.per_connection} requests of the connection wait already"
-            return Refusal(AdsError.MAILBOX_FULL, text)
-        if waiting >= self._limits.per_transport - of_door:
+            return RoutingError(AdsError.MAILBOX_FULL, text)
+        if waiting >= self._limits.per_transport - of_transport:
             by = endpoint.transport
-            text = f"{of_door} requests by {by} wait already, {waiting} of this connection"
-            return Refusal(AdsError.MAILBOX_FULL, text)
-        if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
+            text = f"{of_transport} requests by {by} wait already, {waiting} of this connection"
+            return RoutingError(AdsError.MAILBOX_FULL, text)
+        if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.drop_abandoned():
             text = f"{self._limits.in_flight} requests wait already"
-            return Refusal(AdsError.MAILBOX_FULL, text)
+            return RoutingError(AdsError.MAILBOX_FULL, text)
         return None
 
-    def _find_obstacle(self, header: AmsHeader, endpoint: Endpoint, route: Route) -> Refusal | None:
+    def _find_obstacle(
+        self, header: AmsHeader, endpoint: Endpoint, route: Route
+    ) -> RoutingError | None:
         back = self._table.find(header.source)
         if back is not None and back[1] >= STATION_OCTETS and back[0].is_unidirectional:
             text = f"route {back[0].name} is unidirectional: nothing may be asked from there"
-            return Refusal(AdsError.ACCESS_DENIED, text, back[0])
+            return RoutingError(AdsError.ACCESS_DENIED, text, back[0])
         hop = route.hop
         if hop.transport not in self._transports:
             text = f"route {route.name} is by {hop.transport}, which this station does not have"
-            return Refusal(AdsError.HOST_UNREACHABLE, text, route)
+            return RoutingError(AdsError.HOST_UNREACHABLE, text, route)
         if hop.transport == endpoint.transport and (
             hop == endpoint or not self._transports[hop.transport].is_hub
         ):
             text = f"route {route.name} leads back to where it came from"
-            return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
+            return RoutingError(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
         if self.is_down(hop):
             text = f"{self._table.describe_hop(route)} {self.find_obstacle(route)}"
-            return Refusal(AdsError.HOST_UNREACHABLE, text, route)
+            return RoutingError(AdsError.HOST_UNREACHABLE, text, route)
         return None

@@ -15,7 +15,7 @@ _NO_RETURN = StateFlags.NO_RETURN.value  # plain numbers: enums and operators of
 _NOTIFICATION = AmsCommand.NOTIFICATION.value
 
 
-class Refusal(NamedTuple):
+class RoutingError(NamedTuple):
     """Why a request goes no further."""
 
     error: AdsError
@@ -39,11 +39,11 @@ class ErrorReplier:
         self._transports = transports
         self._record = record
 
-    def refuse(
+    def reply_error(
         self,
         header: AmsHeader,
         endpoint: Endpoint | None,
-        why: Refusal,
+        why: RoutingError,
         at_ns: int,
         took_ns: int = 0,
     ) -> list[Action]:
@@ -52,16 +52,14 @@ class ErrorReplier:
         hop = None
         if why.route is not None:
             hop = why.route.hop
-            self._record.routes.of(why.route.key, at_ns).fail(why.text)
-        self._record.enter(
-            Trace(at_ns, why.outcome, endpoint, hop, header, why.error, took_ns, text)
-        )
+            self._record.routes.of(why.route.key, at_ns).add_error(why.text)
+        self._record.add(Trace(at_ns, why.outcome, endpoint, hop, header, why.error, took_ns, text))
         if endpoint is None or not wants_answer(header):
             return []
         packet = response_to(header, AmsAnswer(why.body, 0 if why.body else why.error))
         traffic = self._record.connections.of(endpoint, at_ns)
-        traffic.fail(why.text)
-        traffic.answer(len(packet), took_ns)
+        traffic.add_error(why.text)
+        traffic.add_answer(len(packet), took_ns)
         return [self._transports.reply(endpoint, packet)]
 
     def drop(
@@ -70,5 +68,5 @@ class ErrorReplier:
         """Say nothing to anybody, and remember it."""
         subject = str(endpoint) if header is None else describe(header, endpoint)
         text = f"{subject}: {text}"
-        self._record.enter(Trace(at_ns, outcome, endpoint, None, header, 0, 0, text))
+        self._record.add(Trace(at_ns, outcome, endpoint, None, header, 0, 0, text))
         return []

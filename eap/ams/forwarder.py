@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
 from eap.ams.access_filter import AccessFilter, AuthorizedRequest, exchange_body
-from eap.ams.admission import Admission, Limits
-from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
+from eap.ams.admission import Admission, RouterLimits
+from eap.ams.error_reply import ErrorReplier, RoutingError, wants_answer
 from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import InFlight, InvokeIds, LoopDetector, Pending, is_marked
 from eap.ams.notification_forwarder import (
-    FOLLOWED,
+    TRACKED_COMMANDS,
     NotificationCleanup,
     NotificationForwarder,
     Samples,
@@ -57,7 +57,7 @@ class Forwarder:
         access_filter: AccessFilter,
         *,
         first_invoke_id: int,
-        limits: Limits,
+        limits: RouterLimits,
         hop_prober: HopProber | None = None,
     ) -> None:
         self.in_flight = InFlight()
@@ -74,15 +74,15 @@ class Forwarder:
             net_id, table, transports.transports, self.in_flight, limits, hop_prober
         )
         self._loop_detector = LoopDetector()
-        self._ending = NotificationCleanup(transports, self.in_flight, self._ids, limits)
+        self._cleanup = NotificationCleanup(transports, self.in_flight, self._ids, limits)
         self.subscription_restorer = SubscriptionRestorer(
             self.notification_forwarder.subscriptions, transports, self.in_flight, self._ids,
-            self._ending, error_replier, limits, self._find_way,
+            self._cleanup, error_replier, limits, self._find_request_route,
         )  # fmt: skip
         if hop_prober is not None:
             hop_prober.watched = self.notification_forwarder.subscriptions.hops
 
-    def take_notification(
+    def forward_notification(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, *, is_own: bool
     ) -> list[Action]:
         """Hand samples to the clients that subscribed, whatever NetID these have.
@@ -100,22 +100,22 @@ class Forwarder:
         Raises:
             CodecError: it is shorter or longer than it says.
         """
-        samples = self.notification_forwarder.hand_on(
+        samples = self.notification_forwarder.distribute(
             header, data, now_ns, lambda hop: self._transports.is_from(hop, endpoint)
         )
         if samples.hop is not None:
             if self._hop_prober is not None:
-                self._hop_prober.hear(samples.hop, now_ns)
+                self._hop_prober.note_answer(samples.hop, now_ns)
             actions = [*samples.replies, *self.subscription_restorer.ended(samples.ended, now_ns)]
             return actions + self._end_unwanted(header, samples, endpoint)
         found = None if is_own else self._admission.find_route(header, endpoint)
         if found is not None and not self._is_refused_for_good(found):
-            return self.take_request(header, data, endpoint, now_ns)
+            return self.forward_request(header, data, endpoint, now_ns)
         text = "no client here subscribed to it, or not any more"
         self._error_replier.drop(endpoint, header, Outcome.LATE, text, now_ns)
         return self._end_unwanted(header, samples, endpoint)
 
-    def _is_refused_for_good(self, found: Route | Refusal) -> bool:
+    def _is_refused_for_good(self, found: Route | RoutingError) -> bool:
         """Return whether samples for a client that is not connected here can never reach it.
 
         A client that does not listen gets samples by its own connection only, and that has ended.
@@ -133,34 +133,36 @@ class Forwarder:
         """Have one notification ended that no client has; the others come again."""
         if not samples.unknown:
             return []
-        return self._ending.end_unwanted(header, samples.unknown[0], endpoint)
+        return self._cleanup.end_unwanted(header, samples.unknown[0], endpoint)
 
-    def take_request(
+    def forward_request(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
     ) -> list[Action]:
         """Pass a request on that is for nobody here, or refuse it."""
-        is_followed = header.command in FOLLOWED
-        own = self.notification_forwarder.find_own(header, data, endpoint) if is_followed else None
+        is_tracked = header.command in TRACKED_COMMANDS
+        own = (
+            self.notification_forwarder.find_deleted(header, data, endpoint) if is_tracked else None
+        )
         if own is not None and own[0].request is not None:
             return self._delete(header, data, own, endpoint, now_ns)
-        found = self._let_on(header, data, endpoint, now_ns)
-        if isinstance(found, Refusal):
-            return self._error_replier.refuse(header, endpoint, found, now_ns)
+        found = self._authorize(header, data, endpoint, now_ns)
+        if isinstance(found, RoutingError):
+            return self._error_replier.reply_error(header, endpoint, found, now_ns)
         route, data, authorized = found
         if own is not None:
             self.notification_forwarder.forget(own)
-        if is_followed and not self.notification_forwarder.has_room(header, data, endpoint):
+        if is_tracked and not self.notification_forwarder.is_within_limits(header, data, endpoint):
             return self._refuse_subscriptions(header, authorized, endpoint, now_ns)
         onward = self._onward(header, endpoint, route)
         if not wants_answer(header):
             if authorized is not None:
-                self._access_filter.give_up(authorized)
-            return self._pass_once(header, data, onward, endpoint, route, now_ns)
+                self._access_filter.abandon(authorized)
+            return self._forward_once(header, data, onward, endpoint, route, now_ns)
         pending = self._admit(header, data, onward, endpoint, route, authorized, now_ns)
         if not isinstance(pending, Pending):
             return pending
-        if is_followed:
-            self.notification_forwarder.follow_request(pending, data[AmsHeader.SIZE :], endpoint)
+        if is_tracked:
+            self.notification_forwarder.track_request(pending, data[AmsHeader.SIZE :], endpoint)
         return [self._forward(pending.invoke_id, data, onward, route)]
 
     def wait_for_service(
@@ -177,41 +179,47 @@ class Forwarder:
         )
         return pending.invoke_id if isinstance(pending, Pending) else pending
 
-    def take_answer(
+    def return_answer(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
     ) -> list[Action]:
         """Send an answer back to who asked, unless it is late or comes from somewhere else."""
         pending = self.in_flight.get(header.invoke_id)
         if pending is None or not self._is_answer(header, data, endpoint, pending):
-            return self._error_replier.drop(endpoint, None, Outcome.LATE, _unasked(header), now_ns)
+            return self._error_replier.drop(
+                endpoint, None, Outcome.LATE, _describe_late(header), now_ns
+            )
         self.in_flight.pop(header.invoke_id)
         if self._hop_prober is not None and pending.route is not None:
-            self._hop_prober.hear(pending.route.hop, now_ns)
+            self._hop_prober.note_answer(pending.route.hop, now_ns)
         if pending.step is not None:
             body = data[AmsHeader.SIZE :]
             return self.subscription_restorer.receive_answer(pending, header, body, now_ns)
         actions: list[Action] = []
         granted = None
-        if pending.handles or pending.asked_for:
+        if pending.handles or pending.request_body:
             body = data[AmsHeader.SIZE :]
-            granted = self.notification_forwarder.follow_answer(pending, header, body, now_ns)
+            granted = self.notification_forwarder.track_answer(pending, header, body, now_ns)
         if granted is not None:
-            actions += self._ending.end(granted.surplus, now_ns)
+            actions += self._cleanup.end(granted.surplus, now_ns)
             actions += self.subscription_restorer.displaced(granted.displaced, now_ns)
             data = data[: AmsHeader.SIZE] + granted.body
-        if pending.came_by is None:
+        if pending.endpoint is None:
             if header.command != AmsCommand.DELETE_NOTIFICATION:  # most of those are our own
-                self._error_replier.drop(endpoint, None, Outcome.LATE, _unasked(header), now_ns)
+                self._error_replier.drop(
+                    endpoint, None, Outcome.LATE, _describe_late(header), now_ns
+                )
             return actions
-        asked = pending.header
+        request = pending.header
         if pending.authorized is not None:
             body = data[AmsHeader.SIZE :]
-            body = self._access_filter.take_answer(pending.authorized, header.error_code, body)
+            body = self._access_filter.complete(pending.authorized, header.error_code, body)
             data = exchange_body(data, body)
-        back = ADDRESSES.pack(asked.source, asked.source_port, asked.target, asked.target_port)
-        number = asked.invoke_id.to_bytes(4, "little")
+        back = ADDRESSES.pack(
+            request.source, request.source_port, request.target, request.target_port
+        )
+        number = request.invoke_id.to_bytes(4, "little")
         packet = back + data[ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
-        actions += self._send_back(pending, pending.came_by, packet, header.error_code, now_ns)
+        actions += self._send_back(pending, pending.endpoint, packet, header.error_code, now_ns)
         for subscription in () if granted is None else granted.new:
             actions += self.subscription_restorer.granted(subscription, now_ns)
         return actions
@@ -221,31 +229,29 @@ class Forwarder:
     ) -> list[Action]:
         """Send back what a service had at hand for a request that never waited."""
         packet = response_to(header, answer)
-        self._record.connections.of(endpoint, now_ns).answer(len(packet), took_ns)
-        self._record.enter(Trace(now_ns, _ANSWERED, endpoint, None, header, 0, took_ns, ""))
+        self._record.connections.of(endpoint, now_ns).add_answer(len(packet), took_ns)
+        self._record.add(Trace(now_ns, _ANSWERED, endpoint, None, header, 0, took_ns, ""))
         return [self._transports.reply(endpoint, packet)]
 
     def answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
         """Send back what a service says to the request with *ticket*, if it still waits."""
         pending = self.in_flight.get(ticket)
-        if pending is None or pending.route is not None or pending.came_by is None:
+        if pending is None or pending.route is not None or pending.endpoint is None:
             return []
         self.in_flight.pop(ticket)
         if pending.authorized is not None:
-            body = self._access_filter.take_answer(
-                pending.authorized, answer.error_code, answer.data
-            )
+            body = self._access_filter.complete(pending.authorized, answer.error_code, answer.data)
             answer = answer._replace(data=body)
         packet = response_to(pending.header, answer)
         why = _with_result(answer)
-        return self._send_back(pending, pending.came_by, packet, answer.error_code, now_ns, why)
+        return self._send_back(pending, pending.endpoint, packet, answer.error_code, now_ns, why)
 
     def send_failed(self, ticket: int, text: str, now_ns: int) -> list[Action]:
         """Answer a request that its door could not send."""
         pending = self.in_flight.pop(ticket)
         return [] if pending is None else self._fail(pending, text, now_ns)
 
-    def ways_of(self, transport: str) -> set[Endpoint]:
+    def endpoints_of(self, transport: str) -> set[Endpoint]:
         """Return by which ways of a door somebody waits here for something."""
         endpoints = {
             *self.in_flight.endpoints(),
@@ -259,7 +265,7 @@ class Forwarder:
             self._give_up(pending)
             if pending.route is None:
                 self.in_flight.pop(pending.invoke_id)
-        return self._ending.end(self.notification_forwarder.close(endpoint), now_ns)
+        return self._cleanup.end(self.notification_forwarder.close(endpoint), now_ns)
 
     def hop_down(self, transport: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop, and refuse what will be for it."""
@@ -285,15 +291,15 @@ class Forwarder:
         """Pass requests on to a hop again."""
         self._admission.hop_up(transport, address)
 
-    def door_removed(self, name: str) -> None:
+    def transport_removed(self, name: str) -> None:
         """Forget everything about a door."""
-        self._admission.door_removed(name)
+        self._admission.transport_removed(name)
 
     def find_obstacle(self, route: Route) -> Obstacle | None:
         """Return why nothing can go by *route* now; None if something can."""
         return self._admission.find_obstacle(route)
 
-    def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | Refusal:
+    def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | RoutingError:
         """Return how a request would go on that is for nobody here."""
         return self._admission.find_route(header, endpoint)
 
@@ -311,20 +317,20 @@ class Forwarder:
         actions: list[Action] = []
         for pending in self.in_flight.due(now_ns):
             self.in_flight.pop(pending.invoke_id)
-            if pending.came_by is not None or pending.step is not None:
+            if pending.endpoint is not None or pending.step is not None:
                 actions += self._time_out(pending, now_ns)
         return actions + self.subscription_restorer.handle_timeout(now_ns)
 
-    def _find_way(
+    def _find_request_route(
         self, header: AmsHeader, packet: bytes, endpoint: Endpoint, now_ns: int
-    ) -> tuple[Route, bytes] | Refusal:
+    ) -> tuple[Route, bytes] | RoutingError:
         """Return by which route a request of a client goes on now, and with which addresses."""
-        found = self._let_on(header, packet, endpoint, now_ns)
-        if isinstance(found, Refusal):
+        found = self._authorize(header, packet, endpoint, now_ns)
+        if isinstance(found, RoutingError):
             return found
         route, _, authorized = found
         if authorized is not None:
-            self._access_filter.give_up(authorized)
+            self._access_filter.abandon(authorized)
         return route, self._onward(header, endpoint, route)
 
     def _onward(self, header: AmsHeader, endpoint: Endpoint, route: Route) -> bytes:
@@ -352,7 +358,7 @@ class Forwarder:
             ]
             answer = AmsAnswer(encode_deleted(header, results))
             actions += self.answer_now(header, endpoint, answer, 0, now_ns)
-        return actions + self._ending.end(grants, now_ns)
+        return actions + self._cleanup.end(grants, now_ns)
 
     def _refuse_subscriptions(
         self,
@@ -362,51 +368,51 @@ class Forwarder:
         now_ns: int,
     ) -> list[Action]:
         if authorized is not None:
-            self._access_filter.give_up(authorized, AdsError.NO_MORE_HANDLES)
+            self._access_filter.abandon(authorized, AdsError.NO_MORE_HANDLES)
         text = f"no more than {MAX_PER_CLIENT} notifications a client, {MAX_TOTAL} in all"
         body = AdsError.NO_MORE_HANDLES.to_bytes(4, "little") + bytes(4)
-        why = Refusal(AdsError.NO_MORE_HANDLES, text, body=body)
-        return self._error_replier.refuse(header, endpoint, why, now_ns)
+        why = RoutingError(AdsError.NO_MORE_HANDLES, text, body=body)
+        return self._error_replier.reply_error(header, endpoint, why, now_ns)
 
-    def _let_on(
+    def _authorize(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
-    ) -> tuple[Route, bytes, AuthorizedRequest | None] | Refusal:
+    ) -> tuple[Route, bytes, AuthorizedRequest | None] | RoutingError:
         """Return by which route a request goes on, and as what."""
         route = self._admission.find_route(header, endpoint)
-        if isinstance(route, Refusal):
+        if isinstance(route, RoutingError):
             return route
-        through = self._access_filter.let_through(header, data, endpoint, now_ns, route.name)
-        return through if isinstance(through, Refusal) else (route, *through)
+        through = self._access_filter.filter_request(header, data, endpoint, now_ns, route.name)
+        return through if isinstance(through, RoutingError) else (route, *through)
 
     def _admit(
         self, header: AmsHeader, data: bytes, onward: bytes, endpoint: Endpoint,
         route: Route | None, authorized: AuthorizedRequest | None, now_ns: int,
     ) -> Pending | list[Action]:  # fmt: skip
         """Remember a request that has an answer, unless something speaks against it."""
-        if self._admission.is_again(header, onward, endpoint):
+        if self._admission.is_duplicate(header, onward, endpoint):
             if authorized is not None:
-                self._access_filter.give_up(authorized)
+                self._access_filter.abandon(authorized)
             text = "the same request waits already"
             return self._error_replier.drop(endpoint, header, Outcome.DROPPED, text, now_ns)
-        why = None if route is None else self._admission.find_circle(header, onward, route)
-        why = why or self._admission.find_room(endpoint)
+        why = None if route is None else self._admission.find_loop(header, onward, route)
+        why = why or self._admission.check_limits(endpoint)
         if why is not None:
             if authorized is not None:
-                self._access_filter.give_up(authorized, why.error)
-            return self._error_replier.refuse(header, endpoint, why, now_ns)
+                self._access_filter.abandon(authorized, why.error)
+            return self._error_replier.reply_error(header, endpoint, why, now_ns)
         invoke_id = header.invoke_id
         if route is None or not is_marked(invoke_id) or invoke_id in self.in_flight:
-            invoke_id = self._ids.take(self.in_flight)
+            invoke_id = self._ids.allocate(self.in_flight)
         allowed = self._limits.timeout_ns
         if route is not None:
             allowed = route.timeout_ns or allowed
-            self._record.routes.of(route.key, now_ns).ask(len(data))
+            self._record.routes.of(route.key, now_ns).add_request(len(data))
         pending = Pending(invoke_id, header, endpoint, route, onward, now_ns, now_ns + allowed)
         pending.authorized = authorized
         self.in_flight.add(pending)
         return pending
 
-    def _pass_once(
+    def _forward_once(
         self,
         header: AmsHeader,
         data: bytes,
@@ -422,9 +428,9 @@ class Forwarder:
                 text = f"passed on already: doubled, or routes to {header.target} run in a circle"
                 return self._error_replier.drop(endpoint, header, Outcome.LOOP, text, now_ns)
         else:
-            invoke_id = self._ids.take(self.in_flight)
+            invoke_id = self._ids.allocate(self.in_flight)
         self._loop_detector.add(invoke_id, onward)
-        self._record.routes.of(route.key, now_ns).ask(len(data))
+        self._record.routes.of(route.key, now_ns).add_request(len(data))
         return [self._forward(invoke_id, data, onward, route)]
 
     def _forward(self, invoke_id: int, data: bytes, onward: bytes, route: Route) -> Action:
@@ -459,13 +465,13 @@ class Forwarder:
                 error = AdsError.words_of(error_code)
                 why = f"{error} from {self._table.describe_hop(route)} or from behind it"
                 text = f"{describe(pending.header, endpoint)}: {why}"
-                traffic.fail(why)
-            traffic.answer(len(packet), took_ns)
+                traffic.add_error(why)
+            traffic.add_answer(len(packet), took_ns)
         connection = self._record.connections.of(endpoint, now_ns)
         if error_code:
-            connection.fail(text)
-        connection.answer(len(packet), took_ns)
-        self._record.enter(
+            connection.add_error(text)
+        connection.add_answer(len(packet), took_ns)
+        self._record.add(
             Trace(now_ns, _ANSWERED, endpoint, hop, pending.header, error_code, took_ns, text)
         )
         return [self._transports.reply(endpoint, packet)]
@@ -475,10 +481,10 @@ class Forwarder:
             return self.subscription_restorer.request_failed(
                 pending, AdsError.HOST_UNREACHABLE, now_ns
             )
-        if pending.route is None or pending.came_by is None:
+        if pending.route is None or pending.endpoint is None:
             return []
         route = pending.route
-        why = Refusal(
+        why = RoutingError(
             AdsError.HOST_UNREACHABLE, f"{self._table.describe_hop(route)}: {text}", route
         )
         return self._refuse(pending, why, now_ns)
@@ -490,24 +496,28 @@ class Forwarder:
             allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
             route = pending.route
             who = "its service" if route is None else self._table.describe_beyond(route)
-            why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route)
+            why = RoutingError(
+                AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route
+            )
             actions = self._refuse(pending, why, now_ns)
         if pending.handles:
             # If it is granted after all, it has to be ended.
-            pending.came_by, pending.step, pending.at_ns = None, None, now_ns
+            pending.endpoint, pending.step, pending.at_ns = None, None, now_ns
             pending.deadline_ns = now_ns + self._limits.timeout_ns
             self.in_flight.add(pending)
         return actions
 
-    def _refuse(self, pending: Pending, why: Refusal, now_ns: int) -> list[Action]:
+    def _refuse(self, pending: Pending, why: RoutingError, now_ns: int) -> list[Action]:
         """Answer a request that nothing came back for."""
         self._give_up(pending, why.error)
         took_ns = now_ns - pending.at_ns
-        return self._error_replier.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
+        return self._error_replier.reply_error(
+            pending.header, pending.endpoint, why, now_ns, took_ns
+        )
 
     def _give_up(self, pending: Pending, error_code: int | None = None) -> None:
         if pending.authorized is not None:
-            self._access_filter.give_up(pending.authorized, error_code)
+            self._access_filter.abandon(pending.authorized, error_code)
             pending.authorized = None
 
 
@@ -517,7 +527,7 @@ def _with_result(answer: AmsAnswer) -> str:
     return f"{answer.why} (0x{result:x})" if answer.why and result else answer.why
 
 
-def _unasked(answer: AmsHeader) -> str:
+def _describe_late(answer: AmsHeader) -> str:
     return (
         f"an answer of {answer.source}:{answer.source_port} to {answer.target}:{answer.target_port}"
         " that nobody waits for, or not any more"

@@ -53,14 +53,24 @@ class Probe(NamedTuple):
 class _Hop:
     """What is known of one hop."""
 
-    __slots__ = ("asked_at_ns", "gone_at_ns", "has_restart_index", "heard_at_ns", "is_down",
-                 "misses", "number", "restart_index", "round_trip_ns", "target")  # fmt: skip
+    __slots__ = (
+        "answered_at_ns",
+        "gone_at_ns",
+        "has_restart_index",
+        "is_down",
+        "misses",
+        "number",
+        "probed_at_ns",
+        "restart_index",
+        "round_trip_ns",
+        "target",
+    )  # fmt: skip
 
     def __init__(self, number: int, target: NetId) -> None:
         self.number = number
         self.target = target
-        self.asked_at_ns: int | None = None
-        self.heard_at_ns = -1
+        self.probed_at_ns: int | None = None
+        self.answered_at_ns = -1
         self.misses = 0
         self.is_down = False
         self.gone_at_ns: int | None = None
@@ -70,10 +80,10 @@ class _Hop:
 
     def is_due(self, now_ns: int, interval_ns: int) -> bool:
         """Say whether to ask it, when its turn has come."""
-        if self.is_down or self.heard_at_ns < 0 or self.asked_at_ns is None:
+        if self.is_down or self.answered_at_ns < 0 or self.probed_at_ns is None:
             return True
-        is_busy = now_ns - self.heard_at_ns < interval_ns
-        return now_ns - self.asked_at_ns >= interval_ns * (_BUSY if is_busy else 1)
+        is_busy = now_ns - self.answered_at_ns < interval_ns
+        return now_ns - self.probed_at_ns >= interval_ns * (_BUSY if is_busy else 1)
 
 
 class HopProber:
@@ -96,7 +106,7 @@ class HopProber:
         self._by_number: dict[int, Endpoint] = {}
         self._paused: set[Endpoint] = set()
         self._closed: set[str] = set()
-        self._turns: list[tuple[int, int]] = []
+        self._schedule: list[tuple[int, int]] = []
         self._number = 0
         self._version = -1
         self.watched: Container[Endpoint] = ()
@@ -116,21 +126,21 @@ class HopProber:
             self._paused.discard(Endpoint(transport, address))
         for endpoint, hop in self._hops.items():
             if endpoint.transport == transport and address in {None, endpoint.connection}:
-                hop.asked_at_ns, hop.misses, hop.is_down = None, 0, False
+                hop.probed_at_ns, hop.misses, hop.is_down = None, 0, False
                 hop.restart_index, hop.has_restart_index = None, True
 
-    def hear(self, hop: Endpoint, now_ns: int) -> None:
+    def note_answer(self, hop: Endpoint, now_ns: int) -> None:
         """Note that a hop answered a request."""
         known = self._hops.get(hop)
         if known is not None:
-            known.heard_at_ns = now_ns
+            known.answered_at_ns = now_ns
             known.misses = 0
 
     def is_answer(self, header: AmsHeader) -> bool:
         """Say whether a response is for the prober."""
         return header.target_port == PROBE_PORT and header.target == self._net_id
 
-    def take_answer(
+    def receive_answer(
         self, header: AmsHeader, body: bytes, endpoint: Endpoint, now_ns: int,
         is_from: Callable[[Endpoint, Endpoint], bool],
     ) -> Endpoint | None:  # fmt: skip
@@ -149,13 +159,13 @@ class HopProber:
         hop = self._by_number.get(header.invoke_id)
         if hop is None or not is_from(hop, endpoint):
             return None
-        self.hear(hop, now_ns)
+        self.note_answer(hop, now_ns)
         known = self._hops[hop]
         known.is_down = False
         if header.command == AmsCommand.READ:
-            return hop if _is_started_again(known, header, body) else None
-        if known.asked_at_ns is not None:
-            known.round_trip_ns = now_ns - known.asked_at_ns
+            return hop if _has_restarted(known, header, body) else None
+        if known.probed_at_ns is not None:
+            known.round_trip_ns = now_ns - known.probed_at_ns
         return None
 
     def is_dead(self, hop: Endpoint) -> bool:
@@ -163,10 +173,10 @@ class HopProber:
         known = self._hops.get(hop)
         return known is not None and known.is_down
 
-    def is_heard(self, hop: Endpoint) -> bool:
+    def has_answered(self, hop: Endpoint) -> bool:
         """Say whether a hop is asked, and has ever answered anything."""
         known = self._hops.get(hop)
-        return known is not None and known.heard_at_ns >= 0
+        return known is not None and known.answered_at_ns >= 0
 
     def round_trip_ns(self, hop: Endpoint) -> int | None:
         """Return how long a hop took to answer last; None if it is not asked or does not."""
@@ -177,29 +187,29 @@ class HopProber:
         """Return when :meth:`probes_due` has something; at once if the routes changed."""
         if self._version != self._table.version:
             return 0
-        return self._turns[0][0] if self._turns else None
+        return self._schedule[0][0] if self._schedule else None
 
     def probes_due(self, now_ns: int) -> Iterator[Probe]:
         """Yield the questions to ask now."""
         if self._version != self._table.version:
             self._follow_table(now_ns)
         interval_ns = max(self._interval_ns, len(self._hops) * _SPACING_NS)
-        while self._turns and self._turns[0][0] <= now_ns:
-            _, number = heappop(self._turns)
+        while self._schedule and self._schedule[0][0] <= now_ns:
+            _, number = heappop(self._schedule)
             endpoint = self._by_number[number]
-            heappush(self._turns, (now_ns + interval_ns, number))
+            heappush(self._schedule, (now_ns + interval_ns, number))
             hop = self._hops[endpoint]
             if endpoint in self._paused or endpoint.transport in self._closed:
-                hop.asked_at_ns = None
+                hop.probed_at_ns = None
             elif endpoint in self.watched or hop.is_due(now_ns, interval_ns):
-                yield self._ask(endpoint, hop, now_ns)
+                yield self._probe(endpoint, hop, now_ns)
                 if endpoint in self.watched and hop.has_restart_index and not hop.is_down:
                     yield Probe(endpoint, self._header(hop, AmsCommand.READ) + _STATE, False)
 
-    def _ask(self, endpoint: Endpoint, hop: _Hop, now_ns: int) -> Probe:
-        if hop.asked_at_ns is not None and hop.heard_at_ns < hop.asked_at_ns:
+    def _probe(self, endpoint: Endpoint, hop: _Hop, now_ns: int) -> Probe:
+        if hop.probed_at_ns is not None and hop.answered_at_ns < hop.probed_at_ns:
             hop.misses += 1
-        hop.asked_at_ns = now_ns
+        hop.probed_at_ns = now_ns
         is_found_dead = hop.misses >= MISSES and not hop.is_down
         hop.is_down = hop.is_down or is_found_dead
         if is_found_dead:
@@ -227,14 +237,14 @@ class HopProber:
                 if hop is None or hop.target != target:
                     self._number += 1
                     hop = _Hop(self._number, target)
-                    self._turns.append((now_ns, hop.number))
+                    self._schedule.append((now_ns, hop.number))
                 self._hops[route.hop] = hop
         self._by_number = {hop.number: endpoint for endpoint, hop in self._hops.items()}
-        self._turns = [each for each in self._turns if each[1] in self._by_number]
-        heapify(self._turns)
+        self._schedule = [each for each in self._schedule if each[1] in self._by_number]
+        heapify(self._schedule)
 
 
-def _is_started_again(hop: _Hop, header: AmsHeader, body: bytes) -> bool:
+def _has_restarted(hop: _Hop, header: AmsHeader, body: bytes) -> bool:
     """Note a restart index; say whether it is another one than before."""
     if header.error_code or any(body[:4]) or len(body) < _HEAD + AdsSystemState.SIZE:
         hop.has_restart_index = False

@@ -33,12 +33,12 @@ class InvokeIds:
     def __init__(self, first: int) -> None:
         self._serial = first % _SERIALS
 
-    def take(self, taken: Container[int]) -> int:
-        """Return the next id that is not among *taken*."""
+    def allocate(self, used: Container[int]) -> int:
+        """Return the next id that is not among *used*."""
         while True:
             self._serial = serial = (self._serial + 1) % _SERIALS
             invoke_id = _mark(serial) << _SERIAL_BITS | serial
-            if invoke_id not in taken:
+            if invoke_id not in used:
                 return invoke_id
 
 
@@ -77,44 +77,44 @@ class Pending:
     Attributes:
         invoke_id: That it has now; unique here.
         header: As it came.
-        came_by: Where it came from and its answer goes; None when nobody waits any more.
+        endpoint: Where it came from and its answer goes; None when nobody waits any more.
         route: How it went on; None to a service of this station.
         onward: Source and target of the packet that went on, 16 octets.
         at_ns: When it came.
         deadline_ns: When its time is up.
         handles: How many notifications it asks for.
-        asked_for: What it asks for, if a subscription is restored by it here later: its body.
+        request_body: What it asks for, if a subscription is restored by it here later: its body.
         step: That of a restoration which the request is; None for a client's.
         authorized: What access rules say of it, where its answer matters to them.
     """
 
     __slots__ = (
-        "asked_for",
         "at_ns",
         "authorized",
-        "came_by",
         "deadline_ns",
+        "endpoint",
         "handles",
         "header",
         "invoke_id",
         "onward",
+        "request_body",
         "route",
         "step",
     )  # fmt: skip
 
     def __init__(
-        self, invoke_id: int, header: AmsHeader, came_by: Endpoint | None, route: Route | None,
+        self, invoke_id: int, header: AmsHeader, endpoint: Endpoint | None, route: Route | None,
         onward: bytes, at_ns: int, deadline_ns: int,
     ) -> None:  # fmt: skip
         self.invoke_id = invoke_id
         self.header = header
-        self.came_by = came_by
+        self.endpoint = endpoint
         self.route = route
         self.onward = onward
         self.at_ns = at_ns
         self.deadline_ns = deadline_ns
         self.handles = 0
-        self.asked_for = b""
+        self.request_body = b""
         self.step: object | None = None
         self.authorized: AuthorizedRequest | None = None
 
@@ -128,8 +128,8 @@ class InFlight:
 
     def __init__(self) -> None:
         self._by_id: dict[int, Pending] = {}
-        self._by_way: dict[Endpoint, dict[int, Pending]] = {}
-        self._by_door: dict[str, int] = {}
+        self._by_endpoint: dict[Endpoint, dict[int, Pending]] = {}
+        self._by_transport: dict[str, int] = {}
         self._by_time: dict[int, OrderedDict[int, Pending]] = {}
         self._asked: dict[tuple[Endpoint, bytes, int], int] = {}
         self._abandoned: OrderedDict[int, None] = OrderedDict()
@@ -149,24 +149,26 @@ class InFlight:
 
     def endpoints(self) -> list[Endpoint]:
         """Return by which ways there came requests that wait."""
-        return list(self._by_way)
+        return list(self._by_endpoint)
 
     def count(self, endpoint: Endpoint) -> int:
         """Return how many came by *endpoint*."""
-        return len(self._by_way.get(endpoint, ()))
+        return len(self._by_endpoint.get(endpoint, ()))
 
-    def count_of_door(self, transport: str) -> int:
+    def count_of_transport(self, transport: str) -> int:
         """Return how many came by any connection of *transport*."""
-        return self._by_door.get(transport, 0)
+        return self._by_transport.get(transport, 0)
 
     def add(self, pending: Pending) -> None:
         """Remember a request."""
-        endpoint = pending.came_by
+        endpoint = pending.endpoint
         key = pending.invoke_id
         self._by_id[key] = pending
         if endpoint is not None:
-            self._by_way.setdefault(endpoint, {})[key] = pending
-            self._by_door[endpoint.transport] = self._by_door.get(endpoint.transport, 0) + 1
+            self._by_endpoint.setdefault(endpoint, {})[key] = pending
+            self._by_transport[endpoint.transport] = (
+                self._by_transport.get(endpoint.transport, 0) + 1
+            )
             self._asked[endpoint, pending.onward, pending.header.invoke_id] = key
         elif pending.step is None:
             self._abandoned[key] = None
@@ -174,7 +176,7 @@ class InFlight:
         allowed = pending.deadline_ns - pending.at_ns
         self._by_time.setdefault(allowed, OrderedDict())[key] = pending
 
-    def is_asked(self, endpoint: Endpoint, onward: bytes, invoke_id: int) -> bool:
+    def has_request(self, endpoint: Endpoint, onward: bytes, invoke_id: int) -> bool:
         """Say whether a request with these addresses and this id of its client waits."""
         return (endpoint, onward, invoke_id) in self._asked
 
@@ -183,7 +185,7 @@ class InFlight:
         pending = self._by_id.pop(invoke_id, None)
         if pending is None:
             return None
-        self._leave(pending)
+        self._detach(pending)
         self._abandoned.pop(invoke_id, None)
         allowed = pending.deadline_ns - pending.at_ns
         waiting = self._by_time[allowed]
@@ -197,14 +199,14 @@ class InFlight:
 
         They stay until their time is up: a packet that runs in a circle is still known.
         """
-        left = list(self._by_way.get(endpoint, {}).values())
+        left = list(self._by_endpoint.get(endpoint, {}).values())
         for pending in left:
-            self._leave(pending)
-            pending.came_by = None
+            self._detach(pending)
+            pending.endpoint = None
             self._abandoned[pending.invoke_id] = None
         return left
 
-    def make_room(self) -> bool:
+    def drop_abandoned(self) -> bool:
         """Forget the oldest request that nobody waits for; return whether there was one."""
         if not self._abandoned:
             return False
@@ -236,15 +238,15 @@ class InFlight:
                 found.append(pending)
         return sorted(found, key=lambda each: each.deadline_ns)
 
-    def _leave(self, pending: Pending) -> None:
-        endpoint = pending.came_by
+    def _detach(self, pending: Pending) -> None:
+        endpoint = pending.endpoint
         if endpoint is None:
             return
-        of_way = self._by_way[endpoint]
-        del of_way[pending.invoke_id]
-        if not of_way:
-            del self._by_way[endpoint]
-        self._by_door[endpoint.transport] -= 1
-        asked = endpoint, pending.onward, pending.header.invoke_id
-        if self._asked.get(asked) == pending.invoke_id:
-            del self._asked[asked]
+        of_endpoint = self._by_endpoint[endpoint]
+        del of_endpoint[pending.invoke_id]
+        if not of_endpoint:
+            del self._by_endpoint[endpoint]
+        self._by_transport[endpoint.transport] -= 1
+        key = endpoint, pending.onward, pending.header.invoke_id
+        if self._asked.get(key) == pending.invoke_id:
+            del self._asked[key]

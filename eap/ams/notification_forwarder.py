@@ -14,7 +14,7 @@ from struct import Struct
 from typing import NamedTuple
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.inflight import InFlight, InvokeIds, Pending, is_marked
 from eap.ams.subscriptions import MAX_PER_CLIENT, Grant, Subscription, Subscriptions, divide
 from eap.ams.transport_table import Action, Reply, TransportTable
@@ -37,7 +37,7 @@ class NotificationCleanup:
     """
 
     def __init__(
-        self, transports: TransportTable, in_flight: InFlight, ids: InvokeIds, limits: Limits
+        self, transports: TransportTable, in_flight: InFlight, ids: InvokeIds, limits: RouterLimits
     ) -> None:
         self._transports = transports
         self._in_flight = in_flight
@@ -50,7 +50,10 @@ class NotificationCleanup:
         for grant in grants:
             if grant.route.hop.transport not in self._transports.transports:
                 continue
-            if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
+            if (
+                len(self._in_flight) >= self._limits.in_flight
+                and not self._in_flight.drop_abandoned()
+            ):
                 break
             handle = grant.handle.to_bytes(4, "little")
             actions.append(self._ask(grant, AmsCommand.DELETE_NOTIFICATION, handle, now_ns))
@@ -83,7 +86,7 @@ class NotificationCleanup:
         return [self._transports.reply(endpoint, encode_packet(head, handle.to_bytes(4, "little")))]
 
     def _ask(self, grant: Grant, command: AmsCommand, body: bytes, now_ns: int) -> Action:
-        invoke_id = self._ids.take(self._in_flight)
+        invoke_id = self._ids.allocate(self._in_flight)
         header = header_to(grant.onward, command, invoke_id)
         route, deadline_ns = grant.route, now_ns + self._limits.timeout_ns
         self._in_flight.add(
@@ -105,7 +108,7 @@ _HANDLE = 4
 _ADD = AmsCommand.ADD_NOTIFICATION.value  # plain numbers: members of enums are slow
 _DELETE = AmsCommand.DELETE_NOTIFICATION.value
 _READ_WRITE = AmsCommand.READ_WRITE.value
-FOLLOWED = frozenset((_ADD, _DELETE, _READ_WRITE))
+TRACKED_COMMANDS = frozenset((_ADD, _DELETE, _READ_WRITE))
 """Commands that may be about notifications."""
 _LOOKUPS = frozenset(
     (
@@ -164,7 +167,7 @@ class NotificationForwarder:
         self._transports = transports
         self._symbols: dict[Endpoint, OrderedDict[tuple[bytes, int, int], bytes]] = {}
 
-    def find_own(
+    def find_deleted(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint
     ) -> list[Subscription] | None:
         """Return the subscriptions of this client that a request deletes.
@@ -174,17 +177,19 @@ class NotificationForwarder:
         handles = deleted_handles(header, data)
         if not handles:
             return None
-        asked = data[: ADDRESSES.size]
+        addresses = data[: ADDRESSES.size]
         find = self.subscriptions.find_of_client
-        found = [find(endpoint, asked, handle) for handle in handles]
+        found = [find(endpoint, addresses, handle) for handle in handles]
         return [each for each in found if each is not None] or None
 
-    def has_room(self, header: AmsHeader, data: bytes, endpoint: Endpoint) -> bool:
+    def is_within_limits(self, header: AmsHeader, data: bytes, endpoint: Endpoint) -> bool:
         """Say whether a client may have the notifications that it asks for."""
         count = _count_of(header, data[AmsHeader.SIZE :])
-        return not count or self.subscriptions.has_room(endpoint, data[: ADDRESSES.size], count)
+        return not count or self.subscriptions.is_within_limits(
+            endpoint, data[: ADDRESSES.size], count
+        )
 
-    def follow_request(self, pending: Pending, body: bytes, endpoint: Endpoint) -> None:
+    def track_request(self, pending: Pending, body: bytes, endpoint: Endpoint) -> None:
         """Note which notifications a client asks for, and which symbol it looks up."""
         header = pending.header
         pending.handles = _count_of(header, body)
@@ -194,22 +199,22 @@ class NotificationForwarder:
             is_first = (transport.is_stream or transport.is_shared) and not is_marked(
                 header.invoke_id
             )
-            pending.asked_for = body if is_first else b""
+            pending.request_body = body if is_first else b""
 
-    def follow_answer(
+    def track_answer(
         self, pending: Pending, header: AmsHeader, body: bytes, now_ns: int
     ) -> Granted | None:
         """Note the notifications that were granted, if any were asked for."""
-        endpoint, route = pending.came_by, pending.route
+        endpoint, route = pending.endpoint, pending.route
         if header.error_code or route is None:
             return None
         if not pending.handles:
-            if pending.asked_for and endpoint is not None:
+            if pending.request_body and endpoint is not None:
                 self._note_symbol(pending, body, endpoint)
             return None
         start = 0 if header.command == AmsCommand.ADD_NOTIFICATION else _SUM_HEAD
         granted = Granted(body, [], [], [])
-        asked = _addresses(pending.header)
+        addresses = _addresses(pending.header)
         requests = _requests_of(pending)
         for number in range(pending.handles):
             at = start + number * _GRANTED.size
@@ -223,8 +228,8 @@ class NotificationForwarder:
                 granted.surplus.append(grant)
                 continue
             request = requests[number] if requests else None
-            symbol = self._symbol_of(endpoint, asked, request)
-            subscription = Subscription(endpoint, asked, grant, now_ns, request, symbol)
+            symbol = self._symbol_of(endpoint, addresses, request)
+            subscription = Subscription(endpoint, addresses, grant, now_ns, request, symbol)
             displaced = self.subscriptions.add(subscription)
             granted.new.append(subscription)
             if displaced is not None:
@@ -249,8 +254,8 @@ class NotificationForwarder:
         handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
         return any(self.subscriptions.find(onward, handle) is not None for handle in handles)
 
-    def hand_on(
-        self, header: AmsHeader, data: bytes, now_ns: int, is_hop: Callable[[Endpoint], bool]
+    def distribute(
+        self, header: AmsHeader, data: bytes, now_ns: int, is_from_hop: Callable[[Endpoint], bool]
     ) -> Samples:
         """Return what the clients get of a notification.
 
@@ -258,13 +263,14 @@ class NotificationForwarder:
             CodecError: it is shorter or longer than it says.
         """
         body = data[AmsHeader.SIZE :]
-        division = divide(body, _back(header), self.subscriptions, now_ns, is_hop)
+        division = divide(body, _back(header), self.subscriptions, now_ns, is_from_hop)
         replies = []
-        for endpoint, asked, part in division.parts:
-            addresses = asked[8:] + asked[:8]
+        for endpoint, addresses, part in division.parts:
             length = len(part).to_bytes(4, "little")
             head = data[ADDRESSES.size : _LENGTH.start] + length
-            packet = addresses + head + data[_LENGTH.stop : AmsHeader.SIZE] + part
+            packet = (
+                addresses[8:] + addresses[:8] + head + data[_LENGTH.stop : AmsHeader.SIZE] + part
+            )
             replies.append(self._transports.reply(endpoint, packet))
         return Samples(replies, division.ended, division.unknown, division.hop)
 
@@ -274,27 +280,27 @@ class NotificationForwarder:
         return self.subscriptions.close(endpoint)
 
     def _note_symbol(self, pending: Pending, body: bytes, endpoint: Endpoint) -> None:
-        place = symbol_place(pending.asked_for, body)
-        if place is None or len(pending.asked_for) > _LONGEST_LOOKUP:
+        place = symbol_location(pending.request_body, body)
+        if place is None or len(pending.request_body) > _LONGEST_LOOKUP:
             return
         mine = self._symbols.setdefault(endpoint, OrderedDict())
         key = _addresses(pending.header), *place
-        mine[key] = pending.asked_for
+        mine[key] = pending.request_body
         mine.move_to_end(key)
         if len(mine) > _MAX_SYMBOLS:
             mine.popitem(last=False)
 
     def _symbol_of(
-        self, endpoint: Endpoint, asked: bytes, request: AddNotification | None
+        self, endpoint: Endpoint, addresses: bytes, request: AddNotification | None
     ) -> bytes:
         mine = self._symbols.get(endpoint)
         if request is None or mine is None:
             return b""
         group = IndexGroup.VALUE_BY_HANDLE if request.group in BY_HANDLE else request.group
-        return mine.get((asked, group, request.offset), b"")
+        return mine.get((addresses, group, request.offset), b"")
 
 
-def symbol_place(lookup: bytes, answer: bytes) -> tuple[int, int] | None:
+def symbol_location(lookup: bytes, answer: bytes) -> tuple[int, int] | None:
     """Return group and offset of a symbol from the answer to its *lookup*, None if it has none."""
     group = int.from_bytes(lookup[:4], "little")
     if group == IndexGroup.SYMBOL_HANDLE:
@@ -351,7 +357,7 @@ def _count_of(header: AmsHeader, body: bytes) -> int:
 
 def _requests_of(pending: Pending) -> list[AddNotification]:
     """Return the parameters of the notifications that were asked for, if they are kept here."""
-    octets = pending.asked_for
+    octets = pending.request_body
     if not octets:
         return []
     if pending.header.command != _ADD:

@@ -26,7 +26,7 @@ from eap.errors import MalformedError
 from eap.ids import NetId
 
 
-class TooLong(NamedTuple):
+class OversizedPacket(NamedTuple):
     """A packet over the limit: only its header is kept, the rest is thrown away as it comes."""
 
     header: AmsHeader
@@ -34,21 +34,21 @@ class TooLong(NamedTuple):
     """Of the whole packet in octets, as its prefix says."""
 
 
-class Asked(NamedTuple):
+class RouterRequest(NamedTuple):
     """What a local client asks the router itself."""
 
     command: RouterCommand
     data: bytes
 
 
-Piece: TypeAlias = bytes | TooLong | Asked
+StreamItem: TypeAlias = bytes | OversizedPacket | RouterRequest
 
 _COMMANDS = frozenset(RouterCommand)
 _LONGEST_COMMAND = 16
 """Octets behind the prefix of one."""
 
 
-class PacketCutter:
+class AmsStreamDecoder:
     """What a connection brought and has not been taken yet.
 
     It never holds more than one packet of the limit, one prefix, and what came last.
@@ -88,7 +88,7 @@ class PacketCutter:
         self.receive(data)
         return None
 
-    def next_piece(self) -> Piece | None:
+    def next_item(self) -> StreamItem | None:
         """Return the next whole packet, None if there is none yet.
 
         Raises:
@@ -108,7 +108,7 @@ class PacketCutter:
         del self._buffer[: start + length]
         return packet
 
-    def _cut_command(self) -> Asked | None:
+    def _cut_command(self) -> RouterRequest | None:
         start, prefix = AmsTcpHeader.SIZE, AmsTcpHeader.decode(self._buffer)
         end = start + prefix.length
         if prefix.length > _LONGEST_COMMAND:
@@ -119,11 +119,11 @@ class PacketCutter:
             )
         if len(self._buffer) < end:
             return None
-        asked = Asked(RouterCommand(prefix.reserved), bytes(self._buffer[start:end]))
+        request = RouterRequest(RouterCommand(prefix.reserved), bytes(self._buffer[start:end]))
         del self._buffer[:end]
-        return asked
+        return request
 
-    def _cut_header(self, length: int) -> TooLong | None:
+    def _cut_header(self, length: int) -> OversizedPacket | None:
         start = AmsTcpHeader.SIZE
         if len(self._buffer) < start + AmsHeader.SIZE:
             return None
@@ -131,7 +131,7 @@ class PacketCutter:
         here = min(start + length, len(self._buffer))
         self._skip = start + length - here
         del self._buffer[:here]
-        return TooLong(header, length)
+        return OversizedPacket(header, length)
 
 
 FRAGMENT_TIMEOUT_NS = 2_000_000_000
@@ -145,19 +145,19 @@ _ADDRESSES = 16
 _REST = AmsHeader.SIZE - _ADDRESSES
 
 
-def iter_fragments(packet: bytes, number: int, room: int) -> Iterator[bytes]:
-    """Yield the packets that carry *packet*, each with at most *room* octets of it.
+def iter_fragments(packet: bytes, number: int, max_size: int) -> Iterator[bytes]:
+    """Yield the packets that carry *packet*, each with at most *max_size* octets of it.
 
     Nobody acknowledges them.
 
     Args:
         packet: A whole packet.
         number: Of the packet, another one for each; 16 bits count.
-        room: Octets behind the header of each.
+        max_size: Octets behind the header of each.
     """
     header = AmsHeader.decode(packet)
     content = packet[_ADDRESSES:]
-    for fragment, at in enumerate(range(0, len(content), room)):
+    for fragment, at in enumerate(range(0, len(content), max_size)):
         head = AmsHeader(
             header.target,
             header.target_port,
@@ -167,10 +167,10 @@ def iter_fragments(packet: bytes, number: int, room: int) -> Iterator[bytes]:
             StateFlags.ADS | StateFlags.NO_RETURN,
             invoke_id=(number & 0xFFFF) << 16 | fragment,
         )
-        yield encode_packet(head, content[at : at + room])
+        yield encode_packet(head, content[at : at + max_size])
 
 
-class _Partial:
+class _PartialPacket:
     """What came so far of one packet."""
 
     __slots__ = ("content", "deadline_ns", "next")
@@ -181,7 +181,7 @@ class _Partial:
         self.deadline_ns = 0
 
 
-class Taken(NamedTuple):
+class ReassemblyResult(NamedTuple):
     """What a fragment leads to."""
 
     packet: bytes | None
@@ -190,7 +190,7 @@ class Taken(NamedTuple):
     """What the sender waits for before it sends the next."""
 
 
-class Assembler:
+class FragmentAssembler:
     """Puts fragments together again.
 
     Attributes:
@@ -201,7 +201,7 @@ class Assembler:
     def __init__(self) -> None:
         self.dropped = 0
         self.octets = 0
-        self._partial: dict[tuple[int, NetId, int], _Partial] = {}
+        self._partial: dict[tuple[int, NetId, int], _PartialPacket] = {}
 
     def reset(self) -> None:
         """Forget the packets that are not complete."""
@@ -211,7 +211,7 @@ class Assembler:
     def __len__(self) -> int:
         return len(self._partial)
 
-    def receive(self, header: AmsHeader, body: bytes, now_ns: int) -> Taken:
+    def receive(self, header: AmsHeader, body: bytes, now_ns: int) -> ReassemblyResult:
         """Take the fragment with *header* and *body*.
 
         Raises:
@@ -237,9 +237,9 @@ class Assembler:
             raise MalformedError(f"packet {number} is {-missing} octets too long",
                                  layout="AmsHeader")  # fmt: skip
         if missing:
-            return Taken(None, _acknowledge(header))
+            return ReassemblyResult(None, _acknowledge(header))
         self._forget(key)
-        return Taken(header.encode()[:_ADDRESSES] + bytes(partial.content), None)
+        return ReassemblyResult(header.encode()[:_ADDRESSES] + bytes(partial.content), None)
 
     def expire(self, now_ns: int) -> None:
         """Forget the packets whose next fragment is late."""
@@ -251,7 +251,7 @@ class Assembler:
             self._drop(key)
         elif len(self._partial) >= MAX_PACKETS:
             self._drop(next(iter(self._partial)))
-        self._partial[key] = _Partial()
+        self._partial[key] = _PartialPacket()
 
     def _drop(self, key: tuple[int, NetId, int]) -> None:
         self._forget(key)
@@ -305,7 +305,7 @@ class Reassembly:
 
     def __init__(self) -> None:
         self.dropped = 0
-        self._senders: OrderedDict[Endpoint, Assembler] = OrderedDict()
+        self._senders: OrderedDict[Endpoint, FragmentAssembler] = OrderedDict()
         self._octets = 0
 
     @property
@@ -313,14 +313,16 @@ class Reassembly:
         """Octets that are kept."""
         return self._octets
 
-    def receive(self, endpoint: Endpoint, header: AmsHeader, body: bytes, now_ns: int) -> Taken:
+    def receive(
+        self, endpoint: Endpoint, header: AmsHeader, body: bytes, now_ns: int
+    ) -> ReassemblyResult:
         """Take a fragment that came by *endpoint*.
 
         Raises:
             MalformedError: it does not fit to the one before it, the whole is too long, or too
                 much is kept already.
         """
-        assembler = self._of(endpoint, now_ns)
+        assembler = self._assembler_of(endpoint, now_ns)
         before = assembler.octets, assembler.dropped
         try:
             taken = assembler.receive(header, body, now_ns)
@@ -339,7 +341,7 @@ class Reassembly:
         if assembler is not None:
             self._octets -= assembler.octets
 
-    def _of(self, endpoint: Endpoint, now_ns: int) -> Assembler:
+    def _assembler_of(self, endpoint: Endpoint, now_ns: int) -> FragmentAssembler:
         assembler = self._senders.get(endpoint)
         if assembler is not None:
             return assembler
@@ -347,7 +349,7 @@ class Reassembly:
             self._expire(now_ns)
         if len(self._senders) >= MAX_SENDERS:
             self._drop(next(iter(self._senders)))
-        assembler = self._senders[endpoint] = Assembler()
+        assembler = self._senders[endpoint] = FragmentAssembler()
         return assembler
 
     def _expire(self, now_ns: int) -> None:
@@ -356,7 +358,9 @@ class Reassembly:
             assembler.expire(now_ns)
             self._account(endpoint, assembler, before)
 
-    def _account(self, endpoint: Endpoint, assembler: Assembler, before: tuple[int, int]) -> None:
+    def _account(
+        self, endpoint: Endpoint, assembler: FragmentAssembler, before: tuple[int, int]
+    ) -> None:
         self._octets += assembler.octets - before[0]
         self.dropped += assembler.dropped - before[1]
         if not len(assembler):

@@ -41,7 +41,7 @@ class Trace(NamedTuple):
 
     at_ns: int
     outcome: Outcome
-    came_by: Endpoint | None
+    endpoint: Endpoint | None
     """None if its connection is gone."""
     hop: Endpoint | None
     """None if it went no further."""
@@ -53,7 +53,7 @@ class Trace(NamedTuple):
     text: str
 
 
-MAX_WAYS = 4096
+MAX_ENDPOINTS = 4096
 """Ways that are counted at a time; the one that was there first makes room."""
 MAX_SOURCES = 8
 """NetIDs that are remembered of those who ask by one way."""
@@ -69,8 +69,8 @@ class Traffic(msgspec.Struct):
         requests: That went there, or came from there.
         answers: That came from there, or went there.
         errors: Requests that did not get to their targets.
-        octets_asked: Octets of the requests.
-        octets_answered: Octets of the answers.
+        request_bytes: Octets of the requests.
+        answer_bytes: Octets of the answers.
         round_trip_ns: Of the latest answer.
         last_error: In words.
         sources: NetIDs that asked, the first of them.
@@ -81,28 +81,28 @@ class Traffic(msgspec.Struct):
     requests: int = 0
     answers: int = 0
     errors: int = 0
-    octets_asked: int = 0
-    octets_answered: int = 0
+    request_bytes: int = 0
+    answer_bytes: int = 0
     round_trip_ns: int = 0
     last_error: str = ""
     sources: tuple[NetId, ...] = ()
     is_answered: bool = False
 
-    def ask(self, octets: int, source: NetId | None = None) -> None:
+    def add_request(self, octets: int, source: NetId | None = None) -> None:
         """Count a request."""
         self.requests += 1
-        self.octets_asked += octets
+        self.request_bytes += octets
         if source is not None and source not in self.sources and len(self.sources) < MAX_SOURCES:
             self.sources += (source,)
 
-    def answer(self, octets: int, took_ns: int) -> None:
+    def add_answer(self, octets: int, took_ns: int) -> None:
         """Count an answer."""
         self.answers += 1
-        self.octets_answered += octets
+        self.answer_bytes += octets
         self.round_trip_ns = took_ns
         self.is_answered = True
 
-    def fail(self, text: str) -> None:
+    def add_error(self, text: str) -> None:
         """Count a request that did not get to its target."""
         self.errors += 1
         self.last_error = text
@@ -119,7 +119,7 @@ class TrafficTable(Generic[KeyT]):
         """Return the traffic of *endpoint*, which may be new."""
         traffic = self._endpoints.get(endpoint)
         if traffic is None:
-            if len(self._endpoints) >= MAX_WAYS:
+            if len(self._endpoints) >= MAX_ENDPOINTS:
                 self._endpoints.popitem(last=False)
             traffic = self._endpoints[endpoint] = Traffic(now_ns)
         return traffic
@@ -173,10 +173,10 @@ class Record:
         """Take the oldest trace of what was not simply answered."""
         return self._events.popleft() if self._events else None
 
-    def enter(self, trace: Trace) -> None:
+    def add(self, trace: Trace) -> None:
         """Remember what became of a packet."""
         self.counts[trace.outcome] += 1
-        if _is_life(trace):
+        if _is_probe(trace):
             return
         self.latest.append(trace)
         if trace.outcome is _ANSWERED and not trace.error_code and not trace.text:
@@ -202,7 +202,7 @@ class Stats(msgspec.Struct, frozen=True):
     counts: dict[Outcome, int]
 
 
-def _is_life(trace: Trace) -> bool:
+def _is_probe(trace: Trace) -> bool:
     """Say whether a router was told that this one lives, as it is every second."""
     header = trace.header
     return (
@@ -218,7 +218,7 @@ def reason_of(trace: Trace) -> str:
     """Return the text of a trace without the request that it is about."""
     if trace.header is None:
         return trace.text
-    return trace.text.removeprefix(f"{describe(trace.header, trace.came_by)}: ")
+    return trace.text.removeprefix(f"{describe(trace.header, trace.endpoint)}: ")
 
 
 def describe(header: AmsHeader, endpoint: Endpoint | None = None) -> str:

@@ -105,7 +105,7 @@ def report_route(
         return RouteReport(route, obstacle.state, obstacle.why, None, known, next_name)
     if round_trip_ns is None and known.answers:
         round_trip_ns = known.round_trip_ns
-    is_up = known.is_answered or (hop_prober is not None and hop_prober.is_heard(route.hop))
+    is_up = known.is_answered or (hop_prober is not None and hop_prober.has_answered(route.hop))
     state = RouteState.UP if is_up else RouteState.UNKNOWN
     return RouteReport(route, state, "", round_trip_ns, known, next_name)
 
@@ -160,10 +160,12 @@ def advise(
             text=f"there is no route to {target}",
             hint="add one: 'eapctl routes add', or under routes in the plant file",
         )
-    return _behind(error, words, target, route, own)
+    return _advise_on_route(error, words, target, route, own)
 
 
-def _behind(error: int, words: str, target: NetId, report: RouteReport, own: NetId) -> Advice:
+def _advise_on_route(
+    error: int, words: str, target: NetId, report: RouteReport, own: NetId
+) -> Advice:
     """Say what is wrong with a route, or behind it."""
     hop = report.route.hop
     where = f"{report.next_name} ({hop})"

@@ -12,8 +12,8 @@ from typing import TypeAlias
 from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
 from eap.ams.access_filter import AccessFilter
-from eap.ams.admission import Limits
-from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
+from eap.ams.admission import RouterLimits
+from eap.ams.error_reply import ErrorReplier, RoutingError, wants_answer
 from eap.ams.forwarder import Forwarder
 from eap.ams.hop_prober import MISSES, HopProber
 from eap.ams.reassembly import Reassembly
@@ -32,7 +32,7 @@ _FRAGMENT = AmsCommand.FRAGMENT.value
 _NOTIFICATION = AmsCommand.NOTIFICATION.value
 _PLC_PORTS = frozenset((801, 811, 821, 831, *range(851, 860)))
 """Of the runtimes of TwinCAT 2 and 3."""
-_NOBODY = 0
+_NO_TICKET = 0
 """Ticket of a request that has no answer."""
 
 
@@ -67,7 +67,7 @@ class Router:
         transports: Iterable[Transport],
         *,
         first_invoke_id: int,
-        limits: Limits | None = None,
+        limits: RouterLimits | None = None,
         hop_prober: HopProber | None = None,
         access: AccessList | None = None,
         answer_now: AnswerNow | None = None,
@@ -84,7 +84,7 @@ class Router:
         self._fragments = Reassembly()
         self._forwarder = Forwarder(
             net_id, table, self._transports, self._error_replier, self.record, self.access_filter,
-            first_invoke_id=first_invoke_id, limits=limits or Limits(), hop_prober=hop_prober,
+            first_invoke_id=first_invoke_id, limits=limits or RouterLimits(), hop_prober=hop_prober,
         )  # fmt: skip
 
     def add_device(self, net_id: NetId, ports: Container[int]) -> None:
@@ -98,16 +98,16 @@ class Router:
     def remove_transport(self, name: str, now_ns: int) -> list[Action]:
         """Forget a door, and whoever waits at it; answer what waits for those behind it."""
         actions: list[Action] = []
-        for endpoint in self._forwarder.ways_of(name):
+        for endpoint in self._forwarder.endpoints_of(name):
             actions += self.connection_closed(*endpoint, now_ns)
         actions += self._forwarder.hop_lost(name, None, f"{name} is there no more", now_ns)
-        self._forwarder.door_removed(name)
+        self._forwarder.transport_removed(name)
         self._transports.remove(name)
         return actions
 
-    def hop_is_at(self, transport: str, address: str, connection: str) -> None:
+    def set_hop_connection(self, transport: str, address: str, connection: str) -> None:
         """Take what comes by *connection* for what comes from the hop that is named *address*."""
-        self._transports.note_place(Endpoint(transport, address), connection)
+        self._transports.set_connection(Endpoint(transport, address), connection)
 
     def is_waiting_for(self, header: AmsHeader, body: bytes, transport: str) -> bool:
         """Say whether a client of this router waits for a packet: for the answer or the sample.
@@ -126,7 +126,13 @@ class Router:
         return is_notification and self._forwarder.notification_forwarder.knows(header, body)
 
     def receive_packet(
-        self, data: bytes, transport: str, connection: str, now_ns: int, *, for_all: bool = False
+        self,
+        data: bytes,
+        transport: str,
+        connection: str,
+        now_ns: int,
+        *,
+        is_broadcast: bool = False,
     ) -> list[Action]:
         """Act on a packet, or on the fragment of one; nothing that a peer sends raises.
 
@@ -135,7 +141,7 @@ class Router:
             transport: That it came by.
             connection: That it came by, or its sender's address.
             now_ns: The time on the monotonic clock.
-            for_all: Whether others got it too: who is not meant says nothing.
+            is_broadcast: Whether others got it too: who is not meant says nothing.
         """
         endpoint = Endpoint(transport, connection)
         try:
@@ -145,10 +151,10 @@ class Router:
                 _, body = decode_packet(data)
                 if header.command == _FRAGMENT:
                     return self._receive_fragment(
-                        header, bytes(body), endpoint, now_ns, for_all=for_all
+                        header, bytes(body), endpoint, now_ns, is_broadcast=is_broadcast
                     )
                 data = data[:end]
-            return self._receive_whole(header, data, endpoint, now_ns, for_all=for_all)
+            return self._receive_whole(header, data, endpoint, now_ns, is_broadcast=is_broadcast)
         except CodecError as exc:
             return self._error_replier.drop(endpoint, None, Outcome.DROPPED, str(exc), now_ns)
 
@@ -230,16 +236,16 @@ class Router:
                 if probe.is_gone:
                     self._gone.append(probe.hop)
                 if probe.hop.transport in self._transports.transports:
-                    actions.append(self._transports.forward(probe.hop, probe.packet, _NOBODY))
+                    actions.append(self._transports.forward(probe.hop, probe.packet, _NO_TICKET))
         return actions
 
-    def take_gone_hops(self) -> list[Endpoint]:
+    def pop_gone_hops(self) -> list[Endpoint]:
         """Return the hops that have been dead for so long that nothing is kept for them."""
         gone, self._gone = self._gone, []
         return gone
 
     @property
-    def has_news(self) -> bool:
+    def has_events(self) -> bool:
         """Whether there are traces or entries of the audit to be taken."""
         return self.record.has_events or self.access_filter.has_entries
 
@@ -262,9 +268,9 @@ class Router:
             text = _no_port(header)
             return Location(True, None, "" if header.target_port in ports else text, may)
         found = self._forwarder.find_route(header, endpoint)
-        route, why = (found.route, found.text) if isinstance(found, Refusal) else (found, "")
+        route, why = (found.route, found.text) if isinstance(found, RoutingError) else (found, "")
         found_route = None if route is None else self.report(route)
-        missing = [each for each in self.interruptions() if each.asked[:6] == header.target]
+        missing = [each for each in self.interruptions() if each.addresses[:6] == header.target]
         number = sum(each.number for each in missing)
         since_ns = min((each.since_ns for each in missing), default=None)
         return Location(False, found_route, why, may, number, since_ns)
@@ -288,38 +294,42 @@ class Router:
         )
 
     def _receive_fragment(
-        self, header: AmsHeader, body: bytes, endpoint: Endpoint, now_ns: int, *, for_all: bool
+        self, header: AmsHeader, body: bytes, endpoint: Endpoint, now_ns: int, *, is_broadcast: bool
     ) -> list[Action]:
         if header.state_flags & _RESPONSE:
             return []  # ours want no acknowledgement
         packet, acknowledgement = self._fragments.receive(endpoint, header, body, now_ns)
         if packet is None:
             return (
-                [] if acknowledgement is None or for_all else [Reply(endpoint, (acknowledgement,))]
+                []
+                if acknowledgement is None or is_broadcast
+                else [Reply(endpoint, (acknowledgement,))]
             )
         whole, _ = decode_packet(packet)
         if whole.command == _FRAGMENT:
             raise MalformedError("a fragment in fragments", layout="AmsHeader")
-        return self._receive_whole(whole, packet, endpoint, now_ns, for_all=for_all)
+        return self._receive_whole(whole, packet, endpoint, now_ns, is_broadcast=is_broadcast)
 
     def _receive_whole(
-        self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, *, for_all: bool
+        self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, *, is_broadcast: bool
     ) -> list[Action]:
         if header.state_flags & _RESPONSE:
             return self._receive_answer(header, data, endpoint, now_ns)
         ports = self._devices.get(header.target)
-        if ports is None and for_all:
+        if ports is None and is_broadcast:
             return []
-        self.record.connections.of(endpoint, now_ns).ask(len(data), header.source)
+        self.record.connections.of(endpoint, now_ns).add_request(len(data), header.source)
         if header.command == _NOTIFICATION:
             is_own = ports is not None
-            return self._forwarder.take_notification(header, data, endpoint, now_ns, is_own=is_own)
+            return self._forwarder.forward_notification(
+                header, data, endpoint, now_ns, is_own=is_own
+            )
         if header.source in self._devices and not self.access_filter.is_this_host(endpoint):
             text = f"it comes back to where it began: {header.source} is of this station"
-            why = Refusal(AdsError.TARGET_MACHINE, text, outcome=Outcome.LOOP)
-            return self._error_replier.refuse(header, endpoint, why, now_ns)
+            why = RoutingError(AdsError.TARGET_MACHINE, text, outcome=Outcome.LOOP)
+            return self._error_replier.reply_error(header, endpoint, why, now_ns)
         if ports is None:
-            return self._forwarder.take_request(header, data, endpoint, now_ns)
+            return self._forwarder.forward_request(header, data, endpoint, now_ns)
         return self._deliver(header, data, endpoint, ports, now_ns)
 
     def _receive_answer(
@@ -327,9 +337,9 @@ class Router:
     ) -> list[Action]:
         hop_prober = self._hop_prober
         if hop_prober is None or not hop_prober.is_answer(header):
-            return self._forwarder.take_answer(header, data, endpoint, now_ns)
+            return self._forwarder.return_answer(header, data, endpoint, now_ns)
         body = data[AmsHeader.SIZE :]
-        hop = hop_prober.take_answer(header, body, endpoint, now_ns, self._transports.is_from)
+        hop = hop_prober.receive_answer(header, body, endpoint, now_ns, self._transports.is_from)
         if hop is None:
             return []
         # Requests stay: those that were asked since then are answered.
@@ -339,11 +349,11 @@ class Router:
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, ports: Container[int], now_ns: int
     ) -> list[Action]:
         if header.target_port not in ports:
-            why = Refusal(AdsError.TARGET_PORT, _no_port(header))
-            return self._error_replier.refuse(header, endpoint, why, now_ns)
-        through = self.access_filter.let_through(header, data, endpoint, now_ns)
-        if isinstance(through, Refusal):
-            return self._error_replier.refuse(header, endpoint, through, now_ns)
+            why = RoutingError(AdsError.TARGET_PORT, _no_port(header))
+            return self._error_replier.reply_error(header, endpoint, why, now_ns)
+        through = self.access_filter.filter_request(header, data, endpoint, now_ns)
+        if isinstance(through, RoutingError):
+            return self._error_replier.reply_error(header, endpoint, through, now_ns)
         data, authorized = through
         body = data[AmsHeader.SIZE :]
         if authorized is None and self._answer_now is not None and wants_answer(header):
@@ -352,8 +362,8 @@ class Router:
                 return self._forwarder.answer_now(header, endpoint, *answer, now_ns)
         if not wants_answer(header):
             if authorized is not None:
-                self.access_filter.give_up(authorized)
-            return [Deliver(_NOBODY, header, body, endpoint)]
+                self.access_filter.abandon(authorized)
+            return [Deliver(_NO_TICKET, header, body, endpoint)]
         ticket = self._forwarder.wait_for_service(header, data, endpoint, authorized, now_ns)
         return [Deliver(ticket, header, body, endpoint)] if isinstance(ticket, int) else ticket
 

@@ -19,7 +19,7 @@ DEFAULT_TARGET = "default"
 """Name of a route that takes what no other one does."""
 
 
-class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SpecStruct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all specifications."""
 
 
@@ -38,11 +38,11 @@ class TransportKind(StrEnum):
     """Programs of this appliance."""
 
 
-IP_DOORS = frozenset((TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP))
+IP_TRANSPORTS = frozenset((TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP))
 """Kinds of doors whose connections begin with an IPv4 address."""
 
 
-class HopSpec(Record, frozen=True):
+class HopSpec(SpecStruct, frozen=True):
     """Where packets go from here.
 
     Attributes:
@@ -59,7 +59,7 @@ class HopSpec(Record, frozen=True):
     address: str
 
 
-class RouteSpec(Record, frozen=True, kw_only=True):
+class RouteSpec(SpecStruct, frozen=True, kw_only=True):
     """One route.
 
     Attributes:
@@ -107,7 +107,7 @@ class AccessService(StrEnum):
     """EtherCAT commands for a bus, VoE, and what cannot be understood."""
 
 
-class ObjectRange(Record, frozen=True):
+class ObjectRange(SpecStruct, frozen=True):
     """Objects from *first* to *last*, and of these the subindexes from *low* to *high*."""
 
     first: int
@@ -134,7 +134,7 @@ class ObjectRange(Record, frozen=True):
         )
 
 
-class AccessTarget(Record, frozen=True):
+class AccessTarget(SpecStruct, frozen=True):
     """Whoever is behind a NetID, given by its first four, five or all six octets.
 
     *port* is None for all its AMS ports.
@@ -144,7 +144,7 @@ class AccessTarget(Record, frozen=True):
     port: int | None = None
 
 
-class AccessRule(Record, frozen=True):
+class AccessRule(SpecStruct, frozen=True):
     """What some may do, or may not; of several rules the first that fits counts.
 
     An empty tuple stands for anything; otherwise one of its items has to fit.
@@ -173,7 +173,7 @@ class AccessRule(Record, frozen=True):
     macs: tuple[str, ...] = ()
 
 
-class AmsUser(Record, frozen=True):
+class AmsUser(SpecStruct, frozen=True):
     """Who may add a route from elsewhere; the first line of *password_file* is the password."""
 
     name: str
@@ -181,7 +181,7 @@ class AmsUser(Record, frozen=True):
     """Absolute path; read whenever it is needed."""
 
 
-class TlsSpec(Record, frozen=True):
+class TlsSpec(SpecStruct, frozen=True):
     """How a connection is kept secret; paths are absolute, PEM.
 
     Attributes:
@@ -197,7 +197,7 @@ class TlsSpec(Record, frozen=True):
     check_name: bool = True
 
 
-class MqttSpec(Record, frozen=True, kw_only=True):
+class MqttSpec(SpecStruct, frozen=True, kw_only=True):
     """A broker by which stations reach each other.
 
     Attributes:
@@ -228,7 +228,7 @@ class MqttSpec(Record, frozen=True, kw_only=True):
     is_prefixed: bool = False
 
 
-class RoutingSpec(Record, frozen=True, kw_only=True):
+class RoutingSpec(SpecStruct, frozen=True, kw_only=True):
     """All that the router of a station is told.
 
     Attributes:
@@ -260,7 +260,7 @@ class RoutingSpec(Record, frozen=True, kw_only=True):
         return any(IPv4Address(address) in IPv4Network(each) for each in networks)
 
 
-class DirectoryPort(Record, frozen=True):
+class DirectoryPort(SpecStruct, frozen=True):
     """A port by name; *slaves* are station addresses by the names of the slaves."""
 
     name: str
@@ -270,7 +270,7 @@ class DirectoryPort(Record, frozen=True):
     slaves: dict[str, int] = {}
 
 
-class DirectoryStation(Record, frozen=True):
+class DirectoryStation(SpecStruct, frozen=True):
     """A station by name, whether it runs here or not."""
 
     name: str

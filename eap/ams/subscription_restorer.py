@@ -26,10 +26,15 @@ from typing import NamedTuple, TypeAlias
 import msgspec
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.admission import Limits
-from eap.ams.error_reply import ErrorReplier, Refusal
+from eap.ams.admission import RouterLimits
+from eap.ams.error_reply import ErrorReplier, RoutingError
 from eap.ams.inflight import InFlight, InvokeIds, Pending
-from eap.ams.notification_forwarder import BY_HANDLE, NotificationCleanup, header_to, symbol_place
+from eap.ams.notification_forwarder import (
+    BY_HANDLE,
+    NotificationCleanup,
+    header_to,
+    symbol_location,
+)
 from eap.ams.record import Outcome
 from eap.ams.routes import Route
 from eap.ams.subscriptions import Grant, Subscription, Subscriptions, key_of
@@ -41,16 +46,16 @@ RETRY_NS = 500_000_000
 """Between two attempts for one pair of addresses."""
 SPACING_NS = 10_000_000
 """Between two requests at all, on the average: many pairs are tried less often."""
-_LOOK_SPACING_NS = 1_000_000
+_LOOKUP_SPACING_NS = 1_000_000
 """Likewise, between two looks for a way that find none, which cost no packet."""
 GROUP = 32
 """Subscriptions of one pair of addresses that are asked for at a time."""
-MAX_ASKED = 128
+MAX_REQUESTS = 128
 """Requests of restorations that wait for answers."""
 TIMEOUT_NS = 2_000_000_000
 """Limit for an answer; then the request is repeated with twice the limit, up to that of requests of
 clients: a slow server is restored too."""
-PATIENCE_NS = 5_000_000_000
+STARTUP_TIMEOUT_NS = 5_000_000_000
 """Limit for refusals with an error that may pass, as while a server starts."""
 MAX_ENDS = 3
 """Ends of a subscription by its server without a sample between them."""
@@ -60,7 +65,7 @@ _SPARE_CHECKS = 256
 """Checks of subscriptions that have ended, before they are dropped ahead of their time."""
 _GRANTED = 8
 """Bytes of the answer of AddNotification: result and handle."""
-_OF_THE_WAY = frozenset(
+_PATH_ERRORS = frozenset(
     (
         AdsError.MAILBOX_FULL, AdsError.TARGET_MACHINE, AdsError.PORT_NOT_CONNECTED,
         AdsError.TCP_SEND, AdsError.HOST_UNREACHABLE, AdsError.NOT_READY, AdsError.BUSY,
@@ -69,7 +74,7 @@ _OF_THE_WAY = frozenset(
     )
 )  # fmt: skip
 """Errors that say nothing about the object."""
-_OF_THE_START = frozenset(
+_STARTUP_ERRORS = frozenset(
     (
         AdsError.TARGET_PORT, AdsError.GENERAL, AdsError.NO_MEMORY, AdsError.STATE,
         AdsError.NO_MORE_HANDLES,
@@ -77,7 +82,9 @@ _OF_THE_START = frozenset(
 )  # fmt: skip
 """Errors that may pass when the server has started, or has forgotten others."""
 
-FindWay: TypeAlias = Callable[[AmsHeader, bytes, Endpoint, int], tuple[Route, bytes] | Refusal]
+RouteFinder: TypeAlias = Callable[
+    [AmsHeader, bytes, Endpoint, int], tuple[Route, bytes] | RoutingError
+]
 """Returns by which route and with which addresses a request goes on now, or why it does not."""
 
 
@@ -85,7 +92,7 @@ class _Session:
     """Subscriptions with the same addresses of server and client that are to be established."""
 
     __slots__ = (
-        "asked",
+        "addresses",
         "at_ns",
         "endpoint",
         "interrupted_at_ns",
@@ -97,9 +104,9 @@ class _Session:
         "waiting",
     )  # fmt: skip
 
-    def __init__(self, endpoint: Endpoint, asked: bytes, at_ns: int) -> None:
+    def __init__(self, endpoint: Endpoint, addresses: bytes, at_ns: int) -> None:
         self.endpoint = endpoint
-        self.asked = asked
+        self.addresses = addresses
         self.at_ns = at_ns
         self.interrupted_at_ns: int | None = None
         self.restored = 0
@@ -126,7 +133,7 @@ class Interruption(NamedTuple):
     """Subscriptions of one client at one server to which nothing comes."""
 
     endpoint: Endpoint
-    asked: bytes
+    addresses: bytes
     """Addresses of server and client."""
     number: int
     since_ns: int
@@ -141,31 +148,31 @@ class SubscriptionRestorer:
         transports: By which servers are asked.
         in_flight: What waits for an answer, these requests too.
         ids: Of requests of this router.
-        ending: Ends what was granted in vain.
+        cleanup: Ends what was granted in vain.
         error_replier: Takes note of what is given up.
         limits: How much may wait.
-        find_way: Finds the route of a client's request, by the access rules too.
+        find_route: Finds the route of a client's request, by the access rules too.
     """
 
     def __init__(
         self, subscriptions: Subscriptions, transports: TransportTable, in_flight: InFlight,
-        ids: InvokeIds, ending: NotificationCleanup, error_replier: ErrorReplier, limits: Limits,
-        find_way: FindWay,
+        ids: InvokeIds, cleanup: NotificationCleanup, error_replier: ErrorReplier,
+        limits: RouterLimits, find_route: RouteFinder,
     ) -> None:  # fmt: skip
         self._subscriptions = subscriptions
         self._transports = transports
         self._in_flight = in_flight
         self._ids = ids
-        self._ending = ending
+        self._cleanup = cleanup
         self._error_replier = error_replier
         self._limits = limits
-        self._find_way = find_way
+        self._find_request_route = find_route
         self._sessions: dict[bytes, _Session] = {}
         self._due: list[tuple[int, int, _Session]] = []
         self._checks: list[tuple[int, int, Subscription]] = []
         self._numbers = count()
         self._deleting: set[tuple[bytes, int]] = set()
-        self._asked = 0
+        self._outstanding = 0
 
     def watch(self, subscription: Subscription) -> None:
         """Check from time to time whether samples come."""
@@ -173,13 +180,13 @@ class SubscriptionRestorer:
             if len(self._checks) > 2 * len(self._subscriptions) + _SPARE_CHECKS:
                 self._checks = [each for each in self._checks if not each[2].is_closed]
                 heapify(self._checks)
-            at_ns = subscription.heard_at_ns + subscription.quiet_limit_ns()
+            at_ns = subscription.received_at_ns + subscription.quiet_limit_ns()
             heappush(self._checks, (at_ns, next(self._numbers), subscription))
 
     def granted(self, subscription: Subscription, now_ns: int) -> list[Action]:
         """Take note of a new subscription that a client asked for."""
         self.watch(subscription)
-        return self._mistrust(subscription, now_ns)
+        return self._reject_deleted_handle(subscription, now_ns)
 
     def interrupt(
         self, subscriptions: Iterable[Subscription], why: str, now_ns: int
@@ -240,12 +247,12 @@ class SubscriptionRestorer:
         step = pending.step
         assert isinstance(step, _Step)  # noqa: S101  for the type
         step.session.timeouts += error is AdsError.TIMEOUT
-        return self._end_step(pending, step, _failed(pending.header, error), b"", now_ns)
+        return self._end_step(pending, step, _failed_header(pending.header, error), b"", now_ns)
 
     def _end_step(
         self, pending: Pending, step: _Step, header: AmsHeader, body: bytes, now_ns: int
     ) -> list[Action]:
-        self._asked -= 1
+        self._outstanding -= 1
         step.session.outstanding -= 1
         error = header.error_code or int.from_bytes(body[:4], "little")
         if len(body) < 4 and not error:
@@ -255,7 +262,7 @@ class SubscriptionRestorer:
             actions += self._deleted(step, step.stale, error, now_ns)
         elif step.subscription is not None:
             actions += self._answered(pending, step, error, body, now_ns)
-        return actions + self._go_on(step.session, now_ns)
+        return actions + self._continue(step.session, now_ns)
 
     def interruptions(self) -> list[Interruption]:
         """Return what is interrupted now, by client and server."""
@@ -264,7 +271,7 @@ class SubscriptionRestorer:
             since_ns = each.interrupted_at_ns
             if since_ns is None:
                 continue
-            key = each.endpoint, each.asked
+            key = each.endpoint, each.addresses
             known = found.get(key, Interruption(*key, 0, since_ns, each.why))
             found[key] = known._replace(
                 number=known.number + 1, since_ns=min(since_ns, known.since_ns)
@@ -283,7 +290,7 @@ class SubscriptionRestorer:
             self._check(heappop(self._checks)[2], now_ns)
         while self._due and self._due[0][0] <= now_ns:
             at_ns, _, session = heappop(self._due)
-            if self._sessions.get(session.asked) is not session or session.at_ns != at_ns:
+            if self._sessions.get(session.addresses) is not session or session.at_ns != at_ns:
                 continue
             if not session.outstanding:
                 actions += self._begin(session, now_ns)
@@ -292,18 +299,18 @@ class SubscriptionRestorer:
     def _check(self, subscription: Subscription, now_ns: int) -> None:
         if subscription.is_closed:
             return
-        at_ns = subscription.heard_at_ns + subscription.quiet_limit_ns()
+        at_ns = subscription.received_at_ns + subscription.quiet_limit_ns()
         if subscription.interrupted_at_ns is None and at_ns <= now_ns:
-            subscription.fruitless += 1
+            subscription.checks += 1
             self._queue(subscription, now_ns)
         at_ns = max(at_ns, now_ns + subscription.quiet_limit_ns() // 2)
         heappush(self._checks, (at_ns, next(self._numbers), subscription))
 
     def _queue(self, subscription: Subscription, now_ns: int) -> _Session:
-        session = self._sessions.get(subscription.asked)
+        session = self._sessions.get(subscription.addresses)
         if session is None:
-            session = self._sessions[subscription.asked] = _Session(
-                subscription.endpoint, subscription.asked, now_ns
+            session = self._sessions[subscription.addresses] = _Session(
+                subscription.endpoint, subscription.addresses, now_ns
             )
             self._schedule(session, now_ns)
         if not subscription.is_queued:
@@ -313,7 +320,7 @@ class SubscriptionRestorer:
 
     def _note(self, session: _Session, outcome: Outcome, text: str, now_ns: int) -> None:
         """Have it in the log: once for all subscriptions of a session."""
-        header = header_to(session.asked, AmsCommand.ADD_NOTIFICATION, 0)
+        header = header_to(session.addresses, AmsCommand.ADD_NOTIFICATION, 0)
         self._error_replier.drop(session.endpoint, header, outcome, text, now_ns)
 
     def _schedule(self, session: _Session, at_ns: int) -> None:
@@ -323,26 +330,26 @@ class SubscriptionRestorer:
     def _begin(self, session: _Session, now_ns: int) -> list[Action]:
         """Ask for one subscription, or for a group when the way is known to be good."""
         actions: list[Action] = []
-        room = 1 if session.is_trying else GROUP
-        while session.waiting and session.outstanding < room and self._has_room():
+        limit = 1 if session.is_trying else GROUP
+        while session.waiting and session.outstanding < limit and self._is_below_limits():
             subscription = session.waiting.popleft()
             if subscription.is_closed:
                 continue
-            actions += self._ask_for(session, subscription, now_ns)
+            actions += self._request(session, subscription, now_ns)
             if session.is_trying and session.at_ns > now_ns:
                 break
-        return actions + self._go_on(session, now_ns)
+        return actions + self._continue(session, now_ns)
 
-    def _ask_for(
+    def _request(
         self, session: _Session, subscription: Subscription, now_ns: int,
-        place: tuple[int, int] | None = None,
+        location: tuple[int, int] | None = None,
     ) -> list[Action]:  # fmt: skip
         request = subscription.request
         assert request is not None  # noqa: S101  for the type
         command, body, symbol_handle = AmsCommand.ADD_NOTIFICATION, request.encode(), None
         is_by_handle = request.group in BY_HANDLE
-        if place is not None:
-            group, offset = place
+        if location is not None:
+            group, offset = location
             symbol_handle = offset if is_by_handle else None
             group = request.group if is_by_handle else group
             body = group.to_bytes(4, "little") + offset.to_bytes(4, "little") + body[8:]
@@ -353,20 +360,20 @@ class SubscriptionRestorer:
             text = "it is of a symbol whose name is not known"
             return self._give_up(session, subscription, text, now_ns)
         step = _Step(session, subscription, symbol_handle=symbol_handle)
-        invoke_id = self._ids.take(self._in_flight)
-        header = header_to(subscription.asked, command, invoke_id)
+        invoke_id = self._ids.allocate(self._in_flight)
+        header = header_to(subscription.addresses, command, invoke_id)
         packet = encode_packet(header, body)
-        found = self._find_way(header, packet, subscription.endpoint, now_ns)
-        if isinstance(found, Refusal):
+        found = self._find_request_route(header, packet, subscription.endpoint, now_ns)
+        if isinstance(found, RoutingError):
             return self._failed(
-                session, subscription, found.error, found.text, now_ns, _LOOK_SPACING_NS
+                session, subscription, found.error, found.text, now_ns, _LOOKUP_SPACING_NS
             )
         route, onward = found
         packet = onward + packet[ADDRESSES.size :]
         handles = int(command == AmsCommand.ADD_NOTIFICATION)
-        return self._ask(step, header, packet, onward, route, handles, now_ns)
+        return self._send(step, header, packet, onward, route, handles, now_ns)
 
-    def _ask(
+    def _send(
         self, step: _Step, header: AmsHeader, packet: bytes, onward: bytes, route: Route,
         handles: int, now_ns: int,
     ) -> list[Action]:  # fmt: skip
@@ -377,7 +384,7 @@ class SubscriptionRestorer:
         pending.handles = handles
         pending.step = step
         self._in_flight.add(pending)
-        self._asked += 1
+        self._outstanding += 1
         step.session.outstanding += 1
         return [self._transports.forward(route.hop, packet, header.invoke_id)]
 
@@ -387,23 +394,23 @@ class SubscriptionRestorer:
         """Act on what a server says to the request for a subscription or a symbol."""
         session, subscription = step.session, step.subscription
         assert subscription is not None  # noqa: S101  for the type
-        place = None if pending.handles else symbol_place(subscription.symbol, body)
-        if not error and (len(body) < _GRANTED if pending.handles else place is None):
+        location = None if pending.handles else symbol_location(subscription.symbol, body)
+        if not error and (len(body) < _GRANTED if pending.handles else location is None):
             error = AdsError.GENERAL
         if subscription.is_closed:
             grant = None if error or not pending.handles else _grant_of(pending, step, body)
-            return [] if grant is None else self._ending.end([grant], now_ns)
+            return [] if grant is None else self._cleanup.end([grant], now_ns)
         if error:
             route = pending.route
             text = AdsError.words_of(error)
             if route is not None:
                 text += f" from {route.name} ({route.hop}) or from behind it"
             failed = self._failed(session, subscription, error, text, now_ns)
-            if step.symbol_handle is not None and error not in _OF_THE_WAY:
-                failed += self._ending.release(_grant_of(pending, step, bytes(_GRANTED)), now_ns)
+            if step.symbol_handle is not None and error not in _PATH_ERRORS:
+                failed += self._cleanup.release(_grant_of(pending, step, bytes(_GRANTED)), now_ns)
             return failed
         if not pending.handles:
-            return self._ask_for(session, subscription, now_ns, place)
+            return self._request(session, subscription, now_ns, location)
         return self._establish(session, subscription, _grant_of(pending, step, body), now_ns)
 
     def _establish(
@@ -416,15 +423,15 @@ class SubscriptionRestorer:
         subscription.interrupted_at_ns = subscription.refused_at_ns = None
         subscription.why = ""
         subscription.skips_repeat = not was_interrupted
-        subscription.established_at_ns = subscription.heard_at_ns = now_ns
+        subscription.established_at_ns = subscription.received_at_ns = now_ns
         session.is_trying = False
         session.restored += was_interrupted
         if before is not None and key_of(before) != key_of(grant):
             session.stale.append((before, not was_interrupted))
         actions = [] if displaced is None else self.displaced([displaced], now_ns)
-        return actions + self._mistrust(subscription, now_ns)
+        return actions + self._reject_deleted_handle(subscription, now_ns)
 
-    def _mistrust(self, subscription: Subscription, now_ns: int) -> list[Action]:
+    def _reject_deleted_handle(self, subscription: Subscription, now_ns: int) -> list[Action]:
         """Ask again for what has the handle of a notification that is being deleted."""
         if subscription.grant is None or key_of(subscription.grant) not in self._deleting:
             return []
@@ -436,13 +443,13 @@ class SubscriptionRestorer:
         spacing_ns: int = SPACING_NS,
     ) -> list[Action]:  # fmt: skip
         """Try again later, or give up."""
-        passes = error in _OF_THE_WAY
+        passes = error in _PATH_ERRORS
         if passes:
             subscription.refused_at_ns = None
-        elif error in _OF_THE_START:
+        elif error in _STARTUP_ERRORS:
             since_ns = subscription.refused_at_ns
             subscription.refused_at_ns = since_ns = now_ns if since_ns is None else since_ns
-            passes = now_ns - since_ns < PATIENCE_NS
+            passes = now_ns - since_ns < STARTUP_TIMEOUT_NS
         if not passes:
             return self._give_up(session, subscription, text, now_ns)
         session.waiting.appendleft(subscription)
@@ -472,7 +479,7 @@ class SubscriptionRestorer:
             return []
         return [self._transports.reply(endpoint, subscription.encode_end(now_ns))]
 
-    def _go_on(self, session: _Session, now_ns: int) -> list[Action]:
+    def _continue(self, session: _Session, now_ns: int) -> list[Action]:
         """Delete what was granted before, then ask for more, when all requests are answered."""
         if session.outstanding:
             return []
@@ -484,7 +491,7 @@ class SubscriptionRestorer:
         if session.outstanding:
             return actions
         if not session.waiting:
-            self._sessions.pop(session.asked, None)
+            self._sessions.pop(session.addresses, None)
             if session.restored and session.interrupted_at_ns is not None:
                 took_s = (now_ns - session.interrupted_at_ns) / 1e9
                 noun = "subscription" if session.restored == 1 else "subscriptions"
@@ -501,29 +508,29 @@ class SubscriptionRestorer:
             return []
         self._deleting.add(key_of(grant))
         step = _Step(session, None, grant, is_check)
-        invoke_id = self._ids.take(self._in_flight)
+        invoke_id = self._ids.allocate(self._in_flight)
         header = header_to(grant.onward, AmsCommand.DELETE_NOTIFICATION, invoke_id)
         packet = encode_packet(header, grant.handle.to_bytes(4, "little"))
-        actions = self._ask(step, header, packet, grant.onward, grant.route, 0, now_ns)
-        return actions + self._ending.release(grant, now_ns)
+        actions = self._send(step, header, packet, grant.onward, grant.route, 0, now_ns)
+        return actions + self._cleanup.release(grant, now_ns)
 
     def _deleted(self, step: _Step, grant: Grant, error: int, now_ns: int) -> list[Action]:
         self._deleting.discard(key_of(grant))
         if not step.is_check or error != AdsError.NOTIFICATION_HANDLE:
             return []
         # The server had forgotten what was quiet: others that were granted before are, too.
-        server = step.session.asked[:6]
+        server = step.session.addresses[:6]
         for each in self._subscriptions:
-            if each.request is not None and each.asked[:6] == server:
-                quiet_ns = now_ns - max(each.established_at_ns, each.heard_at_ns)
+            if each.request is not None and each.addresses[:6] == server:
+                quiet_ns = now_ns - max(each.established_at_ns, each.received_at_ns)
                 if each.interrupted_at_ns is None and quiet_ns > TIMEOUT_NS:
                     self._queue(each, now_ns)
         return []
 
-    def _has_room(self) -> bool:
-        if self._asked >= MAX_ASKED:
+    def _is_below_limits(self) -> bool:
+        if self._outstanding >= MAX_REQUESTS:
             return False
-        return len(self._in_flight) < self._limits.in_flight or self._in_flight.make_room()
+        return len(self._in_flight) < self._limits.in_flight or self._in_flight.drop_abandoned()
 
 
 def _grant_of(pending: Pending, step: _Step, body: bytes) -> Grant:
@@ -532,5 +539,5 @@ def _grant_of(pending: Pending, step: _Step, body: bytes) -> Grant:
     return Grant(pending.onward, handle, pending.route, step.symbol_handle)
 
 
-def _failed(asked: AmsHeader, error: AdsError) -> AmsHeader:
-    return msgspec.structs.replace(asked, error_code=error)
+def _failed_header(request: AmsHeader, error: AdsError) -> AmsHeader:
+    return msgspec.structs.replace(request, error_code=error)

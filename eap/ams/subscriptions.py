@@ -55,7 +55,7 @@ class Subscription:
 
     Attributes:
         endpoint: Connection of the client.
-        asked: Addresses of the server and of the client as the client's request has them, 16 bytes.
+        addresses: Server and client, as the request of the client has them, 16 bytes.
         handle: That the client knows.
         grant: What the server gave last; None if it is known to be gone.
         request: Parameters, if this router restores the subscription; None if another one does.
@@ -66,27 +66,27 @@ class Subscription:
         why: Why nothing comes.
         refused_at_ns: Since when the server refuses it with an error that may pass.
         established_at_ns: When the server granted it last.
-        heard_at_ns: When the latest sample came, or the grant.
+        received_at_ns: When the latest sample came, or the grant.
         time: Stamp of the latest sample.
         digest: Hash of the latest sample.
         skips_repeat: Whether the next sample is left out if it is the latest one again.
-        fruitless: How many checks in a row found it alive.
+        checks: How many checks in a row found it alive.
         ends: How often the server ended it since the latest sample.
     """
 
     __slots__ = (
-        "asked",
+        "addresses",
+        "checks",
         "digest",
         "endpoint",
         "ends",
         "established_at_ns",
-        "fruitless",
         "grant",
         "handle",
-        "heard_at_ns",
         "interrupted_at_ns",
         "is_closed",
         "is_queued",
+        "received_at_ns",
         "refused_at_ns",
         "request",
         "skips_repeat",
@@ -96,11 +96,11 @@ class Subscription:
     )  # fmt: skip
 
     def __init__(
-        self, endpoint: Endpoint, asked: bytes, grant: Grant, now_ns: int,
+        self, endpoint: Endpoint, addresses: bytes, grant: Grant, now_ns: int,
         request: AddNotification | None = None, symbol: bytes = b"",
     ) -> None:  # fmt: skip
         self.endpoint = endpoint
-        self.asked = asked
+        self.addresses = addresses
         self.handle = grant.handle
         self.grant: Grant | None = grant
         self.request = request
@@ -110,17 +110,17 @@ class Subscription:
         self.interrupted_at_ns: int | None = None
         self.why = ""
         self.refused_at_ns: int | None = None
-        self.established_at_ns = self.heard_at_ns = now_ns
+        self.established_at_ns = self.received_at_ns = now_ns
         self.time = 0
         self.digest = 0
         self.skips_repeat = False
-        self.fruitless = 0
+        self.checks = 0
         self.ends = 0
 
     @property
     def server(self) -> NetId:
         """NetID of the server, as the client knows it."""
-        return NetId(self.asked[:6])
+        return NetId(self.addresses[:6])
 
     @property
     def is_on_change(self) -> bool:
@@ -134,8 +134,8 @@ class Subscription:
         if not self.is_on_change:
             usual_ns = (self.request.cycle + self.request.max_delay) * UNIT_NS
             limit_ns = max(_SHORTEST_QUIET_NS, 3 * usual_ns)
-        return limit_ns if not self.fruitless else min(
-            limit_ns << min(self.fruitless, 6), max(limit_ns, _LONGEST_QUIET_NS)
+        return limit_ns if not self.checks else min(
+            limit_ns << min(self.checks, 6), max(limit_ns, _LONGEST_QUIET_NS)
         )  # fmt: skip
 
     def encode_end(self, now_ns: int) -> bytes:
@@ -144,9 +144,9 @@ class Subscription:
         That is a sample without bytes, as TwinCAT sends it; it is alone in its packet, because
         AdsLib skips what follows such a sample.
         """
-        time = self.time + (now_ns - self.heard_at_ns) // UNIT_NS if self.time else 0
+        time = self.time + (now_ns - self.received_at_ns) // UNIT_NS if self.time else 0
         body = encode_notification([Stamp(time, (Sample(self.handle, b""),))])
-        server, port, client, client_port = ADDRESSES.unpack(self.asked)
+        server, port, client, client_port = ADDRESSES.unpack(self.addresses)
         header = AmsHeader(NetId(client), client_port, NetId(server), port, AmsCommand.NOTIFICATION)
         return encode_packet(header, body)
 
@@ -175,9 +175,9 @@ class Subscriptions:
             for handles in clients.values():
                 yield from handles.values()
 
-    def has_room(self, endpoint: Endpoint, asked: bytes, count: int) -> bool:
+    def is_within_limits(self, endpoint: Endpoint, addresses: bytes, count: int) -> bool:
         """Say whether a client may have *count* more."""
-        mine = self._by_client.get(endpoint, {}).get(asked, ())
+        mine = self._by_client.get(endpoint, {}).get(addresses, ())
         return (
             len(mine) + count <= MAX_PER_CLIENT
             and self._counts[host_of(endpoint)] + count <= MAX_TOTAL - self._total
@@ -196,7 +196,7 @@ class Subscriptions:
             self.remove(displaced)
         elif displaced is not None:
             self.detach(displaced)
-        mine = self._by_client.setdefault(endpoint, {}).setdefault(subscription.asked, {})
+        mine = self._by_client.setdefault(endpoint, {}).setdefault(subscription.addresses, {})
         while subscription.handle in mine:
             subscription.handle = _FIRST_OWN_HANDLE + self._own_handle % (1 << 30)
             self._own_handle += 1
@@ -246,17 +246,19 @@ class Subscriptions:
         """Return whose a sample with *handle* is, from the first to the second address."""
         return self._by_grant.get((onward, handle))
 
-    def find_of_client(self, endpoint: Endpoint, asked: bytes, handle: int) -> Subscription | None:
+    def find_of_client(
+        self, endpoint: Endpoint, addresses: bytes, handle: int
+    ) -> Subscription | None:
         """Return the one that a client knows by *handle*."""
-        return self._by_client.get(endpoint, {}).get(asked, {}).get(handle)
+        return self._by_client.get(endpoint, {}).get(addresses, {}).get(handle)
 
     def remove(self, subscription: Subscription) -> Grant | None:
         """Forget a subscription; return what the server gave for it."""
-        endpoint, asked = subscription.endpoint, subscription.asked
+        endpoint, addresses = subscription.endpoint, subscription.addresses
         clients = self._by_client[endpoint]
-        del clients[asked][subscription.handle]
-        if not clients[asked]:
-            del clients[asked]
+        del clients[addresses][subscription.handle]
+        if not clients[addresses]:
+            del clients[addresses]
         host = host_of(endpoint)
         self._counts[host] -= 1
         if not self._counts[host]:
@@ -306,11 +308,11 @@ class Division(NamedTuple):
 
 def divide(
     body: bytes, onward: bytes, subscriptions: Subscriptions, now_ns: int,
-    is_hop: Callable[[Endpoint], bool],
+    is_from_hop: Callable[[Endpoint], bool],
 ) -> Division:  # fmt: skip
     """Return which connection gets what of a notification.
 
-    A handle counts as unknown that was given by another hop than *is_hop* says.
+    A handle counts as unknown that was given by another hop than *is_from_hop* says.
 
     Raises:
         CodecError: the notification is shorter or longer than it says.
@@ -323,7 +325,7 @@ def divide(
     for stamp in decode_notification(body):
         for sample in stamp.samples:
             found = subscriptions.find(onward, sample.handle)
-            if found is None or found.grant is None or not is_hop(found.grant.route.hop):
+            if found is None or found.grant is None or not is_from_hop(found.grant.route.hop):
                 unknown.append(sample.handle)
                 is_as_it_came = False
                 continue
@@ -331,10 +333,10 @@ def divide(
             if not sample.data and (found.request is None or found.request.length):
                 ended.append(found)
                 is_as_it_came = False
-            elif not _take(found, stamp.time, sample.data, now_ns):
+            elif not _note_sample(found, stamp.time, sample.data, now_ns):
                 is_as_it_came = False
             else:
-                mine = parts.setdefault((found.endpoint, found.asked), [])
+                mine = parts.setdefault((found.endpoint, found.addresses), [])
                 if sample.handle == found.handle:
                     mine.append((stamp.time, sample))
                 else:
@@ -347,20 +349,20 @@ def divide(
     return Division(bodies, ended, unknown, hop)
 
 
-def _take(subscription: Subscription, time: int, data: bytes, now_ns: int) -> bool:
+def _note_sample(subscription: Subscription, time: int, data: bytes, now_ns: int) -> bool:
     """Note a sample; return whether the client gets it."""
-    subscription.heard_at_ns = now_ns
+    subscription.received_at_ns = now_ns
     subscription.time = time
     subscription.ends = 0
     if not subscription.is_on_change:
-        subscription.fruitless = 0
+        subscription.checks = 0
         return True
     digest = hash(data)
     is_repeat = subscription.skips_repeat and digest == subscription.digest
     subscription.digest = digest
     subscription.skips_repeat = False
     if not is_repeat:
-        subscription.fruitless = 0
+        subscription.checks = 0
     return not is_repeat
 
 

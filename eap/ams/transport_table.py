@@ -37,7 +37,7 @@ class Deliver(NamedTuple):
     """Names the request, for its answer."""
     header: AmsHeader
     body: bytes
-    came_by: Endpoint
+    endpoint: Endpoint
     """Where notifications go, if it is about any."""
 
 
@@ -49,8 +49,8 @@ class Transport(msgspec.Struct, frozen=True):
 
     Attributes:
         name: As people call it.
-        room: Octets of the longest packet in one piece, header included; 0 for any. What is longer
-            goes in fragments.
+        max_size: Bytes of the longest packet in one piece, header included; 0 for any. A longer
+            packet goes in fragments.
         is_stream: Whether nothing comes twice; elsewhere what is asked again is not passed again.
         is_shared: Whether all answers come by one connection, whoever gives them (a broker).
         is_hub: Whether those behind it reach each other through a router only, so that packets
@@ -58,7 +58,7 @@ class Transport(msgspec.Struct, frozen=True):
     """
 
     name: str
-    room: int = 0
+    max_size: int = 0
     is_stream: bool = False
     is_shared: bool = False
     is_hub: bool = False
@@ -70,7 +70,7 @@ class TransportTable:
     def __init__(self, transports: Iterable[Transport]) -> None:
         self._transports: dict[str, Transport] = {}
         self._number = 0
-        self._places: dict[Endpoint, str] = {}
+        self._connections: dict[Endpoint, str] = {}
         for transport in transports:
             self.add(transport)
 
@@ -82,9 +82,9 @@ class TransportTable:
         """
         if transport.name in self._transports:
             raise ValueError(f"two doors {transport.name!r}")
-        if transport.room and transport.room <= AmsHeader.SIZE:
+        if transport.max_size and transport.max_size <= AmsHeader.SIZE:
             raise ValueError(
-                f"transport {transport.name!r}: {transport.room} bytes,"
+                f"transport {transport.name!r}: {transport.max_size} bytes,"
                 f" expected more than {AmsHeader.SIZE}"
             )
         self._transports[transport.name] = transport
@@ -98,9 +98,9 @@ class TransportTable:
         """All doors by name."""
         return self._transports
 
-    def note_place(self, hop: Endpoint, connection: str) -> None:
+    def set_connection(self, hop: Endpoint, connection: str) -> None:
         """Know that what comes from *hop*, which has a name, comes by *connection*."""
-        self._places[hop] = connection
+        self._connections[hop] = connection
 
     def is_from(self, hop: Endpoint, endpoint: Endpoint) -> bool:
         """Say whether what comes by *endpoint* may come from *hop*."""
@@ -110,20 +110,20 @@ class TransportTable:
             return False
         return (
             self._transports[endpoint.transport].is_shared
-            or self._places.get(hop) == endpoint.connection
+            or self._connections.get(hop) == endpoint.connection
         )
 
     def reply(self, endpoint: Endpoint, packet: bytes) -> Reply:
         """Return how *packet* goes back by *endpoint*."""
-        return Reply(endpoint, self._cut(endpoint.transport, packet))
+        return Reply(endpoint, self._split(endpoint.transport, packet))
 
     def forward(self, hop: Endpoint, packet: bytes, ticket: int) -> Forward:
         """Return how *packet* goes on to *hop*."""
-        return Forward(hop, self._cut(hop.transport, packet), ticket)
+        return Forward(hop, self._split(hop.transport, packet), ticket)
 
-    def _cut(self, transport: str, packet: bytes) -> tuple[bytes, ...]:
-        room = self._transports[transport].room
-        if not room or len(packet) <= room:
+    def _split(self, transport: str, packet: bytes) -> tuple[bytes, ...]:
+        max_size = self._transports[transport].max_size
+        if not max_size or len(packet) <= max_size:
             return (packet,)
         self._number += 1
-        return tuple(iter_fragments(packet, self._number, room - AmsHeader.SIZE))
+        return tuple(iter_fragments(packet, self._number, max_size - AmsHeader.SIZE))

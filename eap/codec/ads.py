@@ -173,10 +173,10 @@ class IndexGroup(IntEnum):
     FOE_WRITE = 0xF405
     FOE_PROGRESS = 0xF406
     SOE = 0xF420
-    """Offset: see :class:`SoePlace`."""
+    """Offset: see :class:`SoeOffset`."""
     VOE = 0xF430
     """Written: a message with its VoE header."""
-    WHEREABOUTS = 0x4541_5001
+    ROUTE_QUERY = 0x4541_5001
     """Own format: of the system service, where it passes requests on to, see ``HopQuestion``."""
 
 
@@ -188,7 +188,7 @@ class AdsRange(WireStruct, frozen=True):
     length: u32
 
 
-class SdoPlace(WireStruct, frozen=True):
+class SdoOffset(WireStruct, frozen=True):
     """The offset that names an entry at SDO; ``encode`` gives its four octets.
 
     *is_slow* allows a slave ten times as long, which Ads.h calls an extended time-out.
@@ -201,7 +201,7 @@ class SdoPlace(WireStruct, frozen=True):
     index: u16 = 0
 
 
-class SoePlace(WireStruct, frozen=True):
+class SoeOffset(WireStruct, frozen=True):
     """The offset that names elements of an IDN at SOE.
 
     *is_command*: a procedure command is to be executed.

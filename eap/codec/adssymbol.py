@@ -50,7 +50,7 @@ class SymbolFlag(IntFlag):
     ATTRIBUTES = 0x1000
 
 
-class SymbolPlace(WireStruct, frozen=True):
+class SymbolAddress(WireStruct, frozen=True):
     """AdsSymbolInfoByName: where a value is; *size* in octets."""
 
     group: u32
@@ -119,7 +119,7 @@ class HandleInfo(WireStruct, frozen=True):
 class SymbolEntry(NamedTuple):
     """One variable as a server tells of it."""
 
-    place: SymbolPlace
+    address: SymbolAddress
     type: int
     """An AdsType; kept as a number if it is none."""
     flags: int
@@ -134,13 +134,13 @@ def encode_entry(entry: SymbolEntry) -> bytes:
     """Return an entry with its texts, each cut to MAX_TEXT octets and ended by a NUL."""
     texts = [encode_text(text) for text in (entry.name, entry.type_name, entry.comment)]
     lengths = [len(text) for text in texts]
-    place = entry.place
+    address = entry.address
     attributes = _encode_attributes(entry.attributes)
     head = _SymbolHead(
         _SymbolHead.SIZE + sum(lengths) + len(texts) + len(attributes),
-        place.group,
-        place.offset,
-        place.size,
+        address.group,
+        address.offset,
+        address.size,
         entry.type,
         entry.flags | (SymbolFlag.ATTRIBUTES if attributes else 0),
         *lengths,
@@ -186,9 +186,9 @@ def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
     for length in lengths:
         texts.append(bytes(data[at : at + length]).decode(_ENCODING, "replace"))
         at += length + 1
-    place = SymbolPlace(head.group, head.offset, head.size)
+    address = SymbolAddress(head.group, head.offset, head.size)
     name, type_name, comment = texts
-    return SymbolEntry(place, head.type, head.flags, name, type_name, comment), end
+    return SymbolEntry(address, head.type, head.flags, name, type_name, comment), end
 
 
 def encode_text(text: str) -> bytes:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from eap.ams.spec import (
-    IP_DOORS,
+    IP_TRANSPORTS,
     AccessRule,
     AccessService,
     AccessTarget,
@@ -281,7 +281,7 @@ def _check_order(
 
 def _reason_never_matching(rule: AccessRule) -> str:
     kinds = {_kind(transport) for transport in rule.transports}
-    is_known = kinds.isdisjoint(IP_DOORS) if rule.networks else bool(rule.macs)
+    is_known = kinds.isdisjoint(IP_TRANSPORTS) if rule.networks else bool(rule.macs)
     if kinds and is_known and not (rule.macs and TransportKind.ETHERNET in kinds):
         return f"clients of {', '.join(rule.transports)} have no such address"
     if rule.objects and rule.services and _OBJECT_SERVICES.isdisjoint(rule.services):

@@ -22,7 +22,7 @@ from eap.device import eap_rules
 from eap.device.eap_rules import MappingEntry, check_mapped, lay_out_mapping, mapped_bits
 from eap.ids import InterfaceUri, NetId, ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.dictionary import ObjectDictionary, check_value, take_bits
+from eap.od.dictionary import ObjectDictionary, check_value, extract_bits
 from eap.od.model import WO, Access, Entry, OdObject, OdState, ReadHook
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import AddressMode, Configured, FrameSub, PortSub, Rx, Status, Tx, Var
@@ -72,7 +72,7 @@ class LiveValues(Protocol):
         the object yet, or no longer.
         """
 
-    def at_one_moment(self) -> AbstractContextManager[None]:
+    def consistent_values(self) -> AbstractContextManager[None]:
         """Show counters of one moment for the length of a block."""
 
 
@@ -83,7 +83,7 @@ class NoLiveValues:
         """Return None for everything."""
         return None
 
-    def at_one_moment(self) -> AbstractContextManager[None]:
+    def consistent_values(self) -> AbstractContextManager[None]:
         """Do nothing."""
         return nullcontext()
 
@@ -309,9 +309,9 @@ class EapDictionary(ObjectDictionary):
                 return item.index, subindex
         return None
 
-    def at_one_moment(self) -> AbstractContextManager[None]:
+    def consistent_values(self) -> AbstractContextManager[None]:
         """Show live counters of one moment for the length of a block."""
-        return self.live.at_one_moment()
+        return self.live.consistent_values()
 
     def _live(self, index: int, key: str, size: int) -> bytes:
         """Return the live value of *key* for the subject of an object; zero without one."""
@@ -592,4 +592,4 @@ def _part(
         raise SdoAbortError(code, index, 1)
     for (subindex, entry), offset in zip(chosen, plan.bit_offsets, strict=True):
         if entry.access & state.write_right:
-            yield subindex, take_bits(data, offset, entry.kind)
+            yield subindex, extract_bits(data, offset, entry.kind)

@@ -189,7 +189,7 @@ class MasterDictionary(ObjectDictionary):
     """
 
     # ETG.1510 clients request all of the entry description and read any extra bytes as the name.
-    tells_values = False
+    describes_values = False
 
     def __init__(
         self,

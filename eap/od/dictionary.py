@@ -19,10 +19,10 @@ class ObjectDictionary:
     """The objects of one device, by index.
 
     Attributes:
-        tells_values: Whether descriptions of entries hold units, defaults and limits if asked for.
+        describes_values: Whether entry descriptions hold units, defaults and limits on request.
     """
 
-    tells_values = True
+    describes_values = True
 
     def __init__(self, objects: Iterable[OdObject] = ()) -> None:
         self._objects: dict[int, OdObject] = {}
@@ -105,13 +105,13 @@ class ObjectDictionary:
         chosen = self._whole(index, first)
         plan = datatypes.layout([entry.kind for _, entry in chosen])
         data = bytearray(plan.size)
-        with self.at_one_moment():
+        with self.consistent_values():
             for (_, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
                 if entry.access & state.read_right:
                     _put_bits(data, bit_offset, entry)
         return bytes(_count_word(self[index]) + data if first == 0 else data)
 
-    def at_one_moment(self) -> AbstractContextManager[None]:
+    def consistent_values(self) -> AbstractContextManager[None]:
         """Have the values that change by themselves be of one moment for the length of a block."""
         return nullcontext()
 
@@ -136,7 +136,7 @@ class ObjectDictionary:
         for (subindex, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
             if not entry.access & state.write_right:
                 continue
-            octets = take_bits(data, bit_offset, entry.kind)
+            octets = extract_bits(data, bit_offset, entry.kind)
             check_value(entry, index, subindex, octets)
             accepted.append((subindex, entry, octets))
         if count is not None:
@@ -243,7 +243,7 @@ def _put_bits(data: bytearray, bit_offset: int, entry: Entry) -> None:
         data[offset + 1] |= value >> 8
 
 
-def take_bits(data: bytes, bit_offset: int, kind: DataType) -> bytes:
+def extract_bits(data: bytes, bit_offset: int, kind: DataType) -> bytes:
     """Return the octets of an entry of type *kind* out of the data of a complete access."""
     offset, bit = divmod(bit_offset, 8)
     if not kind.is_bits:

@@ -82,7 +82,7 @@ def entry_description(
         ValueInfo.MINIMUM: _limit(entry, entry.minimum),
         ValueInfo.MAXIMUM: _limit(entry, entry.maximum),
     }
-    wanted = value_info if dictionary.tells_values else 0
+    wanted = value_info if dictionary.describes_values else 0
     given = {flag: octets for flag, octets in parts.items() if octets and wanted & flag}
     # Rights, category and mappability are in the fixed part, so they are always there.
     flags = value_info & 0x07

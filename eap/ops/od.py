@@ -19,7 +19,7 @@ from eap.codec.datatypes import DataType
 from eap.errors import ConfigError, ControlError, EapError
 from eap.ids import ObjectId
 from eap.od import notation
-from eap.od.dictionary import take_bits
+from eap.od.dictionary import extract_bits
 
 _PLAIN_SIZES = (1, 2, 4, 8)
 
@@ -303,7 +303,7 @@ def _parts(found: ObjectInfo, first: int, octets: bytes) -> list[OdValue]:
     if len(kinds) != len(chosen) or plan.size != len(octets):
         return rows
     for entry, kind, bit_offset in zip(chosen, kinds, plan.bit_offsets, strict=True):
-        rows.append(_value(found.index, entry, take_bits(octets, bit_offset, kind)))
+        rows.append(_value(found.index, entry, extract_bits(octets, bit_offset, kind)))
     return rows
 
 

@@ -21,8 +21,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from eap.ams.spec import Record as AoeRecord
 from eap.ams.spec import RouteSpec, RoutingSpec
+from eap.ams.spec import SpecStruct as AoeRecord
 from eap.device.rollout import without_alternates
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.device import DeviceState

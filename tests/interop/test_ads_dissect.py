@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from eap.ads.endpoint import Endpoint, response_to
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.codec.ams import AmsCommand, decode_packet
 from eap.ids import NetId
 from tests.support.adsdevice import DictStore, Station, variable_device
@@ -17,7 +17,7 @@ from tests.support.vectors import load
 
 pytestmark = pytest.mark.tshark
 
-CLIENT = Client(Endpoint("tcp", "1"), NetId.parse("127.0.0.1.1.1"), 30000)
+CLIENT = AdsClient(Endpoint("tcp", "1"), NetId.parse("127.0.0.1.1.1"), 30000)
 
 
 def frame(packet: bytes) -> bytes:

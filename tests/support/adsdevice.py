@@ -8,7 +8,7 @@ from eap.ads.device import AdsDevice
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, SlaveState
 from eap.ads.operation import AdsRefusedError, WriteControl
 from eap.ads.space import OP, SAFEOP, SystemSpace, al_state_for, states_of
-from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
+from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, AdsSystemState, device_name
 from eap.ids import NetId
@@ -57,9 +57,9 @@ class DictStore:
         self.octets[name] = octets
 
 
-def variables(store: DictStore) -> list[Variable]:
+def variables(store: DictStore) -> list[SymbolVariable]:
     return [
-        Variable(name, kind, f"comment of {name}", "counts" if name == READ_ONLY else "")
+        SymbolVariable(name, kind, f"comment of {name}", "counts" if name == READ_ONLY else "")
         for name, kind in store.types.items()
     ]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ads.objects import ObjectSpace
 from eap.ads.operation import WriteControl
 from eap.ads.space import al_state_for, states_of
@@ -21,7 +21,7 @@ from eap.od.model import OdState
 from tests.support.controlstub import ControlStub
 
 TARGET = "far/bus0/1001"
-NOBODY = Client(Endpoint("local", "1"), NetId(bytes(6)), 1)
+NOBODY = AdsClient(Endpoint("local", "1"), NetId(bytes(6)), 1)
 
 
 class AdsTarget:

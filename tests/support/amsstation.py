@@ -50,7 +50,7 @@ class EchoStation:
         return False
 
     def receive(
-        self, data: bytes, transport: str, connection: str, *, for_all: bool = False
+        self, data: bytes, transport: str, connection: str, *, is_broadcast: bool = False
     ) -> None:
         self.seen.append((data, transport, connection))
         header = AmsHeader.decode(data)

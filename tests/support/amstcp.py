@@ -16,7 +16,7 @@ from typing import Self
 
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.codec.adsnotification import to_filetime
 from eap.ids import NetId
 
@@ -109,7 +109,7 @@ class AmsTcpServer:
         error, body = 7, b""
         if device is not None:
             with self.lock:
-                client = Client(Endpoint("tcp", str(number)), NetId(source), source_port)
+                client = AdsClient(Endpoint("tcp", str(number)), NetId(source), source_port)
                 answer = device.answer(command, packet[_HEADER.size :], client, time.monotonic_ns())
             error, body = answer.error_code, answer.data
         header = _HEADER.pack(

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.hop_prober import HopProber
 from eap.ams.record import Outcome
 from eap.ams.router import AnswerNow, Router
@@ -29,7 +29,7 @@ DOORS = (
     Transport("link", is_hub=True, is_stream=True),
     Transport("segment"),
     Transport("broker", is_shared=True),
-    Transport("narrow", room=60),
+    Transport("narrow", max_size=60),
 )
 
 ANYTHING = AccessRule("anything")
@@ -43,7 +43,7 @@ class Station:
     """A router; what it wants done is taken apart."""
 
     def __init__(self, routes: Iterable[Route] = (), *, first_id: int = 1000,
-                 limits: Limits | None = None, is_probing: bool = False,
+                 limits: RouterLimits | None = None, is_probing: bool = False,
                  rules: Iterable[AccessRule] = (ANYTHING,),
                  answer_now: AnswerNow | None = None) -> None:  # fmt: skip
         self.table = RouteTable([*routes])

@@ -114,7 +114,7 @@ class Line:
         if port == SYSTEM_PORT and command == AmsCommand.READ_WRITE and station.is_ours:
             (asked,) = parse_request(command, body).operations
             assert isinstance(asked, ReadWrite)
-            assert asked.group == IndexGroup.WHEREABOUTS
+            assert asked.group == IndexGroup.ROUTE_QUERY
             question = HopQuestion.decode(asked.data)
             report = await answer_hop_query(station, question, endpoint, NetId.parse("9.9.9.9.1.1"))
             return AmsAnswer(encode_result(0, encode_report(report)))

@@ -191,7 +191,7 @@ class ClientPorts:
     def __len__(self) -> int:
         return len(self._ports)
 
-    def outward(self, packet: bytes) -> bytes:
+    def to_network(self, packet: bytes) -> bytes:
         """Return a packet of a client as it goes to others."""
         if not is_request(packet):
             return packet
@@ -201,11 +201,11 @@ class ClientPorts:
         source = self._net_id + self._port_of(client).to_bytes(2, "little")
         return packet[: _SOURCE.start] + source + packet[_SOURCE.stop :]
 
-    def inward(self, packet: bytes) -> bytes:
+    def to_client(self, packet: bytes) -> bytes:
         """Return a packet of others as the client gets it that it is for."""
         target = packet[_TARGET]
         client = self._clients.get(_port(target)) if target[:6] == self._net_id else None
-        if client is None or not comes_back(packet):
+        if client is None or not is_reply(packet):
             return packet
         self._ports.move_to_end(client)
         return client + packet[_TARGET.stop :]
@@ -230,14 +230,14 @@ def is_request(packet: bytes) -> bool:
     return not flags & StateFlags.RESPONSE and command != AmsCommand.NOTIFICATION
 
 
-def comes_back(packet: bytes) -> bool:
+def is_reply(packet: bytes) -> bool:
     """Say whether a packet is, or may be, for who asked before."""
     is_response = _number(packet, _FLAGS) & StateFlags.RESPONSE
     return bool(is_response) or _number(packet, _COMMAND) in _COMES_BACK
 
 
-def _number(packet: bytes, where: slice) -> int:
-    return int.from_bytes(packet[where], "little")
+def _number(packet: bytes, field: slice) -> int:
+    return int.from_bytes(packet[field], "little")
 
 
 def _port(address: bytes) -> int:

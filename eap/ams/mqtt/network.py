@@ -23,11 +23,11 @@ from eap.ams.mqtt.messages import (
     Payload,
     TopicKind,
     Topics,
-    comes_back,
     decode_info,
     decode_payload,
     encode_info,
     encode_payload,
+    is_reply,
     is_request,
 )
 from eap.ams.routes import Origin, Route, RouteTable
@@ -57,7 +57,7 @@ class Change(Enum):
 
 class _Peer(NamedTuple):
     is_online: bool
-    told_at_ns: int
+    updated_at_ns: int
     route: Route | None
 
 
@@ -85,7 +85,7 @@ class Peers:
     def __len__(self) -> int:
         return len(self._peers)
 
-    def tell(self, net_id: NetId, info: Info, now_ns: int) -> Change:
+    def update(self, net_id: NetId, info: Info, now_ns: int) -> Change:
         """Note what *net_id* told; learn a route to it, if routes are learned."""
         before = self._peers.get(net_id)
         if before is None and len(self._peers) >= MAX_PEERS:
@@ -100,20 +100,20 @@ class Peers:
         self._list(net_id, is_online=info.is_online)
         return Change.UP if info.is_online else Change.DOWN
 
-    def awaited(self) -> list[str]:
+    def missing(self) -> list[str]:
         """Return the hops that some route needs, nothing asks for life, and have not told yet."""
-        there = {str(each) for each, peer in self._peers.items() if peer.is_online}
+        online = {str(each) for each, peer in self._peers.items() if peer.is_online}
         needed = {
             each.hop.connection
             for each in self._table
             if each.hop.transport == self._transport and not each.is_probed
             if each.origin is not Origin.LEARNED
         }
-        return sorted(needed - there)
+        return sorted(needed - online)
 
     def forget(self, since_ns: int, now_ns: int) -> tuple[list[NetId], list[NetId]]:
         """Forget who told nothing since then; return who of them was there, and who was not."""
-        silent = [each for each, peer in self._peers.items() if peer.told_at_ns < since_ns]
+        silent = [each for each, peer in self._peers.items() if peer.updated_at_ns < since_ns]
         were_there, were_not = [], []
         for net_id in silent:
             peer = self._peers.pop(net_id)
@@ -131,9 +131,11 @@ class Peers:
         """Return the NetID of the router that *source* is behind; its own if none is known."""
         if source in self._peers:
             return str(source)
-        near = self._online.get(source.station, ())
+        known_nearby = self._online.get(source.station, ())
         fifth = source[STATION_OCTETS]
-        return str(max(near, key=lambda each: each[STATION_OCTETS] == fifth, default=source))
+        return str(
+            max(known_nearby, key=lambda each: each[STATION_OCTETS] == fifth, default=source)
+        )
 
     def _learn(self, net_id: NetId, name: str, known: Route | None, now_ns: int) -> Route | None:
         """Return the route, new or with more time; None if there cannot be one."""
@@ -157,12 +159,12 @@ class Peers:
         return route if self._table.add(route) else None
 
     def _list(self, net_id: NetId, *, is_online: bool) -> None:
-        near = self._online.setdefault(net_id.station, [])
+        known_nearby = self._online.setdefault(net_id.station, [])
         if is_online:
-            near.append(net_id)
+            known_nearby.append(net_id)
         else:
-            near.remove(net_id)
-        if not near:
+            known_nearby.remove(net_id)
+        if not known_nearby:
             del self._online[net_id.station]
 
 
@@ -194,7 +196,7 @@ class Subscribe(NamedTuple):
     filters: Sequence[str]
 
 
-class Arrived(NamedTuple):
+class PacketReceived(NamedTuple):
     """A packet for the router."""
 
     packet: bytes
@@ -215,7 +217,7 @@ class HopUp(NamedTuple):
     address: str
 
 
-class Closed(NamedTuple):
+class PeerClosed(NamedTuple):
     """Nobody can be answered there any more."""
 
     connection: str
@@ -247,12 +249,14 @@ class Warn(NamedTuple):
     text: str
 
 
-Action: TypeAlias = Publish | Subscribe | Arrived | HopDown | HopUp | Closed | Dropped | Warn
+Action: TypeAlias = (
+    Publish | Subscribe | PacketReceived | HopDown | HopUp | PeerClosed | Dropped | Warn
+)
 
 
 class _Sender(NamedTuple):
     is_prefixed: bool
-    heard_at_ns: int
+    received_at_ns: int
 
 
 class MqttNetwork:
@@ -279,10 +283,10 @@ class MqttNetwork:
         self._ports = ClientPorts(net_id)
         self._senders: OrderedDict[str, _Sender] = OrderedDict()
         self._connected_at_ns: int | None = None
-        self._told_at_ns = 0
-        self._tell_at_ns: int | None = None
+        self._published_at_ns = 0
+        self._publish_at_ns: int | None = None
         self._refresh_at_ns = 0
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
 
     def will(self) -> Publish:
         """Return the message by which the router is gone."""
@@ -293,11 +297,15 @@ class MqttNetwork:
         """Return what to do first on a new connection, in this order."""
         self._connected_at_ns = now_ns
         self._refresh_at_ns = now_ns + CONFIRM_NS
-        return [*self._await(), Subscribe(self._topics.filters), self._tell(now_ns)]
+        return [
+            *self._report_missing(),
+            Subscribe(self._topics.filters),
+            self._publish_info(now_ns),
+        ]
 
     def disconnected(self) -> None:
         """Wait for the next connection."""
-        self._connected_at_ns = self._tell_at_ns = None
+        self._connected_at_ns = self._publish_at_ns = None
 
     def receive_message(
         self, topic: str, payload: bytes, now_ns: int, *, is_retained: bool = False
@@ -316,12 +324,12 @@ class MqttNetwork:
         net_id, kind = parsed
         try:
             if kind is TopicKind.INFO:
-                return self._hear_of(net_id, payload, now_ns, is_retained=is_retained)
+                return self._receive_info(net_id, payload, now_ns, is_retained=is_retained)
             if net_id != self._net_id:
                 return self._drop(Drop.TOPIC, "topic nobody knows", topic[:80])
             if is_retained:  # it would be done again at each connection
                 return self._drop(Drop.TOPIC, "retained packet", topic)
-            return self._take(kind, decode_payload(payload), now_ns)
+            return self._receive_packet(kind, decode_payload(payload), now_ns)
         except CodecError as exc:
             what = "info" if kind is TopicKind.INFO else "packet"
             return self._drop(Drop.BROKEN, f"broken {what}", f"{topic}: {exc}")
@@ -331,16 +339,16 @@ class MqttNetwork:
         sender = self._senders.get(connection)
         is_prefixed = self._spec.is_prefixed if sender is None else sender.is_prefixed
         kind = TopicKind.REQUESTS if is_request(packet) else TopicKind.ANSWERS
-        payload = encode_payload(Payload(self._ports.outward(packet), is_prefixed))
+        payload = encode_payload(Payload(self._ports.to_network(packet), is_prefixed))
         return Publish(self._topics.of(connection, kind), payload, self._spec.qos)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
         if self._connected_at_ns is None:
             return None
-        if self._tell_at_ns is None:
+        if self._publish_at_ns is None:
             return self._refresh_at_ns
-        return min(self._tell_at_ns, self._refresh_at_ns)
+        return min(self._publish_at_ns, self._refresh_at_ns)
 
     def handle_timeout(self, now_ns: int) -> list[Action]:
         """Tell of this router, ask for the others, forget who is gone without a word."""
@@ -352,59 +360,59 @@ class MqttNetwork:
             actions += self._forget(max(self._connected_at_ns, now_ns - EXPIRY_NS), now_ns)
             actions.append(Subscribe((self._topics.all_info,)))
             if self._spec.no_retain:
-                self._tell_at_ns = now_ns
-        if self._tell_at_ns is not None and now_ns >= self._tell_at_ns:
-            actions.append(self._tell(now_ns))
+                self._publish_at_ns = now_ns
+        if self._publish_at_ns is not None and now_ns >= self._publish_at_ns:
+            actions.append(self._publish_info(now_ns))
         return actions
 
-    def _hear_of(
+    def _receive_info(
         self, net_id: NetId, payload: bytes, now_ns: int, *, is_retained: bool
     ) -> list[Action]:
         info = decode_info(payload)
         if net_id == self._net_id:
-            return self._hear_of_itself(info, now_ns, is_retained=is_retained)
+            return self._receive_own_info(info, now_ns, is_retained=is_retained)
         address = str(net_id)
-        change = self._peers.tell(net_id, info, now_ns)
+        change = self._peers.update(net_id, info, now_ns)
         if change is Change.IGNORED:
             return self._drop(Drop.FULL, "one router too many", address)
         if change is Change.DOWN:
-            return [HopDown(address, "it told that it is gone"), Closed(address)]
+            return [HopDown(address, "it told that it is gone"), PeerClosed(address)]
         actions: list[Action] = [HopUp(address)] if change is Change.UP else []
-        is_due = change is Change.UP or now_ns - self._told_at_ns >= _ANSWER_GAP_NS
+        is_due = change is Change.UP or now_ns - self._published_at_ns >= _ANSWER_GAP_NS
         if self._spec.no_retain and info.is_online and is_due:
-            actions += self._tell_soon(now_ns)
+            actions += self._schedule_info(now_ns)
         return actions
 
-    def _hear_of_itself(self, info: Info, now_ns: int, *, is_retained: bool) -> list[Action]:
+    def _receive_own_info(self, info: Info, now_ns: int, *, is_retained: bool) -> list[Action]:
         if not info.is_online:
-            return self._tell_soon(now_ns)  # the last will of a connection before this one
+            return self._schedule_info(now_ns)  # the last will of a connection before this one
         if info == self._info or is_retained:
             return []
         text = f"{info.name!r} tells that it has the NetID {self._net_id}, which is this station's"
         return self._warn("double", f"{text}; each router of a network needs one of its own")
 
-    def _take(self, kind: TopicKind, payload: Payload, now_ns: int) -> list[Action]:
+    def _receive_packet(self, kind: TopicKind, payload: Payload, now_ns: int) -> list[Action]:
         packet = payload.packet
         header = AmsHeader.decode(packet)
-        if kind is TopicKind.ANSWERS and not comes_back(packet):
+        if kind is TopicKind.ANSWERS and not is_reply(packet):
             # Brokers let some write there who may not ask anything.
             return self._drop(Drop.TOPIC, "request on the topic for answers", str(header.source))
         address = self._peers.address_of(header.source)
-        actions = self._hear(address, payload, now_ns)
+        actions = self._note_sender(address, payload, now_ns)
         if len(packet) > MAX_PACKET:
             text = f"{header.source}: {len(packet)} octets"
             actions += self._drop(Drop.LENGTH, "too long a packet", text)
             return actions + self._refuse(header, address, AdsError.AMS_LENGTH)
-        return [*actions, Arrived(self._ports.inward(packet), address)]
+        return [*actions, PacketReceived(self._ports.to_client(packet), address)]
 
-    def _hear(self, address: str, payload: Payload, now_ns: int) -> list[Action]:
+    def _note_sender(self, address: str, payload: Payload, now_ns: int) -> list[Action]:
         """Remember the form that *address* uses."""
         self._senders[address] = _Sender(payload.is_prefixed, now_ns)
         self._senders.move_to_end(address)
         if len(self._senders) <= MAX_SENDERS:
             return []
         oldest, _ = self._senders.popitem(last=False)
-        return [Closed(oldest)]
+        return [PeerClosed(oldest)]
 
     def _refuse(self, header: AmsHeader, address: str, error: AdsError) -> list[Action]:
         if header.state_flags & (StateFlags.RESPONSE | StateFlags.NO_RETURN):
@@ -417,35 +425,35 @@ class MqttNetwork:
         actions: list[Action] = []
         for net_id in were_there:
             actions.append(HopDown(str(net_id), "it is gone without a word"))
-            actions.append(Closed(str(net_id)))
+            actions.append(PeerClosed(str(net_id)))
         actions += [HopUp(str(net_id)) for net_id in (*were_there, *were_not)]
-        actions += self._await()
+        actions += self._report_missing()
         while self._senders:
             address, sender = next(iter(self._senders.items()))
-            if now_ns - sender.heard_at_ns < _SILENCE_NS:
+            if now_ns - sender.received_at_ns < _SILENCE_NS:
                 break
             del self._senders[address]
-            actions.append(Closed(address))
+            actions.append(PeerClosed(address))
         return actions
 
-    def _await(self) -> list[Action]:
-        return [HopDown(each, "it has not told of itself yet") for each in self._peers.awaited()]
+    def _report_missing(self) -> list[Action]:
+        return [HopDown(each, "it has not told of itself yet") for each in self._peers.missing()]
 
-    def _tell(self, now_ns: int) -> Publish:
-        self._told_at_ns = now_ns
-        self._tell_at_ns = None
+    def _publish_info(self, now_ns: int) -> Publish:
+        self._published_at_ns = now_ns
+        self._publish_at_ns = None
         return self.will()._replace(payload=encode_info(self._info))
 
-    def _tell_soon(self, now_ns: int) -> list[Action]:
-        self._tell_at_ns = max(now_ns, self._told_at_ns + _ANNOUNCE_GAP_NS)
-        return [self._tell(now_ns)] if now_ns >= self._tell_at_ns else []
+    def _schedule_info(self, now_ns: int) -> list[Action]:
+        self._publish_at_ns = max(now_ns, self._published_at_ns + _ANNOUNCE_GAP_NS)
+        return [self._publish_info(now_ns)] if now_ns >= self._publish_at_ns else []
 
     def _drop(self, reason: Drop, kind: str, text: str) -> list[Action]:
-        said = self._warn(kind, f"{kind}: {text}; from now on these are only counted")
-        return [Dropped(reason), *said]
+        warning = self._warn(kind, f"{kind}: {text}; from now on these are only counted")
+        return [Dropped(reason), *warning]
 
     def _warn(self, kind: str, text: str) -> list[Action]:
-        if kind in self._said:
+        if kind in self._warned:
             return []
-        self._said.add(kind)
+        self._warned.add(kind)
         return [Warn(text)]

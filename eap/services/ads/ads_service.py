@@ -15,9 +15,9 @@ from typing import TypeAlias
 
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.notifications import Client, NotificationTable
+from eap.ads.notifications import AdsClient, NotificationTable
 from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome, WriteControl
-from eap.ads.request import Outcomes, encode_outcome, take_request
+from eap.ads.request import Outcomes, accept_request, encode_outcome
 from eap.ads.space import AdsSpace, al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsStates, device_name
 from eap.errors import ControlError
@@ -40,7 +40,7 @@ def begin_answer(command: int, body: bytes, perform: Perform) -> AmsAnswer | Awa
         body: What follows the header.
         perform: Does one operation.
     """
-    request = take_request(command, body)
+    request = accept_request(command, body)
     if isinstance(request, AmsAnswer):
         return request
     if request.sum_group:
@@ -126,7 +126,7 @@ class AdsService:
     def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
         """Answer a request, at once where nobody has to be waited for."""
         header = request.header
-        client = Client(request.came_by, header.source, header.source_port)
+        client = AdsClient(request.endpoint, header.source, header.source_port)
         perform = partial(self.perform, header.target_port, client)
         return begin_answer(header.command, request.body, perform)
 
@@ -136,7 +136,7 @@ class AdsService:
             device.notifications.forget(endpoint)
 
     def perform(
-        self, port: int, client: Client, operation: Operation
+        self, port: int, client: AdsClient, operation: Operation
     ) -> OperationOutcome | Awaitable[OperationOutcome]:
         """Do one operation at an AMS port; another state is waited for."""
         if isinstance(operation, WriteControl):

@@ -20,7 +20,7 @@ from typing import NamedTuple, TypeAlias
 from devicebus.errors import MailboxTimeoutError, SoeError
 from devicebus.wire.sii import SiiProtocol
 from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ads.operation import (
     AdsRefusedError,
     Operation,
@@ -34,7 +34,7 @@ from eap.ads.operation import (
 )
 from eap.ads.request import decode_outcome, encode_query
 from eap.ads.space import DeviceDataSpace, al_state_for, states_of
-from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoPlace, SoePlace, device_name
+from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoOffset, SoeOffset, device_name
 from eap.codec.ams import DEVICE_PORT, AmsHeader, decode_packet
 from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
 from eap.codec.mailbox import VoeHeader
@@ -80,7 +80,7 @@ class SlaveTarget(NamedTuple):
     """A slave, and the client that wants something from it."""
 
     slave: SlaveDescription
-    client: Client
+    client: AdsClient
     access: LocalSlave
 
 
@@ -101,7 +101,7 @@ class SlaveAds:
         self._forwarder = AoeForwarder(net_id)
 
     async def perform(
-        self, slave: SlaveDescription, client: Client, operation: Operation
+        self, slave: SlaveDescription, client: AdsClient, operation: Operation
     ) -> OperationOutcome:
         """Do one operation; raise AdsRefusedError, or the errors of a SlaveAccess."""
         match operation:
@@ -206,7 +206,7 @@ class ProcedureCommands:
         self._tasks: dict[tuple[int, int, int], asyncio.Task[None]] = {}
         self._running = TaskSet("procedure commands")
 
-    async def execute(self, access: LocalSlave, station: int, place: SoePlace) -> None:
+    async def execute(self, access: LocalSlave, station: int, place: SoeOffset) -> None:
         """Execute a command, or wait on for one that goes on."""
         key = station, place.drive, place.idn
         task = self._tasks.get(key)
@@ -233,7 +233,7 @@ class ProcedureCommands:
             del self._tasks[key]
 
 
-async def _execute(access: LocalSlave, place: SoePlace) -> None:
+async def _execute(access: LocalSlave, place: SoeOffset) -> None:
     """Execute a command; between two looks at its state the drive serves other clients."""
     what = f"procedure command {Idn.of(place.idn)} at drive {place.drive}"
     loop = asyncio.get_running_loop()
@@ -330,16 +330,16 @@ async def _exchange_vendor(access: LocalSlave, operation: Read | Write | ReadWri
     return b""
 
 
-def _sdo_place(offset: int) -> SdoPlace:
+def _sdo_place(offset: int) -> SdoOffset:
     """Take the offset apart; the subindex means nothing with complete access."""
-    place = SdoPlace.decode(offset.to_bytes(4, "little"))
+    place = SdoOffset.decode(offset.to_bytes(4, "little"))
     if place.reserved:
         raise AdsRefusedError(AdsError.INDEX_OFFSET)
-    return SdoPlace(0, 1, index=place.index) if place.is_complete else place
+    return SdoOffset(0, 1, index=place.index) if place.is_complete else place
 
 
-def _soe_place(offset: int) -> SoePlace:
-    place = SoePlace.decode(offset.to_bytes(4, "little"))
+def _soe_place(offset: int) -> SoeOffset:
+    place = SoeOffset.decode(offset.to_bytes(4, "little"))
     if place.reserved:
         raise AdsRefusedError(AdsError.INDEX_OFFSET)
     return place
@@ -394,7 +394,7 @@ class BusService:
     async def answer(self, request: LocalRequest) -> AmsAnswer:
         """Do the operations of a request; return its answer."""
         header = request.header
-        client = Client(request.came_by, header.source, header.source_port)
+        client = AdsClient(request.endpoint, header.source, header.source_port)
         end_s = asyncio.get_running_loop().time() + ANSWER_S
         try:
             perform = await self._performer(header.target_port, client)
@@ -411,7 +411,7 @@ class BusService:
         """Forget what belongs to a connection that is closed; files stay open for another one."""
         self._master.client_gone(endpoint)
 
-    async def _performer(self, ams_port: int, client: Client) -> Perform:
+    async def _performer(self, ams_port: int, client: AdsClient) -> Perform:
         """Return the function that does operations for a port; raise AdsRefusedError for no port.
 
         A slave that cannot be reached is looked for once more before that is answered.

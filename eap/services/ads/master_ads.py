@@ -25,7 +25,7 @@ from devicebus.wire.datagram import (
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
 from eap.ads.io import MasterSpace, SlaveState
-from eap.ads.notifications import Client, NotificationTable
+from eap.ads.notifications import AdsClient, NotificationTable
 from eap.ads.objects import ObjectSpace
 from eap.ads.operation import (
     AdsRefusedError,
@@ -35,7 +35,7 @@ from eap.ads.operation import (
     WriteControl,
 )
 from eap.ads.space import INIT, al_state_for, states_of
-from eap.ams.access import place_of
+from eap.ams.access import group_and_offset
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, to_filetime
 from eap.codec.ams import DEVICE_PORT
@@ -184,11 +184,11 @@ class MasterAds:
         notifications = self._device.notifications
         self._sender = NotificationSender(notifications, self._look, send, net_id, DEVICE_PORT)
 
-    async def perform(self, operation: Operation, client: Client) -> OperationOutcome:
+    async def perform(self, operation: Operation, client: AdsClient) -> OperationOutcome:
         """Do one operation; raise AdsRefusedError or EapError."""
         if isinstance(operation, ReadWrite) and operation.group == IndexGroup.RAW_COMMAND:
             return OperationOutcome(data=await self._send_commands(operation))
-        group, offset = place_of(operation)
+        group, offset = group_and_offset(operation)
         is_object = group in ObjectSpace.groups
         if is_object:
             await self._provider.refresh(offset >> 16)

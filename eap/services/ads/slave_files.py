@@ -17,7 +17,7 @@ import secrets
 from collections.abc import Awaitable, Collection
 from typing import TypeVar
 
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ads.operation import AdsRefusedError, Read, ReadWrite, Write
 from eap.codec.ads import AdsError, IndexGroup
 from eap.errors import EapError
@@ -83,7 +83,7 @@ class SlaveFiles:
         self,
         access: SlaveAccess,
         station: int,
-        client: Client,
+        client: AdsClient,
         operation: Read | Write | ReadWrite,
     ) -> bytes:
         """Open a file, or do something with the one that the operation's offset names."""
@@ -113,7 +113,7 @@ class SlaveFiles:
         self,
         access: SlaveAccess,
         station: int,
-        client: Client,
+        client: AdsClient,
         name: bytes,
         password: int,
         *,
@@ -203,7 +203,7 @@ class SlaveFiles:
             handle = secrets.randbits(8 * _HANDLE_SIZE)
         return handle
 
-    def _find(self, station: int, client: Client, handle: int) -> _OpenFile:
+    def _find(self, station: int, client: AdsClient, handle: int) -> _OpenFile:
         item = self._open.get(handle)
         if item is None or (item.owner, item.station) != (client.net_id, station):
             why = f"slave {station}: {client.net_id} has no file open by the handle 0x{handle:X}"

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 
 from eap.ads.endpoint import AmsAnswer
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, NoSegmentSpace
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ads.objects import ObjectSpace
 from eap.ads.operation import (
     AdsRefusedError,
@@ -78,7 +78,7 @@ class SystemAds(AdsService):
         self._info = info
 
     def perform(
-        self, port: int, client: Client, operation: Operation
+        self, port: int, client: AdsClient, operation: Operation
     ) -> OperationOutcome | Awaitable[OperationOutcome]:
         """Do one operation; another state is waited for."""
         if isinstance(operation, WriteControl) and operation.ads_state == AdsState.RESET:
@@ -248,7 +248,7 @@ class RouterAds(AdsService):
         super().__init__(device, info, {IO_PORT: [io], DEVICE_PORT: [objects]})
 
     def perform(
-        self, port: int, client: Client, operation: Operation
+        self, port: int, client: AdsClient, operation: Operation
     ) -> OperationOutcome | Awaitable[OperationOutcome]:
         """Do one operation at an AMS port; the I/O server has no state to go to."""
         if port == IO_PORT:
@@ -300,7 +300,7 @@ class EapAds(AdsService):
         return AmsAnswer(encode_result(_DONE, data))
 
     def perform(
-        self, port: int, client: Client, operation: Operation
+        self, port: int, client: AdsClient, operation: Operation
     ) -> OperationOutcome | Awaitable[OperationOutcome]:
         """Do one operation; what changes objects or the state, or finds a writer, takes time."""
         if isinstance(operation, WriteControl):

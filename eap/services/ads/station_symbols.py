@@ -23,7 +23,7 @@ from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import NotificationTable
 from eap.ads.operation import AdsRefusedError
 from eap.ads.space import AdsSpace, Source
-from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
+from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import to_filetime
@@ -140,9 +140,9 @@ class StationSymbols(AdsSpace):
         return SymbolTable(variables, self._file.generation)
 
 
-def _variable(place: VariableSlot) -> Variable:
+def _variable(place: VariableSlot) -> SymbolVariable:
     unit = f"[{place.unit}]" if place.unit else ""
-    return Variable(
+    return SymbolVariable(
         place.name,
         datatypes.parse(place.type),
         " ".join(filter(None, (place.comment, unit))),

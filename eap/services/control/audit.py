@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 
 from eap.ads.operation import Operation, WriteControl
-from eap.ams.access import host_of, place_of
+from eap.ams.access import group_and_offset, host_of
 from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
 from eap.ams.directory import Directory
 from eap.codec.ads import AdsError, IndexGroup
@@ -407,7 +407,7 @@ def operation_words(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]
     if isinstance(operation, AddRoute):
         yield "adds", operation._asdict()
         return
-    group, offset = place_of(operation)
+    group, offset = group_and_offset(operation)
     if group is not None:
         yield "group", f"0x{group:X}"
         yield "offset", f"0x{offset:X}"

@@ -70,7 +70,7 @@ class ImageValues:
         return None if number is None else _encode(_KINDS[key], number)
 
     @contextmanager
-    def at_one_moment(self) -> Iterator[None]:
+    def consistent_values(self) -> Iterator[None]:
         """Show counters of one moment between two cycles for the length of a block."""
         with suppress(ImageError):
             self._moment = self._station.image.snapshot()

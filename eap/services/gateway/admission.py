@@ -92,7 +92,7 @@ class Guard:
         self, endpoint: Endpoint, target: RuleTarget, operation: Operation, *, by_rule: bool = False
     ) -> Decision:
         """Decide on an operation; *by_rule*: a change only if a rule says so."""
-        decision = self._access().grants(endpoint, NOBODY, *target).admission(operation)
+        decision = self._access().grants(endpoint, NOBODY, *target).decide(operation)
         if by_rule and decision.service is not AccessService.READ and not decision.is_by_rule:
             why = "only a rule allows it for several slaves at once"
             return decision._replace(is_allowed=False, why=why)
@@ -103,7 +103,7 @@ class Guard:
     ) -> Decision:
         """Return the verdict on a change when it has been recorded, where that is required."""
         change = AuditedOperation(operation, decision, None)
-        is_change = decision.is_allowed and change.is_told
+        is_change = decision.is_allowed and change.is_audited
         if self.before_change is None or not is_change:
             return decision
         why = self.before_change(_entry(endpoint, target, change))
@@ -131,7 +131,7 @@ class Guard:
         if not decision.is_allowed:
             result = AdsError.ACCESS_DENIED
         audited = AuditedOperation(operation, decision, result)
-        if audited.is_told:
+        if audited.is_audited:
             for write in self.on_audit:
                 write(_entry(endpoint, target, audited))
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from devicebus.errors import SoeError
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.endpoint import Endpoint
-from eap.ams.reassembly import Assembler, iter_fragments
+from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.codec.eoe import EoeType
 from eap.codec.mailbox import MailboxType
@@ -149,7 +149,7 @@ class AdsCodec(MessageCodec):
 
     def __init__(self, access: SlaveAccess, sizes: MailboxSizes, memory: MemoryShare) -> None:
         super().__init__(access, sizes, memory)
-        self._assembler = Assembler()
+        self._assembler = FragmentAssembler()
         self._number = 0
 
     @property

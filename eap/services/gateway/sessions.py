@@ -19,7 +19,7 @@ from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.endpoint import Endpoint
 from eap.ads.operation import Operation
-from eap.ams.access import place_of
+from eap.ams.access import group_and_offset
 from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxError, MailboxType
 from eap.errors import CodecError, EapError, TruncatedError
@@ -350,7 +350,7 @@ class MasterSession:
 
 
 def _index_of(operation: Operation | None) -> int:
-    return place_of(operation)[1] >> 16 if operation else 0
+    return group_and_offset(operation)[1] >> 16 if operation else 0
 
 
 def _op() -> OdState:

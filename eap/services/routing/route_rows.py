@@ -89,7 +89,7 @@ class RouterView:
 
 def interruption_row(found: Interruption, now_ns: int) -> InterruptionRow:
     """Return the record of the interrupted subscriptions of one client."""
-    target, port, source, source_port = ADDRESSES.unpack(found.asked)
+    target, port, source, source_port = ADDRESSES.unpack(found.addresses)
     return InterruptionRow(
         client=str(found.endpoint),
         source=f"{NetId(source)}:{source_port}",
@@ -142,8 +142,8 @@ def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow
         requests=traffic.requests,
         answers=traffic.answers,
         errors=traffic.errors,
-        octets_out=traffic.octets_asked,
-        octets_in=traffic.octets_answered,
+        octets_out=traffic.request_bytes,
+        octets_in=traffic.answer_bytes,
         last_error=traffic.last_error,
     )
 
@@ -160,8 +160,8 @@ def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
         requests=traffic.requests,
         answers=traffic.answers,
         errors=traffic.errors,
-        octets_out=traffic.octets_answered,
-        octets_in=traffic.octets_asked,
+        octets_out=traffic.answer_bytes,
+        octets_in=traffic.request_bytes,
         last_error=traffic.last_error,
     )
 
@@ -177,7 +177,7 @@ def request_row(trace: Trace, now_ns: int) -> RequestRow:
     return RequestRow(
         at=round(time() - (now_ns - trace.at_ns) / _S, 3),
         outcome=trace.outcome,
-        came_by="" if trace.came_by is None else str(trace.came_by),
+        came_by="" if trace.endpoint is None else str(trace.endpoint),
         transport="" if hop is None else hop.transport,
         address="" if hop is None else hop.connection,
         error=trace.error_code,

@@ -32,12 +32,12 @@ class LocalRequest(NamedTuple):
     """Request for a service of this station, admitted by the access rules.
 
     Parts of a sum command that the rules deny are not in *body* any more.  Notifications go to
-    *came_by* by ``StationRouter.send_notification``.
+    *endpoint* by ``StationRouter.send_notification``.
     """
 
     header: AmsHeader
     body: bytes
-    came_by: Endpoint
+    endpoint: Endpoint
 
 
 AnswerNow: TypeAlias = Callable[[AmsHeader, bytes], AmsAnswer | None]
@@ -184,7 +184,7 @@ class SerialQueues:
 
     def put(self, ticket: int, service: Service, request: LocalRequest) -> None:
         """Queue a request for *service*, or begin it."""
-        key = request.came_by, _addresses(request.header)
+        key = request.endpoint, _addresses(request.header)
         waiting = _QueuedRequest(ticket, service, request)
         queue = self._queues.get(key)
         if queue is None:

@@ -23,7 +23,7 @@ from time import monotonic_ns
 from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList, host_of
 from eap.ams.access_filter import AuditEntry
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.hop_prober import HopProber
 from eap.ams.record import Outcome, Record, Stats, Trace, reason_of
 from eap.ams.report import ConnectionReport, Location, RouteReport
@@ -131,8 +131,8 @@ class TraceLog:
         level = _LEVELS[trace.outcome]
         if not logger.isEnabledFor(level):
             return
-        host = "" if trace.came_by is None else host_of(trace.came_by)
-        transport = "" if trace.came_by is None else trace.came_by.transport
+        host = "" if trace.endpoint is None else host_of(trace.endpoint)
+        transport = "" if trace.endpoint is None else trace.endpoint.transport
         # The text has the results inside an answer already.
         code = f" (0x{trace.error_code:x})" if trace.error_code else ""
         extra = caused_by(
@@ -182,7 +182,7 @@ class StationRouter:
         net_ids: Collection[NetId] = (),
         *,
         access: AccessList | None = None,
-        limits: Limits | None = None,
+        limits: RouterLimits | None = None,
     ) -> None:
         self.name = name
         self.net_id = net_id
@@ -301,9 +301,9 @@ class StationRouter:
         """Return whether a hop is down."""
         return self._router.is_down(hop)
 
-    def hop_is_at(self, transport: str, address: str, connection: str) -> None:
+    def set_hop_connection(self, transport: str, address: str, connection: str) -> None:
         """Treat packets from *connection* as packets from the hop named *address*."""
-        self._router.hop_is_at(transport, address, connection)
+        self._router.set_hop_connection(transport, address, connection)
 
     def has_route_to(self, hop: Endpoint) -> bool:
         """Return whether a route leads to a hop."""
@@ -322,7 +322,7 @@ class StationRouter:
         return self._router.is_waiting_for(header, body, transport)
 
     def receive(
-        self, data: bytes, transport: str, connection: str, *, for_all: bool = False
+        self, data: bytes, transport: str, connection: str, *, is_broadcast: bool = False
     ) -> None:
         """Handle an AMS packet, or a fragment of one.
 
@@ -331,11 +331,11 @@ class StationRouter:
             transport: Name of its transport.
             connection: Its connection, or its sender's address; an IP address is followed by a
                 colon, for the access rules.
-            for_all: Whether other stations got it too: only its target answers then.
+            is_broadcast: Whether other stations got it too: only its target answers then.
         """
         self._act(
             self._router.receive_packet(
-                data, transport, connection, monotonic_ns(), for_all=for_all
+                data, transport, connection, monotonic_ns(), is_broadcast=is_broadcast
             )
         )
 
@@ -396,7 +396,7 @@ class StationRouter:
             del self._below_waiters[endpoint]
 
     def _act(self, actions: list[Action]) -> None:
-        if self._router.has_news:
+        if self._router.has_events:
             self._publish_events()  # first: the audit is written before the answer is sent
         for action in actions:  # comparing classes is faster than match
             kind = type(action)
@@ -445,7 +445,7 @@ class StationRouter:
 
     def _handle_timeout(self) -> None:
         actions = self._router.handle_timeout(monotonic_ns())
-        for hop in self._router.take_gone_hops():
+        for hop in self._router.pop_gone_hops():
             self.connection_closed(*hop)  # a datagram transport has no end of a connection
         if actions:
             self._act(actions)

@@ -150,7 +150,7 @@ async def answer_hop_query(
         return report
     further = min(question.further, MAX_FURTHER) - 1
     onward = HopQuestion(NetId.parse(report.target), question.port, further)
-    operation = ReadWrite(IndexGroup.WHEREABOUTS, 0, MAX_REPORT, onward.encode())
+    operation = ReadWrite(IndexGroup.ROUTE_QUERY, 0, MAX_REPORT, onward.encode())
     next_router = NetId.parse(report.next_net_id)
     timeout_s = _HOP_TIMEOUT_S + _TIMEOUT_PER_HOP_S * further
     outcome = await run_operation(station, next_router, SYSTEM_PORT, operation, timeout_s)
@@ -279,7 +279,7 @@ class RouteQuery:
             outcome = OperationOutcome(AdsError.SIZE)
         else:
             source = request.header.source
-            report = await answer_hop_query(self._station, question, request.came_by, source)
+            report = await answer_hop_query(self._station, question, request.endpoint, source)
             data = encode_report(report)
             fits = len(data) <= operation.length
             outcome = OperationOutcome(data=data) if fits else OperationOutcome(AdsError.SIZE)
@@ -296,7 +296,7 @@ def _hop_query(request: LocalRequest) -> ReadWrite | None:
         return None
     if others or not isinstance(operation, ReadWrite):
         return None
-    return operation if operation.group == IndexGroup.WHEREABOUTS else None
+    return operation if operation.group == IndexGroup.ROUTE_QUERY else None
 
 
 FAULT_SEARCH_S = 3.0

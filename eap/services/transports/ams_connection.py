@@ -25,7 +25,7 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from eap.ads.endpoint import AmsAnswer, response_to
-from eap.ams.reassembly import Asked, PacketCutter, Piece, TooLong
+from eap.ams.reassembly import AmsStreamDecoder, OversizedPacket, RouterRequest, StreamItem
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import (
     AmsCommand,
@@ -268,7 +268,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         self._handler = handler
         self._is_ours = is_ours
         self._window = AmsWindow()
-        self._cutter = PacketCutter(LONGEST_ANSWER if is_ours else LONGEST_PACKET)
+        self._cutter = AmsStreamDecoder(LONGEST_ANSWER if is_ours else LONGEST_PACKET)
         self._transport: asyncio.Transport
         self._is_open = False
         self._is_held = False
@@ -392,7 +392,7 @@ class AmsConnection(asyncio.BufferedProtocol):
                 self._hold()
                 return
             try:
-                piece = self._cutter.next_piece()
+                piece = self._cutter.next_item()
             except MalformedError as exc:
                 self._break_off(str(exc))
                 return
@@ -418,7 +418,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
         self._handler.count_dropped(Refusal.AMS_TYPE)
         self._why = f"no AMS packets: {why}"
-        self._cutter = PacketCutter(0)
+        self._cutter = AmsStreamDecoder(0)
         self._has_ended = True
         self._hold()
         self._close_when_done()
@@ -429,14 +429,14 @@ class AmsConnection(asyncio.BufferedProtocol):
             if self.late_since_ns is None:
                 self.late_since_ns = monotonic_ns()  # answers may still wait to be taken
 
-    def _take(self, piece: Piece) -> None:
+    def _take(self, piece: StreamItem) -> None:
         self.used_at_ns = monotonic_ns()
         self._is_used = True
         if not self._is_blocked:
             self.late_since_ns = None
-        if isinstance(piece, TooLong):
+        if isinstance(piece, OversizedPacket):
             self._refuse_length(piece.header)
-        elif isinstance(piece, Asked):
+        elif isinstance(piece, RouterRequest):
             self._answer_client(piece)
         elif int.from_bytes(piece[20:24], "little") != len(piece) - AmsHeader.SIZE:
             self._refuse_length(AmsHeader.decode(piece))
@@ -445,7 +445,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         else:
             self._handler.handle_packet(piece, self)
 
-    def _answer_client(self, asked: Asked) -> None:
+    def _answer_client(self, asked: RouterRequest) -> None:
         port = int.from_bytes(asked.data, "little")
         if self._assign_address is None:
             self._break_off("a router that asks for an address")

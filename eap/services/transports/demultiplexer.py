@@ -27,11 +27,11 @@ class Demultiplexer:
         self._behind = behind
         self._fragments = Reassembly()
 
-    def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
+    def receive(self, data: bytes, connection: str, *, is_broadcast: bool = False) -> None:
         """Act on a packet; the arguments are those of :meth:`StationRouter.receive`."""
-        if len(self._behind) == 1 or for_all:
+        if len(self._behind) == 1 or is_broadcast:
             for station, transport in self._behind:
-                station.receive(data, transport, connection, for_all=for_all)
+                station.receive(data, transport, connection, is_broadcast=is_broadcast)
             return
         try:
             whole = self._whole(data, connection)
@@ -54,10 +54,10 @@ class Demultiplexer:
         """Say whether a NetID is of one of the stations."""
         return any(net_id in station.net_ids for station, _ in self._behind)
 
-    def hop_is_at(self, address: str, connection: str) -> None:
+    def set_hop_connection(self, address: str, connection: str) -> None:
         """Tell the stations that what comes by *connection* comes from the hop *address*."""
         for station, transport in self._behind:
-            station.hop_is_at(transport, address, connection)
+            station.set_hop_connection(transport, address, connection)
 
     def hop_down(self, address: str, text: str) -> None:
         """Tell the stations that nothing can go to *address* by this door; *text* says why."""

@@ -230,7 +230,7 @@ class FrameCounters:
 class PacketReceiver(Protocol):
     """Where packets of a channel go."""
 
-    def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
+    def receive(self, data: bytes, connection: str, *, is_broadcast: bool = False) -> None:
         """Act on a packet that came from the address *connection*."""
 
 
@@ -271,7 +271,7 @@ class MailboxIntake:
         frame, is_for_many = data[:size], self._is_for_many(data)
         packet = aoe_packet(frame) if self._is_aoe_here else None
         if packet is not None:
-            self._demultiplexer.receive(packet, sender, for_all=is_for_many)
+            self._demultiplexer.receive(packet, sender, is_broadcast=is_for_many)
             return None
         if is_for_many:
             return refusal_of(frame)
@@ -341,15 +341,15 @@ class EthernetSegment:
         self._demultiplexer = demultiplexer
         self._resolutions: dict[NetId, _Resolution] = {}
 
-    def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
+    def receive(self, data: bytes, connection: str, *, is_broadcast: bool = False) -> None:
         """Act on a packet; the arguments are those of :meth:`Demultiplexer.receive`."""
         self._learn(data, connection)
-        self._demultiplexer.receive(data, connection, for_all=for_all)
+        self._demultiplexer.receive(data, connection, is_broadcast=is_broadcast)
 
     def find(self, net_id: NetId, now_ns: int, ask: Callable[[], object]) -> str:
         """Return the MAC address of a port, empty while it is not known; *ask* when it is time."""
         if self._demultiplexer.has(net_id):
-            self._demultiplexer.hop_is_at(str(net_id), self.mac)
+            self._demultiplexer.set_hop_connection(str(net_id), self.mac)
             return self.mac
         place = self._resolutions.get(net_id, _Resolution("", None))
         pause_ns = ASK_AGAIN_NS if place.mac else ASK_NS
@@ -370,7 +370,7 @@ class EthernetSegment:
             return
         if place.mac != mac and self._demultiplexer.has(header.target):
             self._resolutions[header.source] = place._replace(mac=mac)
-            self._demultiplexer.hop_is_at(str(header.source), mac)
+            self._demultiplexer.set_hop_connection(str(header.source), mac)
 
 
 class SegmentSender:

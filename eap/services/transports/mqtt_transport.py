@@ -10,13 +10,13 @@ from time import monotonic_ns
 
 from eap.ams.mqtt.network import (
     Action,
-    Arrived,
-    Closed,
     Drop,
     Dropped,
     HopDown,
     HopUp,
     MqttNetwork,
+    PacketReceived,
+    PeerClosed,
     Publish,
     Subscribe,
 )
@@ -146,7 +146,7 @@ class MqttTransport:
             self._timer = asyncio.get_running_loop().call_later(wait_s, self._time_out)
 
     def _do(self, action: Action) -> None:
-        if isinstance(action, Arrived):
+        if isinstance(action, PacketReceived):
             self._router.receive(action.packet, self.name, action.connection)
         elif isinstance(action, (Publish, Subscribe)):
             if (why := self._link.send(action)) is not None:
@@ -155,7 +155,7 @@ class MqttTransport:
             self._router.hop_down(self.name, action.address, action.text)
         elif isinstance(action, HopUp):
             self._router.hop_up(self.name, action.address)
-        elif isinstance(action, Closed):
+        elif isinstance(action, PeerClosed):
             self._router.connection_closed(self.name, action.connection)
         elif isinstance(action, Dropped):
             self._count_dropped(_REFUSALS[action.reason])

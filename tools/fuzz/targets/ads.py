@@ -8,9 +8,9 @@ from struct import Struct
 
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import Endpoint
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ads.request import MAX_ANSWER
-from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
+from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name
 from eap.codec.adsnotification import decode_notification
@@ -20,7 +20,7 @@ from tools.fuzz.messages import cut
 
 _TYPES = {"flags": "WORD", "name": "STRING(20)", "curve": "REAL[4]", "depth": "INT24"}
 _HEAD = Struct("<5I")
-_CLIENT = Client(Endpoint("door", "connection"), NetId(bytes(6)), 1)
+_CLIENT = AdsClient(Endpoint("door", "connection"), NetId(bytes(6)), 1)
 _COMMANDS = tuple(AmsCommand)
 _GROUPS = tuple(IndexGroup)
 
@@ -45,7 +45,7 @@ class _Store:
 
 def _device() -> AdsDevice:
     store = _Store()
-    variables = [Variable(name, kind) for name, kind in store.types.items()]
+    variables = [SymbolVariable(name, kind) for name, kind in store.types.items()]
     return AdsDevice(
         AdsDeviceInfo(1, 0, 0, device_name("fuzzed")),
         lambda: AdsStates(AdsState.RUN, 8),

@@ -19,7 +19,7 @@ from devicebus.mailbox.voe import VoeServer
 from devicebus.master.mailboxes import Unsolicited
 from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite
-from eap.ads.request import take_request
+from eap.ads.request import accept_request
 from eap.ams.access import AccessList
 from eap.ams.spec import AccessRule, AccessService
 from eap.codec.mailbox import (
@@ -148,7 +148,7 @@ async def _nothing(index: int) -> None:
 async def _send_requests(port: int, command: int, body: bytes, *, timeout_s: float) -> AmsAnswer:
     """Read long values and a short file from another station, and take what is written there."""
     del port, timeout_s
-    request = take_request(command, body)
+    request = accept_request(command, body)
     if isinstance(request, AmsAnswer):
         return request
     outcomes = [OperationOutcome(data=_elsewhere(each)) for each in request.operations]

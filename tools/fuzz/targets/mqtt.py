@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.ams.mqtt.network import Arrived, MqttNetwork, Publish
+from eap.ams.mqtt.network import MqttNetwork, PacketReceived, Publish
 from eap.ams.routes import RouteTable
 from eap.ams.spec import MqttSpec
 from eap.codec.ams import AmsHeader, StateFlags
@@ -39,6 +39,6 @@ def _feed(network: MqttNetwork, topic: str, payload: bytes) -> None:
             header = AmsHeader.decode(action.payload[-AmsHeader.SIZE :])
             if not header.state_flags & StateFlags.RESPONSE:
                 raise AssertionError("what was asked is answered with a request")
-        elif isinstance(action, Arrived):
+        elif isinstance(action, PacketReceived):
             back = network.message_for(action.connection, action.packet)
             network.receive_message(back.topic, back.payload, 1)

@@ -28,8 +28,8 @@ def fuzz_one(data: bytes) -> None:
         RouteTable([Route(_FAR, "far", _LINK)]),
         [
             Transport("tcp", is_stream=True),
-            Transport("segment", room=60),
-            Transport("link", room=200),
+            Transport("segment", max_size=60),
+            Transport("link", max_size=200),
         ],
         first_invoke_id=1,
         access=AccessList([AccessRule("wide", transports=("tcp",)), _OBJECTS]),

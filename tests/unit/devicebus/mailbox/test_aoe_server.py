@@ -7,7 +7,7 @@ from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.aoe_server import AdsServer, AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.endpoint import AmsAnswer
-from eap.ams.reassembly import Assembler, iter_fragments
+from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxError, decode_frame
 from eap.ids import NetId
@@ -190,7 +190,7 @@ def test_handler_may_say_that_nobody_was_reached() -> None:
 def test_long_answer_goes_in_fragments() -> None:
     long = bytes(n % 251 for n in range(300))
     server = AoeServer(lambda header, data: AmsAnswer(long), MailboxSizes(128, 128))
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     answers = server.receive_message(REQUEST, 0)
     assert len(answers) == 4
     assert max(map(len, answers)) == 128 - 6

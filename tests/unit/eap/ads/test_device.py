@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from eap.ads.device import FIRST_CHANGE_NS, AdsDevice
 from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ads.operation import Read, Write
 from eap.ads.request import MAX_ANSWER
 from eap.ads.space import AdsSpace
@@ -19,7 +19,7 @@ from eap.ids import NetId
 from tests.support.adsdevice import DictStore, Station, info, variable_device
 
 G = IndexGroup
-CLIENT = Client(Endpoint("tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
+CLIENT = AdsClient(Endpoint("tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
 
 
 class Bench:

@@ -4,7 +4,7 @@ import pytest
 
 from eap.ads import notifications as ads_notifications
 from eap.ads.endpoint import Endpoint
-from eap.ads.notifications import FULL_PACKET, MAX_WATCHED, Client, Notice, NotificationTable
+from eap.ads.notifications import FULL_PACKET, MAX_WATCHED, AdsClient, Notice, NotificationTable
 from eap.ads.operation import AdsRefusedError
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
@@ -19,7 +19,7 @@ from eap.codec.ams import AmsHeader, decode_packet
 from eap.ids import NetId
 
 MS = 1_000_000
-ME = Client(Endpoint("tcp", "1"), NetId(b"client"), 30000)
+ME = AdsClient(Endpoint("tcp", "1"), NetId(b"client"), 30000)
 YOU = ME._replace(endpoint=Endpoint("tcp", "2"))
 OTHER = ME._replace(port=30001)
 CYCLE = TransMode.SERVER_CYCLE

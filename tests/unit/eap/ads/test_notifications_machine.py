@@ -6,7 +6,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, rule
 
-from eap.ads.notifications import Client, NotificationTable
+from eap.ads.notifications import AdsClient, NotificationTable
 from eap.ads.operation import AdsRefusedError
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
@@ -41,7 +41,7 @@ class Watched(RuleBasedStateMachine):
         super().__init__()
         self.table = NotificationTable()
         self.now = 0
-        self.alive: dict[int, tuple[Client, Value, AddNotification]] = {}
+        self.alive: dict[int, tuple[AdsClient, Value, AddNotification]] = {}
         self.last: dict[int, bytes] = {}
         self.unsent: dict[int, list[tuple[int, bytes]]] = {}
 

@@ -17,7 +17,7 @@ from eap.ads.operation import (
     Write,
     WriteControl,
 )
-from eap.ads.request import Outcomes, parse_request, take_request
+from eap.ads.request import Outcomes, accept_request, parse_request
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand, decode_packet
@@ -119,9 +119,9 @@ def test_commands_that_ask_for_nothing(command: int) -> None:
 
 
 def test_what_is_no_request_is_answered_at_once() -> None:
-    assert take_request(AmsCommand.READ, bytes(11)) == AmsAnswer(b"\5\7\0\0" + bytes(4))
-    assert take_request(0, b"") == AmsAnswer(error_code=AdsError.COMMAND)
-    assert take_request(AmsCommand.READ_STATE, b"") == parse_request(AmsCommand.READ_STATE, b"")
+    assert accept_request(AmsCommand.READ, bytes(11)) == AmsAnswer(b"\5\7\0\0" + bytes(4))
+    assert accept_request(0, b"") == AmsAnswer(error_code=AdsError.COMMAND)
+    assert accept_request(AmsCommand.READ_STATE, b"") == parse_request(AmsCommand.READ_STATE, b"")
 
 
 def test_the_first_reasons_are_told() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.space import AdsSpace, steady
+from eap.ads.space import AdsSpace, fixed_size_source
 
 
 @pytest.mark.parametrize(
@@ -24,10 +24,10 @@ def test_what_is_not_overridden_is_refused(attempt: Callable[[AdsSpace], object]
 
 def test_what_gets_longer_or_shorter_ends() -> None:
     octets = [b"four", b"more", b"five!", b"two", b"two"]
-    source = steady(lambda: octets.pop(0), 4)
+    source = fixed_size_source(lambda: octets.pop(0), 4)
     assert source() == b"more"
     for _ in range(2):
         with pytest.raises(AdsRefusedError, match="SIZE"):
             source()
     with pytest.raises(AdsRefusedError, match="SIZE"):
-        steady(lambda: octets.pop(0), 4)
+        fixed_size_source(lambda: octets.pop(0), 4)

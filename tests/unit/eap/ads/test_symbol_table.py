@@ -5,14 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.symbols import SymbolTable, Variable
+from eap.ads.symbols import SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.adssymbol import UploadInfo
 
 
 def test_case_of_names_matters_only_between_two_that_differ_in_it() -> None:
     kind = datatypes.parse("USINT")
-    table = SymbolTable([Variable(name, kind) for name in ("Pump", "valve", "Valve")], 0)
+    table = SymbolTable([SymbolVariable(name, kind) for name in ("Pump", "valve", "Valve")], 0)
     assert table.handle_of("PUMP") == table.handle_of("Pump")
     assert table.handle_of("valve") != table.handle_of("Valve")
     with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
@@ -33,9 +33,9 @@ KINDS = st.sampled_from(["BOOL", "INT24", "STRING(9)", "REAL[3]", "BLOCK(5)", "U
 @given(st.lists(KINDS, max_size=20), st.integers(0, 400))
 def test_every_offset_belongs_to_one_symbol_or_none(kinds: list[str], offset: int) -> None:
     table = SymbolTable(
-        [Variable(f"v{n}", datatypes.parse(kind)) for n, kind in enumerate(kinds)], 0
+        [SymbolVariable(f"v{n}", datatypes.parse(kind)) for n, kind in enumerate(kinds)], 0
     )
-    places = [table.by_handle(n + 1).place for n in range(len(kinds))]
+    places = [table.by_handle(n + 1).address for n in range(len(kinds))]
     owners = [p for p in places if p.offset <= offset < p.offset + p.size]
     assert len(owners) <= 1
     try:
@@ -43,5 +43,5 @@ def test_every_offset_belongs_to_one_symbol_or_none(kinds: list[str], offset: in
     except AdsRefusedError:
         assert not owners
     else:
-        assert owners == [symbol.place]
-        assert start == offset - symbol.place.offset
+        assert owners == [symbol.address]
+        assert start == offset - symbol.address.offset

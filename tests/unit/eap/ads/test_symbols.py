@@ -3,14 +3,14 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.operation import AdsRefusedError
-from eap.ads.symbols import SymbolSpace, SymbolTable, Variable
+from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import (
     AdsType,
+    SymbolAddress,
     SymbolEntry,
     SymbolFlag,
-    SymbolPlace,
     UploadInfo,
     decode_entry,
 )
@@ -36,7 +36,7 @@ def handle(space: SymbolSpace, name: str) -> int:
 
 def test_a_value_is_the_same_whichever_way_it_is_reached(space, store) -> None:
     for name, kind in store.types.items():
-        place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, name.encode()))
+        place = SymbolAddress.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, name.encode()))
         by_name = space.read_write(G.VALUE_BY_NAME, 0, BIG, name.encode())
         assert space.read(G.VALUE_BY_HANDLE, handle(space, name), BIG) == by_name
         assert space.read(G.SYMBOL_NOTIFICATION, handle(space, name), BIG) == by_name
@@ -60,7 +60,7 @@ def test_table_is_uploaded(space) -> None:
     one, end = decode_entry(space.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 798, b"count"))
     assert one == entries[2]
     assert one == SymbolEntry(
-        SymbolPlace(G.DATA, 16, 4),
+        SymbolAddress(G.DATA, 16, 4),
         AdsType.UINT32,
         SymbolFlag.READ_ONLY,
         "count",
@@ -105,7 +105,7 @@ def test_a_handle_comes_with_its_type_where_there_is_room(space) -> None:
 def test_values_are_written(space, store) -> None:
     space.write(G.VALUE_BY_HANDLE, handle(space, "depth"), b"\xfe\xff\xff\xff")
     assert store.get("depth") == -2
-    place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
+    place = SymbolAddress.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
     space.write(place.group, place.offset, bytes(range(8)))
     assert store.octets["curve"] == bytes(range(8))
     for offset, data, result in (
@@ -120,7 +120,7 @@ def test_values_are_written(space, store) -> None:
 
 
 def test_elements_of_a_list_are_read_by_offset(space) -> None:
-    place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
+    place = SymbolAddress.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
     assert space.read(place.group, place.offset + 2, 2) == b"\xfe\xff"
     assert space.read(place.group, place.offset + 6, BIG) == b"\xfc\xff"
 
@@ -143,7 +143,7 @@ def test_watching_goes_on_with_what_is_in_the_next_table_too(space, store) -> No
     space.replace(SymbolTable(reversed(variables(store)), 2), store)
     store.set("count", 5)
     assert value() == b"\5\0\0\0"
-    other = [Variable("count", datatypes.parse("UINT"))]
+    other = [SymbolVariable("count", datatypes.parse("UINT"))]
     for without in (other, []):
         space.replace(SymbolTable(without, 3), store)
         with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
@@ -157,7 +157,7 @@ def test_handles_that_never_were_any(space, number: int) -> None:
 
 
 def test_watching_gives_exactly_what_was_asked_for(space, store) -> None:
-    place = SymbolPlace.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
+    place = SymbolAddress.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
     second = space.watch(G.DATA, place.offset + 2, 2)
     store.set("curve", (1, 2, 3, 4))
     assert second() == b"\2\0"

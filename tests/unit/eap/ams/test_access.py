@@ -93,10 +93,10 @@ def test_host_of_a_way() -> None:
 
 def test_without_rules_this_host_does_everything_and_others_read() -> None:
     here = grants(endpoint=Endpoint("ams-tcp", "127.0.0.1:40000"))
-    assert all(here.admission(each).is_allowed for each in (READ, WRITE, CONTROL))
+    assert all(here.decide(each).is_allowed for each in (READ, WRITE, CONTROL))
     others = grants()
-    assert others.admission(READ)[:3] == (Service.READ, True, "no rule refuses reading")
-    refused = others.admission(WRITE)
+    assert others.decide(READ)[:3] == (Service.READ, True, "no rule refuses reading")
+    refused = others.decide(WRITE)
     assert refused[:3] == (Service.WRITE, False, "no rule allows it, and other hosts only read")
     assert others.may_read
     assert others.may(Service.WRITE) is False
@@ -134,10 +134,10 @@ def test_first_rule_that_fits_counts() -> None:
         AccessRule("not-the-axis", allow=False, objects=(ObjectRange(0x8000, 0x8000),)),
         AccessRule("engineering", services=(Service.WRITE,)),
     )
-    refused = both.admission(WRITE)
+    refused = both.decide(WRITE)
     assert refused[:4] == (Service.WRITE, False, "rule not-the-axis refuses it", True)
-    assert both.admission(Write(G.SDO, 0x8001_0001, b"")).why == "rule engineering allows it"
-    assert not both.admission(CONTROL).is_allowed
+    assert both.decide(Write(G.SDO, 0x8001_0001, b"")).why == "rule engineering allows it"
+    assert not both.decide(CONTROL).is_allowed
     assert both.may(Service.WRITE) is None
     assert both.may(Service.CONTROL) is False
 
@@ -150,27 +150,27 @@ def test_one_object_range_is_opened_for_one_network() -> None:
         objects=(ObjectRange(0x8000, 0x8FFF, 1, 1),),
     )
     near, far = grants(rule), grants(rule, endpoint=Endpoint("ams-tcp", "10.0.1.5:1"))
-    assert near.admission(WRITE).is_allowed
-    assert not near.admission(Write(G.SDO, 0x9000_0001, b"")).is_allowed
-    assert not near.admission(WHOLE).is_allowed, "complete access writes more than the rule opens"
-    assert not near.admission(Write(G.DATA, 0, b"")).is_allowed
-    assert not far.admission(WRITE).is_allowed
+    assert near.decide(WRITE).is_allowed
+    assert not near.decide(Write(G.SDO, 0x9000_0001, b"")).is_allowed
+    assert not near.decide(WHOLE).is_allowed, "complete access writes more than the rule opens"
+    assert not near.decide(Write(G.DATA, 0, b"")).is_allowed
+    assert not far.decide(WRITE).is_allowed
 
 
 def test_a_refusal_of_an_entry_refuses_complete_access_to_its_object() -> None:
     rule = AccessRule("secret", allow=False, objects=(ObjectRange(0x1018, 0x1018, 4, 4),))
     hidden = grants(rule)
-    assert hidden.admission(READ).is_allowed
-    assert not hidden.admission(Read(G.SDO, 0x1018_0004, 4)).is_allowed
-    assert not hidden.admission(Read(G.SDO, 0x1018_0100, 64)).is_allowed
+    assert hidden.decide(READ).is_allowed
+    assert not hidden.decide(Read(G.SDO, 0x1018_0004, 4)).is_allowed
+    assert not hidden.decide(Read(G.SDO, 0x1018_0100, 64)).is_allowed
     assert not hidden.may_read
 
 
 def test_rules_may_lock_this_host_out() -> None:
     rule = AccessRule("nobody-here", allow=False, transports=("local", "ams-tcp"))
     here = grants(rule, endpoint=Endpoint("ams-tcp", "127.0.0.1:1"))
-    assert not here.admission(READ).is_allowed
-    assert grants(rule, endpoint=Endpoint("udp:eap0", "127.0.1.1:1")).admission(WRITE).is_allowed
+    assert not here.decide(READ).is_allowed
+    assert grants(rule, endpoint=Endpoint("udp:eap0", "127.0.1.1:1")).decide(WRITE).is_allowed
 
 
 @pytest.mark.parametrize(
@@ -189,14 +189,14 @@ def test_rules_may_lock_this_host_out() -> None:
     ],
 )
 def test_every_condition_of_a_rule_has_to_fit(rule: AccessRule, *, fits: bool) -> None:
-    assert grants(rule).admission(WRITE).is_allowed is fits
+    assert grants(rule).decide(WRITE).is_allowed is fits
 
 
 def test_a_network_is_no_matter_of_doors_without_addresses() -> None:
     rule = AccessRule("all", networks=("0.0.0.0/0",))
     assert (
         not grants(rule, endpoint=Endpoint("ethernet:eap0", "02:00:00:00:00:01"))
-        .admission(WRITE)
+        .decide(WRITE)
         .is_allowed
     )
 
@@ -222,12 +222,10 @@ def test_what_is_remembered_of_clients_is_bounded() -> None:
 )
 def test_senders_on_ethernet_have_mac_addresses(transport, connection, fits) -> None:
     rule = AccessRule("x", networks=("10.0.0.5/32",), macs=("02-00-00-00-00-0A",))
-    assert (
-        grants(rule, endpoint=Endpoint(transport, connection)).admission(WRITE).is_allowed is fits
-    )
+    assert grants(rule, endpoint=Endpoint(transport, connection)).decide(WRITE).is_allowed is fits
     only = AccessRule("x", networks=("0.0.0.0/0",))
     assert (
         not grants(only, endpoint=Endpoint("ethernet:eap0", "02:00:00:00:00:0a"))
-        .admission(WRITE)
+        .decide(WRITE)
         .is_allowed
     )

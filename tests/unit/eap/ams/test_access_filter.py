@@ -7,7 +7,7 @@ from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import Operation, Read, ReadWrite, Write
 from eap.ads.request import AdsRequest, encode_sum
 from eap.ams.access_filter import MAX_ENTRIES, AuditEntry
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.record import Outcome
 from eap.ams.spec import AccessRule, ObjectRange
 from eap.ams.transport_table import Deliver, Forward
@@ -124,7 +124,9 @@ class TestNoAnswer:
         assert [results(each) for each in entries(here)] == [[None], [None]]
 
     def test_a_change_for_which_there_is_no_room_is_told(self) -> None:
-        here = Station([route(FAR, LINK, "far")], rules=[DRIVES], limits=Limits(per_connection=1))
+        here = Station(
+            [route(FAR, LINK, "far")], rules=[DRIVES], limits=RouterLimits(per_connection=1)
+        )
         here.forwarded(ask(WRITE, SDO_WRITE, FAR_DEVICE), LAPTOP)
         for target in (DEVICE, FAR_DEVICE):
             second = ask(WRITE, SDO_WRITE, target, invoke_id=2)

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.admission import Admission, Limits
-from eap.ams.error_reply import Refusal
+from eap.ams.admission import Admission, RouterLimits
+from eap.ams.error_reply import RoutingError
 from eap.ams.inflight import InFlight, Pending
 from eap.ams.record import Outcome
 from eap.ams.routes import Route, RouteTable
@@ -22,7 +22,7 @@ DOORS = {"tcp": Transport("tcp", is_stream=True, is_hub=True), "segment": Transp
 def make(hop: Endpoint = TCP, **more: object) -> tuple[Admission, InFlight, Route]:
     route = Route(FAR, "far", hop, **more)
     waiting = InFlight()
-    return Admission(OWN, RouteTable([route]), DOORS, waiting, Limits(2, 1)), waiting, route
+    return Admission(OWN, RouteTable([route]), DOORS, waiting, RouterLimits(2, 1)), waiting, route
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,11 @@ def make(hop: Endpoint = TCP, **more: object) -> tuple[Admission, InFlight, Rout
 def test_way_back_is_no_way(hop: Endpoint, endpoint: Endpoint, error: AdsError | None) -> None:
     admission, _, route = make(hop)
     found = admission.find_route(ASKED, endpoint)
-    assert found == route if error is None else isinstance(found, Refusal) and found.error == error
+    assert (
+        found == route
+        if error is None
+        else isinstance(found, RoutingError) and found.error == error
+    )
 
 
 def test_hops_go_down_and_up() -> None:
@@ -49,7 +53,9 @@ def test_hops_go_down_and_up() -> None:
         assert admission.is_down(TCP)
         assert admission.why_down(TCP) == "cut"
         refusal = admission.find_route(ASKED, endpoint)
-        assert refusal == Refusal(AdsError.HOST_UNREACHABLE, "far (1 by tcp) is down: cut", route)
+        assert refusal == RoutingError(
+            AdsError.HOST_UNREACHABLE, "far (1 by tcp) is down: cut", route
+        )
         admission.hop_up("tcp", address)
         assert admission.find_route(ASKED, endpoint) == route
     admission.hop_down("tcp", "3", "cut")
@@ -60,38 +66,38 @@ def test_hops_go_down_and_up() -> None:
 
 def test_circle_has_addresses_and_command_of_what_waits() -> None:
     admission, waiting, route = make()
-    assert admission.find_circle(ASKED, b"addresses", route) is None
+    assert admission.find_loop(ASKED, b"addresses", route) is None
     waiting.add(Pending(9, ASKED, TCP, route, b"addresses", 0, 1))
-    found = admission.find_circle(ASKED, b"addresses", route)
+    found = admission.find_loop(ASKED, b"addresses", route)
     assert found is not None
     assert (found.error, found.outcome) == (AdsError.TARGET_MACHINE, Outcome.LOOP)
-    assert admission.find_circle(ASKED, b"others", route) is None
+    assert admission.find_loop(ASKED, b"others", route) is None
     write = AmsHeader(FAR, 1, CLIENT, 2, 3, invoke_id=9)
-    assert admission.find_circle(write, b"addresses", route) is None
+    assert admission.find_loop(write, b"addresses", route) is None
     waiting.pop(9)
     waiting.add(Pending(9, ASKED, TCP, None, b"addresses", 0, 1))
-    assert admission.find_circle(ASKED, b"addresses", route) is None
+    assert admission.find_loop(ASKED, b"addresses", route) is None
 
 
 def test_only_doors_that_may_double_packets_look_for_doubles() -> None:
     admission, waiting, route = make()
     for number, endpoint in enumerate((TCP, SEGMENT)):
         waiting.add(Pending(number, ASKED, endpoint, route, b"addresses", 0, 1))
-    assert admission.is_again(ASKED, b"addresses", SEGMENT)
-    assert not admission.is_again(ASKED, b"addresses", TCP)
+    assert admission.is_duplicate(ASKED, b"addresses", SEGMENT)
+    assert not admission.is_duplicate(ASKED, b"addresses", TCP)
 
 
 def test_room_is_limited_by_connection_and_in_all() -> None:
     admission, waiting, route = make()
-    assert admission.find_room(TCP) is None
+    assert admission.check_limits(TCP) is None
     waiting.add(Pending(1, ASKED, TCP, route, b"", 0, 1))
-    refusal = admission.find_room(TCP)
+    refusal = admission.check_limits(TCP)
     assert refusal is not None
     assert refusal.error is AdsError.MAILBOX_FULL
-    assert admission.find_room(SEGMENT) is None
+    assert admission.check_limits(SEGMENT) is None
     waiting.add(Pending(2, ASKED, SEGMENT, route, b"", 0, 1))
     other = Endpoint("tcp", "3")
-    assert admission.find_room(other) is not None
+    assert admission.check_limits(other) is not None
     waiting.abandon(TCP)
-    assert admission.find_room(other) is None
+    assert admission.check_limits(other) is None
     assert len(waiting) == 1

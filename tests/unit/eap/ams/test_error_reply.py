@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.error_reply import ErrorReplier, Refusal, wants_answer
+from eap.ams.error_reply import ErrorReplier, RoutingError, wants_answer
 from eap.ams.record import Outcome, Record
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport, TransportTable
@@ -17,13 +17,13 @@ WAY, HOP = Endpoint("tcp", "1"), Endpoint("link", "6")
 ASKED = Ams("6.1.1.1.1.1:1", "7.1.1.1.1.1:2")
 HEADER = AmsHeader.decode(ASKED.octets())
 ROUTE = Route(NetId.parse("6.1.1.1.1.1"), "far", HOP)
-WHY = Refusal(AdsError.HOST_UNREACHABLE, "the cable is cut", ROUTE)
+WHY = RoutingError(AdsError.HOST_UNREACHABLE, "the cable is cut", ROUTE)
 
 
 def test_refusal_is_answered_counted_and_traced() -> None:
     record = Record()
     error_replier = ErrorReplier(TransportTable([Transport("tcp")]), record)
-    assert only_reply(error_replier.refuse(HEADER, WAY, WHY, 9, 4)) == (
+    assert only_reply(error_replier.reply_error(HEADER, WAY, WHY, 9, 4)) == (
         WAY,
         ASKED.answer(b"", 0x1B),
     )
@@ -38,7 +38,7 @@ def test_refusal_is_answered_counted_and_traced() -> None:
 
 def test_nobody_is_answered_when_nobody_waits() -> None:
     error_replier = ErrorReplier(TransportTable([Transport("tcp")]), Record())
-    assert error_replier.refuse(HEADER, None, WHY, 9) == []
+    assert error_replier.reply_error(HEADER, None, WHY, 9) == []
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.inflight import is_marked
 from eap.ams.record import Outcome
 from eap.ams.routes import Route
@@ -287,7 +287,7 @@ def test_request_asked_again_is_passed_once_where_packets_may_be_doubled() -> No
 
 
 def test_requests_that_wait_are_limited() -> None:
-    limits = Limits(in_flight=3, per_connection=2)
+    limits = RouterLimits(in_flight=3, per_connection=2)
     station = Station([route(FAR, LINK)], limits=limits)
     for _ in range(2):
         station.forwarded(ASKED, ONE)
@@ -305,7 +305,7 @@ def test_requests_that_wait_are_limited() -> None:
 
 
 def test_flood_by_one_door_leaves_room_for_the_others() -> None:
-    station = Station([route(FAR, LINK)], limits=Limits(per_transport=2))
+    station = Station([route(FAR, LINK)], limits=RouterLimits(per_transport=2))
     for number in range(2):
         station.forwarded(ASKED, Endpoint("segment", str(number)))
     there = Endpoint("segment", "2")
@@ -315,7 +315,7 @@ def test_flood_by_one_door_leaves_room_for_the_others() -> None:
 
 
 def test_flood_by_some_connections_of_a_door_leaves_room_for_another_one() -> None:
-    station = Station([route(FAR, LINK)], limits=Limits(per_transport=16))
+    station = Station([route(FAR, LINK)], limits=RouterLimits(per_transport=16))
     for port in range(4):
         endpoint = Endpoint("tcp", f"10.0.0.5:{port}")
         while isinstance(station.give(ASKED, endpoint)[0], Forward):

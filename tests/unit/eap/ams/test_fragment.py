@@ -11,7 +11,7 @@ from eap.ams.reassembly import (
     FRAGMENT_TIMEOUT_NS,
     MAX_LENGTH,
     MAX_PACKETS,
-    Assembler,
+    FragmentAssembler,
     iter_fragments,
 )
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet, encode_packet
@@ -29,7 +29,7 @@ def give(assembler, fragment, now_ns=0):
 @given(st.binary(max_size=500), st.integers(1, 200), st.integers(0, 0xFFFF))
 def test_packet_comes_out_as_it_went_in(body, room, number):
     packet = encode_packet(HEADER, body)
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     fragments = list(iter_fragments(packet, number, room))
     taken = [give(assembler, each) for each in fragments]
     assert [each.packet for each in taken] == [None] * (len(taken) - 1) + [packet]
@@ -41,7 +41,7 @@ def test_packet_comes_out_as_it_went_in(body, room, number):
 
 
 def test_packets_of_several_senders_mix():
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     packets = [
         encode_packet(msgspec.structs.replace(HEADER, source_port=port), bytes(100))
         for port in (1, 2)
@@ -52,7 +52,7 @@ def test_packets_of_several_senders_mix():
 
 
 def test_missing_fragment_drops_the_packet():
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     first, _, third = iter_fragments(encode_packet(HEADER, bytes(50)), 1, 25)
     give(assembler, first)
     with pytest.raises(MalformedError, match="out of order"):
@@ -63,7 +63,7 @@ def test_missing_fragment_drops_the_packet():
 
 
 def test_late_fragment_drops_the_packet():
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     first, second = iter_fragments(encode_packet(HEADER, bytes(20)), 1, 20)
     give(assembler, first, 0)
     with pytest.raises(MalformedError):
@@ -71,7 +71,7 @@ def test_late_fragment_drops_the_packet():
 
 
 def test_new_start_takes_the_place_of_the_old():
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     packet = encode_packet(HEADER, bytes(20))
     first, second = iter_fragments(packet, 1, 20)
     give(assembler, first)
@@ -81,7 +81,7 @@ def test_new_start_takes_the_place_of_the_old():
 
 
 def test_only_so_many_packets_are_kept():
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     cut = [list(iter_fragments(encode_packet(HEADER, bytes(20)), n, 20)) for n in range(9)]
     for first, _ in cut:
         give(assembler, first)
@@ -92,7 +92,7 @@ def test_only_so_many_packets_are_kept():
 
 @pytest.mark.parametrize("length", [3, MAX_LENGTH + 1])
 def test_length_that_cannot_be_drops_the_packet(length):
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     fragment = bytearray(next(iter_fragments(encode_packet(HEADER, bytes(20)), 1, 36)))
     fragment[36:40] = length.to_bytes(4, "little")
     with pytest.raises(MalformedError, match="too long"):
@@ -100,7 +100,7 @@ def test_length_that_cannot_be_drops_the_packet(length):
 
 
 def test_forgotten_packets_do_not_go_on():
-    assembler = Assembler()
+    assembler = FragmentAssembler()
     first, second = iter_fragments(encode_packet(HEADER, bytes(20)), 1, 20)
     give(assembler, first)
     assembler.reset()

@@ -79,7 +79,7 @@ def test_hop_that_stays_dead_for_a_minute_is_gone_once() -> None:
         probes, _ = tick(station, second * SECOND)
         if second == 120:
             station.give(probes[0].answer(b"", 6), LINK)
-        if found := station.router.take_gone_hops():
+        if found := station.router.pop_gone_hops():
             gone[second] = found
     assert gone == {62: [LINK], 183: [LINK]}
 

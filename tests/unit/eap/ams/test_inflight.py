@@ -31,22 +31,22 @@ def test_request_is_found_until_it_is_taken_out() -> None:
     assert waiting.get(1) is first
     assert 1 in waiting
     assert (len(waiting), waiting.count(ONE)) == (2, 1)
-    assert [waiting.count_of_door(transport) for transport in ("tcp", "link")] == [2, 0]
-    assert waiting.is_asked(ONE, b"addresses", 7)
+    assert [waiting.count_of_transport(transport) for transport in ("tcp", "link")] == [2, 0]
+    assert waiting.has_request(ONE, b"addresses", 7)
     assert waiting.pop(1) is first
     assert waiting.pop(1) is None
     assert (len(waiting), waiting.count(ONE)) == (1, 0)
-    assert waiting.count_of_door("tcp") == 1
-    assert not waiting.is_asked(ONE, b"addresses", 7)
-    assert waiting.is_asked(TWO, b"addresses", 7)
+    assert waiting.count_of_transport("tcp") == 1
+    assert not waiting.has_request(ONE, b"addresses", 7)
+    assert waiting.has_request(TWO, b"addresses", 7)
 
 
 def test_asked_again_is_known_until_the_latest_is_taken_out() -> None:
     waiting = filled(pending(1), pending(2))
     waiting.pop(1)
-    assert waiting.is_asked(ONE, b"addresses", 7)
+    assert waiting.has_request(ONE, b"addresses", 7)
     waiting.pop(2)
-    assert not waiting.is_asked(ONE, b"addresses", 7)
+    assert not waiting.has_request(ONE, b"addresses", 7)
 
 
 def test_deadlines_come_in_order_whatever_is_allowed() -> None:
@@ -63,20 +63,20 @@ def test_deadlines_come_in_order_whatever_is_allowed() -> None:
 
 def test_abandoned_requests_stay_for_nobody_and_make_room_first() -> None:
     waiting = filled(pending(1), pending(2), pending(3, TWO))
-    assert not waiting.make_room()
+    assert not waiting.drop_abandoned()
     assert [each.invoke_id for each in waiting.abandon(ONE)] == [1, 2]
     assert waiting.abandon(ONE) == []
     assert len(waiting) == 3
-    assert waiting.get(1).came_by is None
-    assert waiting.make_room()
+    assert waiting.get(1).endpoint is None
+    assert waiting.drop_abandoned()
     assert [each.invoke_id for each in waiting] == [2, 3]
     waiting.pop(2)
-    assert not waiting.make_room()
+    assert not waiting.drop_abandoned()
 
 
 def test_request_of_nobody_makes_room_too() -> None:
     waiting = filled(pending(1, None))
-    assert waiting.make_room()
+    assert waiting.drop_abandoned()
     assert len(waiting) == 0
 
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.record import Outcome
 from tests.support.ams import DELETE_NOTIFICATION, Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, SECOND_LINK, Station, route
@@ -42,7 +42,7 @@ def test_notification_that_comes_before_its_answer_is_not_ended() -> None:
 
 
 def test_nothing_is_ended_when_there_is_no_room_to_wait_for_it() -> None:
-    station = Station([route(FAR, LINK)], limits=Limits(in_flight=1))
+    station = Station([route(FAR, LINK)], limits=RouterLimits(in_flight=1))
     station.replied(station.forwarded(ADD, ONE).answer(granted(1)), LINK)
     station.forwarded(ADD, TWO)
     assert station.router.connection_closed(*ONE, 1) == []

@@ -130,7 +130,7 @@ def test_subscription_of_a_client_is_deleted_here_by_that_client_only() -> None:
 
 def test_subscription_of_another_router_is_deleted_at_the_server() -> None:
     station = Station([route(FAR, LINK)])
-    marked = ADD._replace(invoke_id=InvokeIds(7).take(()))
+    marked = ADD._replace(invoke_id=InvokeIds(7).allocate(()))
     station.replied(station.forwarded(marked, ONE).answer(granted(1)), LINK)
     delete = marked._replace(command=DELETE_NOTIFICATION, body=b"\1\0\0\0")
     assert station.forwarded(delete, ONE).body == b"\1\0\0\0"

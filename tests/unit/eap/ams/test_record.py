@@ -12,10 +12,10 @@ def trace(at_ns: int, outcome: Outcome = Outcome.FAILED, error: int = 7, text: s
 
 def test_what_was_simply_answered_is_no_event() -> None:
     record = Record()
-    record.enter(trace(1, Outcome.ANSWERED, 0))
-    record.enter(trace(2, Outcome.ANSWERED, 6))
-    record.enter(trace(3))
-    record.enter(trace(4, Outcome.ANSWERED, 0, "0x2000:00: object does not exist"))
+    record.add(trace(1, Outcome.ANSWERED, 0))
+    record.add(trace(2, Outcome.ANSWERED, 6))
+    record.add(trace(3))
+    record.add(trace(4, Outcome.ANSWERED, 0, "0x2000:00: object does not exist"))
     assert [each.at_ns for each in iter(record.next_event, None)] == [2, 3, 4]
     assert [each.at_ns for each in record.latest] == [1, 2, 3, 4]
     assert (record.counts[Outcome.ANSWERED], record.counts[Outcome.FAILED]) == (3, 1)
@@ -25,8 +25,8 @@ def test_answers_to_probes_are_counted_only() -> None:
     record = Record()
     probe = AmsHeader(NetId.parse("5.1.1.1.1.1"), 10000, NetId.parse("6.1.1.1.1.1"), 1, 4)
     alive = trace(1, Outcome.ANSWERED, 0)._replace(header=probe)
-    record.enter(alive)
-    record.enter(alive._replace(error_code=6))
+    record.add(alive)
+    record.add(alive._replace(error_code=6))
     assert [each.error_code for each in record.latest] == [6]
     assert record.counts[Outcome.ANSWERED] == 2
 
@@ -34,7 +34,7 @@ def test_answers_to_probes_are_counted_only() -> None:
 def test_traces_are_limited() -> None:
     record = Record()
     for number in range(MAX_EVENTS + 3):
-        record.enter(trace(number))
+        record.add(trace(number))
     assert record.next_event() == trace(3)
     assert len(record.latest) == MAX_LATEST
 

@@ -32,7 +32,7 @@ def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
     station = Station()
     asked = Ams(DEVICE, CLIENT, invoke_id=7, body=b"request")
     delivered = station.delivered(asked, TCP)
-    assert (delivered.body, delivered.came_by) == (b"request", TCP)
+    assert (delivered.body, delivered.endpoint) == (b"request", TCP)
     assert delivered.header.encode() + delivered.body == asked.octets()
     answer = AmsAnswer(b"data")
     back = only_reply(station.router.receive_answer(delivered.ticket, answer, 5))
@@ -123,9 +123,9 @@ def test_own_source_is_refused_unless_it_is_of_this_host() -> None:
 
 def test_what_came_by_multicast_is_for_who_is_meant() -> None:
     station = Station([route(FAR, LINK)])
-    assert station.give(Ams(FAR_DEVICE, CLIENT), UDP, for_all=True) == []
-    assert station.give(Ams("9.9.9.9.9.9:1", CLIENT), UDP, for_all=True) == []
-    (delivered,) = station.give(Ams(DEVICE, CLIENT), UDP, for_all=True)
+    assert station.give(Ams(FAR_DEVICE, CLIENT), UDP, is_broadcast=True) == []
+    assert station.give(Ams("9.9.9.9.9.9:1", CLIENT), UDP, is_broadcast=True) == []
+    (delivered,) = station.give(Ams(DEVICE, CLIENT), UDP, is_broadcast=True)
     assert isinstance(delivered, Deliver)
 
 
@@ -223,7 +223,7 @@ def test_fragments_are_acknowledged_to_who_wants_it() -> None:
     first = parse(next(iter_fragments(Ams(DEVICE, CLIENT, body=bytes(50)).octets(), 4, 28)))
     wanting = first._replace(flags=StateFlags.ADS)
     assert station.replied(wanting, UDP) == (UDP, wanting.answer(b""))
-    assert station.give(wanting, UDP, for_all=True) == []
+    assert station.give(wanting, UDP, is_broadcast=True) == []
     assert station.give(wanting.answer(b""), UDP) == []
     assert station.router.stats().fragment_octets == 28
     station.router.connection_closed(*UDP, 0)
@@ -262,7 +262,7 @@ def test_what_passes_is_counted() -> None:
     assert client.traffic.sources == (NetId.parse(CLIENT.partition(":")[0]),)
     for traffic in (client.traffic, hop.traffic):
         assert (traffic.requests, traffic.answers, traffic.errors) == (1, 1, 0)
-        assert (traffic.octets_asked, traffic.octets_answered) == (34, 36)
+        assert (traffic.request_bytes, traffic.answer_bytes) == (34, 36)
         assert traffic.round_trip_ns == 700
     assert station.router.stats().counts[Outcome.ANSWERED] == 1
     assert station.router.record.latest[-1].took_ns == 700

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ams.admission import Limits
-from eap.ams.reassembly import Assembler
+from eap.ams.admission import RouterLimits
+from eap.ams.reassembly import FragmentAssembler
 from eap.ams.transport_table import Action, Deliver, Forward, Reply
 from eap.codec.ams import decode_packet
 from eap.ids import NetId
@@ -43,7 +43,7 @@ class RouterMachine(RuleBasedStateMachine):
     it or with an error; what comes late, twice or from elsewhere reaches nobody.
     """
 
-    LIMITS = Limits(in_flight=12, per_connection=6)
+    LIMITS = RouterLimits(in_flight=12, per_connection=6)
     TARGETS = (DEVICE, "5.1.1.1.2.1:1", FAR_DEVICE, "7.1.1.1.1.1:851", "9.9.9.9.9.9:1",
                "10.0.0.1.1.1:1")  # fmt: skip
 
@@ -58,7 +58,7 @@ class RouterMachine(RuleBasedStateMachine):
         self.asked: list[Deliver] = []
         self.onward: list[tuple[Forward, Ams]] = []
         self.answers: list[tuple[Endpoint, Ams]] = []
-        self.assemblers: dict[Endpoint, Assembler] = {}
+        self.assemblers: dict[Endpoint, FragmentAssembler] = {}
         self.opened = 0
 
     def client_of(self, endpoint: Endpoint) -> Client:
@@ -80,7 +80,7 @@ class RouterMachine(RuleBasedStateMachine):
     def whole(self, hop: Endpoint, packets: tuple[bytes, ...]) -> Ams:
         if len(packets) == 1:
             return parse(packets[0])
-        assembler = self.assemblers.setdefault(hop, Assembler())
+        assembler = self.assemblers.setdefault(hop, FragmentAssembler())
         for each in packets:
             header, body = decode_packet(each)
             packet = assembler.receive(header, bytes(body), self.station.now_ns).packet

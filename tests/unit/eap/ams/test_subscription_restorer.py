@@ -8,15 +8,15 @@ import struct
 import msgspec
 import pytest
 
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.inflight import InvokeIds
 from eap.ams.record import Outcome
 from eap.ams.subscription_restorer import (
     GROUP,
-    MAX_ASKED,
     MAX_ENDS,
-    PATIENCE_NS,
+    MAX_REQUESTS,
     RETRY_NS,
+    STARTUP_TIMEOUT_NS,
     TIMEOUT_NS,
 )
 from eap.ams.subscriptions import Subscription
@@ -116,7 +116,7 @@ def test_subscription_at_a_server_that_starts_is_asked_for_again_for_some_time()
     scene = Scene(CYCLIC)
     scene.lose_hop()
     scene.passes(0)
-    for _ in range(PATIENCE_NS // RETRY_NS):
+    for _ in range(STARTUP_TIMEOUT_NS // RETRY_NS):
         assert scene.answer(scene.asked[0], b"", 6) == []
         scene.passes(RETRY_NS)
         assert len(scene.asked) == 1
@@ -162,7 +162,7 @@ def test_many_clients_are_tried_soon_after_their_hop_comes_back() -> None:
     scene.passes(0)
     scene.station.router.hop_up(*LINK)
     scene.passes(RETRY_NS)
-    assert len(scene.asked) == MAX_ASKED
+    assert len(scene.asked) == MAX_REQUESTS
 
 
 def test_client_deletes_an_interrupted_subscription() -> None:
@@ -288,7 +288,7 @@ def test_others_of_a_server_are_checked_when_it_has_forgotten_one() -> None:
 
 def test_router_that_is_not_the_first_tells_the_one_before_it() -> None:
     scene = Scene()
-    marked = ADD._replace(invoke_id=InvokeIds(7).take(()), body=CYCLIC.encode())
+    marked = ADD._replace(invoke_id=InvokeIds(7).allocate(()), body=CYCLIC.encode())
     scene.station.replied(scene.station.forwarded(marked, ONE).answer(granted(1)), LINK)
     (end,) = scene.lose_hop()
     assert end.body == END
@@ -372,14 +372,19 @@ def test_restoration_waits_longer_for_a_server_that_does_not_answer_in_time() ->
     scene = Scene(CYCLIC)
     scene.lose_hop()
     scene.passes(0)
-    for limit_ns in (TIMEOUT_NS, 2 * TIMEOUT_NS, Limits().timeout_ns, Limits().timeout_ns):
+    for limit_ns in (
+        TIMEOUT_NS,
+        2 * TIMEOUT_NS,
+        RouterLimits().timeout_ns,
+        RouterLimits().timeout_ns,
+    ):
         (add,) = scene.asked
         scene.passes(limit_ns - 1)
         assert scene.asked == []
         scene.passes(1)
         scene.passes(RETRY_NS)
     (add,) = scene.asked
-    scene.passes(Limits().timeout_ns - 1)
+    scene.passes(RouterLimits().timeout_ns - 1)
     scene.answer(add, granted(7))
     assert [each.body for each in scene.sample(7)] == [stream((5, {1: b"data"}))]
 

@@ -109,17 +109,17 @@ def test_subscriptions_of_few_hosts_leave_room_for_others(
     hosts = ("10.0.0.5", "10.0.0.6", "10.0.0.7")
     handles = count()
     for endpoint in [Endpoint("ams-tcp", f"{host}:{port}") for host in hosts for port in range(32)]:
-        while all_.has_room(endpoint, ASKED, 1):
+        while all_.is_within_limits(endpoint, ASKED, 1):
             added(all_, one(next(handles), endpoint))
-    assert all_.has_room(Endpoint("ams-tcp", "10.0.0.8:1"), ASKED, 6)
+    assert all_.is_within_limits(Endpoint("ams-tcp", "10.0.0.8:1"), ASKED, 6)
 
 
 def test_subscriptions_has_room_for_so_many_of_a_client() -> None:
     all_ = Subscriptions()
     added(all_, *(one(handle) for handle in range(MAX_PER_CLIENT - 1)))
-    assert all_.has_room(ONE, ASKED, 1)
-    assert not all_.has_room(ONE, ASKED, 2)
-    assert all_.has_room(TWO, ASKED, 2)
+    assert all_.is_within_limits(ONE, ASKED, 1)
+    assert not all_.is_within_limits(ONE, ASKED, 2)
+    assert all_.is_within_limits(TWO, ASKED, 2)
 
 
 def test_subscriptions_of_a_hop_are_found() -> None:
@@ -132,7 +132,7 @@ def test_subscriptions_of_a_hop_are_found() -> None:
 
 
 @pytest.mark.parametrize(
-    ("request_", "fruitless", "limit_s"),
+    ("request_", "checks", "limit_s"),
     [
         (CYCLIC, 0, 2),
         (CYCLIC, 2, 8),
@@ -143,10 +143,10 @@ def test_subscriptions_of_a_hop_are_found() -> None:
     ],
 )
 def test_subscription_is_checked_the_later_the_longer_it_was_found_alive(
-    request_: AddNotification, fruitless: int, limit_s: int
+    request_: AddNotification, checks: int, limit_s: int
 ) -> None:
     subscription = one(1, request=request_)
-    subscription.fruitless = fruitless
+    subscription.checks = checks
     assert subscription.quiet_limit_ns() == limit_s * SECOND
 
 
@@ -154,7 +154,7 @@ def test_subscription_end_is_a_sample_without_bytes() -> None:
     subscription = one(9)
     end = parse(subscription.encode_end(SECOND))
     assert end.body == stream((0, {9: b""}))
-    subscription.time, subscription.heard_at_ns = 1000, SECOND
+    subscription.time, subscription.received_at_ns = 1000, SECOND
     assert parse(subscription.encode_end(2 * SECOND)).body == stream((10_001_000, {9: b""}))
 
 
@@ -163,7 +163,7 @@ def test_notification_for_one_connection_stays_as_it_is() -> None:
     first, second = added(all_, one(1), one(2))
     body = stream((5, {1: b"a"}), (6, {2: b"bb"}))
     assert divided(body, all_) == ([(ONE, ASKED, body)], [], [], LINK)
-    assert (first.heard_at_ns, first.time, second.time) == (7, 5, 6)
+    assert (first.received_at_ns, first.time, second.time) == (7, 5, 6)
     assert divided(body, all_, hop=ONE) == ([], [], [1, 2], None)
     assert divided(body, all_, b"other") == ([], [], [1, 2], None)
 
@@ -186,13 +186,13 @@ def test_notification_of_an_unchanged_value_is_left_out_after_a_check_only() -> 
     (subscription,) = added(all_, one(1, request=ON_CHANGE))
     body = stream((5, {1: b"a"}))
     assert divided(body, all_).parts
-    subscription.skips_repeat, subscription.fruitless = True, 3
+    subscription.skips_repeat, subscription.checks = True, 3
     assert not divided(body, all_).parts
-    assert subscription.fruitless == 3
+    assert subscription.checks == 3
     assert divided(body, all_).parts
     subscription.skips_repeat = True
     assert divided(stream((5, {1: b"b"})), all_).parts
-    assert subscription.fruitless == 0
+    assert subscription.checks == 0
 
 
 def test_notification_prefix_is_truncated() -> None:

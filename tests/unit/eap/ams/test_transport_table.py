@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.reassembly import Assembler
+from eap.ams.reassembly import FragmentAssembler
 from eap.ams.transport_table import Forward, Reply, Transport, TransportTable
 from eap.codec.ams import decode_packet
 from tests.support.ams import Ams
@@ -13,15 +13,15 @@ WIDE, NARROW = Endpoint("tcp", "1"), Endpoint("box", "1")
 
 
 def test_packet_goes_in_one_piece_where_there_is_room() -> None:
-    transports = TransportTable([Transport("tcp"), Transport("box", room=132)])
+    transports = TransportTable([Transport("tcp"), Transport("box", max_size=132)])
     assert transports.reply(WIDE, PACKET) == Reply(WIDE, (PACKET,))
     assert transports.forward(NARROW, PACKET, 7) == Forward(NARROW, (PACKET,), 7)
 
 
 def test_packet_is_cut_where_there_is_not() -> None:
-    transports = TransportTable([Transport("box", room=60)])
+    transports = TransportTable([Transport("box", max_size=60)])
     for _ in range(2):
-        assembler = Assembler()
+        assembler = FragmentAssembler()
         pieces = transports.reply(NARROW, PACKET).packets
         assert max(map(len, pieces)) == 60
         taken = [assembler.receive(*_read(each), 0).packet for each in pieces]
@@ -30,7 +30,7 @@ def test_packet_is_cut_where_there_is_not() -> None:
 
 
 def test_packets_have_numbers_of_their_own() -> None:
-    transports = TransportTable([Transport("box", room=60)])
+    transports = TransportTable([Transport("box", max_size=60)])
     first, second = (transports.reply(NARROW, PACKET).packets[0] for _ in range(2))
     assert first != second
 
@@ -45,7 +45,7 @@ def test_what_comes_from_a_hop() -> None:
     assert not transports.is_from(Endpoint("broker", "1"), Endpoint("tcp", "1"))
     named = Endpoint("segment", "1.2.3.4.5.6")
     assert not transports.is_from(named, Endpoint("segment", "02:00:00:00:00:01"))
-    transports.note_place(named, "02:00:00:00:00:01")
+    transports.set_connection(named, "02:00:00:00:00:01")
     assert transports.is_from(named, Endpoint("segment", "02:00:00:00:00:01"))
     assert not transports.is_from(named, Endpoint("tcp", "02:00:00:00:00:01"))
 
@@ -54,7 +54,7 @@ def test_doors_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="two doors 'a'"):
         TransportTable([Transport("a"), Transport("a")])
     with pytest.raises(ValueError, match="expected more than 32"):
-        TransportTable([Transport("a", room=32)])
+        TransportTable([Transport("a", max_size=32)])
 
 
 def _read(packet: bytes) -> tuple:

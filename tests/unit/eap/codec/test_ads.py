@@ -15,8 +15,8 @@ from eap.codec.ads import (
     AdsSystemState,
     AdsWriteControl,
     IndexGroup,
-    SdoPlace,
-    SoePlace,
+    SdoOffset,
+    SoeOffset,
     device_name,
     encode_result,
 )
@@ -24,7 +24,7 @@ from eap.errors import TruncatedError
 from tests.support.wirerecords import records
 
 RECORDS = (AdsRange, AdsReadWrite, AdsDeviceInfo, AdsStates, AdsWriteControl, AdsSystemState,
-           SdoPlace, SoePlace)  # fmt: skip
+           SdoOffset, SoeOffset)  # fmt: skip
 
 
 def test_read_request_of_the_vector() -> None:
@@ -59,9 +59,9 @@ def test_system_state_has_16_octets() -> None:
 
 
 def test_offsets_of_objects_and_idns() -> None:
-    place = SdoPlace(subindex=3, is_complete=1, is_slow=1, index=0x1018)
+    place = SdoOffset(subindex=3, is_complete=1, is_slow=1, index=0x1018)
     assert int.from_bytes(place.encode(), "little") == 0x1018_0303
-    place = SoePlace(idn=0x8032, elements=0x41, drive=7, is_command=1)
+    place = SoeOffset(idn=0x8032, elements=0x41, drive=7, is_command=1)
     assert int.from_bytes(place.encode(), "little") == 0x0F41_8032
 
 

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from eap.codec.adssymbol import (
     AdsType,
+    SymbolAddress,
     SymbolEntry,
     SymbolFlag,
-    SymbolPlace,
     UploadInfo,
     decode_entry,
     decode_name,
@@ -21,7 +21,7 @@ from tests.support.wirerecords import records
 TEXTS = st.text(st.characters(codec="cp1252", exclude_characters="\0"), max_size=30)
 ENTRIES = st.builds(
     SymbolEntry,
-    records(SymbolPlace),
+    records(SymbolAddress),
     st.integers(0, 0xFFFF_FFFF),
     st.integers(0, 0xFFFF_FFFF),
     TEXTS,
@@ -33,7 +33,7 @@ ENTRIES = st.builds(
 
 def test_attributes_stand_behind_the_texts() -> None:
     """As the open client ads-client takes them apart."""
-    bare = SymbolEntry(SymbolPlace(1, 2, 3), AdsType.STRING, 0, "a", "b", "c")
+    bare = SymbolEntry(SymbolAddress(1, 2, 3), AdsType.STRING, 0, "a", "b", "c")
     octets = encode_entry(bare._replace(attributes=(("TcEncoding", "UTF-8"),)))
     behind = b"\1\0\x0a\5TcEncoding\0UTF-8\0"
     assert octets.endswith(b"a\0b\0c\0" + behind)
@@ -53,7 +53,7 @@ def test_info_has_the_newest_version_that_there_is_room_for() -> None:
 def test_entry_lies_as_in_the_description_of_pyads() -> None:
     """The example in the class SAdsSymbolEntry of pyads, without what TwinCAT puts behind it."""
     entry = SymbolEntry(
-        SymbolPlace(16448, 385000, 2),
+        SymbolAddress(16448, 385000, 2),
         AdsType.UINT16,
         8,
         "GVL.counter",
@@ -73,7 +73,7 @@ def test_upload_info_has_24_octets() -> None:
 
 
 def test_what_stands_behind_the_texts_is_skipped() -> None:
-    octets = bytearray(encode_entry(SymbolEntry(SymbolPlace(1, 2, 3), 4, 5, "n", "t")))
+    octets = bytearray(encode_entry(SymbolEntry(SymbolAddress(1, 2, 3), 4, 5, "n", "t")))
     octets[:4] = (len(octets) + 10).to_bytes(4, "little")
     entry, end = decode_entry(octets + bytes(30))
     assert (entry.name, entry.comment, end) == ("n", "", len(octets) + 10)
@@ -81,7 +81,7 @@ def test_what_stands_behind_the_texts_is_skipped() -> None:
 
 def test_texts_are_cut_and_hold_no_nul() -> None:
     entry = SymbolEntry(
-        SymbolPlace(1, 2, 3), AdsType.BIT, SymbolFlag.READ_ONLY, "x" * 300, "a\0b", "€→"
+        SymbolAddress(1, 2, 3), AdsType.BIT, SymbolFlag.READ_ONLY, "x" * 300, "a\0b", "€→"
     )
     read, _ = decode_entry(encode_entry(entry))
     assert (read.name, read.type_name, read.comment) == ("x" * 255, "a?b", "€?")
@@ -89,7 +89,7 @@ def test_texts_are_cut_and_hold_no_nul() -> None:
 
 
 def test_broken_entries() -> None:
-    octets = encode_entry(SymbolEntry(SymbolPlace(1, 2, 3), 4, 5, "name", "type"))
+    octets = encode_entry(SymbolEntry(SymbolAddress(1, 2, 3), 4, 5, "name", "type"))
     with pytest.raises(TruncatedError, match="AdsSymbolEntry"):
         decode_entry(octets[:-1])
     with pytest.raises(MalformedError, match="do not hold texts"):

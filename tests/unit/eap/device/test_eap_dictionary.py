@@ -531,7 +531,7 @@ class Recorder:
         self.seen: list[bool] = []
 
     @contextmanager
-    def at_one_moment(self) -> Iterator[None]:
+    def consistent_values(self) -> Iterator[None]:
         self.moments += 1
         self.is_in_moment = True
         yield

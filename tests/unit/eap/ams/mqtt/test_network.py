@@ -14,13 +14,13 @@ from eap.ams.mqtt.network import (
     MAX_PACKET,
     REFRESH_NS,
     Action,
-    Arrived,
-    Closed,
     Drop,
     Dropped,
     HopDown,
     HopUp,
     MqttNetwork,
+    PacketReceived,
+    PeerClosed,
     Publish,
     Subscribe,
     Warn,
@@ -85,7 +85,7 @@ def test_router_that_comes_is_a_hop_and_one_that_goes_is_none() -> None:
     assert place.hear_of(FAR, HERE) == [HopUp(FAR)]
     assert place.hear_of(FAR, HERE) == []
     assert [each.name for each in place.table] == ["far"]
-    assert place.hear_of(FAR, GONE) == [HopDown(FAR, "it told that it is gone"), Closed(FAR)]
+    assert place.hear_of(FAR, GONE) == [HopDown(FAR, "it told that it is gone"), PeerClosed(FAR)]
 
 
 def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
@@ -100,7 +100,7 @@ def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
     assert place.network.next_timeout() == place.now_ns + CONFIRM_NS
     assert place.wait(29) == []
     assert place.wait(1) == [
-        HopDown(FAR, "it is gone without a word"), Closed(FAR), HopUp(FAR),
+        HopDown(FAR, "it is gone without a word"), PeerClosed(FAR), HopUp(FAR),
         HopUp("7.1.1.1.1.1"), Subscribe(("hall/+/info",)),
     ]  # fmt: skip
     place.table.expire(place.now_ns)
@@ -112,15 +112,15 @@ def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
     far = NetId.parse(FAR)
     place.table.add(Route(far, "far", Endpoint("mqtt:hall", FAR), is_probed=False))
     place.network.disconnected()
-    awaited = HopDown(FAR, "it has not told of itself yet")
-    assert place.network.connected(place.now_ns) == [awaited, *place.first]
-    assert place.wait(30)[0] == awaited
+    missing = HopDown(FAR, "it has not told of itself yet")
+    assert place.network.connected(place.now_ns) == [missing, *place.first]
+    assert place.wait(30)[0] == missing
     assert place.hear_of(FAR, HERE) == [HopUp(FAR)]
     place.wait(REFRESH_NS / SECOND)
     place.wait(REFRESH_NS / SECOND)
     gone = place.wait(REFRESH_NS / SECOND)
     assert gone[:4] == [
-        HopDown(FAR, "it is gone without a word"), Closed(FAR), HopUp(FAR), awaited,
+        HopDown(FAR, "it is gone without a word"), PeerClosed(FAR), HopUp(FAR), missing,
     ]  # fmt: skip
 
 
@@ -200,7 +200,7 @@ def test_second_router_with_the_net_id_is_named_once() -> None:
 def test_packet_arrives_and_its_answer_has_its_form(prefix: bytes) -> None:
     place = Place()
     asked = Ams(DEVICE, TOOL, body=b"asked")
-    assert place.asked(prefix + asked.octets()) == [Arrived(asked.octets(), FAR)]
+    assert place.asked(prefix + asked.octets()) == [PacketReceived(asked.octets(), FAR)]
     answer = asked.answer(b"gives").octets()
     assert place.network.message_for(FAR, answer) == Publish(
         f"hall/{FAR}/ams/res", prefix + answer, 0
@@ -224,21 +224,21 @@ def test_client_behind_the_router_asks_and_is_answered() -> None:
     sent = parse(place.network.message_for(FAR, asked.octets()).payload)
     assert sent.source == f"{OWN}:{FIRST_PORT}"
     (arrived,) = place.asked(sent.answer().octets(), "ams/res")
-    assert isinstance(arrived, Arrived)
+    assert isinstance(arrived, PacketReceived)
     assert parse(arrived.packet) == asked.answer()
     note = sent.answer()._replace(command=NOTIFICATION, flags=4)
     for topic in ("ams", "ams/res"):
         (arrived,) = place.asked(note.octets(), topic)
-        assert isinstance(arrived, Arrived)
+        assert isinstance(arrived, PacketReceived)
         assert parse(arrived.packet).target == asked.source
 
 
 def test_answers_go_to_the_router_that_the_sender_is_behind() -> None:
     place = Place()
     asked = Ams(DEVICE, "6.1.1.1.3.1:1001").octets()
-    assert place.asked(asked) == [Arrived(asked, "6.1.1.1.3.1")]
+    assert place.asked(asked) == [PacketReceived(asked, "6.1.1.1.3.1")]
     place.hear_of(FAR, HERE)
-    assert place.asked(asked) == [Arrived(asked, FAR)]
+    assert place.asked(asked) == [PacketReceived(asked, FAR)]
 
 
 def test_one_way_station_tells_so() -> None:
@@ -287,7 +287,7 @@ def test_routers_and_senders_have_limits(monkeypatch: pytest.MonkeyPatch) -> Non
     for number in (7, 8):
         assert len(place.asked(Ams(DEVICE, f"{number}.1.1.1.1.1:1").octets())) == 1
     closed, _ = place.asked(Ams(DEVICE, "9.1.1.1.1.1:1").octets())
-    assert closed == Closed("7.1.1.1.1.1")
+    assert closed == PeerClosed("7.1.1.1.1.1")
 
 
 def test_sender_that_nobody_told_of_is_forgotten_when_silent_for_an_hour() -> None:
@@ -295,10 +295,10 @@ def test_sender_that_nobody_told_of_is_forgotten_when_silent_for_an_hour() -> No
     place.asked(Ams(DEVICE, "7.1.1.1.1.1:1").octets())
     place.now_ns += 1800 * SECOND
     place.asked(Ams(DEVICE, "8.1.1.1.1.1:1").octets())
-    assert Closed("7.1.1.1.1.1") not in place.wait(1799)
+    assert PeerClosed("7.1.1.1.1.1") not in place.wait(1799)
     place.now_ns += REFRESH_NS
-    assert place.wait(1)[0] == Closed("7.1.1.1.1.1")
-    assert Closed("8.1.1.1.1.1") not in place.wait(REFRESH_NS / SECOND)
+    assert place.wait(1)[0] == PeerClosed("7.1.1.1.1.1")
+    assert PeerClosed("8.1.1.1.1.1") not in place.wait(REFRESH_NS / SECOND)
 
 
 @given(st.sampled_from([f"{OWN}/ams", f"{OWN}/ams/res", f"{FAR}/info", f"{OWN}/info"]),
@@ -328,7 +328,7 @@ class AnyOrder(RuleBasedStateMachine):
                 assert self.is_connected
 
     @rule(number=st.integers(1, 4), is_online=st.booleans(), is_retained=st.booleans())
-    def tell(self, number: int, is_online: bool, is_retained: bool) -> None:
+    def update(self, number: int, is_online: bool, is_retained: bool) -> None:
         if not self.is_connected:
             return
         net_id = f"6.1.1.1.{number}.1"

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
@@ -27,7 +27,7 @@ from tests.support.stationengine import make_device
 
 TXPD, CONTROL = 0xD000, 0xF200
 OK = bytes(4)
-CLIENT = Client(Endpoint("ams-tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
+CLIENT = AdsClient(Endpoint("ams-tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
 TARGET = NetId.parse("1.2.3.4.5.1")
 INFO = device_info("left/eap0", "1.2.3")
 

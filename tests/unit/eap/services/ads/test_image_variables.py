@@ -42,7 +42,7 @@ def test_every_variable_is_a_symbol_of_its_type(symbols, station):
         names.append(found.name)
     assert names == [place.name for place in station.image.layout.variables]
     setpoint = entry(symbols, "setpoint")
-    assert (setpoint.type_name, setpoint.place.size) == ("ARRAY [0..1] OF REAL", 8)
+    assert (setpoint.type_name, setpoint.address.size) == ("ARRAY [0..1] OF REAL", 8)
     assert (setpoint.comment, setpoint.flags) == ("pressure [bar]", 0)
     assert entry(symbols, "load").flags == SymbolFlag.READ_ONLY
 

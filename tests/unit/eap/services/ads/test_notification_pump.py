@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from eap.ads.endpoint import Endpoint
-from eap.ads.notifications import Client, NotificationTable
+from eap.ads.notifications import AdsClient, NotificationTable
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification, to_filetime
 from eap.codec.ams import AmsCommand, decode_packet
@@ -27,7 +27,7 @@ MS = 1_000_000
 CYCLE = 10 * MS
 NET_ID, PORT = NetId.parse("1.2.3.4.5.1"), 0xFFFF
 WAY = Endpoint("ams-tcp", "127.0.0.1:5 #1")
-CLIENT = Client(WAY, NetId.parse("1.2.3.4.1.1"), 30000)
+CLIENT = AdsClient(WAY, NetId.parse("1.2.3.4.1.1"), 30000)
 UNIX_AT_0 = 1_700_000_000 * 10**9
 
 

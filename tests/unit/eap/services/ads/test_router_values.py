@@ -103,8 +103,8 @@ def test_routes_are_told_as_they_do(router, values):
     }
     assert values.routes() is values.routes()
     traffic = router.record.routes.of(route.key, monotonic_ns())
-    traffic.ask(40)
-    traffic.answer(40, 2_000_000)
+    traffic.add_request(40)
+    traffic.add_answer(40, 2_000_000)
     keys = (RouterLive.ROUTE_STATE, RouterLive.ROUTE_ROUND_TRIP, RouterLive.ROUTE_REQUESTS)
     assert [values.of_route(key, route) for key in keys] == [1, 2000, 1]
     router.remove_route(ROUTE.net_id, ROUTE.hop)

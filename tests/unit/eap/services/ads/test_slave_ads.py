@@ -7,7 +7,7 @@ import pytest
 from devicebus.mailbox import aoe_client
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.operation import Read, ReadState, ReadWrite, Write, WriteControl
-from eap.codec.ads import AdsError, AdsRange, AdsState, IndexGroup, SoePlace
+from eap.codec.ads import AdsError, AdsRange, AdsState, IndexGroup, SoeOffset
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.codec.coe import EntryDescription, ObjectDescription
@@ -173,7 +173,7 @@ def test_objects_refused_by_the_slave_are_results_with_the_abort_code(operation,
 
 
 def place(idn: Idn, elements: int = 0, **more: int) -> int:
-    return int.from_bytes(SoePlace(idn.number, elements, **more).encode(), "little")
+    return int.from_bytes(SoeOffset(idn.number, elements, **more).encode(), "little")
 
 
 def test_elements_are_read_one_behind_the_other():

@@ -63,15 +63,15 @@ def test_counters_of_one_moment_do_not_change_and_values_of_programs_do(values, 
         return tuple(number(right, key, "left-state") for key in keys)
 
     arrive(5)
-    with right.at_one_moment():
+    with right.consistent_values():
         received, _ = seen()
         arrive(6)
         assert seen() == (received, 5)
     assert seen() == (6, 6)
     left = values["left"]
-    with left.at_one_moment(), files["left"].image.writing(Writer.APPLICATION):
+    with left.consistent_values(), files["left"].image.writing(Writer.APPLICATION):
         files["left"].image.write("state.VarCtrl", 2)
-    with left.at_one_moment():
+    with left.consistent_values():
         assert number(left, EapLive.TX_VAR_CTRL, "state") == 2
 
 

@@ -15,7 +15,7 @@ from devicebus.mailbox.soe_server import SoeParameter, SoeServer
 from eap.ads.endpoint import AmsAnswer
 from eap.ads.operation import Read, ReadWrite, Write
 from eap.ads.request import encode_query
-from eap.ams.reassembly import Assembler, iter_fragments
+from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxType
@@ -156,7 +156,7 @@ def packet(operation: Read | Write, flags: StateFlags = StateFlags.ADS) -> bytes
 
 
 def joined(replies: Iterator[bytes] | list[bytes]) -> bytes:
-    assembler, whole = Assembler(), None
+    assembler, whole = FragmentAssembler(), None
     for each in replies:
         header, body = decode_packet(each)
         whole, _ = assembler.receive(header, bytes(body), 0)

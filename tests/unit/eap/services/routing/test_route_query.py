@@ -57,7 +57,7 @@ def ask(operation: Operation) -> AmsAnswer:
 @pytest.mark.parametrize(("further", "station"), [(0, "island-01"), (1, "island-02")])
 def test_a_question_is_answered_or_handed_on(further: int, station: str) -> None:
     question = HopQuestion(TARGET, 1001, further)
-    answer = ask(ReadWrite(G.WHEREABOUTS, 0, 4096, question.encode()))
+    answer = ask(ReadWrite(G.ROUTE_QUERY, 0, 4096, question.encode()))
     outcome = decode_outcome(9, answer.error_code, answer.data)
     assert decode_report(outcome.data).station == station
 
@@ -65,8 +65,8 @@ def test_a_question_is_answered_or_handed_on(further: int, station: str) -> None
 @pytest.mark.parametrize(
     "operation",
     [
-        ReadWrite(G.WHEREABOUTS, 0, 4096, b"\5\1"),
-        ReadWrite(G.WHEREABOUTS, 0, 10, HopQuestion(TARGET, 1001).encode()),
+        ReadWrite(G.ROUTE_QUERY, 0, 4096, b"\5\1"),
+        ReadWrite(G.ROUTE_QUERY, 0, 10, HopQuestion(TARGET, 1001).encode()),
     ],
 )
 def test_questions_that_are_too_short_and_answers_that_are_too_long(operation: Operation) -> None:
@@ -74,7 +74,7 @@ def test_questions_that_are_too_short_and_answers_that_are_too_long(operation: O
 
 
 @pytest.mark.parametrize(
-    "operation", [ReadState(), Read(G.WHEREABOUTS, 0, 4), ReadWrite(G.SYMBOL_HANDLE, 0, 4, b"x")]
+    "operation", [ReadState(), Read(G.ROUTE_QUERY, 0, 4), ReadWrite(G.SYMBOL_HANDLE, 0, 4, b"x")]
 )
 def test_everything_else_is_for_who_stands_behind(operation: Operation) -> None:
     assert ask(operation).data.startswith(b"rest")

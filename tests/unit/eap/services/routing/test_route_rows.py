@@ -73,8 +73,8 @@ def test_warnings_and_circles_are_told() -> None:
     shadowed = Route(FAR, "other", Endpoint("udp:eap0", "127.0.9.3:34980"), Origin.ADDED)
     left.router.add_route(shadowed)
     for number in range(MAX_LOOPS + 3):
-        left.router.record.enter(loop(f"circle {number}"))
-    left.router.record.enter(loop("circle 1"))
+        left.router.record.add(loop(f"circle {number}"))
+    left.router.record.add(loop("circle 1"))
     warnings = row(left).warnings
     assert any("route other" in each and "is not taken" in each for each in warnings)
     assert [each for each in warnings if each.startswith("loop")][:2] == [
@@ -93,7 +93,7 @@ def test_requests_and_connections_of_a_running_router() -> None:
         return left
 
     left = asyncio.run(script())
-    left.router.record.enter(loop("later"))
+    left.router.record.add(loop("later"))
     found = row(left, requests=1)
     assert [each.outcome for each in found.requests] == ["loop"]
     (connection,) = found.connections
@@ -135,5 +135,5 @@ def test_all_of_a_request_is_told() -> None:
     assert (found.transport, found.address, found.error, found.took_us) == (*HOP, 6, 2000)
     said = "READ of 127.0.9.2.1.1:851 for 5.1.1.1.1.1:30000 (127.0.0.1:1 by ams-tcp): cut"
     assert request_row(trace._replace(text=said), 4 * 10**9).text == "cut"
-    bare = request_row(trace._replace(came_by=None, hop=None, header=None), 4 * 10**9)
+    bare = request_row(trace._replace(endpoint=None, hop=None, header=None), 4 * 10**9)
     assert (bare.service, bare.came_by, bare.transport, bare.text) == ("", "", "", "no such port")

@@ -10,7 +10,7 @@ import pytest
 from eap.ads.device import AdsDevice
 from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, SlaveState
-from eap.ads.notifications import Client
+from eap.ads.notifications import AdsClient
 from eap.ams.directory import Directory
 from eap.ams.routes import Route
 from eap.ams.spec import DirectoryPort, DirectoryStation
@@ -22,7 +22,7 @@ from eap.services.routing.scanning import scan, scan_targets
 from tests.support.eventually import elapse
 from tests.support.tracedplant import Line, Station, to
 
-NOBODY = Client(Endpoint("x", "1"), NetId(bytes(6)), 1)
+NOBODY = AdsClient(Endpoint("x", "1"), NetId(bytes(6)), 1)
 
 
 class Master:

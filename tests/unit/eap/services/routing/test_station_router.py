@@ -8,7 +8,7 @@ import pytest
 
 from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
-from eap.ams.admission import Limits
+from eap.ams.admission import RouterLimits
 from eap.ams.routes import Route
 from eap.ams.spec import AccessRule
 from eap.ams.transport_table import Transport
@@ -29,7 +29,7 @@ PEER = Endpoint("in", "peer")
 DOORS = (
     Transport("in", is_stream=True, is_hub=True),
     Transport("out"),
-    Transport("narrow", room=60),
+    Transport("narrow", max_size=60),
     Transport("ams-tcp", is_stream=True),
 )
 
@@ -195,7 +195,7 @@ def test_hop_that_is_down_is_answered_for_at_once_until_it_is_up(scene):
 
 
 def test_time_is_up_at_a_hop_and_at_a_service():
-    scene = Scene(limits=Limits(timeout_ns=20_000_000))
+    scene = Scene(limits=RouterLimits(timeout_ns=20_000_000))
     scene.add_route(timeout_ns=10_000_000)
 
     async def never(request):

@@ -103,8 +103,8 @@ def test_fragments_are_put_together_before_anybody_is_asked(stations, sender):
 
 def test_what_was_for_all_is_answered_by_who_is_meant_only(stations, sender):
     way_in = demultiplexer(*stations)
-    way_in.receive(ask("2.2.2.2.2.1:65535"), "peer", for_all=True)
-    way_in.receive(ask("9.9.9.9.1.1:1"), "peer", for_all=True)
+    way_in.receive(ask("2.2.2.2.2.1:65535"), "peer", is_broadcast=True)
+    way_in.receive(ask("9.9.9.9.1.1:1"), "peer", is_broadcast=True)
     assert [each.source for _, each in sender.sent] == ["2.2.2.2.2.1:65535"]
 
 
@@ -140,7 +140,7 @@ def test_hops_are_those_of_all_stations(stations, sender):
     assert [each.is_down(HOP) for each in stations] == [True, True]
     way_in.hop_up("hop")
     assert [each.is_down(HOP) for each in stations] == [False, False]
-    way_in.hop_is_at("hop", "place")
+    way_in.set_hop_connection("hop", "place")
     second.receive(ask(FAR, invoke_id=2), "link", "peer")
     way_in.receive(sender.sent[-1][1].answer(b"far").octets(), "place")
     assert sender.sent[-1][1].body == b"far"

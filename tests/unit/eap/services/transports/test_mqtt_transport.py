@@ -136,7 +136,7 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
             body = len(stamps).to_bytes(4, "little") + stamps
             news = Ams(f"{there.header.source}:{there.header.source_port}", request.target,
                        command=NOTIFICATION, body=body)  # fmt: skip
-            two.router.send_notification(there.came_by, news.octets())
+            two.router.send_notification(there.endpoint, news.octets())
             await eventually(lambda: len(sender.sent) == 2)
             assert sender.sent[1] == ("10.0.0.9:1#1", news._replace(target=tool))
             one_is_gone = [Endpoint("mqtt:hall", "5.1.1.1.1.1")]
