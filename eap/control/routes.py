@@ -1,6 +1,6 @@
 """Control protocol: routes, and AMS requests through a router.
 
-The records of requests and answers, which server and client share; docs/control.md describes them.
+Server and client share these records of requests and answers; docs/control.md describes them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from eap.ams.report import HopReport
 from eap.control.protocol import Document, Method, Parameters
 
 PAGE = 1000
-"""Most routes of one answer."""
+"""Limit of the routes in one answer."""
 MAX_XML = 1 << 20
-"""Characters of a file with routes."""
+"""Limit of the characters of a file with routes."""
 MAX_TEXT = 255
 MAX_TIMEOUT_MS = 60_000
 
@@ -25,10 +25,10 @@ StateName: TypeAlias = Literal["up", "down", "unknown", "client"]
 
 
 class RoutesListParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_list``: of one station, or of all.
+    """``routes_list``: routes of one station, or of all.
 
-    Of each station *count* routes from number *first* on, of those that have *match* in their name,
-    NetID, transport, address, origin or state; and the latest *requests*.
+    Each station answers with *count* routes from number *first* on, of those that have *match* in
+    their name, NetID, transport, address, origin or state, and with the latest *requests*.
     """
 
     station: str = ""
@@ -39,21 +39,21 @@ class RoutesListParameters(Parameters, frozen=True, kw_only=True):
 
 
 class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_add``: a route that is kept, until it is removed.
+    """``routes_add``: adds a route, which is stored until it is removed.
 
     Attributes:
-        station: Whose router gets it.
-        name: As people call it.
-        net_id: Of the station that it leads to; empty if *name* is a station of the plant.
-        via: Where packets go: ``STATION/PORT`` of the plant, or a kind of transport and an address,
-            such as ``ams-tcp:192.168.1.5``, ``udp:10.0.0.5``, ``mqtt:NETWORK``.
-        port: EAP port that they leave by; empty for the first that can.
-        octets: How many octets of a NetID have to be those of *net_id*; 0 for a default route.
-        virtual: NetID by which the station is known here; empty for its own.
-        unidirectional: Whether requests from there are refused.
-        timeout_ms: How long an answer may take; 0 for as long as usual.
+        station: Station whose router gets the route.
+        name: Name for people.
+        net_id: NetID of the target; empty if *name* is a station of the plant.
+        via: Next hop: ``STATION/PORT`` of the plant, or a kind of transport and an address, such as
+            ``ams-tcp:192.168.1.5``, ``udp:10.0.0.5``, ``mqtt:NETWORK``.
+        port: Local EAP port of the transport; empty for the first that fits.
+        octets: Number of bytes of *net_id* that must match; 0 for a default route.
+        virtual: NetID of the target in requests; empty for its own.
+        unidirectional: Whether requests from the target are denied.
+        timeout_ms: Time limit of an answer; 0 for the default.
         probed: Whether the next hop is probed from time to time.
-        replaces: Name or NetID of an added route that this one takes the place of; empty for none.
+        replaces: Name or NetID of an added route that this one replaces; empty for none.
     """
 
     station: str
@@ -70,7 +70,7 @@ class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
 
 
 class RoutesRemoveParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_remove``: by name or NetID; *transport* and *address* choose among several."""
+    """``routes_remove``: by name or NetID; *transport* and *address* select one of several."""
 
     station: str
     route: Text
@@ -79,7 +79,7 @@ class RoutesRemoveParameters(Parameters, frozen=True, kw_only=True):
 
 
 class RoutesTestParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_test``: asks *target* for its state.
+    """``routes_test``: reads the state of *target*.
 
     It is a route's name, a NetID (and ``:PORT``), or a name of the plant.
     """
@@ -90,7 +90,7 @@ class RoutesTestParameters(Parameters, frozen=True, kw_only=True):
 
 
 class RoutesImportParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_import``: adds the routes of a StaticRoutes file, or says what it would add."""
+    """``routes_import``: adds the routes of a StaticRoutes file; a dry run only checks them."""
 
     station: str
     xml: Annotated[str, Meta(max_length=MAX_XML)]
@@ -104,9 +104,9 @@ class RoutesExportParameters(Parameters, frozen=True, kw_only=True):
 
 
 class RoutesScanParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_scan``: asks for routers of other hosts, from one station or from all.
+    """``routes_scan``: scans for routers of other hosts, from one station or from all.
 
-    Asks *address*, of a host or a network, or the networks of the stations.
+    The scan goes to *address*, a host or a network, or to the networks of the stations.
     """
 
     station: str = ""
@@ -115,9 +115,9 @@ class RoutesScanParameters(Parameters, frozen=True, kw_only=True):
 
 
 class RoutesAddRemoteParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_add_remote``: asks the router at *address* for a route to that of *station*.
+    """``routes_add_remote``: requests a route to *station* at the router of *address*.
 
-    User and password are those of the other system; they are sent in clear.
+    User and password are those of the other system; they are sent in clear text.
     """
 
     station: str
@@ -132,14 +132,14 @@ class EndpointRow(Document, frozen=True, kw_only=True):
     """One path of packets, and the figures of its requests.
 
     Attributes:
-        transport: Of its packets.
-        address: Of the other end.
-        requests: That went out by a route, or came in by a connection.
-        answers: To them.
-        errors: Requests that did not get to their targets.
-        octets_out: Of packets that left here.
-        octets_in: Of packets that came here.
-        last_error: In words, empty while there was none.
+        transport: Transport of its packets.
+        address: Address of the other end.
+        requests: Requests sent by a route, or received by a connection.
+        answers: Their answers.
+        errors: Requests that did not reach their targets.
+        octets_out: Bytes sent.
+        octets_in: Bytes received.
+        last_error: Latest error in words, empty without one.
     """
 
     transport: str
@@ -153,21 +153,21 @@ class EndpointRow(Document, frozen=True, kw_only=True):
 
 
 class RouteRow(EndpointRow, frozen=True, kw_only=True):
-    """One route: a way to the next hop.
+    """One route with its next hop.
 
     Attributes:
-        name: As people call it.
-        net_id: By which it is requested here.
-        octets: How many of its octets have to match; 0 for a default route.
-        origin: Plant file, its ports, a change at run time, or the station itself.
-        state: Whether a request would go on.
-        why: What is wrong with one that is down.
+        name: Name for people.
+        net_id: NetID of the target in requests.
+        octets: Number of its bytes that must match; 0 for a default route.
+        origin: Plant file, its ports, a change at run time, or a scan.
+        state: Whether a request would be forwarded.
+        why: Reason for state ``down``.
         next_name: Name of the router at the next hop.
-        rtt_us: Round trip to the next hop; None while it is not known.
-        expires_s: In how many seconds it is forgotten; None for never.
-        real: The NetID that the station itself has, where *net_id* is a virtual one; else empty.
-        unidirectional: Whether requests from there are refused.
-        timeout_ms: How long an answer may take; 0 for as long as usual.
+        rtt_us: Round trip to the next hop; None while it is unknown.
+        expires_s: Remaining lifetime; None without a limit.
+        real: NetID that the target has itself, where *net_id* is a virtual one; else empty.
+        unidirectional: Whether requests from the target are denied.
+        timeout_ms: Time limit of an answer; 0 for the default.
         probed: Whether the next hop is probed from time to time.
     """
 
@@ -187,18 +187,18 @@ class RouteRow(EndpointRow, frozen=True, kw_only=True):
 
     @property
     def pattern(self) -> str:
-        """The NetIDs that it is for, ``5.1.2.3.*.*``; ``default`` for all others."""
+        """NetIDs that match, such as ``5.1.2.3.*.*``; ``default`` for all."""
         octets = self.net_id.split(".")[: self.octets]
         return ".".join([*octets, *["*"] * (6 - self.octets)]) if self.octets else "default"
 
 
 class ConnectionRow(EndpointRow, frozen=True, kw_only=True):
-    """One connection that requests came by, or one sender where there are none.
+    """One connection that requests came by, or one sender of datagrams.
 
     Attributes:
-        since_s: For how many seconds it has been used.
+        since_s: Age of the connection.
         net_ids: Sources of its requests, the first few.
-        took_us: How long the latest answer took; None before the first.
+        took_us: Time of the latest answer; None before the first.
     """
 
     since_s: int
@@ -207,20 +207,20 @@ class ConnectionRow(EndpointRow, frozen=True, kw_only=True):
 
 
 class RequestRow(Document, frozen=True, kw_only=True):
-    """What became of one packet.
+    """Outcome of one packet.
 
     Attributes:
         at: Wall clock, seconds of Unix time.
         outcome: ``answered``, ``failed``, ``denied``, ``loop``, ``late`` or ``dropped``.
-        service: Of ADS; empty where the packet could not be read, as with the next two.
+        service: ADS service; empty for an invalid packet, as with the next two.
         target: NetID and AMS port.
         source: NetID and AMS port.
-        came_by: Address and transport; empty if its connection is gone.
-        transport: Of its next hop; empty for a service of this station, and if it did not go on.
-        address: That it went on to.
-        error: Of the AMS header of its answer.
-        took_us: From the request to its answer.
-        text: What was wrong; empty if nothing.
+        came_by: Address and transport; empty if its connection is closed.
+        transport: Transport of its next hop; empty for a local service, or if it was not forwarded.
+        address: Address of its next hop.
+        error: Error code in the AMS header of its answer.
+        took_us: Time from the request to its answer.
+        text: Reason of a failure; empty otherwise.
     """
 
     at: float
@@ -237,15 +237,15 @@ class RequestRow(Document, frozen=True, kw_only=True):
 
 
 class InterruptionRow(Document, frozen=True, kw_only=True):
-    """Subscriptions of one client at one server to which nothing comes; they are being restored.
+    """Interrupted subscriptions of one client at one server, which are being restored.
 
     Attributes:
         client: Address and transport of the client.
         source: NetID and AMS port of the client.
         target: NetID and AMS port of the server.
-        count: How many subscriptions there are.
-        since_s: For how many seconds nothing has come.
-        why: What was wrong last.
+        count: Number of subscriptions.
+        since_s: Duration of the interruption.
+        why: Latest reason.
     """
 
     client: str
@@ -257,7 +257,7 @@ class InterruptionRow(Document, frozen=True, kw_only=True):
 
 
 class RouterRow(Document, frozen=True, kw_only=True):
-    """The router of one station; *total* routes match, of which *routes* are some."""
+    """Router of one station; *total* routes match, of which *routes* are one page."""
 
     station: str
     net_id: str
@@ -270,17 +270,17 @@ class RouterRow(Document, frozen=True, kw_only=True):
 
 
 class TestResult(Document, frozen=True, kw_only=True):
-    """What came of a question to a target.
+    """Result of a request to a target.
 
     Attributes:
         target: NetID and AMS port of the request.
-        name: Of the route that was taken; empty for none.
-        ok: Whether there is a way there and back.
-        rtt_us: How long that took; None without an answer.
-        state: ADS state, such as ``RUN``; empty if it did not tell.
-        error: Of the answer.
-        text: All that in words.
-        hint: What to do; empty if nothing.
+        name: Name of the matching route; empty for none.
+        ok: Whether the target answered.
+        rtt_us: Round trip; None without an answer.
+        state: ADS state, such as ``RUN``; empty if it is unknown.
+        error: Error code of the answer.
+        text: Result in words.
+        hint: Remedy; empty for none.
     """
 
     __test__ = False
@@ -296,16 +296,16 @@ class TestResult(Document, frozen=True, kw_only=True):
 
 
 class NeighbourRow(Document, frozen=True, kw_only=True):
-    """A router of another host that answered.
+    """Router of another host that answered.
 
     Attributes:
         station: Sender of the request.
-        name: Of the router or its host.
-        net_id: Of the router.
-        address: IPv4 address that the answer came from.
-        version: Of its software; empty if it does not tell.
-        route: Name of the route that leads there; empty for none.
-        is_learned: Whether that was learned.
+        name: Name of the router or its host.
+        net_id: NetID of the router.
+        address: IPv4 source address of the answer.
+        version: Version of its software; empty if it sends none.
+        route: Name of the route to it; empty for none.
+        is_learned: Whether this scan learned that route.
     """
 
     station: str
@@ -321,9 +321,9 @@ class RemoteRouteResult(Document, frozen=True, kw_only=True):
     """Answer of another router to a request to add a route.
 
     Attributes:
-        ok: Whether it has it now.
-        result: An ADS result; None if it said nothing.
-        text: That in words.
+        ok: Whether it has the route now.
+        result: An ADS result; None without answer.
+        text: Result in words.
     """
 
     ok: bool
@@ -332,7 +332,7 @@ class RemoteRouteResult(Document, frozen=True, kw_only=True):
 
 
 class ImportRow(Document, frozen=True, kw_only=True):
-    """One route of a file, and why it was not added; *reason* is empty if it was."""
+    """One route of a file; *reason* is empty if it was added."""
 
     name: str
     net_id: str
@@ -341,7 +341,7 @@ class ImportRow(Document, frozen=True, kw_only=True):
 
 
 class Export(Document, frozen=True, kw_only=True):
-    """A StaticRoutes file, and the names of routes that it cannot hold."""
+    """StaticRoutes file, and the names of the routes that it cannot hold."""
 
     xml: str
     left_out: list[str] = field(default_factory=list)
@@ -354,14 +354,14 @@ class RouteAnswer(Document, frozen=True, kw_only=True):
 
 
 class AddedRoute(Document, frozen=True, kw_only=True):
-    """Answer to ``routes_add``; *warnings* name what hides the route."""
+    """Answer to ``routes_add``; *warnings* name routes that hide the new one."""
 
     route: RouteRow
     warnings: list[str]
 
 
 class ViaParameters(Parameters, frozen=True, kw_only=True):
-    """Base: *via* is the station whose router sends the requests; empty for the first one here."""
+    """Base of requests through a router; *via* is its station, empty for the first local one."""
 
     via: str = ""
 
@@ -377,9 +377,9 @@ class TraceParameters(ViaParameters, frozen=True, kw_only=True):
 
 
 class AskParameters(TraceParameters, frozen=True, kw_only=True):
-    """``ams_ask``: one ADS request; *data* is what follows the header, in hexadecimal digits.
+    """``ams_ask``: one ADS request; *data* follows the header, in hexadecimal digits.
 
-    With *device* a station stands for its first EAP port, not for its router.
+    With *device* a station name is the address of its first EAP port, not that of its router.
     """
 
     command: Annotated[int, Meta(ge=1, le=0xFFFF)]
@@ -389,7 +389,7 @@ class AskParameters(TraceParameters, frozen=True, kw_only=True):
 
 
 class SlaveEntry(Document, frozen=True):
-    """Slave of a bus port; *state* is None while it is not known."""
+    """Slave of a bus port; *state* is None while it is unknown."""
 
     address: int
     name: str
@@ -397,7 +397,7 @@ class SlaveEntry(Document, frozen=True):
 
 
 class ScannedPort(Document, frozen=True):
-    """Port of a station, with the slaves of a bus; *error* says why they are not known."""
+    """Port of a station, with the slaves of a bus; *error* is the reason if these are unknown."""
 
     name: str
     kind: str
@@ -408,7 +408,7 @@ class ScannedPort(Document, frozen=True):
 
 
 class StationEntry(Document, frozen=True):
-    """Station of the plant; *error* says why it did not answer."""
+    """Station of the plant; *error* is the reason of a missing answer."""
 
     name: str
     net_id: str
@@ -417,7 +417,7 @@ class StationEntry(Document, frozen=True):
 
 
 class ScanVia(Document, frozen=True):
-    """Station that scanned, and the address at which AMS/TCP reaches it."""
+    """Station that scanned, and its AMS/TCP address."""
 
     station: str
     address: str
@@ -431,16 +431,17 @@ class PlantScan(Document, frozen=True):
 
 
 class MergedScan(Document, frozen=True):
-    """``eapctl scan``: answers of all appliances."""
+    """Output of ``eapctl scan``: answers of all appliances."""
 
     stations: list[StationEntry]
     via: list[ScanVia]
 
 
 class HopRow(Document, frozen=True, kw_only=True):
-    """One router on the way to a target; *spent_us* is the part of *took_us* behind the last one.
+    """One router on the path to a target.
 
-    *interrupted* is None where an older router does not tell it.
+    *spent_us* is the part of *took_us* behind the previous router.  *interrupted* is None if an
+    older router does not report it.
     """
 
     station: str
@@ -469,7 +470,7 @@ class TargetAnswer(Document, frozen=True):
 
 
 class TracedPath(Document, frozen=True):
-    """Answer to ``trace``; *why* says where the way ends."""
+    """Answer to ``trace``; *why* is the reason if the path ends before the target."""
 
     target: str
     address: str
@@ -481,7 +482,7 @@ class TracedPath(Document, frozen=True):
 
 
 class AmsReply(Document, frozen=True):
-    """Answer to ``ams_ask``: error of the AMS header, and what follows it."""
+    """Answer to ``ams_ask``: error code of the AMS header, and the data that follows it."""
 
     error: int
     data: str
@@ -501,7 +502,7 @@ AMS_ASK = Method("ams_ask", AskParameters, AmsReply)
 
 
 def hop_row(report: HopReport, took_us: int, spent_us: int, *, is_opaque: bool) -> HopRow:
-    """Return one router of a way."""
+    """Return the record of one router on a path."""
     return HopRow(
         station=report.station,
         net_id=report.net_id,
@@ -520,7 +521,7 @@ def hop_row(report: HopReport, took_us: int, spent_us: int, *, is_opaque: bool) 
 
 
 def interruption_text(row: InterruptionRow) -> str:
-    """Return in words what is interrupted."""
+    """Return the interruption in words."""
     noun = "subscription is" if row.count == 1 else "subscriptions are"
     return (
         f"{row.count} {noun} interrupted, of {row.source} ({row.client}) at {row.target}: {row.why}"

@@ -1,7 +1,7 @@
-"""Listeners of this process: connections accepted, admitted by the policy, served and closed.
+"""Listeners of this process: they accept connections, admit, serve and close them.
 
-The policy is :mod:`eap.net.connections`; all listeners of the process share one table, because they
-share the descriptors of the process.
+The policy is :mod:`eap.net.connections`.  All listeners of the process share one table, because
+they share the descriptors of the process.
 """
 
 from __future__ import annotations
@@ -29,10 +29,9 @@ from eap.net.realtime import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descr
 from eap.services.rate_limits import caused_by
 
 _ACCEPT_SLICE_NS, _LOCAL_ACCEPT_SLICE_NS = 5_000_000, 20_000_000
-"""Time for accepting connections before others have their turn: a crowd that is refused has to go
-quickly, for the clients that get a place wait behind it."""
+"""Time slice for accepting connections: short, because established clients wait meanwhile."""
 _PAUSE_S = 1.0
-"""After an error of the listener; connections that wait keep waiting."""
+"""Pause after an error of the listener; new connections wait in its backlog."""
 _CREDENTIALS = struct.Struct("3i")
 _numbers = count(1)
 
@@ -45,28 +44,28 @@ class ConnectionServer(Protocol[C]):
     """User of a listener, which knows the protocol."""
 
     def connection_from(self, sock: socket.socket, host: str) -> C:
-        """Return the connection on a socket that was accepted.
+        """Return the connection on an accepted socket.
 
         Raises:
-            OSError: the peer has gone again.
+            OSError: the peer has disconnected already.
         """
 
     async def serve_connection(self, connection: C, sock: socket.socket) -> None:
         """Serve *connection* until its end; the caller closes *sock*."""
 
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
-        """Count a connection that gets no place, and is closed next."""
+        """Count a connection that is not admitted; the caller closes it next."""
 
 
 class TaskConnection:
-    """A connection that one task serves; it is closed by cancelling that task.
+    """Connection that one task serves, and that is closed by cancelling it.
 
     Attributes:
-        host: As the policy counts it.
-        used_at_ns: When the last frame was complete.
-        late_since_ns: Since when a frame is unfinished, or answers are not taken.
-        is_used: Whether a frame was complete ever.
-        closed_for: Reason why the policy closed it.
+        host: Host that the policy counts it for.
+        used_at_ns: Time of the latest complete frame.
+        late_since_ns: Since when a frame is incomplete, or answers are not read; None otherwise.
+        is_used: Whether there was a complete frame.
+        closed_for: Reason for which the policy closed it.
     """
 
     def __init__(self, host: str) -> None:
@@ -79,22 +78,22 @@ class TaskConnection:
 
     @property
     def activity(self) -> Activity:
-        """Current use."""
+        """Current use, for the policy."""
         return Activity.IDLE if self.is_used else Activity.UNUSED
 
     def begin(self) -> None:
-        """Note the running task as the one that serves this connection."""
+        """Make the running task the one that serves this connection."""
         self._task = asyncio.current_task()
         if self.closed_for is not None:
             self.close(self.closed_for)
 
     def note_partial(self) -> None:
-        """Note that a frame has begun."""
+        """Note the first byte of a frame."""
         if self.late_since_ns is None:
             self.late_since_ns = monotonic_ns()
 
     def note_frame(self) -> None:
-        """Note that a frame is complete."""
+        """Note a complete frame."""
         self.used_at_ns = monotonic_ns()
         self.late_since_ns = None
         self.is_used = True
@@ -110,7 +109,7 @@ class Listeners:
     """All listeners of one process, with their common table.
 
     Args:
-        overdue_ns: Time that a peer has to finish a frame, or to take answers.
+        overdue_ns: Time limit of a peer to complete a frame, or to read answers.
     """
 
     def __init__(self, overdue_ns: int = OVERDUE_NS) -> None:
@@ -123,7 +122,7 @@ class Listeners:
         return [each.stats for each in self.table.listeners]
 
     async def serve(self) -> None:
-        """Close overdue connections, and report on crowded listeners, until cancelled."""
+        """Close overdue connections and report crowded listeners, until cancelled."""
         while True:
             await asyncio.sleep(self._overdue_ns / 4e9)
             for connection in self.table.take_overdue(monotonic_ns(), self._overdue_ns):
@@ -148,11 +147,11 @@ class ListeningSocket(Generic[C]):
     """One listening socket.
 
     Args:
-        sock: It stays open.
-        name: For ``status`` and log lines.
+        sock: The socket, which stays open.
+        name: Shown in ``status`` and the log.
         server: Serves the connections.
-        listeners: Of the process.
-        limits: Places.
+        listeners: All listeners of the process.
+        limits: Limits of the connections.
     """
 
     def __init__(
@@ -169,7 +168,7 @@ class ListeningSocket(Generic[C]):
         self._listener = listeners.table.add_listener(name, limits)
         self._is_local = sock.family == socket.AF_UNIX
         reserve = descriptor_reserve()
-        # The operator of this host may use some of what is kept from all others.
+        # Half of the reserve is for the operator of this host.
         self._reserve = reserve // 2 if self._is_local else reserve
 
     async def serve(self) -> None:
@@ -186,7 +185,7 @@ class ListeningSocket(Generic[C]):
                     connection.close(CloseReason.ENDED)
 
     def _accept_some(self, group: asyncio.TaskGroup) -> bool:
-        """Accept what waits, not too much at a time; return whether to go on at once."""
+        """Accept waiting connections for one time slice; return False to pause."""
         end_ns = monotonic_ns() + (_LOCAL_ACCEPT_SLICE_NS if self._is_local else _ACCEPT_SLICE_NS)
         while monotonic_ns() < end_ns:
             try:
@@ -199,7 +198,7 @@ class ListeningSocket(Generic[C]):
             try:
                 connection = self._server.connection_from(sock, self._host_of(sock))
             except OSError as exc:
-                logger.debug("%s: a peer has left again: %s", self._listener.name, exc)
+                logger.debug("%s: a peer disconnected at once: %s", self._listener.name, exc)
                 sock.close()
                 continue
             self._admit(connection, sock, group)
@@ -230,7 +229,7 @@ class ListeningSocket(Generic[C]):
             await self._server.serve_connection(connection, sock)
         except* OSError as group:
             logger.debug("%s: connection ended: %s", self._listener.name, group.exceptions[0])
-        except* Exception:  # one connection is no reason to end all of them
+        except* Exception:  # a failed connection must not end the others
             logger.exception("%s: a connection failed", self._listener.name)
 
     def _forget(self, connection: C, sock: socket.socket) -> None:
@@ -238,7 +237,7 @@ class ListeningSocket(Generic[C]):
         self._table.remove(self._listener, connection)
 
     def _close_unused(self, error: OSError) -> bool:
-        """Close an unused connection for want of descriptors; return whether there was one."""
+        """Close an unused connection to free a descriptor; return whether there was one."""
         logger.debug("%s: %s", self._listener.name, error)
         if error.errno not in OUT_OF_DESCRIPTORS:
             return False
@@ -249,7 +248,7 @@ class ListeningSocket(Generic[C]):
 
 
 async def wait_readable(sock: socket.socket) -> None:
-    """Wait until there is something to read, or to accept."""
+    """Wait until the socket has data to read, or a connection to accept."""
     loop = asyncio.get_running_loop()
     readable = loop.create_future()
     loop.add_reader(sock, _set_once, readable)
@@ -272,9 +271,9 @@ def process_of(connection: socket.socket) -> tuple[int, int]:
 
 
 def connection_name(connection: socket.socket) -> str:
-    """Return a name that no other connection of this process ever has: peer, and a number."""
+    """Return the peer with a number, a name that is unique in this process."""
     host, port = "", 0
     if connection.family == socket.AF_INET:
-        with suppress(OSError):  # the peer has gone again already
+        with suppress(OSError):  # the peer has disconnected already
             host, port = connection.getpeername()
     return f"{host}:{port}#{next(_numbers)}"

@@ -1,15 +1,15 @@
-"""One AMS/TCP connection, whoever opened it: packets in, and packets out (Beckhoff ADS, AMS/TCP).
+"""One AMS/TCP connection, accepted or opened: received and sent packets (Beckhoff ADS, AMS/TCP).
 
-Rule 1: requests are handed on as they come, and answered in any order; who sends ahead of too many
-answers, or takes none, is not read from until that has changed.
-Rule 2: after a few packets others have their turn, however much more of them wait here.
-Rule 3: a connection that this side opened is always read from: what comes are answers mostly, and
-two stations that wait for each other to read would wait for ever.
-Rule 4: a connection has a name that no other one ever has: clients of one host share its NetID, and
-often ports and numbers of requests too.
-Rule 5: a client that asks for an AMS address, as local clients of a TwinCAT router do, is given one
-that no station and no other client has; answers come back by the connection, so nothing is kept of
-the address.
+Rule 1: requests are forwarded as they come, and answered in any order.  Reading pauses while too
+many of them are pending, or while the peer does not read its answers.
+Rule 2: after a few packets other connections have their turn, however many more are buffered.
+Rule 3: a connection that this side opened is always read: it mostly receives answers, and two
+stations that both wait for the other to read would deadlock.
+Rule 4: the name of a connection is unique: clients of one host share its NetID, and often ports and
+invoke ids too.
+Rule 5: a client that requests an AMS address, as local clients of a TwinCAT router do, gets one
+that no station and no other client has.  Answers return by the connection, so the router keeps no
+record of the address.
 """
 
 from __future__ import annotations
@@ -42,11 +42,12 @@ from eap.net.connections import Activity, CloseReason
 from eap.runtime.discards import Refusal
 
 MAX_REQUESTS = 64
-"""Requests of one connection that wait for their answers."""
+"""Limit of the pending requests of one connection."""
 MAX_OCTETS = 256 << 10
-"""Of these requests and of the answers that they ask for; one request may have more."""
+"""Limit of the bytes of these requests and of the requested answers; a single request may exceed
+it."""
 _COMMAND, _COMMAND_GROUP, _FLAGS = 16, 17, 18
-"""Octets of the AMS header: both of the command, the lower one of the state flags."""
+"""Offsets in the AMS header: both bytes of the command, and the lower one of the state flags."""
 _ERROR = slice(24, 28)
 _RESULT = slice(AmsHeader.SIZE, AmsHeader.SIZE + 4)
 _LENGTH = struct.Struct("<8xI")
@@ -59,21 +60,21 @@ _ABOUT_NOTIFICATIONS = frozenset((_ADD, _DELETE))
 _READ_WRITE = AmsCommand.READ_WRITE.value
 _GROUP = slice(AmsHeader.SIZE, AmsHeader.SIZE + 4)
 _SUM_ITEMS = AmsHeader.SIZE + 8
-"""Place of the items in the answer to a sum command, behind its result and length."""
+"""Offset of the items in the answer to a sum command, behind its result and length."""
 _SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value.to_bytes(4, "little")
 _SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value.to_bytes(4, "little")
 _ITEM_SIZES = {_SUM_ADD: 8, _SUM_DELETE: 4}
-"""Octets of one item: a result, and a handle where a notification was added."""
+"""Bytes of one item: a result, and a handle where a notification was added."""
 _INVOKE_ID = slice(28, 32)
 _MAX_SUMS = 256
 _NO_ERROR = bytes(4)
 
 
 class SubscriptionCounter:
-    """Notifications of one connection: granted by an answer, and not ended by a later one.
+    """Number of notifications of one connection, counted from its answers.
 
     Attributes:
-        count: As above.
+        count: Granted by an answer and not ended by a later one.
     """
 
     __slots__ = ("_sums", "count")
@@ -81,16 +82,16 @@ class SubscriptionCounter:
     def __init__(self) -> None:
         self.count = 0
         self._sums: dict[bytes, bytes] = {}
-        """Index groups of the sum commands that wait: their answers do not repeat them."""
+        """Index groups of the pending sum commands, which their answers do not repeat."""
 
     def note_request(self, packet: bytes) -> None:
-        """Note a request that came in."""
+        """Note a received request."""
         group = packet[_GROUP]
         if group in _ITEM_SIZES and packet[_COMMAND] == _READ_WRITE and len(self._sums) < _MAX_SUMS:
             self._sums[packet[:16] + packet[_INVOKE_ID]] = group
 
     def note_answer(self, packet: bytes) -> None:
-        """Note an answer that goes out."""
+        """Note a sent answer."""
         command = packet[_COMMAND]
         if command in _ABOUT_NOTIFICATIONS:
             count = int(_is_granted(packet))
@@ -108,10 +109,10 @@ class SubscriptionCounter:
 
 
 class AmsWindow:
-    """Requests and octets under way on one connection.
+    """Pending requests and bytes of one connection.
 
     Attributes:
-        requests: Number of requests that wait for their answers.
+        requests: Number of pending requests.
         subscriptions: Notifications of the connection.
     """
 
@@ -128,9 +129,9 @@ class AmsWindow:
         return self.requests >= MAX_REQUESTS or self._octets >= MAX_OCTETS
 
     def note_incoming(self, packet: bytes) -> bool:
-        """Note a packet that came in; return whether it is an answer."""
+        """Note a received packet; return whether it is an answer."""
         flags, command = packet[_FLAGS], packet[_COMMAND]
-        # Those with a group of their own are fragments, of which nothing waits for an answer.
+        # A command of another group is a fragment, which has no answer.
         if flags & _WITHOUT_ANSWER or packet[_COMMAND_GROUP] or command == _NOTIFICATION:
             return bool(flags & _RESPONSE)
         size = len(packet)
@@ -144,11 +145,11 @@ class AmsWindow:
         return False
 
     def note_outgoing(self, packet: bytes) -> bool:
-        """Note a packet that goes out; return whether it is the answer to one that came in."""
+        """Note a sent packet; return whether it answers a received one."""
         if not packet[_FLAGS] & _RESPONSE or packet[_COMMAND_GROUP] or not self.requests:
             return False
-        # Answers come in any order and do not say how long their requests were; the average does,
-        # and nothing is left when all have come.
+        # Answers come in any order and do not repeat the size of their requests.  The average is
+        # near enough, and reaches 0 with the last answer.
         self._octets -= self._octets // self.requests
         self.requests -= 1
         self.subscriptions.note_answer(packet)
@@ -160,55 +161,57 @@ def _is_granted(answer: bytes) -> bool:
 
 
 LONGEST_PACKET = 256 << 10
-"""Octets of an AMS packet; nothing here has a value a quarter as long."""
+"""Limit of the bytes of an AMS packet; no value here is a quarter as long."""
 LONGEST_ANSWER = 4 << 20
-"""Octets of a packet by a connection that this side opened: the symbols of a large controller."""
+"""Likewise on a connection that this side opened: the symbols of a large controller."""
 MAX_UNSENT = 8 << 20
-"""Octets that wait for a peer to take them; a client is kept below by what it may ask for at a
-time, unless it does not keep up with its notifications."""
+"""Limit of the bytes that a peer has not read.  The pending requests keep a client below, unless it
+does not keep up with its notifications.
+"""
 _RECEIVED = memoryview(bytearray(64 << 10))
-"""Of all connections.  What asyncio takes by default, 256 KB anew for each packet, is asked of the
-kernel and given back each time, which takes longer than all the rest."""
+"""Receive buffer of all connections.  The default of asyncio allocates and frees 256 KB for each
+packet, which takes longer than everything else.
+"""
 _PER_TURN = 8
-"""Packets of one connection before others have their turn, while few have more to do."""
+"""Packets of one connection in a row, while few connections have more."""
 _FEW = 4
-"""With more connections than these that have more to do, each has one packet a turn."""
+"""With more connections than these that have more packets, each gets one packet in a row."""
 _FIRST_PORT, _LAST_PORT = 32768, 40959
-"""AMS ports for clients that ask for one, as a TwinCAT router numbers them."""
+"""AMS ports for clients that request one, as a TwinCAT router numbers them."""
 _FIRST_SUFFIX, _LAST_SUFFIX = 0x8001, 0xFEFE
-"""Last two bytes of the NetIDs for these clients: not .1.1, .2.1 and so on, which stations have."""
+"""Last two bytes of the NetIDs for these clients; stations have .1.1, .2.1 and so on."""
 _NO_RETURN = StateFlags.NO_RETURN.value  # a plain number: operators of flags are slow
 
 logger = logging.getLogger(__name__)
 
 
 class PacketHandler(Protocol):
-    """Who acts on what a connection brings."""
+    """User of a connection, which handles its packets."""
 
     def connection_opened(self, connection: AmsConnection) -> None:
-        """Take *connection*, by which can be sent from now on."""
+        """Begin to use *connection* for sending."""
 
     def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
-        """Act on a request whose length is right; its answer goes back by *connection*."""
+        """Handle a request with a valid length; its answer returns by *connection*."""
 
     def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Act on a response."""
+        """Handle an answer."""
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
-        """Forget it: nothing comes and nothing can be sent any more; *why* is for people."""
+        """Stop using *connection*; *why* is for people."""
 
     def count_dropped(self, reason: Refusal) -> None:
-        """Count what is not taken."""
+        """Count a dropped packet or connection."""
 
 
 class ClientAddresses:
-    """AMS addresses for clients that ask for one: no two are the same, nor are they a station's.
+    """AMS addresses for clients that request one, unlike those of stations and other clients.
 
     The first four bytes are those of the client's IP address, as access rules expect them.
 
     Args:
-        first: Number of the first address; another one in each process makes it unlikely that two
-            routers give the same address to two clients of one host.
+        first: Number of the first address.  A different one in each process makes it unlikely that
+            two routers assign the same address to two clients of one host.
     """
 
     def __init__(self, first: int) -> None:
@@ -229,24 +232,24 @@ class AmsConnection(asyncio.BufferedProtocol):
     """One connection.
 
     Args:
-        name: Of this one and no other.
-        address: Of the peer.
-        handler: Acts on what it brings.
+        name: Unique name.
+        address: IP address of the peer.
+        handler: Handles its packets.
         is_ours: Whether this side opened it.
-        assign_address: Returns NetID and port for a client on a host that asks for an AMS address;
-            without it no peer may ask for one.
-        host: By which the policy counts it (:mod:`eap.net.connections`).
+        assign_address: Returns NetID and port for a client on a host that requests an AMS address;
+            without it a request for one ends the connection.
+        host: Host that the policy counts it for (:mod:`eap.net.connections`).
 
     Attributes:
         name: As above.
         host: As above.
-        used_at_ns: When the last packet came.
-        late_since_ns: Since when a packet is unfinished, or answers are not taken.
-        closed: Done, with the reason, when the connection has ended.
+        used_at_ns: Time of the latest packet.
+        late_since_ns: Since when a packet is incomplete, or answers are not read; None otherwise.
+        closed: Completed with the reason when the connection has ended.
     """
 
     _busy_count: ClassVar[int] = 0
-    """Connections of this process that have more to do."""
+    """Number of connections of this process with more packets."""
 
     def __init__(
         self,
@@ -281,7 +284,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         self._is_closed = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin (asyncio)."""
+        """Open the connection (asyncio)."""
         assert isinstance(transport, asyncio.Transport)  # noqa: S101  for the type
         self._transport = transport
         self._is_open = True
@@ -290,14 +293,14 @@ class AmsConnection(asyncio.BufferedProtocol):
             transport.abort()
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Return where octets go; they are taken before anybody else has a turn (asyncio)."""
+        """Return the receive buffer; it is emptied before another connection receives (asyncio)."""
         del sizehint
         return _RECEIVED
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Take octets (asyncio)."""
+        """Handle received bytes (asyncio)."""
         if self._is_ours and not self._is_blocked:
-            # Answers of 4 MB take longer than 10 s by a slow link: the latest byte counts.
+            # An answer of 4 MB takes longer than 10 s on a slow link: its latest byte counts.
             self.late_since_ns = None
         packet = self._cutter.receive_one(bytes(_RECEIVED[:nbytes]))
         if packet is None:
@@ -308,26 +311,26 @@ class AmsConnection(asyncio.BufferedProtocol):
                 self._hold()
 
     def eof_received(self) -> bool:
-        """Take the end of what the peer sends; it may still wait for answers (asyncio)."""
+        """Note the end of the received data; the peer may still read answers (asyncio)."""
         self._has_ended = True
         self._close_when_done()
         return True
 
     def pause_writing(self) -> None:
-        """Read no more: the peer does not take what waits for it (asyncio)."""
+        """Pause reading while the peer does not read (asyncio)."""
         self._is_blocked = True
         self.late_since_ns = monotonic_ns()
         if not self._is_ours:
             self._hold()
 
     def resume_writing(self) -> None:
-        """Read again (asyncio)."""
+        """Resume reading (asyncio)."""
         self._is_blocked = False
         self.late_since_ns = None
         self._schedule()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End (asyncio)."""
+        """End the connection (asyncio)."""
         if isinstance(exc, OSError) and exc.strerror:
             self._why = exc.strerror
         self._handler.connection_closed(self, self._why)
@@ -335,14 +338,14 @@ class AmsConnection(asyncio.BufferedProtocol):
             self.closed.set_result(self._why)
 
     def send(self, packets: Iterable[bytes]) -> str | None:
-        """Send packets; return why not if that is not possible any more."""
+        """Send packets; return the reason if that is impossible."""
         transport = self._transport
         if transport.is_closing():
             return "the connection was closed"
         if self._is_blocked and transport.get_write_buffer_size() > MAX_UNSENT:
             if not self._is_ours:
                 self.close(CloseReason.OVERDUE)
-            return "the peer takes nothing"
+            return "the peer does not read"
         for packet in packets:
             transport.write(encode_with_prefix(packet))
             if self._window.note_outgoing(packet) and (self._is_held or self._has_ended):
@@ -351,7 +354,7 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     @property
     def activity(self) -> Activity:
-        """Current use, for the policy for connections."""
+        """Current use, for the policy."""
         if self._window.subscriptions.count:
             return Activity.SUBSCRIBED
         if self._window.requests:
@@ -359,7 +362,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         return Activity.IDLE if self._is_used else Activity.UNUSED
 
     def close(self, why: str) -> None:
-        """Close it at once, even before it is open; the handler is told *why*."""
+        """Close it at once, even before it is open; the handler gets the reason *why*."""
         if why is CloseReason.OVERDUE and not self._has_ended:
             self._handler.count_dropped(Refusal.AMS_SLOW)
         self._why = why
@@ -378,10 +381,10 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._is_held = True
             self._transport.pause_reading()
         if not self._is_blocked:
-            self.late_since_ns = None  # what is unfinished waits here, not at the peer
+            self.late_since_ns = None  # an incomplete packet waits here, not at the peer
 
     def _go_on(self) -> None:
-        """Take some of the packets that are here, and read on when there are no more."""
+        """Handle some of the buffered packets, and resume reading after the last one."""
         if self._is_scheduled:
             self._is_scheduled = False
             AmsConnection._busy_count -= 1
@@ -414,7 +417,7 @@ class AmsConnection(asyncio.BufferedProtocol):
             self.late_since_ns = monotonic_ns()
 
     def _break_off(self, why: str) -> None:
-        """Read no more: these are no AMS packets."""
+        """Stop reading, because these are no AMS packets."""
         logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
         self._handler.count_dropped(Refusal.AMS_TYPE)
         self._why = f"no AMS packets: {why}"
@@ -427,7 +430,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         if self._is_ours or not (self._window.requests or self._is_scheduled):
             self._transport.close()
             if self.late_since_ns is None:
-                self.late_since_ns = monotonic_ns()  # answers may still wait to be taken
+                self.late_since_ns = monotonic_ns()  # the peer may not have read all answers
 
     def _take(self, piece: StreamItem) -> None:
         self.used_at_ns = monotonic_ns()
@@ -455,7 +458,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         if asked.command is RouterCommand.NET_ID:
             self._transport.write(encode_net_id(net_id))
         elif asked.command is RouterCommand.CLOSE_PORT:
-            self._why = "the client gave its port back"
+            self._why = "the client closed its port"
             self._has_ended = True
             self._close_when_done()
         elif port:
@@ -466,7 +469,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _refuse_length(self, header: AmsHeader) -> None:
         self._handler.count_dropped(Refusal.AMS_LENGTH)
         if header.state_flags & StateFlags.RESPONSE:
-            # Whoever waits for this answer need not wait any longer.
+            # The client of this answer need not wait for its time-out.
             answer = msgspec.structs.replace(header, length=0, error_code=AdsError.AMS_LENGTH)
             self._handler.handle_answer(answer.encode(), self)
         elif not header.state_flags & _NO_RETURN and header.command != AmsCommand.NOTIFICATION:

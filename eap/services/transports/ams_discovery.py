@@ -56,7 +56,7 @@ RATES = SourceRates(
     new=Rate(10, 1.0),
     local=Rate(50, 10.0),
 )
-"""Requests that are decided; the others get no answer.  Passwords take time to guess."""
+"""Requests that are decided; others get no answer, so that guessing passwords takes time."""
 MAX_SOURCES = 1024
 _SHOWN = 80
 
@@ -72,10 +72,10 @@ class _Request(NamedTuple):
 
 
 class RouteAdmin:
-    """Takes the requests that come to one address.
+    """Handler of the add-route requests that come to one address.
 
     Args:
-        stations: The routes of each station there; all of them get a route.
+        stations: Routes of each station there; all of them get a route.
         clock: In seconds.
     """
 
@@ -86,16 +86,16 @@ class RouteAdmin:
         self._clock = clock
         self._limiter = SourceRateLimiter(RATES, MAX_SOURCES, clock())
 
-    async def take(
+    async def handle(
         self, question: Discovery, sender: str, *, is_this_host: bool
     ) -> AdsError | None:
-        """Add the route that *question* asks for, and return the result for its sender.
+        """Add the requested route, and return the result for its sender.
 
-        None stands for no answer: the sender, or all together, ask too often.
+        None stands for no answer: the rate limit of the sender or of all senders is exceeded.
 
         Args:
             question: The datagram.
-            sender: IPv4 address that it came from.
+            sender: Its source IPv4 address.
             is_this_host: Whether a program of this host sent it.
         """
         now_s = self._clock()
@@ -114,7 +114,7 @@ class RouteAdmin:
                 result, why = await _decide(station, question, sender, is_this_host=is_this_host)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
             cause = caused_by((station.router.net_id, name, sender, why), sender)
-            logger.log(level, "route %r asked for by %s: %s", name, sender, why, extra=cause)
+            logger.log(level, "route %r requested by %s: %s", name, sender, why, extra=cause)
             entry = _audited(station.router.net_id, question, sender, result, why)
             for write in station.router.on_audit:
                 write(entry)
@@ -125,7 +125,7 @@ class RouteAdmin:
 def _audited(
     router: NetId, question: Discovery, sender: str, result: AdsError, why: str
 ) -> AuditEntry:
-    """Return what the audit says of a request."""
+    """Return the entry of the audit about a request."""
     octets = (question.find(Tag.NET_ID) or b"")[:6].ljust(6, b"\0")
     wanted = AddRoute(
         decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN],
@@ -142,7 +142,7 @@ def _audited(
 async def _decide(
     station: StationRoutes, question: Discovery, sender: str, *, is_this_host: bool
 ) -> tuple[AdsError, str]:
-    """Return the result for the sender, and what was done in words."""
+    """Return the result for the sender, and a text for the log."""
     if refused := _why_not(station.spec.users, question, is_this_host=is_this_host):
         return AdsError.ACCESS, f"refused: {refused}"
     try:
@@ -159,18 +159,18 @@ async def _decide(
 
 
 def _why_not(users: Sequence[AmsUser], question: Discovery, *, is_this_host: bool) -> str:
-    """Return why the sender may have no route, empty if it may."""
+    """Return why the sender may not add a route, empty if it may."""
     if users:
         user = decode_text(question.find(Tag.USER) or b"")[:_SHOWN]
         return "" if _is_known(users, question) else f"user {user!r} or the password is wrong"
-    return "" if is_this_host else "the station has no users, so only this host may"
+    return "" if is_this_host else "the station has no users, so only this host may add routes"
 
 
 def _is_known(users: Sequence[AmsUser], question: Discovery) -> bool:
     name = decode_text(question.find(Tag.USER) or b"")
     given = (question.find(Tag.PASSWORD) or b"").partition(b"\0")[0]
     is_known = False
-    for user in users:  # all of them: how long it takes tells nobody whether a name is right
+    for user in users:  # all of them: the time must not reveal whether a user exists
         password = _password(user)
         is_right = password is not None and hmac.compare_digest(password, given)
         is_known |= is_right and hmac.compare_digest(user.name.encode(), name.encode())
@@ -178,7 +178,7 @@ def _is_known(users: Sequence[AmsUser], question: Discovery) -> bool:
 
 
 def _password(user: AmsUser) -> bytes | None:
-    """Return the password of *user*, None if there is none, with a warning."""
+    """Return the password of *user*; log a warning and return None without one."""
     try:
         password = read_password(Path(user.password_file))
         reason = "" if password else f"{user.password_file}: its first line is empty"
@@ -191,10 +191,10 @@ def _password(user: AmsUser) -> bytes | None:
 
 
 def _read(question: Discovery, sender: str) -> _Request:
-    """Return what is wanted; raise ValueError if that can be nothing."""
+    """Return the requested route; raise ValueError if its values are impossible."""
     octets = question.find(Tag.NET_ID) or b""
     if len(octets) != 6 or not any(octets):
-        raise ValueError("it names no NetID")
+        raise ValueError("it has no NetID")
     where = decode_text(question.find(Tag.HOST) or b"").strip() or sender
     host, port = parse_host(where, AMS_TCP_PORT)
     name = decode_text(question.find(Tag.ROUTE_NAME) or b"").strip() or where
@@ -203,14 +203,14 @@ def _read(question: Discovery, sender: str) -> _Request:
 
 
 def _written(table: RouteTable, net_id: NetId) -> str:
-    """Return the route of the plant file that *net_id* takes, empty if there is none."""
+    """Return the name of the configured route to *net_id*, empty if there is none."""
     found = table.find(net_id)
     is_written = found is not None and found[1] and found[0].origin is Origin.STATIC
     return found[0].name if found is not None and is_written else ""
 
 
 async def _add(station: StationRoutes, wanted: _Request) -> None:
-    """Add a route for all NetIDs that begin as the wanted one, or for that alone."""
+    """Add a route for all NetIDs of the requested station, or for the requested NetID alone."""
     hop = HopSpec(TransportKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
     is_here = station.has(wanted.net_id.station)
     spec = RouteSpec(
@@ -218,7 +218,7 @@ async def _add(station: StationRoutes, wanted: _Request) -> None:
         net_id=str(wanted.net_id),
         hop=hop,
         octets=len(wanted.net_id) if is_here else STATION_OCTETS,
-        is_probed=False,  # most tools answer nobody
+        is_probed=False,  # most tools answer no requests
         is_client=True,
     )
     await station.add(spec, is_kept=wanted.is_kept)
@@ -230,52 +230,51 @@ _DATAGRAMS_PER_TURN = 64
 
 
 class RouterName(NamedTuple):
-    """A router that can be found."""
+    """Router that answers requests for server info."""
 
     name: str
-    """Of its station."""
+    """Name of its station."""
     net_id: NetId
 
 
 class AmsDiscovery:
-    """The routers that are found at one address.
+    """Server for the datagrams to one address.
 
     Args:
-        sock: Opened by the supervisor for datagrams to that address; answers go out by it.  It
-            stays open.
-        routers: At that address.
-        desk: Decides on routes.
-        questions: That were asked by *sock*, for their answers come there too.
-        count_dropped: Counts a datagram that is not answered.
+        sock: Bound to that address by the supervisor; answers are sent by it, and it stays open.
+        routers: Routers at that address.
+        route_admin: Handles add-route requests.
+        requests: Requests that were sent by *sock*, which receives their answers too.
+        count_dropped: Counts a datagram without answer.
     """
 
     def __init__(
         self,
         sock: socket.socket,
         routers: Sequence[RouterName],
-        desk: RouteAdmin,
-        questions: RouterRequests,
+        route_admin: RouteAdmin,
+        requests: RouterRequests,
         count_dropped: Callable[[Refusal], None],
     ) -> None:
         self._sock = sock
         self._own = sock.getsockname()[0]
         self._routers = routers
-        self._route_admin = desk
-        self._questions = questions
+        self._route_admin = route_admin
+        self._requests = requests
         self._count_dropped = count_dropped
         self._tasks = TaskSet("AMS discovery")
 
     def watch(self, sock: socket.socket | None = None) -> None:
-        """Answer whenever something arrives, as long as the running loop lives.
+        """Answer datagrams as long as the running loop lives.
 
-        With *sock* what arrives there: broadcasts to the network of the address.
+        With *sock* those that arrive there: broadcasts to the network of the address.
         """
         watched = self._sock if sock is None else sock
         watched.setblocking(False)
         asyncio.get_running_loop().add_reader(watched.fileno(), self._drain, watched)
 
     async def answers_to(self, data: bytes, sender: str) -> list[bytes]:
-        """Return the datagrams that go back to the *sender* of *data*: one a router, or none."""
+        """Return the answers to the datagram *data*: one for each router, or none."""
         try:
             question = decode_discovery(data)
         except CodecError:
@@ -286,12 +285,12 @@ class AmsDiscovery:
         service, number = question.header.service, question.header.invoke_id
         if service == DiscoveryService.SERVER_INFO:
             for router in self._routers:
-                # The name first: there are tools that look at no number of a tag.
+                # The name first: some tools ignore the numbers of tags.
                 name = Tag.HOST, encode_text(router.name)
                 yield _answer(router, service, number, [name, (Tag.VERSION, _VERSION)])
         elif service == DiscoveryService.ADD_ROUTE:
             is_this_host = sender == self._own or IPv4Address(sender).is_loopback
-            result = await self._route_admin.take(question, sender, is_this_host=is_this_host)
+            result = await self._route_admin.handle(question, sender, is_this_host=is_this_host)
             if result is not None:
                 tag = Tag.RESULT, result.to_bytes(4, "little")
                 yield _answer(self._routers[0], service, number, [tag])
@@ -303,8 +302,8 @@ class AmsDiscovery:
             except BlockingIOError:
                 return
             except OSError:
-                continue  # what ICMP says of an answer that went before
-            if self._questions.receive(data, sender[0]):
+                continue  # ICMP error of an earlier answer
+            if self._requests.receive(data, sender[0]):
                 continue
             self._tasks.start(self._answer(data, sender))
 

@@ -39,10 +39,10 @@ logger = logging.getLogger(__name__)
 
 
 class AmsClients:
-    """Connections to all AMS/TCP listeners of this process, by name; the carrier of their door.
+    """Connections to all AMS/TCP listeners of this process, by name; sender of their transport.
 
     Attributes:
-        addresses: For clients that ask for an AMS address.
+        addresses: For clients that request an AMS address.
     """
 
     def __init__(self) -> None:
@@ -53,15 +53,15 @@ class AmsClients:
         return len(self._connections)
 
     def add(self, connection: AmsConnection) -> None:
-        """Take one more."""
+        """Add a connection."""
         self._connections[connection.name] = connection
 
     def remove(self, connection: AmsConnection) -> None:
-        """Forget one that has ended."""
+        """Remove a closed connection."""
         del self._connections[connection.name]
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
-        """Send packets by a connection; return why not if there is none of that name."""
+        """Send packets by a connection; return the reason if there is none of that name."""
         found = self._connections.get(connection)
         return "the connection was closed" if found is None else found.send(packets)
 
@@ -69,14 +69,14 @@ class AmsClients:
 class AmsTransport:
     """One listening socket and the stations behind it.
 
-    A peer that has vanished without a word is found out by the kernel within a minute.
+    The kernel detects a peer that vanished without FIN within a minute (TCP keep-alive).
 
     Args:
         listener: Opened by the supervisor; it stays open.
-        entrance: To the stations that are reached by it.
-        clients: Where those who have connected are found when an answer is there.
-        count_dropped: Counts what is not answered as it was wanted.
-        listeners: Of this process.
+        demultiplexer: To the stations behind the listener.
+        clients: All connections of the process.
+        count_dropped: Counts dropped packets and connections.
+        listeners: All listeners of the process.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class AmsTransport:
         await self._listening.serve()
 
     def connection_from(self, sock: socket.socket, host: str) -> AmsConnection:
-        """Return the connection on a socket that was accepted (ConnectionServer)."""
+        """Return the connection on an accepted socket (ConnectionServer)."""
         set_stream_options(sock)
         return AmsConnection(
             connection_name(sock),
@@ -118,26 +118,26 @@ class AmsTransport:
             connection.close(CloseReason.ENDED)
 
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
-        """Count a connection that gets no place (ConnectionServer)."""
+        """Count a connection that is not admitted (ConnectionServer)."""
         del sock, why
         self.count_dropped(Refusal.AMS_FULL)
 
     def connection_opened(self, connection: AmsConnection) -> None:
-        """Keep it (PacketHandler)."""
+        """Add the connection (PacketHandler)."""
         self._clients.add(connection)
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
-        """Let others have its place (PacketHandler)."""
+        """Remove the connection (PacketHandler)."""
         logger.debug("AMS/TCP connection %s: %s", connection.name, why)
         self._clients.remove(connection)
         self._demultiplexer.connection_closed(connection.name)
 
     def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
-        """Hand a request to the stations (PacketHandler)."""
+        """Forward a request to the stations (PacketHandler)."""
         self._demultiplexer.receive(packet, connection.name)
 
     def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Count a response: nothing is asked by connections that others opened (PacketHandler)."""
+        """Count an answer: no requests are sent on accepted connections (PacketHandler)."""
         del packet, connection
         self.count_dropped(Refusal.AMS_UNASKED)
 
@@ -146,10 +146,13 @@ class AmsTransport:
 
 
 async def resolve(host: str) -> str:
-    """Return the address of *host*, which may be one already.
+    """Return the IPv4 address of a host name or address, without blocking the loop.
+
+    A thread of its own looks the name up.  The executor of asyncio would delay the end of the
+    process until its threads have ended, even if the name server does not answer.
 
     Raises:
-        OSError: there is no such name, or nobody says whose it is.
+        OSError: there is no such name, or no name server answers.
     """
     try:
         return str(IPv4Address(host))
@@ -158,7 +161,7 @@ async def resolve(host: str) -> str:
     loop = asyncio.get_running_loop()
     found: asyncio.Future[str] = loop.create_future()
 
-    def take(result: str | OSError) -> None:
+    def complete(result: str | OSError) -> None:
         if found.done():
             return
         if isinstance(result, str):
@@ -175,53 +178,53 @@ async def resolve(host: str) -> str:
         except UnicodeError:
             result = OSError(f"{host!r} is not a host name")
         with suppress(RuntimeError):  # the loop has ended meanwhile
-            loop.call_soon_threadsafe(take, result)
+            loop.call_soon_threadsafe(complete, result)
 
     Thread(target=look_up, name=f"resolve {host}", daemon=True).start()
     return await found
 
 
 CONNECT_S = 3.0
-"""How long a peer may take to accept a connection."""
+"""Time limit for connecting to a peer."""
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 5.0
-"""Before a connection is tried again."""
+"""Pauses before the next attempt."""
 MAX_EARLY = 64
 """Packets that wait for the first connection."""
 _UNCONFIRMED_S = 10.0
 _STABLE_S = 10.0
-"""A connection that lasted so long was a good one: the next is tried soon."""
+"""After a connection of this duration the pauses begin anew."""
 
 
 PEER_PREFIX = f"{TransportKind.AMS_TCP}:"
-"""Begin of the names of doors to peers; the address of the peer follows."""
+"""Prefix of the names of uplink transports; the address of the peer follows."""
 
 
 class PacketRouter(Protocol):
-    """What a connection to a peer needs of the router of its station."""
+    """Router of a station, as the connection to a peer uses it."""
 
     @property
     def name(self) -> str:
         """Name of the station."""
 
     def receive(self, data: bytes, transport: str, connection: str) -> None:
-        """Act on a packet; what has to be said goes to ``AmsUplink.send``."""
+        """Handle a packet; answers go to ``AmsUplink.send``."""
 
     def connection_closed(self, transport: str, connection: str) -> None:
-        """Forget what the peer asked for."""
+        """Drop the pending requests of the peer."""
 
     def hop_down(self, transport: str, address: str | None, text: str) -> None:
-        """Answer what waits for the peer, and what will be for it."""
+        """Mark the peer as down."""
 
     def hop_up(self, transport: str, address: str | None) -> None:
-        """Pass requests on to it again."""
+        """Mark the peer as up."""
 
 
 class PeerAddress(NamedTuple):
-    """Where a peer listens."""
+    """Host and port of a peer's listener."""
 
     host: str
-    """Name or address."""
+    """Name or IPv4 address."""
     port: int
 
     def __str__(self) -> str:
@@ -229,18 +232,18 @@ class PeerAddress(NamedTuple):
 
 
 class AmsUplink(ReconnectingLink):
-    """The connection to one peer.
+    """Connection to one peer.
 
     Args:
-        peer: Whom to connect to.
+        peer: Host and port to connect to.
         transport: Its name at the router.
-        address: By which routes name the peer.
-        router: Of the station.
+        address: Address of the peer in routes.
+        router: Router of the station.
         sources: The station's own IPv4 addresses.
-        claims: Peers that the station is connected with, by address and port: all its uplinks share
+        claims: Peers that the station is connected to, by address and port; all its uplinks share
             it.
-        count_dropped: Counts what is not taken.
-        may_be_client: Says whether the peer may be a client that does not listen.
+        count_dropped: Counts dropped packets.
+        may_be_client: Returns whether the peer may be a client without a listener.
     """
 
     def __init__(
@@ -271,8 +274,8 @@ class AmsUplink(ReconnectingLink):
         self._early: list[bytes] | None = []
 
     def send(self, connection: str, packets: Iterable[bytes]) -> str | None:
-        """Send packets to the peer; return why not if that cannot be done (TransportSender)."""
-        del connection  # there is one
+        """Send packets to the peer; return the reason of a failure (TransportSender)."""
+        del connection  # a peer has one connection
         if self._connection is not None:
             return self._connection.send(packets)
         if self._early is None:
@@ -283,7 +286,7 @@ class AmsUplink(ReconnectingLink):
         return None
 
     def connection_opened(self, connection: AmsConnection) -> None:
-        """Send what has waited (PacketHandler)."""
+        """Send the packets that waited (PacketHandler)."""
         self._connection = connection
         self._was_open = True
         early, self._early = self._early, None
@@ -292,30 +295,30 @@ class AmsUplink(ReconnectingLink):
             connection.send(early)
 
     def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
-        """Hand a request of the peer on (PacketHandler)."""
+        """Forward a request of the peer (PacketHandler)."""
         del connection
         self._router.receive(packet, *self._endpoint)
 
     def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Hand an answer of the peer on (PacketHandler)."""
+        """Forward an answer of the peer (PacketHandler)."""
         del connection
         self._router.receive(packet, *self._endpoint)
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
-        """Tell the router (PacketHandler)."""
+        """Notify the router (PacketHandler)."""
         if self._connection is connection:
             self._connection = None
             self._router.connection_closed(*self._endpoint)
             self._closed.set_result(why)
 
     def end(self) -> None:
-        """Close the connection at once, before the door is gone."""
+        """Close the connection at once, before its transport is removed."""
         if self._connection is not None:
             self._connection.close("")
             self.connection_closed(self._connection, "the route was removed")
 
     def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
-        """Tell the router, and the log if the reason is another one."""
+        """Mark the peer as down, and log a new reason (ReconnectingLink)."""
         del has_lasted
         self._early = None
         self._router.hop_down(*self._endpoint, reason)
@@ -333,9 +336,9 @@ class AmsUplink(ReconnectingLink):
             async with asyncio.timeout(CONNECT_S):
                 host = await resolve(self.peer.host)
         except TimeoutError:
-            return f"the address of {self.peer.host} is not found in time"
+            return f"{self.peer.host}: no address within {CONNECT_S:g} s"
         except OSError as exc:
-            return f"the address of {self.peer.host} is not found: {exc.strerror or exc}"
+            return f"{self.peer.host}: no address: {exc.strerror or exc}"
         key = host, self.peer.port
         other = self._claims.setdefault(key, self)
         if other is not self:
@@ -360,10 +363,10 @@ class AmsUplink(ReconnectingLink):
             return f"{self.peer} refuses connections: no router runs there"
         except OSError as exc:
             return f"{self.peer}: {exc.strerror}"
-        return await self._last(sock, host)
+        return await self._serve(sock, host)
 
-    async def _last(self, sock: socket.socket, host: str) -> str:
-        """Hand over an open connection, and wait for its end; return why it ended."""
+    async def _serve(self, sock: socket.socket, host: str) -> str:
+        """Serve an open connection; return the reason of its end."""
         loop = asyncio.get_running_loop()
         self._closed = loop.create_future()
         since = loop.time()
@@ -387,10 +390,10 @@ class AmsUplink(ReconnectingLink):
 
 
 def source_for(host: str, sources: Collection[str]) -> str | None:
-    """Return by which of a station's addresses it is known to *host*, None for any.
+    """Return the station's source address towards *host*, None for any.
 
-    Routers tell peers apart by their addresses; stations that share a machine and its network each
-    come from their own.
+    Routers identify peers by their addresses; stations that share a host and its network each use
+    their own.
     """
     for source in sources:
         if host.startswith("127.") and source.startswith("127."):
@@ -414,19 +417,19 @@ class UplinkRouter(PacketRouter, Protocol):
         """All routes."""
 
     def add_transport(self, transport: Transport, sender: TransportSender) -> None:
-        """Let packets come and go by *transport*."""
+        """Add a transport with its sender."""
 
     def remove_transport(self, name: str) -> None:
-        """Forget a door."""
+        """Remove a transport."""
 
 
 class AmsUplinks:
-    """The uplinks of one station: they follow its routes.
+    """Uplinks of one station: one for each peer that a route names.
 
     Args:
-        router: Of the station.
+        router: Router of the station.
         sources: The station's own IPv4 addresses.
-        count_dropped: Counts what is not taken.
+        count_dropped: Counts dropped packets.
     """
 
     def __init__(
@@ -454,7 +457,7 @@ class AmsUplinks:
             await asyncio.Event().wait()
 
     def _follow(self, hop: Endpoint) -> None:
-        """Open the connection to *hop*, or close it, as there are routes to it or none."""
+        """Open or close the connection to *hop* after its routes changed."""
         if not hop.transport.startswith(PEER_PREFIX):
             return
         is_used = any(route.hop == hop for route in self._router.table)
@@ -487,7 +490,7 @@ class AmsUplinks:
         if (task := self._tasks.pop(hop, None)) is not None:
             task.cancel()
         self._uplinks.pop(hop).end()
-        self._router.hop_up(*hop)  # nothing is known of it any more
+        self._router.hop_up(*hop)  # a removed hop has no state
         self._router.remove_transport(hop.transport)
 
     def _start(self, hop: Endpoint) -> None:

@@ -1,4 +1,4 @@
-"""A socket or a listener behind which there are stations: whose a packet is that comes by it."""
+"""Demultiplexer: the station of a packet, where several share a socket or a listener."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from eap.services.routing.station_router import StationRouter
 
 
 class Demultiplexer:
-    """One way in.
+    """Distributes the packets of one socket among its stations.
 
-    A packet is for the station that has its target, or where somebody waits for it; a request for
-    none of them goes to the one with the best route.  Where that cannot be told, to the first.
+    A packet goes to the station with its target NetID, or with a pending request that it answers;
+    any other request to the station with the best route.  The first station gets what is left.
 
     Args:
-        behind: The stations, and by what name each knows the door.
+        behind: The stations, each with its name of the transport.
     """
 
     def __init__(self, behind: Sequence[tuple[StationRouter, str]]) -> None:
@@ -41,63 +41,63 @@ class Demultiplexer:
             station, transport = self._find(header, bytes(body))
         except CodecError:
             whole = data
-            station, transport = self._behind[0]  # which remembers that it came
+            station, transport = self._behind[0]  # its record shows the packet
         station.receive(whole, transport, connection)
 
     def connection_closed(self, connection: str) -> None:
-        """Tell the stations that a connection has ended."""
+        """Notify the stations that a connection has ended."""
         for station, transport in self._behind:
             self._fragments.forget(Endpoint(transport, connection))
             station.connection_closed(transport, connection)
 
     def has(self, net_id: NetId) -> bool:
-        """Say whether a NetID is of one of the stations."""
+        """Return whether a NetID belongs to one of the stations."""
         return any(net_id in station.net_ids for station, _ in self._behind)
 
     def set_hop_connection(self, address: str, connection: str) -> None:
-        """Tell the stations that what comes by *connection* comes from the hop *address*."""
+        """Treat packets from *connection* as packets from the hop *address*, at all stations."""
         for station, transport in self._behind:
             station.set_hop_connection(transport, address, connection)
 
     def hop_down(self, address: str, text: str) -> None:
-        """Tell the stations that nothing can go to *address* by this door; *text* says why."""
+        """Mark the hop *address* as down at all stations; *text* is the reason."""
         for station, transport in self._behind:
             station.hop_down(transport, address, text)
 
     def hop_up(self, address: str) -> None:
-        """Take back what :meth:`hop_down` said."""
+        """Mark the hop *address* as up at all stations."""
         for station, transport in self._behind:
             station.hop_up(transport, address)
 
     def has_route_to(self, address: str) -> bool:
-        """Say whether a route of a station leads to *address* by this door."""
+        """Return whether a route of a station leads to *address*."""
         return any(
             station.has_route_to(Endpoint(transport, address))
             for station, transport in self._behind
         )
 
     def is_awaited(self, address: str) -> bool:
-        """Say whether a station waits for an answer from there."""
+        """Return whether a station waits for an answer from *address*."""
         return any(
             station.is_awaited(Endpoint(transport, address)) for station, transport in self._behind
         )
 
     def waiting(self, connection: str) -> int:
-        """Return how many requests of a connection wait for their answers."""
+        """Return the number of pending requests of a connection."""
         return sum(
             station.waiting(Endpoint(transport, connection)) for station, transport in self._behind
         )
 
     async def wait_below(self, connection: str, count: int) -> None:
-        """Wait until fewer than *count* requests of a connection wait at each station."""
+        """Wait until fewer than *count* requests of a connection are pending at each station."""
         for station, transport in self._behind:
             await station.wait_below(transport, connection, count)
 
     def _whole(self, data: bytes, connection: str) -> bytes | None:
-        """Return the packet that *data* is or completes; None if more is to come.
+        """Return the packet that *data* is or completes; None if fragments are missing.
 
         Raises:
-            CodecError: it is none, or fits to no fragment before it.
+            CodecError: *data* is no packet, or a fragment without those before it.
         """
         header, body = decode_packet(data)
         if header.command != AmsCommand.FRAGMENT:

@@ -39,39 +39,39 @@ _MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
 
 
 QUICK_NS = 120_000
-"""Frames that come within this time after the last was answered are quick."""
+"""Frames that come within this time after the last answer are quick."""
 SPIN_LIMIT_NS = 60_000
-"""How long is watched for the next of them."""
+"""Time limit of one busy-poll for the next frame."""
 MAX_SPIN_FRAMES = 32
-"""That are taken so before others have their turn."""
+"""Limit of the frames in one busy-poll, because other tasks wait for the loop."""
 MAX_FRUITLESS = 2
-"""How often in a row that may be in vain: who was quick may have been interrupted."""
+"""Fruitless polls in a row before backing off: a quick sender may have been interrupted."""
 MAX_BACKOFF = 1024
-"""Frames that are not waited for, once many were waited for in vain."""
+"""Most frames without busy-polling after many fruitless polls."""
 
 
 class DrainedChannel(Protocol):
-    """What services needs of a UDP or an Ethernet channel."""
+    """UDP or Ethernet channel, as services use it."""
 
     def drain(self, now_ns: int) -> int:
-        """Hand what waits to the takers; return how many frames there were."""
+        """Pass the waiting frames to the takers; return their number."""
 
     def fileno(self) -> int:
         """Return the descriptor to watch."""
 
 
 MailboxHandler: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], Refusal | None]
-"""Takes a frame of type 5 as a Taker does; returns why not if it does not."""
+"""Handles a frame of type 5; returns the reason if it is dropped."""
 
 
 class FrameIntake:
-    """Takes the frames of one socket for the *stations* that listen there.
+    """Sorts the frames of one socket by type, for the stations that listen there.
 
     Args:
-        stations: At which is counted what is not taken.
-        counters: Where.
-        from_ns: Since when this process runs, on the monotonic clock.
-        mailbox: Takes type 5.
+        stations: Stations at which dropped frames are counted.
+        counters: The counters.
+        from_ns: Start of this process, on the monotonic clock.
+        mailbox: Handles type 5.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class FrameIntake:
         self.mailbox = mailbox
 
     def receive(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
-        """Take, or count, one frame that arrived at *at_ns* on the monotonic clock."""
+        """Handle, or count, one frame that arrived at *at_ns* on the monotonic clock."""
         if at_ns < self._from_ns:
             reason: Refusal | None = Refusal.STALE
         elif size < EtherCatHeader.SIZE:
@@ -109,18 +109,18 @@ def watch_channel(channel: DrainedChannel) -> None:
 
 
 class BusyPoller:
-    """Drains a channel, and looks again for a while where the next frame is likely to be near.
+    """Drains a channel, and busy-polls it for a while where the next frame is probably near.
 
-    Who waits for each answer before asking again does so at once: the next frame is there sooner
-    than a process falls asleep, is woken and finds its way through an event loop, which takes as
-    long as to answer.  So while frames come that quickly the channel is watched, for some
-    microseconds after each and for some frames in all, because others wait for the loop.
+    A client that waits for each answer sends the next request at once.  It is there sooner than a
+    process can sleep, be woken and run an event loop, which takes as long as the answer itself.  So
+    while frames come that quickly the channel is polled, for some microseconds after each and for
+    some frames in all, because other tasks wait for the loop.
 
-    Where the sender shares the processor he cannot go on before this gives up.  So each time in
-    vain the channel is not watched for twice as many frames.
+    A sender on the same processor cannot run during a poll.  So each fruitless poll doubles the
+    number of frames without polling.
 
     Args:
-        channel: What is drained.
+        channel: Channel to drain.
         clock: The monotonic clock, in nanoseconds.
     """
 
@@ -133,7 +133,7 @@ class BusyPoller:
         self._backoff = 1
 
     def drain(self) -> None:
-        """Take what waits; and what comes, if this came quickly after what was taken last."""
+        """Handle the waiting frames; poll for more if they came soon after the last answer."""
         channel, clock = self._channel, self._clock
         now_ns = clock()
         is_quick = now_ns - self._handled_ns < QUICK_NS
@@ -145,7 +145,7 @@ class BusyPoller:
             self._watch(taken, now_ns)
 
     def _watch(self, taken: int, now_ns: int) -> None:
-        """Look for more, after *taken* frames."""
+        """Poll for more after *taken* frames."""
         channel, clock = self._channel, self._clock
         while taken < MAX_SPIN_FRAMES:
             if now_ns - self._handled_ns > SPIN_LIMIT_NS:
@@ -158,7 +158,7 @@ class BusyPoller:
                 self._handled_ns, self._retries, self._backoff = now_ns, MAX_FRUITLESS, 1
 
     def _note_fruitless(self) -> None:
-        """Remember that nothing came; of somebody who was quick until now that says little."""
+        """Back off after a fruitless poll, unless the sender was quick until now."""
         if self._retries:
             self._retries -= 1
         else:
@@ -170,56 +170,56 @@ _MAX_PEERS = 1024
 
 
 class FrameHandler(Protocol):
-    """Takes frames that are no AoE to a station: a gateway, if there is one."""
+    """Handler of frames that are not AoE to a station: the gateways, if there are any."""
 
     @property
     def is_there(self) -> bool:
-        """Whether there is any gateway."""
+        """Whether there is a gateway."""
 
     def receive(
         self, frame: bytes, connection: str, send: Callable[[str, bytes], object]
     ) -> Refusal | None:
-        """Act on a frame of *connection*, to which *send* sends; return why not if not taken."""
+        """Handle a frame of *connection*, answered by *send*; return the reason if dropped."""
 
     def connection_closed(self, connection: str) -> None:
-        """Forget who is gone."""
+        """Drop what belongs to a closed connection."""
 
     def waiting(self, connection: str) -> int:
-        """Return how many requests of a connection wait for their answers."""
+        """Return the number of pending requests of a connection."""
 
     async def wait_below(self, connection: str, count: int) -> None:
-        """Wait until fewer than *count* requests of a connection wait."""
+        """Wait until fewer than *count* requests of a connection are pending."""
 
 
 def aoe_packet(data: Buffer) -> bytes | None:
-    """Return the AMS packet in a frame of type 5 that is for a station, None if it is for none."""
+    """Return the AMS packet for a station in a frame of type 5, None if it has none."""
     packet = aoe_packet_in(data)
     return packet if packet is not None and len(packet) >= AmsHeader.SIZE else None
 
 
 def refusal_of(data: Buffer) -> Refusal:
-    """Return why nobody takes a frame of type 5 that is neither for a station nor for a gateway."""
+    """Return why a frame of type 5 is dropped that is for no station and no gateway."""
     try:
         decode_frame(data)
     except MalformedError:
-        return Refusal.MAILBOX  # of a protocol that nobody knows
+        return Refusal.MAILBOX  # an unknown mailbox protocol
     except CodecError:
         return Refusal.TRUNCATED
     return Refusal.MAILBOX
 
 
 class FrameCounters:
-    """Counts the frames to each peer from 1 to 7, so that none is taken for a repeated one.
+    """Mailbox counters of the frames to each peer, 1 to 7 in turn (ETG.1000.4, mailbox header).
 
-    What comes is not looked at for that: requests are told apart by who asks and by their numbers,
-    and clients of their own making often leave the counter at 1.
+    A receiver drops a frame with the counter of the previous one as repeated.  Received counters
+    are not checked: requests have a sender and an invoke id, and simple clients send 1 only.
     """
 
     def __init__(self) -> None:
         self._latest: OrderedDict[str, int] = OrderedDict()
 
     def frame(self, peer: str, packet: bytes) -> bytes:
-        """Return the frame that brings *packet* to *peer*."""
+        """Return the frame of *packet* to *peer*."""
         counter = next_counter(self._latest.pop(peer, 0))
         self._latest[peer] = counter
         if len(self._latest) > _MAX_PEERS:
@@ -228,21 +228,21 @@ class FrameCounters:
 
 
 class PacketReceiver(Protocol):
-    """Where packets of a channel go."""
+    """Receiver of the packets of a channel."""
 
     def receive(self, data: bytes, connection: str, *, is_broadcast: bool = False) -> None:
-        """Act on a packet that came from the address *connection*."""
+        """Handle a packet from the address *connection*."""
 
 
 class MailboxIntake:
-    """One channel's frames for the stations behind it.
+    """Frames of type 5 of one channel, for the stations and gateways behind it.
 
     Args:
-        entrance: To these stations.
-        gateway: For what is no AoE to a station; a frame for many is for no gateway.
-        sender: Sends what the gateway answers.
-        is_for_many: Tells of a frame whether it was meant for many.
-        is_aoe_here: Whether AoE is for the stations; otherwise that is for the gateway too.
+        demultiplexer: To the stations.
+        gateway: For all but AoE to a station; a multicast frame goes to no gateway.
+        sender: Sends the answers of the gateway.
+        is_for_many: Returns whether a frame is multicast.
+        is_aoe_here: Whether AoE is for the stations; otherwise the gateway gets it too.
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class MailboxIntake:
     def receive(
         self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin
     ) -> Refusal | None:
-        """Act on a frame; return why not if it is not taken."""
+        """Handle a frame; return the reason if it is dropped."""
         del at_ns
         sender = origin.sender_of(data)
         if not sender:
@@ -280,7 +280,7 @@ class MailboxIntake:
     def drop_reason(
         self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin
     ) -> Refusal | None:
-        """Return why a frame is not taken that this intake gets too, without acting on it."""
+        """Return why a frame is dropped that another intake handles, without handling it."""
         del at_ns, origin
         if aoe_packet(data[:size]) is not None:
             return None
@@ -290,14 +290,14 @@ class MailboxIntake:
 
 
 class ChannelSender:
-    """Sends packets in frames to addresses that *channel* reaches."""
+    """Sends packets in frames to the addresses that *channel* reaches."""
 
     def __init__(self, channel: FrameChannel) -> None:
         self._channel = channel
         self._counters = FrameCounters()
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
-        """Send packets to the address *connection*; return why not if that cannot be done."""
+        """Send packets to the address *connection*; return the reason of a failure."""
         return self._send(connection, [self._counters.frame(connection, each) for each in packets])
 
     def send_frame(self, connection: str, frame: bytes) -> str | None:
@@ -317,22 +317,22 @@ class ChannelSender:
 
 
 ASK_NS = 1_000_000_000
-"""Between two questions for a NetID that nobody answered."""
+"""Time between two queries for a NetID without answer."""
 ASK_AGAIN_NS = 30_000_000_000
-"""Between two questions for one whose address is known."""
+"""Time between two queries for a NetID with a known MAC address."""
 
 
 class _Resolution(NamedTuple):
     mac: str
-    """Empty while it is not known."""
+    """Empty while it is unknown."""
     asked_at_ns: int | None
 
 
 class EthernetSegment:
-    """The way in from one interface and VLAN, and the addresses of its stations.
+    """Ethernet interface and VLAN, with the MAC addresses of NetIDs there.
 
     Args:
-        entrance: To the stations of this host that are on it.
+        demultiplexer: To the local stations on it.
         mac: Own address.
     """
 
@@ -342,12 +342,12 @@ class EthernetSegment:
         self._resolutions: dict[NetId, _Resolution] = {}
 
     def receive(self, data: bytes, connection: str, *, is_broadcast: bool = False) -> None:
-        """Act on a packet; the arguments are those of :meth:`Demultiplexer.receive`."""
+        """Handle a packet; the arguments are those of :meth:`Demultiplexer.receive`."""
         self._learn(data, connection)
         self._demultiplexer.receive(data, connection, is_broadcast=is_broadcast)
 
     def find(self, net_id: NetId, now_ns: int, ask: Callable[[], object]) -> str:
-        """Return the MAC address of a port, empty while it is not known; *ask* when it is time."""
+        """Return the MAC address of a NetID, empty while unknown; *ask* when a query is due."""
         if self._demultiplexer.has(net_id):
             self._demultiplexer.set_hop_connection(str(net_id), self.mac)
             return self.mac
@@ -377,9 +377,9 @@ class SegmentSender:
     """Sends packets of one station to MAC addresses, and to NetIDs of ports.
 
     Args:
-        segment: Where they are.
-        channel: Of the station's port.
-        net_id: Of the station's router, in whose name is asked.
+        segment: Resolves the NetIDs.
+        channel: Channel of the station's port.
+        net_id: NetID of the station's router, the source of queries.
     """
 
     def __init__(self, segment: EthernetSegment, channel: FrameChannel, net_id: NetId) -> None:
@@ -388,17 +388,17 @@ class SegmentSender:
         self._net_id = net_id
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
-        """Send packets to an address; return why not if that cannot be done."""
+        """Send packets to an address; return the reason of a failure."""
         mac = connection
         if ":" not in connection:
             net_id = NetId.parse(connection)
             mac = self._segment.find(net_id, monotonic_ns(), lambda: self._ask(net_id))
         if not mac:
-            return "nobody has said yet which MAC address it has"
+            return "its MAC address is not known yet"
         if mac != self._segment.mac:
             return self._sender.send(mac, packets)
         loop = asyncio.get_running_loop()
-        for packet in packets:  # a packet socket does not get what its own host sends
+        for packet in packets:  # a packet socket does not receive frames of its own host
             loop.call_soon(self._segment.receive, packet, mac)
         return None
 

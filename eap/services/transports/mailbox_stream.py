@@ -40,42 +40,42 @@ from eap.services.transports.demultiplexer import Demultiplexer
 from eap.services.transports.mailbox_frames import FrameCounters, FrameHandler, aoe_packet
 
 CONNECT_S = 3.0
-"""How long the other side may take to accept."""
+"""Time limit for connecting."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0
 _LASTING_S = 5.0
-"""A connection that ends sooner counts as one that could not be made."""
+"""A connection that ends sooner counts as a failed attempt."""
 _UNCONFIRMED_S = 10.0
-"""Time for the other side to confirm what was sent, before the connection is lost."""
+"""Time without acknowledgement of sent data until the connection is closed (TCP_USER_TIMEOUT)."""
 _MAX_WAITING = 256 << 10
-"""Octets that wait for one connection."""
+"""Limit of the bytes that wait for one connection."""
 
 Write: TypeAlias = Callable[[bytes], None]
 Serve: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter, str], Awaitable[None]]
-"""Takes what comes by a connection, with the address of its other end, until it ends."""
+"""Serves a connection to the named address until its end."""
 
 
 class HopRouter(Protocol):
-    """The routers for which there are connections."""
+    """Routers, as the connections to other stations use them."""
 
     def hop_down(self, address: str, text: str) -> None:
-        """Answer what waits for a hop, and what will be for it."""
+        """Mark a hop as down."""
 
     def hop_up(self, address: str) -> None:
-        """Pass requests on again."""
+        """Mark a hop as up."""
 
     def has_route_to(self, address: str) -> bool:
-        """Say whether a route leads there."""
+        """Return whether a route leads there."""
 
     def is_awaited(self, address: str) -> bool:
-        """Say whether an answer from there is waited for."""
+        """Return whether an answer from there is pending."""
 
 
 class StreamUplinks:
-    """The connections of one transport to other stations, by ``ADDRESS:PORT``.
+    """Connections of one transport to other stations, by ``ADDRESS:PORT``.
 
     Args:
-        hops: Hears of those that come and go.
-        serve: Takes what comes by one.
+        hops: Notified of hops that are down or up.
+        serve: Serves a connection.
         source: Own address to connect from; empty for any.
     """
 
@@ -87,7 +87,7 @@ class StreamUplinks:
         self._tasks = TaskSet("connections to other stations")
 
     def send(self, address: str, data: bytes) -> str | None:
-        """Send *data*, now or when there is a connection; return why not if that cannot be."""
+        """Send *data* now or as soon as there is a connection; return the reason of a failure."""
         uplink = self._uplinks.get(address)
         if uplink is None:
             if not _is_address(address):
@@ -110,7 +110,7 @@ class StreamUplinks:
 
 
 class _StreamUplink(ReconnectingLink):
-    """Link to one other station, and the data that waits for its connection."""
+    """Connection to one other station, and the data that waits for it."""
 
     def __init__(self, address: str, source: str, hops: HopRouter, serve: Serve) -> None:
         super().__init__(ReconnectPolicy(FIRST_PAUSE_S, LONGEST_PAUSE_S, _LASTING_S))
@@ -123,16 +123,16 @@ class _StreamUplink(ReconnectingLink):
         self._octets = 0
 
     def send(self, data: bytes) -> str | None:
-        """Send data, or keep it for the next connection; return why not if that cannot be."""
+        """Send data, or keep it for the next connection; return the reason of a failure."""
         if self._writer is not None:
             if self._writer.is_closing():
                 return "the connection is closed"
             if self._writer.transport.get_write_buffer_size() > _MAX_WAITING:
-                return "the other side takes nothing"
+                return "the peer does not read"
             self._writer.write(data)
             return None
         if self._octets + len(data) > _MAX_WAITING:
-            return "too much waits for the connection"
+            return "the queue of the connection is full"
         self._octets += len(data)
         self._waiting.append(data)
         return None
@@ -160,14 +160,14 @@ class _StreamUplink(ReconnectingLink):
             self._forget()
             await self._serve(reader, writer, self._address)
         except (OSError, TimeoutError) as exc:
-            return f"the connection broke: {exc.strerror or 'the other side takes nothing'}"
+            return f"the connection broke: {exc.strerror or 'the peer does not read'}"
         finally:
             self._writer = None
             writer.transport.abort()
         return ""
 
     def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
-        """Tell the routers, unless nobody waits for an answer (ReconnectingLink)."""
+        """Mark the hop as down, unless no answer is pending (ReconnectingLink)."""
         del has_lasted
         self._forget()
         if not reason and not self._hops.is_awaited(self._address):
@@ -176,7 +176,7 @@ class _StreamUplink(ReconnectingLink):
         return True
 
     def _is_wanted(self) -> bool:
-        """Say whether a route leads there (ReconnectingLink)."""
+        """Return whether a route leads there (ReconnectingLink)."""
         return self._hops.has_route_to(self._address)
 
     def _forget(self) -> None:
@@ -190,25 +190,25 @@ def _is_address(text: str) -> bool:
 
 
 SLOW_READER_S = 10.0
-"""A peer that takes nothing for this long while answers wait for it is disconnected."""
+"""Time without reading, while answers wait, until a peer is disconnected."""
 LARGEST_FRAME = EtherCatHeader.SIZE + 0x7FF
-"""What the 11 bits of Length allow."""
+"""Largest value of the 11-bit Length, with the frame header."""
 MAX_UNANSWERED = 64
-"""Requests of one connection that wait; what it sends ahead stays in the connection."""
+"""Limit of the pending requests of one connection; later ones stay in the socket."""
 MAX_AT_GATEWAY = 16
-"""Likewise, requests for slaves and the master."""
+"""Likewise, requests to slaves and masters."""
 _FLAGS, _RESPONSE = 18, StateFlags.RESPONSE.value
-"""Place of the AMS state flags, and their bit for answers."""
+"""Offset of the AMS state flags, and their bit for answers."""
 _MAX_UNSENT = 1 << 20
-"""Octets that wait for a client that does not take them."""
+"""Limit of the bytes that a client has not read."""
 
 
 class StreamConnection(TaskConnection):
-    """A connection of a TCP listener, from its acceptance to its end.
+    """Accepted connection of a TCP listener.
 
     Attributes:
         subscriptions: Notifications of its client.
-        waiting: Returns how many requests that came by it wait for their answers.
+        waiting: Returns the number of its pending requests.
     """
 
     def __init__(self, host: str) -> None:
@@ -218,21 +218,21 @@ class StreamConnection(TaskConnection):
 
     @property
     def activity(self) -> Activity:
-        """Current use."""
+        """Current use, for the policy."""
         if self.subscriptions.count:
             return Activity.SUBSCRIBED
         return Activity.BUSY if self.waiting() else super().activity
 
 
 class MailboxStreams:
-    """All connections of one port, those that came and those to others; the carrier of its door.
+    """All connections of one port, accepted and opened; sender of its transport.
 
     Args:
-        entrance: To the stations behind the port.
-        gateway: For what is no AoE to a station.
-        count_dropped: Counts a frame that is not taken.
+        demultiplexer: To the stations behind the port.
+        gateway: For all but AoE to a station.
+        count_dropped: Counts dropped frames.
         source: Own address to connect from; empty for any.
-        is_aoe_here: Whether AoE is for the stations; otherwise that is for the gateway too.
+        is_aoe_here: Whether AoE is for the stations; otherwise the gateway gets it too.
     """
 
     def __init__(
@@ -253,9 +253,9 @@ class MailboxStreams:
         self._streams: dict[str, tuple[asyncio.StreamWriter, StreamConnection]] = {}
 
     async def serve(self, connection: StreamConnection, sock: socket.socket) -> None:
-        """Take what comes by *sock* until its end, and close it.
+        """Serve an accepted connection until its end, and close it.
 
-        Its first frame may have been looked at, not taken.
+        Its first frame may have been peeked at; it is still in the socket.
         """
         reader, writer = await asyncio.open_connection(sock=sock)
         name = connection_name(sock)
@@ -264,7 +264,7 @@ class MailboxStreams:
         try:
             await self._take(reader, writer, name, connection)
             async with asyncio.timeout(SLOW_READER_S):
-                # Who has only closed its sending side still listens.
+                # A client that closed its sending side may still read.
                 await self._demultiplexer.wait_below(name, 1)
                 await self._gateway.wait_below(name, 1)
                 writer.close()
@@ -280,7 +280,7 @@ class MailboxStreams:
             self._gateway.connection_closed(name)
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
-        """Send packets on a connection; return why not if that cannot be done."""
+        """Send packets on a connection; return the reason of a failure."""
         frames = b"".join(self._counters.frame(connection, packet) for packet in packets)
         if connection not in self._streams:
             return self._uplinks.send(connection, frames)
@@ -289,19 +289,19 @@ class MailboxStreams:
         return self.send_frame(connection, frames)
 
     def send_frame(self, connection: str, frame: bytes) -> str | None:
-        """Send what is packed already on a connection that came; returns as :meth:`send` does."""
+        """Send a complete frame on an accepted connection; returns as :meth:`send` does."""
         found = self._streams.get(connection)
         if found is None or found[0].is_closing():
             return "the connection is closed"
         writer, _ = found
         if writer.transport.get_write_buffer_size() > _MAX_UNSENT:
             writer.transport.abort()
-            return "the other side takes nothing"
+            return "the peer does not read"
         writer.write(frame)
         return None
 
     async def close(self) -> None:
-        """Close the connections to others."""
+        """Close the connections to other stations."""
         await self._uplinks.close()
 
     async def _serve_uplink(
@@ -319,7 +319,7 @@ class MailboxStreams:
         name: str,
         connection: StreamConnection,
     ) -> None:
-        """Take frames until the end, or until what comes is none."""
+        """Handle frames until the end, or until an invalid one."""
         while True:
             try:
                 head = await reader.readexactly(1)
@@ -345,7 +345,7 @@ class MailboxStreams:
                 await self._gateway.wait_below(name, MAX_AT_GATEWAY)
             async with asyncio.timeout(SLOW_READER_S):
                 await writer.drain()
-            await asyncio.sleep(0)  # others first: more of this one may be there already
+            await asyncio.sleep(0)  # a fast sender must not keep the loop from other connections
 
 
 LIMITS = Limits()
@@ -357,16 +357,16 @@ logger = logging.getLogger(__name__)
 class TcpTransport:
     """One listening socket and the ports behind it.
 
-    Connections of type 4 leave the account of this process when they go to the engine, which has
-    one of its own for each port (:class:`eap.net.tcpport.TcpPort`).
+    A connection of type 4 leaves the connection table of this process when the engine gets it; the
+    engine has one for each port (:class:`eap.net.tcpport.TcpPort`).
 
     Args:
         listener: Opened by the supervisor; it stays open.
-        takers: Ports that take type 4 from TCP; may be empty.
-        link: To the engine.
-        count_dropped: Counts a connection that was closed.
-        streams: Take the connections of type 5.
-        listeners: Of this process.
+        takers: Ports that accept type 4 by TCP; may be empty.
+        link: Link to the engine.
+        count_dropped: Counts closed connections.
+        streams: Serves the connections of type 5.
+        listeners: All listeners of the process.
     """
 
     def __init__(
@@ -393,7 +393,7 @@ class TcpTransport:
             await self._mailboxes.close()
 
     def connection_from(self, sock: socket.socket, host: str) -> StreamConnection:
-        """Return the connection on a socket that was accepted (ConnectionServer)."""
+        """Return the connection on an accepted socket (ConnectionServer)."""
         set_stream_options(sock)
         return StreamConnection(host)
 
@@ -411,7 +411,7 @@ class TcpTransport:
                 self._count_dropped(Refusal.TCP_SLOW)
 
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
-        """Count a connection that gets no place (ConnectionServer)."""
+        """Count a connection that is not admitted (ConnectionServer)."""
         del sock, why
         self._count_dropped(Refusal.TCP_FULL)
 
@@ -432,7 +432,7 @@ async def _first_type(connection: StreamConnection, sock: socket.socket) -> int:
     """Return the type in the first frame header, which stays in the socket.
 
     Raises:
-        OSError: the peer closed before it sent a whole header.
+        OSError: the peer closed the connection before a whole header.
     """
     while True:
         await wait_readable(sock)
@@ -442,4 +442,4 @@ async def _first_type(connection: StreamConnection, sock: socket.socket) -> int:
         if len(head) == EtherCatHeader.SIZE:
             return EtherCatHeader.decode(head).type
         connection.note_partial()
-        await asyncio.sleep(_PEEK_PAUSE_S)  # one octet stays readable: do not spin on it
+        await asyncio.sleep(_PEEK_PAUSE_S)  # one byte stays readable: do not spin on it

@@ -1,4 +1,4 @@
-"""The door of a station to a network of AMS routers behind an MQTT broker."""
+"""AMS over MQTT: transport of a station to a network of AMS routers behind a broker."""
 
 from __future__ import annotations
 
@@ -42,38 +42,38 @@ def open_mqtt_transports(
     routers: Mapping[str, StationRouter],
     counters: DiscardCounters,
 ) -> list[MqttTransport]:
-    """Return the doors of all stations to brokers, to be served.
+    """Return the MQTT transports of all stations, to be served.
 
     Args:
-        routing: What the stations are told, by their names.
-        routers: Of the stations.
-        counters: Of what is not taken.
+        routing: Routing configuration by station.
+        routers: Routers by station.
+        counters: Of dropped messages.
 
     Raises:
-        EnvironmentalError: there are some, and MQTT is not installed.
+        EnvironmentalError: there is a broker, and MQTT is not installed.
     """
     return [
         MqttTransport(
             spec,
             routers[station],
             partial(counters.count, station),
-            learns=told.learns_by_mqtt(spec.network),
+            learns=config.learns_by_mqtt(spec.network),
         )
-        for station, told in routing.items()
-        for spec in told.mqtt
+        for station, config in routing.items()
+        for spec in config.mqtt
     ]
 
 
 class MqttTransport:
-    """One network of one station; packets for it are handed to the router as they come.
+    """One network of one station; the router gets its packets as they come.
 
-    Nobody who comes by it is this host, whatever NetID he says he has.
+    A client behind a broker is never this host, whatever its source NetID.
 
     Args:
         spec: The network and its broker.
-        router: Of the station.
-        count_dropped: Counts a message that comes to nothing.
-        learns: Whether routers that tell of themselves become routes.
+        router: Router of the station.
+        count_dropped: Counts a dropped message.
+        learns: Whether announced routers become routes.
 
     Raises:
         EnvironmentalError: MQTT is not installed.
@@ -98,7 +98,7 @@ class MqttTransport:
         self._timer: asyncio.TimerHandle | None = None
         self._due_ns: int | None = None
         router.add_transport(Transport(self.name, is_shared=True, is_hub=True), self)
-        router.hop_down(self.name, None, "there was no connection to its broker yet")
+        router.hop_down(self.name, None, "not connected to its broker yet")
 
     async def serve(self) -> None:
         """Keep the connection until cancelled."""
@@ -109,7 +109,7 @@ class MqttTransport:
                 self._timer.cancel()
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
-        """Send packets to the router with the NetID *connection*; return why not, if not."""
+        """Send packets to the router with NetID *connection*; return the reason of a failure."""
         for packet in packets:
             if (why := self._link.send(self._network.message_for(connection, packet))) is not None:
                 return why

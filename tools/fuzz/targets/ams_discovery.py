@@ -87,12 +87,12 @@ async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     routes = StationRoutes(_Router(), RoutingSpec(users=users), _Store())
     refused: list[Refusal] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        desk = RouteAdmin([routes])
-        questions = RouterRequests(sock, [OWN])
-        if questions.receive(data, "127.0.0.1"):
+        route_admin = RouteAdmin([routes])
+        requests = RouterRequests(sock, [OWN])
+        if requests.receive(data, "127.0.0.1"):
             raise AssertionError("the answer to a question that was not asked")
         routers = [RouterName("left", OWN)]
-        discovery = AmsDiscovery(sock, routers, desk, questions, refused.append)
+        discovery = AmsDiscovery(sock, routers, route_admin, requests, refused.append)
         answers = await discovery.answers_to(data, "127.0.0.1")
         added = routes.added
         again = await discovery.answers_to(data, "127.0.0.1")

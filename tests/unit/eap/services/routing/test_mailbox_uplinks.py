@@ -165,13 +165,13 @@ def test_memory_is_bounded(monkeypatch):
     async def script(scene):
         assert scene.uplinks.send(scene.address, bytes(600)) is None
         why = scene.uplinks.send(scene.address, bytes(600))
-        assert why == "too much waits for the connection"
+        assert why == "the queue of the connection is full"
         await scene.accept()
         await scene.said("up")
         while scene.uplinks.send(scene.address, bytes(1 << 16)) is None:
             pass
         why = scene.uplinks.send(scene.address, b"x")
-        assert why == "the other side takes nothing"
+        assert why == "the peer does not read"
 
     play(script)
 

@@ -262,7 +262,7 @@ def test_client_that_asks_gets_an_address_that_nobody_else_has() -> None:
     for _ in range(2):
         taker = talk(script)
         assert not taker.refused
-        assert taker.why == "the client gave its port back"
+        assert taker.why == "the client closed its port"
     assert addresses[0] != addresses[1]
     assert not any(map(is_taken, map(NetId, addresses)))
 

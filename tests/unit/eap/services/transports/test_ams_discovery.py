@@ -37,22 +37,22 @@ def sock():
         yield bound
 
 
-class Desk:
+class Admin:
     """Stands for who decides on routes."""
 
     def __init__(self, result=AdsError.NONE):
         self.result = result
-        self.asked = []
+        self.requested = []
 
-    async def take(self, question, sender, *, is_this_host):
-        self.asked.append((question.find(Tag.ROUTE_NAME), sender, is_this_host))
+    async def handle(self, question, sender, *, is_this_host):
+        self.requested.append((question.find(Tag.ROUTE_NAME), sender, is_this_host))
         return self.result
 
 
-def discovery(sock, *routers, desk=None, refused=None):
+def discovery(sock, *routers, route_admin=None, refused=None):
     refuse = [].append if refused is None else refused.append
     questions = RouterRequests(sock, [LEFT.net_id])
-    return AmsDiscovery(sock, routers or [LEFT], desk or Desk(), questions, refuse)
+    return AmsDiscovery(sock, routers or [LEFT], route_admin or Admin(), questions, refuse)
 
 
 def test_every_router_of_the_address_names_itself(sock):
@@ -78,16 +78,21 @@ def test_the_number_of_the_question_comes_back(sock):
     ("sender", "is_this_host"), [("127.0.0.1", True), ("127.9.9.9", True), ("10.0.0.5", False)]
 )
 def test_a_route_is_decided_on_and_answered_once(sock, sender, is_this_host):
-    desk = Desk(AdsError.ACCESS)
-    (answer,) = asyncio.run(discovery(sock, LEFT, RIGHT, desk=desk).answers_to(ADD_ROUTE, sender))
+    admin = Admin(AdsError.ACCESS)
+    (answer,) = asyncio.run(
+        discovery(sock, LEFT, RIGHT, route_admin=admin).answers_to(ADD_ROUTE, sender)
+    )
     read = decode_discovery(answer)
     assert read.header.service == 0x8000_0006
     assert read.find(Tag.RESULT) == b"\4\7\0\0"
-    assert desk.asked == [(b"myroute\0", sender, is_this_host)]
+    assert admin.requested == [(b"myroute\0", sender, is_this_host)]
 
 
 def test_too_many_routes_are_not_answered(sock):
-    assert asyncio.run(discovery(sock, desk=Desk(None)).answers_to(ADD_ROUTE, "10.0.0.5")) == []
+    assert (
+        asyncio.run(discovery(sock, route_admin=Admin(None)).answers_to(ADD_ROUTE, "10.0.0.5"))
+        == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -157,7 +162,7 @@ def test_answers_to_own_questions_are_none_of_tools(sock):
     async def run():
         loop = asyncio.get_running_loop()
         questions = RouterRequests(sock, [LEFT.net_id])
-        AmsDiscovery(sock, [LEFT], Desk(), questions, refused.append).watch()
+        AmsDiscovery(sock, [LEFT], Admin(), questions, refused.append).watch()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             other.bind(("127.0.0.2", 0))
             other.setblocking(False)

@@ -285,7 +285,7 @@ def test_peer_that_takes_nothing_is_read_from_and_left_after_a_while():
             why = None
             while why is None:
                 why = uplink.send("", [packet(bytes(1 << 20))])
-            assert why == "the peer takes nothing"
+            assert why == "the peer does not read"
             writer.write(prefixed(packet(b"answer", 5)))
             await router.until(packet(b"answer", 5))
             await eventually(lambda: len(router.seen) == 2)
@@ -299,7 +299,7 @@ def test_peer_that_takes_nothing_is_read_from_and_left_after_a_while():
 def test_name_that_is_not_known_is_said():
     async def run():
         async with serving(1, "a..b") as (_, router, _):
-            await router.until("the address of a..b is not found: 'a..b' is not a host name")
+            await router.until("a..b: no address: 'a..b' is not a host name")
 
     asyncio.run(run())
 

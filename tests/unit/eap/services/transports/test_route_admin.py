@@ -51,7 +51,7 @@ def routes(name="left", **told) -> StationRoutes:
 
 def ask(found, question=ADD_ROUTE, sender="10.0.0.5", *, is_this_host=False):
     route_admin = RouteAdmin([found], clock=lambda: 0.0)
-    return asyncio.run(route_admin.take(question, sender, is_this_host=is_this_host))
+    return asyncio.run(route_admin.handle(question, sender, is_this_host=is_this_host))
 
 
 def asked(**tags) -> Discovery:
@@ -77,7 +77,7 @@ def test_a_program_of_this_host_adds_a_route_that_is_kept(caplog):
     assert again.added == (ADDED,)
     assert [route.origin for route in again.router.table] == [Origin.ADDED]
     assert caplog.messages == [
-        "route 'myroute' asked for by 10.0.0.5: added, to 192.168.0.10.1.1 at myhost:48898"
+        "route 'myroute' requested by 10.0.0.5: added, to 192.168.0.10.1.1 at myhost:48898"
     ]
 
 
@@ -85,7 +85,7 @@ def test_others_are_refused_as_long_as_there_are_no_users(caplog):
     found = routes()
     assert ask(found) == AdsError.ACCESS
     assert found.added == ()
-    assert "the station has no users, so only this host may" in caplog.text
+    assert "the station has no users, so only this host may add routes" in caplog.text
 
 
 @pytest.mark.parametrize("content", ["1", "1\n", "1\r\n", "1\nmore\n"])
@@ -145,9 +145,9 @@ def test_what_is_left_out_is_made_up(tags, change):
 @pytest.mark.parametrize(
     ("tags", "why"),
     [
-        ({"net_id": None}, "it names no NetID"),
-        ({"net_id": b"12345"}, "it names no NetID"),
-        ({"net_id": bytes(6)}, "it names no NetID"),
+        ({"net_id": None}, "it has no NetID"),
+        ({"net_id": b"12345"}, "it has no NetID"),
+        ({"net_id": bytes(6)}, "it has no NetID"),
         ({"host": b"a b\0"}, "'a b' is no name of a host"),
         ({"host": b"239.1.1.1\0"}, "'239.1.1.1' is not the IPv4 address of a host"),
         ({"net_id": bytes(NetId.parse(OWN))}, "NetID 10.0.0.1.2.1 is one of this station itself"),
@@ -187,7 +187,7 @@ def test_a_route_that_cannot_be_kept_is_not_added(monkeypatch, caplog):
 
 def test_all_stations_of_an_address_get_the_route():
     both = [routes(), routes("right")]
-    taking = RouteAdmin(both).take(ADD_ROUTE, "127.0.0.1", is_this_host=True)
+    taking = RouteAdmin(both).handle(ADD_ROUTE, "127.0.0.1", is_this_host=True)
     assert asyncio.run(taking) == AdsError.NONE
     assert [each.added for each in both] == [(ADDED,), (ADDED,)]
 
@@ -209,7 +209,7 @@ def test_who_asked_is_audited():
 
 
 class Desk:
-    """A desk with a clock; *ask* returns the results of some requests of one sender."""
+    """A route admin with a clock; *ask* returns the results of some requests of one sender."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -217,13 +217,13 @@ class Desk:
 
     def ask(self, sender, count=1, *, is_this_host=False):
         takings = [
-            self.route_admin.take(ADD_ROUTE, sender, is_this_host=is_this_host)
+            self.route_admin.handle(ADD_ROUTE, sender, is_this_host=is_this_host)
             for _ in range(count)
         ]
         return [asyncio.run(each) for each in takings]
 
 
-def test_route_desk_sender_guesses_passwords_is_limited():
+def test_route_admin_sender_guesses_passwords_is_limited():
     route_admin = Desk()
     burst = RATES.source.burst
     assert route_admin.ask("10.0.0.5", burst + 2) == [AdsError.ACCESS] * burst + [None] * 2
@@ -231,14 +231,14 @@ def test_route_desk_sender_guesses_passwords_is_limited():
     assert route_admin.ask("10.0.0.5", 3) == [AdsError.ACCESS] * 2 + [None]
 
 
-def test_route_desk_flood_of_one_sender_others_are_answered():
+def test_route_admin_flood_of_one_sender_others_are_answered():
     route_admin = Desk()
     route_admin.ask("10.0.0.5", 10 * RATES.source.burst)
     assert route_admin.ask("10.0.0.6") == [AdsError.ACCESS]
     assert route_admin.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
 
 
-def test_route_desk_flood_of_many_senders_known_ones_and_this_host_are_answered():
+def test_route_admin_flood_of_many_senders_known_ones_and_this_host_are_answered():
     route_admin = Desk()
     assert route_admin.ask("10.0.0.5") == [AdsError.ACCESS]
     answers = [route_admin.ask(f"10.1.{number // 250}.{number % 250}") for number in range(5000)]
@@ -247,7 +247,7 @@ def test_route_desk_flood_of_many_senders_known_ones_and_this_host_are_answered(
     assert route_admin.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
 
 
-def test_route_desk_known_senders_are_limited_together_and_new_ones_are_answered():
+def test_route_admin_known_senders_are_limited_together_and_new_ones_are_answered():
     route_admin = Desk()
     senders = [f"10.0.0.{number}" for number in range(1, 30)]
     for sender in senders:
