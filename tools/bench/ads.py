@@ -23,7 +23,7 @@ from tools.bench.network import Worker
 from tools.bench.pacing import wait
 from tools.bench.settings import Settings
 
-TITLE = "ADS by AMS/TCP: 4 octets of a dictionary, read by pyads and by plain sockets over loopback"
+TITLE = "ADS by AMS/TCP: 4 bytes of a dictionary, read by pyads and by plain sockets over loopback"
 NEAR, FAR, SERVER = "127.0.9.31", "127.0.9.32", "127.0.9.33"
 CLIENTS = 100
 SLAVES = list(range(1001, 1017))

@@ -10,7 +10,7 @@ from tools.bench.network import cable
 from tools.bench.settings import Settings
 from tools.bench.simulator import simulator
 
-TITLE = "16 slaves, 512 octets, 1 ms, while 1 MB goes through FoE and SDOs run on every slave"
+TITLE = "16 slaves, 512 bytes, 1 ms, while 1 MB goes through FoE and SDOs run on every slave"
 SLAVES = 16
 OCTETS = 512
 CYCLE_US = 1000

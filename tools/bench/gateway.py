@@ -21,7 +21,7 @@ from tools.bench.network import ROOT, Worker
 from tools.bench.pacing import wait
 from tools.bench.settings import Settings
 
-TITLE = "Mailbox gateway: 4 octets of a dictionary read by plain sockets over loopback"
+TITLE = "Mailbox gateway: 4 bytes of a dictionary read by plain sockets over loopback"
 GATEWAY, ECHO = "127.0.9.51", "127.0.9.52"
 CYCLE_US = 2000
 CLIENTS = 32

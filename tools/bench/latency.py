@@ -15,7 +15,7 @@ from tools.bench.network import Cable, Page, cable
 from tools.bench.settings import Settings
 from tools.bench.stations import Shape
 
-TITLE = "One-way latency of a 600-octet PD at 1 kHz, woken on arrival, beside a blocking raw loop"
+TITLE = "One-way latency of a 600-byte PD at 1 kHz, woken on arrival, beside a blocking raw loop"
 SHAPE = Shape(1, 1, 600)
 OURS = ("product_roles.publish_paced", "product_roles.subscribe_on_arrival")
 RAW = ("raw_roles.send_paced", "raw_roles.receive_stamps")

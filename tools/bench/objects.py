@@ -59,7 +59,7 @@ def _reads(repeats: int) -> list[Figure]:
     whole = _record()
     complete = _best(lambda: whole.upload_complete(_RECORD, 0, OdState.OP), repeats)
     return [
-        _beside("read of a live entry of 4 octets", live, lookup),
+        _beside("read of a live entry of 4 bytes", live, lookup),
         _beside("read of a stored entry", stored, lookup),
         _beside(f"complete access of a record of {_RECORD_ENTRIES} entries", complete, lookup),
     ]
@@ -87,7 +87,7 @@ def _memory() -> Figure:
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     octets = (after - before) / (count * each)
-    measured = f"{octets * _ENTRIES / 1e6:.1f} MB, {octets:.0f} octets an entry"
+    measured = f"{octets * _ENTRIES / 1e6:.1f} MB, {octets:.0f} bytes an entry"
     return report(f"memory of a dictionary of {_ENTRIES:,} entries", measured, octets)
 
 

@@ -59,7 +59,7 @@ def run(settings: Settings) -> list[Figure]:
     for record in _RECORDS:
         decode = _best(_repeat(type(record).decode, record.encode()), settings.micro_repeats)
         encode = _best(_repeat(record.encode), settings.micro_repeats)
-        name = f"{type(record).__name__}, {record.SIZE} octets"
+        name = f"{type(record).__name__}, {record.SIZE} bytes"
         figures.append(report(name, f"decode {decode:.0f} ns, encode {encode:.0f} ns"))
     return figures
 

@@ -31,7 +31,7 @@ def run(settings: Settings) -> list[Figure]:
 
 def _lookups(repeats: int) -> list[Figure]:
     figures = []
-    for name, octets in (("exact", 6), ("by four octets", 4)):
+    for name, octets in (("exact", 6), ("by four bytes", 4)):
         few, many = (
             _best(_lookup(_table(count), octets), repeats) / _TARGETS for count in (_FEW, _MANY)
         )

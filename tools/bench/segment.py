@@ -14,7 +14,7 @@ from tools.bench.buses import bus
 from tools.bench.figures import Figure, report
 from tools.bench.settings import Settings
 
-TITLE = "Simulated segment alone: frames of 512 octets of process data, all slaves in OP"
+TITLE = "Simulated segment alone: frames of 512 bytes of process data, all slaves in OP"
 SLAVES = (1, 4, 16, 32, 64)
 OCTETS = 512
 _FRAMES = 200

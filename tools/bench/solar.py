@@ -11,7 +11,7 @@ from tools.bench.figures import Figure, at_most, report
 from tools.bench.network import ROOT, cable
 from tools.bench.settings import Settings
 
-TITLE = "solar-line: 15 stations, 54 PDs of 600 and 1024 octets, every 10 ms, one engine process"
+TITLE = "solar-line: 15 stations, 54 PDs of 600 and 1024 bytes, every 10 ms, one engine process"
 PLANT = ROOT / "config" / "solar-line.yaml"
 _MEGA = 1 << 20
 

@@ -33,10 +33,10 @@ class Case(NamedTuple):
 
 
 CASES = (
-    Case("600-octet PD, 1 frame a cycle", Shape(1, 1, 600), 0.7, 1.0),
-    Case("600-octet PDs, 32 frames a cycle", Shape(32, 1, 600), 0.7, 1.0),
-    Case("10 PDs of 60 octets a frame", Shape(1, 10, 60), 0.45),
-    Case("10 PDs of 140 octets a frame", Shape(1, 10, 140), 0.45),
+    Case("600-byte PD, 1 frame a cycle", Shape(1, 1, 600), 0.7, 1.0),
+    Case("600-byte PDs, 32 frames a cycle", Shape(32, 1, 600), 0.7, 1.0),
+    Case("10 PDs of 60 bytes a frame", Shape(1, 10, 60), 0.45),
+    Case("10 PDs of 140 bytes a frame", Shape(1, 10, 140), 0.45),
 )
 
 

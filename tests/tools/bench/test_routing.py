@@ -14,7 +14,7 @@ def test_look_ups_find_and_packets_pass(monkeypatch: pytest.MonkeyPatch) -> None
     figures = routing.run(Settings(micro_repeats=1))
     assert [figure.name for figure in figures] == [
         "look-up exact: 50 routes, ratio to 10",
-        "look-up by four octets: 50 routes, ratio to 10",
+        "look-up by four bytes: 50 routes, ratio to 10",
         "a packet through a router",
         "a packet through a router with 50 routes",
     ]
