@@ -278,7 +278,7 @@ class DirectoryStation(SpecStruct, frozen=True):
     ports: tuple[DirectoryPort, ...]
 
 
-_NEW_START = "this needs a new start of the appliance"
+_NEW_START = "restart the appliance"
 
 
 def describe_routing(old: RoutingSpec, new: RoutingSpec) -> list[str]:

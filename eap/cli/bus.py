@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import CommandGroup, LazyGroup
-from eap.cli.output import Renderer
+from eap.cli.output import Renderer, times
 from eap.cli.params import (
     BusCommand,
     CommandT,
@@ -54,12 +54,12 @@ _STANDARD = Path("-")
     ),
 )
 def bus() -> None:
-    """Look at a bus of slaves and talk to them.
+    """Scan, diagnose and access the slaves of a bus.
 
-    The bus is a port of a running station (STATION/PORT), with its master, or is behind an
-    interface (--interface URI), where the command is the master.  SLAVE is a station address (1001
-    is the first slave) or the slave's name.  Slaves stay in their states, except that behind an
-    interface one in INIT is brought to PREOP when its mailbox is needed.
+    The bus is a bus port of a running station (STATION/PORT), whose master serves the command; with
+    --interface URI the command is the master itself.  SLAVE is a station address (1001 is the first
+    slave) or the slave's name.  Slaves keep their states, with one exception: with --interface, a
+    slave in INIT is brought to PREOP when its mailbox is needed.
     """
 
 
@@ -67,7 +67,7 @@ def bus() -> None:
 @bus_options
 @json_option("Print one object.")
 def scan(bus: Place, output: Renderer) -> None:
-    """Show all slaves: identity, state, alias, mailbox protocols."""
+    """Show all slaves with identity, state, alias and mailbox protocols."""
     from eap.cli.bus_view import scan_tables
     from eap.ops.bus_info import scan_slaves
 
@@ -81,10 +81,10 @@ def scan(bus: Place, output: Renderer) -> None:
 @click.argument("words", nargs=-1, metavar="[SLAVE] [INIT|PREOP|SAFEOP|OP|BOOT]")
 @json_option("Print one object.")
 def state(words: tuple[str, ...], bus: Place, output: Renderer) -> None:
-    """Show states, or bring slaves to a state.
+    """Show or request the state of one slave, or of all slaves.
 
-    One slave, or all of them.  The master of a running station keeps them there.  Behind an
-    interface no master does: a slave with outputs leaves OP when it receives no process data.
+    The master of a running station keeps slaves in the requested state.  With --interface no master
+    runs afterwards: a slave with outputs leaves OP when it receives no more process data.
     """
     from eap.cli.bus_view import state_view
     from eap.ops.bus_info import slave_states
@@ -92,7 +92,7 @@ def state(words: tuple[str, ...], bus: Place, output: Renderer) -> None:
     target = words[-1].upper() if words and words[-1].upper() in STATES else None
     rest = words[:-1] if target else words
     if len(rest) > 1:
-        raise click.UsageError(f"{rest[-1]!r} is not a state, expected one of {', '.join(STATES)}")
+        raise click.UsageError(f"{rest[-1]!r} is not a state; expected one of {', '.join(STATES)}")
     with open_session(bus) as session:
         found = slave_states(session, rest[0] if rest else None, target)
     note = ""
@@ -104,15 +104,15 @@ def state(words: tuple[str, ...], bus: Place, output: Renderer) -> None:
 @click.command(cls=BusCommand)
 @bus_options
 @click.argument("slave", required=False, metavar="[SLAVE]")
-@click.option("--full", is_flag=True, help="Show slaves without errors too, however many.")
-@click.option("--reset", is_flag=True, help="Clear error counters and findings that are over.")
+@click.option("--full", is_flag=True, help="Show slaves without errors too.")
+@click.option("--reset", is_flag=True, help="Clear the error counters and past faults.")
 @json_option("Print one object.")
 def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Renderer) -> None:
     """Show present and past faults of a bus.
 
-    One line for each cause, below a table of states and error counters of ports.  A running station
-    tells since when, or until when; behind an interface the counters are those since the slaves
-    were switched on, or the last --reset.
+    Prints a table of the states and the error counters of ports, and below it one line for each
+    cause.  The master of a running station knows when a fault began and ended.  With --interface
+    the counters are those since the slaves were powered on or since the last --reset.
     """
     from time import time
 
@@ -120,7 +120,7 @@ def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Rendere
     from eap.ops.bus_info import diagnosis, reset_diagnosis
 
     if reset and slave is not None:
-        raise click.UsageError("--reset is for the whole bus: leave SLAVE out")
+        raise click.UsageError("--reset clears the counters of the whole bus: omit SLAVE")
     with open_session(bus) as session:
         if reset:
             output.show(reset_diagnosis(session), reset_view)
@@ -138,9 +138,9 @@ def sii() -> None:
 @bus_options
 @slave_argument
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
-@json_option("Print one object, with all octets in hexadecimal digits.")
+@json_option("Print one object, with all bytes in hexadecimal digits.")
 def sii_dump(slave: str, file: Path | None, bus: Place, output: Renderer) -> None:
-    """Read the EEPROM; with FILE, store its octets there."""
+    """Read the EEPROM and print it, or store it in FILE."""
     from eap.cli.bus_view import eeprom_lines
     from eap.ops.bus_info import read_eeprom
     from eap.runtime.durable import whole_file
@@ -159,14 +159,14 @@ def sii_dump(slave: str, file: Path | None, bus: Place, output: Renderer) -> Non
 @click.argument("file", type=click.Path(exists=True, path_type=Path, dir_okay=False))
 @json_option("Print one object.")
 def sii_write(slave: str, file: Path, bus: Place, output: Renderer) -> None:
-    """Write FILE into the EEPROM, read it back and compare.
+    """Write FILE to the EEPROM, read it back and compare.
 
-    The master of a running station reads it when it brings its bus up anew.
+    The master of a running station reads it at the next start of its plant.
     """
     from eap.ops.bus_info import WrittenEeprom, write_eeprom
 
     def lines(done: WrittenEeprom) -> Iterator[str]:
-        yield f"slave {done.address}: {done.octets} octets written and compared"
+        yield f"slave {done.address}: {done.octets} bytes written and verified"
         if isinstance(bus, StationBus):
             yield f"\nThe master of {bus} uses the old content until its plant starts again."
 
@@ -191,7 +191,7 @@ def sii_write(slave: str, file: Path, bus: Place, output: Renderer) -> None:
 def voe(
     slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, output: Renderer
 ) -> None:
-    """Send a message of a vendor's own protocol (VoE) and print the answer."""
+    """Send a vendor-specific message (VoE) and print the reply."""
     from eap.ops.bus_foe import exchange
 
     with open_session(bus) as session:
@@ -201,14 +201,16 @@ def voe(
 
 def _value_options(command: CommandT) -> CommandT:
     complete = click.option(
-        "--complete", is_flag=True, help="The whole object at once, from INDEX:0 or INDEX:1 on."
+        "--complete",
+        is_flag=True,
+        help="Complete access: the whole object, from INDEX:0 or INDEX:1.",
     )
     kind = click.option(
         "--type",
         "kind",
         type=parse_type,
         metavar="TYPE",
-        help="Data type, such as UINT or STRING(16); read from the slave if left out.",
+        help="Data type, such as UINT or STRING(16) [default: as the slave describes it]",
     )
     return complete(kind(command))
 
@@ -262,8 +264,9 @@ def sdo_write(
 ) -> None:
     """Write an entry.
 
-    INDEX and SUB are hexadecimal, with or without 0x: 0x8000:01, 8000:1.  VALUE is as the type has
-    it: 12, 0xC, -1.5e3, true, text; hexadecimal digits for a block and with --complete.
+    INDEX and SUB are hexadecimal, with or without 0x: 0x8000:01, 8000:1.  VALUE is a
+    literal of the entry's type: 12, 0xC, -1.5e3, true, text; hexadecimal digits for a block and
+    with --complete.
     """
     from eap.ops.bus_objects import write_entry
 
@@ -333,7 +336,7 @@ def idn() -> None:
 @_drive_option
 @json_option("Print one object.")
 def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Renderer) -> None:
-    """Read an IDN with all elements that it has."""
+    """Read all elements of an IDN."""
     from eap.cli.bus_view import idn_lines
     from eap.ops.bus_objects import read_idn
 
@@ -354,7 +357,7 @@ def idn_write(
 ) -> None:
     """Write the value of an IDN.
 
-    The numbers of a list have commas between them.
+    Separate the numbers of a list by commas.
     """
     from eap.ops.bus_objects import write_idn
 
@@ -383,7 +386,7 @@ def _password_option(command: CommandT) -> CommandT:
         type=number_up_to(0xFFFFFFFF),
         default=0,
         metavar="N",
-        help="If the slave requires one.",
+        help="Password, if the slave requires one.",
     )(command)
 
 
@@ -409,14 +412,14 @@ def foe_get(
 ) -> None:
     """Read the file NAME of a slave into FILE.
 
-    FILE is NAME in this folder if left out, and - for stdout.
+    FILE defaults to NAME in this folder; - is stdout.
     """
     from eap.ops.bus_foe import get_file
 
     target = file or Path(Path(name).name)
     is_stdout = target == _STANDARD
     if is_stdout and output.is_json:
-        raise click.UsageError("the file and --json cannot both go to stdout")
+        raise click.UsageError("both the file and --json go to stdout: name a FILE, or omit --json")
     with open_session(bus) as session, _progress(name, hidden=output.is_json) as report:
         whole = None if is_stdout else target
         done = get_file(session, slave, name, whole, password=password, report=report)
@@ -442,15 +445,15 @@ def foe_put(
     bus: Place,
     output: Renderer,
 ) -> None:
-    """Write FILE to a slave, as NAME if that is given.
+    """Write FILE to a slave as NAME; NAME defaults to the file's name.
 
-    FILE is - for stdin, which needs a NAME.
+    FILE - is stdin and needs NAME.
     """
     from eap.ops.bus_foe import put_file
 
     is_stdin = file == _STANDARD
     if is_stdin and not name:
-        raise click.UsageError("a file from stdin needs a NAME at the slave")
+        raise click.UsageError("a file from stdin has no name: give NAME")
     target = name or file.name
     with open_session(bus) as session, _progress(target, hidden=output.is_json) as report:
         source = None if is_stdin else file
@@ -460,17 +463,17 @@ def foe_put(
 
 def _transfer_text(done: FileTransfer, what: str) -> str:
     text = (
-        f"{what}: {done.octets} octets in {done.seconds:.1f} s, {done.rate / 1000:.0f} kB/s\n"
+        f"{what}: {done.octets} bytes in {done.seconds:.1f} s, {done.rate / 1000:.0f} kB/s\n"
         f"sha256 {done.sha256}"
     )
     if done.restarts:
-        text += f"\nbegan anew {done.restarts} times: the bus had interrupted it"
+        text += f"\nrestarted {times(done.restarts)}: the bus interrupted the transfer"
     return text
 
 
 @contextmanager
 def _progress(name: str, *, hidden: bool) -> Iterator[Callable[[int, int | None, int], None]]:
-    """Show a bar on stderr while a file is on its way; only a terminal gets one."""
+    """Show a progress bar on stderr, if that is a terminal."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

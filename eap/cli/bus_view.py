@@ -99,13 +99,13 @@ def diagnosis_view(
         yield _port_table(shown)
     if rest := len(found.slaves) - len(shown):
         slaves = count(rest, "slave")
-        yield Styled(f"not shown: {slaves} without errors of their own (--full)", style="dim")
+        yield Styled(f"not shown: {slaves} without errors (--full shows them)", style="dim")
     yield ""
     frames = found.frames
     yield (
         f"{count(frames.sent, 'frame')} sent, {frames.late} late, {frames.lost} lost,"
-        f" {frames.retried} sent again\nround trip {duration(frames.round_trip_us)},"
-        f" time-out {duration(frames.timeout_us)}"
+        f" {frames.retried} repeated\nround trip {duration(frames.round_trip_us)},"
+        f" timeout {duration(frames.timeout_us)}"
     )
     for row in found.findings:
         yield Styled(finding_line(row, now_s), style="dim" if row.is_over else "red")
@@ -116,7 +116,7 @@ def finding_line(row: FindingRow, now_s: float) -> str:
     if not row.is_over:
         since = "" if row.since is None else f"since {_ago(row.since, now_s)} ago: "
         return f"{since}{row.what}" + (f"; {row.advice}" if row.advice else "")
-    until = "before the master looked"
+    until = "before the master started"
     if row.until is not None:
         until = f"until {_ago(row.until, now_s)} ago"
     return f"was, {until}: {row.what}; --reset clears this"
@@ -161,7 +161,7 @@ def _port_table(slaves: Iterable[DiagnosedSlave]) -> TextTable:
 
 def eeprom_lines(content: EepromContent, *, has_octets: bool) -> Iterator[str]:
     """Yield the identity in an EEPROM and its categories, then its octets if wanted."""
-    yield f"slave {content.address}: {content.name or 'without a name'}"
+    yield f"slave {content.address}: {content.name or 'no name'}"
     identity = {
         "vendor": content.vendor,
         "product": content.product,
@@ -170,9 +170,9 @@ def eeprom_lines(content: EepromContent, *, has_octets: bool) -> Iterator[str]:
     }
     for key, number in identity.items():
         yield f"  {key:9} 0x{number:08X}"
-    intact = "right" if content.intact else "WRONG"
+    intact = "correct" if content.intact else "WRONG"
     kinds = ", ".join(f"{each.type} ({each.octets})" for each in content.categories)
-    yield f"  check sum {intact}; {content.octets} bytes"
+    yield f"  checksum {intact}; {content.octets} bytes"
     yield f"  categories (bytes) {kinds or 'none'}"
     image = bytes.fromhex(content.data) if has_octets else b""
     for offset in range(0, len(image), 16):
@@ -184,7 +184,7 @@ def value_line(found: SdoValue) -> str:
     octets = bytes.fromhex(found.data)
     name = ObjectId(found.index, found.subindex)
     if found.value is None:
-        return f"{name} = [{octets.hex(' ')}] ({count(len(octets), 'octet')})"
+        return f"{name} = [{octets.hex(' ')}] ({count(len(octets), 'byte')})"
     kind = f" {found.type}" if found.type else ""
     return f"{name} ={kind} {_value(found.value, found.data)}"
 
@@ -274,7 +274,7 @@ def _reason(row: SlaveStateRow) -> str:
 
 def _attribute(found: IdnElements) -> str:
     """Return the form of an IDN's value, and the states in which it cannot be written."""
-    parts = [found.display.lower(), count(found.octets, "octet")]
+    parts = [found.display.lower(), count(found.octets, "byte")]
     if found.is_list:
         parts[1] += " each, a list"
     if found.decimals:
@@ -297,7 +297,7 @@ def _plain(value: Any) -> str:
 def _value(value: Any, data: str) -> str:
     octets = bytes.fromhex(data)
     if value is None or value == data:
-        more = f" … ({len(octets)} octets)" if len(octets) > _SHOWN_OCTETS else ""
+        more = f" … ({len(octets)} bytes)" if len(octets) > _SHOWN_OCTETS else ""
         return f"[{octets[:_SHOWN_OCTETS].hex(' ')}{more}]"
     if isinstance(value, bool):
         return "true" if value else "false"

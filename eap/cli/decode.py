@@ -32,16 +32,16 @@ _SEPARATORS = str.maketrans("", "", ":-, \t\r\n")
 
 @click.command()
 @click.argument("source", metavar="HEX|FILE", nargs=-1, required=True)
-@json_option("Print one object a frame, on one line.")
+@json_option("Print one object per frame and line.")
 @click.pass_context
 def decode(ctx: click.Context, source: tuple[str, ...], output: Renderer) -> None:
     """Decode one frame given as HEX, or all frames of a pcap or pcapng FILE.
 
-    HEX starts at the EtherCAT header or at the Ethernet header; spaces are allowed.  A file whose
-    name is hexadecimal digits is written ./NAME.  In a file, frames are found under EtherType
-    0x88A4 and on UDP and TCP port 34980.
+    HEX starts at the EtherCAT header or at the Ethernet header; spaces are allowed.  Write ./NAME
+    for a file whose name consists of hexadecimal digits.  In a file, frames are decoded under
+    EtherType 0x88A4 and on UDP and TCP port 34980.
 
-    Exit code 1 means that a frame had an error, 2 that the input cannot be read.
+    Exits with 1 when a frame has an error, with 2 when the input cannot be read.
     """
     failed, shown = False, 0
     for frame in _frames(" ".join(source)):
@@ -49,7 +49,7 @@ def decode(ctx: click.Context, source: tuple[str, ...], output: Renderer) -> Non
         shown += 1
         output.show(frame, frame_view)
     if not shown:
-        click.echo("no EtherCAT frame in this capture", err=True)
+        click.echo("the capture has no EtherCAT frame", err=True)
     if failed:
         ctx.exit(ExitCode.FAILED)
 
@@ -61,7 +61,7 @@ def _frames(source: str) -> Iterator[DecodedFrame]:
         yield from _frames_of_file(source)
         return
     if not octets:
-        raise click.UsageError("there are no octets to decode")
+        raise click.UsageError("no bytes to decode: give HEX or FILE")
     yield from _frames_of_octets(octets)
 
 
@@ -125,9 +125,9 @@ def _headline(frame: DecodedFrame) -> str:
         vlan = f" VLAN {frame.vlan_id}" if isinstance(frame.vlan_id, int) else ""
         parts.append(f"{frame.transport}{vlan} {frame.source} → {frame.destination}")
     if frame.type is None:
-        return "  ".join([*parts, "no frame"])
+        return "  ".join([*parts, "not an EtherCAT frame"])
     name = _NAMES.get(frame.type, "undocumented")
-    parts.append(f"type {frame.type} ({name}), {frame.length} octets")
+    parts.append(f"type {frame.type} ({name}), {frame.length} bytes")
     if frame.publisher:
         parts.append(f"publisher {frame.publisher}, cycle {frame.cycle}")
     return "  ".join(parts)
@@ -180,5 +180,5 @@ def _ams_line(packet: DecodedAms) -> str:
 def _octets(digits: str) -> str:
     size = len(digits) // 2
     pairs = " ".join(digits[at : at + 2] for at in range(0, min(size, _SHOWN_OCTETS) * 2, 2))
-    more = f" … ({size} octets)" if size > _SHOWN_OCTETS else ""
+    more = f" … ({size} bytes)" if size > _SHOWN_OCTETS else ""
     return f"[{pairs}{more}]"

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from eap.ops.bus_objects import SdoDumpEntry
 
 
-_JSON = json_option("Print one object for each gateway; docs/control.md explains its fields.")
+_JSON = json_option("Print one object per gateway; docs/control.md explains its fields.")
 _TARGET = click.argument("target", metavar="STATION[/PORT]")
 _SHOWN_CLIENTS = 10
 """Each command is a client of its own, so there are soon hundreds."""
@@ -49,8 +49,9 @@ _SHOWN_CLIENTS = 10
 def gateway() -> None:
     """Start, stop and show the mailbox gateways of a station (ETG.8200).
 
-    Each bus port has one: other programs reach its slaves by UDP and TCP 34980, those of further
-    bus ports by the numbers behind it.  STATION stands for all bus ports of a station.
+    Each bus port has a gateway: other programs reach the slaves of the first bus at UDP and TCP
+    port 34980, those of further buses at the following port numbers.  STATION means all bus ports
+    of a station.
     """
 
 
@@ -79,7 +80,7 @@ def stop(target: str, plant: str | None, output: Renderer) -> None:
 def status(target: str, plant: str | None, output: Renderer) -> None:
     """Show sockets, clients and requests of a gateway.
 
-    Without STATION, of all gateways that run.
+    Without STATION, of all running stations.
     """
     rows = _call("status", target, plant) if target else _all_rows(plant)
     output.show_rows(rows, _status_view)
@@ -93,7 +94,7 @@ def _call(
 
     station, slash, port = target.partition("/")
     if not station or (slash and not port) or "/" in port:
-        raise click.UsageError(f"{target!r} is no STATION and no STATION/PORT")
+        raise click.UsageError(f"{target!r} is neither STATION nor STATION/PORT")
     method = {
         "start": control_gateway.GATEWAY_START,
         "stop": control_gateway.GATEWAY_STOP,
@@ -124,7 +125,7 @@ def _all_rows(plant: str | None) -> list[GatewayRow]:
                 else:
                     rows += found
     if not rows:
-        raise ControlError("no running station has a mailbox gateway")
+        raise ControlError("no running station has a mailbox gateway: none has a bus port")
     return rows
 
 
@@ -141,7 +142,7 @@ def _status_view(rows: Iterable[GatewayRow]) -> Iterator[TextTable | str]:
 def gateway_view(row: GatewayRow) -> Iterator[TextTable | str]:
     """Yield the state of one gateway, its clients, and the requests to master and slaves."""
     settings = row.settings
-    served = ", ".join(row.served) or "nowhere"
+    served = ", ".join(row.served) or "no socket"
     silent = ", silent" if settings.silent else ""
     dropped = f", {count(row.turned_away, 'frame')} dropped" if row.turned_away else ""
     yield (
@@ -174,7 +175,7 @@ def gateway_view(row: GatewayRow) -> Iterator[TextTable | str]:
             ),
         )
         if left := len(latest) - len(shown):
-            yield f"  {count(left, 'earlier client')} not shown; --json shows all"
+            yield f"  {count(left, 'earlier client')} not shown (--json shows them)"
     if row.slaves:
         yield ""
         yield _table(
@@ -298,23 +299,21 @@ def _invoke(command: click.Command, **values: Any) -> Any:
         "eapctl gw 127.0.1.1 foe put 1001 new.bin firmware.bin --tcp",
     ),
 )
-@click.option(
-    _TCP, is_flag=True, help="Connect by TCP, else datagrams are sent (UDP); anywhere on the line."
-)
+@click.option(_TCP, is_flag=True, help="Use TCP instead of UDP; anywhere on the command line.")
 @click.option(
     _MAILBOX,
     type=click.IntRange(16, 1492),
-    metavar="OCTETS",
-    help="How large the slave's mailbox is where the master does not tell, as of virtual addresses;"
-    " files need it. Anywhere on the line.",
+    metavar="BYTES",
+    help="Mailbox size of the slave where the master does not describe it (virtual addresses);"
+    " files need it. Anywhere on the command line.",
 )
 @click.argument("place", metavar="HOST[:PORT]", callback=_parse_place)
 @click.pass_context
 def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) -> None:
-    """Talk to a master and its slaves through a mailbox gateway, any vendor's.
+    """Access a master and its slaves through a mailbox gateway of any vendor (ETG.8200).
 
     SLAVE is a station address (1001 is the first slave) or the slave's name as the master knows it;
-    0 is the master itself.  The port is 34980 if it is left out.
+    0 is the master itself.  PORT defaults to 34980.
     """
     ctx.obj = place._replace(tcp=tcp, mailbox=mailbox)
 
@@ -322,9 +321,9 @@ def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) 
 @click.command(cls=BusCommand, short_help="Show all objects of the master or a slave as a tree.")
 @bus_options
 @click.argument("slave", default="0", metavar="[SLAVE]")
-@json_option("Print one object a line.")
+@json_option("Print one object per line.")
 def od(slave: str, bus: Place, output: Renderer) -> None:
-    """Show every object with its entries and values; of the master if SLAVE is left out."""
+    """Show every object with its entries and values; SLAVE defaults to the master."""
     from eap.ops.bus_objects import dump_entries
 
     with open_session(bus) as session:

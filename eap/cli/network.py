@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     )
 
 _VIA = click.option(
-    "--via", metavar="STATION", help="Station whose router sends the requests; the first without."
+    "--via", metavar="STATION", help="Station whose router sends the requests [default: the first]"
 )
 
 
@@ -35,9 +35,9 @@ _VIA = click.option(
 def scan(via: str | None, plant: str | None, output: Renderer) -> None:
     """List the stations of the plant, local and remote, with their ports and slaves.
 
-    Each line ends with the Python line that connects pyads to it; 'eapctl od', 'state' and 'trace'
-    take its name.  A station or bus that does not answer is shown as the plant file has it, with
-    the reason on stderr.
+    The names are those that 'eapctl od', 'state' and 'trace' accept; each line ends with the Python
+    code that connects pyads to the device.  A station or bus that does not answer is shown as in
+    the plant file, with the reason on stderr.
     """
     from eap.control.routes import MergedScan
     from eap.ops import routing
@@ -59,7 +59,7 @@ def scan(via: str | None, plant: str | None, output: Renderer) -> None:
 @click.argument("targets", nargs=-1, required=True, metavar="TARGET…")
 @_VIA
 @plant_option
-@json_option("Print one object for each target; docs/trace.md explains its fields.")
+@json_option("Print one object per target; docs/trace.md explains its fields.")
 @click.pass_context
 def trace(
     ctx: click.Context,
@@ -72,7 +72,7 @@ def trace(
 
     TARGET is STATION, STATION/PORT or STATION/PORT/SLAVE of the plant, or NETID:PORT.
 
-    Exits with 1 when a target is not reached; the last line says at which hop, and why.
+    Exits with 1 when TARGET is not reached; the last line names the hop that failed and the cause.
     """
     from eap.ops import routing
 
@@ -100,7 +100,7 @@ def scan_table(answer: PlantScan) -> TextTable:
     not be pasted.
     """
     table = TextTable(
-        "Name", Column("What", rank=1), "State", "AMS address", Column("To paste", rank=2)
+        "Name", Column("Kind", rank=1), "State", "AMS address", Column("pyads", rank=2)
     )
     for station in answer.stations:
         for line in _lines(station, answer.via):
@@ -156,8 +156,8 @@ def trace_view(found: TracedPath) -> Iterator[TextTable | Styled | str]:
         Column("Hop", is_number=True),
         "Router",
         Column("NetID", rank=2),
-        Column("There", is_number=True),
-        Column("Part", rank=1, is_number=True),
+        Column("Total", is_number=True),
+        Column("Hop time", rank=1, is_number=True),
         Column("Next hop", wraps=True),
     )
     for number, hop in enumerate(found.hops, 1):

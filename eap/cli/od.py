@@ -1,4 +1,4 @@
-"""``eapctl od`` and ``state``: dictionary and state of a device, near or reached through routes."""
+"""``eapctl od`` and ``state``: dictionary and state of a device, local or remote."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TYPE = click.option(
     "kind",
     type=parse_type,
     metavar="TYPE",
-    help="Data type, such as UINT or STRING(16), in place of the one that the device describes.",
+    help="Data type, such as UINT or STRING(16) [default: as the device describes it]",
 )
 
 
@@ -54,18 +54,18 @@ def _target(text: str, plant: str | None) -> Target:
 
 @click.group(cls=CommandGroup)
 def od() -> None:
-    """Read and write the object dictionary of a station.
+    """Read and write the object dictionary of a device.
 
     TARGET is STATION or STATION/PORT for an EAP port of a station, STATION/router for its router,
-    STATION/PORT for the master of a bus port, and STATION/PORT/SLAVE for a slave behind it.  What
-    does not run here, by name or as NETID:PORT, is reached through routes.  INDEX and SUB are
+    STATION/PORT for the master of a bus port, and STATION/PORT/SLAVE for a slave of that bus.  A
+    remote device, given by name or as NETID:PORT, is reached through routes.  INDEX and SUB are
     hexadecimal, with or without 0x (0xD000:07, D000:7).
     """
 
 
 @od.command("list")
 @target_argument
-@json_option("Print one object a line.")
+@json_option("Print one object per line.")
 def list_objects(target: Target, output: Renderer) -> None:
     """List all objects with their names."""
     from eap.ops.od import object_rows
@@ -90,7 +90,7 @@ def _object_table(rows: Iterable[OdObjectRow]) -> Iterator[TextTable]:
 @click.argument("entry", type=parse_entry, metavar="INDEX[:SUB]")
 @_TYPE
 @click.option(
-    "--complete", is_flag=True, help="The whole object at once, from INDEX:0 or INDEX:1 on."
+    "--complete", is_flag=True, help="Complete access: the whole object, from INDEX:0 or INDEX:1."
 )
 @json_option("Print one object.")
 def read(
@@ -114,19 +114,19 @@ def read(
 @click.argument("value", required=False, metavar="[VALUE]")
 @_TYPE
 @click.option(
-    "--hex", "octets", type=parse_octets, metavar="DIGITS", help="Octets as they are, for VALUE."
+    "--hex", "octets", type=parse_octets, metavar="DIGITS", help="Raw bytes, instead of VALUE."
 )
 @click.option(
     "--complete",
     is_flag=True,
-    help="The whole object at once, from INDEX:0 or INDEX:1 on; needs --hex.",
+    help="Complete access: the whole object, from INDEX:0 or INDEX:1; needs --hex.",
 )
 @click.option(
     "--from",
     "file",
     type=click.Path(path_type=Path, dir_okay=False, allow_dash=True),
     metavar="FILE",
-    help="Everything that 'od dump' wrote to FILE, in the order that a device needs.",
+    help="All entries of FILE, the output of 'od dump', in the order that the device needs.",
 )
 @json_option("Print one object: what was written.")
 def write(
@@ -139,16 +139,16 @@ def write(
     target: Target,
     output: Renderer,
 ) -> None:
-    """Write an entry, a whole object, or all that a file holds.
+    """Write an entry, a whole object, or all entries of a file.
 
-    VALUE is as the entry's type has it: 12, 0xC, -1.5e3, true, text, hexadecimal digits for octets,
-    and 127.0.1.1.2.1, 01:01:05:04:00:00 or 10.0.0.1 where these are an address.
+    VALUE is a literal of the entry's type: 12, 0xC, -1.5e3, true, text, hexadecimal digits for raw
+    bytes, and 127.0.1.1.2.1, 01:01:05:04:00:00 or 10.0.0.1 for an address.
 
-    A station takes configuration in PREOP only ('eapctl state TARGET PREOP').
+    A station accepts configuration in PREOP only ('eapctl state TARGET PREOP').
     """
     if file is not None:
         if entry or value or octets is not None or kind is not None or complete:
-            raise click.UsageError("--from FILE says what to write: leave the rest out")
+            raise click.UsageError("--from FILE has entries and values: omit all other arguments")
         _load(target, file, output)
         return
     place = _entry_to_write(entry, value, octets, complete=complete)
@@ -177,9 +177,9 @@ def _load(target: Target, file: Path, output: Renderer) -> None:
 
 @od.command()
 @target_argument
-@json_option("Print one entry a line, as an object.")
+@json_option("Print one object per entry and line.")
 def dump(target: Target, output: Renderer) -> None:
-    """Write all entries of all objects to stdout, for people and for 'od write --from'."""
+    """Print all entries of all objects, in the form that 'od write --from' reads."""
     from eap.cli.od_text import dump_lines
     from eap.ops.od import dump_rows
     from eap.ops.od_devices import open_device
@@ -196,11 +196,11 @@ def _entry_to_write(
 ) -> ObjectId:
     """Return index and subindex; raise UsageError unless exactly one value is given."""
     if entry is None:
-        raise click.UsageError("say what to write: INDEX[:SUB] VALUE, or --from FILE")
+        raise click.UsageError("nothing to write: give INDEX[:SUB] VALUE, or --from FILE")
     if (value is None) == (octets is None):
-        raise click.UsageError("say the value once: VALUE, or --hex DIGITS")
+        raise click.UsageError("expected one value: VALUE or --hex DIGITS")
     if complete and octets is None:
-        raise click.UsageError("--complete writes octets: give them with --hex DIGITS")
+        raise click.UsageError("--complete writes raw bytes: give them with --hex DIGITS")
     return parse_entry(entry)
 
 
@@ -215,14 +215,14 @@ def _entry_to_write(
 @json_option("Print one object: state, and error or null.")
 @click.pass_context
 def state(ctx: click.Context, wanted: str | None, target: Target, output: Renderer) -> None:
-    """Show the state of TARGET, or bring it to another one.
+    """Show the state of TARGET, or request another one.
 
-    TARGET is STATION or STATION/PORT: PREOP takes configuration, SAFEOP sends, OP sends and
-    receives.  A slave is STATION/PORT/SLAVE, and has INIT and BOOT too; so has a bus port, which
-    stands for all its slaves.  What does not run here, by name or NETID:PORT, is reached through
-    routes.
+    TARGET is STATION or STATION/PORT.  In PREOP a station accepts configuration, in SAFEOP it
+    sends, in OP it sends and receives.  STATION/PORT/SLAVE is a slave, which has INIT and BOOT too;
+    a bus port means all its slaves.  A remote device, given by name or as NETID:PORT, is reached
+    through routes.
 
-    Exits with 1 when the state was refused, which leaves the station where it was.
+    Exits with 1 when the request is refused; the station then keeps its state.
     """
     from eap.control.device import TargetState
 

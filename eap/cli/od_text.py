@@ -58,7 +58,7 @@ def object_lines(found: OdWholeObject) -> Iterator[str]:
     yield _object_line(found.index, found.name, found.label)
     if not found.entries:
         octets = bytes.fromhex(found.data)
-        yield f"{RAW} {octets.hex(' ')}  # {len(octets)} octets"
+        yield f"{RAW} {octets.hex(' ')}  # {len(octets)} bytes"
     yield from map(value_line, found.entries)
 
 

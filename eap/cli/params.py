@@ -84,9 +84,7 @@ def parse_names(words: tuple[str, ...]) -> dict[str, list[str]]:
         elif current:
             names[current].append(word)
         elif names:
-            raise click.UsageError(
-                f"{word!r} follows {words[0]!r} without its station: write STATION/{word}"
-            )
+            raise click.UsageError(f"{word!r} has no station: write STATION/{word}")
         else:
             current = word
             names[current] = []
@@ -118,7 +116,9 @@ def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) ->
     except ValueError:
         cycle_us = 0.0
     if not MIN_CYCLE_US <= cycle_us <= MAX_CYCLE_US or cycle_us % 1:
-        raise click.BadParameter(f"{text!r} is no device cycle: expected 0.1 to 60000 milliseconds")
+        raise click.BadParameter(
+            f"{text!r} is not a device cycle: expected 0.1 to 60000 milliseconds"
+        )
     return int(cycle_us)
 
 
@@ -165,7 +165,9 @@ def parse_octets(text: str) -> bytes:
     try:
         return bytes.fromhex(text.removeprefix("0x"))
     except ValueError:
-        raise click.BadParameter(f"{text!r} is not pairs of hexadecimal digits") from None
+        raise click.BadParameter(
+            f"{text!r} is not hexadecimal: expected pairs of digits, such as 0aff"
+        ) from None
 
 
 def slave_argument(command: CommandT) -> CommandT:
@@ -257,7 +259,7 @@ class BusCommand(click.Command):
                 next(rest, None)
             elif not word.startswith("-"):
                 if parse_port(word) is not None:
-                    text = f"{word!r} and --interface are two buses: leave one out"
+                    text = f"{word!r} and --interface are two buses: omit one"
                     raise click.UsageError(text, ctx)
                 return
 
@@ -268,8 +270,8 @@ def bus_options(command: CommandT) -> CommandT:
         "--interface",
         type=parse_uri,
         metavar="URI",
-        help="Where the bus is, in place of STATION/PORT: ethernet://IFACE (needs CAP_NET_RAW) or"
-        " udp://ADDRESS[:PORT].",
+        help="Interface of the bus, instead of STATION/PORT: ethernet://IFACE (needs CAP_NET_RAW)"
+        " or udp://ADDRESS[:PORT].",
     )
     plant = click.option("--plant", metavar="NAME", help="Only the appliance that runs this plant.")
     place = click.argument(_PLACE, required=False, callback=_to_port, metavar="STATION/PORT")
@@ -319,12 +321,12 @@ def _to_port(ctx: click.Context, param: click.Parameter, text: str | None) -> St
     del param
     port = parse_port(text or "")
     if port is None and not ctx.resilient_parsing:
-        problem = f"{text!r} is no STATION/PORT: " if text else ""
+        problem = f"{text!r} is not STATION/PORT" if text else "no bus given"
         command = ctx.command
         forms = " or ".join(
             f"{ctx.command_path} {command.usage_of(ctx, form)}"
             for form in _FORMS
             if isinstance(command, BusCommand)
         )
-        raise click.UsageError(f"{problem}say which bus: {forms}", ctx)
+        raise click.UsageError(f"{problem}: expected {forms}", ctx)
     return port

@@ -34,9 +34,9 @@ def pd() -> None:
 @pd.command("list", short_help="List every PD and every variable.")
 @plant_option
 @station_option
-@json_option("One object a line: a PD, or the variables of a station that no PD carries.")
+@json_option("Print one object per line: a PD, or the variables of a station in no PD.")
 def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
-    """List every PD with what identifies it, and every variable with its type and writer."""
+    """List every PD with ID, version, port and address, and every variable with type and writer."""
     from eap.cli.pd_view import listed_pds, pd_table
     from eap.control.protocol import PD_LIST, VARIABLES
     from eap.ops.client import connect
@@ -53,7 +53,7 @@ def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
 
 @pd.command()
 @click.argument("names", nargs=-1, required=True, metavar="STATION [VAR]...")
-@click.option("--count", type=click.IntRange(1), metavar="N", help="End after so many lines.")
+@click.option("--count", type=click.IntRange(1), metavar="N", help="End after N lines.")
 @click.option(
     "--period",
     "period_ms",
@@ -61,17 +61,18 @@ def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
     default=100,
     show_default=True,
     metavar="MS",
-    help="How often to look for changes.",
+    help="Polling period for changes.",
 )
 @plant_option
-@json_option("One object a line.")
+@json_option("Print one object per line.")
 def watch(
     names: tuple[str, ...], count: int | None, period_ms: int, plant: str | None, output: Renderer
 ) -> None:
     """Print a line for each change of a variable, until Ctrl-C.
 
-    All variables of STATION, or those named.  STATION/VAR names one of another station.  The first
-    lines have the present values, later ones the number of cycles that were skipped before them.
+    Watches all variables of STATION, or only the named ones; STATION/VAR names one of a further
+    station.  The first lines show the present values; later lines also show the number of cycles
+    skipped before them.
     """
     from eap.cli.pd_view import SkippedCycles, change_lines, changes
 
@@ -95,9 +96,9 @@ def watch(
 @plant_option
 @json_option("Print one object: what was written.")
 def set_value(words: tuple[str, ...], plant: str | None, output: Renderer) -> None:
-    """Set a variable that the plant file gives to the application.
+    """Set a variable whose writer is the application.
 
-    VALUE as the variable's type has it: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
+    VALUE is a literal of the variable's type: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
     hexadecimal digits for a raw block.
     """
     from eap.cli.pd_view import WrittenVariable, value_text
@@ -125,5 +126,5 @@ def _to_json(kind: DataType, text: str) -> Any:
     value = kind.parse_text(text)
     numbers = value if isinstance(value, tuple) else (value,)
     if any(isinstance(number, float) and not isfinite(number) for number in numbers):
-        raise ValueError(f"{text!r} cannot be set from here: expected a finite number")
+        raise ValueError(f"{text!r} cannot be sent to the appliance: expected a finite number")
     return kind.to_plain(value)

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from eap.cli.output import Column, TextTable, quality
+from eap.cli.output import Column, Styled, TextTable, quality
 from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
 from eap.ops.client import connect_station
@@ -84,24 +84,24 @@ def listed_pds(
 
 
 def pd_table(rows: Iterable[ListedPd]) -> Iterator[TextTable]:
-    """Yield the table of PDs, with a line for each of their variables."""
+    """Yield the table of PDs: a heading for each station, a line for each variable of a PD."""
     table = TextTable(
-        "Station",
         "",
         "PD",
-        Column("ID", rank=2, is_number=True),
-        Column("Version", rank=5, is_number=True),
-        Column("Port", rank=4),
-        Column("To or from", rank=3, wraps=True),
+        Column("ID", is_number=True),
+        Column("Version", rank=4, is_number=True),
+        Column("Port", rank=3),
+        Column("To or from", rank=1, wraps=True),
         "Variable",
-        Column("Type", rank=1),
-        "Writer",
+        Column("Type", rank=2),
+        Column("Writer", rank=5),
     )
     station = ""
     for row in rows:
-        name = row.station if row.station != station else ""
-        station = row.station
-        own = (name, *_identification(row))
+        if row.station != station:
+            station = row.station
+            table.add_row("", Styled(station, style="bold"))
+        own = _identification(row)
         for variable in row.variables:
             kind = f"{variable.type} {variable.unit}".rstrip()
             table.add_row(*own, variable.name, kind, variable.writer)
@@ -112,13 +112,15 @@ def pd_table(rows: Iterable[ListedPd]) -> Iterator[TextTable]:
 
 
 def _identification(row: ListedPd) -> tuple[str, ...]:
-    """Return direction, name, ID, version, port, and the other end of a PD."""
+    """Return direction, name, ID, version, port, and the destination or publisher of a PD."""
     if isinstance(row, UncarriedVariables):
         return "", "in no PD", "", "", "", ""
-    arrow = "→" if row.direction == "tx" else "←"
-    far = row.destination or "" if row.direction == "tx" else row.publisher or "any publisher"
+    if row.direction == "tx":
+        arrow, remote = "→", row.destination or ""
+    else:
+        arrow, remote = "←", row.publisher or "any publisher"
     polled = f", polled by {row.poll}" if row.poll else ""
-    return arrow, row.name, str(row.id), str(row.version), row.port, f"{far}{polled}"
+    return arrow, row.name, str(row.id), str(row.version), row.port, f"{remote}{polled}"
 
 
 def changes(
@@ -172,7 +174,7 @@ class SkippedCycles:
             if station not in self._totals:
                 self._write(
                     f"{station}: {skipped} cycles before cycle {cycle} skipped: values are"
-                    f" looked at every {self._period_ms} ms; choose a shorter --period"
+                    f" polled every {self._period_ms} ms; choose a shorter --period"
                 )
             self._totals[station] = self._totals.get(station, 0) + skipped
             self._last[station] = cycle

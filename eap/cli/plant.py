@@ -30,9 +30,10 @@ SHAPES = ("ring", "star")
 @json_option("Print one object: ok, all findings, and warnings.")
 @click.pass_context
 def check(ctx: click.Context, plant: Path, output: Renderer) -> None:
-    """Check the plant file PLANT, and report all errors at once.
+    """Check the plant file PLANT and report all errors.
 
-    Exits with 2 when there is an error.  What works, but not with all commands, is a warning.
+    Exits with 2 when there is an error.  A warning names a part that runs but that some commands do
+    not support.
     """
     from eap.ops.plant import check_plant  # yaml; --help must not wait
 
@@ -42,7 +43,9 @@ def check(ctx: click.Context, plant: Path, output: Renderer) -> None:
     for finding in found.findings:
         output.remark(str(finding))
     if len(found.findings) > 1:
-        output.remark(f"{plant}: {len(found.findings)} findings, not a plant yet")
+        output.remark(
+            f"{plant}: {len(found.findings)} errors: the plant cannot run; correct the file"
+        )
     output.show(found, lambda _: _summary(plant, checked))
     if found.findings:
         ctx.exit(ExitCode.UNUSABLE)
@@ -69,20 +72,25 @@ def _summary(file: Path, plant: Plant | None) -> Iterator[str]:
     default=3,
     show_default=True,
     metavar="N",
-    help="How many stations.",
+    help="Number of stations.",
 )
-@click.option("--ring", "shape", flag_value="ring", default="ring", help="Each sends to the next.")
 @click.option(
-    "--star", "shape", flag_value="star", help="The first sends to the others, they send to it."
+    "--ring", "shape", flag_value="ring", default="ring", help="Each station sends to the next."
 )
-@click.option("--name", metavar="NAME", help="Name of the plant; the file's unless given.")
+@click.option(
+    "--star",
+    "shape",
+    flag_value="star",
+    help="The first station exchanges PDs with each other one.",
+)
+@click.option("--name", metavar="NAME", help="Name of the plant [default: the file's name]")
 @click.option(
     "--address",
     default="127.0.1.{n}",
     show_default=True,
     metavar="PATTERN",
-    help="Addresses of the stations: {n} is a station's number; 10.0.0.11 is that of the first, the"
-    " others follow; ethernet://eth0 is the interface of each on its host.",
+    help="Addresses of the stations: {n} is the station's number; 10.0.0.11 is the address of the"
+    " first station, the others follow; ethernet://eth0 is the interface of each on its host.",
 )
 @click.option(
     "--cycle",
@@ -93,7 +101,7 @@ def _summary(file: Path, plant: Plant | None) -> Iterator[str]:
     metavar="MS",
     help="Device cycle in milliseconds.",
 )
-@click.option("--force", is_flag=True, help="Write over a file that is there.")
+@click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @json_option("Print one object: file, plant and stations.")
 def new(
     file: Path,
@@ -105,10 +113,10 @@ def new(
     force: bool,
     output: Renderer,
 ) -> None:
-    """Write the plant file FILE, or stdout for -, with N stations in a ring or a star.
+    """Write the plant file FILE (- is stdout) with N stations in a ring or a star.
 
-    Names, NetIDs, addresses and PD ids are allocated; the file explains itself, passes 'eapctl
-    check' and runs.
+    Allocates names, NetIDs, addresses and PD IDs.  The file has explanatory comments, passes
+    'eapctl check' and runs unchanged.
     """
     from eap.config.new_plant import NewPlant, Shape, plant_text
 
@@ -124,7 +132,7 @@ def new(
     )
     if is_stdout:
         if output.is_json:
-            raise click.UsageError("--json tells of a file: name one in place of -")
+            raise click.UsageError("--json describes the written file: name a file instead of -")
         write_text(text, end="")
         return
     _write(file, text, force=force)
@@ -139,7 +147,7 @@ def _write(file: Path, text: str, *, force: bool) -> None:
     from eap.runtime.durable import whole_file
 
     if file.exists() and not force:
-        raise click.ClickException(f"{file} exists: write over it with --force")
+        raise click.ClickException(f"{file} exists: overwrite it with --force")
     with whole_file(file) as target:
         target.write(text.encode())
 
@@ -155,15 +163,15 @@ def plant_arguments(command: CommandT) -> CommandT:
         "stations",
         multiple=True,
         metavar="NAME",
-        help="Only this station; may be given several times.",
+        help="Only this station; repeatable.",
     )
     return click.argument("plant", type=PLANT_FILE)(stations(command))
 
 
 keep_going_option = click.option(
-    "--keep-going", is_flag=True, help="Go on with the other stations when one refuses."
+    "--keep-going", is_flag=True, help="Continue with the other stations when one refuses."
 )
-_RESULT = json_option("Print one object: ok, the steps with their results, and refusals.")
+_RESULT = json_option("Print one object: ok, the steps with their results, refusals.")
 
 
 @contextmanager
@@ -190,7 +198,8 @@ def running_plant(
 def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Renderer) -> None:
     """Show the differences, object by object, between PLANT and its stations that run here.
 
-    Nothing is changed.  Exits with 1 when a station cannot become what the file says while it runs.
+    Changes nothing.  Exits with 1 when a station cannot be changed as the file requires while it
+    runs.
     """
     from eap.ops.plant import PlanReport, plan_all, start_command, steps_to
 
@@ -215,12 +224,12 @@ def apply(
 ) -> None:
     """Apply PLANT to its stations that run here, without a restart.
 
-    Everything without a change goes on undisturbed.  Each station changes between two of its
-    cycles, and keeps the change over a restart.  A receiver takes a new layout beside the old one
-    before anything sends it.  The first refusal of a station ends it; 'eapctl rollback' brings back
-    the state before.
+    Unchanged parts continue undisturbed.  Each station changes between two of its cycles and keeps
+    the change over a restart.  A receiver accepts a new layout beside the old one before a sender
+    uses it.  The command ends at the first refusal of a station; 'eapctl rollback' restores the
+    previous state.
 
-    Exits with 1 when a station refused.
+    Exits with 1 when a station refuses.
     """
     from eap.ops.plant import apply_steps, plan_all, steps_to
 
@@ -241,11 +250,11 @@ def apply(
 def rollback(
     ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Renderer
 ) -> None:
-    """Take back the last change of the stations of PLANT that run here.
+    """Undo the last change of the stations of PLANT that run here.
 
-    Stations that it did not change stay as they are.  A second rollback undoes the first one.
+    Other stations keep their configuration.  A second rollback undoes the first one.
 
-    Exits with 1 when a station refused.
+    Exits with 1 when a station refuses.
     """
     from eap.ops.plant import roll_back
 
@@ -295,7 +304,7 @@ def plan_lines(report: PlanReport, command: str) -> Iterator[str]:
     else:
         names = [each.station for each in plans]
         all_of = f"{names[0]} is" if len(names) == 1 else f"all {len(names)} stations are"
-        yield f"nothing differs: {all_of} as the file says"
+        yield f"no differences: {all_of} as the file says"
     if report.absent:
         yield f"not running here: {', '.join(report.absent)}; start them with:"
         yield f"  {command}"
@@ -313,12 +322,12 @@ def _plan_summary(report: PlanReport) -> Iterator[str]:
     yield (
         f"{count(len(differing), 'station')} of {len(report.stations)} to change"
         + (f" ({numbers})" if numbers else "")
-        + (f", {others} as the file says" if others else "")
+        + (f", {others} unchanged" if others else "")
     )
     if refusing:
         yield f"cannot be applied: {', '.join(refusing)} refused"
     elif len(report.steps) > 1:
-        yield "'eapctl apply' goes these steps:"
+        yield "'eapctl apply' takes these steps:"
         for number, step in enumerate(report.steps, 1):
             yield f"  {number}. {step.station} {step.why}"
 
@@ -361,16 +370,15 @@ def _end_lines(report: ChangeReport, stations: int) -> Iterator[str]:
     refused = [step.station for step in report.steps if not step.ok]
     changed = list(dict.fromkeys(step.station for step in report.steps if step.ok))
     if not changed:
-        yield "nothing was changed"
+        yield "no station changed"
         return
     others = stations - len(changed)
-    rest = f", {others} as before" if others else ""
+    rest = f", {others} unchanged" if others else ""
     yield f"{count(len(changed), 'station')} changed{rest}"
     if refused or report.error is not None:
-        what = f"{', '.join(refused)} refused" if refused else "broken off"
-        are = "is" if len(changed) == 1 else "are"
-        yield f"{what}: changed until then {are} {', '.join(changed)}"
-        yield "'eapctl apply' goes on with it, 'eapctl rollback' brings back the state before"
+        what = f"{', '.join(refused)} refused" if refused else "interrupted"
+        yield f"{what}: changed so far: {', '.join(changed)}"
+        yield "'eapctl apply' continues, 'eapctl rollback' restores the previous state"
 
 
 DEFAULT_CYCLE_US = 10_000
@@ -379,29 +387,29 @@ _OF_A_BLANK = "interface", "net_id", "cycle_us"
 
 def _blank_options(command: CommandT) -> CommandT:
     blank = click.option(
-        "--blank", metavar="NAME", help="In place of PLANT: a station without any configuration."
+        "--blank", metavar="NAME", help="Instead of PLANT: one station without configuration."
     )
     interface = click.option(
         "--interface",
         metavar="URI",
-        help="Of the blank station's port eap0, such as udp://10.0.0.1 or ethernet://eth0.",
+        help="Interface of the blank station's port eap0: udp://10.0.0.1 or ethernet://eth0.",
     )
     net_id = click.option(
         "--net-id",
         metavar="N",
-        help="AMS NetID of that port: publisher ID of its frames, address of its dictionary.",
+        help="AMS NetID of that port: publisher ID of its frames and address of its dictionary.",
     )
     cycle = click.option(
         "--cycle",
         "cycle_us",
         callback=parse_cycle,
         metavar="MS",
-        help="Device cycle of the blank station in milliseconds; 10 unless given.",
+        help="Device cycle of the blank station in milliseconds [default: 10]",
     )
     resume = click.option(
         "--resume",
         is_flag=True,
-        help="Let the blank station go on with what it was configured to be when it last ran.",
+        help="Resume the last configuration of the blank station.",
     )
     return blank(interface(net_id(cycle(resume(command)))))
 
@@ -413,15 +421,15 @@ def _blank_options(command: CommandT) -> CommandT:
     "stations",
     multiple=True,
     metavar="NAME",
-    help="Run only this station; may be given several times.",
+    help="Run only this station; repeatable.",
 )
 @_blank_options
 @click.option(
     "--realtime/--no-realtime",
     default=True,
     show_default=True,
-    help="Ask for SCHED_FIFO, locked memory and PM QoS; without permission the plant runs all the"
-    " same, and status says so.",
+    help="Request SCHED_FIFO, locked memory and PM QoS; without permission the plant runs without"
+    " them, and 'eapctl status' shows a warning.",
 )
 @click.option(
     "--priority",
@@ -448,12 +456,12 @@ def run(
 ) -> None:
     """Run the stations of the plant file PLANT until Ctrl-C or SIGTERM.
 
-    With --blank, run one station that has an EAP port and nothing else, in PREOP: 'eapctl od
-    write', 'eapctl apply' or another tool configures it.
+    With --blank, run one station that has a single EAP port, in PREOP; 'eapctl od write', 'eapctl
+    apply' or another tool configures it.
 
-    When each has run its first cycle, one line {"ready": true, "stations": [...]} appears on
-    stdout; messages go to stderr.  Exits with 2, and starts nothing, when the file or this machine
-    is not fit.
+    Prints one line {"ready": true, "stations": [...]} on stdout when each station has run its first
+    cycle; messages go to stderr.  Exits with 2, and starts nothing, when the plant file has errors
+    or this host lacks an address, interface or permission.
     """
     _check_form(ctx)
     from eap.runtime.handover import EngineOptions
@@ -475,11 +483,11 @@ def _check_form(ctx: click.Context) -> None:
     if ctx.params["blank"] is None:
         if given or ctx.params["resume"]:
             names = "--interface, --net-id, --cycle and --resume"
-            raise click.UsageError(f"{names} go with --blank NAME", ctx)
+            raise click.UsageError(f"{names} need --blank NAME", ctx)
         if not has_plant:
-            raise click.UsageError("say what to run: PLANT, or --blank NAME", ctx)
+            raise click.UsageError("nothing to run: give PLANT, or --blank NAME", ctx)
     elif has_plant or ctx.params["stations"]:
-        raise click.UsageError("--blank NAME takes the place of PLANT and --station", ctx)
+        raise click.UsageError("--blank NAME excludes PLANT and --station", ctx)
     elif not {"interface", "net_id"} <= given:
         raise click.UsageError("--blank NAME needs --interface URI and --net-id N", ctx)
 

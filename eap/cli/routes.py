@@ -45,14 +45,14 @@ _FILE = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
 @plant_option
 @click.pass_context
 def routes(ctx: click.Context, plant: str | None) -> None:
-    """Show the routes and connections of the routers of running stations, live.
+    """Show the AMS routes and connections of running stations.
 
-    In a terminal and without a command: a live table for keyboard and mouse.  Otherwise it is
-    printed once, as by 'eapctl routes list'.
+    Without a command, a terminal shows a live table with keyboard and mouse; otherwise the table is
+    printed once, like 'eapctl routes list'.
     """
     if ctx.invoked_subcommand is not None:
         if plant:
-            raise click.UsageError("--plant goes behind the command")
+            raise click.UsageError("--plant stands before its command: write it after the command")
         return
     if not is_terminal():
         ctx.invoke(list_all, plant=plant, station=None, match="", output=Renderer(is_json=False))
@@ -72,8 +72,8 @@ def _run_view(plant: str | None) -> None:
         if exc.name != "textual":
             raise
         raise EnvironmentalError(
-            "the live view needs Textual: pip install 'eap-appliance[tui]' brings it along;"
-            " 'eapctl routes list' shows the same once"
+            "the live view needs Textual: install it with pip install 'eap-appliance[tui]', or use"
+            " 'eapctl routes list'"
         ) from None
     run_view(plant)
 
@@ -97,7 +97,7 @@ def list_all(station: str | None, match: str, plant: str | None, output: Rendere
     output.show(RouterList([row for each in found for row in each.stations]), routes_view)
 
 
-@click.command(short_help="Add a route, which is kept until it is removed.")
+@click.command(short_help="Add a persistent route.")
 @click.argument("station")
 @click.argument("name")
 @click.argument("net_id", required=False, default="", metavar="[NETID]")
@@ -114,25 +114,25 @@ def list_all(station: str | None, match: str, plant: str | None, output: Rendere
     type=click.Choice(["6", "5", "4", "0"]),
     default="4",
     show_default=True,
-    help="Number of octets of NETID that have to match; 0 is a default route.",
+    help="Number of NETID bytes that must match; 0 is a default route.",
 )
 @click.option(
     "--virtual",
     default="",
     metavar="NETID",
-    help="NetID of NAME at STATION, if it differs from its own (NAT).",
+    help="Virtual NetID of NAME at STATION (NAT).",
 )
-@click.option("--unidirectional", is_flag=True, help="Refuse requests that come from there.")
+@click.option("--unidirectional", is_flag=True, help="Refuse requests from this next hop.")
 @click.option(
     "--timeout",
     "timeout_ms",
     type=click.IntRange(1, 600_000),
     metavar="MS",
-    help="Time limit for an answer.",
+    help="Timeout of an answer.",
 )
 @click.option("--no-probe", is_flag=True, help="Do not probe the next hop.")
 @plant_option
-@json_option("Print one object: route and warnings.")
+@json_option("Print one object: the route and warnings.")
 def add(
     station: str,
     name: str,
@@ -147,10 +147,10 @@ def add(
     plant: str | None,
     output: Renderer,
 ) -> None:
-    """Add a route to the router of STATION: to NAME with NETID, by way of VIA.
+    """Add a route to NAME with NETID, through VIA, to the router of STATION.
 
-    NETID may be left out when NAME is a station of the plant.  A route of the plant file goes
-    before one that was added; 'eapctl routes test STATION NAME' shows whether it works.
+    NETID is optional when NAME is a station of the plant.  The route is kept until it is removed.
+    Routes of the plant file take precedence.  'eapctl routes test STATION NAME' tests the route.
     """
     from eap.cli.routes_view import path_of
     from eap.control.routes import ROUTES_ADD
@@ -174,9 +174,11 @@ def add(
 @click.option(
     "--transport",
     default="",
-    help="Of several routes with one name or NetID the one with this transport.",
+    help="Transport, to choose among routes of the same name or NetID.",
 )
-@click.option("--address", default="", help="Likewise, the one to this address.")
+@click.option(
+    "--address", default="", help="Address, to choose among routes of the same name or NetID."
+)
 @plant_option
 @json_option("Print one object: the route.")
 def remove(
@@ -184,7 +186,7 @@ def remove(
 ) -> None:
     """Remove ROUTE, a name or NetID, from the router of STATION.
 
-    Routes of the plant file are removed there; learned ones expire.
+    Routes of the plant file are removed there; auto-discovered routes expire.
     """
     from eap.control.routes import ROUTES_REMOVE
     from eap.ops.client import connect_station
@@ -197,7 +199,7 @@ def remove(
     output.show(removed, lambda _: f"{station}: removed {row.name} ({row.net_id}, {row.address})")
 
 
-@click.command(short_help="Measure the round trip to stations.")
+@click.command(short_help="Test routes and measure round trips.")
 @click.argument("station", required=False, metavar="[STATION]")
 @click.argument("targets", nargs=-1, metavar="[TARGET]...")
 @click.option(
@@ -207,10 +209,10 @@ def remove(
     default=5000,
     show_default=True,
     metavar="MS",
-    help="Time limit for each answer.",
+    help="Timeout of each answer.",
 )
 @plant_option
-@json_option("Print one object a target and line.")
+@json_option("Print one object per target and line.")
 @click.pass_context
 def test(
     ctx: click.Context,
@@ -220,14 +222,14 @@ def test(
     plant: str | None,
     output: Renderer,
 ) -> None:
-    """Read the state of each TARGET through the router of STATION, and measure the time.
+    """Read the state of each TARGET through the router of STATION and measure the round trip.
 
     TARGET is the name of a route, a NetID, or a name of the plant (STATION, STATION/PORT,
-    STATION/PORT/SLAVE); all routes without one, of all running stations without STATION.  A target
-    that does not answer is shown with the place of the fault, its cause and a remedy.
+    STATION/PORT/SLAVE).  Without TARGET all routes of STATION are tested, without STATION those of
+    all running stations.  For a target that does not answer the failed hop, the cause and a remedy
+    are shown.
 
-    Exits with 1 when a target does not answer; without a TARGET a client that does not listen is no
-    failure.
+    Exits with 1 when a target does not answer; without TARGET, routes to clients may fail.
     """
     from eap.cli.routes_view import result_table
     from eap.ops.routing import TestedTarget, list_routes
@@ -265,11 +267,9 @@ def _test(station: str, target: str, timeout_ms: int, plant: str | None) -> Test
 @click.command("import", short_help="Add the routes of a StaticRoutes file.")
 @click.argument("station")
 @click.argument("file", type=_FILE)
-@click.option(
-    "--dry-run", is_flag=True, help="Show the routes that would be added, and add nothing."
-)
+@click.option("--dry-run", is_flag=True, help="Show the routes, but add none.")
 @plant_option
-@json_option("Print one route a line, as an object.")
+@json_option("Print one object per route and line.")
 @click.pass_context
 def import_routes(
     ctx: click.Context,
@@ -281,10 +281,10 @@ def import_routes(
 ) -> None:
     """Add the routes of FILE (StaticRoutes.xml of TwinCAT) to the router of STATION.
 
-    Name, address and NetID of each are read; its type has to be TCP_IP.  A route that exists
-    already is replaced.  FILE - is stdin.
+    Reads name, address and NetID of each route; its type must be TCP_IP.  An existing route is
+    replaced.  FILE - is stdin.
 
-    Exits with 1 when a route could not be added; the others are.
+    Exits with 1 when a route cannot be added; the other routes are added.
     """
     from eap.cli.routes_view import import_table
     from eap.control.routes import ROUTES_IMPORT
@@ -305,9 +305,9 @@ def import_routes(
 @click.argument("file", type=_FILE, required=False, metavar="[FILE]")
 @plant_option
 def export(station: str, file: Path | None, plant: str | None) -> None:
-    """Write the AMS/TCP routes of STATION to FILE, or to stdout, in the form of TwinCAT.
+    """Write the AMS/TCP routes of STATION to FILE or stdout, in TwinCAT's StaticRoutes format.
 
-    Routes with other transports have no place in such a file; they are named on stderr.
+    The format has no other transports; routes with other transports are named on stderr.
     """
     from eap.control.routes import ROUTES_EXPORT
     from eap.ops.client import connect_station
@@ -320,10 +320,10 @@ def export(station: str, file: Path | None, plant: str | None) -> None:
     else:
         with whole_file(file) as target:
             target.write(found.xml.encode())
-        write_text(f"{file}: the AMS/TCP routes of {station}")
+        write_text(f"{file}: AMS/TCP routes of {station} written")
     if found.left_out:
         names = ", ".join(found.left_out)
-        click.echo(f"{station}: no AMS/TCP routes, so left out: {names}", err=True)
+        click.echo(f"{station}: routes without AMS/TCP are not exported: {names}", err=True)
 
 
 def _read(file: Path) -> str:
@@ -354,7 +354,7 @@ def _read(file: Path) -> str:
     "--password-file",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Its first line is the password; prompt for it without.",
+    help="File with the password in its first line [default: prompt]",
 )
 @click.option(
     "--wait",
@@ -363,7 +363,7 @@ def _read(file: Path) -> str:
     default=5000,
     show_default=True,
     metavar="MS",
-    help="Time limit for the answer.",
+    help="Timeout of the answer.",
 )
 @plant_option
 @json_option("Print one object: ok, result, text.")
@@ -415,7 +415,7 @@ def _password(user: str, file: Path | None) -> str:
 
 
 @click.command(
-    short_help="Discover the routers of other hosts, and learn routes to them.",
+    short_help="Discover the routers of other hosts, and add temporary routes.",
     epilog=examples("eapctl routes scan", "eapctl routes scan island-01 --address 192.168.1.5"),
 )
 @click.argument("station", required=False, metavar="[STATION]")
@@ -423,7 +423,7 @@ def _password(user: str, file: Path | None) -> str:
     "--address",
     default="",
     metavar="ADDRESS",
-    help="IPv4 address of the only host or network to ask; the networks of STATION without.",
+    help="IPv4 address of a host or network [default: the networks of STATION]",
 )
 @click.option(
     "--wait",
@@ -432,17 +432,17 @@ def _password(user: str, file: Path | None) -> str:
     default=1000,
     show_default=True,
     metavar="MS",
-    help="Time limit for answers.",
+    help="Waiting time for answers.",
 )
 @plant_option
-@json_option("Print one object a router and line.")
+@json_option("Print one object per router and line.")
 def scan(
     station: str | None, address: str, wait_ms: int, plant: str | None, output: Renderer
 ) -> None:
     """Discover the AMS routers of other hosts by UDP 48899.
 
-    Routes to those that answer are learned, for ten minutes, unless there is one already or the
-    plant file says 'learn: false'.  The request is sent by STATION, or by all that run here.
+    STATION, or each running station, sends the request.  A route to each router that answers is
+    added for ten minutes, unless one exists or the plant file has 'learn: false'.
     """
     from contextlib import ExitStack
 

@@ -33,14 +33,14 @@ def routes_view(found: RouterList) -> Iterator[TextTable | Styled | str]:
     remarks = [f"{each.station}: {text}" for each in stations for text in _remarks(each)]
     if remarks:
         yield ""
-        yield Styled("Worth a look", style="bold")
+        yield Styled("Warnings", style="bold")
         yield from remarks
 
 
 def result_table(results: Iterable[TestedTarget]) -> Iterator[TextTable]:
     """Yield the results of tests, by station."""
     table = TextTable(
-        "Station", "Target", Column("Round trip", is_number=True), Column("Says", wraps=True)
+        "Station", "Target", Column("Round trip", is_number=True), Column("Result", wraps=True)
     )
     for result in results:
         said = Styled(result.text, style="" if result.ok else _STYLES["down"])
@@ -64,7 +64,7 @@ def neighbour_table(rows: Iterable[NeighbourRow]) -> Iterator[TextTable]:
     for row in rows:
         route = Styled(row.route or "none", style=_STYLES["up" if row.route else "unknown"])
         if row.is_learned:
-            route.append(" (learned)", style="none")
+            route.append(" (auto-discovered)", style="none")
         table.add_row(row.station, row.name, row.net_id, row.address, row.version, route)
     yield table
 
@@ -87,7 +87,7 @@ def _routes(stations: Sequence[RouterRow]) -> TextTable:
         Column("Transport", rank=3),
         Column("Address", rank=4),
         "State",
-        Column("Trip", rank=1, is_number=True),
+        Column("RTT", rank=1, is_number=True),
         Column("Requests", is_number=True),
         Column("Errors", is_number=True),
     )
@@ -113,9 +113,9 @@ def _connections(stations: Sequence[RouterRow]) -> TextTable:
         "Connection",
         Column("Transport", rank=3),
         Column("NetIDs", rank=1),
-        Column("For", is_number=True),
+        Column("Open", is_number=True),
         Column("Requests", is_number=True),
-        Column("Octets", rank=2, is_number=True),
+        Column("Bytes", rank=2, is_number=True),
         Column("Errors", is_number=True),
     )
     for station in stations:
@@ -152,7 +152,7 @@ def _dead_hops(routes: Sequence[RouteRow]) -> Iterator[str]:
     for first, *others in by_hop.values():
         name = first.next_name or first.name
         beyond = dict.fromkeys(row.name for row in (first, *others) if row.name != name)
-        text = f"; so are the routes by it: {', '.join(beyond)}" if beyond else ""
+        text = f"; so are the routes through it: {', '.join(beyond)}" if beyond else ""
         yield f"{name} ({path_of(first)}) is down: {first.why}{text}"
 
 
@@ -213,7 +213,7 @@ def route_state(row: RouteRow) -> str:
     if row.why and row.next_name not in {"", row.name}:
         rest = f"{row.next_name}: {row.why}"
     if row.state == "unknown" and not rest:
-        rest = "no request was answered yet"
+        rest = "no request answered yet"
     return f"{row.state}: {rest}" if rest else row.state
 
 
@@ -221,7 +221,7 @@ def figures(row: EndpointRow) -> str:
     """Return all figures of a row in words."""
     return (
         f"{count(row.requests, 'request')}, {count(row.answers, 'answer')},"
-        f" {count(row.errors, 'error')}; octets: {short(row.octets_out)} out,"
+        f" {count(row.errors, 'error')}; bytes: {short(row.octets_out)} out,"
         f" {short(row.octets_in)} in"
     )
 

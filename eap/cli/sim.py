@@ -36,7 +36,7 @@ def _parse_interface(
 def sim() -> None:
     """Run simulated slaves, and inject faults.
 
-    A master of the EtherCAT device protocol cannot tell them from real ones.
+    To an EtherCAT master they behave like real slaves.
     """
 
 
@@ -49,20 +49,20 @@ def sim() -> None:
     required=True,
     callback=_parse_interface,
     metavar="URI",
-    help="Where to answer: ethernet://IFACE (needs CAP_NET_RAW) or udp://ADDRESS[:PORT].",
+    help="Interface of the segment: ethernet://IFACE (needs CAP_NET_RAW) or udp://ADDRESS[:PORT].",
 )
 @click.option(
     "--second",
     callback=_parse_interface,
     metavar="URI",
-    help="The other line of a ring: ethernet://IFACE.",
+    help="Second interface of a ring: ethernet://IFACE.",
 )
-@click.option("--faults", is_flag=True, help="Take faults as JSON, one a line, from stdin.")
+@click.option("--faults", is_flag=True, help="Read faults from stdin, one JSON object per line.")
 def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults: bool) -> None:
     """Run the slaves of the bus file BUS.
 
-    When they answer, one line {"ready": true, "slaves": n} appears on stdout; Ctrl-C or SIGTERM
-    ends them.  docs/simulator.md describes bus files; config/buses has some to start from.
+    Prints one line {"ready": true, "slaves": n} on stdout when the slaves answer; Ctrl-C or SIGTERM
+    ends the command.  docs/simulator.md describes bus files; config/buses has examples.
     """
     from eap.runtime import busfile  # yaml and sockets; --help must not wait
     from eap.segment import process as segment_process
@@ -70,7 +70,7 @@ def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults:
     loaded = busfile.load_or_raise(bus)
     if second is not None and not (loaded.spec.ring and second.scheme == "ethernet"):
         raise click.UsageError(
-            "--second is an ethernet:// interface, for a bus file with ring: true"
+            "--second needs an ethernet:// interface and a bus file with ring: true"
         )
     command_fd = sys.stdin.fileno() if faults else None
     segment_process.run(loaded, interface, write_json, second=second, command_fd=command_fd)
@@ -116,7 +116,7 @@ def _place_argument(command: CommandT) -> CommandT:
 def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> StationBus:
     port = parse_port(text)
     if port is None:
-        raise click.BadParameter(f"{text!r} is no STATION/PORT, such as press/bus0", ctx, param)
+        raise click.BadParameter(f"{text!r} is not STATION/PORT, such as press/bus0", ctx, param)
     return port
 
 
@@ -129,7 +129,7 @@ def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> StationBu
 )
 @_place_argument
 @click.argument("words", nargs=-1, required=True, metavar="JSON|KIND [KEY=VALUE]...")
-@click.option("--end", is_flag=True, help="End the described fault instead of beginning it.")
+@click.option("--end", is_flag=True, help="End this fault instead of starting it.")
 @plant_option
 @json_option("Print one object: what was sent.")
 def fault(
@@ -138,13 +138,13 @@ def fault(
     """Inject a fault into a simulated bus of a running station.
 
     KIND is loss, delay, corrupt, wkc, cut, power, mailbox, foe, sdo, eeprom, tx-pdo, emergency,
-    al-error, refuse or drift; most want slave=NAME, and take at_ms and for_ms.  docs/simulator.md
-    says what each does, and its keys.
+    al-error, refuse or drift; most need slave=NAME and accept at_ms and for_ms.  docs/simulator.md
+    describes each kind and its keys.
     """
     command = parse_fault(words) | ({"end": True} if end else {})
     _send(bus, command, plant)
     kind = command.get("kind")
-    output.show(command, lambda _: f"{bus}: fault {kind} {'ends' if end else 'begins'}")
+    output.show(command, lambda _: f"{bus}: fault {kind} {'ended' if end else 'started'}")
 
 
 @click.command(
@@ -159,7 +159,7 @@ def fault(
 @click.argument("slave")
 @click.argument("entry")
 @click.argument("value", required=False, metavar="[VALUE]")
-@click.option("--release", is_flag=True, help="Let the entry change again; without VALUE.")
+@click.option("--release", is_flag=True, help="Release the entry; without VALUE.")
 @plant_option
 @json_option("Print one object: what was sent.")
 def set_value(
@@ -171,20 +171,20 @@ def set_value(
     plant: str | None,
     output: Renderer,
 ) -> None:
-    """Force an entry of a simulated slave to a value, until --release.
+    """Force an entry of a simulated slave to VALUE until it is released.
 
     SLAVE is its name in the bus file, ENTRY the name of an input or another entry, or an object
     such as 0x6000:1.
     """
     if release == (value is not None):
-        raise click.UsageError("expected either VALUE or --release")
+        raise click.UsageError("expected one of VALUE and --release")
     where: dict[str, Any] = {"slave": slave, "entry": entry}
     if value is None:
         command = {"release": where}
     else:
         command = {"set": where | {"value": parse_value(value)}}
     _send(bus, command, plant)
-    done = "changes again" if release else f"= {value}"
+    done = "released" if release else f"= {value}"
     output.show(command, lambda _: f"{bus}: {slave} {entry} {done}")
 
 

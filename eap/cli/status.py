@@ -65,7 +65,7 @@ class Look(NamedTuple):
 
 @click.command()
 @click.option("--full", is_flag=True, help="Show every process, port, bus and PD.")
-@click.option("--watch", is_flag=True, help="Show it again and again, with rates; Ctrl-C ends it.")
+@click.option("--watch", is_flag=True, help="Refresh until Ctrl-C, and show rates.")
 @click.option(
     "--interval",
     "interval_s",
@@ -73,7 +73,7 @@ class Look(NamedTuple):
     default=2.0,
     show_default=True,
     metavar="S",
-    help="Seconds from one look to the next with --watch.",
+    help="Seconds between refreshes with --watch.",
 )
 @plant_option
 @station_option
@@ -88,7 +88,7 @@ def status(
 ) -> None:
     """Show the state of the running appliances: errors first, then a line for each station.
 
-    Errors and warnings have place, cause, beginning and remedy.
+    Each error and warning has its place, cause, time and remedy.
     """
     view = _full if full else _screen
     if not watch:
@@ -158,7 +158,7 @@ def _page(
     if isinstance(found, Look):
         yield from view(found)
     else:
-        yield Styled(f"{found}; waiting for it", style="bold red")
+        yield Styled(f"{found}; waiting for an appliance", style="bold red")
 
 
 def _screen(look: Look) -> Iterator[RenderableType]:
@@ -508,8 +508,8 @@ def _buses_table(stations: Sequence[Row]) -> TextTable:
         Column("State", wraps=True),
         Column("Cycles", rank=1, is_number=True),
         Column("Lost", is_number=True),
-        Column("Counters", is_number=True),
-        Column("Trip", rank=2, is_number=True),
+        Column("WKC", is_number=True),
+        Column("RTT", rank=2, is_number=True),
     )
     for station in stations:
         for port in station["ports"]:
@@ -577,7 +577,7 @@ def _received(row: Row, state: str) -> tuple[str | Styled, ...]:
 def _frames(stations: Sequence[Row]) -> TextTable:
     table = TextTable(
         "Frame",
-        Column("Goes to", wraps=True),
+        Column("Destination", wraps=True),
         "Subscriber",
         Column("Frames", rank=1, is_number=True),
         Column("Skipped", is_number=True),

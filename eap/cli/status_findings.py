@@ -41,13 +41,13 @@ REASONS = {
     "poll": "polled",
 }
 STATES = {
-    "PREOP": "it exchanges no process data",
-    "SAFEOP": "it receives no process data",
+    "PREOP": "the station exchanges no process data",
+    "SAFEOP": "the station receives no process data",
 }
 """Effect of the states that a station can be left in by request."""
 LISTENER_COUNTS = {
     "refused": "refused",
-    "evicted": "closed to make room",
+    "evicted": "closed in favour of others",
     "overdue": "closed as too slow",
 }
 _MOST_DESCRIPTORS = 0.9
@@ -152,7 +152,7 @@ def _of_appliance(appliance: Row) -> Iterator[StatusFinding]:
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():
         if not process["pid"]:
-            yield _error(f"{plant} {name}", "not running", "it is being started again")
+            yield _error(f"{plant} {name}", "not running", "it is being restarted")
         elif step := process.get("step"):
             yield _warning(f"{plant} {name}", f"starting: {step}")
     if audit := appliance.get("audit"):
@@ -168,7 +168,7 @@ def _of_appliance(appliance: Row) -> Iterator[StatusFinding]:
         if isinstance(outcome, str) and not outcome.startswith("fifo") and outcome != _NOT_ASKED
     ]
     if refused:
-        advice = "cycles may be late: run as root, or with --no-realtime"
+        advice = "cycles may be late: run as root, or use --no-realtime"
         yield _warning(f"{plant} engine", f"no realtime: {', '.join(refused)}", advice)
     if counts := _counts(engine.get("bus_requests", {})):
         yield _info(f"{plant} engine", f"requests to buses: {counts}")
@@ -178,7 +178,7 @@ def _of_audit(where: str, audit: Row) -> Iterator[StatusFinding]:
     lost, error = count(audit["lines"], "line"), audit["error"]
     if error:
         effect = "changes are refused" if audit["required"] else "changes are not recorded"
-        advice = f"{lost} lost; make room for {audit['file']}, or make its folder writable"
+        advice = f"{lost} lost; free space for {audit['file']}, or make its folder writable"
         yield _error(where, f"cannot be written: {error}; {effect}", advice, audit["since"])
     elif audit["lines"]:
         yield _warning(where, f"{lost} lost; written again", since=audit["since"])
@@ -197,7 +197,7 @@ def _of_listener(plant: str, listener: Row) -> Iterator[StatusFinding]:
     ago_us = listener["crowded_ago_us"]
     where, what = f"{plant} {listener['name']}", _counts(counts)
     if ago_us is not None and ago_us < _RECENT_US:
-        places = f"crowded: {listener['open']} of {listener['limit']} places taken"
+        places = f"{listener['open']} of {listener['limit']} connections in use"
         _, _, number = listener["name"].rpartition(":")
         advice = f"'ss -tn sport = :{number}' shows the hosts" if number.isdecimal() else ""
         yield _warning(where, f"{places}; connections: {what}", advice)
@@ -212,7 +212,7 @@ def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[St
         of_all = "any station" if len(hung) == len(stations) > 1 else names
         since = now_s - max(station["cycle_age_us"] for station in hung) / 1e6
         what = f"runs no cycles of {of_all}"
-        yield _error(f"{plant} engine", what, "the log of 'eapctl run' says why", since)
+        yield _error(f"{plant} engine", what, "see the log of 'eapctl run'", since)
 
 
 def _is_hung(station: Row) -> bool:
@@ -234,7 +234,7 @@ def _of_station(station: Row) -> Iterator[StatusFinding]:
             yield _error(where, "no frame comes back", "check cable and interface of the bus")
     for frame in filter(is_special, station.get("frames", ())):
         if frame["address"] is None:
-            waits = f"waits for a frame of {frame['destination']}, to learn its MAC address"
+            waits = f"MAC address of {frame['destination']} unknown: waiting for a frame from it"
             yield _warning(f"{station['name']} → {frame['name']}", waits)
     for row in station["pd"]["tx"]:
         yield from _of_sent(f"{station['name']} → {row['name']}", row)
@@ -248,14 +248,14 @@ def _of_station(station: Row) -> Iterator[StatusFinding]:
 def _of_cycles(station: Row) -> Iterator[StatusFinding]:
     name, state = station["name"], station["state"]
     if effect := STATES.get(state):
-        advice = f"'eapctl state {name} OP' ends that"
+        advice = f"'eapctl state {name} OP' returns it to OP"
         yield _warning(name, f"in {state}, as requested: {effect}", advice)
     if held := station.get("links_held"):
-        yield _warning(name, f"held {count(held, 'linked value')} back: not a number")
+        yield _warning(name, f"{count(held, 'linked value')} held back: not a number")
     if overruns := station.get("overruns"):
-        yield _info(name, f"left out {count(overruns, 'cycle')}")
+        yield _info(name, f"{count(overruns, 'cycle')} skipped: overrun")
     if torn := station.get("torn"):
-        yield _info(name, f"found {count(torn, 'torn write')}")
+        yield _info(name, f"{count(torn, 'torn write')} read")
     if discarded := _counts(station["discarded"]):
         yield _info(name, f"dropped: {discarded}")
 
@@ -264,17 +264,17 @@ _BUS_COUNTERS = (
     ("wkc_errors", "cycle", "with a wrong working counter"),
     ("lost", "exchange", "lost: no frame came back"),
     ("late", "exchange", "late: the bus or this host was busy"),
-    ("skipped", "exchange", "left out: others were under way"),
+    ("skipped", "exchange", "skipped: others were pending"),
 )
 
 
 def _of_bus(where: str, bus: Row) -> Iterator[StatusFinding]:
-    advice = f"'eapctl bus diag {where}' says more"
+    advice = f"'eapctl bus diag {where}' shows details"
     if bus["fault"]:
         lines = "; ".join(line.strip() for line in bus["fault"].splitlines())
         yield _error(where, lines.replace(":; ", ": "), advice)
     elif not bus["is_up"]:
-        yield _warning(where, "not up yet")
+        yield _warning(where, "starting up")
     for each in bus.get("findings", []):
         yield _error(where, each["what"], each["advice"] or advice, each["since"])
     for key, noun, text in _BUS_COUNTERS:
@@ -285,8 +285,8 @@ def _of_bus(where: str, bus: Row) -> Iterator[StatusFinding]:
 def _of_sent(where: str, row: Row) -> Iterator[StatusFinding]:
     frame_state = row.get("frame_state", 0)
     if frame_state & _TOO_LARGE:
-        advice = "fewer or smaller PDs in its frame"
-        yield _error(where, "not sent: its frame is larger than its network carries", advice)
+        advice = "use fewer or smaller PDs in its frame"
+        yield _error(where, "not sent: its frame exceeds the maximum size of its network", advice)
     if frame_state & _NO_SUBSCRIBER:
         advice = "check cable and power of the receiving station"
         yield _error(where, "its subscriber does not answer", advice)
@@ -302,8 +302,8 @@ def _of_sent(where: str, row: Row) -> Iterator[StatusFinding]:
 def _of_silent(station: Row) -> Iterator[StatusFinding]:
     """Yield the subscriptions that receive nothing; many with the same fault as one finding."""
     stale = [row for row in station["pd"]["rx"] if row["state"] == "stale"]
-    advice = "check its sender and the way to it"
-    yield from _grouped(station, stale, "stale: nothing received within the time-out", advice)
+    advice = "check its sender and the network path"
+    yield from _grouped(station, stale, "stale: nothing received within the timeout", advice)
     waiting = [row for row in station["pd"]["rx"] if row["state"] == "waiting"]
     cyclic = [row for row in waiting if row["lost"] is not None]
     yield from _grouped(station, cyclic, "nothing received yet", advice, _warning)
@@ -328,7 +328,7 @@ def _grouped(
 def _of_received(where: str, row: Row) -> Iterator[StatusFinding]:
     if wrong := {_OTHER_VERSION: "version", _OTHER_LENGTH: "length"}.get(row.get("var_state", 0)):
         advice = "compare the plant files of both stations"
-        yield _error(where, f"dropped: another {wrong} than expected", advice)
+        yield _error(where, f"dropped: unexpected {wrong}", advice)
     remarks = []
     if row.get("timeouts"):
         remarks.append(f"timed out {times_of(row['timeouts'])}")
@@ -358,7 +358,7 @@ def _of_sources(station: Row) -> Iterator[StatusFinding]:
         if ago_us > _RECENT_US:
             yield _info(where, text)
         else:
-            yield _warning(where, text, "find out which of them should not send")
+            yield _warning(where, text, "stop the wrong sender")
 
 
 def _counts(counts: Row) -> str:

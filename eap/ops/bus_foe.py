@@ -27,8 +27,7 @@ from eap.runtime.durable import whole_file
 from eap.runtime.foe_restart import PAUSE_S, Restarts
 
 Report: TypeAlias = Callable[[int, int | None, int], None]
-"""Called now and then with the octets done, how many there are if that is known, and the number of
-restarts."""
+"""Progress callback: bytes done, their total if it is known, and the number of restarts."""
 
 
 class FileTransfer(Struct, frozen=True, kw_only=True):
@@ -192,7 +191,7 @@ class _FileCopy:
 def _note_restarts(exc: BusError, restarts: Restarts) -> None:
     if restarts.count:
         exc.add_note(
-            f"the transfer began anew {restarts.count} times, last after: {restarts.reason}"
+            f"the transfer restarted {restarts.count} times, last after: {restarts.reason}"
         )
 
 
@@ -233,8 +232,8 @@ def _telling_how_far(progress: Progress, done: str) -> Iterator[None]:
         if progress.done:
             of = f" of {progress.total}" if progress.total else ""
             exc.add_note(
-                f"{progress.done}{of} octets were {done}; FoE does not go on in the middle of a"
-                " file: the same command begins anew"
+                f"{progress.done}{of} bytes were {done}; FoE cannot resume a file: repeat the"
+                " command"
             )
         raise
 

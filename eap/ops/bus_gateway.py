@@ -60,8 +60,7 @@ class GatewayBus:
             self._slaves = self._client.slaves()
         except NOT_TOLD as exc:
             raise BusError(
-                f"the gateway cannot be asked for its slaves and their names: {exc}; name a slave"
-                " by its station address, such as 1001"
+                f"the gateway does not list its slaves: {exc}; use a station address, such as 1001"
             ) from exc
         return [_slave(each) for each in self._slaves]
 
@@ -75,7 +74,7 @@ class GatewayBus:
             return _slave(_unknown(MASTER_ADDRESS, "master"))
         number = _number(name)
         if number == ALL_SLAVES:
-            raise ConfigError(f"{name} is all slaves, each of which answers for itself: name one")
+            raise ConfigError(f"{name} addresses all slaves: name one slave")
         if number < 0:
             return choose(self.scan(), name)
         return _slave(_unknown(number, name))
@@ -88,7 +87,7 @@ class GatewayBus:
         """
         if slave.station == MASTER_ADDRESS or self._mailbox is not None:
             return
-        reason = "the master does not tell how long its mailbox is"
+        reason = "the master does not describe its mailbox size"
         try:
             if self._slaves is None:
                 self.scan()
@@ -96,8 +95,8 @@ class GatewayBus:
             reason += f" ({exc.__cause__})"
         if self._told_of(slave) is None:
             raise BusError(
-                f"slave {slave.name}: {reason}, and in packets of another length a file would be"
-                " cut off; say it (--mailbox OCTETS)"
+                f"slave {slave.name}: {reason}, and packets of another size would cut a file"
+                " off; use --mailbox BYTES"
             )
 
     def converse(
@@ -180,7 +179,7 @@ class GatewayBus:
         told = self._told_of(slave)
         if told is None:
             known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
-            return f"the master knows no slave {slave.station}; it knows {known or 'none'}"
+            return f"unknown slave {slave.station}; slaves known to the master: {known or 'none'}"
         if not told.to_slave:
             return str(no_mailbox(_slave(told), state_name(_slave(told).status.state)))
         return ""
@@ -227,7 +226,7 @@ def _slave(slave: MasterSlave) -> Slave:
 
 
 def _refuse(what: str) -> NoReturn:
-    raise BusError(f"{what}: a mailbox gateway passes mailbox messages only")
+    raise BusError(f"{what}: a mailbox gateway transfers only mailbox messages")
 
 
 @contextmanager

@@ -270,14 +270,14 @@ def write_eeprom(bus: SlaveBus, slave: str, image: bytes) -> WrittenEeprom:
         SiiError: no slave would start with this image, or the EEPROM does not take it.
     """
     if not sii.is_intact(image):
-        raise SiiError("the check sum of this image is wrong: a slave would not load it")
+        raise SiiError("wrong checksum in the image: the slave would not load it")
     sii.decode(image)
     unit = bus.find(slave)
     what = f"slave {unit.station}: its EEPROM"
     bus.run(eeprom.write_image(unit.station, image), what)
     there = bus.run(eeprom.read_image(unit.station), what)
     if not image.startswith(there):
-        raise SiiError(f"{what} holds something else than was written")
+        raise SiiError(f"{what} differs from the written image")
     bus.run(eeprom.reload(unit.station), what)
     return WrittenEeprom(unit.station, unit.name, len(image))
 

@@ -266,7 +266,7 @@ def _starting(folder: ApplianceFolder) -> Iterator[str]:
             if process.step:
                 yield f"{name} is starting ({process.step})"
             elif not process.pid:
-                yield f"{name} ended and will be started again"
+                yield f"{name} ended and is being restarted"
 
 
 def _none_runs(
@@ -276,7 +276,7 @@ def _none_runs(
     if running:
         others = ", ".join(f"{info.plant} ({', '.join(info.stations)})" for info in running)
         names = [name for info in running for name in info.stations]
-        hint = f"running are {others}{suggest(station, names) if station else ''}"
+        hint = f"; running: {others}{suggest(station, names) if station else ''}"
     else:
-        hint = f"start one with 'eapctl run PLANT' (looked in {describe_roots()})"
-    return ControlError(f"no {wanted} runs: {hint}", code=ErrorCode.UNAVAILABLE)
+        hint = f": start one with 'eapctl run PLANT' (looked in {describe_roots()})"
+    return ControlError(f"no {wanted} runs{hint}", code=ErrorCode.UNAVAILABLE)

@@ -56,7 +56,7 @@ _PADDED = 2
 """Octets of subindex 0 in a whole object."""
 _UNTOLD = frozenset((AdsError.NOT_FOUND, AdsError.SERVICE, AdsError.INDEX_GROUP, AdsError.GENERAL))
 _OCTETS = 6
-_NOT_THERE = "is no STATION, STATION/PORT or STATION/PORT/SLAVE, and no NETID[:PORT]"
+_NOT_THERE = "is not STATION, STATION/PORT, STATION/PORT/SLAVE or NETID[:PORT]"
 
 
 class Target(NamedTuple):

@@ -198,7 +198,7 @@ class PlantLink:
         notes, refused = answer.station + router.changes, answer.refused + router.refused
         if self._clients[spec.name].info.audit_required != self._audit_required:
             duty = "required" if self._audit_required else "optional"
-            refused += [f"access: audit becomes {duty}: this needs a new start of the appliance"]
+            refused += [f"access: audit becomes {duty}: restart the appliance"]
         return StationPlan(spec.name, answer.changes, notes, refused)
 
     def apply(self, spec: StationSpec, cause: str) -> ApplyAnswer:
@@ -424,7 +424,7 @@ def check_plant(path: Path) -> tuple[CheckReport, Plant | None]:
 def _small_dictionaries(station: StationSpec) -> Iterator[tuple[str, str]]:
     for port, reason in _misfits(station):
         yield (
-            f"port {port}: {reason}; it runs, but cannot be changed while it does",
+            f"port {port}: {reason}; the port runs, but cannot be changed at run time",
             "no more than an object dictionary holds",
         )
 

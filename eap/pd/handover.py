@@ -307,7 +307,7 @@ def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
     for name, port in after.items():
         if name in before:
             found += [f"port {name}: {what}" for what in _port_differences(before[name], port)]
-    return [f"{line}: this needs a new start of the appliance" for line in found]
+    return [f"{line}: restart the appliance" for line in found]
 
 
 def _port_differences(old: PortSpec, new: PortSpec) -> Iterator[str]:

@@ -134,7 +134,7 @@ def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
         if port.name in before
     ]
     return needs_new_start(old, new) + [
-        f"{what}: net_id {was} -> {becomes}: this needs a new start of the appliance"
+        f"{what}: net_id {was} -> {becomes}: restart the appliance"
         for what, was, becomes in net_ids
         if was != becomes
     ]

@@ -142,7 +142,7 @@ def assert_nothing_lost(before: dict[tuple[str, str], dict[str, Any]], line: Lin
 
 
 def test_one_variable_more_in_one_pd(line: Line) -> None:
-    assert line.command("plan") == "nothing differs: all 15 stations are as the file says\n"
+    assert line.command("plan") == "no differences: all 15 stations are as the file says\n"
     line.file.write_text(new_text())
     before = line.subscriptions()
     discarded = {each["name"]: each["discarded"] for each in line.appliance.status()["stations"]}
@@ -161,7 +161,7 @@ def test_one_variable_more_in_one_pd(line: Line) -> None:
     assert_nothing_lost(before, line)
     stations = line.appliance.status()["stations"]
     assert {each["name"]: each["discarded"] for each in stations} == discarded
-    assert line.command("plan") == "nothing differs: all 15 stations are as the file says\n"
+    assert line.command("plan") == "no differences: all 15 stations are as the file says\n"
 
     before = line.subscriptions()
     assert line.command("rollback").splitlines()[-1] == "2 stations changed, 13 as before"

@@ -78,5 +78,5 @@ def test_a_broker_needs_a_new_start(farm, file):
     broker = "    routes: [{mqtt: mqtt://127.0.0.1, network: n}]\n"
     file.write_text(PLANT + broker)
     said = change(appliance, "apply", str(file))
-    assert "MQTT network n: added: this needs a new start of the appliance" in said
-    assert "nothing was changed" in said
+    assert "MQTT network n: added: restart the appliance" in said
+    assert "no station changed" in said

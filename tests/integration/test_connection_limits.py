@@ -78,7 +78,7 @@ def test_services_with_few_descriptors_serve_on_among_silent_connections(
     row = listener(appliance, "ams-tcp" if port == 48898 else "tcp")
     assert row["evicted"] + row["refused"] > 150
     assert row["open"] < 45
-    assert "closed to make room" in appliance.command("status", "--full")
+    assert "closed in favour of others" in appliance.command("status", "--full")
 
 
 def test_soft_limit_of_descriptors_is_raised_to_the_hard_one(farm: Plants) -> None:

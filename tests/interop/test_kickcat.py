@@ -1,7 +1,7 @@
 """KickCAT as the master of our simulated slaves.
 
 It is asked for no object that needs segments: KickCAT 2.5 takes the bit that marks the last segment
-(ETG.1000.6) for one that says more will follow, and looks for the data four octets too far on.
+(ETG.1000.6) for one that shows details will follow, and looks for the data four octets too far on.
 Later ones read segments, but not the data that comes with the first response.  Nor is it asked for
 what there is not: 2.5 takes no abort for an answer.  SOEM does all of this (test_pysoem.py).
 """

@@ -174,7 +174,7 @@ class Wire:
 
 
 def entries(*variables: str) -> tuple[BusEntrySpec, ...]:
-    """Process data of a slave, written as ``name:bits``; without a name it is padding."""
+    """Process data of a slave, written as ``name:bits``; no name it is padding."""
     rows = (variable.rsplit(":", 1) for variable in variables)
     return tuple(BusEntrySpec(name, 0x6000, 1, int(bits)) for name, bits in rows)
 

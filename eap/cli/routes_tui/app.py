@@ -327,7 +327,7 @@ _FIELDS = {
     "net_id": ("NetID", "5.1.2.3.1.1; may be empty for a station of the plant"),
     "via": ("Via", "STATION/PORT, ams-tcp:HOST, udp:ADDRESS, mqtt:NETWORK"),
     "port": ("EAP port", "to leave by; may be empty"),
-    "octets": ("Octets", "of the NetID that have to match: 4, 5 or 6; 0 for a default route"),
+    "octets": ("Bytes", "of the NetID that must match: 4, 5 or 6; 0 for a default route"),
     "virtual": ("Virtual", "NetID that it has here (NAT); may be empty"),
     "timeout_ms": ("Time-out", "of an answer, in ms; may be empty"),
 }

@@ -58,10 +58,10 @@ def test_the_order_of_rules_matters():
 
 def test_brokers_need_a_new_start():
     assert routing_needs_new_start(OLD, replace(OLD, mqtt=())) == [
-        "MQTT network n: removed: this needs a new start of the appliance"
+        "MQTT network n: removed: restart the appliance"
     ]
     assert routing_needs_new_start(OLD, replace(OLD, learn=False)) == [
-        "routes by MQTT: learn is another one: this needs a new start of the appliance"
+        "routes by MQTT: learn is another one: restart the appliance"
     ]
     assert routing_needs_new_start(OLD, replace(OLD, learn=("mqtt:n",))) == []
     without = replace(OLD, mqtt=())

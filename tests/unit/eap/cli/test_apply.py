@@ -51,12 +51,12 @@ def test_apply_and_back(stub, file):
         ),
         "3 stations changed",
     ]
-    assert run("apply", file).output == "nothing was changed\n"
+    assert run("apply", file).output == "no station changed\n"
     result = run("rollback", file, "--station", "station-02")
     assert result.output.splitlines() == [
         "station-02 runs the new configuration: ok",
         f"  {CHANGE}  10000 -> 20000 us  ok",
-        "1 station changed, 2 as before",
+        "1 station changed, 2 unchanged",
     ]
     assert {spec.cycle_us for spec in stub.specs.values()} == {10_000, 20_000}
 
@@ -78,9 +78,9 @@ def test_refusal_in_the_middle(stub, file):
         "station-02 runs the new configuration: refused",
         f"  {CHANGE}  20000 -> 10000 us  not today",
         "  ! not today",
-        "1 station changed, 2 as before",
-        "station-02 refused: changed until then is station-01",
-        "'eapctl apply' goes on with it, 'eapctl rollback' brings back the state before",
+        "1 station changed, 2 unchanged",
+        "station-02 refused: changed so far: station-01",
+        "'eapctl apply' continues, 'eapctl rollback' restores the previous state",
     ]
     assert stub.specs["station-03"].cycle_us == 20_000
     result = run("apply", file, "--keep-going")
@@ -95,7 +95,7 @@ def test_what_cannot_be_leaves_all_as_it_is(stub, file):
     assert result.output.splitlines() == [
         "station-02 cannot change while it runs",
         "  ! port eap0 would be new",
-        "nothing was changed",
+        "no station changed",
     ]
     result = run("apply", file, "--keep-going", "--json")
     assert result.exit_code == 1
@@ -106,7 +106,7 @@ def test_what_cannot_be_leaves_all_as_it_is(stub, file):
 
 
 def test_nothing_to_roll_back(stub, file):
-    assert run("rollback", file).output == "nothing was changed\n"
+    assert run("rollback", file).output == "no station changed\n"
 
 
 def test_appliance_that_goes_away(stub, file):
@@ -119,9 +119,9 @@ def test_appliance_that_goes_away(stub, file):
     result = run("apply", file)
     assert (result.exit_code, result.stderr) == (1, "appliance ring does not answer\n")
     assert result.output.splitlines()[2:5] == [
-        "1 station changed, 2 as before",
-        "broken off: changed until then is station-01",
-        "'eapctl apply' goes on with it, 'eapctl rollback' brings back the state before",
+        "1 station changed, 2 unchanged",
+        "interrupted: changed so far: station-01",
+        "'eapctl apply' continues, 'eapctl rollback' restores the previous state",
     ]
     result = run("apply", file, "--json")
     assert result.exit_code == 1

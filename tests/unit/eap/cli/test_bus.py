@@ -55,7 +55,7 @@ def test_state(line, command):
 def test_state_that_there_is_not(line, command):
     code, _, err = command("state", "sensor", "RUN", *WHERE)
     assert code == 2
-    assert "'RUN' is not a state, expected one of INIT, PREOP" in err
+    assert "'RUN' is not a state; expected one of INIT, PREOP" in err
 
 
 def test_state_that_is_refused(line, command):
@@ -82,7 +82,7 @@ def test_eeprom_there_and_back(line, command, tmp_path):
     octets = file.stat().st_size
     assert document(command, "sii", "write", "sensor", str(file))["octets"] == octets
     code, out, _ = command("sii", "write", "sensor", str(file), *WHERE)
-    assert (code, out) == (0, f"slave 1003: {octets} octets written and compared\n")
+    assert (code, out) == (0, f"slave 1003: {octets} bytes written and verified\n")
 
 
 def test_vendor_message(monkeypatch, command):
@@ -162,9 +162,9 @@ def test_what_the_running_master_makes_of_it(bus_appliance, command, tmp_path):
         (("scan", "press/eap0"), 1, "port eap0 of station press is no bus; its bus ports are bus0"),
         (("scan", "press/bus2"), 1, "no port 'bus2'; its bus ports are bus0, bus1, did you mean"),
         (("scan", "saw/bus0"), 1, "station saw has no port 'bus0'; it has no bus ports"),
-        (("scan", "pres/bus0"), 1, "no station pres runs: running are works (press, saw), did you"),
+        (("scan", "pres/bus0"), 1, "no station pres runs; running: works (press, saw), did you"),
         (("scan", "press/bus0", "--plant", "work"), 1, "no station press runs"),
-        (("scan", "press/bus0/x"), 2, "'press/bus0/x' is no STATION/PORT"),
+        (("scan", "press/bus0/x"), 2, "'press/bus0/x' is not STATION/PORT"),
         (("state", "press/bus0", "nobody"), 1, "unknown slave 'nobody'"),
         (("voe", "press/bus0", "1001", "00", "--vendor", "1"), 1, "mailbox error"),
         (("sdo", "read", "press/bus0", "sensor", "0x8000:9"), 1, "subindex does not exist"),

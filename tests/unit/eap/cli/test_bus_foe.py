@@ -27,7 +27,7 @@ def command(monkeypatch, tmp_path):
 
 def test_there_and_back(command, tmp_path):
     result = command("put", "drive", "new.bin", "firmware.bin")
-    assert result.output.startswith("new.bin → firmware.bin: 25600 octets in ")
+    assert result.output.startswith("new.bin → firmware.bin: 25600 bytes in ")
     assert result.output.endswith(f"sha256 {sha256(CONTENT).hexdigest()}\n")
     row = json.loads(command("get", "drive", "firmware.bin", "--json").output)
     assert (row["file"], row["octets"]) == ("firmware.bin", 25600)
@@ -60,6 +60,6 @@ def test_stdin_and_stdout(monkeypatch, tmp_path):
 
 def test_stdin_has_no_name_and_stdout_takes_one_thing(command):
     nameless = command("put", "drive", "-")
-    assert (nameless.exit_code, "needs a NAME" in nameless.stderr) == (2, True)
+    assert (nameless.exit_code, "has no name: give NAME" in nameless.stderr) == (2, True)
     both = command("get", "drive", "firmware.bin", "-", "--json")
-    assert (both.exit_code, "cannot both go to stdout" in both.stderr) == (2, True)
+    assert (both.exit_code, "and --json go to stdout" in both.stderr) == (2, True)

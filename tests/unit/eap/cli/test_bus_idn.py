@@ -25,7 +25,7 @@ def test_read(command):
     out = command("read", "drive", "S-0-0032").output
     assert out == (
         "S-0-0032 = 2\n  name       Primary operation mode\n  default    2\n"
-        "  attribute  unsigned, 4 octets\n"
+        "  attribute  unsigned, 4 bytes\n"
     )
     assert json.loads(command("read", "1001", "32", "--json").output)["value"] == 2
 

@@ -66,10 +66,13 @@ def test_both_forms(words, shown):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ((), "say which bus: show STATION/PORT SLAVE [OPTIONS] or show --interface URI SLAVE"),
-        (("1001",), "'1001' is no STATION/PORT"),
+        (
+            (),
+            "no bus given: expected show STATION/PORT SLAVE [OPTIONS] or show --interface URI",
+        ),
+        (("1001",), "'1001' is not STATION/PORT"),
         (("press/bus0",), "Missing argument 'SLAVE'"),
-        (("press/bus0", "1001", "--interface", UDP), "are two buses: leave one out"),
+        (("press/bus0", "1001", "--interface", UDP), "are two buses: omit one"),
         (("--type", "x", "press/bus0", "--interface", UDP, "1001"), "are two buses"),
         (("1001", "--interface", UDP, "--plant", "x"), "--plant goes with STATION/PORT"),
         (("1001", "--interface", "eth0"), "is not an interface"),

@@ -31,7 +31,7 @@ def test_write(command):
     row = json.loads(command("write", "sensor", "0x8000:1", "6", "--json").output)
     assert row["data"] == "06000000"
     assert command("read", "sensor", "0x8000", "--complete").output == (
-        "0x8000:00 = [02 00 06 00 00 00 fb ff] (8 octets)\n"
+        "0x8000:00 = [02 00 06 00 00 00 fb ff] (8 bytes)\n"
     )
 
 

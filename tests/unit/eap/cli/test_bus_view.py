@@ -104,11 +104,11 @@ def test_diagnosis_shows_ports_frames_and_findings():
     found = diagnosis([bad, gone], PRESENT, OVER)
     lines = [line.rstrip() for line in shown(*diagnosis_view(found, NOW_S)).splitlines()]
     assert lines[-3:] == [
-        "round trip 480 µs, time-out 2.0 ms",
+        "round trip 480 µs, timeout 2.0 ms",
         "since 30.0 s ago: c (1003) does not answer; check",
         "was, until 12.0 s ago: b (1002) did not answer; --reset clears this",
     ]
-    assert lines[-4] == "1 frame sent, 3 late, 0 lost, 2 sent again"
+    assert lines[-4] == "1 frame sent, 3 late, 0 lost, 2 repeated"
     assert any("no answer" in line for line in lines)
 
 
@@ -117,7 +117,7 @@ def test_diagnosis_of_many_slaves_shows_those_with_errors_unless_all_are_wanted(
     rows[49] = diagnosed(1050, ports=[port(0, lost_links=1)])
     found = diagnosis(rows, PRESENT)
     short = shown(*diagnosis_view(found, NOW_S))
-    assert "not shown: 98 slaves without errors of their own (--full)" in short
+    assert "not shown: 98 slaves without errors (--full shows them)" in short
     assert "s1002" in short
     assert "s1050" in short
     assert "s1100" in shown(*diagnosis_view(found, NOW_S, is_full=True))
@@ -125,7 +125,7 @@ def test_diagnosis_of_many_slaves_shows_those_with_errors_unless_all_are_wanted(
 
 def test_diagnosis_of_counters_of_an_unknown_time_says_so():
     assert finding_line(msgspec.convert(OVER | {"until": None}, FindingRow), NOW_S) == (
-        "was, before the master looked: b (1002) did not answer; --reset clears this"
+        "was, before the master started: b (1002) did not answer; --reset clears this"
     )
 
 
@@ -134,8 +134,8 @@ def test_eeprom():
                "intact": False, "octets": 17, "categories": []}  # fmt: skip
     found = record(EepromContent, **content, data=bytes(17).hex())
     lines = list(eeprom_lines(found, has_octets=True))
-    assert lines[0] == "slave 1001: without a name"
-    assert lines[-4:-2] == ["  check sum WRONG; 17 bytes", "  categories (bytes) none"]
+    assert lines[0] == "slave 1001: no name"
+    assert lines[-4:-2] == ["  checksum WRONG; 17 bytes", "  categories (bytes) none"]
     assert lines[-1] == "0010  00"
 
 
@@ -147,7 +147,7 @@ def test_eeprom():
         ({"type": "REAL", "value": 0.5, "data": "0000003f"}, "REAL 0.5"),
         ({"type": "STRING(2)", "value": "ab", "data": "6162"}, "STRING(2) ab"),
         ({"type": None, "value": 1, "data": "01"}, "1 (0x01)"),
-        ({"type": None, "value": None, "data": "010203"}, "[01 02 03] (3 octets)"),
+        ({"type": None, "value": None, "data": "010203"}, "[01 02 03] (3 bytes)"),
         ({"type": "BLOCK(1)", "value": "07", "data": "07"}, "BLOCK(1) [07]"),
     ],
 )
@@ -172,7 +172,7 @@ def test_objects_and_entries():
         )
     )
     assert "Whole: Part" in text
-    assert "(40 octets)" in text
+    assert "(40 bytes)" in text
     assert "broken" in text
 
 
@@ -186,11 +186,11 @@ def test_idns():
         "S-0-0024 = 1, 2 mm",
         "  name       Targets",
         "  maximum    5",
-        "  attribute  signed, 2 octets each, a list, 1 decimal, factor 10, read only in SAFEOP, OP",
+        "  attribute  signed, 2 bytes each, a list, 1 decimal, factor 10, read only in SAFEOP, OP",
     ]
     command = row | {"is_list": False, "is_command": True, "data_state": 7, "protected_in": []}
     assert list(idn_lines(IdnElements(**command)))[-2:] == [
-        "  attribute  signed, 2 octets, 1 decimal, factor 10, a procedure command",
+        "  attribute  signed, 2 bytes, 1 decimal, factor 10, a procedure command",
         "  data state 0x0007 (executing)",
     ]
     assert "Targets" in shown(*idn_table([NamedIdn("S-0-0024", 24, "Targets")]))

@@ -59,7 +59,7 @@ def test_all_findings_at_once(plant: Path) -> None:
     assert first.startswith(f"{plant}:7: ")
     assert second.startswith(f"{plant}:11: ")
     assert "; expected " in first
-    assert total == f"{plant}: 2 findings, not a plant yet"
+    assert total == f"{plant}: 2 errors: the plant cannot run; correct the file"
 
 
 def test_findings_for_programs(plant: Path) -> None:

@@ -117,7 +117,7 @@ def test_frame_with_an_error_is_shown_and_fails() -> None:
         (["zz" * 400], "is neither a file nor hexadecimal digits"),
         (["/"], "Is a directory: '/'"),
         (["123"], "neither a file nor hexadecimal"),
-        ([""], "there are no octets to decode"),
+        ([""], "no bytes to decode: give HEX or FILE"),
         ([], "Missing argument 'HEX|FILE'"),
     ],
 )

@@ -32,7 +32,7 @@ def test_process_data_with_its_origin() -> None:
     )
     assert text.splitlines() == [
         (
-            "#3 22:13:20.250000  ethernet VLAN 5 A → B  type 4 (process data), 21 octets  "
+            "#3 22:13:20.250000  ethernet VLAN 5 A → B  type 4 (process data), 21 bytes  "
             "publisher 192.168.0.1.1.1, cycle 1"
         ),
         "└── PD 1001 (0x03e9)  version 7  quality 2.5 ms  [01]",
@@ -63,13 +63,13 @@ def test_error_reply_says_why() -> None:
 
 def test_undocumented_type_and_long_data() -> None:
     text = render(b"\x28\x70" + bytes(40))
-    assert "type 7 (undocumented), 40 octets" in text
-    assert "00 … (40 octets)]" in text
+    assert "type 7 (undocumented), 40 bytes" in text
+    assert "00 … (40 bytes)]" in text
 
 
 def test_error_is_a_line_of_its_own() -> None:
     assert "└── error: EtherCatHeader at offset 0" in render(b"\x15\x40")
-    assert render(b"\x15").startswith("no frame")
+    assert render(b"\x15").startswith("not an EtherCAT frame")
 
 
 @pytest.mark.parametrize("vector", load_all("ethernet", "frame"), ids=lambda v: v.name)

@@ -71,5 +71,5 @@ def test_status_without_a_station_says_that_there_is_no_gateway(runtime):
 def test_what_is_no_target(asked, target):
     found = gateway("stop", target)
     assert found.exit_code == 2
-    assert "is no STATION and no STATION/PORT" in found.output
+    assert "is neither STATION nor STATION/PORT" in found.output
     assert not asked

@@ -62,12 +62,12 @@ def test_of_many_clients_the_latest_are_shown_and_those_with_transfers():
     text = shown(ROW | {"clients": [busy, *idle]})
     ports = [line.split()[0][-4:] for line in text.splitlines() if "10.0.0.9:" in line]
     assert ports == [*(str(port) for port in range(6019, 6009, -1)), "5000"]
-    assert "10 earlier clients not shown; --json shows all" in text
+    assert "10 earlier clients not shown (--json shows them)" in text
 
 
 def test_one_that_is_stopped_and_silent():
     quiet = ROW | {"state": "stopped", "turned_away": 3, "served": [], "clients": [], "slaves": []}
     quiet["settings"] = ROW["settings"] | {"silent": True}
     assert shown(quiet) == (
-        "mixer/bus0: stopped at nowhere; answers within 900 ms, silent, 3 frames dropped\n"
+        "mixer/bus0: stopped at no socket; answers within 900 ms, silent, 3 frames dropped\n"
     )

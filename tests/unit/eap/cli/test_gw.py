@@ -48,10 +48,10 @@ def test_tcp_may_stand_behind_the_host(gateway, words, monkeypatch) -> None:
 @pytest.mark.parametrize("option", [("--mailbox", "140"), ("--mailbox=140",)])
 def test_the_mailbox_of_a_slave_may_be_told_behind_the_host(gateway, option, tmp_path) -> None:
     refused = run(gateway, "foe", "get", "7", "f", str(tmp_path / "f"))
-    assert (refused.exit_code, "say it (--mailbox OCTETS)" in refused.output) == (1, True)
+    assert (refused.exit_code, "use --mailbox BYTES" in refused.output) == (1, True)
     asked = run(gateway, "foe", "get", "7", "f", str(tmp_path / "f"), *option)
     assert "UNSUPPORTED_PROTOCOL" in asked.output
-    assert "the master knows no slave 7; it knows 1001 (drive)" in asked.output
+    assert "unknown slave 7; slaves known to the master: 1001 (drive)" in asked.output
     assert run(gateway, "scan", "--mailbox").exit_code == 2
     assert run(gateway, "voe", "drive", "--vendor", "1", "--", "--tcp").exit_code == 2
 

@@ -52,7 +52,7 @@ def test_a_file_that_is_there_stays(run, tmp_path):
     result = run("hall.yaml")
     assert (result.exit_code, result.stderr) == (
         1,
-        "hall.yaml exists: write over it with --force\n",
+        "hall.yaml exists: overwrite it with --force\n",
     )
     assert (tmp_path / "hall.yaml").read_text() == "mine"
     assert run("hall.yaml", "--force").exit_code == 0

@@ -151,13 +151,16 @@ def test_write_of_octets(command, device):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (("write", "mixer"), "say what to write"),
-        (("write", "mixer", "0xD000:7"), "say the value once"),
-        (("write", "mixer", "0xD000:7", "1", "--hex", "01"), "say the value once"),
-        (("write", "mixer", "0xD000:1", "1", "--complete"), "--complete writes octets"),
+        (("write", "mixer"), "nothing to write"),
+        (("write", "mixer", "0xD000:7"), "expected one value: VALUE or --hex DIGITS"),
+        (
+            ("write", "mixer", "0xD000:7", "1", "--hex", "01"),
+            "expected one value: VALUE or --hex DIGITS",
+        ),
+        (("write", "mixer", "0xD000:1", "1", "--complete"), "--complete writes raw bytes"),
         (("write", "mixer", "0xD000:x", "1"), "such as 0x1018:01"),
-        (("write", "mixer", "1", "--from", "x"), "leave the rest out"),
-        (("read", "mixer//eap0", "1"), "is no STATION, STATION/PORT or STATION/PORT/SLAVE"),
+        (("write", "mixer", "1", "--from", "x"), "omit all other arguments"),
+        (("read", "mixer//eap0", "1"), "is not STATION, STATION/PORT, STATION/PORT/SLAVE"),
         (("write", "mixer", "0xD000:7", "fast"), "0xD000:07: 'fast' is not a value of UDINT"),
     ],
 )

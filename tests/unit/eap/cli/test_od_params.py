@@ -23,4 +23,4 @@ def test_target_comes_first():
 def test_what_is_no_target():
     result = CliRunner().invoke(show, ["a/", "x"])
     assert result.exit_code == 2
-    assert "'a/' is no STATION" in result.output
+    assert "'a/' is not STATION" in result.output

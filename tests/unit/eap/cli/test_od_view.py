@@ -37,4 +37,4 @@ def test_values_read_as_they_were(given, line):
 
 def test_whole_object_that_nobody_knows():
     given = record(OdWholeObject, index=0x8000, name="Settings", data="0102")
-    assert list(object_lines(given)) == ["# 0x8000 Settings", "hex 01 02  # 2 octets"]
+    assert list(object_lines(given)) == ["# 0x8000 Settings", "hex 01 02  # 2 bytes"]

@@ -69,7 +69,8 @@ def test_list_merges_all_appliances(other_appliance: Appliance) -> None:
 def test_list_for_people(appliance: Appliance) -> None:
     result = invoke("list")
     rows = [" ".join(line.split()) for line in result.stdout.splitlines()]
-    assert "mixer → state 101 3 eap0 239.1.2.3 ticks UDINT engine" in rows
+    assert rows[2] == "mixer"
+    assert "→ state 101 3 eap0 239.1.2.3 ticks UDINT engine" in rows
     assert "← other 103 0 eap0 any publisher silent INT engine" in rows
     assert "setpoint INT 1/min application" in rows
 

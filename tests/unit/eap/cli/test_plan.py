@@ -32,9 +32,9 @@ def plan(*words):
 
 
 def test_nothing_differs(stub, file):
-    assert plan(file).output == "nothing differs: all 3 stations are as the file says\n"
+    assert plan(file).output == "no differences: all 3 stations are as the file says\n"
     assert plan(file, "--station", "station-02").output == (
-        "nothing differs: station-02 is as the file says\n"
+        "no differences: station-02 is as the file says\n"
     )
     assert json.loads(plan(file, "--json").output)["ok"] is True
 
@@ -46,7 +46,7 @@ def test_differences(stub, file):
     assert plan(file).output.splitlines()[:3] == [
         "station-02",
         "  ~ 0xF800:08 Configured objects: Device cycle time  10000 -> 5000 us",
-        "1 station of 3 to change (1 changed), 2 as the file says",
+        "1 station of 3 to change (1 changed), 2 unchanged",
     ]
     document = json.loads(plan(file, "--json").output)
     assert document["ok"] is True
@@ -77,7 +77,7 @@ def test_stations_elsewhere(file, runtime):
     with ExitStack() as stack:
         PlantStub("ring", specs[1:], stack)
         assert plan(file).output.splitlines() == [
-            "nothing differs: all 2 stations are as the file says",
+            "no differences: all 2 stations are as the file says",
             "not running here: station-01; start them with:",
             f"  eapctl run {file} --station station-01",
         ]

@@ -52,8 +52,8 @@ def test_all_kinds_of_differences():
         "  * link a to b: added",
         "saw",
         "  ~ 0x6003:00 Tx variable 3 (speed)  1 -> 2",
-        "2 stations of 3 to change (1 added, 1 removed, 1 changed), 1 as the file says",
-        "'eapctl apply' goes these steps:",
+        "2 stations of 3 to change (1 added, 1 removed, 1 changed), 1 unchanged",
+        "'eapctl apply' takes these steps:",
         "  1. saw takes both",
         "  2. mixer switches",
     ]

@@ -35,7 +35,7 @@ def test_list(command, stub):
     row = next(line.split() for line in output.splitlines() if "island-02 " in line)
     assert row == ["island-01", "island-02", "127.0.1.2.*.*", "udp:eap0", "127.0.1.2:34980", "up",
                    "840", "µs", "12", "0"]  # fmt: skip
-    assert "Worth a look" in output
+    assert "Warnings" in output
     assert "press (192.168.1.5:48898 by ams-tcp) is down: connection refused" in output
     assert "127.0.0.1:40112#3" in output
     assert output == command().output  # no terminal here

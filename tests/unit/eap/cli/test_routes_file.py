@@ -52,8 +52,8 @@ def test_import_of_what_is_no_text(stub):
 def test_export(stub, tmp_path):
     result = routes("export", "island-01")
     assert result.stdout == "<TcConfig>island-01</TcConfig>\n"
-    assert result.stderr == "island-01: no AMS/TCP routes, so left out: island-02\n"
+    assert result.stderr == "island-01: routes without AMS/TCP are not exported: island-02\n"
     file = tmp_path / "out.xml"
     result = routes("export", "island-01", str(file))
-    assert result.stdout == f"{file}: the AMS/TCP routes of island-01\n"
+    assert result.stdout == f"{file}: AMS/TCP routes of island-01 written\n"
     assert file.read_text() == "<TcConfig>island-01</TcConfig>\n"

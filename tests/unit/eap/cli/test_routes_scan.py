@@ -36,7 +36,7 @@ def test_who_answers_is_a_row(stub):
     result = run()
     assert result.exit_code == 0
     assert "5.1.2.3.1.1" in result.output
-    assert "cx (learned)" in result.output
+    assert "cx (auto-discovered)" in result.output
     assert stub.requests == [("routes_scan", {"station": "", "address": "", "wait_ms": 1000})]
 
 

@@ -47,7 +47,7 @@ def test_kinds_and_states() -> None:
     )
     assert routes_view.route_state(PRESS) == "down: connection refused"
     new = msgspec.structs.replace(ISLAND, state="unknown", rtt_us=None)
-    assert routes_view.route_state(new) == "unknown: no request was answered yet"
+    assert routes_view.route_state(new) == "unknown: no request answered yet"
     silent = msgspec.structs.replace(ISLAND, rtt_us=None)
     assert routes_view.route_state(silent) == "up"
 

@@ -37,7 +37,7 @@ def test_tables_of_routes_and_connections() -> None:
     assert ["press", "5.1.2.3.1.1", "ams-tcp", "192.168.1.5:48898", "down", "3", "3"] in rows
     assert ["island-01", "127.0.0.1:40112#3", "ams-tcp", "127.0.0.1.1.1", "75", "s", "15",
             "47.3k", "3"] in rows  # fmt: skip
-    remarks = text.partition("Worth a look\n")[2].splitlines()
+    remarks = text.partition("Warnings\n")[2].splitlines()
     assert [each.strip().partition(":")[2][:22] for each in remarks] == [
         " route press (5.1.2.3.", " press (192.168.1.5:48", " press, last error: pr",
         " 127.0.0.1:40112#3 by ",
@@ -46,7 +46,7 @@ def test_tables_of_routes_and_connections() -> None:
 
 def test_stations_that_are_well_have_no_remarks() -> None:
     quiet = FakeRoutes().stations["island-02"]
-    assert "Worth a look" not in shown(*view_of(RouterList([quiet])))
+    assert "Warnings" not in shown(*view_of(RouterList([quiet])))
     assert "Connection" not in shown(*view_of(RouterList([quiet])))
 
 
@@ -94,7 +94,7 @@ def test_routers_of_other_hosts() -> None:
     )  # fmt: skip
     lone = msgspec.structs.replace(cx, name="pc", version="", route="", is_learned=False)
     rows = [line.split() for line in shown(*neighbour_table([cx, lone])).splitlines()]
-    assert ["left", "cx", "5.1.2.3.1.1", "10.0.0.5", "3.1.4024", "cx", "(learned)"] in rows
+    assert ["left", "cx", "5.1.2.3.1.1", "10.0.0.5", "3.1.4024", "cx", "(auto-discovered)"] in rows
     assert ["left", "pc", "5.1.2.3.1.1", "10.0.0.5", "none"] in rows
 
 
@@ -107,7 +107,8 @@ def test_routes_by_a_hop_that_is_down_are_one_remark() -> None:
         shown(*view_of(RouterList([msgspec.structs.replace(station, routes=rows)]))).split()
     )
     assert (
-        "press (192.168.1.5:48898 by ams-tcp) is down: connection refused; so are the routes by it:"
+        "press (192.168.1.5:48898 by ams-tcp) is down: connection refused;"
+        " so are the routes through it:"
         " saw" in text
     )
     assert "saw (192" not in text

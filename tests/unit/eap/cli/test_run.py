@@ -64,12 +64,12 @@ BLANK = ["--blank", "mixer", "--interface", "udp://127.9.7.1", "--net-id", "127.
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ([], "say what to run: PLANT, or --blank NAME"),
-        (["plant.yaml", *BLANK], "takes the place of PLANT"),
-        ([*BLANK, "--station", "mixer"], "takes the place of PLANT and --station"),
+        ([], "nothing to run: give PLANT, or --blank NAME"),
+        (["plant.yaml", *BLANK], "excludes PLANT"),
+        ([*BLANK, "--station", "mixer"], "excludes PLANT and --station"),
         (BLANK[:4], "needs --interface URI and --net-id N"),
-        (["plant.yaml", "--cycle", "5"], "go with --blank NAME"),
-        (["plant.yaml", "--resume"], "go with --blank NAME"),
+        (["plant.yaml", "--cycle", "5"], "need --blank NAME"),
+        (["plant.yaml", "--resume"], "need --blank NAME"),
         ([*BLANK, "--cycle", "0"], "0.1 to 60000 milliseconds"),
     ],
 )

@@ -49,7 +49,7 @@ def test_scan_leaves_out_lines_to_paste_that_would_wrap() -> None:
     shown = lines(answer(STATION), 80)
     assert max(map(len, shown)) <= 80
     assert len(shown) == 7
-    assert shown[-1] == "not shown for lack of width: To paste"
+    assert shown[-1] == "not shown for lack of width: pyads"
     assert "127.0.1.1.3.1:1002" in shown[5]
 
 
@@ -64,4 +64,4 @@ def test_scan_names_what_did_not_answer() -> None:
 
 def test_scan_without_ams_tcp_has_nothing_to_paste() -> None:
     assert client_line("127.0.1.1.3.1", 1001, "") == ""
-    assert "pyads" not in "".join(lines(answer(STATION, address="")))
+    assert "pyads.Connection" not in "".join(lines(answer(STATION, address="")))

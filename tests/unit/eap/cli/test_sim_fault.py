@@ -63,7 +63,7 @@ def test_fault_begins_and_ends(bus_appliance, command):
     segment = bus_appliance.lines[0].segment
     assert command("fault", "press/bus0", "loss", "every=3") == (
         0,
-        "press/bus0: fault loss begins\n",
+        "press/bus0: fault loss started\n",
         "",
     )
     assert segment._on_frames
@@ -80,7 +80,7 @@ def test_value_is_kept_and_released(bus_appliance, command):
     entry = {"slave": "sensor", "entry": "0x6000:1"}
     assert json.loads(out) == {"set": entry | {"value": -5}}
     out = command("set", "press/bus0", "sensor", "0x6000:1", "--release")[1]
-    assert out == "press/bus0: sensor 0x6000:1 changes again\n"
+    assert out == "press/bus0: sensor 0x6000:1 released\n"
 
 
 @pytest.mark.net
@@ -90,11 +90,11 @@ def test_value_is_kept_and_released(bus_appliance, command):
         (("fault", "press/bus0", "powr"), 1, "no fault 'powr', did you mean power? (one of loss"),
         (("fault", "press/bus0", "power", "slave=x"), 1, "no slave 'x' (one of coupler"),
         (("fault", "press/eap0", "loss"), 1, "port eap0 of station press is no bus"),
-        (("fault", "press", "loss"), 2, "'press' is no STATION/PORT, such as press/bus0"),
+        (("fault", "press", "loss"), 2, "'press' is not STATION/PORT, such as press/bus0"),
         (("fault", "press/bus0"), 2, "Missing argument"),
         (("set", "press/bus0", "buttons", "x", "1"), 1, "buttons has no entry 'x'"),
-        (("set", "press/bus0", "buttons", "start"), 2, "expected either VALUE or --release"),
-        (("set", "press/bus0", "buttons", "start", "1", "--release"), 2, "expected either"),
+        (("set", "press/bus0", "buttons", "start"), 2, "expected one of VALUE and --release"),
+        (("set", "press/bus0", "buttons", "start", "1", "--release"), 2, "expected one of"),
     ],
 )
 def test_refusals(bus_appliance, command, words, code, reason):

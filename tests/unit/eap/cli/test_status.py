@@ -68,7 +68,7 @@ def test_status_for_people(appliance: Appliance) -> None:
 def test_unknown_plant_names_those_that_run(appliance: Appliance) -> None:
     result = CliRunner().invoke(main, ["status", "--plant", "lime"])
     assert result.exit_code == 1
-    assert result.stderr == "no plant lime runs: running are line (mixer, filler)\n"
+    assert result.stderr == "no plant lime runs; running: line (mixer, filler)\n"
 
 
 def interrupted_after(
@@ -112,7 +112,7 @@ def test_watch_goes_on_while_no_appliance_runs(
         result = CliRunner().invoke(main, ["status", "--watch"])
     assert result.exit_code == 0
     assert "no appliance runs: start one with 'eapctl run PLANT'" in result.stdout
-    assert result.stdout.index("waiting for it") < result.stdout.index("line: ")
+    assert result.stdout.index("waiting for an appliance") < result.stdout.index("line: ")
 
 
 def test_watch_for_programs_prints_an_object_a_line(
@@ -127,5 +127,5 @@ def test_findings_are_in_the_document(appliance: Appliance) -> None:
     status = json.loads(CliRunner().invoke(main, ["status", "--json"]).stdout)
     assert {
         "severity": "error", "where": "line services", "what": "not running",
-        "advice": "it is being started again", "since": None, "plant": "line",
+        "advice": "it is being restarted", "since": None, "plant": "line",
     } in status["findings"]  # fmt: skip

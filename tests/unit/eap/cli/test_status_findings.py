@@ -41,8 +41,8 @@ def test_findings_are_sorted_errors_first_and_name_the_plant() -> None:
 def test_station_in_a_requested_state_is_a_warning(state: str, effect: str) -> None:
     assert texts(state=state, rx=[rx("left", state="stale")]) == [
         (
-            f"warning mixer: in {state}, as requested: it {effect} no process data;"
-            " 'eapctl state mixer OP' ends that"
+            f"warning mixer: in {state}, as requested: the station {effect} no process data;"
+            " 'eapctl state mixer OP' returns it to OP"
         )
     ]
 
@@ -52,8 +52,8 @@ def test_process_that_does_not_run_is_an_error() -> None:
     status["processes"]["services"]["pid"] = None
     status["processes"]["segments"] = {"mixer/bus0": {"pid": None}}
     assert found(status) == [
-        ("error", "line services: not running; it is being started again"),
-        ("error", "line segment mixer/bus0: not running; it is being started again"),
+        ("error", "line services: not running; it is being restarted"),
+        ("error", "line segment mixer/bus0: not running; it is being restarted"),
     ]
 
 
@@ -105,7 +105,7 @@ def test_engine_without_realtime_is_one_warning() -> None:
             "warning",
             (
                 "line engine: no realtime: scheduler (needs CAP_SYS_NICE), memory locked (needs"
-                " CAP_IPC_LOCK); cycles may be late: run as root, or with --no-realtime"
+                " CAP_IPC_LOCK); cycles may be late: run as root, or use --no-realtime"
             ),
         )
     ]
@@ -135,7 +135,8 @@ def test_audit_that_cannot_be_written_is_an_error(required: bool, effect: str) -
     }  # fmt: skip
     text = (
         "line audit: cannot be written: No space left on device, since"
-        f" {clock(NOW_S - 5)} (5.0 s); {effect}; 7 lines lost; make room for /state/audit.jsonl, or"
+        f" {clock(NOW_S - 5)} (5.0 s); {effect}; 7 lines lost; free space for"
+        " /state/audit.jsonl, or"
         " make its folder writable"
     )
     assert found(status) == [("error", text)]
@@ -168,8 +169,7 @@ def test_findings_of_the_services_are_taken_over() -> None:
 def test_station_without_cycles_is_an_error_since_its_last_one(cycle_us: int, hangs: bool) -> None:
     since = f"{clock(NOW_S - 3.1)} (3.1 s)"
     expected = (
-        f"error line engine: runs no cycles of mixer, since {since};"
-        " the log of 'eapctl run' says why"
+        f"error line engine: runs no cycles of mixer, since {since}; see the log of 'eapctl run'"
     )
     assert texts(cycle_us=cycle_us, cycle_age_us=3_100_000) == [expected] * hangs
 
@@ -178,8 +178,8 @@ def test_stale_pd_is_an_error_since_the_last_good_one() -> None:
     last = NOW_S - 90
     assert texts(rx=[rx("left", state="stale", last_good=last), rx("right")]) == [
         (
-            f"error mixer ← left: stale: nothing received within the time-out, since {clock(last)}"
-            " (90.0 s); check its sender and the way to it"
+            f"error mixer ← left: stale: nothing received within the timeout, since {clock(last)}"
+            " (90.0 s); check its sender and the network path"
         )
     ]
 
@@ -210,7 +210,7 @@ def test_cyclic_pd_that_never_came_is_a_warning_and_any_other_a_remark() -> None
 def test_pd_of_another_layout_is_an_error(var_state: int, wrong: str) -> None:
     assert texts(rx=[rx("left", var_state=var_state)]) == [
         (
-            f"error mixer ← left: dropped: another {wrong} than expected;"
+            f"error mixer ← left: dropped: unexpected {wrong};"
             " compare the plant files of both stations"
         )
     ]
@@ -219,7 +219,9 @@ def test_pd_of_another_layout_is_an_error(var_state: int, wrong: str) -> None:
 def test_frame_states_of_sent_pds_are_errors() -> None:
     rows = [tx("a", frame_state=3), tx("b", frame_state=4), tx("c", frame_state=1, skipped=2)]
     first, second, third = texts(tx=rows)
-    assert first.startswith("error mixer → a: not sent: its frame is larger than its network")
+    assert first.startswith(
+        "error mixer → a: not sent: its frame exceeds the maximum size of its network"
+    )
     assert second.startswith("error mixer → b: its subscriber does not answer")
     assert third == "info mixer → c: skipped 2 times"
 
@@ -227,7 +229,7 @@ def test_frame_states_of_sent_pds_are_errors() -> None:
 def test_frame_that_waits_for_an_address_is_a_warning() -> None:
     rows = [frame("new", destination="5.3.3.3.2.1", address=None), frame("known")]
     assert texts(frames=rows) == [
-        "warning mixer → new: waits for a frame of 5.3.3.3.2.1, to learn its MAC address"
+        "warning mixer → new: MAC address of 5.3.3.3.2.1 unknown: waiting for a frame from it"
     ]
 
 
@@ -255,9 +257,9 @@ def test_buses_and_their_slaves() -> None:
     down = bus_port("bus1", is_up=False, fault="no frame comes back\nso far", findings=[], lost=0)
     starting = bus_port("bus2", is_up=False, findings=[], lost=0)
     assert texts(ports=[bus_port(wkc_errors=4), down, starting]) == [
-        "error mixer/bus0: press (1002) is lost; 'eapctl bus diag mixer/bus0' says more",
-        "error mixer/bus1: no frame comes back; so far; 'eapctl bus diag mixer/bus1' says more",
-        "warning mixer/bus2: not up yet",
+        "error mixer/bus0: press (1002) is lost; 'eapctl bus diag mixer/bus0' shows details",
+        "error mixer/bus1: no frame comes back; so far; 'eapctl bus diag mixer/bus1' shows details",
+        "warning mixer/bus2: starting up",
         "info mixer/bus0: 4 cycles with a wrong working counter",
         "info mixer/bus0: 3 exchanges lost: no frame came back",
     ]
@@ -266,7 +268,7 @@ def test_buses_and_their_slaves() -> None:
 def test_findings_tell_late_exchanges_from_lost_ones() -> None:
     (*_, late, skipped) = texts(ports=[bus_port(lost=0, findings=[], late=2, skipped=1)])
     assert late == "info mixer/bus0: 2 exchanges late: the bus or this host was busy"
-    assert skipped == "info mixer/bus0: 1 exchange left out: others were under way"
+    assert skipped == "info mixer/bus0: 1 exchange skipped: others were pending"
 
 
 def test_bus_that_is_down_is_one_finding() -> None:
@@ -277,7 +279,7 @@ def test_bus_that_is_down_is_one_finding() -> None:
     ) == [
         (
             "error mixer/bus0: the bus is not as configured: a is missing;"
-            " 'eapctl bus diag mixer/bus0' says more"
+            " 'eapctl bus diag mixer/bus0' shows details"
         )
     ]
 
@@ -290,9 +292,9 @@ def test_what_happened_since_the_start_are_remarks() -> None:
     assert texts(
         tx=[alarm], rx=[left], discarded={"unknown_id": 8}, overruns=1, torn=2, links_held=3
     ) == [
-        "warning mixer: held 3 linked values back: not a number",
-        "info mixer: left out 1 cycle",
-        "info mixer: found 2 torn writes",
+        "warning mixer: 3 linked values held back: not a number",
+        "info mixer: 1 cycle skipped: overrun",
+        "info mixer: 2 torn writes read",
         "info mixer: dropped: 8 unknown id",
         "info mixer → alarm: sent on change once, resend 8 times",
         (
@@ -311,10 +313,10 @@ LISTENER = {
 def test_listener_that_is_crowded_now_is_a_warning_and_a_remark_later() -> None:
     status = document()
     status["appliances"][0]["listeners"] = [LISTENER]
-    counts = "5 refused, 12 closed to make room, 3 closed as too slow"
+    counts = "5 refused, 12 closed in favour of others, 3 closed as too slow"
     where = "line ams-tcp 10.0.0.1:48898"
     advice = "'ss -tn sport = :48898' shows the hosts"
-    text = f"{where}: crowded: 128 of 128 places taken; connections: {counts}; {advice}"
+    text = f"{where}: 128 of 128 connections in use; connections: {counts}; {advice}"
     assert found(status) == [("warning", text)]
     status["appliances"][0]["listeners"] = [LISTENER | {"crowded_ago_us": 61_000_000}]
     assert found(status) == [("info", f"{where}: connections: {counts}")]

@@ -77,7 +77,7 @@ def test_screen_shows_errors_first_with_their_counts() -> None:
     lines = show(status)
     assert lines[0] == "line: 2 errors, 1 warning (1 station, 1 PD)"
     assert lines[1].startswith("error    mixer/bus0: press (1002) is lost")
-    assert lines[2] == " " * 9 + "more"
+    assert lines[2] == " " * 9 + "details"
     assert lines[3].startswith("error    mixer ← left: stale: nothing received within")
     row = next(line for line in lines if line.startswith("mixer"))
     assert row.split()[:8] == ["mixer", "OP", "up", "0", "123400", "12", "3", "5"]

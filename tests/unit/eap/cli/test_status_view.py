@@ -114,7 +114,7 @@ def test_remarks_follow_below_the_tables_and_faults_stand_above() -> None:
     lines = show(status).splitlines()
     assert lines[0] == "line: 1 error (1 station, 2 PDs)"
     assert lines[1].startswith("error  mixer ← right: stale")
-    assert lines[-2:] == ["mixer: left out 1 cycle", "mixer ← left: 4 late"]
+    assert lines[-2:] == ["mixer: 1 cycle skipped: overrun", "mixer ← left: 4 late"]
 
 
 @pytest.mark.parametrize(("width", "left_out"), [(80, "Jitter or response µs"), (100, "")])
@@ -160,7 +160,7 @@ def test_frames_whose_subscriber_is_monitored() -> None:
         frame("to-oven", monitor_interval_ms=500, subscriber="missing", address="10.0.0.3"),
     ]
     text = show(document(frames=frames))
-    assert row_of(text, "Subscriber") == "Frame Goes to Subscriber Frames Skipped"
+    assert row_of(text, "Subscriber") == "Frame Destination Subscriber Frames Skipped"
     assert row_of(text, "to-panel") == "mixer/to-panel 10.0.0.2 present 90 0"
     assert row_of(text, "to-oven") == "mixer/to-oven 10.0.0.2 at 10.0.0.3 missing 90 0"
     assert "to-all" not in text
@@ -173,7 +173,7 @@ def test_frames_to_a_net_id() -> None:
         frame("new", destination="5.3.3.3.2.1", address=None, sent=0, skipped=7, frame_state=1),
     ]
     text = show(document(frames=frames))
-    assert row_of(text, "known") == "mixer/known 5.2.2.2.2.1 at 02:00:00:00:00:02 90 0"
+    assert row_of(text, "mixer/known") == "mixer/known 5.2.2.2.2.1 at 02:00:00:00:00:02 90 0"
     assert row_of(text, "mixer/new") == "mixer/new 5.3.3.3.2.1 at an unknown address 0 7"
 
 

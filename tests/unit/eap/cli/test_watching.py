@@ -53,9 +53,7 @@ def test_skipped_cycles_between_json_lines_are_reported_once_and_at_the_end() ->
     ]
     lines = [skipped.take_out(change) for change in stream]
     (note,) = notes
-    assert note.startswith(
-        "mixer: 9 cycles before cycle 15 skipped: values are looked at every 100"
-    )
+    assert note.startswith("mixer: 9 cycles before cycle 15 skipped: values are polled every 100")
     skipped.close()
     assert notes[1:] == ["mixer: 11 cycles skipped in all"]
     assert [line.cycle for line in lines] == [5, 15, 15, 18]

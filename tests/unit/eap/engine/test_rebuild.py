@@ -178,9 +178,7 @@ def test_what_needs_another_start_is_refused_and_the_old_goes_on(running):
     other = replace(running.left, ports=(eap_port(1, "loop://y"),))
     error = running.configure(other)
     assert isinstance(error, EngineRefusedError)
-    assert str(error) == (
-        "port eap0: interface loop://x -> loop://y: this needs a new start of the appliance"
-    )
+    assert str(error) == ("port eap0: interface loop://x -> loop://y: restart the appliance")
     cycle = running.word("left", StationWord.CYCLE)
     running.cycles(3)
     assert running.word("left", StationWord.CYCLE) == cycle + 3

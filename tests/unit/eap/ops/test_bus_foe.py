@@ -123,10 +123,10 @@ def test_who_breaks_off_is_told_how_far_it_came(tmp_path):
     with FakeGateway() as gateway, open_gateway("127.0.0.1", gateway.port, tcp=False) as bus:
         with pytest.raises(KeyboardInterrupt) as caught:
             put_file(bus, "drive", source, "f", password=0, report=leave)
-        assert re.match(r"512 of 1024 octets were written; FoE does", caught.value.__notes__[0])
+        assert re.match(r"512 of 1024 bytes were written; FoE cannot", caught.value.__notes__[0])
         with pytest.raises(KeyboardInterrupt) as caught:
             get_file(bus, "drive", "f", target, password=0, report=leave)
-        assert re.match(r"600 octets were read; FoE does", caught.value.__notes__[0])
+        assert re.match(r"600 bytes were read; FoE cannot", caught.value.__notes__[0])
     assert [path.name for path in tmp_path.iterdir()] == ["a.bin"]
 
 
@@ -211,4 +211,4 @@ def test_transfer_that_is_interrupted_again_and_again_is_given_up(tmp_path, monk
         put_file(bus, "drive", source, "f", password=0, report=lambda *_: None)
     assert bus.faults == 1 + RESTARTS
     notes = " ".join(caught.value.__notes__)
-    assert f"the transfer began anew {RESTARTS} times, last after: the slave's mailbox" in notes
+    assert f"the transfer restarted {RESTARTS} times, last after: the slave's mailbox" in notes

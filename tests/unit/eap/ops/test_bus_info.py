@@ -144,5 +144,5 @@ def test_image_that_no_slave_would_load(line):
     with line.session() as bus:
         image = bytearray.fromhex(read_eeprom(bus, "sensor").data)
         image[0] ^= 1
-        with pytest.raises(SiiError, match="check sum"):
+        with pytest.raises(SiiError, match="wrong checksum"):
             write_eeprom(bus, "sensor", bytes(image))

@@ -16,7 +16,7 @@ def test_names(text):
 
 @pytest.mark.parametrize("text", ["", "/", "mixer/", "/eap0", "a/b/c/d", "a//c"])
 def test_what_is_no_device(text):
-    with pytest.raises(ValueError, match="is no STATION, STATION/PORT or STATION/PORT/SLAVE"):
+    with pytest.raises(ValueError, match="is not STATION, STATION/PORT, STATION/PORT/SLAVE"):
         Target.parse(text)
 
 

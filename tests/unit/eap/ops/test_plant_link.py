@@ -51,9 +51,7 @@ def test_plan_refuses_another_duty_of_the_audit(stack):
     PlantStub("line", PLANT.stations, stack)
     with link_to(replace(PLANT, audit_required=True), FILE) as link:
         plan = link.plan(PLANT.stations[0])
-    assert plan.refused == [
-        "access: audit becomes required: this needs a new start of the appliance"
-    ]
+    assert plan.refused == ["access: audit becomes required: restart the appliance"]
 
 
 def test_requests(stack):

@@ -392,7 +392,7 @@ def test_what_was_replaced_can_be_taken_apart():
     assert sent_ids(wire) == [3]
 
 
-END = ": this needs a new start of the appliance"
+END = ": restart the appliance"
 BUS = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1", bus=BusPortSpec("/x.yaml"))
 
 

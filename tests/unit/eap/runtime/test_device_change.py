@@ -164,7 +164,7 @@ def test_plan_reports_changed_layout_with_same_version(plain):
 def test_what_needs_a_new_start(plain, change, words):
     (reason,) = find_refusals(plain, change(plain))
     assert reason.startswith(words)
-    assert reason.endswith("needs a new start of the appliance")
+    assert reason.endswith("restart the appliance")
 
 
 def test_sources_links_and_variables_of_buses_are_told(plain):

@@ -47,7 +47,7 @@ def test_everything_fits_80_by_24(stub):
         assert shown[0] == " line, 2 stations: 2 routes, 1 down, 1 connection, 1 warning"
         assert shown[1] == " r Routes 2  c Connections 1  w Warnings 1  s all stations"
         assert shown[2].split() == [
-            "Station", "Route", "NetID", "Transport", "State", "Trip", "Asked", "Octets", "Errors"
+            "Station", "Route", "NetID", "Transport", "State", "RTT", "Reqs", "Bytes", "Errors"
         ]  # fmt: skip
         assert shown[3].split() == [
             "island-01", "island-02", "127.0.1.2.*.*", "udp:eap0", "up", "840", "µs", "12",
@@ -66,7 +66,7 @@ def test_everything_fits_60_by_15(stub):
         shown = screen.text().splitlines()
         assert len(shown) == 15
         assert shown[1] == " r Routes 2  c Connections 1  w Warnings 1  s all stations"
-        assert shown[2].split() == ["Station", "Route", "NetID", "State", "Trip", "Errors"]
+        assert shown[2].split() == ["Station", "Route", "NetID", "State", "RTT", "Errors"]
         assert shown[3].split() == [
             "island-01", "island-02", "127.0.1.2.*.*", "up", "840", "µs", "0"
         ]  # fmt: skip
@@ -122,7 +122,7 @@ def test_connections_and_warnings(stub):
         assert " asked by 127.0.0.1.1.1\n" in shown
         shown = await screen.press("w")
         assert "island-01 route press (5.1.2.3.1.1) is not taken" in shown
-        assert "Trip" in await screen.click("#views", offset=(3, 0))
+        assert "RTT" in await screen.click("#views", offset=(3, 0))
         assert "75 s" in await screen.click("#views", offset=(15, 0))
 
     run(script)

@@ -17,8 +17,8 @@ def widths(view: View, width: int, *, has_station: bool = True) -> dict[str, int
 def test_columns_are_as_wide_as_they_need_to_be() -> None:
     found = widths(View.ROUTES, 80)
     assert found == {
-        "Station": 9, "Route": 9, "NetID": 13, "Transport": 9, "State": 5, "Trip": 7, "Asked": 5,
-        "Octets": 6, "Errors": 6,
+        "Station": 9, "Route": 9, "NetID": 13, "Transport": 9, "State": 5, "RTT": 7, "Reqs": 5,
+        "Bytes": 6, "Errors": 6,
     }  # fmt: skip
     assert sum(found.values()) + len(found) <= 80
 
@@ -45,7 +45,7 @@ def test_long_texts_give_way_to_their_least(view: View, width: int) -> None:
 
 def test_columns_are_left_out_on_narrow_screens_before_names_are_cut() -> None:
     found = widths(View.ROUTES, 60)
-    assert found == {"Station": 9, "Route": 9, "NetID": 13, "State": 5, "Trip": 7, "Errors": 6}
+    assert found == {"Station": 9, "Route": 9, "NetID": 13, "State": 5, "RTT": 7, "Errors": 6}
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_detail_of_a_route() -> None:
     island, press = (detail(line) for line in lines(View.ROUTES, [ROUTER], ""))
     assert [text.partition("127")[0] for text, _ in island] == [
         "island-02  ", "derived; up: round trip 840 µs",
-        "12 requests, 12 answers, 0 errors; octets: 1234 out, 45.7k in", island[3][0][:9] + "READ ",
+        "12 requests, 12 answers, 0 errors; bytes: 1234 out, 45.7k in", island[3][0][:9] + "READ ",
     ]  # fmt: skip
     assert press[1] == ("added; down: connection refused", "down")
     assert press[4][0].startswith("route press (5.1.2.3.1.1) is not taken")

@@ -48,7 +48,7 @@ def test_apply_and_rollback(ask):
 
 def test_what_needs_a_new_start_is_refused(ask):
     broker = RoutingSpec(mqtt=(MqttSpec(network="n", host="broker"),))
-    refused = ["MQTT network n: added: this needs a new start of the appliance"]
+    refused = ["MQTT network n: added: restart the appliance"]
     for answer in (ask("plan", routing=broker), ask("apply", routing=broker)):
         assert answer.refused == refused
     assert ask("export") == RunningRouting(routing=OLD)
