@@ -66,12 +66,12 @@ def _synchronize_counter(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Throw away what waits in the mailbox, and use up one counter."""
     mailbox = _opened(slave)
     _, now_ns = yield Sleep(0)
-    mailbox.look(now_ns)
+    mailbox.poll(now_ns)
     greeting = _send_first_message(SiiProtocol(slave.found.sii.fixed.protocols), slave.state)
     yield from wait_for(mailbox.converse(greeting, now_ns, name="greeting", requester=bus))
     for _ in range(2):
         _, now_ns = yield Sleep(SETTLE_NS // 2)
-        mailbox.look(now_ns)
+        mailbox.poll(now_ns)
 
 
 def _send_first_message(protocols: SiiProtocol, state: AlState | None) -> Conversation[None]:

@@ -133,7 +133,7 @@ def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedur
     _, now_ns = yield Sleep(0)
     present = [slave.found for slave in bus.slaves.values() if not slave.is_lost]
     states = yield from synchronize(present, now_ns + bus.settings.epoch_offset_ns, only=only)
-    bus.follow(states[0].station if states else None)
+    bus.distribute_time(states[0].station if states else None)
 
 
 def wait_for(task: Task[T]) -> Procedure[T]:

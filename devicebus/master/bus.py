@@ -124,7 +124,7 @@ class BusSlave:
         is_set_up: Whether its sync managers and FMMUs are set for process data.
         channels: Its process data.
         mailbox: Open in the states that have one.
-        missed_ns: Since when it is not where it belongs; None while it is.
+        missing_since_ns: Since when it is not where it belongs; None while it is.
         is_lost: Whether it has not answered and was not set up anew since.
         work: What is going on to bring it somewhere.
         retry_ns: Not tried again before then.
@@ -141,7 +141,7 @@ class BusSlave:
         self.is_set_up = False
         self.channels: tuple[ProcessDataChannel, ...] = ()
         self.mailbox: Mailbox | None = None
-        self.missed_ns: int | None = None
+        self.missing_since_ns: int | None = None
         self.is_lost = False
         self.work: Task[Any] | None = None
         self.retry_ns = 0
@@ -156,7 +156,7 @@ class BusSlave:
         """Note that something about it has changed."""
         self.revision = self._changes.note()
 
-    def begin(self, work: Task[Any]) -> None:
+    def start_work(self, work: Task[Any]) -> None:
         """Note that *work* brings it somewhere, and later that this is done."""
         self.work = work
         work.watch(lambda _: self.note_change())
@@ -171,7 +171,7 @@ class BusSlave:
         """Whether it is being brought somewhere."""
         return self.work is not None and not self.work.is_done
 
-    def lose(self) -> None:
+    def mark_lost(self) -> None:
         """Forget where it was: it does not answer, or something else is in its place."""
         self.is_lost = True
         self.state = None
@@ -187,7 +187,7 @@ class BusState:
         image, cycle: None until process data is laid out.
         reference: Station address of the slave whose clock the others follow.
         is_lost: No frame comes back, so that nothing is known about any slave.
-        is_troubled: The last cycle was not as expected: look at the slaves soon.
+        needs_check: The last cycle was not as expected: look at the slaves soon.
     """
 
     def __init__(self, settings: MasterSettings) -> None:
@@ -204,7 +204,7 @@ class BusState:
         self.cycle: Cycle | None = None
         self.reference: int | None = None
         self.is_lost = False
-        self.is_troubled = False
+        self.needs_check = False
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
 
     def emit(self, event: Event) -> None:
@@ -237,13 +237,13 @@ class BusState:
         if self.cycle is not None:
             self.cycle.set_participation(slave.station, participation)
 
-    def follow(self, reference: int | None) -> None:
+    def distribute_time(self, reference: int | None) -> None:
         """Hand this slave's time to the others in every cycle, or nobody's."""
         self.reference = reference
         if self.cycle is not None:
             self.cycle.extra = [] if reference is None else [drift_datagram(reference)]
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew: no slave is known."""
         for slave in self.slaves.values():
             if slave.work is not None:
@@ -253,4 +253,4 @@ class BusState:
         self.changes.note()
         self.image = self.cycle = self.reference = None
         self.link.stop_cycles()
-        self.is_lost = self.is_troubled = False
+        self.is_lost = self.needs_check = False

@@ -191,8 +191,8 @@ def _port_order(node: TopologyNode) -> list[int]:
 
 
 def _port_before(node: TopologyNode, port: int) -> int:
-    way = _port_order(node)
-    return way[way.index(port) - 1]
+    order = _port_order(node)
+    return order[order.index(port) - 1]
 
 
 def _inside(node: TopologyNode, times: Sequence[int]) -> int:

@@ -27,13 +27,13 @@ from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.errors import CodecError
 
-_COE_UNASKED = frozenset(
+_COE_UNSOLICITED = frozenset(
     (CoeService.EMERGENCY, CoeService.TX_PDO, CoeService.TX_PDO_REMOTE_REQUEST)
 )
-_SOE_UNASKED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
+_SOE_UNSOLICITED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
 _TAG = 0x8000
 _TAGS = 0x3FFF
-MAX_KEPT = 64
+MAX_STORED = 64
 """Fragments that are kept at most."""
 
 
@@ -42,7 +42,7 @@ class ReplyMatcher:
 
     def __init__(self, kind: MailboxType) -> None:
         self._kind = kind
-        self._kept: deque[bytes] = deque()
+        self._stored: deque[bytes] = deque()
         self._has_more = False
         self._tag = 0
         self._echoes = False
@@ -52,43 +52,43 @@ class ReplyMatcher:
     def next_address(self) -> int:
         """Return the address field of the next request: 0 until something has timed out."""
         self._suspected = self._has_more = False
-        self._kept.clear()
+        self._stored.clear()
         if self._tag:
             self._tag = _TAG | (self._tag + 1 & _TAGS)
         return self._tag
 
-    def expire(self, ask: MailboxRequest) -> None:
+    def expire(self, step: MailboxRequest) -> None:
         """Note that a request has timed out: its reply may still come."""
         if not self._suspected:
-            self._expired.append(ask)
+            self._expired.append(step)
         self._tag = self._tag or _TAG
 
-    def took(self, data: bytes) -> None:
+    def note_part(self, data: bytes) -> None:
         """Note that a part was sent or received: what belongs to it may follow."""
         self._has_more = has_more(self._kind, data)
 
-    def keep(self, data: bytes) -> bool:
+    def store(self, data: bytes) -> bool:
         """Keep a fragment that is not listened for yet; return whether the message is one."""
         is_next = self._has_more and not is_unsolicited(self._kind, data)
-        if not is_next or len(self._kept) >= MAX_KEPT:
+        if not is_next or len(self._stored) >= MAX_STORED:
             return False
-        self._kept.append(data)
+        self._stored.append(data)
         self._has_more = has_more(self._kind, data)
         return True
 
-    def take_kept(self, ask: MailboxRequest) -> bytes | None:
-        """Return the fragment that *ask* listens for, if it was kept."""
-        while self._kept:
-            data = self._kept.popleft()
-            if answers(ask.type, ask.request, data):
+    def take_stored(self, step: MailboxRequest) -> bytes | None:
+        """Return the fragment that *step* listens for, if it was kept."""
+        while self._stored:
+            data = self._stored.popleft()
+            if answers(step.type, step.request, data):
                 return data
         return None
 
-    def answers(self, header: MailboxHeader, data: bytes, ask: MailboxRequest) -> bool:
-        """Return whether a message is the reply that *ask* waits for."""
-        if header.type == MailboxType.ERR or _fits(header, data, ask):
+    def answers(self, header: MailboxHeader, data: bytes, step: MailboxRequest) -> bool:
+        """Return whether a message is the reply that *step* waits for."""
+        if header.type == MailboxType.ERR or _fits(header, data, step):
             return not self._is_late(header, data)
-        self._forget(header, data)
+        self._drop_expired(header, data)
         return False
 
     def _is_late(self, header: MailboxHeader, data: bytes) -> bool:
@@ -100,20 +100,20 @@ class ReplyMatcher:
             return False
         if self._echoes or header.address & _TAG:
             return True
-        self._suspected = self._forget(header, data)
+        self._suspected = self._drop_expired(header, data)
         return self._suspected
 
-    def _forget(self, header: MailboxHeader, data: bytes) -> bool:
+    def _drop_expired(self, header: MailboxHeader, data: bytes) -> bool:
         """Drop the request that timed out and has its reply now; return whether there is one."""
-        for ask in self._expired:
-            if header.type == MailboxType.ERR or _fits(header, data, ask):
-                self._expired.remove(ask)
+        for step in self._expired:
+            if header.type == MailboxType.ERR or _fits(header, data, step):
+                self._expired.remove(step)
                 return True
         return False
 
 
-def _fits(header: MailboxHeader, data: bytes, ask: MailboxRequest) -> bool:
-    return header.type == ask.type and answers(ask.type, ask.request, data)
+def _fits(header: MailboxHeader, data: bytes, step: MailboxRequest) -> bool:
+    return header.type == step.type and answers(step.type, step.request, data)
 
 
 def is_unsolicited(kind: MailboxType, data: bytes) -> bool:
@@ -121,9 +121,9 @@ def is_unsolicited(kind: MailboxType, data: bytes) -> bool:
     try:
         match kind:
             case MailboxType.COE:
-                return CoeHeader.decode(data).service in _COE_UNASKED
+                return CoeHeader.decode(data).service in _COE_UNSOLICITED
             case MailboxType.SOE:
-                return SoeHeader.decode(data).opcode in _SOE_UNASKED
+                return SoeHeader.decode(data).opcode in _SOE_UNSOLICITED
             case MailboxType.EOE:
                 return EoeHeader.decode(data).type == EoeType.FRAGMENT
             case MailboxType.AOE:
@@ -138,17 +138,17 @@ class QueuedConversation:
     """A conversation that was started.
 
     Attributes:
-        ask: Its next request.
+        step: Its next request.
         ready_ns: Earliest time for it.
     """
 
-    __slots__ = ("ask", "conversation", "ready_ns", "requester", "task")
+    __slots__ = ("conversation", "ready_ns", "requester", "step", "task")
 
     def __init__(
-        self, conversation: Conversation[Any], ask: MailboxRequest, name: str, requester: Hashable
+        self, conversation: Conversation[Any], step: MailboxRequest, name: str, requester: Hashable
     ) -> None:
         self.conversation = conversation
-        self.ask = ask
+        self.step = step
         self.ready_ns = 0
         self.requester = requester
         self.task: Task[Any] = Task(name, conversation.close)
@@ -196,7 +196,7 @@ class ConversationQueue:
 
     def add(self, job: QueuedConversation) -> None:
         """Queue a conversation."""
-        self._queue(job.ask.type).add(job)
+        self._queue(job.step.type).add(job)
 
     def matcher(self, kind: MailboxType) -> ReplyMatcher:
         """Return the matcher for the replies of a protocol."""
@@ -205,7 +205,7 @@ class ConversationQueue:
     def _queue(self, kind: MailboxType) -> ProtocolQueue:
         return self._queues.setdefault(kind, ProtocolQueue(kind))
 
-    def take(self, now_ns: int) -> QueuedConversation | None:
+    def next_job(self, now_ns: int) -> QueuedConversation | None:
         """Return the conversation that goes on now, if any may.
 
         One that only listens goes first: no other would know its message.
@@ -217,8 +217,8 @@ class ConversationQueue:
                 ready.append(queue.active)
         if not ready:
             return None
-        job = next((each for each in ready if each.ask.listen), ready[0])
-        self._queues[job.ask.type] = self._queues.pop(job.ask.type)
+        job = next((each for each in ready if each.step.listen), ready[0])
+        self._queues[job.step.type] = self._queues.pop(job.step.type)
         return job
 
     def next_ready(self) -> int | None:

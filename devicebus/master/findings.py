@@ -295,10 +295,10 @@ def _no_answer(slaves: Sequence[SlaveView], first: int, count: int, port: int | 
             slaves=_stations(run),
             since_ns=_since_ns(run),
         )
-    who = f"{silent} does not answer"
+    text = f"{silent} does not answer"
     if count > 1:
-        who = f"{silent} and {_count(count - 1)} behind it do not answer"
-    parts = [who]
+        text = f"{silent} and {_count(count - 1)} behind it do not answer"
+    parts = [text]
     if first:
         lost = "" if port is None else f", whose port {port} has lost its link"
         parts.append(f"the last that answers before it is {slaves[first - 1]}{lost}")
@@ -325,11 +325,11 @@ def _errors(
         for port in slave.ports
         if port.port == fault.port
     )
-    far = f" to {names[fault.neighbour]}" if fault.neighbour is not None else ""
-    place = f"port {fault.port} of {names[fault.station]}"
+    cable_end = f" to {names[fault.neighbour]}" if fault.neighbour is not None else ""
+    location = f"port {fault.port} of {names[fault.station]}"
     return BusFinding(
-        what=f"errors {verb} at {place}: {describe_counters(port)}",
-        advice=f"check its cable{far} first",
+        what=f"errors {verb} at {location}: {describe_counters(port)}",
+        advice=f"check its cable{cable_end} first",
         slaves=(fault.station,),
         port=fault.port,
     )

@@ -335,7 +335,7 @@ class Link:
             index, oldest = next(iter(self._overdue.items()))
             if now_ns - oldest.deadline_ns < LINGER_NS:
                 break
-            self._lose(index, now_ns)
+            self._count_lost(index, now_ns)
         due = [index for index, each in self._in_flight.items() if each.deadline_ns <= now_ns]
         again: list[_QueuedDatagram] = []
         for index in due:
@@ -396,14 +396,14 @@ class Link:
         """Return an index that no frame has; the oldest overdue frame may have to give its own."""
         in_flight, overdue = self._in_flight, self._overdue
         if len(in_flight) + len(overdue) >= INDEXES:
-            self._lose(next(iter(overdue)), now_ns)
+            self._count_lost(next(iter(overdue)), now_ns)
         index = self._index
         while index in in_flight or index in overdue:
             index = (index + 1) % INDEXES
         self._index = (index + 1) % INDEXES
         return index
 
-    def _lose(self, index: int, now_ns: int) -> None:
+    def _count_lost(self, index: int, now_ns: int) -> None:
         """Count an overdue frame as lost."""
         sent = self._overdue.pop(index)
         self._lost += 1
@@ -415,23 +415,23 @@ class Link:
         items: list[_QueuedDatagram] = []
         self._fill(items, queue, MAX_BODY, cyclic=cyclic)
         if cyclic and not queue and self._credit is not None and self._credit > 0:
-            room = MAX_BODY - sum(OVERHEAD + len(item.datagram.data) for item in items)
-            self._fill(items, self._acyclic, min(room, MAX_PIGGYBACK), cyclic=False)
+            max_size = MAX_BODY - sum(OVERHEAD + len(item.datagram.data) for item in items)
+            self._fill(items, self._acyclic, min(max_size, MAX_PIGGYBACK), cyclic=False)
         return items
 
     def _fill(
         self,
         items: list[_QueuedDatagram],
         queue: deque[_QueuedDatagram],
-        room: int,
+        max_size: int,
         *,
         cyclic: bool,
     ) -> None:
-        """Add what *room* bytes hold."""
+        """Add what *max_size* bytes hold."""
         size = 0
         while queue and len(items) < MAX_DATAGRAMS:
             octets = OVERHEAD + len(queue[0].datagram.data)
-            if size + octets > room:
+            if size + octets > max_size:
                 break
             item = queue.popleft()
             if item.is_over:

@@ -181,7 +181,7 @@ class Mailbox:
         """Start a conversation; *requester* takes turns with others that use the same protocol."""
         task: Task[T]
         try:
-            ask = next(conversation)
+            step = next(conversation)
         except (StopIteration, EapError) as end:
             task = Task(name, conversation.close)
             if isinstance(end, EapError):
@@ -189,13 +189,13 @@ class Mailbox:
             else:
                 task.finish(end.value)
             return task
-        job = QueuedConversation(conversation, ask, f"slave {self.station}: {name}", requester)
-        refusal = self._refusal_of(ask, job.task.name)
-        if refusal is not None:
+        job = QueuedConversation(conversation, step, f"slave {self.station}: {name}", requester)
+        problem = self._check_step(step, job.task.name)
+        if problem is not None:
             conversation.close()
-            job.task.fail(refusal)
+            job.task.fail(problem)
             return job.task
-        job.ready_ns = now_ns + ask.delay_ns
+        job.ready_ns = now_ns + step.delay_ns
         self._queue.add(job)
         self._begin(self._serve(), now_ns)
         return job.task
@@ -205,10 +205,10 @@ class Mailbox:
         """Whether something is sent or read."""
         return self._is_busy
 
-    def look(self, now_ns: int) -> None:
+    def poll(self, now_ns: int) -> None:
         """Read what the slave has sent unasked, if nothing else is going on."""
         if self._is_open:
-            self._begin(self._listen(), now_ns)
+            self._begin(self._poll(), now_ns)
 
     def close(self) -> None:
         """The slave has left the states with a mailbox: end everything."""
@@ -223,12 +223,12 @@ class Mailbox:
             repeats=self._port.repeats, duplicates=self._watch.repeated, gaps=self._watch.gaps
         )
 
-    def _refusal_of(self, ask: MailboxRequest, who: str) -> BusError | None:
+    def _check_step(self, step: MailboxRequest, who: str) -> BusError | None:
         """Why a request cannot be sent."""
         if not self._is_open:
             return MailboxClosedError(f"{who}: the slave's mailbox is closed")
-        size = MailboxHeader.SIZE + len(ask.request)
-        if ask.listen or size <= self.sizes.to_slave:
+        size = MailboxHeader.SIZE + len(step.request)
+        if step.listen or size <= self.sizes.to_slave:
             return None
         return MailboxSizeError(
             f"{who}: a message of {size} bytes, the slave's mailbox holds {self.sizes.to_slave}"
@@ -244,7 +244,7 @@ class Mailbox:
         try:
             _, now_ns = yield Sleep(0)
             while (ready_ns := self._queue.next_ready()) is not None:
-                job = self._queue.take(now_ns)
+                job = self._queue.next_job(now_ns)
                 if job is None:
                     _, now_ns = yield Sleep(min(ready_ns - now_ns, MAX_PAUSE_NS))
                 else:
@@ -252,7 +252,7 @@ class Mailbox:
         finally:
             self._is_busy = False
 
-    def _listen(self) -> Procedure[None]:
+    def _poll(self) -> Procedure[None]:
         """Take messages as long as there are some, and then serve who came meanwhile."""
         with suppress(EapError):  # a slave that is gone says so to whoever asks it for something
             for _ in range(MAX_UNSOLICITED):
@@ -263,17 +263,17 @@ class Mailbox:
 
     def _serve_one(self, job: QueuedConversation) -> Procedure[int]:
         """Do what a conversation asks for next and resume it; return the time."""
-        ask = job.ask
+        step = job.step
         _, start_ns = yield Sleep(0)
         error: EapError | None = None
-        message = MailboxMessage(ask.type, b"")
+        message = MailboxMessage(step.type, b"")
         try:
-            message = yield from self._exchange(ask, start_ns + ask.timeout_ns)
+            message = yield from self._exchange(step, start_ns + step.timeout_ns)
         except EapError as exc:
             error = exc
             self._counters.fail(exc)
-            if isinstance(exc, MailboxTimeoutError) and not ask.listen:
-                self._queue.matcher(ask.type).expire(ask)
+            if isinstance(exc, MailboxTimeoutError) and not step.listen:
+                self._queue.matcher(step.type).expire(step)
         _, now_ns = yield Sleep(0)
         if error is None:
             self._counters.answer(now_ns - start_ns)
@@ -284,51 +284,51 @@ class Mailbox:
             _resume(job, lambda: job.conversation.throw(reason), now_ns)
         return now_ns
 
-    def _exchange(self, ask: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage]:
-        refusal = self._refusal_of(ask, f"slave {self.station}")
-        if refusal is not None:
-            raise refusal
-        if ask.listen:
-            kept = self._queue.matcher(ask.type).take_kept(ask)
-            if kept is not None:
-                return MailboxMessage(ask.type, kept)
+    def _exchange(self, step: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage]:
+        problem = self._check_step(step, f"slave {self.station}")
+        if problem is not None:
+            raise problem
+        if step.listen:
+            stored = self._queue.matcher(step.type).take_stored(step)
+            if stored is not None:
+                return MailboxMessage(step.type, stored)
         else:
-            early = yield from self._send(ask, deadline_ns)
+            early = yield from self._send(step, deadline_ns)
             if early is not None:
                 return early
-            if not ask.expects_reply:
-                self._queue.matcher(ask.type).took(ask.request)
-                return MailboxMessage(ask.type, b"")
+            if not step.expects_reply:
+                self._queue.matcher(step.type).note_part(step.request)
+                return MailboxMessage(step.type, b"")
         pause_ns = FIRST_PAUSE_NS
         is_full = True  # a quick slave has answered by now: look at once, and look only then
         while True:
-            reply = (yield from self._receive(ask)) if is_full else None
+            reply = (yield from self._receive(step)) if is_full else None
             if reply is not None:
                 return reply
             _, now_ns = yield Sleep(pause_ns)
             if now_ns >= deadline_ns:
                 raise MailboxTimeoutError(
-                    f"slave {self.station}: no {ask.type.name} reply within"
-                    f" {ask.timeout_ns // 1_000_000} ms"
+                    f"slave {self.station}: no {step.type.name} reply within"
+                    f" {step.timeout_ns // 1_000_000} ms"
                 )
             pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)
             is_full = yield from self._is_full(deadline_ns)
 
-    def _send(self, ask: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage | None]:
+    def _send(self, step: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage | None]:
         """Write a request; return its reply if that came while it was written again."""
         self._counter = next_counter(self._counter)
-        address = self._queue.matcher(ask.type).next_address()
-        header = MailboxHeader(0, address, type=ask.type, counter=self._counter)
-        message = encode_message(header, ask.request)
+        address = self._queue.matcher(step.type).next_address()
+        header = MailboxHeader(0, address, type=step.type, counter=self._counter)
+        message = encode_message(header, step.request)
         maybe_there = False
         while True:
-            posted = yield from self._post(message, deadline_ns)
-            if posted.is_taken:
+            written = yield from self._write_message(message, deadline_ns)
+            if written.is_accepted:
                 self._counters.sent += 1
                 return None
-            maybe_there = maybe_there or posted.is_ambiguous
+            maybe_there = maybe_there or written.is_ambiguous
             if (yield from self._is_full(deadline_ns)):
-                reply = yield from self._receive(ask if maybe_there else None)
+                reply = yield from self._receive(step if maybe_there else None)
                 if reply is not None:
                     return reply
             _, now_ns = yield Sleep(MAX_PAUSE_NS)
@@ -338,19 +338,19 @@ class Mailbox:
                     " messages"
                 )
 
-    def _post(self, message: bytes, deadline_ns: int) -> Procedure[WriteResult]:
+    def _write_message(self, message: bytes, deadline_ns: int) -> Procedure[WriteResult]:
         """Write a request, also after the bus was silent for a while."""
         was_silent = False
         while True:
             try:
-                posted = yield from self._port.post(message)
+                written = yield from self._port.write_message(message)
             except FrameLostError:
                 was_silent = True
                 _, now_ns = yield Sleep(MAX_PAUSE_NS)
                 if now_ns >= deadline_ns:
                     raise
             else:
-                return posted._replace(is_ambiguous=posted.is_ambiguous or was_silent)
+                return written._replace(is_ambiguous=written.is_ambiguous or was_silent)
 
     def _is_full(self, deadline_ns: int) -> Procedure[bool]:
         """Return whether the slave has a message, also after the bus was silent for a while."""
@@ -362,9 +362,9 @@ class Mailbox:
                 if now_ns >= deadline_ns:
                     raise
 
-    def _receive(self, ask: MailboxRequest | None) -> Procedure[MailboxMessage | None]:
-        """Read one message; return it if it is the reply to *ask*."""
-        octets = yield from self._port.fetch()
+    def _receive(self, step: MailboxRequest | None) -> Procedure[MailboxMessage | None]:
+        """Read one message; return it if it is the reply to *step*."""
+        octets = yield from self._port.read_message()
         if octets is None:
             return None
         self._counters.received += 1
@@ -376,12 +376,12 @@ class Mailbox:
         data = bytes(body)
         if not self._watch.is_new(header.counter):
             return None
-        if ask is not None and self._queue.matcher(ask.type).answers(header, data, ask):
+        if step is not None and self._queue.matcher(step.type).answers(header, data, step):
             if header.type == MailboxType.ERR:
-                raise self._refusal(data)
-            self._queue.matcher(ask.type).took(data)
+                raise self._mailbox_error(data)
+            self._queue.matcher(step.type).note_part(data)
             return MailboxMessage(header.type, data, counter=header.counter)
-        if self._queue.matcher(header.type).keep(data):
+        if self._queue.matcher(header.type).store(data):
             return None
         if is_unsolicited(header.type, data):
             self._counters.unsolicited += 1
@@ -390,7 +390,7 @@ class Mailbox:
             self._counters.late += 1
         return None
 
-    def _refusal(self, data: bytes) -> EapError:
+    def _mailbox_error(self, data: bytes) -> EapError:
         try:
             detail = MailboxErrorReply.decode(data).detail
         except CodecError:
@@ -407,7 +407,7 @@ def _resume(job: QueuedConversation, action: Callable[[], MailboxRequest], now_n
     if job.task.is_done:
         return
     try:
-        job.ask = action()
+        job.step = action()
     except StopIteration as end:
         job.task.finish(end.value)
     except EapError as error:
@@ -415,4 +415,4 @@ def _resume(job: QueuedConversation, action: Callable[[], MailboxRequest], now_n
     except OSError as exc:  # of a file that the conversation reads or writes
         job.task.fail(BusError(f"{job.task.name}: {exc}"))
     else:
-        job.ready_ns = now_ns + job.ask.delay_ns
+        job.ready_ns = now_ns + job.step.delay_ns

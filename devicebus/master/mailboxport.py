@@ -60,7 +60,7 @@ class MailboxArea(NamedTuple):
 class WriteResult(NamedTuple):
     """What became of a message on its way to the slave."""
 
-    is_taken: bool
+    is_accepted: bool
     """False: the mailbox is still full."""
     is_ambiguous: bool
     """Whether it may have got there although it was not taken: a frame was lost."""
@@ -78,9 +78,9 @@ class MailboxPort:
         self.area = area
         self.repeats = 0
         self._repeat = 0
-        self._has_to_repeat = False
+        self._needs_repeat = False
 
-    def post(self, message: bytes) -> Procedure[WriteResult]:
+    def write_message(self, message: bytes) -> Procedure[WriteResult]:
         """Write a message, once its mailbox is empty.
 
         Raises:
@@ -97,12 +97,12 @@ class MailboxPort:
             FrameLostError: nothing comes back.
             WorkingCounterError: the slave does not answer.
         """
-        if self._has_to_repeat:
-            yield from self._ask_again()
+        if self._needs_repeat:
+            yield from self._request_repeat()
         (status,) = yield from read(self.station, STATUS, 1, "mailbox status")
         return bool(status & SmStatus.MAILBOX_FULL)
 
-    def fetch(self) -> Procedure[bytes | None]:
+    def read_message(self) -> Procedure[bytes | None]:
         """Read the slave's message, None if there is none or the frame is lost.
 
         The read has emptied the mailbox all the same: :meth:`is_full` has the message repeated.
@@ -111,13 +111,13 @@ class MailboxPort:
         try:
             (reply,), _ = yield [fprd(self.station, area.to_master, area.to_master_size, tries=1)]
         except FrameLostError:
-            self._has_to_repeat = True
+            self._needs_repeat = True
             self._repeat ^= 1
             self.repeats += 1
             return None
         return reply.data if reply.wkc else None
 
-    def _ask_again(self) -> Procedure[None]:
+    def _request_repeat(self) -> Procedure[None]:
         """Hand the toggled repeat bit to the slave and wait until it has copied it."""
         octet = bytes((1 | self._repeat << 1,))
         yield from write(self.station, _ACTIVATE, octet, "repeat request")
@@ -128,7 +128,7 @@ class MailboxPort:
             if copied >> 1 & 1 == self._repeat:
                 break
             _, now_ns = yield Sleep(POLL_NS)
-        self._has_to_repeat = False
+        self._needs_repeat = False
 
 
 def configure(station: int, area: MailboxArea) -> Procedure[None]:

@@ -124,7 +124,7 @@ class Master:
             raise BusError(f"slave {station} is on its way to {slave.target.name} already")
         slave.target = target
         work = self.run(bring(self._bus, slave, target), now_ns, f"slave {station}: state")
-        slave.begin(work)
+        slave.start_work(work)
         return work
 
     def converse(

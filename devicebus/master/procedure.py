@@ -77,14 +77,14 @@ class Task(Generic[T]):
     def finish(self, value: T) -> None:
         """It has a result: for whoever runs it."""
         self._value.append(value)
-        self._tell()
+        self._notify_watchers()
 
     def fail(self, error: EapError) -> None:
         """It went wrong: for whoever runs it."""
         self.error = error
-        self._tell()
+        self._notify_watchers()
 
-    def _tell(self) -> None:
+    def _notify_watchers(self) -> None:
         self._stop = _do_nothing  # whoever is behind it knows the task: this would be a circle
         watchers, self._watchers = self._watchers, []
         for callback in watchers:
@@ -150,9 +150,9 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
     children = [_Child(procedure, now_ns) for procedure in procedures]
     try:
         while running := [child for child in children if child.is_running]:
-            asking = [child for child in running if child.datagrams]
-            if asking:
-                now_ns = yield from _exchange_step(asking)
+            waiting = [child for child in running if child.datagrams]
+            if waiting:
+                now_ns = yield from _exchange_step(waiting)
             else:
                 pause_ns = min(child.wake_ns for child in running) - now_ns
                 _, now_ns = yield Sleep(pause_ns)
@@ -197,11 +197,11 @@ class _Child(Generic[T]):
                 self.datagrams = step
 
 
-def _exchange_step(asking: Sequence[_Child[T]]) -> Procedure[int]:
+def _exchange_step(waiting: Sequence[_Child[T]]) -> Procedure[int]:
     """Send what the children want and tell them what came back; return the time."""
-    replies, now_ns = yield [datagram for child in asking for datagram in child.datagrams]
+    replies, now_ns = yield [datagram for child in waiting for datagram in child.datagrams]
     start = 0
-    for child in asking:
+    for child in waiting:
         end = start + len(child.datagrams)
         child.resume(StepReplies(replies[start:end], now_ns))
         start = end
@@ -236,13 +236,13 @@ class Runner:
             if not run.task.is_done:
                 run.resume(StepReplies((), now_ns))
 
-    def take_step(self, run: _Run, step: Step, now_ns: int) -> None:
+    def queue_step(self, run: _Run, step: Step, now_ns: int) -> None:
         """Queue the next step of a procedure."""
         if isinstance(step, Sleep):
             entry = (now_ns + step.duration_ns, next(self._number), run)
             heapq.heappush(self._sleeping, entry)
         else:
-            run.exchange = self._link.submit(step, run.take)
+            run.exchange = self._link.submit(step, run.handle_replies)
 
 
 class _Run:
@@ -256,7 +256,7 @@ class _Run:
         self._procedure = procedure
         self._runner = runner
 
-    def take(self, outcome: list[DatagramReply] | FrameLostError, now_ns: int) -> None:
+    def handle_replies(self, outcome: list[DatagramReply] | FrameLostError, now_ns: int) -> None:
         """The link has answered."""
         self.exchange = None
         if isinstance(outcome, FrameLostError):
@@ -280,7 +280,7 @@ class _Run:
         except EapError as error:
             self.task.fail(error)
         else:
-            self._runner.take_step(self, step, now_ns)
+            self._runner.queue_step(self, step, now_ns)
 
     def stop(self) -> None:
         """Close the procedure and drop its step."""

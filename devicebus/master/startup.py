@@ -32,22 +32,22 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
         IdentityError: the bus is not the expected one.
         BusError: slaves did not get there; the message names each and why.
     """
-    bus.forget()
+    bus.reset()
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
     found = yield from scan(bus.settings.first_station)
     slaves = yield from _identify(bus, found)
     bus.slaves = {slave.station: slave for slave in slaves}
     for slave in slaves:
         slave.target = target
-    crew = _StartingSlaves(slaves)
-    yield from crew.do(lambda slave: bring(bus, slave, AlState.INIT))
+    starting = _StartingSlaves(slaves)
+    yield from starting.run_all(lambda slave: bring(bus, slave, AlState.INIT))
     if target is not AlState.INIT:
-        yield from crew.do(lambda slave: bring(bus, slave, AlState.PREOP))
+        yield from starting.run_all(lambda slave: bring(bus, slave, AlState.PREOP))
     if target in _WITH_PROCESS_DATA:
-        yield from crew.do(lambda slave: _plan(bus, slave))
-        if crew.fit:
-            yield from _run_process_data(bus, crew, target)
-    crew.check()
+        yield from starting.run_all(lambda slave: _read_process_data(bus, slave))
+        if starting.remaining:
+            yield from _run_process_data(bus, starting, target)
+    starting.check()
 
 
 def shut_down(bus: BusState) -> Procedure[None]:
@@ -57,7 +57,7 @@ def shut_down(bus: BusState) -> Procedure[None]:
         StateTimeoutError: some stay in another state.
         FrameLostError: nothing comes back.
     """
-    bus.forget()
+    bus.reset()
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
     _, now_ns = yield Sleep(0)
     deadline_ns = now_ns + TIMEOUT_NS[AlState.INIT]
@@ -75,13 +75,13 @@ def set_up_cycle(bus: BusState) -> None:
     layout = plan_image([_process_data_of(slave) for slave in slaves])
     knows_lrw = bus.settings.allow_lrw and all(slave.found.esc.knows_lrw for slave in slaves)
 
-    def trouble(now_ns: int) -> None:
+    def on_fault(now_ns: int) -> None:
         del now_ns
-        bus.is_troubled = True
+        bus.needs_check = True
 
     bus.image = BusImage(layout)
-    bus.cycle = Cycle(bus.link, bus.image, trouble, knows_lrw=knows_lrw)
-    bus.follow(bus.reference)
+    bus.cycle = Cycle(bus.link, bus.image, on_fault, knows_lrw=knows_lrw)
+    bus.distribute_time(bus.reference)
 
 
 def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusSlave]]:
@@ -105,19 +105,19 @@ def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusS
     ]
 
 
-def _run_process_data(bus: BusState, crew: _StartingSlaves, target: AlState) -> Procedure[None]:
+def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState) -> Procedure[None]:
     """Lay out process data and bring those that are left to SAFEOP or OP."""
-    for slave, _ in crew.errors:
+    for slave, _ in starting.errors:
         slave.channels = _channels_by_eeprom(slave)
     if bus.settings.clocks:
         yield from set_clocks(bus)
     set_up_cycle(bus)
-    yield from crew.do(lambda slave: bring(bus, slave, AlState.SAFEOP))
+    yield from starting.run_all(lambda slave: bring(bus, slave, AlState.SAFEOP))
     if target is AlState.OP:
-        yield from crew.do(lambda slave: bring(bus, slave, AlState.OP))
+        yield from starting.run_all(lambda slave: bring(bus, slave, AlState.OP))
 
 
-def _plan(bus: BusState, slave: BusSlave) -> Procedure[None]:
+def _read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Find out what a slave exchanges, and that it fits the bus."""
     yield from read_process_data(bus, slave)
     plan_image([_process_data_of(slave)])
@@ -141,20 +141,20 @@ class _StartingSlaves:
     """The slaves that go from step to step together.
 
     Attributes:
-        fit: Those that are left.
+        remaining: Those that are left.
         errors: What went wrong with the others.
     """
 
     def __init__(self, slaves: Sequence[BusSlave]) -> None:
-        self.fit = list(slaves)
+        self.remaining = list(slaves)
         self.errors: list[tuple[BusSlave, EapError]] = []
 
-    def do(self, work: Callable[[BusSlave], Procedure[None]]) -> Procedure[None]:
+    def run_all(self, work: Callable[[BusSlave], Procedure[None]]) -> Procedure[None]:
         """Let all that are left do something together; raises FrameLostError."""
-        results = yield from together([work(slave) for slave in self.fit])
-        done = list(zip(self.fit, results, strict=True))
+        results = yield from together([work(slave) for slave in self.remaining])
+        done = list(zip(self.remaining, results, strict=True))
         self.errors += [(slave, error) for slave, error in done if isinstance(error, EapError)]
-        self.fit = [slave for slave, error in done if not isinstance(error, EapError)]
+        self.remaining = [slave for slave, error in done if not isinstance(error, EapError)]
 
     def check(self) -> None:
         """Raise what went wrong: one error as it is, several as one with a line for each cause."""

@@ -46,7 +46,7 @@ def poll_mailboxes(bus: BusState) -> Procedure[None]:
             continue  # the next look comes soon
         for mailbox, reply in zip(part, replies, strict=True):
             if reply.wkc and reply.data[0] & SmStatus.MAILBOX_FULL:
-                mailbox.look(now_ns)
+                mailbox.poll(now_ns)
 
 
 ERRORS_PERIOD_NS = 1_000_000_000
@@ -150,9 +150,9 @@ def _wait_for_period(bus: BusState) -> Procedure[int]:
     """Wait for the next look; return the time."""
     _, now_ns = yield Sleep(SLICE_NS)
     end_ns = now_ns + PERIOD_NS - SLICE_NS
-    while now_ns < end_ns and not bus.is_troubled:
+    while now_ns < end_ns and not bus.needs_check:
         _, now_ns = yield Sleep(SLICE_NS)
-    bus.is_troubled = False
+    bus.needs_check = False
     return now_ns
 
 
@@ -169,16 +169,16 @@ def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     """A slave does not answer although the frame came back: leave it out."""
     if slave.is_lost:
         return
-    slave.lose()
+    slave.mark_lost()
     slave.retry_ns = 0
-    slave.missed_ns = slave.missed_ns or now_ns
+    slave.missing_since_ns = slave.missing_since_ns or now_ns
     work, slave.work = slave.work, None
     if work is not None:
         work.cancel()
     bus.close_mailbox(slave)
     bus.set_participation(slave, Participation.UNCERTAIN)
     if slave.station == bus.reference:
-        bus.follow(None)  # without it the others would be handed the empty datagram's time
+        bus.distribute_time(None)  # without it the others would be handed the empty datagram's time
     bus.emit(SlaveLost(slave.station, now_ns))
 
 
@@ -194,8 +194,8 @@ def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) 
     if status.state == slave.target and not status.error and is_set_up and not slave.is_lost:
         _report_back(bus, slave, now_ns)
         return
-    if slave.missed_ns is None:
-        slave.missed_ns = now_ns
+    if slave.missing_since_ns is None:
+        slave.missing_since_ns = now_ns
         shown = status.state | (ERROR if status.error else 0)
         bus.emit(SlaveLeft(slave.station, shown, status.code, now_ns))
     _begin(bus, slave, status, now_ns)
@@ -203,9 +203,9 @@ def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) 
 
 def _report_back(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     """A slave is where it belongs: report it if it was missed."""
-    missed_ns, slave.missed_ns = slave.missed_ns, None
-    if missed_ns is not None:
-        bus.emit(SlaveBack(slave.station, now_ns - missed_ns, now_ns))
+    missing_since_ns, slave.missing_since_ns = slave.missing_since_ns, None
+    if missing_since_ns is not None:
+        bus.emit(SlaveBack(slave.station, now_ns - missing_since_ns, now_ns))
 
 
 def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> None:
@@ -215,7 +215,7 @@ def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> Non
         and slave.target in _WITH_PROCESS_DATA
         and slave.is_set_up
     )
-    bus.is_troubled = True
+    bus.needs_check = True
 
     def done(task: Task[int]) -> None:
         error = task.error
@@ -226,13 +226,13 @@ def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> Non
         elif not (slave.is_lost and isinstance(error, WorkingCounterError)):
             slave.retry_ns = now_ns + RETRY_NS
             if isinstance(error, IdentityError):
-                slave.lose()
+                slave.mark_lost()
                 bus.close_mailbox(slave)
             bus.emit(SlaveFailed(slave.station, str(error), now_ns))
 
     work = _bring_back(bus, slave, stays=stays)
     task = bus.runner.start(work, now_ns, f"bringing back slave {slave.station}")
-    slave.begin(task)
+    slave.start_work(task)
     task.watch(done)
 
 
@@ -263,9 +263,9 @@ def _readdress(bus: BusState, count: int, now_ns: int) -> Procedure[None]:
         places = _missing_addresses(bus, stations, now_ns)
         if places:
             yield from assign_stations(places)
-            bus.is_troubled = True
+            bus.needs_check = True
     except EapError:
-        bus.is_troubled = True  # the line has changed meanwhile: look again
+        bus.needs_check = True  # the line has changed meanwhile: look again
 
 
 def _missing_addresses(

@@ -71,7 +71,7 @@ class Bench:
         """Whether every slave is in OP, and the master knows it and exchanges its process data."""
         return (
             all(slave.state is AlState.OP for slave in self.segment.segment.slaves)
-            and all(unit.missed_ns is None for unit in self.master.slaves.values())
+            and all(unit.missing_since_ns is None for unit in self.master.slaves.values())
             and self._expected_wkc() == self._whole_wkc
         )
 

@@ -69,19 +69,19 @@ def test_forgetting_ends_what_runs():
     bus.open_mailbox(unit, AREA)
     unit.work = bus.runner.start(scan(), 0)
     assert unit.is_busy
-    bus.is_lost = bus.is_troubled = True
-    bus.forget()
+    bus.is_lost = bus.needs_check = True
+    bus.reset()
     assert not unit.is_busy
     assert (bus.slaves, bus.image, bus.cycle, unit.mailbox) == ({}, None, None, None)
     assert not bus.is_lost
-    assert not bus.is_troubled
+    assert not bus.needs_check
 
 
 def test_the_reference_is_followed_in_every_cycle():
     bus, _ = made()
-    bus.follow(1001)
+    bus.distribute_time(1001)
     assert bus.reference == 1001
     set_up_cycle(bus)
     assert bus.cycle.extra == [frmw(1001, 0x0910, 8)]
-    bus.follow(None)
+    bus.distribute_time(None)
     assert (bus.reference, bus.cycle.extra) == (None, [])

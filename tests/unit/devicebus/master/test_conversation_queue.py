@@ -125,33 +125,33 @@ REST = MailboxRequest(COE, LISTED.request[:6], listen=True)
 
 def test_fragments_that_come_before_somebody_listens_are_kept(matcher):
     matcher.next_address()
-    assert not matcher.keep(PARTS[1])
+    assert not matcher.store(PARTS[1])
     assert give(matcher, PARTS[0], ask=LISTED)
-    matcher.took(PARTS[0])
-    assert not matcher.keep(EMERGENCY)
-    assert matcher.keep(PARTS[1])
-    assert matcher.keep(PARTS[2])
-    assert not matcher.keep(PARTS[2])
-    assert [matcher.take_kept(REST) for _ in range(3)] == [*PARTS[1:], None]
+    matcher.note_part(PARTS[0])
+    assert not matcher.store(EMERGENCY)
+    assert matcher.store(PARTS[1])
+    assert matcher.store(PARTS[2])
+    assert not matcher.store(PARTS[2])
+    assert [matcher.take_stored(REST) for _ in range(3)] == [*PARTS[1:], None]
 
 
 def test_what_was_kept_is_forgotten_with_the_next_request(matcher):
-    matcher.took(PARTS[0])
-    assert matcher.keep(PARTS[1])
+    matcher.note_part(PARTS[0])
+    assert matcher.store(PARTS[1])
     matcher.next_address()
-    assert matcher.take_kept(REST) is None
-    assert not matcher.keep(PARTS[1])
+    assert matcher.take_stored(REST) is None
+    assert not matcher.store(PARTS[1])
 
 
 def test_not_all_is_kept(matcher):
-    matcher.took(PARTS[0])
-    assert sum(matcher.keep(PARTS[1]) for _ in range(100)) == 64
+    matcher.note_part(PARTS[0])
+    assert sum(matcher.store(PARTS[1]) for _ in range(100)) == 64
 
 
 def test_kept_messages_that_answer_something_else_are_dropped(matcher):
-    matcher.took(PARTS[0])
-    matcher.keep(YES)
-    assert matcher.take_kept(REST) is None
+    matcher.note_part(PARTS[0])
+    matcher.store(YES)
+    assert matcher.take_stored(REST) is None
 
 
 def talk(kind, *, listen):
@@ -168,7 +168,7 @@ def job(name, requester="r", kind=COE, listen=False, ready_ns=0):
 def order(queue, *, count):
     names = []
     for _ in range(count):
-        taken = queue.take(0)
+        taken = queue.next_job(0)
         names.append(taken.task.name)
         taken.task.finish(None)
     return names
@@ -181,38 +181,38 @@ def test_requesters_take_turns():
     queue.add(job("a", "a"))
     queue.add(job("b", "b"))
     assert order(queue, count=5) == ["greedy0", "greedy1", "a", "b", "greedy2"]
-    assert queue.take(0) is None
+    assert queue.next_job(0) is None
 
 
 def test_a_conversation_of_a_protocol_ends_before_the_next_begins():
     queue = ConversationQueue()
     queue.add(job("first"))
     queue.add(job("second", "s"))
-    assert [queue.take(0).task.name for _ in range(3)] == ["first"] * 3
+    assert [queue.next_job(0).task.name for _ in range(3)] == ["first"] * 3
 
 
 def test_protocols_take_turns_message_by_message():
     queue = ConversationQueue()
     queue.add(job("file", kind=FOE))
     queue.add(job("sdo"))
-    assert [queue.take(0).task.name for _ in range(4)] == ["file", "sdo", "file", "sdo"]
+    assert [queue.next_job(0).task.name for _ in range(4)] == ["file", "sdo", "file", "sdo"]
 
 
 def test_who_only_listens_goes_first():
     queue = ConversationQueue()
     queue.add(job("file", kind=FOE))
     queue.add(job("fragments", listen=True))
-    assert [queue.take(0).task.name for _ in range(3)] == ["fragments"] * 3
+    assert [queue.next_job(0).task.name for _ in range(3)] == ["fragments"] * 3
 
 
 def test_who_waits_holds_nobody_up():
     queue = ConversationQueue()
     queue.add(job("busy", kind=FOE, ready_ns=50))
-    assert (queue.take(49), queue.next_ready()) == (None, 50)
+    assert (queue.next_job(49), queue.next_ready()) == (None, 50)
     queue.add(job("sdo"))
-    assert queue.take(49).task.name == "sdo"
+    assert queue.next_job(49).task.name == "sdo"
     assert queue.next_ready() == 0
-    assert queue.take(50).task.name == "busy"
+    assert queue.next_job(50).task.name == "busy"
 
 
 def test_cancelled_conversations_are_passed_by():
@@ -222,9 +222,9 @@ def test_cancelled_conversations_are_passed_by():
         queue.add(each)
     jobs[0].task.cancel()
     jobs[1].task.cancel()
-    assert queue.take(0) is jobs[2]
+    assert queue.next_job(0) is jobs[2]
     jobs[2].task.cancel()
-    assert (queue.take(0), queue.next_ready()) == (None, None)
+    assert (queue.next_job(0), queue.next_ready()) == (None, None)
 
 
 def test_all_fail_at_once():
@@ -238,7 +238,7 @@ def test_all_fail_at_once():
     for each in jobs[1:]:
         with pytest.raises(BusError, match=f"{each.task.name}: it is gone"):
             each.task.result()
-    assert queue.take(0) is None
+    assert queue.next_job(0) is None
 
 
 def test_each_protocol_has_its_own_judge():

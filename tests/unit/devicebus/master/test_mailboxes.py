@@ -233,7 +233,7 @@ def test_closing_ends_everything(line, slow):
     for task in tasks:
         with pytest.raises(BusError, match=r"slave 1001: a request: .* mailbox (was|is) closed"):
             task.result()
-    slow.look(line.now_ns)
+    slow.poll(line.now_ns)
     frames = line.frames
     line.elapse(10 * MS)
     assert line.frames == frames
@@ -266,20 +266,20 @@ def test_what_comes_unasked_is_told_and_disturbs_no_request(line, box):
     protocols[MailboxType.VOE] = talker = Talker()
     talker.unasked = [b"news"]
     line.elapse(2 * MS)
-    box.look(line.now_ns)
+    box.poll(line.now_ns)
     line.elapse(2 * MS)
     assert line.heard == [Unsolicited(1001, MailboxType.VOE, b"news")]
     talker.unasked = [b"more"] * 3
     line.elapse(2 * MS)
     assert line.wait(start(line, box, vendor())) == VENDOR
-    box.look(line.now_ns)
+    box.poll(line.now_ns)
     line.elapse(2 * MS)
     assert len(line.heard) == 4
     assert box.stats().unsolicited == 4
 
 
 def test_requests_that_come_while_it_looks_are_served_too(line, box):
-    box.look(line.now_ns)
+    box.poll(line.now_ns)
     assert line.wait(start(line, box, vendor())) == VENDOR
 
 
@@ -320,7 +320,7 @@ def test_fragments_wait_for_who_comes_back_for_them(line, box):
     parts = [line.wait(start(line, box, ask(request)))]
     while left := int.from_bytes(parts[-1][4:6], "little"):
         line.elapse(20 * MS)
-        box.look(line.now_ns)
+        box.poll(line.now_ns)
         line.elapse(20 * MS)
         parts.append(line.wait(start(line, box, ask(request[:6], listen=True))))
         assert int.from_bytes(parts[-1][4:6], "little") == left - 1
@@ -362,7 +362,7 @@ def test_an_endless_talker_is_taken_in_portions(line, box):
     talker = server(line).protocols[MailboxType.VOE] = Talker()
     talker.messages_to_send = lambda now: [b"again"]
     line.elapse(2 * MS)
-    box.look(line.now_ns)
+    box.poll(line.now_ns)
     line.elapse(5 * MS)
     assert len(line.heard) <= 16
     assert line.wait(start(line, box, vendor())) == VENDOR

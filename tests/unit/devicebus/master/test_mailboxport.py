@@ -67,13 +67,15 @@ class Wire:
 
 def test_a_message_fills_its_mailbox():
     wire = Wire()
-    assert drive(MailboxPort(7, AREA).post(b"abc"), wire) == WriteResult(True, False)
+    assert drive(MailboxPort(7, AREA).write_message(b"abc"), wire) == WriteResult(True, False)
     assert wire.accesses == [DatagramRequest(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 0)]
 
 
 def test_a_full_mailbox_takes_nothing():
-    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0)) == WriteResult(False, False)
-    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0, tries=2)) == WriteResult(
+    assert drive(MailboxPort(7, AREA).write_message(b"abc"), Wire(wkc=0)) == WriteResult(
+        False, False
+    )
+    assert drive(MailboxPort(7, AREA).write_message(b"abc"), Wire(wkc=0, tries=2)) == WriteResult(
         False, True
     )
 
@@ -82,14 +84,14 @@ def test_messages_are_fetched_whole_and_never_read_twice():
     wire = Wire(reply=b"x" * 48)
     port = MailboxPort(7, AREA)
     assert drive(port.is_full(), wire)
-    assert drive(port.fetch(), wire) == b"x" * 48
+    assert drive(port.read_message(), wire) == b"x" * 48
     assert wire.accesses[-1] == DatagramRequest(Command.FPRD, 7, 0x1080, bytes(48), 1)
-    assert drive(port.fetch(), Wire(wkc=0)) is None
+    assert drive(port.read_message(), Wire(wkc=0)) is None
     assert not drive(port.is_full(), Wire())
 
 
 def lose_read(port):
-    fetching = port.fetch()
+    fetching = port.read_message()
     next(fetching)
     with pytest.raises(StopIteration) as end:
         fetching.throw(FrameLostError("gone"))
@@ -101,7 +103,7 @@ def test_a_lost_reply_is_asked_for_again():
     lose_read(port)
     assert drive(port.is_full(), wire)
     assert wire.accesses[0] == DatagramRequest(Command.FPWR, 7, 0x080E, b"\x03", 0)
-    assert drive(port.fetch(), wire) == b"x"
+    assert drive(port.read_message(), wire) == b"x"
     assert len(wire.accesses) == 4
     lose_read(port)
     assert drive(port.is_full(), wire)

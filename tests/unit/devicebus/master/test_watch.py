@@ -291,7 +291,7 @@ def test_slave_is_shown_lost_until_it_is_set_up_anew(line):
     line.elapse(50 * MS)
     line.segment.switch(2, on=True)
     shown = []
-    while unit.missed_ns is not None:
+    while unit.missing_since_ns is not None:
         line.step(line.now_ns + MS)
         state = 0 if unit.is_lost else int(unit.state)
         assert state == 0 or (unit.mailbox is not None) is (state > AlState.INIT)
