@@ -1,10 +1,11 @@
-"""Taking over the mailbox of a slave from whoever used it before.
+"""Procedure that takes over the mailbox of a slave from another master.
 
-A slave drops a message with the counter of the one before (ETG.1000.4), and nobody can ask it which
-that was.  So the first message is one that needs no answer: dropped or not, the next one is new.
+A slave drops a message with the counter of the message before (ETG.1000.4), and that counter cannot
+be read.  The first message therefore needs no answer: whether the slave drops it or not, the
+counter of the second message is new.
 
-With CoE it is a request that every slave knows.  An abort would ask for no answer at all, but
-slaves are in use that take one for a request which they never finish, and are deaf from then on.
+With CoE the first message is an upload of 0x1000, which every slave supports.  An abort would need
+no answer at all, but some slaves handle it as a request that they never finish and stop answering.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ from eap.codec.coe import CoeService, SdoRequest, encode_message, encode_plain
 from eap.codec.mailbox import MailboxType, VoeHeader
 
 SETTLE_NS = 2_000_000
-"""How long an answer to the first message is waited for, to be thrown away."""
+"""Wait for an answer to the first message, which is discarded."""
 _MAILBOX_MODE = 2
 _DEVICE_TYPE = 0x1000
 
 
 def attach(bus: BusState, slave: BusSlave) -> Procedure[Mailbox]:
-    """Return the open mailbox of a slave, which is brought to PREOP if it is in INIT.
+    """Return the open mailbox of a slave; a slave in INIT is brought to PREOP.
 
     Raises:
-        BusError: it has none that can be.
-        AlStatusError: it refuses PREOP.
-        WorkingCounterError: it does not answer.
+        BusError: the slave has no usable mailbox.
+        AlStatusError: the slave refuses PREOP.
+        WorkingCounterError: the slave does not answer.
     """
     if slave.state is AlState.INIT:
         yield from bring(bus, slave, AlState.PREOP)
@@ -63,7 +64,7 @@ def _opened(slave: BusSlave) -> Mailbox:
 
 
 def _synchronize_counter(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Throw away what waits in the mailbox, and use up one counter."""
+    """Discard waiting messages and send the first message, which uses one counter."""
     mailbox = _opened(slave)
     _, now_ns = yield Sleep(0)
     mailbox.poll(now_ns)
@@ -75,7 +76,7 @@ def _synchronize_counter(bus: BusState, slave: BusSlave) -> Procedure[None]:
 
 
 def _send_first_message(protocols: SiiProtocol, state: AlState | None) -> Conversation[None]:
-    """Send what changes nothing, in a protocol that the slave knows; an answer is thrown away."""
+    """Send a message without effect in a protocol of the slave; an answer is discarded."""
     if protocols & SiiProtocol.COE and state is not AlState.BOOT:
         body = encode_plain(SdoRequest.UPLOAD, _DEVICE_TYPE, 0)
         request = encode_message(CoeService.SDO_REQUEST, body)

@@ -1,4 +1,4 @@
-"""Bringing a slave from state to state, with what has to be set up before each (ETG.1000.6)."""
+"""State changes of a slave, with the registers that each state needs (ETG.1000.6)."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from devicebus.wire.sii import SiiFixed, SiiProtocol
 
 MAX_SYNC_MANAGERS = 16
 WATCHDOG_DIVIDER = 2498
-"""Gives steps of 100 µs."""
+"""Watchdog divider for steps of 100 µs."""
 _STEPS_PER_MS = 10
 MAX_WATCHDOG_MS = 0xFFFF // _STEPS_PER_MS
 
 
 def standard_mailbox(fixed: SiiFixed) -> MailboxArea:
-    """Return the mailboxes for PREOP, SAFEOP and OP."""
+    """Return the mailbox area for PREOP, SAFEOP and OP."""
     return MailboxArea(fixed.receive_offset, fixed.receive_size, fixed.send_offset, fixed.send_size)
 
 
 def boot_mailbox(fixed: SiiFixed) -> MailboxArea:
-    """Return the mailboxes for BOOT."""
+    """Return the mailbox area for BOOT."""
     return MailboxArea(
         fixed.boot_receive_offset,
         fixed.boot_receive_size,
@@ -67,7 +67,7 @@ def set_process_data(layout: SlaveLayout) -> Procedure[None]:
 
 
 def set_watchdog(station: int, timeout_ms: int) -> Procedure[None]:
-    """Set the time after which a slave without new outputs leaves OP; 0 switches it off.
+    """Set the process data watchdog: without outputs for so long a slave leaves OP; 0 disables it.
 
     Raises:
         ValueError: the time does not fit the register.
@@ -91,9 +91,9 @@ def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
     """Bring a slave to *target*, step by step.
 
     Raises:
-        AlStatusError, StateTimeoutError: it refuses, or takes too long.
-        SiiError: nothing is known of it, for its EEPROM cannot be read.
-        WorkingCounterError: it does not answer.
+        AlStatusError, StateTimeoutError: the slave refuses, or takes too long.
+        SiiError: its EEPROM cannot be read, so its configuration is unknown.
+        WorkingCounterError: the slave does not answer.
     """
     if slave.found.fault:
         raise SiiError(slave.found.fault)
@@ -105,7 +105,7 @@ def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
         yield from change_state(slave.station, step)
         before, slave.state, current = current, step, step
         if step is AlState.INIT:
-            bus.close_mailbox(slave)  # not before: the slave may have stayed where it has one
+            bus.close_mailbox(slave)  # only now: a slave that refused INIT keeps its mailbox
         if before in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
             yield from _end_process_data(bus, slave)
         slave.is_set_up = step in _WITH_PROCESS_DATA
@@ -119,7 +119,7 @@ def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
 
 
 def read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Find out what a slave in PREOP exchanges."""
+    """Read the PDO mapping of a slave in PREOP."""
     sii = slave.found.sii
     if slave.mailbox is not None and sii.fixed.protocols & SiiProtocol.COE:
         reading = read_channels(sii)
@@ -129,7 +129,7 @@ def read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
 
 
 def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedure[None]:
-    """Set the clocks of all slaves, or *only* of those that came back."""
+    """Set the clocks of all slaves, or *only* of the given stations."""
     _, now_ns = yield Sleep(0)
     present = [slave.found for slave in bus.slaves.values() if not slave.is_lost]
     states = yield from synchronize(present, now_ns + bus.settings.epoch_offset_ns, only=only)
@@ -137,14 +137,14 @@ def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedur
 
 
 def wait_for(task: Task[T]) -> Procedure[T]:
-    """Wait within a procedure for something that runs beside it; return its result."""
+    """Wait within a procedure for another task; return its result."""
     while not task.is_done:
         yield Sleep(_POLL_NS)
     return task.result()
 
 
 def _prepare(bus: BusState, slave: BusSlave, current: AlState, step: AlState) -> Procedure[None]:
-    """Set up what the slave checks on its way to *step*."""
+    """Write the registers that the slave checks on its way to *step*."""
     if current in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
         bus.set_participation(slave, Participation.UNCERTAIN)
     if current is AlState.INIT:
@@ -166,13 +166,13 @@ def _prepare_mailbox(bus: BusState, slave: BusSlave, step: AlState) -> Procedure
 
 
 def _end_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Take the slave out of the cycle: a controller would go on counting in any state."""
+    """Remove the slave from the cycle."""
     yield from clear(slave.station, fmmus=slave.found.esc.fmmus, sync_managers=0)
     bus.set_participation(slave, Participation.ABSENT)
 
 
 def _begin_preop(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Open the mailbox and tell the slave what to exchange."""
+    """Open the mailbox and write the PDO configuration."""
     area = standard_mailbox(slave.found.sii.fixed)
     if not area.is_there:
         return

@@ -1,4 +1,4 @@
-"""What the master knows about its bus, shared by the procedures that work on it."""
+"""State of a bus and its slaves, shared by the procedures of the master, and its events."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SlaveLost(msgspec.Struct, frozen=True):
 
 
 class SlaveLeft(msgspec.Struct, frozen=True):
-    """A slave has left its state by itself; *status* and *code* as in its AL status."""
+    """A slave has left its state unrequested; *status* and *code* as in its AL status."""
 
     station: int
     status: int
@@ -37,7 +37,7 @@ class SlaveLeft(msgspec.Struct, frozen=True):
 
 
 class SlaveBack(msgspec.Struct, frozen=True):
-    """A slave is back in the state where it belongs, so long after it was missed."""
+    """A slave is back in its target state; *duration_ns* is the time since it left."""
 
     station: int
     duration_ns: int
@@ -45,7 +45,7 @@ class SlaveBack(msgspec.Struct, frozen=True):
 
 
 class SlaveFailed(msgspec.Struct, frozen=True):
-    """A slave could not be brought back; it is tried again."""
+    """A slave could not be brought back to its target state; the master retries."""
 
     station: int
     reason: str
@@ -53,7 +53,7 @@ class SlaveFailed(msgspec.Struct, frozen=True):
 
 
 class BusLost(msgspec.Struct, frozen=True):
-    """No frame comes back."""
+    """Frames stopped coming back."""
 
     at_ns: int
 
@@ -68,66 +68,66 @@ Event: TypeAlias = SlaveLost | SlaveLeft | SlaveBack | SlaveFailed | BusLost | B
 
 
 MAX_EVENTS = 1000
-"""Events that wait for the user; the oldest are dropped."""
+"""Limit for queued events; the oldest are dropped."""
 
 
 class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """How a master works."""
+    """Settings of a master."""
 
     expected: Sequence[ExpectedSlave] = ()
-    """Slaves in the order of the line; nothing is compared without any."""
+    """Expected slaves in the order of the segment; empty disables the comparison."""
     pdo_configurations: Mapping[int, PdoConfiguration] = {}
-    """PDOs by station address; other slaves keep what they come with."""
+    """PDO configuration by station address; other slaves keep their defaults."""
     first_station: int = FIRST_STATION
     frame_timeout_ns: int = CEILING_NS
-    """How long a frame may be under way at most; the time-out follows the round trip up to this."""
+    """Limit for the time-out of a frame, which follows the round trip."""
     frame_retries: int = RETRIES
-    """Times that an access is sent again when its frame is overdue."""
+    """Repetitions of a datagram whose frame is overdue."""
     acyclic_octets: int = 1536
-    """Budget of acyclic datagrams in a cycle."""
+    """Budget of acyclic datagrams per cycle."""
     watchdog_ms: int | None = None
-    """After so long without outputs slaves leave OP; None keeps what they come with."""
+    """Process data watchdog of the slaves; None keeps their defaults."""
     clocks: bool = False
-    """Whether distributed clocks are set and kept together; SYNC0 needs it."""
+    """Set and synchronize distributed clocks; required by SYNC0."""
     sync0: Mapping[int, Sync0] = {}
-    """By station address."""
+    """SYNC0 by station address."""
     epoch_offset_ns: int = 0
-    """From the master's time to nanoseconds since 2000-01-01, which the clocks show."""
+    """Offset from the master's time to DC system time (nanoseconds since 2000-01-01)."""
     allow_lrw: bool = True
-    """False exchanges process data by LWR and LRD even where slaves know LRW."""
+    """False exchanges process data by LWR and LRD even if all slaves support LRW."""
 
 
 class ChangeCount:
-    """Number of changes on a bus that matter to its users: states, mailboxes, slaves, faults."""
+    """Count of the changes on a bus that users see: states, mailboxes, slaves, faults."""
 
     def __init__(self) -> None:
         self.count = 0
 
     def note(self) -> int:
-        """Count one more; return the number."""
+        """Count a change; return the new count."""
         self.count += 1
         return self.count
 
 
 _NOTED = frozenset(("state", "target", "is_lost", "mailbox", "work"))
-"""Attributes of a unit whose changes matter to users of the bus."""
+"""Attributes of a slave whose changes users of the bus see."""
 _UNSET = object()
 
 
 class BusSlave:
-    """One slave that the master drives.
+    """Slave as the master drives it.
 
     Attributes:
-        revision: Number of its last change among those of the bus.
-        state: Its AL state as it was read last; None until it was read since the slave answers.
-        target: Where it belongs.
-        is_set_up: Whether its sync managers and FMMUs are set for process data.
-        channels: Its process data.
-        mailbox: Open in the states that have one.
-        missing_since_ns: Since when it is not where it belongs; None while it is.
-        is_lost: Whether it has not answered and was not set up anew since.
-        work: What is going on to bring it somewhere.
-        retry_ns: Not tried again before then.
+        revision: Count of changes of the bus at its last change.
+        state: AL state at the last read; None after the slave was lost, until the next read.
+        target: Requested state.
+        is_set_up: True while its sync managers and FMMUs are configured for process data.
+        channels: Sync managers of its process data.
+        mailbox: Open mailbox; None in states without one.
+        missing_since_ns: Time at which it left its target state; None while it is there.
+        is_lost: True from a missing answer until the slave is configured again.
+        work: Task that brings it to a state.
+        retry_ns: Earliest time of the next attempt.
     """
 
     def __init__(self, found: FoundSlave, name: str, changes: ChangeCount | None = None) -> None:
@@ -147,47 +147,47 @@ class BusSlave:
         self.retry_ns = 0
 
     def __setattr__(self, name: str, value: object) -> None:
-        """Note a change; here, so that no procedure can forget it."""
+        """Set an attribute and note the change, so that no procedure can forget to."""
         if name in _NOTED and getattr(self, name, _UNSET) is not value:
             self.note_change()
         super().__setattr__(name, value)
 
     def note_change(self) -> None:
-        """Note that something about it has changed."""
+        """Note a change of this slave."""
         self.revision = self._changes.note()
 
     def start_work(self, work: Task[Any]) -> None:
-        """Note that *work* brings it somewhere, and later that this is done."""
+        """Note the task that brings the slave to a state, and its end."""
         self.work = work
         work.watch(lambda _: self.note_change())
 
     @property
     def al_state(self) -> int:
-        """AL state to be shown, 0 while it is not known or the slave is not set up anew."""
+        """AL state to display; 0 while it is unknown or the slave is not yet configured again."""
         return 0 if self.is_lost else int(self.state or 0)
 
     @property
     def is_busy(self) -> bool:
-        """Whether it is being brought somewhere."""
+        """True while a task brings it to a state."""
         return self.work is not None and not self.work.is_done
 
     def mark_lost(self) -> None:
-        """Forget where it was: it does not answer, or something else is in its place."""
+        """Mark the slave as lost: it does not answer, or another device is in its place."""
         self.is_lost = True
         self.state = None
         self.is_set_up = False
 
 
 class BusState:
-    """All slaves, their process data, and the wire to them.
+    """Slaves of a bus, their process data, and the link to them.
 
     Attributes:
-        changes: Noted by units, and here with each event and each new list of units.
-        slaves: By station address, in the order of the line.
-        image, cycle: None until process data is laid out.
+        changes: Count of changes: of slaves, of events and of the list of slaves.
+        slaves: By station address, in the order of the segment.
+        image, cycle: None before the process data layout is known.
         reference: Station address of the slave whose clock the others follow.
-        is_lost: No frame comes back, so that nothing is known about any slave.
-        needs_check: The last cycle was not as expected: look at the slaves soon.
+        is_lost: True while no frame comes back, so that the state of every slave is unknown.
+        needs_check: True after a faulty cycle: the watch reads the slaves' states soon.
     """
 
     def __init__(self, settings: MasterSettings) -> None:
@@ -208,7 +208,7 @@ class BusState:
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
 
     def emit(self, event: Event) -> None:
-        """Queue an event for the user."""
+        """Queue an event."""
         self._events.append(event)
         if isinstance(event, Unsolicited):
             return
@@ -218,33 +218,33 @@ class BusState:
             slave.note_change()
 
     def next_event(self) -> Event | None:
-        """Take the oldest event."""
+        """Return and remove the oldest event."""
         return self._events.popleft() if self._events else None
 
     def open_mailbox(self, slave: BusSlave, area: MailboxArea) -> None:
-        """The slave's mailbox works from now on."""
+        """Open the slave's mailbox."""
         self.close_mailbox(slave)
         slave.mailbox = Mailbox(slave.station, area, self.runner, self.emit)
 
     def close_mailbox(self, slave: BusSlave) -> None:
-        """The slave's mailbox works no longer: whoever waits for it is told."""
+        """Close the slave's mailbox; its pending conversations fail."""
         mailbox, slave.mailbox = slave.mailbox, None
         if mailbox is not None:
             mailbox.close()
 
     def set_participation(self, slave: BusSlave, participation: Participation) -> None:
-        """The slave takes part in the cycle, or no longer."""
+        """Set the slave's participation in the cycle."""
         if self.cycle is not None:
             self.cycle.set_participation(slave.station, participation)
 
     def distribute_time(self, reference: int | None) -> None:
-        """Hand this slave's time to the others in every cycle, or nobody's."""
+        """Distribute this slave's time in every cycle; None stops the distribution."""
         self.reference = reference
         if self.cycle is not None:
             self.cycle.extra = [] if reference is None else [drift_datagram(reference)]
 
     def reset(self) -> None:
-        """Begin anew: no slave is known."""
+        """Reset: all slaves become unknown."""
         for slave in self.slaves.values():
             if slave.work is not None:
                 slave.work.cancel()

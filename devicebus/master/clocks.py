@@ -1,8 +1,8 @@
 """Distributed clocks: delays, offsets, drift, SYNC0 (ETG.1000.4; ESC data sheet, section I 9).
 
-All slaves latch when one frame passes each of their ports.  From this follows how long a frame
-takes to each slave, and how far its clock is off; the first slave with a clock is the reference,
-whose time a datagram of every cycle then hands to the others.
+Every slave latches the time at which one frame passes its ports.  The propagation delay of each
+slave and the offset of its clock follow from these times.  The first slave with a clock is the
+reference clock; a datagram in every cycle distributes its time to the others.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SPEED_START = 0x1000
 _DRIFT_FRAMES = 20
 _DRIFT_PER_FRAME = 15
 SYNC_LEAD_NS = 100_000_000
-"""How far ahead SYNC0 begins; its registers must be written by then."""
+"""Lead time of the first SYNC0 pulse, within which its registers must be written."""
 _CYCLIC_OUT = 0x03
 """Cyclic operation and SYNC0, in the activation register."""
 
@@ -34,40 +34,40 @@ class Sync0(msgspec.Struct, frozen=True):
 
     cycle_ns: int
     shift_ns: int = 0
-    """After the start of the cycle that all slaves share."""
+    """Shift from the start of the common cycle."""
 
 
 class Latched(NamedTuple):
-    """When one frame passed a slave, by that slave's own clock."""
+    """Times at which one frame passed a slave, by that slave's local clock."""
 
     ports: tuple[int, int, int, int]
-    """32 bits each."""
+    """Receive time of each port, 32 bits."""
     processing: int
-    """64 bits, at the processing unit."""
+    """Receive time of the processing unit, 64 bits."""
 
 
 class ClockState(NamedTuple):
-    """What was set in one slave."""
+    """Clock registers written to one slave."""
 
     station: int
     delay_ns: int
-    """From the reference to this slave."""
+    """Propagation delay from the reference to this slave."""
     offset_ns: int
 
 
 def synchronize(
     slaves: Sequence[FoundSlave], time_ns: int, *, only: frozenset[int] | None = None
 ) -> Procedure[tuple[ClockState, ...]]:
-    """Set delays and offsets; return them, the reference first, nothing without any clock.
+    """Set delays and offsets; return them, the reference clock first, empty without a clock.
 
     Args:
-        slaves: All in the order of the line.
-        time_ns: System time, since 2000-01-01, that all get if no other clock runs already.
-        only: Station addresses of slaves that came back; the others are left alone.
+        slaves: All slaves in the order of the segment.
+        time_ns: System time since 2000-01-01, used unless a clock already runs.
+        only: Station addresses of slaves that came back; the others stay unchanged.
 
     Raises:
         WorkingCounterError: a slave does not answer.
-        FrameLostError: nothing comes back.
+        FrameLostError: no frame comes back.
     """
     clocks = [slave for slave in slaves if slave.esc.has_clock]
     if not clocks:
@@ -99,9 +99,9 @@ def synchronize(
 def find_delays(
     nodes: Mapping[int, TopologyNode], latched: Mapping[int, Latched]
 ) -> dict[int, int]:
-    """Return the delay to each slave with a clock, by position; the first one's is 0.
+    """Return the delay to each slave with a clock, by position; 0 for the first.
 
-    Slaves without a clock count as a part of the cable.
+    A slave without a clock is treated as part of the cable.
     """
     delays: dict[int, int] = {}
     for position in sorted(latched):
@@ -119,12 +119,12 @@ def find_delays(
 
 
 def drift_datagram(reference: int) -> DatagramRequest:
-    """Return the datagram that hands the reference's time to all; one belongs in every cycle."""
+    """Return the datagram that distributes the reference's time; one is part of every cycle."""
     return frmw(reference, Register.DC_SYSTEM_TIME, 8)
 
 
 def start_sync0(station: int, sync0: Sync0) -> Procedure[int]:
-    """Start SYNC0 in a slave whose clock is set; return when the first pulse comes.
+    """Start SYNC0 in a slave whose clock is set; return the time of the first pulse.
 
     Raises WorkingCounterError if the slave does not answer.
     """
@@ -141,7 +141,7 @@ def start_sync0(station: int, sync0: Sync0) -> Procedure[int]:
 
 
 def read_difference(station: int) -> Procedure[int]:
-    """Return by how many nanoseconds a slave's clock is ahead of the reference."""
+    """Return the difference of a slave's clock from the reference in ns, positive if ahead."""
     octets = yield from read(station, Register.DC_SYSTEM_TIME_DIFFERENCE, 4, "DC difference")
     value = int.from_bytes(octets, "little")
     magnitude = value & 0x7FFF_FFFF
@@ -175,7 +175,7 @@ def _write_state(state: ClockState) -> Procedure[None]:
 def _clocked_parent(
     position: int, nodes: Mapping[int, TopologyNode], latched: Mapping[int, Latched]
 ) -> tuple[int | None, int]:
-    """Return the nearest slave with a clock towards the master, and its port that leads here."""
+    """Return the nearest slave with a clock towards the master, and its port to this slave."""
     node = nodes[position]
     while node.parent is not None and node.parent not in latched:
         if node.parent not in nodes:
@@ -185,7 +185,7 @@ def _clocked_parent(
 
 
 def _port_order(node: TopologyNode) -> list[int]:
-    """Return the open ports in the order in which a frame comes in at them."""
+    """Return the open ports in the order in which a frame enters them."""
     turn = _ORDER.index(node.entry_port)
     return [port for port in _ORDER[turn:] + _ORDER[:turn] if port in node.ports]
 
@@ -196,5 +196,5 @@ def _port_before(node: TopologyNode, port: int) -> int:
 
 
 def _inside(node: TopologyNode, times: Sequence[int]) -> int:
-    """Return how long a frame is behind a slave, from coming in to its last return."""
+    """Return the time from a frame's arrival at a slave to its last return from behind it."""
     return times[_port_order(node)[-1]] - times[node.entry_port] & _U32

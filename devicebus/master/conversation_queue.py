@@ -1,13 +1,13 @@
 """Queue of the conversations with one slave, and the matching of its replies to their requests.
 
-Conversations of one protocol run one after the other, for a server knows only one transfer;
-requesters take turns.  Protocols take turns message by message, so that a long file transfer does
-not hold up an SDO.
+Conversations of one protocol run one after the other, because a server has only one transfer;
+requesters alternate.  Protocols alternate message by message, so that a long file transfer does not
+delay an SDO.
 
-The counter of a reply says nothing about its request.  After a time-out requests therefore carry a
-tag in the address field, which slaves echo; with one that does not, the first reply that would
-have answered the request that timed out is taken for late.  A slave may send the next fragment of
-an answer before the master listens for it: it is kept.
+The counter of a reply is unrelated to its request.  After a time-out requests therefore carry a tag
+in the address field, which slaves echo.  Some slaves do not echo it: then the first reply that fits
+the request that timed out counts as late.  A slave may send the next fragment of an answer before
+the master listens for it; such a fragment is stored.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _SOE_UNSOLICITED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
 _TAG = 0x8000
 _TAGS = 0x3FFF
 MAX_STORED = 64
-"""Fragments that are kept at most."""
+"""Limit for stored fragments."""
 
 
 class ReplyMatcher:
-    """Tags of the requests of one protocol to one slave, and the matching of its messages."""
+    """Tags of the requests of one protocol to one slave, and the matching of its replies."""
 
     def __init__(self, kind: MailboxType) -> None:
         self._kind = kind
@@ -50,7 +50,7 @@ class ReplyMatcher:
         self._suspected = False
 
     def next_address(self) -> int:
-        """Return the address field of the next request: 0 until something has timed out."""
+        """Return the address field of the next request: 0 before the first time-out."""
         self._suspected = self._has_more = False
         self._stored.clear()
         if self._tag:
@@ -58,17 +58,17 @@ class ReplyMatcher:
         return self._tag
 
     def expire(self, step: MailboxRequest) -> None:
-        """Note that a request has timed out: its reply may still come."""
+        """Note a request that has timed out, whose reply may still come."""
         if not self._suspected:
             self._expired.append(step)
         self._tag = self._tag or _TAG
 
     def note_part(self, data: bytes) -> None:
-        """Note that a part was sent or received: what belongs to it may follow."""
+        """Note a part that was sent or received; further fragments of it may follow."""
         self._has_more = has_more(self._kind, data)
 
     def store(self, data: bytes) -> bool:
-        """Keep a fragment that is not listened for yet; return whether the message is one."""
+        """Store a fragment that no conversation listens for yet; return false for no fragment."""
         is_next = self._has_more and not is_unsolicited(self._kind, data)
         if not is_next or len(self._stored) >= MAX_STORED:
             return False
@@ -77,7 +77,7 @@ class ReplyMatcher:
         return True
 
     def take_stored(self, step: MailboxRequest) -> bytes | None:
-        """Return the fragment that *step* listens for, if it was kept."""
+        """Return the stored fragment that *step* listens for, or None."""
         while self._stored:
             data = self._stored.popleft()
             if answers(step.type, step.request, data):
@@ -85,7 +85,7 @@ class ReplyMatcher:
         return None
 
     def answers(self, header: MailboxHeader, data: bytes, step: MailboxRequest) -> bool:
-        """Return whether a message is the reply that *step* waits for."""
+        """Return true if a message is the reply to *step*."""
         if header.type == MailboxType.ERR or _fits(header, data, step):
             return not self._is_late(header, data)
         self._drop_expired(header, data)
@@ -104,7 +104,7 @@ class ReplyMatcher:
         return self._suspected
 
     def _drop_expired(self, header: MailboxHeader, data: bytes) -> bool:
-        """Drop the request that timed out and has its reply now; return whether there is one."""
+        """Remove the expired request that this message answers; return false if there is none."""
         for step in self._expired:
             if header.type == MailboxType.ERR or _fits(header, data, step):
                 self._expired.remove(step)
@@ -117,7 +117,7 @@ def _fits(header: MailboxHeader, data: bytes, step: MailboxRequest) -> bool:
 
 
 def is_unsolicited(kind: MailboxType, data: bytes) -> bool:
-    """Return whether slaves send this kind of message unasked; any other that comes so is late."""
+    """Return true for a message that slaves send unsolicited; any other without request is late."""
     try:
         match kind:
             case MailboxType.COE:
@@ -135,11 +135,11 @@ def is_unsolicited(kind: MailboxType, data: bytes) -> bool:
 
 
 class QueuedConversation:
-    """A conversation that was started.
+    """Started conversation.
 
     Attributes:
         step: Its next request.
-        ready_ns: Earliest time for it.
+        ready_ns: Earliest time of this request.
     """
 
     __slots__ = ("conversation", "ready_ns", "requester", "step", "task")
@@ -155,7 +155,7 @@ class QueuedConversation:
 
 
 class ProtocolQueue:
-    """The conversations of one protocol with one slave; *matcher* matches their replies."""
+    """Conversations of one protocol with one slave; *matcher* matches their replies."""
 
     def __init__(self, kind: MailboxType) -> None:
         self.matcher = ReplyMatcher(kind)
@@ -168,7 +168,7 @@ class ProtocolQueue:
         self.advance()
 
     def advance(self) -> None:
-        """Begin the conversation of the next requester if the last one is over."""
+        """Activate the conversation of the next requester if the active one has ended."""
         if self.active is not None and not self.active.task.is_done:
             return
         self.active = None
@@ -189,7 +189,7 @@ class ProtocolQueue:
 
 
 class ConversationQueue:
-    """All conversations with one slave."""
+    """Conversations of all protocols with one slave."""
 
     def __init__(self) -> None:
         self._queues: dict[MailboxType, ProtocolQueue] = {}
@@ -206,9 +206,9 @@ class ConversationQueue:
         return self._queues.setdefault(kind, ProtocolQueue(kind))
 
     def next_job(self, now_ns: int) -> QueuedConversation | None:
-        """Return the conversation that goes on now, if any may.
+        """Return the conversation to continue now, or None.
 
-        One that only listens goes first: no other would know its message.
+        A conversation that only listens has priority: no other can match its message.
         """
         ready = []
         for queue in self._queues.values():
@@ -222,14 +222,14 @@ class ConversationQueue:
         return job
 
     def next_ready(self) -> int | None:
-        """Return when the next conversation may go on."""
+        """Return the time at which the next conversation is ready."""
         times = [
             queue.active.ready_ns for queue in self._queues.values() if queue.active is not None
         ]
         return min(times, default=None)
 
     def fail_all(self, reason: str) -> None:
-        """End every conversation."""
+        """Fail every conversation with MailboxClosedError."""
         for queue in self._queues.values():
             for job in list(queue):
                 if not job.task.is_done:

@@ -1,7 +1,7 @@
-"""The exchange of process data: one or a few logical datagrams a cycle, and their counters.
+"""Cyclic exchange of process data: logical datagrams, expected working counters, statistics.
 
-A slave counts once its FMMUs and sync managers are set up, and no longer when it is away, so that
-the others' inputs stay valid while one is missing.
+A slave counts in the expected working counter from the configuration of its FMMUs and sync managers
+until it is lost, so that the inputs of the others stay valid without it.
 """
 
 from __future__ import annotations
@@ -19,37 +19,37 @@ from devicebus.master.link import Exchange, Link
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, logical
 
 MAX_UNDER_WAY = 2
-"""Cycles under way at once: more would only make those behind them late, acyclic frames too."""
+"""Limit for cycles in flight: more would only delay the later ones, and acyclic frames too."""
 
 
 class Participation(Enum):
-    """Whether a slave takes part."""
+    """Participation of a slave in the cycle."""
 
     ABSENT = auto()
-    """It is not set up and does not count."""
+    """Not configured: it does not count."""
     UNCERTAIN = auto()
-    """It may count or not: it is being set up, or lost and might come back as it was."""
+    """Counts or not: it is being configured, or is lost and may return as it was."""
     ACTIVE = auto()
 
 
 class CycleStats(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters since process data runs; times in nanoseconds."""
+    """Counters since the start of the exchange; times in nanoseconds."""
 
     cycles: int
     good: int
     """Cycles that came back with the expected working counters."""
     wkc_errors: int
     late: int
-    """Cycles that came back after their time-out; their inputs were taken all the same."""
+    """Cycles that came back after their time-out; their inputs were used."""
     lost: int
     """Cycles that never came back."""
     skipped: int
-    """Cycles that were not sent, because MAX_UNDER_WAY were under way already."""
+    """Cycles not sent because MAX_UNDER_WAY were in flight."""
     expected_wkc: int
     received_wkc: int
-    """Both of the last cycle, over all datagrams."""
+    """Expected and received working counter of the last cycle, over all datagrams."""
     trip_ns: int
-    """From queueing the last cycle to its reply."""
+    """Time from queueing the last cycle to its reply."""
     max_trip_ns: int
 
 
@@ -62,16 +62,16 @@ class _CyclicDatagram(NamedTuple):
 
 
 class Cycle:
-    """Exchanges the process data of *image* once whenever it is told to.
+    """Exchange of the process data of *image*, once per call of start().
 
     Args:
-        link: Takes the datagrams.
+        link: Link that sends the datagrams.
         image: Outputs and inputs.
-        knows_lrw: Whether all slaves let one datagram read and write.
+        knows_lrw: True if all slaves support LRW.
         on_fault: Called with the time when a cycle does not come back as expected.
 
     Attributes:
-        is_good: Whether the last cycle has come back with the expected working counters.
+        is_good: True if the last cycle has come back with the expected working counters.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Cycle:
         self._image = image
         self._on_fault = on_fault
         self.extra: Sequence[DatagramRequest] = ()
-        """More datagrams of each cycle; their replies go to *handle_extra*."""
+        """Additional datagrams of each cycle; *handle_extra* receives their replies."""
         self.handle_extra: Callable[[Sequence[DatagramReply]], None] = lambda replies: None
         self._participation = dict.fromkeys(image.layout.slaves, Participation.ABSENT)
         self._datagrams = tuple(
@@ -106,22 +106,22 @@ class Cycle:
         self._received = self._trip_ns = self._max_trip_ns = 0
 
     def set_participation(self, station: int, participation: Participation) -> None:
-        """A slave comes or goes."""
+        """Change the participation of a slave."""
         if station in self._participation and self._participation[station] is not participation:
             self._participation[station] = participation
             self._update_expected(self._image.layout.slaves[station].group)
 
     def participation(self, station: int) -> Participation:
-        """Whether a slave takes part."""
+        """Return the participation of a slave."""
         return self._participation.get(station, Participation.ABSENT)
 
     @property
     def is_full(self) -> bool:
-        """Whether the last cycle has come back well from all slaves that should take part."""
+        """True if the last cycle came back with the full working counter of all active slaves."""
         return self.is_good and self._received == self._expected > 0
 
     def start(self, now_ns: int) -> None:
-        """Queue this cycle's datagrams, unless so many are under way that they would only wait."""
+        """Queue this cycle's datagrams, unless MAX_UNDER_WAY cycles are in flight."""
         self._link.start_cycle()
         under_way = self._under_way
         while under_way and (not under_way[0].missing or under_way[0].is_overdue):
@@ -211,7 +211,7 @@ class Cycle:
                 inputs[slave.inputs : slave.inputs + slave.inputs_size] = data[start:end]
 
     def _update_expected(self, number: int) -> None:
-        """Work out anew which working counters the datagrams of a group may have, as bits."""
+        """Compute the allowed working counters of a group's datagrams, as a bit set."""
         members = self._members[number]
         participations = [self._participation[slave.station] for slave in members]
         self._all_active[number] = all(each is Participation.ACTIVE for each in participations)
@@ -242,7 +242,7 @@ def _datagrams_of(number: int, group: DatagramGroup, *, knows_lrw: bool) -> list
 
 
 def _count(command: Command, slave: SlaveLayout) -> int:
-    """What a slave adds to the working counter (ETG.1000.4)."""
+    """Return a slave's increment of the working counter (ETG.1000.4)."""
     reads = int(slave.inputs_size > 0)
     writes = int(slave.outputs_size > 0)
     match command:

@@ -1,7 +1,7 @@
-"""Where the bus is ill: states, and the error counters of every port.
+"""Diagnosis of a bus: AL status and error counters of the ports of every slave.
 
-A damaged frame is counted as invalid by the first slave that sees it and as forwarded by those
-behind it; the first port that counts is next to the cable or the slave at fault (ESC data sheet).
+The first slave that receives a damaged frame counts it as invalid, the slaves behind it as
+forwarded; the first port that counts is next to the faulty cable or slave (ESC data sheet).
 """
 
 from __future__ import annotations
@@ -35,39 +35,39 @@ class PortErrors(msgspec.Struct, frozen=True):
 
     @property
     def total(self) -> int:
-        """What arose here: errors that only passed are not counted."""
+        """Sum of the errors that arose at this port, without forwarded ones."""
         return self.invalid_frames + self.physical + self.lost_links
 
 
 class SlaveDiagnosis(msgspec.Struct, frozen=True):
-    """What one slave says of itself; nothing if it does not answer."""
+    """Diagnosis of one slave; empty if it does not answer."""
 
     station: int
     answers: bool
     state: str = ""
     code: int = 0
     text: str = ""
-    """What *code* means."""
+    """Text of *code*."""
     ports: tuple[PortErrors, ...] = ()
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """Where errors start: at this port, or on the cable to what is wired to it."""
+    """Port at which errors start, at the slave or on the cable of that port."""
 
     station: int
     port: int
     neighbour: int | None
-    """Station address of the slave at the other end; None for the master or nobody."""
+    """Station address of the slave at the other end; None for the master or an open end."""
 
 
 class BusDiagnosis(msgspec.Struct, frozen=True):
-    """All slaves in the order of the line."""
+    """Diagnosis of all slaves in the order of the segment."""
 
     slaves: tuple[SlaveDiagnosis, ...]
     faults: tuple[Fault, ...] = ()
     """Ports that have counted errors, in the order of the frame."""
     is_silent: bool = False
-    """Whether no frame came back: then nothing is known about any slave."""
+    """True if no frame came back, so that the state of every slave is unknown."""
 
     @property
     def first_fault(self) -> Fault | None:
@@ -76,7 +76,7 @@ class BusDiagnosis(msgspec.Struct, frozen=True):
 
 
 def diagnose(stations: Sequence[int]) -> Procedure[BusDiagnosis]:
-    """Read states and counters of slaves, which come in the order of the line."""
+    """Read AL status and counters of slaves given in the order of the segment."""
     found = []
     statuses = []
     try:
@@ -92,14 +92,14 @@ def diagnose(stations: Sequence[int]) -> Procedure[BusDiagnosis]:
 
 
 def port_counters(octets: bytes) -> tuple[int, ...]:
-    """Return for each port how many errors arose there, of all kinds."""
+    """Return the sum of the errors that arose at each port."""
     return tuple(
         octets[2 * port] + octets[2 * port + 1] + octets[16 + port] for port in range(_PORTS)
     )
 
 
 def clear_counters(stations: Sequence[int]) -> Procedure[None]:
-    """Set all error counters back to 0; slaves that do not answer are left out."""
+    """Reset all error counters; slaves that do not answer are skipped."""
     for start in range(0, len(stations), _PER_STEP):
         part = stations[start : start + _PER_STEP]
         yield [fpwr(at, Register.RX_ERROR, bytes(COUNTERS)) for at in part]

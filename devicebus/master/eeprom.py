@@ -8,23 +8,23 @@ from devicebus.wire.register import EepromCommand, EepromControl, Register
 from devicebus.wire.sii import CategoryHeader, SiiFixed
 
 BUSY_TIMEOUT_NS = 20_000_000
-"""How long the EEPROM may work on one command."""
+"""Time-out for one EEPROM command."""
 POLL_NS = 100_000
 TRIES = 4
-"""How often a command is given that the EEPROM does not acknowledge."""
+"""Attempts of a command that the EEPROM does not acknowledge."""
 RETRY_NS = 4_000_000
-"""How long it is left alone then: it stores a word in up to 10 ms, and is deaf meanwhile."""
+"""Pause between attempts: the EEPROM stores a word in up to 10 ms and does not answer meanwhile."""
 MIN_LIMIT = 4096
-"""Bytes that an EEPROM may fill whatever size it gives: many give none."""
+"""Accepted size in bytes whatever the EEPROM declares: many declare none."""
 MAX_SIZE = 0x20000
-"""Bytes that word addresses of 16 bits reach."""
+"""Address range of 16 bit word addresses in bytes."""
 
 _ADDRESS_AND_DATA = 14
 _END = b"\xff\xff"
 
 
 def take_over(station: int) -> Procedure[None]:
-    """Take the EEPROM from the slave's application, which may have left it assigned to itself."""
+    """Take the EEPROM back from the slave's application."""
     yield from write(station, Register.EEPROM_CONFIGURATION, b"\2", "EEPROM configuration")
     yield from write(station, Register.EEPROM_CONFIGURATION, b"\0", "EEPROM configuration")
 
@@ -50,7 +50,7 @@ def write_word(station: int, word: int, data: bytes) -> Procedure[None]:
 
 
 def reload(station: int) -> Procedure[None]:
-    """Let the controller take over its settings from the EEPROM, as after power-on."""
+    """Make the controller reload its configuration from the EEPROM, as after power-on."""
     request = EepromControl(command=EepromCommand.RELOAD).encode() + bytes(4)
     yield from _command(station, request, "reloading")
 
@@ -85,7 +85,7 @@ def read_image(station: int) -> Procedure[bytes]:
 
 
 def write_image(station: int, image: bytes) -> Procedure[None]:
-    """Write a whole image word by word, those that already fit excepted.
+    """Write an image word by word, except words that are equal already.
 
     Raises:
         SiiError: the image is of odd length, or the EEPROM does not take it.

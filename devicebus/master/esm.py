@@ -1,4 +1,4 @@
-"""States of one slave: asking for them, waiting, and why they are refused (ETG.1000.6)."""
+"""EtherCAT state machine of one slave: requests, time-outs and AL status codes (ETG.1000.6)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TIMEOUT_NS = {
     AlState.SAFEOP: 10_000_000_000,
     AlState.OP: 10_000_000_000,
 }
-"""How long a slave may take to reach each state (ETG.1020)."""
+"""Time-out of each state change (ETG.1020)."""
 ACKNOWLEDGE_TIMEOUT_NS = 200_000_000
 POLL_NS = 500_000
 
@@ -24,7 +24,7 @@ _LADDER = (AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP)
 
 
 def path(current: AlState, target: AlState) -> tuple[AlState, ...]:
-    """Return the states to ask for, one after the other, to get from one to another."""
+    """Return the states to request in turn on the way from *current* to *target*."""
     if current is target:
         return ()
     if AlState.BOOT in {current, target}:
@@ -36,22 +36,23 @@ def path(current: AlState, target: AlState) -> tuple[AlState, ...]:
 
 
 def read_status(station: int) -> Procedure[AlStatus]:
-    """Return where a slave stands; raises WorkingCounterError if it does not answer."""
+    """Return the AL status of a slave; raises WorkingCounterError if it does not answer."""
     octets = yield from read(station, Register.AL_STATUS, AlStatus.SIZE, "AL status")
     return AlStatus.decode(octets)
 
 
 def acknowledge(station: int) -> Procedure[AlState]:
-    """Take back a slave's error, if it has one; return where it stands.
+    """Acknowledge the error of a slave, if it has one; return its state.
 
     Raises:
-        StateTimeoutError: it keeps the error.
-        BusError: it stands in no state that exists.
-        WorkingCounterError: it does not answer.
+        StateTimeoutError: the slave keeps the error.
+        BusError: its state is undefined.
+        WorkingCounterError: the slave does not answer.
     """
     status = yield from read_status(station)
     if status.error:
-        # An error without a code is our own bit, mirrored by a controller that emulates a device.
+        # An error without a code is the master's acknowledge bit, mirrored by a controller in
+        # device emulation (0x0141 bit 0).
         control = AlControl(status.state, acknowledge=int(status.code != 0)).encode()
         yield from write(station, Register.AL_CONTROL, control, "AL control")
         status = yield from _poll_until(
@@ -65,19 +66,19 @@ def acknowledge(station: int) -> Procedure[AlState]:
     try:
         return AlState(status.state)
     except ValueError:
-        raise BusError(f"slave {station}: stands in {_name(status)}, which no slave may") from None
+        raise BusError(f"slave {station}: {_name(status)} is no state of ETG.1000.6") from None
 
 
 def change_state(
     station: int, target: AlState, *, timeout_ns: int | None = None
 ) -> Procedure[None]:
-    """Bring a slave to a state that its present one leads to; an error is acknowledged first.
+    """Change the state of a slave by one transition; an error is acknowledged first.
 
     Raises:
-        AlStatusError: the slave refuses, with its reason.
-        StateTimeoutError: it is not there after *timeout_ns*, by default as long as the standard
-            gives it.
-        WorkingCounterError: it does not answer.
+        AlStatusError: the slave refuses, with an AL status code.
+        StateTimeoutError: the state is not reached within *timeout_ns*, by default the time of
+            the standard.
+        WorkingCounterError: the slave does not answer.
     """
     current = yield from acknowledge(station)
     if current is target:
@@ -104,7 +105,7 @@ def change_state(
 def _poll_until(
     station: int, is_reached: Callable[[AlStatus], bool], timeout_ns: int
 ) -> Procedure[AlStatus]:
-    """Read the AL status until it is as wanted or the time is over; return the last one."""
+    """Read the AL status until *is_done* or the time-out; return the last one."""
     _, now_ns = yield Sleep(0)
     deadline_ns = now_ns + timeout_ns
     while True:

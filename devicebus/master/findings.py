@@ -1,7 +1,7 @@
-"""Findings about a bus: one for each cause, however many slaves show it.
+"""Findings about a bus: one for each cause, for any number of slaves.
 
-A cut cable silences all slaves behind it, and a frame that does not come back says nothing about
-any of them.  A finding therefore names the first slave concerned and what still answers.
+A cut cable silences all slaves behind it, and a lost frame gives no information about any slave.  A
+finding therefore names the first slave concerned and the nearest slaves that answer.
 """
 
 from __future__ import annotations
@@ -20,64 +20,64 @@ from eap.errors import EapError
 
 NO_ANSWER = "it does not answer"
 SAME_TIME_NS = 2_000_000_000
-"""Faults that ended within this time of each other had one cause: errors are read each second."""
+"""Faults that ended within this time have one cause: error counters are read each second."""
 RECENT_NS = 2_500_000_000
-"""Errors of a port that were counted within this time go on."""
+"""Errors of a port counted within this time are still going on."""
 _LISTED = 3
-"""So many slaves are named one by one."""
+"""Limit for naming slaves one by one."""
 _SLAVE = re.compile(r"^slave \d+(?: \([^)]*\))?:? ")
 _NO_FRAME = "no frame came back"
 
 
 class SlaveView(NamedTuple):
-    """One slave as it shows itself."""
+    """Slave with its present fault, for findings."""
 
     station: int
     name: str
     answers: bool = True
     trouble: str = ""
-    """Why it is not in the state where it belongs, empty if it is."""
+    """Reason that it is not in its target state; empty if it is."""
     since_ns: int | None = None
-    """How many nanoseconds ago it stopped answering, or *trouble* began, if that is known."""
+    """Age of the fault in ns, if known."""
 
     def __str__(self) -> str:
         return f"{self.name} ({self.station})"
 
 
 class Times(NamedTuple):
-    """How many nanoseconds ago a fault began and was over."""
+    """Ages of the start and the end of a fault in ns."""
 
     since_ns: int
     until_ns: int
 
 
 class BusFinding(msgspec.Struct, frozen=True, kw_only=True):
-    """One cause of trouble."""
+    """One cause of faults, with advice."""
 
     what: str
     advice: str = ""
     slaves: tuple[int, ...] = ()
-    """Station addresses of the slaves concerned, in the order of the line."""
+    """Station addresses of the slaves concerned, in the order of the segment."""
     port: int | None = None
     """Port at which errors start, or whose link was lost."""
     is_over: bool = False
     since_ns: int | None = None
-    """How many nanoseconds ago it began, if that is known."""
+    """Age of its start in ns, if known."""
     until_ns: int | None = None
-    """How many nanoseconds ago it was over, if it is and that is known."""
+    """Age of its end in ns, if it has ended and this is known."""
 
 
 class History(NamedTuple):
-    """Notes of a running master about its slaves; nothing else knows times."""
+    """Past faults of the slaves as a running master noted them."""
 
     over: tuple[tuple[SlaveView, Times], ...] = ()
-    """Slaves with the trouble that they had, in the order of the line."""
+    """Slaves with their past fault, in the order of the segment."""
     silence: Times | None = None
-    """When no frame came back the last time, if that is over."""
+    """Last period without frames, if it has ended."""
     silent_since_ns: int | None = None
-    """How many nanoseconds ago frames stopped coming back, if they have."""
+    """Age of the present period without frames in ns, if there is one."""
     ports: Mapping[tuple[int, int], Times] = MappingProxyType({})
-    """When errors were counted, by station address and port."""
+    """Periods in which errors were counted, by station address and port."""
 
 
 def find_causes(
@@ -85,12 +85,12 @@ def find_causes(
     diagnosis: BusDiagnosis | None = None,
     history: History | None = None,
 ) -> list[BusFinding]:
-    """Return what is wrong, and behind that what was; for a bus whose frames come back.
+    """Return present findings, then past ones, of a bus whose frames come back.
 
     Args:
-        slaves: All slaves in the order of the line.
-        diagnosis: Their registers, if these were read.
-        history: Times; without it errors that were counted are taken for those of now.
+        slaves: All slaves in the order of the segment.
+        diagnosis: Their AL status and counters, if read.
+        history: Past faults; without it counted errors are reported as present.
     """
     faults = list(diagnosis.faults) if diagnosis is not None else []
     found = []
@@ -98,7 +98,7 @@ def find_causes(
         before = slaves[first - 1].station if first else None
         there = next((each for each in faults if each.station == before), None)
         found.append(_no_answer(slaves, first, count, there.port if there else None))
-        if there is not None:  # the link that was lost there has the same cause
+        if there is not None:  # the lost link of that port has the same cause
             faults.remove(there)
     for trouble, group in _by_trouble([each for each in slaves if each.answers]):
         found.append(
@@ -113,7 +113,7 @@ def find_causes(
 
 
 def find_silence(slaves: Sequence[SlaveView], since_ns: int | None = None) -> BusFinding:
-    """Return the finding that no frame comes back, which says nothing about any slave."""
+    """Return the finding that no frame comes back, so that no slave can be blamed."""
     if not slaves:
         return BusFinding(what="no frame comes back", advice="check the interface and the cable")
     return BusFinding(
@@ -130,9 +130,9 @@ def _port_findings(
     faults: Sequence[Fault],
     history: History | None,
 ) -> Iterator[BusFinding]:
-    """Yield the first of the ports whose errors are new, and the first of those of each time.
+    """Yield the first port with new errors, and the first port of each past period.
 
-    Both ends of a cable count its errors: only the end that comes first is named.
+    Both ends of a cable count its errors: only the first end is named.
     """
     ports = history.ports if history is not None else {}
     timed = [(fault, ports.get((fault.station, fault.port))) for fault in faults]
@@ -162,12 +162,12 @@ def _is_over(times: Times | None) -> bool:
 
 
 def _past(slaves: Sequence[SlaveView], history: History) -> list[BusFinding]:
-    """Return what was wrong and is over, what ended at one time as one finding."""
+    """Return past findings; faults that ended at one time are one finding."""
     groups: list[list[tuple[SlaveView, Times]]] = []
     silence = history.silence
     for slave, times in history.over:
         if silence is not None and any(_same_time(times.since_ns, each) for each in silence):
-            continue  # it was missed because of the silence, or its watchdog ran out then
+            continue  # the silence is the cause, directly or by the slave's watchdog
         for group in groups:
             same = _same_time(group[0][1].until_ns, times.until_ns)
             if group[0][0].trouble == slave.trouble and same:
@@ -194,7 +194,7 @@ def _past(slaves: Sequence[SlaveView], history: History) -> list[BusFinding]:
 
 
 def _merged(past: Sequence[BusFinding], found: Sequence[BusFinding]) -> Iterator[BusFinding]:
-    """Yield what is over; errors of a port that began with the trouble of slaves belong to it."""
+    """Yield past findings; port errors that began with a fault of slaves are merged into it."""
     ports = [each for each in found if each.is_over]
     for each in past:
         there = [port for port in ports if _belongs(port, each)]
@@ -210,7 +210,7 @@ def _merged(past: Sequence[BusFinding], found: Sequence[BusFinding]) -> Iterator
 
 
 def _belongs(port: BusFinding, trouble: BusFinding) -> bool:
-    """Whether errors of a port came with a trouble of slaves, or with the end of it at one."""
+    """Return true if port errors came with a fault of slaves, or with its end at one of them."""
     return _same_time(port.since_ns, trouble.since_ns) or (
         port.slaves[0] in trouble.slaves and _same_time(port.since_ns, trouble.until_ns)
     )
@@ -223,10 +223,10 @@ def _same_time(one_ns: int | None, other_ns: int | None) -> bool:
 
 
 def join_errors(errors: Sequence[tuple[str, EapError]]) -> EapError:
-    """Return one error for those of several slaves, with one line for each cause.
+    """Join the errors of several slaves into one error, with one line for each cause.
 
     Args:
-        errors: Names of slaves, and what went wrong with each; at least one.
+        errors: Names of slaves with their errors; at least one.
     """
     if len(errors) == 1:
         return errors[0][1]
@@ -245,7 +245,7 @@ def join_errors(errors: Sequence[tuple[str, EapError]]) -> EapError:
 
 
 def describe_trouble(names: Sequence[str], trouble: str) -> str:
-    """Return what is wrong with the slaves of these *names*, whose number it may begin with."""
+    """Return the text of a fault that the slaves of these *names* share."""
     text = _SLAVE.sub("", trouble)
     colon = "" if len(names) == 1 and text.startswith("it ") else ":"
     return f"{_listed(names)}{colon} {text.removeprefix('it ')}"
@@ -263,7 +263,7 @@ def describe_counters(port: PortErrors) -> str:
 
 
 def _cause(error: EapError) -> str:
-    """Return what went wrong without the slave that it went wrong with."""
+    """Return the text of an error without its slave."""
     return _NO_FRAME if isinstance(error, FrameLostError) else _SLAVE.sub("", str(error))
 
 
@@ -316,7 +316,7 @@ def _no_answer(slaves: Sequence[SlaveView], first: int, count: int, port: int | 
 def _errors(
     slaves: Sequence[SlaveView], diagnosis: BusDiagnosis, fault: Fault, verb: str
 ) -> BusFinding:
-    """Return the finding about the port at which errors start, or started."""
+    """Return the finding about the first port with errors."""
     names = {each.station: str(each) for each in slaves}
     port = next(
         port
@@ -348,7 +348,7 @@ def _describe(slaves: Sequence[SlaveView], trouble: str) -> str:
 
 
 def _describe_past(slaves: Sequence[SlaveView], trouble: str) -> str:
-    """Return what was wrong with slaves, in the past."""
+    """Return the text of a past fault."""
     if trouble == NO_ANSWER:
         return f"{_listed([str(each) for each in slaves])} did not answer"
     return _describe(slaves, trouble)

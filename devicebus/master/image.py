@@ -1,4 +1,9 @@
-"""Outputs and inputs of all slaves as two blocks of bytes, and their values by name."""
+"""Process image of a bus: layout in logical addresses and datagrams, and values by name.
+
+Slaves share one logical datagram as long as it fits a frame.  A sync manager is never split,
+because its slave accepts and provides its area as a whole.  A datagram contains all outputs, then
+all inputs, so that one LRW, or an LWR and an LRD, exchange both.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +22,13 @@ from eap.codec.values import DataType, Value
 BASE = 0x0001_0000
 """First logical address."""
 MAX_FMMUS = 16
-"""Of a controller, whatever it says of itself."""
+"""Limit for the FMMUs of a controller."""
 _STRIDE = 0x0800
-"""Between the addresses of two datagrams; more than the bytes of one."""
+"""Distance of the logical addresses of two datagrams, longer than one datagram."""
 
 
 class SlaveProcessData(NamedTuple):
-    """What a slave needs: its process data, and how many FMMUs it has for that."""
+    """Process data of a slave, and the number of its FMMUs."""
 
     station: int
     channels: tuple[ProcessDataChannel, ...]
@@ -31,7 +36,7 @@ class SlaveProcessData(NamedTuple):
 
 
 class SlaveLayout(NamedTuple):
-    """A slave's part of the image, outputs and inputs each from a byte on."""
+    """Part of a slave in the image; outputs and inputs each begin at a byte."""
 
     station: int
     outputs: int
@@ -39,13 +44,13 @@ class SlaveLayout(NamedTuple):
     inputs: int
     inputs_size: int
     group: int
-    """Which of the datagrams carries it."""
+    """Number of its datagram group."""
     fmmus: tuple[Fmmu, ...]
     sync_managers: tuple[tuple[int, SyncManager], ...]
 
 
 class DatagramGroup(NamedTuple):
-    """What one LRW, or one LWR and one LRD, exchange."""
+    """Process data that one LRW, or one LWR and one LRD, exchange."""
 
     address: int
     outputs: int
@@ -55,13 +60,13 @@ class DatagramGroup(NamedTuple):
 
 
 class ProcessVariable(msgspec.Struct, frozen=True):
-    """An entry of a PDO in the image."""
+    """PDO entry in the image."""
 
     station: int
     name: str
     is_output: bool
     bit_offset: int
-    """From the start of all outputs, or of all inputs."""
+    """Offset from the start of all outputs, or of all inputs."""
     bit_length: int
     data_type: int
     index: int
@@ -69,26 +74,26 @@ class ProcessVariable(msgspec.Struct, frozen=True):
 
 
 class ProcessDataLayout(NamedTuple):
-    """All of it."""
+    """Layout of the process data of all slaves."""
 
     slaves: dict[int, SlaveLayout]
-    """By station address."""
+    """Slaves by station address."""
     groups: tuple[DatagramGroup, ...]
     variables: tuple[ProcessVariable, ...]
 
     @property
     def outputs_size(self) -> int:
-        """Bytes of all outputs."""
+        """Size of all outputs in bytes."""
         return sum(group.outputs_size for group in self.groups)
 
     @property
     def inputs_size(self) -> int:
-        """Bytes of all inputs."""
+        """Size of all inputs in bytes."""
         return sum(group.inputs_size for group in self.groups)
 
 
 def plan_image(slaves: Sequence[SlaveProcessData]) -> ProcessDataLayout:
-    """Give every slave its place.
+    """Assign outputs, inputs, FMMUs and datagrams to every slave.
 
     Raises:
         BusError: a slave has more process data than a frame holds, or too few FMMUs.
@@ -115,7 +120,7 @@ def plan_image(slaves: Sequence[SlaveProcessData]) -> ProcessDataLayout:
 
 
 def _group(slaves: Sequence[SlaveProcessData]) -> Iterator[list[SlaveProcessData]]:
-    """Divide the slaves with process data into as few datagrams as their order allows."""
+    """Divide the slaves with process data into as few datagrams as possible, in their order."""
     members: list[SlaveProcessData] = []
     total = 0
     for slave in slaves:
@@ -140,7 +145,7 @@ def _size(slave: SlaveProcessData, *, is_output: bool) -> int:
 def _plan_slave(
     slave: SlaveProcessData, group: int, start: tuple[int, int], shift: tuple[int, int]
 ) -> SlaveLayout:
-    """Place one slave; *shift* leads from offsets in the image to logical addresses."""
+    """Plan one slave; *shift* converts image offsets to logical addresses."""
     ends = list(start)
     fmmus = []
     managers = []
@@ -214,11 +219,11 @@ _UNTYPED = {8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
 
 
 class BusImage:
-    """Process data of a bus.
+    """Outputs and inputs of a bus.
 
     Attributes:
-        outputs: What goes out with the next cycle.
-        inputs: What came with the last one; a slave that is away keeps its last inputs.
+        outputs: Outputs of the next cycle.
+        inputs: Inputs of the last cycle; a lost slave keeps its last inputs.
     """
 
     def __init__(self, layout: ProcessDataLayout) -> None:
@@ -228,7 +233,7 @@ class BusImage:
         self._variables = {(each.station, each.name): each for each in layout.variables}
 
     def variable(self, station: int, name: str) -> ProcessVariable:
-        """Return an entry by its slave and name; raise BusError naming those that exist."""
+        """Return an entry by its slave and name; raise BusError with the known names."""
         try:
             return self._variables[station, name]
         except KeyError:
@@ -238,7 +243,7 @@ class BusImage:
             ) from None
 
     def read(self, station: int, name: str) -> Value:
-        """Return a value; raise BusError if there is no such entry."""
+        """Return the value of an entry; raise BusError for an unknown entry."""
         variable = self.variable(station, name)
         octets = self.read_octets(variable)
         kind = data_type_of(variable)
@@ -248,8 +253,8 @@ class BusImage:
         """Set an output.
 
         Raises:
-            BusError: there is no such entry, or it is an input.
-            ValueError: the value is none of its type.
+            BusError: the entry is unknown, or an input.
+            ValueError: the value does not fit the type.
         """
         variable = self.variable(station, name)
         if not variable.is_output:
@@ -260,7 +265,7 @@ class BusImage:
         self.write_octets(variable, kind.encode(value) if kind else bytes(value))  # type: ignore[arg-type]
 
     def read_octets(self, variable: ProcessVariable) -> bytes:
-        """Return the bits of an entry, from bit 0 of the first byte on."""
+        """Return the bits of an entry, shifted to bit 0 of the first byte."""
         block = self.outputs if variable.is_output else self.inputs
         first, shift = divmod(variable.bit_offset, 8)
         bits = variable.bit_length
@@ -269,7 +274,7 @@ class BusImage:
         return word.to_bytes((bits + 7) // 8, "little")
 
     def write_octets(self, variable: ProcessVariable, octets: bytes) -> None:
-        """Set the bits of an output; what lies beside them stays."""
+        """Set the bits of an output; neighbouring bits stay unchanged."""
         first, shift = divmod(variable.bit_offset, 8)
         mask = (1 << variable.bit_length) - 1
         end = first + (shift + variable.bit_length + 7) // 8
@@ -279,7 +284,7 @@ class BusImage:
 
 
 def data_type_of(variable: ProcessVariable) -> DataType | None:
-    """Return the data type of an entry; one that nobody told is a number of that many bits."""
+    """Return the data type of an entry; without one, an unsigned number of its bit length."""
     kind = _KINDS.get(variable.data_type)
     if kind is not None and kind.bit_length == variable.bit_length:
         return kind

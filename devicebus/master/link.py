@@ -1,17 +1,17 @@
-"""Accesses become datagrams, datagrams frames, and frames that come back answers.
+"""Link of a master: datagrams are packed into frames, sent, matched and repeated.
 
-Every datagram of a frame carries the frame's index; a frame that comes back is taken only if its
-index is awaited and each datagram is the one that was sent, so that foreign and damaged frames
-never answer anything.
+Every datagram of a frame carries the frame's index.  A frame that comes back is accepted only if
+its index is in flight and each datagram is the one that was sent, so that foreign and damaged
+frames answer nothing.
 
-A frame is overdue after a time-out that follows the measured round trip (:mod:`roundtrip`), and is
-sent again then.  It is not given up: for LINGER_NS its index belongs to it alone, and if it comes
-back it is late and still answers what nothing else has answered.  Only then it counts as lost.  A
-busy machine therefore makes frames late, and nothing fails by that.
+A frame is overdue after a time-out that follows the measured round trip (:class:`RoundTrip`); its
+acyclic datagrams are sent again.  The overdue frame keeps its index for LINGER_NS.  If it comes
+back in this time it is late, and answers the datagrams that have no answer yet; otherwise it is
+lost.  A busy machine therefore makes frames late, and nothing fails.
 
-Cyclic accesses go first; a few short acyclic ones may ride along, which spares a frame.  Once
-cycles run, acyclic ones share a budget that each cycle refills: a cycle sends at most the budget
-and one frame of them, however much is waiting.
+Cyclic datagrams go first; a few short acyclic ones share their frame, which saves a frame.  While
+cycles run, acyclic datagrams share a budget that each cycle refills: a cycle sends at most the
+budget and one frame more, whatever is queued.
 """
 
 from __future__ import annotations
@@ -34,23 +34,27 @@ from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.wire import Buffer
 
 FLOOR_NS = 2_000_000
-"""Shortest time-out: a wire of 200 slaves takes less than 1 ms, the rest is for this machine."""
+"""Minimum time-out: 200 slaves take less than 1 ms, the rest is reserve for this machine."""
 CEILING_NS = 1_000_000_000
-"""Longest time-out unless the plant file says otherwise."""
+"""Default for the maximum time-out."""
 BACKOFF_LIMIT_NS = 100_000_000
-"""Time-out before anything is measured, and the end of backing off: a slow bus is known by its late
-frames, and a silent one is to be noticed soon."""
+"""Time-out before the first measurement, and limit of the back-off: late frames show a slow bus,
+and a silent bus must be detected soon."""
 
 
 class RoundTrip:
-    """Estimate of the round trip, and the time-out that follows from it.
+    """Round trip estimate and the time-out that follows from it (RFC 6298).
+
+    RFC 6298 ignores the round trip of a repeated segment (Karn's rule), because the answer does not
+    tell which transmission it belongs to.  Here each transmission has a frame index of its own, so
+    every round trip is measured, also that of a late frame, which shows a slow bus.
 
     Args:
-        ceiling_ns: Longest time-out.
+        ceiling_ns: Maximum time-out.
 
     Attributes:
-        timeout_ns: How long a frame may be under way that is sent for the first time.
-        smoothed_ns: Mean of the latest round trips, 0 before the first.
+        timeout_ns: Time-out of a frame that is sent for the first time.
+        smoothed_ns: Smoothed round trip, 0 before the first.
     """
 
     __slots__ = (
@@ -71,16 +75,16 @@ class RoundTrip:
         self.timeout_ns = self._backoff_limit_ns
 
     def timeout_of(self, number: int, last: int) -> int:
-        """Return how long sending *number* of *last* is waited for.
+        """Return the time-out of attempt *number* of *last*.
 
-        Each time twice as long, up to BACKOFF_LIMIT_NS; the last one as long as that at least.
+        It doubles with each attempt up to BACKOFF_LIMIT_NS, which is the minimum of the last one.
         """
         if number == last > 1:
             return max(self.timeout_ns, self._backoff_limit_ns)
         return max(self.timeout_ns, min(self.timeout_ns << number - 1, self._backoff_limit_ns))
 
     def measure(self, round_trip_ns: int) -> None:
-        """Take a round trip into account."""
+        """Add a round trip to the estimate."""
         smoothed_ns, variation_ns = self.smoothed_ns, self._variation_ns
         if not smoothed_ns:
             smoothed_ns, variation_ns = round_trip_ns, round_trip_ns >> 1
@@ -100,22 +104,22 @@ class RoundTrip:
 
 
 RETRIES = 4
-"""Times that an access is sent again unless the plant file says otherwise."""
+"""Default for the repetitions of a datagram."""
 LINGER_NS = 1_000_000_000
-"""How long an overdue frame may still come back; then it is lost."""
+"""Time after the time-out in which a frame is late; after it the frame is lost."""
 INDEXES = 256
 MAX_DATAGRAMS = 15
-"""Datagrams of a frame; some slaves and masters know no more."""
+"""Datagrams in a frame; some slaves and masters support no more."""
 MAX_BODY = 1498
-"""Bytes of a frame behind its header, as many as an Ethernet frame carries."""
+"""Bytes of a frame without its header: the capacity of an Ethernet frame."""
 MAX_DATA = MAX_BODY - OVERHEAD
-"""Bytes of one access."""
+"""Bytes of one datagram."""
 MIN_COST = 64
-"""What a datagram takes of the budget at least: a short one costs as much time as this many."""
+"""Minimum cost of a datagram in the budget: a short one takes as much time as so many bytes."""
 MAX_PIGGYBACK = 256
-"""Bytes of acyclic datagrams in a cyclic frame: 20 µs of it at 100 Mbit/s."""
+"""Bytes of acyclic datagrams in a cyclic frame: 20 µs at 100 Mbit/s."""
 MAX_ACYCLIC_FRAMES = 8
-"""Acyclic frames under way at once; more would only wait in somebody's buffer."""
+"""Limit for acyclic frames in flight; more would only wait in buffers."""
 
 Done: TypeAlias = Callable[[list[DatagramReply] | FrameLostError, int], None]
 
@@ -129,7 +133,7 @@ _FIXED_ADP = _BY_STATION | {Command.LRD, Command.LWR, Command.LRW}
 
 
 class LinkStats(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters of frames since the start, and the time-out as it is now."""
+    """Counters of frames since the start, and the present time-out."""
 
     sent: int
     received: int
@@ -139,25 +143,25 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
     """Frames that have not come back for LINGER_NS."""
     retried: int
-    """Frames in which something was sent again."""
+    """Frames with a repeated datagram."""
     unexpected: int
-    """Frames that nobody has sent, or that came twice, or after they counted as lost."""
+    """Frames that were not sent by this master, came twice, or came after LINGER_NS."""
     malformed: int
-    """Frames that came back as something else."""
+    """Frames that came back with other datagrams."""
     timeout_ns: int
-    """How long the next frame may be under way."""
+    """Time-out of the next frame."""
     round_trip_ns: int
-    """Mean of the latest round trips, 0 before the first."""
+    """Smoothed round trip, 0 before the first."""
     max_acyclic_octets: int = 0
-    """Most bytes of acyclic datagrams that one cycle has sent, headers included."""
+    """Largest number of bytes of acyclic datagrams in a cycle, headers included."""
 
 
 class Exchange:
-    """Accesses that are answered together.
+    """Datagrams whose replies are reported together.
 
     Attributes:
-        missing: How many are not answered yet.
-        is_overdue: Whether a cyclic frame of it has not come back in time.
+        missing: Number of datagrams without a reply.
+        is_overdue: True if a cyclic frame of it has not come back in time.
     """
 
     __slots__ = ("cancelled", "done", "is_cyclic", "is_overdue", "missing", "replies")
@@ -171,18 +175,18 @@ class Exchange:
         self.is_overdue = False
 
     def cancel(self) -> None:
-        """Forget it: nothing more is sent, and *done* is not called."""
+        """Cancel: no datagram is sent any more, and *done* is not called."""
         self.cancelled = True
 
     def fail(self, error: FrameLostError, now_ns: int) -> None:
-        """Report that it will not be answered, unless it was cancelled."""
+        """Report the error to *done*, unless the exchange was cancelled."""
         if not self.cancelled:
             self.cancelled = True
             self.done(error, now_ns)
 
 
 class _QueuedDatagram:
-    """One access on its way."""
+    """Datagram that is queued or in flight."""
 
     __slots__ = ("datagram", "exchange", "is_answered", "limit", "number", "tries")
 
@@ -202,7 +206,7 @@ class _QueuedDatagram:
 
 
 class _SentFrame:
-    """A frame that is under way, or overdue."""
+    """Frame that is in flight or overdue."""
 
     __slots__ = ("cyclic", "deadline_ns", "items", "sent_ns")
 
@@ -216,12 +220,12 @@ class _SentFrame:
 
 
 class Link:
-    """The wire as its users see it.
+    """Link to the segment.
 
     Args:
-        ceiling_ns: How long a frame may be under way at most.
-        retries: How often an access is sent again that does not say otherwise.
-        acyclic_octets: Budget of acyclic accesses in a cycle, datagram headers included.
+        ceiling_ns: Maximum time-out of a frame.
+        retries: Repetitions of a datagram that sets no number of its own.
+        acyclic_octets: Budget of acyclic datagrams in a cycle in bytes, headers included.
     """
 
     def __init__(
@@ -248,17 +252,17 @@ class Link:
     def submit(
         self, datagrams: Sequence[DatagramRequest], done: Done, *, cyclic: bool = False
     ) -> Exchange:
-        """Queue accesses; *done* is called once with all replies, or with what went wrong.
+        """Queue datagrams; *done* is called once, with all replies or with an error.
 
-        They go out in order, as many as fit in one frame.  Acyclic ones are sent again when their
-        frame is overdue.  Cyclic ones are sent once: *done* is called with the replies of a late
-        frame too, and with FrameLostError when that counts as lost.
+        They are sent in order, as many as fit in one frame.  Acyclic datagrams are sent again when
+        their frame is overdue.  Cyclic datagrams are sent once: *done* is called with the replies
+        of a late frame too, and with FrameLostError for a lost frame.
 
         Raises:
-            ValueError: there is none, or one does not fit a frame.
+            ValueError: there is no datagram, or one does not fit a frame.
         """
         if not datagrams or max(len(datagram.data) for datagram in datagrams) > MAX_DATA:
-            raise ValueError(f"accesses of at most {MAX_DATA} bytes are needed, at least one")
+            raise ValueError(f"no datagram, or one with more than {MAX_DATA} bytes")
         exchange = Exchange(len(datagrams), done, is_cyclic=cyclic)
         queue = self._cyclic if cyclic else self._acyclic
         tries = self._tries
@@ -269,19 +273,19 @@ class Link:
         return exchange
 
     def start_cycle(self) -> None:
-        """A new cycle begins: refill the budget; what was overdrawn is taken off."""
+        """Begin a cycle: refill the budget, less the overdraft of the cycle before."""
         self._max_spent = max(self._max_spent, self._spent)
         self._spent = 0
         credit = self._credit or 0
         self._credit = min(credit, 0) + self._budget
 
     def stop_cycles(self) -> None:
-        """No cycles run any more: acyclic accesses go out as they come."""
+        """End the cyclic operation: acyclic datagrams are sent without a budget."""
         self._credit = None
         self._spent = 0
 
     def frames_to_send(self, now_ns: int) -> list[bytes]:
-        """Take the frames that are ready to go out."""
+        """Return the frames to send now."""
         frames: list[bytes] = []
         while self._cyclic and len(self._in_flight) < INDEXES:
             self._send(self._cyclic, frames, now_ns, cyclic=True)
@@ -290,7 +294,7 @@ class Link:
         return frames
 
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
-        """Take a frame that came back; one that answers nothing is counted."""
+        """Handle a frame that came back; one that answers nothing is counted."""
         index = data[3] if len(data) > EtherCatHeader.SIZE + DatagramHeader.SIZE else -1
         sent = self._in_flight.get(index)
         is_late = sent is None
@@ -322,15 +326,15 @@ class Link:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a frame may come back."""
+        """True while a frame may come back."""
         return bool(self._in_flight or self._overdue)
 
     def next_timeout(self) -> int | None:
-        """When the next frame under way is overdue."""
+        """Return the time at which the next frame in flight is overdue."""
         return min([sent.deadline_ns for sent in self._in_flight.values()], default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Send again what overdue frames held, or give it up."""
+        """Repeat or fail the datagrams of overdue frames."""
         while self._overdue:
             index, oldest = next(iter(self._overdue.items()))
             if now_ns - oldest.deadline_ns < LINGER_NS:
@@ -393,7 +397,7 @@ class Link:
         frames.append(_encode(items, index))
 
     def _free_index(self, now_ns: int) -> int:
-        """Return an index that no frame has; the oldest overdue frame may have to give its own."""
+        """Return a free index; if all are in use, that of the oldest overdue frame."""
         in_flight, overdue = self._in_flight, self._overdue
         if len(in_flight) + len(overdue) >= INDEXES:
             self._count_lost(next(iter(overdue)), now_ns)
@@ -427,7 +431,7 @@ class Link:
         *,
         cyclic: bool,
     ) -> None:
-        """Add what *max_size* bytes hold."""
+        """Add queued datagrams up to *max_size* bytes."""
         size = 0
         while queue and len(items) < MAX_DATAGRAMS:
             octets = OVERHEAD + len(queue[0].datagram.data)
@@ -495,7 +499,7 @@ def _match(
 
 def _lost(item: _QueuedDatagram) -> FrameLostError:
     datagram = item.datagram
-    # A frame to one slave that is lost says nothing about the others; a broadcast goes to any.
+    # Only a lost broadcast gives a hint about the cable: it does not depend on one slave.
     is_broadcast = datagram.command in _BROADCAST
     advice = "; check the cable to the first slave and its power" if is_broadcast else ""
     return FrameLostError(

@@ -1,7 +1,7 @@
-"""The mailbox of one slave: one request at a time, from all requesters, and its counters.
+"""Mailbox of one slave: one request at a time, for all requesters, with counters.
 
-Conversations are queued and their replies matched (:mod:`conversation_queue`), written and read
-(:mod:`mailboxport`).
+:mod:`conversation_queue` queues conversations and matches replies; :mod:`mailboxport` writes and
+reads the messages.
 """
 
 from __future__ import annotations
@@ -45,50 +45,50 @@ T = TypeVar("T")
 
 FIRST_PAUSE_NS = 50_000
 MAX_PAUSE_NS = 1_000_000
-"""Between two looks for a reply; doubled from the first to this."""
+"""Maximum pause between two polls for a reply; the pause doubles from FIRST_PAUSE_NS."""
 MAX_UNSOLICITED = 16
-"""Messages taken in one go while nobody has asked for anything."""
+"""Limit for unsolicited messages read in one poll."""
 
 
 class Unsolicited(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """A message that a slave sent unasked: an emergency, a notification, an Ethernet fragment."""
+    """Unsolicited message of a slave: emergency, notification, Ethernet fragment."""
 
     station: int
     type: MailboxType
     data: bytes
-    """Without the mailbox header."""
+    """Message without mailbox header."""
 
 
 Report: TypeAlias = Callable[[Unsolicited], None]
 
 
 class MailboxStats(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters since the slave is known; times in nanoseconds."""
+    """Counters of a slave's mailbox; times in nanoseconds."""
 
     sent: int
     received: int
     timeouts: int
     errors: int
-    """Requests that ended in any other error."""
+    """Requests that ended in another error than a time-out."""
     last_error: str
     repeats: int
-    """Times that the slave was asked to repeat, because a reply was lost."""
+    """Repeat requests, each after a lost reply."""
     duplicates: int
-    """Messages dropped because they repeat the one before."""
+    """Messages dropped because their counter is that of the message before."""
     gaps: int
-    """Times that the slave's counter left numbers out."""
+    """Gaps in the slave's counter."""
     late: int
-    """Messages that answered nothing: their requests had timed out."""
+    """Messages without a request, because the request had timed out."""
     unsolicited: int
     malformed: int
     latency_ns: int
-    """Of the last request, from writing it to its reply."""
+    """Latency of the last request, from its start to its reply."""
     mean_latency_ns: int
     max_latency_ns: int
 
 
 class RequestCounters:
-    """Counters of a mailbox, without those of the wire."""
+    """Counters of requests and messages, without those of MailboxPort."""
 
     __slots__ = (
         "answered",
@@ -112,14 +112,14 @@ class RequestCounters:
         self.last_error = ""
 
     def answer(self, latency_ns: int) -> None:
-        """Count a request that was answered."""
+        """Count an answered request."""
         self.answered += 1
         self.last_ns = latency_ns
         self.total_ns += latency_ns
         self.max_ns = max(self.max_ns, latency_ns)
 
     def fail(self, error: EapError) -> None:
-        """Count a request that ended in an error."""
+        """Count a failed request."""
         if isinstance(error, MailboxTimeoutError):
             self.timeouts += 1
         else:
@@ -127,7 +127,7 @@ class RequestCounters:
         self.last_error = str(error)
 
     def stats(self, *, repeats: int, duplicates: int, gaps: int) -> MailboxStats:
-        """Return a snapshot, with the counters of the wire."""
+        """Return a snapshot, with the counters of the port."""
         return MailboxStats(
             sent=self.sent,
             received=self.received,
@@ -147,13 +147,13 @@ class RequestCounters:
 
 
 class Mailbox:
-    """The mailbox of one slave that is in PREOP or above, or in BOOT.
+    """Open mailbox of a slave in PREOP, SAFEOP, OP or BOOT.
 
     Args:
-        station: Of the slave.
-        area: As its sync managers are set up.
-        runner: Runs what is sent and read.
-        report: Takes unsolicited messages.
+        station: Station address of the slave.
+        area: Addresses and sizes of its mailbox sync managers.
+        runner: Runner of its procedures.
+        report: Called with unsolicited messages.
     """
 
     def __init__(self, station: int, area: MailboxArea, runner: Runner, report: Report) -> None:
@@ -178,7 +178,7 @@ class Mailbox:
         name: str = "a request",
         requester: Hashable = None,
     ) -> Task[T]:
-        """Start a conversation; *requester* takes turns with others that use the same protocol."""
+        """Start a conversation; requesters of the same protocol alternate."""
         task: Task[T]
         try:
             step = next(conversation)
@@ -202,16 +202,16 @@ class Mailbox:
 
     @property
     def is_busy(self) -> bool:
-        """Whether something is sent or read."""
+        """True while a request or a poll runs."""
         return self._is_busy
 
     def poll(self, now_ns: int) -> None:
-        """Read what the slave has sent unasked, if nothing else is going on."""
+        """Read unsolicited messages, unless a request or a poll runs."""
         if self._is_open:
             self._begin(self._poll(), now_ns)
 
     def close(self) -> None:
-        """The slave has left the states with a mailbox: end everything."""
+        """Close the mailbox; its conversations fail."""
         self._is_open = False
         if self._work is not None:
             self._work.cancel()
@@ -224,7 +224,7 @@ class Mailbox:
         )
 
     def _check_step(self, step: MailboxRequest, who: str) -> BusError | None:
-        """Why a request cannot be sent."""
+        """Return the error of a request that cannot be sent, or None."""
         if not self._is_open:
             return MailboxClosedError(f"{who}: the slave's mailbox is closed")
         size = MailboxHeader.SIZE + len(step.request)
@@ -253,8 +253,8 @@ class Mailbox:
             self._is_busy = False
 
     def _poll(self) -> Procedure[None]:
-        """Take messages as long as there are some, and then serve who came meanwhile."""
-        with suppress(EapError):  # a slave that is gone says so to whoever asks it for something
+        """Read waiting messages, then serve conversations that were started meanwhile."""
+        with suppress(EapError):  # the next request to a lost slave reports the error
             for _ in range(MAX_UNSOLICITED):
                 if not (yield from self._port.is_full()):
                     break
@@ -262,7 +262,7 @@ class Mailbox:
         yield from self._serve()
 
     def _serve_one(self, job: QueuedConversation) -> Procedure[int]:
-        """Do what a conversation asks for next and resume it; return the time."""
+        """Execute one step of a conversation and resume it; return the time."""
         step = job.step
         _, start_ns = yield Sleep(0)
         error: EapError | None = None
@@ -300,7 +300,7 @@ class Mailbox:
                 self._queue.matcher(step.type).note_part(step.request)
                 return MailboxMessage(step.type, b"")
         pause_ns = FIRST_PAUSE_NS
-        is_full = True  # a quick slave has answered by now: look at once, and look only then
+        is_full = True  # a quick slave has answered already: read before the first poll
         while True:
             reply = (yield from self._receive(step)) if is_full else None
             if reply is not None:
@@ -315,7 +315,7 @@ class Mailbox:
             is_full = yield from self._is_full(deadline_ns)
 
     def _send(self, step: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage | None]:
-        """Write a request; return its reply if that came while it was written again."""
+        """Write a request; return its reply if it came during a repetition of the write."""
         self._counter = next_counter(self._counter)
         address = self._queue.matcher(step.type).next_address()
         header = MailboxHeader(0, address, type=step.type, counter=self._counter)
@@ -334,12 +334,11 @@ class Mailbox:
             _, now_ns = yield Sleep(MAX_PAUSE_NS)
             if now_ns >= deadline_ns:
                 raise MailboxTimeoutError(
-                    f"slave {self.station}: its mailbox is still full, the slave does not take"
-                    " messages"
+                    f"slave {self.station}: its mailbox is still full, the slave does not read it"
                 )
 
     def _write_message(self, message: bytes, deadline_ns: int) -> Procedure[WriteResult]:
-        """Write a request, also after the bus was silent for a while."""
+        """Write a request; retry while no frame comes back."""
         was_silent = False
         while True:
             try:
@@ -353,7 +352,7 @@ class Mailbox:
                 return written._replace(is_ambiguous=written.is_ambiguous or was_silent)
 
     def _is_full(self, deadline_ns: int) -> Procedure[bool]:
-        """Return whether the slave has a message, also after the bus was silent for a while."""
+        """Return true if the slave has a message; retry while no frame comes back."""
         while True:
             try:
                 return (yield from self._port.is_full())
@@ -403,7 +402,7 @@ class Mailbox:
 
 
 def _resume(job: QueuedConversation, action: Callable[[], MailboxRequest], now_ns: int) -> None:
-    """Let a conversation go on, unless it was cancelled meanwhile."""
+    """Resume a conversation, unless it was cancelled meanwhile."""
     if job.task.is_done:
         return
     try:
@@ -412,7 +411,7 @@ def _resume(job: QueuedConversation, action: Callable[[], MailboxRequest], now_n
         job.task.finish(end.value)
     except EapError as error:
         job.task.fail(error)
-    except OSError as exc:  # of a file that the conversation reads or writes
+    except OSError as exc:  # raised by the file that the conversation reads or writes
         job.task.fail(BusError(f"{job.task.name}: {exc}"))
     else:
         job.ready_ns = now_ns + job.step.delay_ns

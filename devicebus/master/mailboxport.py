@@ -1,7 +1,7 @@
-"""The two mailboxes of one slave as the wire has them (ETG.1000.4, sync managers 0 and 1).
+"""Mailbox sync managers 0 and 1 of one slave, read and written by a master (ETG.1000.4).
 
-A message that was written but whose frame was lost is written again, with the counter by which the
-slave knows it; one that was read but whose frame was lost is asked for again by the repeat bit.
+A message whose write frame was lost is written again with the same counter, by which the slave
+drops the repetition.  A message whose read frame was lost is requested again by the repeat bit.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from devicebus.wire.datagram import fprd, fpwr
 from devicebus.wire.register import Register, SmStatus, SyncManager
 
 REPEAT_TIMEOUT_NS = 100_000_000
-"""How long a slave may take to repeat; one that never does has forgotten the message."""
+"""Time-out for the repeat acknowledge; after it the message is lost."""
 POLL_NS = 200_000
 
 FIRST_MEMORY = 0x1000
-"""Where registers end and memory begins."""
+"""First address of the process data memory, behind the registers."""
 _IN = Register.SYNC_MANAGER + SyncManager.SIZE
 STATUS = _IN + 5
 _ACTIVATE = _IN + 6
@@ -28,7 +28,7 @@ _PDI_CONTROL = _IN + 7
 
 
 class MailboxArea(NamedTuple):
-    """Where the mailboxes lie in a slave's memory; sizes in bytes, 0 without a mailbox."""
+    """Addresses and sizes in bytes of a slave's mailboxes; size 0 without a mailbox."""
 
     to_slave: int
     to_slave_size: int
@@ -37,11 +37,11 @@ class MailboxArea(NamedTuple):
 
     @property
     def is_there(self) -> bool:
-        """Whether the slave has a mailbox at all."""
+        """True if the slave has a mailbox."""
         return min(self.to_slave_size, self.to_master_size) >= MINIMUM_SIZE
 
     def check(self, station: int) -> None:
-        """Raise BusError if no frame can reach it, or if it lies over the registers."""
+        """Raise BusError if an area exceeds a frame, or overlaps the registers."""
         for start, size in (self[:2], self[2:]):
             if size > MAX_DATA or not FIRST_MEMORY <= start <= 0x1_0000 - size:
                 raise BusError(
@@ -58,19 +58,19 @@ class MailboxArea(NamedTuple):
 
 
 class WriteResult(NamedTuple):
-    """What became of a message on its way to the slave."""
+    """Result of writing a message."""
 
     is_accepted: bool
     """False: the mailbox is still full."""
     is_ambiguous: bool
-    """Whether it may have got there although it was not taken: a frame was lost."""
+    """True if a frame was lost, so that the slave may have received the message all the same."""
 
 
 class MailboxPort:
-    """Writes to and reads from the mailboxes of one slave.
+    """Access to the mailboxes of one slave.
 
     Attributes:
-        repeats: How often the slave was asked to repeat.
+        repeats: Number of repeat requests.
     """
 
     def __init__(self, station: int, area: MailboxArea) -> None:
@@ -81,20 +81,20 @@ class MailboxPort:
         self._needs_repeat = False
 
     def write_message(self, message: bytes) -> Procedure[WriteResult]:
-        """Write a message, once its mailbox is empty.
+        """Write a message; a full mailbox refuses it.
 
         Raises:
-            FrameLostError: nothing comes back.
+            FrameLostError: no frame comes back.
         """
         padded = message.ljust(self.area.to_slave_size, b"\0")
         (reply,), _ = yield [fpwr(self.station, self.area.to_slave, padded)]
         return WriteResult(reply.wkc == 1, reply.tries > 1)
 
     def is_full(self) -> Procedure[bool]:
-        """Return whether the slave has a message, which it repeats first if one was lost.
+        """Return true if the slave has a message; request a repetition first if one was lost.
 
         Raises:
-            FrameLostError: nothing comes back.
+            FrameLostError: no frame comes back.
             WorkingCounterError: the slave does not answer.
         """
         if self._needs_repeat:
@@ -103,9 +103,9 @@ class MailboxPort:
         return bool(status & SmStatus.MAILBOX_FULL)
 
     def read_message(self) -> Procedure[bytes | None]:
-        """Read the slave's message, None if there is none or the frame is lost.
+        """Read the slave's message; return None without a message or if the frame is lost.
 
-        The read has emptied the mailbox all the same: :meth:`is_full` has the message repeated.
+        A lost read frame has emptied the mailbox: :meth:`is_full` requests the repetition.
         """
         area = self.area
         try:
@@ -118,7 +118,7 @@ class MailboxPort:
         return reply.data if reply.wkc else None
 
     def _request_repeat(self) -> Procedure[None]:
-        """Hand the toggled repeat bit to the slave and wait until it has copied it."""
+        """Toggle the repeat bit of SM 1 (0x080E bit 1) and wait for its copy (0x080F bit 1)."""
         octet = bytes((1 | self._repeat << 1,))
         yield from write(self.station, _ACTIVATE, octet, "repeat request")
         _, now_ns = yield Sleep(0)

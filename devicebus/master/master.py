@@ -1,4 +1,4 @@
-"""The master: everything together behind the calls of a core."""
+"""Master of one bus: its core without I/O, driven by frames and time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ T = TypeVar("T")
 _WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP))
 
 LOOK_NS = 10_000_000
-"""How often idle mailboxes are looked into for unsolicited messages."""
+"""Poll period of idle mailboxes for unsolicited messages."""
 
 
 class MasterStats(msgspec.Struct, frozen=True):
@@ -45,13 +45,13 @@ class MasterStats(msgspec.Struct, frozen=True):
 
 
 class Master:
-    """A type-1 master for one bus.
+    """Type-1 master for one bus.
 
-    The user starts tasks, the driver feeds frames and time, and whoever has the clock of the plant
-    calls :meth:`start_cycle`.
+    The user starts tasks; the driver feeds frames and time and calls :meth:`start_cycle` in each
+    cycle.
 
     Attributes:
-        port_errors: When the error counters of ports have grown.
+        port_errors: Log of the error counters of all ports.
     """
 
     def __init__(self, settings: MasterSettings | None = None) -> None:
@@ -64,34 +64,34 @@ class Master:
 
     @property
     def slaves(self) -> dict[int, BusSlave]:
-        """The slaves by station address, in the order of the line; for reading."""
+        """Slaves by station address in the order of the segment, read-only."""
         return self._bus.slaves
 
     @property
     def changes(self) -> int:
-        """Number of changes so far that matter to users: of states, mailboxes, slaves, faults."""
+        """Count of the changes that users see: of states, mailboxes, slaves, faults."""
         return self._bus.changes.count
 
     @property
     def image(self) -> BusImage | None:
-        """Process data, None before it is laid out."""
+        """Process image, None before its layout is known."""
         return self._bus.image
 
     @property
     def cycle(self) -> Cycle | None:
-        """The exchange of process data, None before it is laid out; for reading."""
+        """Cyclic exchange, None before the layout is known; read-only."""
         return self._bus.cycle
 
     @property
     def is_waiting(self) -> bool:
-        """Whether frames are under way, so that some may come back."""
+        """True while frames may come back."""
         return self._bus.link.is_waiting
 
     def bring_up(self, now_ns: int, target: AlState = AlState.OP) -> Task[None]:
-        """Find the slaves and bring them to *target*; from then on they are kept there.
+        """Find the slaves, bring them to *target* and keep them there.
 
-        What ran before ends.  OP needs cycles: call :meth:`start_cycle` all the while.  Once
-        process data is laid out, slaves that fail are tried again and the others are kept.
+        The operation before is cancelled.  OP needs cycles: call :meth:`start_cycle` meanwhile.
+        Once the layout is known, failed slaves are retried and the others are kept in *target*.
         """
         self._stop()
         task = self._bus.runner.start(start_up(self._bus, target), now_ns, "bringing up the bus")
@@ -105,23 +105,23 @@ class Master:
         return task
 
     def shut_down(self, now_ns: int) -> Task[None]:
-        """Forget the slaves and bring them to INIT, where their outputs are off."""
+        """Bring all slaves to INIT, where their outputs are off, and forget them."""
         self._stop()
         self._running = self.run(shut_down(self._bus), now_ns, "shutting down the bus")
         return self._running
 
     def scan(self, now_ns: int) -> Task[tuple[FoundSlave, ...]]:
-        """Look who is there, without changing anybody's state."""
+        """Find and describe the slaves without changing a state."""
         return self.run(scan(self._bus.settings.first_station), now_ns, "scanning the bus")
 
     def request_state(self, station: int, target: AlState, now_ns: int) -> Task[None]:
-        """Bring one slave to a state, where it is kept then.
+        """Bring one slave to a state and keep it there.
 
-        Raises BusError if there is no such slave, or it is being brought somewhere.
+        Raises BusError for an unknown slave, or one whose state is being changed.
         """
         slave = self._slave(station)
         if slave.is_busy:
-            raise BusError(f"slave {station} is on its way to {slave.target.name} already")
+            raise BusError(f"slave {station} is being brought to {slave.target.name} already")
         slave.target = target
         work = self.run(bring(self._bus, slave, target), now_ns, f"slave {station}: state")
         slave.start_work(work)
@@ -136,9 +136,9 @@ class Master:
         name: str = "a request",
         requester: Hashable = None,
     ) -> Task[T]:
-        """Talk to a slave's mailbox.
+        """Start a conversation with a slave's mailbox.
 
-        Raises BusError if there is no such slave, or its mailbox is closed.
+        Raises BusError for an unknown slave or a closed mailbox.
         """
         slave = self._slave(station)
         if slave.mailbox is None:
@@ -147,35 +147,35 @@ class Master:
         return slave.mailbox.converse(conversation, now_ns, name=name, requester=requester)
 
     def run(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
-        """Run any procedure beside everything else."""
+        """Run a procedure concurrently with all others."""
         return self._bus.runner.start(procedure, now_ns, name)
 
     def start_cycle(self, now_ns: int) -> None:
-        """Exchange process data once, and refill the budget of everything else."""
+        """Exchange process data once, and refill the budget of acyclic datagrams."""
         if self._bus.cycle is not None:
             self._bus.cycle.start(now_ns)
 
     def stop_cycles(self) -> None:
-        """No cycle will be started for now: acyclic frames need not hold back."""
+        """End the cyclic operation: acyclic datagrams are sent without a budget."""
         self._bus.link.stop_cycles()
 
     def frames_to_send(self, now_ns: int) -> list[bytes]:
-        """Take the frames that are ready to go out."""
+        """Return the frames to send now."""
         return self._bus.link.frames_to_send(now_ns)
 
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
-        """Take a frame that came back."""
+        """Handle a frame that came back."""
         self._bus.link.receive_frame(data, now_ns)
 
     def next_timeout(self) -> int | None:
-        """When :meth:`handle_timeout` must be called."""
+        """Return the time at which :meth:`handle_timeout` must be called."""
         times = [self._bus.link.next_timeout(), self._bus.runner.next_timeout()]
         if self._has_mailbox():
             times.append(self._look_ns)
         return min((at for at in times if at is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Time passed; early calls are harmless."""
+        """Handle expired timers; early calls have no effect."""
         self._bus.link.handle_timeout(now_ns)
         self._bus.runner.handle_timeout(now_ns)
         if now_ns >= self._look_ns and self._has_mailbox():
@@ -189,7 +189,7 @@ class Master:
             )
 
     def next_event(self) -> Event | None:
-        """Take the oldest event."""
+        """Return and remove the oldest event."""
         return self._bus.next_event()
 
     def stats(self) -> MasterStats:
@@ -215,7 +215,7 @@ class Master:
 
     @property
     def is_lost(self) -> bool:
-        """Whether no frame comes back, so that nothing is known about any slave."""
+        """True while no frame comes back, so that the state of every slave is unknown."""
         return self._bus.is_lost
 
     def _slave(self, station: int) -> BusSlave:
@@ -223,11 +223,11 @@ class Master:
             return self._bus.slaves[station]
         except KeyError:
             known = ", ".join(map(str, self._bus.slaves)) or "none"
-            raise BusError(f"there is no slave {station}; known are {known}") from None
+            raise BusError(f"unknown slave {station}; known slaves: {known}") from None
 
 
 def why_closed(slave: BusSlave) -> NoMailboxError | MailboxClosedError:
-    """Return why a slave has no open mailbox: never, not in its state, or not yet again."""
+    """Return the error of a slave without an open mailbox: permanent, by its state, or for now."""
     who = f"slave {slave.station} ({slave.name})"
     if slave.is_lost:
         return MailboxClosedError(f"{who} does not answer")

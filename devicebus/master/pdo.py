@@ -1,7 +1,8 @@
-"""Process data of a slave: which PDOs its sync managers carry, and what these map.
+"""PDO assignment and PDO mapping of a slave (ETG.1000.6).
 
-The EEPROM says it for simple slaves; those with CoE are asked, and may be told (ETG.1000.6, objects
-0x1C10 and following for the assignment, 0x1600 and 0x1A00 and following for the mapping).
+Simple slaves have them in the EEPROM only.  Slaves with CoE have them in objects, which the master
+reads and may write: 0x1C10 and following for the assignment, 0x1600 and 0x1A00 and following for
+the mapping.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from eap.ids import ObjectId
 from eap.od.abort import SdoAbortError
 
 ASSIGNMENT = 0x1C10
-"""Object that assigns PDOs to sync manager 0; the others follow."""
+"""Assignment object of sync manager 0; those of the others follow."""
 MAX_ENTRIES = 254
 OUTPUTS, INPUTS = 3, 4
-"""Types of sync managers."""
+"""Sync manager types of outputs and inputs."""
 _WRITES = 0x04
 
 
 class PdoEntry(msgspec.Struct, frozen=True):
-    """One mapped entry; index 0 is padding."""
+    """Mapped entry; index 0 is padding."""
 
     index: int
     subindex: int
@@ -38,14 +39,14 @@ class PdoEntry(msgspec.Struct, frozen=True):
 
 
 class Pdo(msgspec.Struct, frozen=True):
-    """A PDO and what it maps, in order."""
+    """PDO with its mapped entries in order."""
 
     index: int
     entries: tuple[PdoEntry, ...]
 
 
 class ProcessDataChannel(NamedTuple):
-    """A sync manager that carries process data."""
+    """Sync manager of process data with its PDOs."""
 
     number: int
     start: int
@@ -53,7 +54,7 @@ class ProcessDataChannel(NamedTuple):
     is_output: bool
     pdos: tuple[Pdo, ...]
     fixed_size: int = 0
-    """Bytes that it has without any PDO."""
+    """Size in bytes without PDOs."""
 
     @property
     def size(self) -> int:
@@ -63,16 +64,16 @@ class ProcessDataChannel(NamedTuple):
 
 
 class PdoConfiguration(msgspec.Struct, frozen=True, kw_only=True):
-    """What a slave is told to exchange."""
+    """PDO assignment and mapping to write to a slave."""
 
     assignment: Mapping[int, Sequence[int]] = {}
-    """PDOs by sync manager."""
+    """Assigned PDOs by sync manager."""
     mapping: Mapping[int, Sequence[tuple[int, int, int]]] = {}
-    """Index, subindex and bits of each entry, by PDO."""
+    """Index, subindex and bit length of each entry, by PDO."""
 
 
 def channels_from_sii(sii: Sii) -> tuple[ProcessDataChannel, ...]:
-    """Return the sync managers for process data with the PDOs that the EEPROM assigns."""
+    """Return the process data sync managers with the PDOs that the EEPROM assigns."""
     return tuple(
         ProcessDataChannel(
             number,
@@ -92,12 +93,12 @@ def channels_from_sii(sii: Sii) -> tuple[ProcessDataChannel, ...]:
 
 
 def read_channels(sii: Sii) -> Conversation[tuple[ProcessDataChannel, ...]]:
-    """Ask a slave with CoE what its sync managers carry.
+    """Read the PDO assignment and mapping of a slave with CoE.
 
-    What the slave does not know by SDO is as its EEPROM says.
+    A sync manager without these objects has the PDOs of the EEPROM.
 
     Raises:
-        MailboxProtocolError: an answer is no list.
+        MailboxProtocolError: an answer is no valid list.
         MailboxTimeoutError: the slave does not answer.
     """
     known = channels_from_sii(sii)
@@ -126,10 +127,10 @@ def read_channels(sii: Sii) -> Conversation[tuple[ProcessDataChannel, ...]]:
 
 
 def write_configuration(choice: PdoConfiguration, sizes: MailboxSizes) -> Conversation[None]:
-    """Tell a slave in PREOP what to map and to assign.
+    """Write PDO mapping and assignment to a slave in PREOP.
 
     Raises:
-        SdoAbortError: the slave refuses.
+        SdoAbortError: the slave refuses a value.
     """
     for pdo, entries in choice.mapping.items():
         numbers = [index << 16 | subindex << 8 | bits for index, subindex, bits in entries]

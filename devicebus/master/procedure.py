@@ -1,4 +1,4 @@
-"""Procedure: an action of the master, written as a generator; :mod:`runner` runs it.
+"""Procedure: action of the master, written as a generator; :class:`Runner` runs it as a Task.
 
     def read_twice(station: int) -> Procedure[bytes]:
         first = yield from read(station, Register.TYPE, 1)
@@ -6,8 +6,8 @@
         (reply,), now_ns = yield [fprd(station, Register.TYPE, 1)]
         return first + reply.data
 
-A procedure yields accesses that are answered together, or a Sleep.  It has FrameLostError thrown
-in when frames do not come back, and is closed to cancel it.
+A procedure yields datagrams, whose replies come together, or a Sleep.  FrameLostError is thrown
+into it when frames do not come back; closing the generator cancels it.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ T = TypeVar("T")
 
 
 def _do_nothing() -> None:
-    """There is nothing to stop any more."""
+    """Stop function of a task that has ended."""
 
 
 class Task(Generic[T]):
-    """A procedure or a conversation that runs.
+    """Running procedure or conversation.
 
     Args:
-        name: What it does, for messages.
-        stop: Ends what is behind it, for :meth:`cancel`.
+        name: Name for messages.
+        stop: Stops the procedure or conversation, for :meth:`cancel`.
     """
 
     def __init__(self, name: str, stop: Callable[[], None]) -> None:
@@ -46,14 +46,14 @@ class Task(Generic[T]):
 
     @property
     def is_done(self) -> bool:
-        """Whether there is a result or an error."""
+        """True once there is a result or an error."""
         return bool(self._value) or self.error is not None
 
     def result(self) -> T:
-        """Return what came out, or raise what went wrong.
+        """Return the result, or raise the error of the task.
 
         Raises:
-            BusError: it still runs, or was cancelled.
+            BusError: the task still runs, or was cancelled.
         """
         if self.error is not None:
             raise self.error
@@ -62,43 +62,43 @@ class Task(Generic[T]):
         return self._value[0]
 
     def watch(self, callback: Callable[[Task[T]], None]) -> None:
-        """Call back once it is done, at once if it already is."""
+        """Call *callback* at the end of the task, at once if it has ended."""
         if self.is_done:
             callback(self)
         else:
             self._watchers.append(callback)
 
     def cancel(self) -> None:
-        """End it where it stands; nothing more is sent for it.  Harmless when it is done."""
+        """Cancel the task: nothing more is sent for it.  No effect on an ended task."""
         if not self.is_done:
             self._stop()
             self.fail(BusError(f"{self.name} was cancelled"))
 
     def finish(self, value: T) -> None:
-        """It has a result: for whoever runs it."""
+        """Set the result; called by the runner."""
         self._value.append(value)
         self._notify_watchers()
 
     def fail(self, error: EapError) -> None:
-        """It went wrong: for whoever runs it."""
+        """Set the error; called by the runner."""
         self.error = error
         self._notify_watchers()
 
     def _notify_watchers(self) -> None:
-        self._stop = _do_nothing  # whoever is behind it knows the task: this would be a circle
+        self._stop = _do_nothing  # breaks the reference cycle between the task and its procedure
         watchers, self._watchers = self._watchers, []
         for callback in watchers:
             callback(self)
 
 
 class Sleep(NamedTuple):
-    """Resume after this long."""
+    """Pause of a procedure."""
 
     duration_ns: int
 
 
 class StepReplies(NamedTuple):
-    """Value that a procedure is resumed with: one reply for each access, and the time."""
+    """Result of a step: one reply for each datagram, and the time."""
 
     replies: Sequence[DatagramReply]
     now_ns: int
@@ -115,7 +115,7 @@ def read(
 
     Raises:
         WorkingCounterError: the slave did not answer.
-        FrameLostError: nothing came back.
+        FrameLostError: no frame came back.
     """
     (reply,), _ = yield [fprd(station, ado, size, tries=tries)]
     if reply.wkc != 1:
@@ -139,12 +139,12 @@ def not_answered(what: str, reply: DatagramReply) -> WorkingCounterError:
 
 
 def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]]:
-    """Run procedures in step, so that their accesses share frames.
+    """Run procedures in lockstep, so that their datagrams share frames.
 
-    Returns what each returned, or the error that ended it.
+    Returns the result of each procedure, or the error that ended it.
 
     Raises:
-        FrameLostError: nothing comes back, which says nothing about any slave.
+        FrameLostError: no frame comes back, so that no procedure can continue.
     """
     _, now_ns = yield Sleep(0)
     children = [_Child(procedure, now_ns) for procedure in procedures]
@@ -166,7 +166,7 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
 
 
 class _Child(Generic[T]):
-    """One of several procedures that run in step."""
+    """One of several procedures that run in lockstep."""
 
     def __init__(self, procedure: Procedure[T], now_ns: int) -> None:
         self.procedure = procedure
@@ -198,7 +198,7 @@ class _Child(Generic[T]):
 
 
 def _exchange_step(waiting: Sequence[_Child[T]]) -> Procedure[int]:
-    """Send what the children want and tell them what came back; return the time."""
+    """Send the datagrams of the children and resume them with the replies; return the time."""
     replies, now_ns = yield [datagram for child in waiting for datagram in child.datagrams]
     start = 0
     for child in waiting:
@@ -209,7 +209,7 @@ def _exchange_step(waiting: Sequence[_Child[T]]) -> Procedure[int]:
 
 
 class Runner:
-    """Starts procedures, hands them what the link brings, and wakes them in time."""
+    """Runner of concurrent procedures over one link."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -217,20 +217,20 @@ class Runner:
         self._number = count()
 
     def start(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
-        """Run a procedure; its first accesses are queued at once."""
+        """Start a procedure; its first datagrams are queued at once."""
         run = _Run(procedure, self)
         run.task = Task(name, run.stop)
         run.advance(lambda: next(procedure), now_ns)
         return run.task
 
     def next_timeout(self) -> int | None:
-        """Return the time at which the next sleeper wakes."""
+        """Return the end of the next pause."""
         while self._sleeping and self._sleeping[0][2].task.is_done:
             heapq.heappop(self._sleeping)
         return self._sleeping[0][0] if self._sleeping else None
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Resume sleepers that are due."""
+        """Resume the procedures whose pause has ended."""
         while self._sleeping and self._sleeping[0][0] <= now_ns:
             _, _, run = heapq.heappop(self._sleeping)
             if not run.task.is_done:
@@ -246,7 +246,7 @@ class Runner:
 
 
 class _Run:
-    """One procedure that runs."""
+    """Running procedure with its pending step."""
 
     __slots__ = ("_procedure", "_runner", "exchange", "task")
 
@@ -257,7 +257,7 @@ class _Run:
         self._runner = runner
 
     def handle_replies(self, outcome: list[DatagramReply] | FrameLostError, now_ns: int) -> None:
-        """The link has answered."""
+        """Resume the procedure with the replies of the link, or with its error."""
         self.exchange = None
         if isinstance(outcome, FrameLostError):
             error = outcome
@@ -270,7 +270,7 @@ class _Run:
         self.advance(lambda: self._procedure.send(answer), answer.now_ns)
 
     def advance(self, action: Callable[[], Step], now_ns: int) -> None:
-        """Run it up to its next step, or to its end; sleeps of no length are none."""
+        """Run the procedure to its next step or its end; a Sleep of 0 resumes it at once."""
         try:
             step = action()
             while isinstance(step, Sleep) and step.duration_ns <= 0:

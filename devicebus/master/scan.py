@@ -1,4 +1,8 @@
-"""Finding the slaves: how many, which, and how they are wired."""
+"""Scan of a bus: number, identity and topology of the slaves, compared with the expected ones.
+
+A frame leaves a slave through its open ports in the order 3, 1, 2 and enters at port 0, so the open
+ports of all slaves in the order of the frame give the tree (ETG.1000.4, DL status).
+"""
 
 from __future__ import annotations
 
@@ -22,18 +26,18 @@ _ORDER = (3, 1, 2)
 
 
 class TopologyNode(NamedTuple):
-    """How a slave hangs on the bus."""
+    """Position of a slave in the topology."""
 
     ports: tuple[int, ...]
-    """Open ports."""
+    """Open ports of the slave."""
     parent: int | None
-    """Position of the slave that it is wired to; None for the master."""
+    """Position of the slave that it is connected to; None for the master."""
     parent_port: int
     entry_port: int
 
 
 def open_ports(status: DlStatus) -> tuple[int, ...]:
-    """Return the ports with communication whose loop is open."""
+    """Return the ports with communication and an open loop."""
     pairs = (
         (status.loop0, status.communication0),
         (status.loop1, status.communication1),
@@ -44,12 +48,12 @@ def open_ports(status: DlStatus) -> tuple[int, ...]:
 
 
 def find_topology(statuses: Sequence[DlStatus]) -> tuple[TopologyNode, ...]:
-    """Return where each slave hangs, in the order of positions.
+    """Return the topology node of each slave, in the order of positions.
 
-    Open ports that lead nowhere are tolerated: a slave behind them may be gone by now.
+    Open ports without a slave are tolerated: a slave behind them may have been lost meanwhile.
     """
     nodes: list[TopologyNode] = []
-    exits: list[tuple[int, list[int]]] = []  # slaves with ports that no slave was found at yet
+    exits: list[tuple[int, list[int]]] = []  # slaves with open ports whose slave is not yet known
     for position, status in enumerate(statuses):
         ports = open_ports(status)
         while exits and not exits[-1][1]:
@@ -66,11 +70,11 @@ FIRST_STATION = 1001
 MAX_SLAVES = 0xFFFF - FIRST_STATION
 _IDENTITY_WORD = 8
 _PER_STEP = 60
-"""Accesses that are under way at once while slaves are looked at one by one."""
+"""Datagrams in flight at once while slaves are read one by one."""
 
 
 class EscInfo(WireStruct, frozen=True):
-    """ETG.1000.4: what a controller says about itself, from 0x0000 on."""
+    """ETG.1000.4: type and features of a controller, from 0x0000 on."""
 
     type: u8
     revision: u8
@@ -78,23 +82,23 @@ class EscInfo(WireStruct, frozen=True):
     fmmus: u8
     sync_managers: u8
     ram: u8
-    """KiB of process data memory."""
+    """Process data memory in KiB."""
     port_descriptor: u8
     features: u16
 
     @property
     def has_clock(self) -> bool:
-        """Whether it takes part in distributed clocks."""
+        """True if it supports distributed clocks."""
         return bool(self.features & 0x04)
 
     @property
     def knows_lrw(self) -> bool:
-        """Whether it may be read and written by one logical datagram."""
+        """True if it supports LRW."""
         return not self.features & 0x0200
 
 
 class Identity(WireStruct, frozen=True):
-    """ETG.2010: who a slave is, from word 8 of the EEPROM on."""
+    """ETG.2010: identity of a slave, from word 8 of the EEPROM on."""
 
     vendor: u32
     product: u32
@@ -109,7 +113,7 @@ class Identity(WireStruct, frozen=True):
 
 
 class FoundSlave(NamedTuple):
-    """A slave as a scan finds it."""
+    """Slave found by a scan."""
 
     position: int
     station: int
@@ -120,11 +124,11 @@ class FoundSlave(NamedTuple):
     identity: Identity
     sii: Sii
     fault: str = ""
-    """Why the EEPROM says nothing: identity and *sii* are empty then."""
+    """Error of an unreadable EEPROM; identity and *sii* are empty then."""
 
     @property
     def name(self) -> str:
-        """What the slave calls itself."""
+        """Name in the EEPROM, or the station address."""
         return self.sii.name or f"slave {self.station}"
 
 
@@ -136,19 +140,19 @@ class _Registers(NamedTuple):
 
 
 def count_slaves() -> Procedure[int]:
-    """Return how many slaves a frame passes."""
+    """Return the number of slaves that a frame passes."""
     (reply,), _ = yield [brd(Register.TYPE, 1)]
     return reply.wkc
 
 
 def scan(first_station: int = FIRST_STATION) -> Procedure[tuple[FoundSlave, ...]]:
-    """Give each slave its station address by position, and read all that it says about itself.
+    """Assign station addresses by position, and read registers and EEPROM of each slave.
 
-    States and configuration of the slaves stay as they are.
+    States and configuration of the slaves stay unchanged.
 
     Raises:
-        WorkingCounterError: a slave went away meanwhile.
-        FrameLostError: nothing comes back.
+        WorkingCounterError: a slave was lost meanwhile.
+        FrameLostError: no frame comes back.
     """
     count = yield from count_slaves()
     if count > MAX_SLAVES:
@@ -165,9 +169,9 @@ def scan(first_station: int = FIRST_STATION) -> Procedure[tuple[FoundSlave, ...]
 
 
 def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
-    """Give the slaves at some positions their station addresses.
+    """Assign station addresses to the slaves at the given positions.
 
-    Raises WorkingCounterError if nobody is at a position.
+    Raises WorkingCounterError for a position without a slave.
     """
     replies = yield from _in_frames(
         [apwr(at, Register.STATION_ADDRESS, to.to_bytes(2, "little")) for at, to in places]
@@ -178,13 +182,13 @@ def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
 
 
 def read_stations(count: int) -> Procedure[list[int]]:
-    """Return the station addresses at the first *count* positions; 0 where there is none."""
+    """Return the station addresses at the first *count* positions; 0 for none."""
     replies = yield from _in_frames([aprd(at, Register.STATION_ADDRESS, 2) for at in range(count)])
     return [int.from_bytes(reply.data, "little") if reply.wkc else 0 for reply in replies]
 
 
 def read_identity(station: int) -> Procedure[Identity]:
-    """Read from the EEPROM only who a slave is.
+    """Read the identity of a slave from its EEPROM.
 
     Raises:
         SiiError: the EEPROM cannot be read.
@@ -253,7 +257,7 @@ def _in_frames(datagrams: Sequence[DatagramRequest]) -> Procedure[list[DatagramR
 
 
 class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
-    """A slave that a configuration names; what is None may be anything."""
+    """Configured slave; None accepts any value."""
 
     name: str
     vendor: int
@@ -261,11 +265,11 @@ class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
     revision: int | None = None
     serial: int | None = None
     alias: int | None = None
-    """With one, other than 0, it may be anywhere in the line (:func:`match_aliases`)."""
+    """Alias; a slave with one other than 0 may have any position (:func:`match_aliases`)."""
 
 
 def fits(expected: ExpectedSlave, identity: Identity) -> bool:
-    """Whether a slave may stand for the expected one."""
+    """Return true if *identity* fits the expected slave."""
     return (
         (expected.vendor, expected.product) == (identity.vendor, identity.product)
         and expected.revision in {None, identity.revision}
@@ -274,7 +278,7 @@ def fits(expected: ExpectedSlave, identity: Identity) -> bool:
 
 
 def check_bus(expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]) -> None:
-    """Compare the bus with what was found; raise IdentityError that lists every difference."""
+    """Compare found with expected slaves; raise IdentityError with every difference."""
     lines = list(iter_differences(expected, found))
     if lines:
         text = "\n  ".join(lines)
@@ -285,15 +289,14 @@ def check_bus(expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]) ->
 
 
 def match_aliases(expected: Sequence[ExpectedSlave], aliases: Sequence[int]) -> tuple[int, ...]:
-    """Return which of the expected slaves is to stand at each position, by their numbers.
+    """Return the number of the expected slave for each position.
 
-    A slave that is expected with an alias is looked for wherever in the line it is, and those
-    behind it up to the next with an alias stay behind it.  If an alias is missing or there twice,
-    the order is the expected one.
+    A slave with an alias may have any position; the slaves behind it, up to the next one with an
+    alias, stay behind it.  If an alias is missing or found twice, the order is the expected one.
 
     Args:
-        expected: In the order of the configuration.
-        aliases: Of the slaves that are there, in the order of the line.
+        expected: Expected slaves in the order of the configuration.
+        aliases: Aliases of the found slaves in the order of the segment.
     """
     blocks: dict[int, list[int]] = {0: []}
     for number, each in enumerate(expected):
@@ -311,9 +314,9 @@ def match_aliases(expected: Sequence[ExpectedSlave], aliases: Sequence[int]) -> 
 def iter_differences(
     expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]
 ) -> Iterator[str]:
-    """Yield one line a difference; a missing slave does not make all behind it different.
+    """Yield one line for each difference; a missing slave does not make those behind it differ.
 
-    With as many slaves as expected, position is compared with position.
+    With the expected number of slaves, they are compared by position.
     """
     if len(expected) == len(found):
         for each, slave in zip(expected, found, strict=True):

@@ -1,4 +1,4 @@
-"""From an unknown bus to one that runs, and to one that rests."""
+"""Procedures that bring all slaves of a bus to a state, and back to INIT."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
 def start_up(bus: BusState, target: AlState) -> Procedure[None]:
-    """Find all slaves and bring them to *target*, INIT to OP, together.
+    """Find all slaves and bring them to *target*, from INIT to OP, together.
 
-    For OP cycles have to run as soon as the bus has one.  Slaves that fail are left behind and the
-    others go on without them.
+    OP needs cycles as soon as the bus has a Cycle.  A slave that fails is left out; the others go
+    on without it.
 
     Raises:
-        IdentityError: the bus is not the expected one.
-        BusError: slaves did not get there; the message names each and why.
+        IdentityError: the slaves are not the expected ones.
+        BusError: slaves did not reach the state; the message has a line for each cause.
     """
     bus.reset()
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
@@ -51,11 +51,11 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
 
 
 def shut_down(bus: BusState) -> Procedure[None]:
-    """Bring all slaves to INIT, and keep nobody anywhere any more.
+    """Bring all slaves to INIT, and forget them.
 
     Raises:
-        StateTimeoutError: some stay in another state.
-        FrameLostError: nothing comes back.
+        StateTimeoutError: a slave stays in another state.
+        FrameLostError: no frame comes back.
     """
     bus.reset()
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
@@ -70,7 +70,7 @@ def shut_down(bus: BusState) -> Procedure[None]:
 
 
 def set_up_cycle(bus: BusState) -> None:
-    """Lay out the process data of all slaves, so that cycles can run."""
+    """Plan the process image of all slaves and create the cycle."""
     slaves = bus.slaves.values()
     layout = plan_image([_process_data_of(slave) for slave in slaves])
     knows_lrw = bus.settings.allow_lrw and all(slave.found.esc.knows_lrw for slave in slaves)
@@ -85,7 +85,7 @@ def set_up_cycle(bus: BusState) -> None:
 
 
 def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusSlave]]:
-    """Return the slaves in the order of the line, with the names and stations they are to have."""
+    """Return the slaves in the order of the segment, with their configured names and stations."""
     expected = bus.settings.expected
     if not expected:
         return [BusSlave(slave, slave.name, bus.changes) for slave in found]
@@ -106,7 +106,7 @@ def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusS
 
 
 def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState) -> Procedure[None]:
-    """Lay out process data and bring those that are left to SAFEOP or OP."""
+    """Plan the process image and bring the remaining slaves to SAFEOP or OP."""
     for slave, _ in starting.errors:
         slave.channels = _channels_by_eeprom(slave)
     if bus.settings.clocks:
@@ -118,13 +118,13 @@ def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState)
 
 
 def _read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Find out what a slave exchanges, and that it fits the bus."""
+    """Read the process data of a slave, and check that it fits a frame."""
     yield from read_process_data(bus, slave)
     plan_image([_process_data_of(slave)])
 
 
 def _channels_by_eeprom(slave: BusSlave) -> tuple[ProcessDataChannel, ...]:
-    """Return what a slave that has failed may exchange once it comes back, by its EEPROM."""
+    """Return the process data of a failed slave by its EEPROM, for its return."""
     channels = channels_from_sii(slave.found.sii)
     try:
         plan_image([SlaveProcessData(slave.station, channels, slave.found.esc.fmmus)])
@@ -138,11 +138,11 @@ def _process_data_of(slave: BusSlave) -> SlaveProcessData:
 
 
 class _StartingSlaves:
-    """The slaves that go from step to step together.
+    """Slaves that are started together, step by step.
 
     Attributes:
-        remaining: Those that are left.
-        errors: What went wrong with the others.
+        remaining: Slaves without an error.
+        errors: The other slaves with their errors.
     """
 
     def __init__(self, slaves: Sequence[BusSlave]) -> None:
@@ -150,14 +150,14 @@ class _StartingSlaves:
         self.errors: list[tuple[BusSlave, EapError]] = []
 
     def run_all(self, work: Callable[[BusSlave], Procedure[None]]) -> Procedure[None]:
-        """Let all that are left do something together; raises FrameLostError."""
+        """Run a procedure for each remaining slave in lockstep; raises FrameLostError."""
         results = yield from together([work(slave) for slave in self.remaining])
         done = list(zip(self.remaining, results, strict=True))
         self.errors += [(slave, error) for slave, error in done if isinstance(error, EapError)]
         self.remaining = [slave for slave, error in done if not isinstance(error, EapError)]
 
     def check(self) -> None:
-        """Raise what went wrong: one error as it is, several as one with a line for each cause."""
+        """Raise the errors: a single one as it is, several as one with a line for each cause."""
         if self.errors:
             raise join_errors(
                 [(f"{slave.name} ({slave.station})", error) for slave, error in self.errors]

@@ -1,6 +1,11 @@
-"""Watching the slaves: one that goes is left out, one that comes back is brought back.
+"""Supervision of the slaves of a running bus: states, error counters and mailboxes.
 
-The others notice nothing: every step is an acyclic access within the budget of the cycle.
+A slave that does not answer is left out of the cycle; a slave that comes back is brought to its
+target state.  Every step is an acyclic datagram within the budget of the cycle, so the other slaves
+are not disturbed.
+
+The error counters of a controller have no time.  They are read once a second, so that a mended
+cable is told from one that still damages frames.
 """
 
 from __future__ import annotations
@@ -31,11 +36,11 @@ from devicebus.wire.register import AlStatus, Register, SmStatus
 from eap.errors import EapError
 
 _PER_STEP = 15
-"""As many as share one frame."""
+"""Slaves whose registers share one frame."""
 
 
 def poll_mailboxes(bus: BusState) -> Procedure[None]:
-    """Have the mailboxes read that are full and that nobody is busy with."""
+    """Poll the idle mailboxes and read the full ones."""
     idle = [slave.mailbox for slave in bus.slaves.values() if slave.mailbox is not None]
     idle = [mailbox for mailbox in idle if not mailbox.is_busy]
     for start in range(0, len(idle), _PER_STEP):
@@ -53,32 +58,32 @@ ERRORS_PERIOD_NS = 1_000_000_000
 
 
 class ErrorPeriod(NamedTuple):
-    """First and last time at which more errors were seen at a port."""
+    """First and last time at which the error counters of a port had grown."""
 
     since_ns: int
     until_ns: int
 
 
 class PortErrorLog:
-    """When the counters of each port have grown, by station address and port."""
+    """Log of the times at which error counters have grown, by station address and port."""
 
     def __init__(self) -> None:
         self._counters: dict[int, tuple[int, ...]] = {}
         self._growth: dict[int, dict[int, ErrorPeriod]] = {}
 
     def of(self, station: int) -> dict[int, ErrorPeriod]:
-        """Return by port when errors were seen; a port that was quiet is not there."""
+        """Return the error periods of a slave by port; a port without errors is missing."""
         return self._growth.get(station, {})
 
     def clear(self) -> None:
-        """Forget all times; what the counters show now is not new."""
+        """Forget all times; the present counters are the new base."""
         self._growth.clear()
 
     def take(self, station: int, octets: bytes, now_ns: int) -> None:
-        """Take the counters of a slave as they are now.
+        """Compare the counters of a slave with those of the poll before.
 
-        What they show at the first look has happened at an unknown time.  Counters that are smaller
-        than before were cleared, or the slave was switched off: older times go with them.
+        Errors before the first poll have an unknown time.  Smaller counters were cleared, or the
+        slave was switched off: older times are forgotten.
         """
         counters = port_counters(octets)
         before = self._counters.get(station, counters)
@@ -101,26 +106,26 @@ def poll_error_counters(bus: BusState, log: PortErrorLog) -> Procedure[None]:
         try:
             replies, now_ns = yield [fprd(at, Register.RX_ERROR, COUNTERS, tries=1) for at in part]
         except FrameLostError:
-            return  # the next look comes soon
+            return  # the next poll comes soon
         for station, reply in zip(part, replies, strict=True):
             if reply.wkc:
                 log.take(station, reply.data, now_ns)
 
 
 PERIOD_NS = 100_000_000
-"""Between two looks at all slaves while nothing is wrong."""
+"""Poll period of the AL status of all slaves without a fault."""
 SLICE_NS = 5_000_000
-"""After trouble in the cycle the next look comes this soon."""
+"""Delay of the next poll after a faulty cycle."""
 RETRY_NS = 1_000_000_000
-"""Before a slave that could not be brought back is tried again."""
+"""Pause before the next attempt for a slave that could not be brought back."""
 _STATES_PER_STEP = 60
-"""Slaves whose states are read together."""
+"""Slaves whose AL status is read together."""
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 _STATES = {int(state): state for state in AlState}
 
 
 def watch(bus: BusState) -> Procedure[None]:
-    """Look at the slaves for ever."""
+    """Supervise the slaves without end."""
     while True:
         now_ns = yield from _wait_for_period(bus)
         try:
@@ -147,7 +152,7 @@ def watch(bus: BusState) -> Procedure[None]:
 
 
 def _wait_for_period(bus: BusState) -> Procedure[int]:
-    """Wait for the next look; return the time."""
+    """Wait for the next poll; return the time."""
     _, now_ns = yield Sleep(SLICE_NS)
     end_ns = now_ns + PERIOD_NS - SLICE_NS
     while now_ns < end_ns and not bus.needs_check:
@@ -166,7 +171,7 @@ def _read_states(stations: Sequence[int]) -> Procedure[list[DatagramReply]]:
 
 
 def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
-    """A slave does not answer although the frame came back: leave it out."""
+    """Leave out a slave that does not answer although the frame came back."""
     if slave.is_lost:
         return
     slave.mark_lost()
@@ -178,15 +183,17 @@ def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     bus.close_mailbox(slave)
     bus.set_participation(slave, Participation.UNCERTAIN)
     if slave.station == bus.reference:
-        bus.distribute_time(None)  # without it the others would be handed the empty datagram's time
+        bus.distribute_time(
+            None
+        )  # otherwise the others would receive the time of an empty datagram
     bus.emit(SlaveLost(slave.station, now_ns))
 
 
 def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> None:
-    """A slave answers: bring it back if it is not where it belongs."""
+    """Handle the AL status of a slave: bring it back if it is not in its target state."""
     if slave.is_busy:
         return
-    if not slave.is_lost:  # of one that was, the identity is compared before its state counts
+    if not slave.is_lost:  # a lost slave's identity is compared before its state counts
         slave.state = _STATES.get(status.state)
     if now_ns < slave.retry_ns:
         return
@@ -202,7 +209,7 @@ def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) 
 
 
 def _report_back(bus: BusState, slave: BusSlave, now_ns: int) -> None:
-    """A slave is where it belongs: report it if it was missed."""
+    """Report a slave that has returned to its target state."""
     missing_since_ns, slave.missing_since_ns = slave.missing_since_ns, None
     if missing_since_ns is not None:
         bus.emit(SlaveBack(slave.station, now_ns - missing_since_ns, now_ns))
@@ -220,7 +227,7 @@ def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> Non
     def done(task: Task[int]) -> None:
         error = task.error
         if slave.work is not task or isinstance(error, FrameLostError):
-            return  # the slave is lost meanwhile, or nobody knows: the next look begins again
+            return  # the slave was lost meanwhile, or no frame came back: the next poll tries again
         if error is None:
             _report_back(bus, slave, task.result())
         elif not (slave.is_lost and isinstance(error, WorkingCounterError)):
@@ -237,7 +244,7 @@ def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> Non
 
 
 def _bring_back(bus: BusState, slave: BusSlave, *, stays: bool) -> Procedure[int]:
-    """Bring a slave back; return the time.  Unless it *stays* set up it begins in INIT."""
+    """Bring a slave back to its target state, by INIT unless it *stays*; return the time."""
     if not stays:
         found = slave.found.identity
         identity = yield from read_identity(slave.station)
@@ -257,7 +264,7 @@ def _bring_back(bus: BusState, slave: BusSlave, *, stays: bool) -> Procedure[int
 
 
 def _readdress(bus: BusState, count: int, now_ns: int) -> Procedure[None]:
-    """Give slaves that came without an address that of the lost one whose place they have."""
+    """Assign slaves without a station address that of the lost slave at their position."""
     try:
         stations = yield from read_stations(count)
         places = _missing_addresses(bus, stations, now_ns)
@@ -265,13 +272,13 @@ def _readdress(bus: BusState, count: int, now_ns: int) -> Procedure[None]:
             yield from assign_stations(places)
             bus.needs_check = True
     except EapError:
-        bus.needs_check = True  # the line has changed meanwhile: look again
+        bus.needs_check = True  # the segment has changed meanwhile: poll again
 
 
 def _missing_addresses(
     bus: BusState, stations: Sequence[int], now_ns: int
 ) -> list[tuple[int, int]]:
-    """Return positions and station addresses; a lost slave comes behind those before it."""
+    """Return positions and station addresses to assign; lost slaves keep their order."""
     order = {station: number for number, station in enumerate(bus.slaves)}
     lost = [at for at, slave in bus.slaves.items() if slave.is_lost and slave.retry_ns <= now_ns]
     places = []

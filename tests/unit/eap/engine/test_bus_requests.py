@@ -198,7 +198,7 @@ def test_who_listens_gets_what_comes(office):
 def test_a_slave_without_a_mailbox_says_so_at_once(office):
     error = office.ask(ask(1, station=1003)).error
     assert "slave 1003 (level) has no mailbox" in error.message
-    assert "no slave 1234" in office.ask(ask(2, station=1234)).error.message
+    assert "unknown slave 1234" in office.ask(ask(2, station=1234)).error.message
     assert "Invalid enum value 14" in office.ask(ask(3, kind=14)).error.message
 
 
@@ -237,7 +237,7 @@ def test_what_disturbs_others_is_refused(office, command):
         (DescribeBus(id=1, bus=-1), "no bus -1"),
         (BringSlaves(id=1, bus=0, station=0, target=5), "malformed request: Invalid enum value 5"),
         (read(1, 77), "malformed request: Invalid enum value 77"),
-        (BringSlaves(id=1, bus=0, station=9, target=8), "no slave 9"),
+        (BringSlaves(id=1, bus=0, station=9, target=8), "unknown slave 9"),
     ],
 )
 def test_what_cannot_be_is_refused(office, request_, reason):

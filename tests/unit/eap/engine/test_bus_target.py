@@ -40,7 +40,7 @@ def test_without_slaves_there_is_nothing_to_bring():
     master = Master()
     with pytest.raises(BusError, match="no slave is known"):
         bring_all(master, AlState.OP, 0)
-    with pytest.raises(BusError, match="no slave 1001"):
+    with pytest.raises(BusError, match="unknown slave 1001"):
         bring_one(master, 1001, AlState.OP, 0)
 
 
@@ -60,7 +60,7 @@ def test_one_that_is_on_its_way_is_named():
     line = line_of(count=1)
     bring_one(line.core, 1001, AlState.INIT, line.now_ns)
     task = bring_all(line.core, AlState.PREOP, line.now_ns)
-    assert "on its way to INIT" in str(task.error)
+    assert "being brought to INIT" in str(task.error)
 
 
 def test_cancelling_stops_all_of_them():
