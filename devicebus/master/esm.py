@@ -66,7 +66,7 @@ def acknowledge(station: int) -> Procedure[AlState]:
     try:
         return AlState(status.state)
     except ValueError:
-        raise BusError(f"slave {station}: {_name(status)} is no state of ETG.1000.6") from None
+        raise BusError(f"slave {station}: {_name(status)} is no AL state") from None
 
 
 def change_state(

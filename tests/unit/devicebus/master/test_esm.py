@@ -120,7 +120,7 @@ def test_an_error_that_stays():
 
 
 def test_a_state_that_does_not_exist():
-    with pytest.raises(BusError, match="slave 7: state 5 is no state of ETG.1000.6"):
+    with pytest.raises(BusError, match="slave 7: state 5 is no AL state"):
         drive(change_state(7, OP), stuck(5))
 
 
