@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from eap.config.document import Node
-    from eap.pd.rules import Breach
+    from eap.pd.rules import RuleViolation
 
 _VARYING = re.compile(r"'[^']*'|\S*\d\S*|, did you mean [^?]*\?")
 """Parts of a message that differ from one use of an anchor to the next."""
@@ -69,7 +69,7 @@ class FindingReport:
         else:
             self._findings.setdefault((where, message, expected), finding)
 
-    def add_breaches(self, at: str, breaches: Iterable[Breach]) -> None:
+    def add_breaches(self, at: str, breaches: Iterable[RuleViolation]) -> None:
         """Report *breaches* of rules by the section at *at*."""
         for breach in breaches:
             self.add(f"{at}.{breach.key}", breach.message, breach.expected)

@@ -30,7 +30,7 @@ from eap.od.profiles.table import ProfileObject, Rule
 from eap.pd import rules
 from eap.pd.address import address_text, source_octets
 from eap.pd.device import DeviceFault, FaultCode
-from eap.pd.rules import MADE_SUFFIXES, NAME, Breach, is_group, is_name
+from eap.pd.rules import MADE_SUFFIXES, NAME, RuleViolation, is_group, is_name
 from eap.pd.spec import (
     REQUESTER,
     EngineSource,
@@ -292,13 +292,13 @@ class FoundRecord(NamedTuple):
         """Make a fault about it."""
         return DeviceFault(code, detail, self.at, subindex, self.port)
 
-    def refuse(self, breaches: Iterable[Breach]) -> None:
+    def refuse(self, breaches: Iterable[RuleViolation]) -> None:
         """Raise a DeviceFault for the first of *breaches*, at the entry that it names."""
         for breach in breaches:
             raise fault_of(breach, self.at, self.port)
 
 
-def fault_of(breach: Breach, index: int, port: str) -> DeviceFault:
+def fault_of(breach: RuleViolation, index: int, port: str) -> DeviceFault:
     """Return the fault for *breach* at the object of *index*."""
     subindex = profile.row_of(index).subindex_of(breach.entry or breach.key)
     detail = f"{breach.message}; expected {breach.expected}"
@@ -346,7 +346,7 @@ def _check_unique(found: Iterable[FoundRecord], subindex: int, what: str) -> Non
         raise second.fault(FaultCode.NAME_TWICE, detail, subindex)
 
 
-def _breaches_of_frame(frame: TxFrameSpec, uri: InterfaceUri) -> Iterator[Breach]:
+def _breaches_of_frame(frame: TxFrameSpec, uri: InterfaceUri) -> Iterator[RuleViolation]:
     is_answer = frame.destination == REQUESTER
     destination = None if is_answer else Destination.parse(frame.destination)
     return chain(
@@ -357,7 +357,7 @@ def _breaches_of_frame(frame: TxFrameSpec, uri: InterfaceUri) -> Iterator[Breach
     )
 
 
-def _breaches_of_pd(pd: TxPdSpec, frame: TxFrameSpec, cycle_us: int) -> Iterator[Breach]:
+def _breaches_of_pd(pd: TxPdSpec, frame: TxFrameSpec, cycle_us: int) -> Iterator[RuleViolation]:
     trigger = pd.trigger
     return chain(
         rules.check_polled(pd),

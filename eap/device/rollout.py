@@ -27,8 +27,8 @@ from eap.pd.spec import (
     PortKind,
     RxAlternateSpec,
     RxPdSpec,
+    SentVariableSpec,
     StationSpec,
-    TakenVariableSpec,
     TxPdSpec,
 )
 
@@ -359,7 +359,7 @@ def _names(form: PdLayout, layout: PdLayout) -> dict[tuple[str, str], str]:
 def _alternate(ours: dict[tuple[str, str], str], layout: PdLayout) -> RxAlternateSpec:
     """Return *layout* as an alternate with the local name of each variable, empty for none."""
     variables = (
-        TakenVariableSpec(ours.pop((each.name, each.type), ""), each.type)
+        SentVariableSpec(ours.pop((each.name, each.type), ""), each.type)
         for each in layout.variables
     )
     return RxAlternateSpec(layout.version, tuple(variables))

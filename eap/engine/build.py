@@ -17,7 +17,7 @@ from devicebus.master.bus import MasterSettings
 from devicebus.master.scan import ExpectedSlave
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.engine_bus import EngineBus
-from eap.engine.rebuild import EngineStation, Rebuilds, has_tcp, open_tcp_port
+from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort
 from eap.net.connections import CloseReason
@@ -31,11 +31,11 @@ from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
-from eap.pd.link import FrameChannel, Taker
+from eap.pd.link import FrameChannel, FrameHandler
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec, Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
-from eap.runtime.discards import DiscardCounters, Refusal, Tally
+from eap.runtime.drop_counters import DropCounterFeed, DropCounters, DropReason
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
@@ -162,9 +162,9 @@ def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> 
     )
 
 
-_REFUSALS: Mapping[str, Refusal] = {
-    CloseReason.OVERDUE: Refusal.TCP_SLOW,
-    CloseReason.EVICTED: Refusal.TCP_EVICTED,
+_REFUSALS: Mapping[str, DropReason] = {
+    CloseReason.OVERDUE: DropReason.TCP_SLOW,
+    CloseReason.EVICTED: DropReason.TCP_EVICTED,
 }
 
 
@@ -196,9 +196,9 @@ class EnginePlant:
         folder = ApplianceFolder(Path(handover.folder))
         self._stations: dict[str, EngineStation] = {}
         self._batch = ReceiveBatch()
-        self._tallies: list[Tally] = []
+        self._tallies: list[DropCounterFeed] = []
         self._counters = self._resources.enter_context(
-            DiscardCounters(folder.discards("engine"), [s.name for s in handover.stations])
+            DropCounters(folder.discards("engine"), [s.name for s in handover.stations])
         )
         for spec in handover.stations:
             step(f"building station {spec.name}")
@@ -213,7 +213,7 @@ class EnginePlant:
             elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
                 self._open_datagrams(shared)
         self.engine = Engine([place.station for place in self._stations.values()])
-        self.rebuilds = Rebuilds(self.engine, self._stations)
+        self.rebuilds = StationRebuilder(self.engine, self._stations)
         self._resources.callback(self.rebuilds.close)
         self.arrivals[self.rebuilds.fileno()] = self.rebuilds.collect
         step("building buses")
@@ -242,7 +242,7 @@ class EnginePlant:
         if not port.accept(receiver, monotonic_ns(), spare_descriptors=spare):
             receiver.close()
             for station in {owner.station for owner in passed.owners}:
-                self._counters.count(station, Refusal.TCP_FULL)
+                self._counters.count(station, DropReason.TCP_FULL)
 
     def image(self, station: str) -> Image:
         """Return the process image of a station as it is now."""
@@ -308,7 +308,9 @@ class EnginePlant:
         port = open_tcp_port(spec, datagrams)
         place = self._stations[name.station]
         place.tcp_ports[name.port] = port
-        self._tallies.append(Tally(self._counters, [name.station], port.closed, _tcp_reason))
+        self._tallies.append(
+            DropCounterFeed(self._counters, [name.station], port.closed, _tcp_reason)
+        )
         station.connect(name.port, port)
         place.settle_tcp()
 
@@ -316,7 +318,9 @@ class EnginePlant:
         interface = EthernetInterface(socket.socket(fileno=shared.engine_fd), packet_batch())
         self._resources.callback(interface.close)
         stations = sorted({owner.station for owner in shared.owners})
-        self._tallies.append(Tally(self._counters, stations, interface.discarded, Refusal))
+        self._tallies.append(
+            DropCounterFeed(self._counters, stations, interface.discarded, DropReason)
+        )
         for owner in shared.owners:
             spec = self._handover.port(owner)
             port = interface.port(
@@ -332,7 +336,7 @@ class EnginePlant:
         if any(self._handover.port(owner).wake is Wake.ARRIVAL for owner in owners):
             self.arrivals[channel.fileno()] = channel.drain
 
-    def _taker(self, name: PortName) -> Taker:
+    def _taker(self, name: PortName) -> FrameHandler:
         return self._station(name).takers[name.port]
 
     def _station(self, name: PortName) -> Station:
@@ -344,8 +348,8 @@ class EnginePlant:
                 yield PortName(station.name, port.name), port
 
 
-def _tcp_reason(closed: str) -> Refusal | None:
+def _tcp_reason(closed: str) -> DropReason | None:
     """Return what to count for a connection that ended; one that was just closed is no refusal."""
     if closed.startswith("frame of type"):
-        return Refusal.TCP_TYPE
+        return DropReason.TCP_TYPE
     return _REFUSALS.get(closed)

@@ -28,7 +28,7 @@ SHARE_NS = 12_000_000
 """Of each window; then descriptors wait for the next one.  Cycles take frames all the while."""
 
 
-class Arrivals:
+class CycleWaiter:
     """Waits for cycles and serves *handlers* meanwhile; *ticker* is closed by its owner."""
 
     def __init__(self, ticker: Ticker, handlers: Mapping[int, Callable[[int], object]]) -> None:
@@ -101,7 +101,7 @@ def run_cycles(
     is_told = False
     ticker = Ticker()
     try:
-        arrivals = Arrivals(ticker, plant.arrivals)
+        arrivals = CycleWaiter(ticker, plant.arrivals)
         while not stop.is_set:
             if not is_told and engine.is_under_way:
                 is_told = True

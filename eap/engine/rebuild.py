@@ -78,7 +78,7 @@ class EngineStation:
             port.close()
 
 
-class Successor:
+class StationReplacement:
     """What is to take the place of a station; made in a thread, or in a test without one.
 
     Raises:
@@ -184,7 +184,7 @@ class _Job:
         self.place = place
         self.request = request
         self.reply = reply
-        self.successor: Successor | None = None
+        self.successor: StationReplacement | None = None
         self.error: EapError | None = None
         self.is_built = False
         self.is_stale = False
@@ -230,14 +230,14 @@ class _Job:
         try:
             spec = _read(self.request)
             if spec != self.place.station.spec:
-                self.successor = Successor(self.place, spec)
+                self.successor = StationReplacement(self.place, spec)
         except EngineRefusedError as exc:
             self.error = exc
         except Exception as exc:  # noqa: BLE001  the engine goes on, whatever it was given
             text = str(exc) if isinstance(exc, EapError) else f"{type(exc).__name__}: {exc}"
             self.error = EngineRefusedError(f"station {self.request.station}: {text}")
 
-    def _put(self, successor: Successor, engine: Engine, now_ns: int) -> None:
+    def _put(self, successor: StationReplacement, engine: Engine, now_ns: int) -> None:
         try:
             self._before = successor.take_over(engine, now_ns)
         except EapError as exc:
@@ -245,7 +245,7 @@ class _Job:
             self.error = exc
 
 
-class Rebuilds:
+class StationRebuilder:
     """Does what services asks for with the *stations* of *engine*, one change after the other."""
 
     def __init__(self, engine: Engine, stations: dict[str, EngineStation]) -> None:

@@ -80,7 +80,7 @@ class Connection(Protocol):
         """Close it at once, in whatever state; called by the driver, never by the policy."""
 
 
-class Limits(NamedTuple):
+class ListenerLimits(NamedTuple):
     """Places of one listener."""
 
     total: int = 128
@@ -117,7 +117,7 @@ class AcceptDecision(NamedTuple):
 class Listener:
     """One listener with its connections; made by :meth:`ConnectionTable.add_listener`."""
 
-    def __init__(self, name: str, limits: Limits) -> None:
+    def __init__(self, name: str, limits: ListenerLimits) -> None:
         self.name = name
         self.limits = limits
         self.refused = 0
@@ -165,7 +165,7 @@ class ConnectionTable:
     def __init__(self) -> None:
         self.listeners: list[Listener] = []
 
-    def add_listener(self, name: str, limits: Limits) -> Listener:
+    def add_listener(self, name: str, limits: ListenerLimits) -> Listener:
         """Return a new listener."""
         listener = Listener(name, limits)
         self.listeners.append(listener)

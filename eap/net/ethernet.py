@@ -12,7 +12,7 @@ from eap.codec.ethercat import ETHERTYPE
 from eap.ids import BROADCAST_MAC, EAP_MULTICAST_MAC, Destination, MacAddr
 from eap.net.mmsg import BATCH, BUFFER_SIZE, ReceiveBatch, SendBatch, note_receive_error
 from eap.net.packetsocket import PACKET_ADD_MEMBERSHIP, PACKET_MR_MULTICAST, SOL_PACKET
-from eap.pd.link import OutFrame, Taker
+from eap.pd.link import FrameHandler, OutFrame
 
 ETHERNET_HEADER = 14
 MINIMUM_SIZE = 60
@@ -59,14 +59,14 @@ class EthernetInterface:
         self._octets = batch.octets
         self._heads = batch.octets.cast("Q")
         self._tags = batch.control.cast("H")
-        self._routes: dict[int, dict[int, list[Taker]]] = {}
+        self._routes: dict[int, dict[int, list[FrameHandler]]] = {}
         self._own_source = bytes(self.address)
         self.has_neighbours = False
         self._has_ports = False
-        self._local: deque[tuple[Taker, memoryview, int]] = deque()
+        self._local: deque[tuple[FrameHandler, memoryview, int]] = deque()
 
     def port(
-        self, taker: Taker, *, vlan_id: int = 0, priority: int = 0, join: Sequence[str] = ()
+        self, taker: FrameHandler, *, vlan_id: int = 0, priority: int = 0, join: Sequence[str] = ()
     ) -> EthernetPort:
         """Return a new port that takes and sends frames of *vlan_id*; 0 is untagged.
 
@@ -175,7 +175,7 @@ class EthernetInterface:
                     take(view, size - ETHERNET_HEADER, at_ns, self)
         return taken
 
-    def _takers(self, head: int, tag: int) -> Sequence[Taker]:
+    def _takers(self, head: int, tag: int) -> Sequence[FrameHandler]:
         """Return who takes a frame of this first word and VLAN tag; count one of no port's VLAN."""
         by_address = self._routes.get(tag & _VID)
         if by_address is None:
@@ -197,7 +197,7 @@ class EthernetPort:
     minimum_size = MINIMUM_SIZE
 
     def __init__(
-        self, interface: EthernetInterface, taker: Taker, vlan_id: int, priority: int
+        self, interface: EthernetInterface, taker: FrameHandler, vlan_id: int, priority: int
     ) -> None:
         self.interface = interface
         self.taker = taker

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
-from eap.pd.link import OutFrame, Taker
+from eap.pd.link import FrameHandler, OutFrame
 
 DRAIN_LIMIT = 256
 HOLD_NS = 100_000_000
@@ -63,7 +63,7 @@ class Faults:
         )
 
 
-class _Waiting:
+class _FrameInFlight:
     """One frame under way to one port."""
 
     __slots__ = ("data", "due_ns", "order", "sender")
@@ -84,13 +84,13 @@ class LoopbackChannel:
     minimum_size = 0
 
     def __init__(self, ports: list[LoopbackChannel], faults: Faults) -> None:
-        self.takers: list[Taker] = []
+        self.takers: list[FrameHandler] = []
         self.errors: dict[str, int] = {}
         self._ports = ports
         self._faults = faults
         self._random = random.Random(faults.seed)  # noqa: S311  repeatable, not secret
-        self._queue: list[_Waiting] = []
-        self._held: list[_Waiting] = []
+        self._queue: list[_FrameInFlight] = []
+        self._held: list[_FrameInFlight] = []
         self._order = 0
         self._address = f"{_ADDRESS}{next(_numbers)}"
         self._sender = ""
@@ -148,7 +148,7 @@ class LoopbackChannel:
                 continue
             for _ in range(2 if faults.duplicate and draw() < faults.duplicate else 1):
                 self._order += 1
-                frame = _Waiting(data, due_ns, self._order, self._address)
+                frame = _FrameInFlight(data, due_ns, self._order, self._address)
                 port._queue.append(frame)  # noqa: SLF001  another port of the same line
                 if faults.reorder and draw() < faults.reorder:
                     frame.due_ns += HOLD_NS

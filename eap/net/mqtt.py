@@ -21,7 +21,7 @@ from eap.net.host import read_password_text
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy
 
 if TYPE_CHECKING:
-    from eap.net.mqttclient import Client
+    from eap.net.mqttclient import MqttClient
 
 KEEPALIVE_S = 10
 """After how much silence the broker is asked whether it is there; it waits half as long again."""
@@ -147,7 +147,7 @@ class MqttLink(ReconnectingLink):
         writer.close()
         await writer.wait_closed()
 
-    async def _serve(self, client: Client) -> None:
+    async def _serve(self, client: MqttClient) -> None:
         self._outbox = asyncio.Queue()
         self._octets = 0
         self._is_connected = True
@@ -170,12 +170,12 @@ class MqttLink(ReconnectingLink):
             first = group_error.exceptions[0]
             raise first from first.__cause__
 
-    async def _read(self, client: Client) -> None:
+    async def _read(self, client: MqttClient) -> None:
         client.inbox.overrun = self._handlers.overrun
         async for message in client.messages:
             self._handlers.message(message.topic.value, message.payload, message.retain)
 
-    async def _write(self, client: Client, group: asyncio.TaskGroup) -> None:
+    async def _write(self, client: MqttClient, group: asyncio.TaskGroup) -> None:
         room = asyncio.Semaphore(_UNCONFIRMED)
 
         async def confirm(message: Publish) -> None:
@@ -195,7 +195,7 @@ class MqttLink(ReconnectingLink):
             else:
                 await _publish(client, message)
 
-    async def _subscribe(self, client: Client, message: Subscribe) -> None:
+    async def _subscribe(self, client: MqttClient, message: Subscribe) -> None:
         for topic in await client.subscribe_all(message.filters):
             logger.warning("%s does not let %s read %s", self._name, self._client_id, topic)
 
@@ -218,7 +218,7 @@ def require_mqtt() -> None:
         ) from None
 
 
-async def _publish(client: Client, message: Publish) -> None:
+async def _publish(client: MqttClient, message: Publish) -> None:
     await client.publish(
         message.topic, message.payload, qos=message.qos, retain=message.is_retained
     )

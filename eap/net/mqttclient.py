@@ -20,7 +20,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from eap.ams.mqtt.network import Publish
 from eap.ams.spec import TlsSpec
 
-__all__ = ["Client", "MqttError", "describe", "is_too_new", "make_client", "tls_context"]
+__all__ = ["MqttClient", "MqttError", "describe", "is_too_new", "make_client", "tls_context"]
 
 MAX_MESSAGE = 1 << 20
 """Octets of a message; the broker is asked to keep longer ones."""
@@ -81,7 +81,7 @@ class ClientErrorLog(logging.Handler):
         self.latest = record.getMessage()
 
 
-class Client(aiomqtt.Client):
+class MqttClient(aiomqtt.Client):
     """A client that connects within bounded time and can be closed at any time."""
 
     error_log: ClientErrorLog
@@ -145,7 +145,7 @@ def make_client(
     host: str, port: int, client_id: str, *,
     login: tuple[str, str] | None, tls: ssl.SSLContext | None, will: Publish, keepalive_s: int,
     is_old: bool,
-) -> Client:  # fmt: skip
+) -> MqttClient:  # fmt: skip
     """Return a client that is not connected yet; *is_old* makes it speak MQTT 3.1.1."""
     properties = None
     if not is_old:
@@ -157,7 +157,7 @@ def make_client(
     logger = logging.Logger(__name__, logging.ERROR)  # noqa: LOG001
     error_log = ClientErrorLog()
     logger.addHandler(error_log)
-    client = Client(
+    client = MqttClient(
         host,
         port,
         username=user,
@@ -185,7 +185,7 @@ def is_too_new(error: MqttError) -> bool:
     return str(error) == "Operation timed out"  # connected, but not answered
 
 
-def describe(error: MqttError, client: Client, user: str) -> str:
+def describe(error: MqttError, client: MqttClient, user: str) -> str:
     """Return in words why there is no connection."""
     if isinstance(error, MqttConnectError) and _code(error) in _LOGIN:
         if not user:

@@ -24,7 +24,7 @@ from eap.net.ethernet import ETHERNET_HEADER, MINIMUM_SIZE
 from eap.net.interface import interface_of
 from eap.net.mmsg import count_error
 from eap.net.packetsocket import ARPHRD_LOOPBACK, PACKET_AUXDATA, SOL_PACKET
-from eap.pd.monitor import Evidence
+from eap.pd.monitor import ProbeResult
 
 _NETLINK_ROUTE = 0
 _NEWROUTE, _GETROUTE, _NEWNEIGH, _GETNEIGH = 24, 26, 28, 30
@@ -55,20 +55,20 @@ class NeighbourState(IntEnum):
     PERMANENT = 0x80
 
     @property
-    def evidence(self) -> Evidence:
+    def evidence(self) -> ProbeResult:
         """What it says of who is there; an entry that nobody ever checks says nothing."""
-        return _EVIDENCE.get(self, Evidence.PENDING)
+        return _EVIDENCE.get(self, ProbeResult.PENDING)
 
 
 _EVIDENCE = {
-    NeighbourState.REACHABLE: Evidence.SEEN,
-    NeighbourState.FAILED: Evidence.ABSENT,
-    NeighbourState.NOARP: Evidence.BLIND,
-    NeighbourState.PERMANENT: Evidence.BLIND,
+    NeighbourState.REACHABLE: ProbeResult.SEEN,
+    NeighbourState.FAILED: ProbeResult.ABSENT,
+    NeighbourState.NOARP: ProbeResult.BLIND,
+    NeighbourState.PERMANENT: ProbeResult.BLIND,
 }
 
 
-class Neighbour(NamedTuple):
+class NeighbourEntry(NamedTuple):
     """An entry of the table."""
 
     state: NeighbourState
@@ -89,7 +89,7 @@ class RouteKind(Enum):
     """Nowhere, or to many."""
 
 
-class Route(NamedTuple):
+class KernelRoute(NamedTuple):
     """The way to an address; *neighbour* is the next on it."""
 
     kind: RouteKind
@@ -115,7 +115,7 @@ class NeighbourTable:
         self._sock.setblocking(False)
         self._sequence = 0
 
-    def look(self, address: str, source: str = "") -> Evidence:
+    def look(self, address: str, source: str = "") -> ProbeResult:
         """Say whether the kernel lately reached the host that has *address*.
 
         That can be told of hosts on the same network.  Addresses of this machine itself have no
@@ -127,14 +127,14 @@ class NeighbourTable:
         """
         route = self.route(address, source)
         if route.kind in {RouteKind.LOCAL, RouteKind.NONE}:
-            return Evidence.BLIND
+            return ProbeResult.BLIND
         neighbour = self.neighbour(route.neighbour, route.interface)
-        evidence = Evidence.PENDING if neighbour is None else neighbour.state.evidence
-        if route.kind is RouteKind.GATEWAY and evidence is not Evidence.ABSENT:
-            return Evidence.BLIND
+        evidence = ProbeResult.PENDING if neighbour is None else neighbour.state.evidence
+        if route.kind is RouteKind.GATEWAY and evidence is not ProbeResult.ABSENT:
+            return ProbeResult.BLIND
         return evidence
 
-    def route(self, address: str, source: str = "") -> Route:
+    def route(self, address: str, source: str = "") -> KernelRoute:
         """Return the way that a datagram from *source* to *address* takes."""
         attributes = _attribute(_RTA_DST, socket.inet_aton(address))
         if source:
@@ -142,19 +142,19 @@ class NeighbourTable:
         head = _ROUTE.pack(socket.AF_INET, 32, 32 if source else 0, 0, 0, 0, 0, 0, 0)
         answer = self._ask(_GETROUTE, _NEWROUTE, head + attributes)
         if answer is None:
-            return Route(RouteKind.NONE)
+            return KernelRoute(RouteKind.NONE)
         kind = _ROUTE.unpack_from(answer)[_ROUTE_TYPE]
         found = dict(_attributes(answer, _ROUTE.size))
         if kind == _RTN_LOCAL:
-            return Route(RouteKind.LOCAL)
+            return KernelRoute(RouteKind.LOCAL)
         if kind != _RTN_UNICAST or _RTA_OIF not in found:
-            return Route(RouteKind.NONE)
+            return KernelRoute(RouteKind.NONE)
         interface = int(struct.unpack("@i", found[_RTA_OIF])[0])
         if _RTA_GATEWAY in found:
-            return Route(RouteKind.GATEWAY, interface, socket.inet_ntoa(found[_RTA_GATEWAY]))
-        return Route(RouteKind.DIRECT, interface, address)
+            return KernelRoute(RouteKind.GATEWAY, interface, socket.inet_ntoa(found[_RTA_GATEWAY]))
+        return KernelRoute(RouteKind.DIRECT, interface, address)
 
-    def neighbour(self, address: str, interface: int) -> Neighbour | None:
+    def neighbour(self, address: str, interface: int) -> NeighbourEntry | None:
         """Return the entry of *address* at the interface of that index, None if there is none."""
         head = _NEIGHBOUR.pack(socket.AF_INET, interface, 0, 0, 0)
         wanted = head + _attribute(_NDA_DST, socket.inet_aton(address))
@@ -164,7 +164,7 @@ class NeighbourTable:
         state = _NEIGHBOUR.unpack_from(answer)[2]
         found = dict(_attributes(answer, _NEIGHBOUR.size))
         mac = found.get(_NDA_LLADDR, b"")
-        return Neighbour(
+        return NeighbourEntry(
             NeighbourState(state) if state in _STATES else NeighbourState.NONE,
             MacAddr(mac) if len(mac) == 6 else None,
         )

@@ -16,7 +16,7 @@ from eap.codec.ethercat import EAP_PORT, EtherCatHeader, FrameType
 from eap.ids import Destination
 from eap.net.connections import OWN_HOST, Activity
 from eap.net.mmsg import count_error
-from eap.pd.link import OutFrame, Taker
+from eap.pd.link import FrameHandler, OutFrame
 
 _SEND_BUFFER = 32 << 10
 _DEAD_PEER_MS = 3000
@@ -108,7 +108,7 @@ class TcpSender:
         destination: str,
         source: str,
         errors: dict[str, int],
-        takers: Sequence[Taker] = (),
+        takers: Sequence[FrameHandler] = (),
     ) -> None:
         where = Destination.parse(destination)
         self._destination = destination
@@ -252,7 +252,7 @@ class TcpReceiver:
     def __init__(
         self,
         sock: socket.socket,
-        takers: Sequence[Taker],
+        takers: Sequence[FrameHandler],
         name: str = "",
         writer: TcpWriter | None = None,
         *,

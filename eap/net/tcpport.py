@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from eap.ids import Destination, DestinationKind
-from eap.net.connections import CloseReason, ConnectionTable, Limits
+from eap.net.connections import CloseReason, ConnectionTable, ListenerLimits
 from eap.net.tcp import CONNECTION, TcpReceiver, TcpSender
-from eap.pd.link import FrameChannel, OutFrame, Taker
+from eap.pd.link import FrameChannel, FrameHandler, OutFrame
 
-LIMITS = Limits(total=32, reserved=8, per_host=16)
+LIMITS = ListenerLimits(total=32, reserved=8, per_host=16)
 """Incoming connections of a port: each costs a system call a cycle, whether it says anything."""
 LOOK_NS = 1_000_000_000
 """Between two looks for connections that leave a frame unfinished."""
@@ -31,7 +31,10 @@ class TcpPort:
     minimum_size = 0
 
     def __init__(
-        self, address: str, datagrams: FrameChannel | None = None, answers: Sequence[Taker] = ()
+        self,
+        address: str,
+        datagrams: FrameChannel | None = None,
+        answers: Sequence[FrameHandler] = (),
     ) -> None:
         self._answers = list(answers)
         self.errors: dict[str, int] = {}
@@ -55,7 +58,7 @@ class TcpPort:
             self._senders = {**self._senders, destination: sender}
         return b""
 
-    def follow(self, destinations: Collection[str], answers: Iterable[Taker]) -> None:
+    def follow(self, destinations: Collection[str], answers: Iterable[FrameHandler]) -> None:
         """Keep connections to *destinations* only, and hand what comes back to *answers*."""
         self._answers[:] = answers
         for gone in self._senders.keys() - destinations:

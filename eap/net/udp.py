@@ -18,7 +18,7 @@ from typing import NamedTuple
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import Destination
 from eap.net.mmsg import BATCH, ReceiveBatch, SendBatch, note_receive_error
-from eap.pd.link import OutFrame, Taker
+from eap.pd.link import FrameHandler, OutFrame
 
 _BATCHES_PER_DRAIN = 4
 _NO_ADDRESS = "0.0.0.0"  # noqa: S104  a source, which Linux would take for this host
@@ -35,7 +35,7 @@ class UdpChannel:
     minimum_size = 0
 
     def __init__(
-        self, sock: socket.socket, batch: ReceiveBatch, takers: Sequence[Taker] = ()
+        self, sock: socket.socket, batch: ReceiveBatch, takers: Sequence[FrameHandler] = ()
     ) -> None:
         sock.setblocking(False)
         self.takers = list(takers)

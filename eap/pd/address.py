@@ -15,7 +15,7 @@ from ipaddress import IPv4Address
 
 from eap.codec.ethercat import FrameType
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
-from eap.pd.link import FrameOrigin, Taker
+from eap.pd.link import FrameHandler, FrameOrigin
 from eap.pd.words import RxWord
 
 _KIND_SHIFT = 48
@@ -185,7 +185,7 @@ class NetIdLearner:
         learn: Called with such a NetID and the address that its frames come from.
     """
 
-    def __init__(self, taker: Taker) -> None:
+    def __init__(self, taker: FrameHandler) -> None:
         self.sought: Container[bytes] = ()
         self.learn: Callable[[bytes, str], None] = forget
         self._taker = taker

@@ -26,7 +26,7 @@ class FrameOrigin(Protocol):
         """
 
 
-Taker: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], None]
+FrameHandler: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], None]
 """Takes one frame: ``take(data, size, at_ns, origin)``.
 
 *data* starts at the EtherCAT header and may be longer than the frame; *size* octets of it arrived.

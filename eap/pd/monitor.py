@@ -30,7 +30,7 @@ class SubscriberPresence(IntEnum):
     MISSING = 2
 
 
-class Evidence(Enum):
+class ProbeResult(Enum):
     """Evidence from one question, or from traffic without one."""
 
     SEEN = auto()
@@ -73,7 +73,7 @@ class PresenceTracker:
         self._patience_ns = max(policy.trust_ns, policy.misses * interval_ns)
         self._told_at_ns = now_ns
         self._hits = self._misses = self._blind = 0
-        self._verdict: Evidence | None = None  # of this round
+        self._verdict: ProbeResult | None = None  # of this round
 
     def begin_round(self) -> None:
         """Note that a new question is under way."""
@@ -84,17 +84,17 @@ class PresenceTracker:
         """True if the next round may change something: it had better come soon."""
         return bool(self._hits if self.presence is SubscriberPresence.MISSING else self._misses)
 
-    def take(self, evidence: Evidence, now_ns: int) -> SubscriberPresence:
+    def take(self, evidence: ProbeResult, now_ns: int) -> SubscriberPresence:
         """Count *evidence* and return the presence that follows."""
         before = self.presence
         match evidence:
-            case Evidence.SEEN:
+            case ProbeResult.SEEN:
                 self._hit(now_ns)
-            case Evidence.MISSED | Evidence.ABSENT:
+            case ProbeResult.MISSED | ProbeResult.ABSENT:
                 self._miss(evidence, now_ns)
-            case Evidence.BLIND:
+            case ProbeResult.BLIND:
                 self._look_in_vain()
-            case Evidence.PENDING:
+            case ProbeResult.PENDING:
                 if now_ns - self._told_at_ns > self._patience_ns:
                     self.presence = SubscriberPresence.UNKNOWN
         if self.presence is not before:
@@ -104,26 +104,26 @@ class PresenceTracker:
     def _hit(self, now_ns: int) -> None:
         self._told_at_ns = now_ns
         self._misses = self._blind = 0
-        if self._verdict is not Evidence.SEEN:
-            self._verdict = Evidence.SEEN
+        if self._verdict is not ProbeResult.SEEN:
+            self._verdict = ProbeResult.SEEN
             self._hits += 1
         if self.presence is not SubscriberPresence.MISSING or self._hits >= self._policy.hits:
             self.presence = SubscriberPresence.PRESENT
 
-    def _miss(self, evidence: Evidence, now_ns: int) -> None:
-        if evidence is Evidence.MISSED and self._verdict is Evidence.SEEN:
+    def _miss(self, evidence: ProbeResult, now_ns: int) -> None:
+        if evidence is ProbeResult.MISSED and self._verdict is ProbeResult.SEEN:
             return
         self._told_at_ns = now_ns
         self._hits = self._blind = 0
-        if self._verdict is not Evidence.MISSED:
-            self._verdict = Evidence.MISSED
+        if self._verdict is not ProbeResult.MISSED:
+            self._verdict = ProbeResult.MISSED
             self._misses += 1
-        if evidence is Evidence.ABSENT or self._misses >= self._policy.misses:
+        if evidence is ProbeResult.ABSENT or self._misses >= self._policy.misses:
             self.presence = SubscriberPresence.MISSING
 
     def _look_in_vain(self) -> None:
         if self._verdict is None:
-            self._verdict = Evidence.BLIND
+            self._verdict = ProbeResult.BLIND
             self._blind += 1
         if self._blind >= self._policy.misses:
             self.presence = SubscriberPresence.UNKNOWN
@@ -172,12 +172,12 @@ class PresenceChanged(NamedTuple):
     name: str
     old: SubscriberPresence
     new: SubscriberPresence
-    cause: Evidence
+    cause: ProbeResult
     answered_by: MacAddr | None
     """Who answered last for its address; not where the frames go if it is missing all the same."""
 
 
-class _Claim:
+class _AddressClaim:
     """Questions of one host for an address that it may want for itself."""
 
     __slots__ = ("first_ns", "last_ns")
@@ -197,7 +197,7 @@ class _Watch:
         self.queued = False
         self.asked_at_ns = now_ns - target.interval_ns
         self.due_ns = self.claimed_until_ns = now_ns
-        self.claims: dict[MacAddr, _Claim] = {}
+        self.claims: dict[MacAddr, _AddressClaim] = {}
 
     def ask(self, now_ns: int) -> None:
         self.tracker.begin_round()
@@ -211,7 +211,7 @@ class _Watch:
         if known is None or now_ns - known.last_ns > policy.claimant_ns:
             if len(self.claims) >= _CLAIMANTS_KEPT:
                 del self.claims[next(iter(self.claims))]
-            known = self.claims[mac] = _Claim(now_ns)
+            known = self.claims[mac] = _AddressClaim(now_ns)
         known.last_ns = now_ns
         until_ns = known.first_ns + policy.claim_ns
         self.claimed_until_ns = max(self.claimed_until_ns, until_ns)
@@ -284,7 +284,7 @@ class SubscriberMonitor:
                 continue
             watch.due_ns = _NOT_PLANNED
             if watch.waits:
-                self._take(watch, Evidence.MISSED, now_ns)
+                self._take(watch, ProbeResult.MISSED, now_ns)
             elif watch.claimed_until_ns > now_ns:
                 self._postpone(watch)
             else:
@@ -298,7 +298,7 @@ class SubscriberMonitor:
             return
         watch.answered_by = mac
         if watch.target.mac in {None, mac}:
-            self._take(watch, Evidence.SEEN, now_ns)
+            self._take(watch, ProbeResult.SEEN, now_ns)
 
     def receive_claim(self, name: str, mac: MacAddr, now_ns: int) -> None:
         """Take note that *mac* asks whether it may take the address of target *name*.
@@ -307,9 +307,9 @@ class SubscriberMonitor:
         """
         watch = self._watches.get(name)
         if watch is not None and watch.claim(mac, now_ns, self._policy):
-            self._take(watch, Evidence.PENDING, now_ns)
+            self._take(watch, ProbeResult.PENDING, now_ns)
 
-    def receive_evidence(self, name: str, evidence: Evidence, now_ns: int) -> None:
+    def receive_evidence(self, name: str, evidence: ProbeResult, now_ns: int) -> None:
         """Take *evidence* about target *name*; unknown names are ignored."""
         watch = self._watches.get(name)
         if watch is not None:
@@ -319,7 +319,7 @@ class SubscriberMonitor:
         """Return the next change of a presence, None when there is none."""
         return self._events.popleft() if self._events else None
 
-    def _take(self, watch: _Watch, evidence: Evidence, now_ns: int) -> None:
+    def _take(self, watch: _Watch, evidence: ProbeResult, now_ns: int) -> None:
         watch.waits = False
         old = watch.tracker.presence
         new = watch.tracker.take(evidence, now_ns)

@@ -18,7 +18,7 @@ REQUESTERS_PER_CYCLE = 32
 """Senders that one port answers in a cycle: each costs it a frame."""
 
 
-class Requests:
+class PollRequests:
     """Requests that came to one port since the last answers.
 
     Args:
@@ -47,14 +47,14 @@ class Requests:
         pending, self._pending = self._pending, {}
         return pending
 
-    def follow(self, before: Requests) -> None:
+    def follow(self, before: PollRequests) -> None:
         """Go on with what *before* has noted and this one takes too."""
         for sender, names in before.take().items():
             if known := names & self.names:
                 self.add(sender, known)
 
 
-class PollQuestion:
+class OutgoingPoll:
     """One TxPD of this station that asks others.
 
     Args:
@@ -74,7 +74,7 @@ class PollQuestion:
         self._waiting: dict[str, int] = {}
         self._state = self._read_state()
 
-    def follow(self, before: PollQuestion) -> None:
+    def follow(self, before: OutgoingPoll) -> None:
         """Go on where *before* was; the words of the image have been carried over."""
         self._sent_at_ns, self._before_ns = before._sent_at_ns, before._before_ns
         self._waiting = {
@@ -120,25 +120,25 @@ class PollAnswer(NamedTuple):
     """An RxPD that answers a question."""
 
     name: str
-    question: PollQuestion
+    question: OutgoingPoll
     words: int
     """Index of its first word."""
 
 
-def requests_at(spec: StationSpec, port: str) -> Requests:
+def requests_at(spec: StationSpec, port: str) -> PollRequests:
     """Return where the requests go that polled PDs of *port* wait for."""
     frames = [frame for frame in spec.frames if frame.port == port]
-    return Requests(pd.poll_request for frame in frames for pd in frame.pds if pd.poll_request)
+    return PollRequests(pd.poll_request for frame in frames for pd in frame.pds if pd.poll_request)
 
 
-def questions_of(image: Image) -> dict[str, PollQuestion]:
+def questions_of(image: Image) -> dict[str, OutgoingPoll]:
     """Return what a station asks, by the TxPD that does it."""
     answers: dict[str, list[str]] = {}
     for slot in image.layout.rx:
         if slot.poll_request:
             answers.setdefault(slot.poll_request, []).append(slot.name)
     return {
-        slot.name: PollQuestion(image.words, slot, answers[slot.name])
+        slot.name: OutgoingPoll(image.words, slot, answers[slot.name])
         for slot in image.layout.tx
         if slot.name in answers
     }

@@ -10,7 +10,7 @@ from eap.pd.address import from_word, net_id_of, to_word
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
-from eap.pd.poll import Requests
+from eap.pd.poll import PollRequests
 from eap.pd.spec import TriggerSpec, TxFrameSpec
 from eap.pd.txframe import (
     EVENT_BIT,
@@ -300,7 +300,7 @@ ANSWERS_KEPT = 64
 _POLL = REASON_INDEX[Reason.POLL]
 
 
-class _AnswerFrame:
+class _ResponseFrame:
     """The polled PDs of one TxFrame, and a buffer for each requester."""
 
     def __init__(self, slot: FrameSlot, pds: tuple[TxPd, ...]) -> None:
@@ -323,7 +323,7 @@ class _AnswerFrame:
         return selection
 
 
-class Answerer:
+class PollResponder:
     """Answers what one port is asked.
 
     All polled PDs of a TxFrame that one sender asked for go to it in one frame.
@@ -344,7 +344,7 @@ class Answerer:
         publisher: NetId,
         channel: FrameChannel,
         frames: Iterable[FrameRow],
-        requests: Requests,
+        requests: PollRequests,
     ) -> None:
         self._image = image
         self._inputs = inputs
@@ -352,7 +352,7 @@ class Answerer:
         self._channel = channel
         self._requests = requests
         self._frames = [
-            _AnswerFrame(
+            _ResponseFrame(
                 slot,
                 tuple(
                     TxPd(where, Trigger(TriggerSpec(), None), Gather(image, inputs, pd.variables))
@@ -361,7 +361,7 @@ class Answerer:
             )
             for spec, slot, slots in frames
         ]
-        self._sending: list[tuple[_AnswerFrame, Selection]] = []
+        self._sending: list[tuple[_ResponseFrame, Selection]] = []
         self.read_controls()
 
     def read_controls(self) -> None:
@@ -401,7 +401,7 @@ class Answerer:
             for pd in selection.pds:
                 enter_sent(words, pd.slot, _POLL, now_ns)
 
-    def _skip(self, frame: _AnswerFrame, pds: Iterable[TxSlot], now_ns: int) -> None:
+    def _skip(self, frame: _ResponseFrame, pds: Iterable[TxSlot], now_ns: int) -> None:
         if frame.suppressed:
             enter_suppressed(self._image.words, frame.slot, now_ns)
         enter_skipped(self._image.words, pds, now_ns)

@@ -17,8 +17,8 @@ from eap.pd.image import Image
 from eap.pd.layout import FrameSlot, RxSlot, TxSlot
 from eap.pd.monitor import SubscriberPresence
 from eap.pd.words import (
-    DISCARDS,
     HISTOGRAM_BINS,
+    PD_DROP_REASONS,
     REASON_INDEX,
     REASONS,
     FrameState,
@@ -168,8 +168,10 @@ def _spread(bins: list[int], largest: int) -> dict[str, int | None]:
 
 
 def _discarded(image: Image, first: int) -> dict[str, int]:
-    counts = image.words[first : first + len(DISCARDS)].tolist()
-    return {reason.value: count for reason, count in zip(DISCARDS, counts, strict=True) if count}
+    counts = image.words[first : first + len(PD_DROP_REASONS)].tolist()
+    return {
+        reason.value: count for reason, count in zip(PD_DROP_REASONS, counts, strict=True) if count
+    }
 
 
 def tx_status(image: Image, slot: TxSlot) -> dict[str, Any]:

@@ -35,7 +35,7 @@ _NAME = re.compile(r"[^\s/]+")
 _Item = TypeVar("_Item")
 
 
-class Breach(NamedTuple):
+class RuleViolation(NamedTuple):
     """A breach of a rule."""
 
     code: FaultCode
@@ -88,34 +88,36 @@ def doubles(items: Iterable[tuple[Hashable, _Item]]) -> Iterator[tuple[_Item, _I
             first[key] = item
 
 
-def check_phase(cycle_us: int, phase_us: int) -> Iterator[Breach]:
+def check_phase(cycle_us: int, phase_us: int) -> Iterator[RuleViolation]:
     """A station runs within its cycle."""
     if phase_us >= cycle_us:
         message = f"phase_us {phase_us} is not within the cycle"
-        yield Breach(FaultCode.CYCLE_TIME, "phase_us", message, f"less than {cycle_us}")
+        yield RuleViolation(FaultCode.CYCLE_TIME, "phase_us", message, f"less than {cycle_us}")
 
 
-def check_modulo(name: str, divider: int | None, modulo: int | None) -> Iterator[Breach]:
+def check_modulo(name: str, divider: int | None, modulo: int | None) -> Iterator[RuleViolation]:
     """A modulo is one of its divider."""
     if modulo is None:
         return
     if not divider:
         message = f"{name!r} has a modulo but no divider"
-        yield Breach(FaultCode.MODULO, "modulo", message, "both or none")
+        yield RuleViolation(FaultCode.MODULO, "modulo", message, "both or none")
     elif modulo >= divider:
         message = f"modulo {modulo} of {name!r} never comes up"
-        yield Breach(FaultCode.MODULO, "modulo", message, f"less than the divider, {divider}")
+        yield RuleViolation(
+            FaultCode.MODULO, "modulo", message, f"less than the divider, {divider}"
+        )
 
 
-def check_answers(frame: TxFrameSpec) -> Iterator[Breach]:
+def check_answers(frame: TxFrameSpec) -> Iterator[RuleViolation]:
     """A frame of answers leaves with the request, and in no rhythm of its own."""
     if frame.destination == REQUESTER and frame.divider:
         message = f"frame {frame.name!r} carries answers and has a divider"
         expected = "none: an answer leaves in the cycle that the request is taken in"
-        yield Breach(FaultCode.TRIGGERS, "divider", message, expected)
+        yield RuleViolation(FaultCode.TRIGGERS, "divider", message, expected)
 
 
-def check_frame_of(pd: TxPdSpec, frame: TxFrameSpec, line: str = "") -> Iterator[Breach]:
+def check_frame_of(pd: TxPdSpec, frame: TxFrameSpec, line: str = "") -> Iterator[RuleViolation]:
     """Answers, and nothing else, are in frames to the requester; *line* says where *frame* is."""
     if bool(pd.poll_request) is (frame.destination == REQUESTER):
         return
@@ -127,66 +129,66 @@ def check_frame_of(pd: TxPdSpec, frame: TxFrameSpec, line: str = "") -> Iterator
         where = f"frame {frame.name!r}{', ' if line else ''}{line}"
         message = f"PD {pd.name!r} goes to who asks for it ({where}), but nothing does"
         expected = "poll: the subscription that asks, or another frame"
-    yield Breach(FaultCode.POLL, "frame", message, expected, entry="to")
+    yield RuleViolation(FaultCode.POLL, "frame", message, expected, entry="to")
 
 
 def check_monitoring(
     frame: TxFrameSpec, destination: Destination | None, uri: InterfaceUri
-) -> Iterator[Breach]:
+) -> Iterator[RuleViolation]:
     """One station at a time can be looked for; *destination* is None for the requester."""
     key, interval = "monitor_interval_ms", frame.monitor_interval_ms
     message = f"frame {frame.name!r} is monitored but goes to "
     code = FaultCode.MONITORING
     if 0 < interval < MIN_MONITOR_INTERVAL_MS:
         expected = f"at least {MIN_MONITOR_INTERVAL_MS}, or 0 for never"
-        yield Breach(code, key, f"monitor_interval_ms is {interval}", expected)
+        yield RuleViolation(code, key, f"monitor_interval_ms is {interval}", expected)
     elif interval and destination is None:
-        yield Breach(code, key, f"{message}who asks", "it only on a unicast frame")
+        yield RuleViolation(code, key, f"{message}who asks", "it only on a unicast frame")
     elif interval and destination is not None:
         if destination.is_group:
-            yield Breach(code, key, f"{message}many", "it only on a unicast frame")
+            yield RuleViolation(code, key, f"{message}many", "it only on a unicast frame")
         elif destination.kind is DestinationKind.TCP or uri.scheme == "loop":
-            yield Breach(code, key, f"{message}{destination} by {uri}", "Ethernet or UDP")
+            yield RuleViolation(code, key, f"{message}{destination} by {uri}", "Ethernet or UDP")
     if not frame.monitor_ip:
         return
     if uri.scheme != "ethernet":
         message = f"frame {frame.name!r} has a monitor_ip, but its own address says whom to look"
-        yield Breach(code, "monitor_ip", f"{message} for", "monitor_ip only on Ethernet")
+        yield RuleViolation(code, "monitor_ip", f"{message} for", "monitor_ip only on Ethernet")
     elif not interval:
         message = f"frame {frame.name!r} has a monitor_ip but no monitor_interval_ms"
-        yield Breach(code, "monitor_ip", message, "both or none")
+        yield RuleViolation(code, "monitor_ip", message, "both or none")
 
 
-def check_triggers(pd: TxPdSpec) -> Iterator[Breach]:
+def check_triggers(pd: TxPdSpec) -> Iterator[RuleViolation]:
     """Triggers of a PD that exclude each other."""
     trigger, on_change, code = pd.trigger, pd.trigger.on_change, FaultCode.TRIGGERS
     if trigger.cycle_us and trigger.divider:
         message = f"PD {pd.name!r} has a cycle_us and a divider"
-        yield Breach(code, "divider", message, "one of the two")
+        yield RuleViolation(code, "divider", message, "one of the two")
     if on_change is None:
         return
     for key in ("cycle_us", "divider"):
         if getattr(trigger, key):
             message = f"PD {pd.name!r} is sent on change and has a {key}"
             expected = "on_change.timeout_ms for sending it again"
-            yield Breach(code, key, message, expected, entry="on_change")
+            yield RuleViolation(code, key, message, expected, entry="on_change")
     if 0 < on_change.timeout_ms * 1000 < on_change.inhibit_us:
         message = f"PD {pd.name!r} is to be sent again before changes may be"
         expected = f"timeout_ms of at least {-(-on_change.inhibit_us // 1000)}"
-        yield Breach(FaultCode.TIME_OUT, "on_change.timeout_ms", message, expected)
+        yield RuleViolation(FaultCode.TIME_OUT, "on_change.timeout_ms", message, expected)
 
 
-def check_polled(pd: TxPdSpec) -> Iterator[Breach]:
+def check_polled(pd: TxPdSpec) -> Iterator[RuleViolation]:
     """An answer has no other trigger."""
     if not pd.poll_request:
         return
     for key in ("cycle_us", "divider", "on_change", "event"):
         if getattr(pd.trigger, key):
             message = f"PD {pd.name!r} has both poll and {key}"
-            yield Breach(FaultCode.TRIGGERS, key, message, "one of the two", entry="poll")
+            yield RuleViolation(FaultCode.TRIGGERS, key, message, "one of the two", entry="poll")
 
 
-def check_times(pd: TxPdSpec, frame: TxFrameSpec | None, cycle_us: int) -> Iterator[Breach]:
+def check_times(pd: TxPdSpec, frame: TxFrameSpec | None, cycle_us: int) -> Iterator[RuleViolation]:
     """A PD is due in cycles of the device in which its frame leaves.
 
     The message of a GATE ends with the divider of *frame*; None leaves that rule out.
@@ -197,7 +199,9 @@ def check_times(pd: TxPdSpec, frame: TxFrameSpec | None, cycle_us: int) -> Itera
         is_between = below < trigger.cycle_us
         expected = f"{below} or {below + cycle_us}" if is_between else str(below)
         message = f"cycle_us {trigger.cycle_us} of PD {pd.name!r} is no multiple of the device"
-        yield Breach(FaultCode.CYCLE_TIME, "cycle_us", f"{message} cycle, {cycle_us}", expected)
+        yield RuleViolation(
+            FaultCode.CYCLE_TIME, "cycle_us", f"{message} cycle, {cycle_us}", expected
+        )
         return
     step = trigger.divider or trigger.cycle_us // cycle_us
     if frame is None or not frame.divider or not step:
@@ -207,17 +211,17 @@ def check_times(pd: TxPdSpec, frame: TxFrameSpec | None, cycle_us: int) -> Itera
     if step % frame.divider:
         multiple = frame.divider * (1 if trigger.divider else cycle_us)
         message = f"PD {pd.name!r} is due every {step} cycles, {gate}"
-        yield Breach(FaultCode.GATE, key, message, f"a multiple of {multiple}")
+        yield RuleViolation(FaultCode.GATE, key, message, f"a multiple of {multiple}")
     elif trigger.modulo % frame.divider != frame.modulo:
         message = f"PD {pd.name!r} is due at {trigger.modulo} of {step} cycles, {gate}"
         expected = f"a modulo that leaves {frame.modulo} when divided by {frame.divider}"
         shown = "modulo" if trigger.modulo else key
-        yield Breach(FaultCode.GATE, shown, message, expected, entry=key)
+        yield RuleViolation(FaultCode.GATE, shown, message, expected, entry=key)
 
 
-def check_time_out(name: str, timeout_ms: int, cycle_us: int) -> Iterator[Breach]:
+def check_time_out(name: str, timeout_ms: int, cycle_us: int) -> Iterator[RuleViolation]:
     """A time-out is no shorter than the device cycle in which it is looked at."""
     if 0 < timeout_ms * 1000 < cycle_us:
         message = f"timeout_ms {timeout_ms} of {name!r} is shorter than the device cycle of"
         expected = f"at least {-(-cycle_us // 1000)}, or 0 for never"
-        yield Breach(FaultCode.TIME_OUT, "timeout_ms", f"{message} {cycle_us} us", expected)
+        yield RuleViolation(FaultCode.TIME_OUT, "timeout_ms", f"{message} {cycle_us} us", expected)

@@ -198,7 +198,7 @@ class TxFrameSpec(SpecRecord, frozen=True):
     """Ethernet: IPv4 address of the subscriber, to probe for by ARP; empty leaves it unknown."""
 
 
-class TakenVariableSpec(SpecRecord, frozen=True):
+class SentVariableSpec(SpecRecord, frozen=True):
     """One variable as it is sent; *name* is that of the RxPD's variable, empty if it has none."""
 
     name: str
@@ -212,7 +212,7 @@ class RxAlternateSpec(SpecRecord, frozen=True):
     """
 
     version: int
-    variables: tuple[TakenVariableSpec, ...]
+    variables: tuple[SentVariableSpec, ...]
     """Everything that is sent, in PDO order."""
 
 

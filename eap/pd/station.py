@@ -20,10 +20,10 @@ from eap.ids import InterfaceUri, NetId
 from eap.pd.address import NetIdLearner, forget
 from eap.pd.device import DeviceState, EapDevice
 from eap.pd.image import Image, Inputs, Sampler
-from eap.pd.link import CyclicBus, FrameChannel, StateChannel, Taker
+from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, StateChannel
 from eap.pd.links import Generators, Links
 from eap.pd.poll import questions_of, requests_at
-from eap.pd.publisher import Answerer, FrameRow, Publisher
+from eap.pd.publisher import FrameRow, PollResponder, Publisher
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
@@ -78,8 +78,8 @@ class Station:
         """True if anything follows from what was received."""
         self._has_own_variables = self._computes
         self.buses: list[CyclicBus] = []
-        self._publishers: list[tuple[Publisher | Answerer, FrameChannel]] = []
-        self._sending: list[tuple[Publisher | Answerer, FrameChannel]] = []
+        self._publishers: list[tuple[Publisher | PollResponder, FrameChannel]] = []
+        self._sending: list[tuple[Publisher | PollResponder, FrameChannel]] = []
         """The publishers, in states that send."""
         self._ports: dict[str, tuple[FrameChannel, Publisher | None]] = {}
         self._channels: list[FrameChannel] = []
@@ -100,7 +100,7 @@ class Station:
             for subscriber in self._subscribers.values()
             if subscriber.has_timeouts
         ]
-        self.takers: dict[str, Taker] = {
+        self.takers: dict[str, FrameHandler] = {
             name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
         }
         self._learners = {port: NetIdLearner(self.takers[port]) for port in _learning_ports(spec)}
@@ -135,7 +135,7 @@ class Station:
             self._publishers.append((publisher, out))
         if polled := _pds_of(frames, polled=True):
             requests = self._requests[port]
-            answerer = Answerer(self.image, self._inputs, net_id, out, polled, requests)
+            answerer = PollResponder(self.image, self._inputs, net_id, out, polled, requests)
             self._publishers.append((answerer, out))
         self._ports[port] = channel, publisher
         self._teach(port)

@@ -17,11 +17,18 @@ from eap.pd.address import SourceWatch
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot
 from eap.pd.link import FrameOrigin
-from eap.pd.poll import PollQuestion, Requests
+from eap.pd.poll import OutgoingPoll, PollRequests
 from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import RxPdSpec
-from eap.pd.subscription import FramePlan, RefusedPd, RxSubscription, SubstituteValue, TakenPd, walk
-from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
+from eap.pd.subscription import (
+    AcceptedPd,
+    DroppedPd,
+    FramePlan,
+    RxSubscription,
+    SubstituteValue,
+    walk,
+)
+from eap.pd.words import PD_DROP_INDEX, PdDropReason, RxState, RxWord, StationWord
 
 _KEY = struct.Struct("<10s4x6s").unpack_from
 """EtherCAT header, publisher and count, and the header of the first PD: what tells layouts apart.
@@ -60,18 +67,18 @@ class Subscriber:
         image: Image,
         subscriptions: Iterable[tuple[RxPdSpec, RxSlot]],
         own_cycle_ns: int,
-        requests: Requests,
-        questions: Mapping[str, PollQuestion] = MappingProxyType({}),
+        requests: PollRequests,
+        questions: Mapping[str, OutgoingPoll] = MappingProxyType({}),
     ) -> None:
         self._table = SubscriptionTable(image, subscriptions, own_cycle_ns, requests, questions)
         self._open_from_ns = _NEVER
-        self._closed_reason = Discard.SUPPRESSED
+        self._closed_reason = PdDropReason.SUPPRESSED
         self._next_timeout_ns = _NEVER
 
     def open(self, from_ns: int) -> None:
         """Take what arrives from now on; what arrived earlier is stale (the station is in Op)."""
         self._open_from_ns = from_ns
-        self._closed_reason = Discard.STALE
+        self._closed_reason = PdDropReason.STALE
         self._next_timeout_ns = from_ns
 
     def resume(self, from_ns: int) -> None:
@@ -83,7 +90,7 @@ class Subscriber:
     def close(self) -> None:
         """Take nothing (the station left Op)."""
         self._open_from_ns = _NEVER
-        self._closed_reason = Discard.SUPPRESSED
+        self._closed_reason = PdDropReason.SUPPRESSED
         self._next_timeout_ns = _NEVER
 
     def learn_from(self, before: Subscriber) -> None:
@@ -194,8 +201,8 @@ class SubscriptionTable:
         image: Image,
         subscriptions: Iterable[tuple[RxPdSpec, RxSlot]],
         own_cycle_ns: int,
-        requests: Requests,
-        questions: Mapping[str, PollQuestion],
+        requests: PollRequests,
+        questions: Mapping[str, OutgoingPoll],
     ) -> None:
         self._requests = requests
         self.memory = image.memory
@@ -250,7 +257,7 @@ class SubscriptionTable:
     def learn(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
         """Make the plan of a layout not seen before from *source*, None without PDs."""
         pds = walk(data, size)
-        if isinstance(pds, Discard):
+        if isinstance(pds, PdDropReason):
             self.discard(pds, 1)
             return None
         if not pds:
@@ -260,7 +267,7 @@ class SubscriptionTable:
         refused = []
         for header, offset in pds:
             match = self._match(publisher, header, source)
-            if isinstance(match, RefusedPd):
+            if isinstance(match, DroppedPd):
                 refused.append(match)
             else:
                 chosen += [(subscription, header, offset) for subscription in match]
@@ -295,7 +302,7 @@ class SubscriptionTable:
         source: bytes,
         at_ns: int,
         taking: Iterable[RxSubscription],
-        refused: Iterable[RefusedPd],
+        refused: Iterable[DroppedPd],
     ) -> SourceWatch:
         """Return the watch over the frames of *publisher* that are judged as those of *source*."""
         expected = source if source in self._sources else b""
@@ -318,20 +325,20 @@ class SubscriptionTable:
 
     def _match(
         self, publisher: bytes, header: PdHeader, source: bytes
-    ) -> list[RxSubscription] | RefusedPd:
+    ) -> list[RxSubscription] | DroppedPd:
         """Find the subscriptions that take a PD, or what to count instead."""
         pd_id = header.pd_id
         candidates = self._by_key.get((publisher, pd_id), []) + self._by_key.get((b"", pd_id), [])
         if not candidates:
             others = self._by_id.get(pd_id, [])
-            return _refuse_all([(other, Discard.WRONG_PUBLISHER) for other in others])
+            return _refuse_all([(other, PdDropReason.WRONG_PUBLISHER) for other in others])
         misfits = [(c, c.mismatch(header.version, header.length, source)) for c in candidates]
         fitting = [candidate for candidate, reason in misfits if reason is None]
         return fitting or _refuse_all([(c, reason) for c, reason in misfits if reason is not None])
 
-    def discard(self, reason: Discard, count: int, subscriptions: Iterable[int] = ()) -> None:
+    def discard(self, reason: PdDropReason, count: int, subscriptions: Iterable[int] = ()) -> None:
         """Count *count* PDs under *reason*, for the station and for *subscriptions*."""
-        index = DISCARD_INDEX[reason]
+        index = PD_DROP_INDEX[reason]
         self.words[StationWord.DISCARDED + index] += count
         for first_word in subscriptions:
             self.words[first_word + RxWord.DISCARDED + index] += 1
@@ -369,7 +376,7 @@ class SubscriptionTable:
             return
         sender = origin.sender_of(data)
         if not sender or not self._requests.add(sender, names):
-            reason = Discard.TOO_MANY_REQUESTS if sender else Discard.NO_SENDER
+            reason = PdDropReason.TOO_MANY_REQUESTS if sender else PdDropReason.NO_SENDER
             refused = [s.slot.words for s in self.subscriptions if s.slot.name in names]
             self.discard(reason, len(names), refused)
 
@@ -423,24 +430,24 @@ class SubscriptionTable:
         return parted
 
 
-_UNKNOWN_ID = RefusedPd((StationWord.DISCARDED + DISCARD_INDEX[Discard.UNKNOWN_ID],))
-_VAR_STATE = {Discard.VERSION: 1, Discard.LENGTH: 2}
+_UNKNOWN_ID = DroppedPd((StationWord.DISCARDED + PD_DROP_INDEX[PdDropReason.UNKNOWN_ID],))
+_VAR_STATE = {PdDropReason.VERSION: 1, PdDropReason.LENGTH: 2}
 
 
-def _take(subscription: RxSubscription, header: PdHeader, offset: int) -> TakenPd:
+def _take(subscription: RxSubscription, header: PdHeader, offset: int) -> AcceptedPd:
     """Return how *subscription* takes the PD with *header* at *offset* of the frame."""
     slot = subscription.slot
     alternate = subscription.alternates.get((header.version, header.length))
     size = PdHeader.SIZE + slot.size
-    return TakenPd(subscription.tracker, slot.words, offset, slot.offset, size, alternate)
+    return AcceptedPd(subscription.tracker, slot.words, offset, slot.offset, size, alternate)
 
 
-def _refuse_all(reasons: list[tuple[RxSubscription, Discard]]) -> RefusedPd:
+def _refuse_all(reasons: list[tuple[RxSubscription, PdDropReason]]) -> DroppedPd:
     """Count a PD once for the station, and for each subscription under its own reason."""
     if not reasons:
         return _UNKNOWN_ID
-    counters = [StationWord.DISCARDED + DISCARD_INDEX[reasons[0][1]]]
-    counters += [s.slot.words + RxWord.DISCARDED + DISCARD_INDEX[why] for s, why in reasons]
+    counters = [StationWord.DISCARDED + PD_DROP_INDEX[reasons[0][1]]]
+    counters += [s.slot.words + RxWord.DISCARDED + PD_DROP_INDEX[why] for s, why in reasons]
     mismatches = [(s.slot.words, _VAR_STATE[why]) for s, why in reasons if why in _VAR_STATE]
-    wrong_source = [s.slot.words for s, why in reasons if why is Discard.WRONG_SOURCE]
-    return RefusedPd(tuple(counters), tuple(mismatches), tuple(wrong_source))
+    wrong_source = [s.slot.words for s, why in reasons if why is PdDropReason.WRONG_SOURCE]
+    return DroppedPd(tuple(counters), tuple(mismatches), tuple(wrong_source))

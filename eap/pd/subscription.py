@@ -19,10 +19,10 @@ from eap.pd.address import SourceWatch, source_octets
 from eap.pd.copyplan import CopyPlan
 from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxSlot
-from eap.pd.poll import PollAnswer, PollQuestion
+from eap.pd.poll import OutgoingPoll, PollAnswer
 from eap.pd.sequence import SequenceTracker
 from eap.pd.spec import RxPdSpec, Substitute
-from eap.pd.words import Discard
+from eap.pd.words import PdDropReason
 
 
 class RxSubscription:
@@ -57,7 +57,7 @@ class RxSubscription:
         spec: RxPdSpec,
         slot: RxSlot,
         substitute: SubstituteValue,
-        question: PollQuestion | None = None,
+        question: OutgoingPoll | None = None,
     ) -> None:
         self.slot = slot
         self.answer = None if question is None else PollAnswer(spec.name, question, slot.words)
@@ -68,16 +68,16 @@ class RxSubscription:
         self.source = source_octets(spec.source) if spec.source else b""
         self.tracker: SequenceTracker
 
-    def mismatch(self, version: int, length: int, source: bytes) -> Discard | None:
+    def mismatch(self, version: int, length: int, source: bytes) -> PdDropReason | None:
         """Return why such a PD from the address *source* does not fit, None if it does."""
         if self.source and source != self.source:
-            return Discard.WRONG_SOURCE
+            return PdDropReason.WRONG_SOURCE
         if (version, length) in self.alternates:
             return None
         if version != self.slot.version and not self.ignore_version:
-            return Discard.VERSION
+            return PdDropReason.VERSION
         if length != self.slot.size:
-            return Discard.LENGTH
+            return PdDropReason.LENGTH
         return None
 
     def deadline_ns(self) -> int | None:
@@ -122,7 +122,7 @@ Copy: TypeAlias = tuple[slice, slice]
 """Octets of the frame and where they go in the image."""
 
 
-class TakenPd(NamedTuple):
+class AcceptedPd(NamedTuple):
     """A PD of the frame that a subscription takes: offsets of its header here and there."""
 
     tracker: SequenceTracker
@@ -136,7 +136,7 @@ class TakenPd(NamedTuple):
     """What copies it, header included, if it is laid out otherwise than in the image."""
 
 
-class RefusedPd(NamedTuple):
+class DroppedPd(NamedTuple):
     """A PD that no subscription takes: counters to add one to, and VarState words to set."""
 
     counters: tuple[int, ...]
@@ -187,8 +187,8 @@ class FramePlan:
         self,
         end: int,
         pds: Iterable[tuple[bytes, int]],
-        taken: Iterable[TakenPd],
-        refused: Iterable[RefusedPd],
+        taken: Iterable[AcceptedPd],
+        refused: Iterable[DroppedPd],
         *,
         watch: SourceWatch,
         requests: Iterable[tuple[SequenceTracker, str]] = (),
@@ -234,8 +234,8 @@ class FramePlan:
         return memoryview(frame.ljust(self.end, b"\0"))
 
 
-def _parts(taken: Iterable[TakenPd]) -> tuple[tuple[SequenceTracker, tuple[Copy, ...]], ...]:
-    runs: dict[SequenceTracker, list[TakenPd]] = {}
+def _parts(taken: Iterable[AcceptedPd]) -> tuple[tuple[SequenceTracker, tuple[Copy, ...]], ...]:
+    runs: dict[SequenceTracker, list[AcceptedPd]] = {}
     for pd in taken:
         pieces = runs.setdefault(pd.tracker, [])
         if pd.alternate is not None:
@@ -256,7 +256,7 @@ def _parts(taken: Iterable[TakenPd]) -> tuple[tuple[SequenceTracker, tuple[Copy,
     )
 
 
-def _continues(run: TakenPd, pd: TakenPd) -> bool:
+def _continues(run: AcceptedPd, pd: AcceptedPd) -> bool:
     return run.source + run.size == pd.source and run.target + run.size == pd.target
 
 
@@ -265,17 +265,17 @@ HEADER_KEY = struct.Struct("<6s2x")
 assert HEADER_KEY.size == PdHeader.SIZE  # noqa: S101  the two must not drift apart
 
 
-def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | Discard:
+def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | PdDropReason:
     """Return each PD header with its offset, or why the frame is dropped as a whole."""
     try:
         ethercat = EtherCatHeader.decode(data[:size])
         if ethercat.type != FrameType.PROCESS_DATA:
-            return Discard.WRONG_TYPE
+            return PdDropReason.WRONG_TYPE
         end = PD_FRAME_START + ethercat.length
         frame = data[: min(end, size)]
         count = PdFrameHeader.decode(frame, PD_FRAME_START).count
         if FIRST_PD + count * PdHeader.SIZE > end:
-            return Discard.COUNT_TOO_LARGE
+            return PdDropReason.COUNT_TOO_LARGE
         pds = []
         offset = FIRST_PD
         for _ in range(count):
@@ -283,5 +283,5 @@ def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | Discard:
             pds.append((header, offset))
             offset += PdHeader.SIZE + header.length
     except TruncatedError:
-        return Discard.TRUNCATED
-    return pds if offset <= end <= size else Discard.TRUNCATED
+        return PdDropReason.TRUNCATED
+    return pds if offset <= end <= size else PdDropReason.TRUNCATED

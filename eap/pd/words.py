@@ -11,7 +11,7 @@ from enum import IntEnum, IntFlag, StrEnum, auto
 from itertools import accumulate
 
 
-class Discard(StrEnum):
+class PdDropReason(StrEnum):
     """Reason for which a PD, or a whole frame, was dropped."""
 
     WRONG_PUBLISHER = auto()
@@ -45,9 +45,9 @@ class Reason(StrEnum):
     POLL = auto()
 
 
-DISCARDS = tuple(Discard)
+PD_DROP_REASONS = tuple(PdDropReason)
 REASONS = tuple(Reason)
-DISCARD_INDEX = {reason: index for index, reason in enumerate(DISCARDS)}
+PD_DROP_INDEX = {reason: index for index, reason in enumerate(PD_DROP_REASONS)}
 REASON_INDEX = {reason: index for index, reason in enumerate(REASONS)}
 
 HISTOGRAM_BINS = 64
@@ -85,7 +85,7 @@ class StationWord(IntEnum):
     """Cycles in which a writer had stopped in the middle of writing."""
     LATENESS_MAX_NS = 16
     DISCARDED = 17
-    LATENESS = DISCARDED + len(DISCARDS)
+    LATENESS = DISCARDED + len(PD_DROP_REASONS)
     LINKS_HELD = LATENESS + HISTOGRAM_BINS
     """Values that no link could pass on, because their source was infinite or no number."""
     SAMPLED_UNTIL = LINKS_HELD + 1
@@ -160,7 +160,7 @@ class RxWord(IntEnum):
     """Address of the last frame dropped because it is not the publisher's."""
     WRONG_SOURCE_AT_NS = 8
     DISCARDED = 9
-    RECEIVED = DISCARDED + len(DISCARDS)
+    RECEIVED = DISCARDED + len(PD_DROP_REASONS)
     DUPLICATED = RECEIVED + 1
     REORDERED = RECEIVED + 2
     LATE = RECEIVED + 3

@@ -28,7 +28,7 @@ MAX_RESOURCE = 16 << 20
 """Octets of the largest file that a bus file may refer to."""
 
 
-class Bus(msgspec.Struct, frozen=True):
+class BusFile(msgspec.Struct, frozen=True):
     """A bus file that can be built, with the files it refers to by the names it uses."""
 
     spec: BusSpec
@@ -44,7 +44,7 @@ class Bus(msgspec.Struct, frozen=True):
 class BusResult(msgspec.Struct, frozen=True):
     """Either a bus and no findings, or no bus and all findings in the order of the file."""
 
-    bus: Bus | None
+    bus: BusFile | None
     findings: tuple[PlantFinding, ...]
 
 
@@ -57,7 +57,7 @@ def load(path: Path) -> BusResult:
         return BusResult(None, report.findings())
     slaves = range(len(spec.slaves))
     revised = frozenset(n for n in slaves if f"slaves[{n}].revision" in report.lines)
-    bus = Bus(spec, {}, revised)
+    bus = BusFile(spec, {}, revised)
     for number, slave in enumerate(spec.slaves):
         at = f"slaves[{number}]"
         for name in _files(slave):
@@ -73,7 +73,7 @@ def load(path: Path) -> BusResult:
     return BusResult(None if findings else bus, findings)
 
 
-def load_or_raise(path: Path) -> Bus:
+def load_or_raise(path: Path) -> BusFile:
     """Read the bus file at *path*; raise ConfigError with every finding if it is none."""
     result = load(path)
     if result.bus is None:
@@ -105,7 +105,7 @@ def _line(spec: BusSpec) -> tuple[int, ...]:
     return trace_path(links, (0, 0)).order
 
 
-def _describe(bus: Bus, number: int) -> DescribedSlave:
+def _describe(bus: BusFile, number: int) -> DescribedSlave:
     spec = bus.spec.slaves[number]
     slave = build_slave(spec, bus.resources)
     image = sii.decode(slave.esc.image)
@@ -148,7 +148,7 @@ def _files(slave: SlaveSpec) -> Iterator[str]:
             yield channel.csv
 
 
-def _read_resource(bus: Bus, path: Path, name: str, report: FindingReport, at: str) -> None:
+def _read_resource(bus: BusFile, path: Path, name: str, report: FindingReport, at: str) -> None:
     try:
         with path.open("rb") as file:
             octets = file.read(MAX_RESOURCE + 1)
@@ -182,14 +182,14 @@ def _check_wiring(spec: BusSpec, number: int, report: FindingReport, at: str) ->
             report.add(at, message, "another port (key port, 1 to 3)")
 
 
-def _check_slave(slave: SlaveSpec, bus: Bus, report: FindingReport, at: str) -> None:
+def _check_slave(slave: SlaveSpec, bus: BusFile, report: FindingReport, at: str) -> None:
     try:
         build_slave(slave, bus.resources)
     except ValueError as exc:
         report.add(at, f"{slave.name}: {exc}", "a device that can be built")
 
 
-def _check_faults(bus: Bus, report: FindingReport) -> None:
+def _check_faults(bus: BusFile, report: FindingReport) -> None:
     if not bus.spec.faults:
         return
     segment = FaultySegment(build_segment(bus.spec, bus.resources))

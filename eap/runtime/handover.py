@@ -94,7 +94,7 @@ class BusSocket(SpecRecord, frozen=True):
     """The other side of that pair, for services."""
 
 
-class Handed(SpecRecord, frozen=True):
+class InheritedRecord(SpecRecord, frozen=True):
     """What crosses to a child in a descriptor."""
 
     def to_descriptor(self) -> int:
@@ -112,7 +112,7 @@ class Handed(SpecRecord, frozen=True):
             return msgspec.json.decode(file.read(), type=cls, dec_hook=decode_value)
 
 
-class SegmentHandover(Handed, frozen=True):
+class SegmentHandover(InheritedRecord, frozen=True):
     """All that the process of a simulated segment gets."""
 
     supervisor: int
@@ -138,7 +138,7 @@ class EngineOptions(SpecRecord, frozen=True):
     """Of SCHED_FIFO, 1 to 99."""
 
 
-class Handover(Handed, frozen=True):
+class Handover(InheritedRecord, frozen=True):
     """All that engine and services get; a descriptor that it does not need is NO_DESCRIPTOR."""
 
     supervisor: int

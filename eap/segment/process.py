@@ -26,7 +26,7 @@ from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net import realtime
 from eap.net.busport import SegmentSocket, open_segment
-from eap.runtime.busfile import Bus, load_or_raise
+from eap.runtime.busfile import BusFile, load_or_raise
 from eap.runtime.handover import SegmentHandover
 from eap.runtime.startup import Startup, catch_end_signals
 
@@ -99,7 +99,7 @@ class CommandMessages:
 
 
 def run(
-    bus: Bus,
+    bus: BusFile,
     interface: InterfaceUri,
     say: Callable[[dict[str, Any]], None],
     *,

@@ -31,7 +31,7 @@ from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 from eap.pd.words import StationWord
 from eap.release import RELEASE
-from eap.runtime.discards import DiscardCounters
+from eap.runtime.drop_counters import DropCounters
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
@@ -223,7 +223,7 @@ class Services:
         self._directory = Directory(handover.directory)
         self._names = [station.name for station in handover.stations]
         self._counters = resources.enter_context(
-            DiscardCounters(self._folder.discards("services"), self._names)
+            DropCounters(self._folder.discards("services"), self._names)
         )
         self._link = resources.enter_context(socket.socket(fileno=handover.link_fd))
         self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
@@ -336,7 +336,7 @@ class Services:
     ) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
-            DiscardCounters(self._folder.discards("engine"), self._names)
+            DropCounters(self._folder.discards("engine"), self._names)
         )
         identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
 

@@ -26,7 +26,7 @@ from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.pd.link import FrameOrigin
 from eap.pd.spec import StationSpec
-from eap.runtime.discards import DiscardCounters, Refusal
+from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.routing.remote_routers import RouterRequests
@@ -73,7 +73,7 @@ class Network(NamedTuple):
     """Of these routers; tools may add some."""
     gateways: Mapping[PortName, MailboxGateway]
     """To the buses, in their order."""
-    counters: DiscardCounters
+    counters: DropCounters
     """Of dropped frames and closed connections."""
     listeners: Listeners
     """Of this process."""
@@ -110,10 +110,10 @@ class Network(NamedTuple):
         )
         return GatewayTransport([(self.gateways[owner], f"{kind}:{name}")])
 
-    def drop_counter(self, stations: Sequence[str]) -> Callable[[Refusal], None]:
+    def drop_counter(self, stations: Sequence[str]) -> Callable[[DropReason], None]:
         """Return the function that counts a reason at each of *stations*."""
 
-        def count_dropped(reason: Refusal) -> None:
+        def count_dropped(reason: DropReason) -> None:
             for station in stations:
                 self.counters.count(station, reason)
 
@@ -307,7 +307,7 @@ class MailboxTransports:
         self,
         shared: SharedSocket,
         accepting: tuple[PortName, ...],
-        count_dropped: Callable[[Refusal], None],
+        count_dropped: Callable[[DropReason], None],
         streams: MailboxStreams,
     ) -> TcpTransport:
         listener, listeners = self._network.open_socket(shared), self._network.listeners
@@ -426,7 +426,9 @@ def _stations_of(shared: SharedSocket) -> list[str]:
     return list(dict.fromkeys(owner.station for owner in shared.owners))
 
 
-def _drop_mailbox(data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
+def _drop_mailbox(
+    data: memoryview, size: int, at_ns: int, origin: FrameOrigin
+) -> DropReason | None:
     """Drop each frame: the ports of the interface are not all known yet."""
     del data, size, at_ns, origin
-    return Refusal.MAILBOX
+    return DropReason.MAILBOX

@@ -9,8 +9,8 @@ from eap.ids import NetId
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image, format_image
 from eap.pd.layout import RxSlot, VariableSlot, plan_layout
-from eap.pd.link import OutFrame, Taker
-from eap.pd.poll import Requests
+from eap.pd.link import FrameHandler, OutFrame
+from eap.pd.poll import PollRequests
 from eap.pd.spec import (
     BusEntrySpec,
     BusPortSpec,
@@ -24,7 +24,7 @@ from eap.pd.spec import (
 )
 from eap.pd.station import Station
 from eap.pd.subscriber import Subscriber
-from eap.pd.words import DISCARDS, RxWord, StationWord
+from eap.pd.words import PD_DROP_REASONS, RxWord, StationWord
 
 PEER = "5.23.91.23.1.1"
 """NetID of the port that publishes in most tests."""
@@ -90,7 +90,7 @@ class From:
 
 
 def give(
-    taker: Taker, frame: bytes, at_ns: int, sender: str = "somebody", source: bytes = b""
+    taker: FrameHandler, frame: bytes, at_ns: int, sender: str = "somebody", source: bytes = b""
 ) -> None:
     """Hand *frame* over as a driver does: in a buffer that is longer than it."""
     taker(memoryview(frame + b"\xee" * 32), len(frame), at_ns, From(sender, source))
@@ -108,7 +108,7 @@ class Receiver:
         """Start as an engine does, also once more on the same image."""
         pairs = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
         self.subscriber = Subscriber(
-            self.image, list(pairs), self.spec.cycle_us * 1000, Requests(())
+            self.image, list(pairs), self.spec.cycle_us * 1000, PollRequests(())
         )
         self.subscriber.open(now_ns)
 
@@ -131,8 +131,10 @@ class Receiver:
         first = StationWord.DISCARDED
         if name is not None:
             first = self.slot(name).words + RxWord.DISCARDED
-        counts = self.image.words[first : first + len(DISCARDS)].tolist()
-        return {why.value: count for why, count in zip(DISCARDS, counts, strict=True) if count}
+        counts = self.image.words[first : first + len(PD_DROP_REASONS)].tolist()
+        return {
+            why.value: count for why, count in zip(PD_DROP_REASONS, counts, strict=True) if count
+        }
 
 
 class Wire:
@@ -148,7 +150,7 @@ class Wire:
         self.minimum_size = minimum_size
         self.sent: list[bytes] = []
         self.waiting: list[tuple[bytes, int]] = []
-        self.takers: list[Taker] = []
+        self.takers: list[FrameHandler] = []
         self.refuse = False
         self.log: list[str] = []
         self._header = header

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter_ns
 from typing import Any, NamedTuple
 
-from eap.engine.rebuild import EngineStation, Successor
+from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.ids import InterfaceUri
 from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines
@@ -113,7 +113,7 @@ def _swaps(pds: int) -> list[Change]:
 def _change(place: EngineStation, engine: Engine, spec: Any) -> Change:
     engine.handle_timeout(engine.next_timeout())
     times = [perf_counter_ns()]
-    successor = Successor(place, spec)
+    successor = StationReplacement(place, spec)
     times.append(perf_counter_ns())
     before = successor.take_over(engine, engine.next_timeout() - 1)
     times.append(perf_counter_ns())

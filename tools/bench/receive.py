@@ -15,7 +15,7 @@ from eap.codec.wire import WireStruct
 from eap.ids import NetId
 from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
-from eap.pd.link import Taker
+from eap.pd.link import FrameHandler
 from eap.pd.station import Station
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.machine import memory_folder
@@ -80,7 +80,7 @@ def _frame(shape: Shape, repeats: int) -> Figure:
     return at_most(name, learned / naive, 1, "", detail)
 
 
-def _receiving(take: Taker, data: bytearray, shape: Shape) -> Callable[[], int]:
+def _receiving(take: FrameHandler, data: bytearray, shape: Shape) -> Callable[[], int]:
     """Return a run of the product's receive path: match, check, copy, counters."""
     view, put, size = memoryview(data), _CYCLE.pack_into, shape.frame_size
     cycle = 0

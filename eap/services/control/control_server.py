@@ -48,7 +48,7 @@ from eap.control.protocol import (
 )
 from eap.errors import ControlError, EapError, ImageError
 from eap.gateway.requests import operation_of
-from eap.net.connections import Activity, Limits
+from eap.net.connections import Activity, ListenerLimits
 from eap.od.abort import SdoAbortError
 from eap.runtime.bus_errors import to_record
 from eap.services.control.audit import operation_words
@@ -163,7 +163,7 @@ def _shortened(value: Any) -> Any:
     return value if len(text) <= _MAX_WORDS else f"{text[:_MAX_WORDS]}…"
 
 
-LIMITS = Limits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
+LIMITS = ListenerLimits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
 
 logger = logging.getLogger(__name__)
 

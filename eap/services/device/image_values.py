@@ -27,10 +27,10 @@ from eap.pd.layout import (
 )
 from eap.pd.report import frame_state, quality, tracker_word, tx_status, tx_var_state, var_state
 from eap.pd.words import (
-    DISCARD_INDEX,
+    PD_DROP_INDEX,
     REASON_INDEX,
-    Discard,
     FrameWord,
+    PdDropReason,
     Reason,
     RxWord,
     StationWord,
@@ -151,8 +151,8 @@ def _tracked(word: RxWord) -> Callable[[Image, RxSlot], int]:
     return lambda image, place: int(image.words[tracker_word(image, place) + word])
 
 
-def _discarded(reason: Discard) -> Callable[[Image, RxSlot], int]:
-    offset = RxWord.DISCARDED + DISCARD_INDEX[reason]
+def _discarded(reason: PdDropReason) -> Callable[[Image, RxSlot], int]:
+    offset = RxWord.DISCARDED + PD_DROP_INDEX[reason]
     return lambda image, place: int(image.words[place.words + offset])
 
 
@@ -174,8 +174,8 @@ _OF_STATION: dict[str, int] = {
     EapLive.STATION_LATENESS_MAX: StationWord.LATENESS_MAX_NS,
     EapLive.STATION_LINKS_HELD: StationWord.LINKS_HELD,
 } | {
-    key: StationWord.DISCARDED + DISCARD_INDEX[reason]
-    for reason in Discard
+    key: StationWord.DISCARDED + PD_DROP_INDEX[reason]
+    for reason in PdDropReason
     if (key := f"station_discarded_{reason}") in _KINDS
 }
 _OF_FRAME: dict[str, Callable[[Image, FrameSlot], int]] = {
@@ -203,4 +203,8 @@ _OF_RX: dict[str, Callable[[Image, RxSlot], int]] = {
     EapLive.RX_LATE: _tracked(RxWord.LATE),
     EapLive.RX_TIMEOUTS: _tracked(RxWord.TIMEOUTS),
     EapLive.RX_JITTER_MAX: _tracked(RxWord.JITTER_MAX_US),
-} | {key: _discarded(reason) for reason in Discard if (key := f"rx_discarded_{reason}") in _KINDS}
+} | {
+    key: _discarded(reason)
+    for reason in PdDropReason
+    if (key := f"rx_discarded_{reason}") in _KINDS
+}

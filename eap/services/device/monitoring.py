@@ -25,9 +25,9 @@ from eap.pd.address import from_word
 from eap.pd.image import Image
 from eap.pd.layout import FrameSlot
 from eap.pd.monitor import (
-    Evidence,
     MonitorTarget,
     PresenceChanged,
+    ProbeResult,
     SubscriberMonitor,
     SubscriberPresence,
 )
@@ -90,7 +90,7 @@ class UdpSubscriberProbe:
         found, self._refused = self._refused, set()
         return found & self._refused_at_ns.keys()
 
-    def look(self, target: Destination, sent_at_ns: int) -> Evidence:
+    def look(self, target: Destination, sent_at_ns: int) -> ProbeResult:
         """Return what is known of *target*, to which a frame was sent last at *sent_at_ns*.
 
         A refusal holds until frames have been sent for a while without another one.
@@ -99,10 +99,10 @@ class UdpSubscriberProbe:
         refused_at_ns = self._refused_at_ns.get(key, 0)
         if refused_at_ns:
             if sent_at_ns - refused_at_ns < REFUSAL_NS:
-                return Evidence.ABSENT
+                return ProbeResult.ABSENT
             self._refused_at_ns[key] = 0
         if self._table is None:
-            return Evidence.BLIND
+            return ProbeResult.BLIND
         return self._table.look(target.host, self._source)
 
     def close(self) -> None:
@@ -313,18 +313,20 @@ class SubscriberWatch:
         for row in self._rows_by_udp():
             target = _ip_of(row)
             if target is not None and key_of(target) in refused[self._endpoints.udp[row.port]]:
-                self._monitor.receive_evidence(row.name, Evidence.ABSENT, now_ns)
+                self._monitor.receive_evidence(row.name, ProbeResult.ABSENT, now_ns)
 
     def _rows_by_udp(self) -> Iterator[_Row]:
         return (row for row in self._rows.values() if row.port in self._endpoints.udp)
 
-    def _ask(self, row: _Row) -> Evidence | None:
+    def _ask(self, row: _Row) -> ProbeResult | None:
         """Ask for the subscriber of *row*; return what is known at once, None if it may answer."""
         if hop_prober := self._hop_prober(row):
-            return None if hop_prober.probe(IPv4Address(row.place.monitor_ip)) else Evidence.BLIND
+            return (
+                None if hop_prober.probe(IPv4Address(row.place.monitor_ip)) else ProbeResult.BLIND
+            )
         target, endpoint = _ip_of(row), self._endpoints.udp.get(row.port)
         if target is None or endpoint is None:
-            return Evidence.BLIND
+            return ProbeResult.BLIND
         return endpoint.look(target, row.word(FrameWord.SENT_AT_NS))
 
     def _hop_prober(self, row: _Row) -> ArpProber | None:

@@ -9,7 +9,7 @@ from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxError, encode_plain_frame
 from eap.errors import MalformedError, TruncatedError
 from eap.gateway.requests import mailbox_error
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.transports.mailbox_frames import refusal_of
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class GatewayTransport:
 
     def receive(
         self, frame: bytes, connection: str, send: Callable[[str, bytes], object]
-    ) -> Refusal | None:
+    ) -> DropReason | None:
         """Act on a frame; return why not if it is not taken.
 
         Args:
@@ -51,7 +51,7 @@ class GatewayTransport:
             return refusal_of(frame)
         if not self._gateway.is_open:
             self._gateway.turned_away += 1
-            return Refusal.GATEWAY_OFF
+            return DropReason.GATEWAY_OFF
 
         def answer(frame: bytes) -> None:
             send(connection, frame)
@@ -59,11 +59,11 @@ class GatewayTransport:
         try:
             self._gateway.receive(frame, Endpoint(self._name, connection), answer)
         except TruncatedError:
-            return Refusal.TRUNCATED
+            return DropReason.TRUNCATED
         except MalformedError:
             if not self._gateway.settings.is_silent:
                 _refuse_type(frame, answer)
-            return Refusal.MAILBOX
+            return DropReason.MAILBOX
         return None
 
     def connection_closed(self, connection: str) -> None:

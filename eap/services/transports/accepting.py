@@ -21,7 +21,7 @@ from eap.net.connections import (
     CloseReason,
     Connection,
     ConnectionTable,
-    Limits,
+    ListenerLimits,
     ListenerStats,
     host_of,
 )
@@ -160,7 +160,7 @@ class ListeningSocket(Generic[C]):
         name: str,
         server: ConnectionServer[C],
         listeners: Listeners,
-        limits: Limits,
+        limits: ListenerLimits,
     ) -> None:
         self._socket = sock
         self._server = server

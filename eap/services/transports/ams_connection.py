@@ -39,7 +39,7 @@ from eap.codec.ams import (
 from eap.errors import MalformedError
 from eap.ids import NetId
 from eap.net.connections import Activity, CloseReason
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 
 MAX_REQUESTS = 64
 """Limit of the pending requests of one connection."""
@@ -200,7 +200,7 @@ class PacketHandler(Protocol):
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
         """Stop using *connection*; *why* is for people."""
 
-    def count_dropped(self, reason: Refusal) -> None:
+    def count_dropped(self, reason: DropReason) -> None:
         """Count a dropped packet or connection."""
 
 
@@ -364,7 +364,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     def close(self, why: str) -> None:
         """Close it at once, even before it is open; the handler gets the reason *why*."""
         if why is CloseReason.OVERDUE and not self._has_ended:
-            self._handler.count_dropped(Refusal.AMS_SLOW)
+            self._handler.count_dropped(DropReason.AMS_SLOW)
         self._why = why
         self._is_closed = True
         if self._is_open:
@@ -419,7 +419,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _break_off(self, why: str) -> None:
         """Stop reading, because these are no AMS packets."""
         logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
-        self._handler.count_dropped(Refusal.AMS_TYPE)
+        self._handler.count_dropped(DropReason.AMS_TYPE)
         self._why = f"no AMS packets: {why}"
         self._cutter = AmsStreamDecoder(0)
         self._has_ended = True
@@ -467,7 +467,7 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._transport.write(encode_opened_port(net_id, own_port))
 
     def _refuse_length(self, header: AmsHeader) -> None:
-        self._handler.count_dropped(Refusal.AMS_LENGTH)
+        self._handler.count_dropped(DropReason.AMS_LENGTH)
         if header.state_flags & StateFlags.RESPONSE:
             # The client of this answer need not wait for its time-out.
             answer = msgspec.structs.replace(header, length=0, error_code=AdsError.AMS_LENGTH)

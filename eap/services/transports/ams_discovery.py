@@ -44,7 +44,7 @@ from eap.errors import CodecError, ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, NetId, parse_host
 from eap.net.host import read_password
 from eap.release import RELEASE
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates, caused_by
 from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
@@ -254,7 +254,7 @@ class AmsDiscovery:
         routers: Sequence[RouterName],
         route_admin: RouteAdmin,
         requests: RouterRequests,
-        count_dropped: Callable[[Refusal], None],
+        count_dropped: Callable[[DropReason], None],
     ) -> None:
         self._sock = sock
         self._own = sock.getsockname()[0]
@@ -310,7 +310,7 @@ class AmsDiscovery:
     async def _answer(self, data: bytes, sender: tuple[str, int]) -> None:
         answers = await self.answers_to(data, sender[0])
         if not answers:
-            self._count_dropped(Refusal.AMS_DISCOVERY)
+            self._count_dropped(DropReason.AMS_DISCOVERY)
         for answer in answers:
             try:
                 self._sock.sendto(answer, sender)

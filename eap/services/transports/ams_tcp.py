@@ -24,16 +24,16 @@ from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AMS_TCP_PORT
 from eap.ids import NetId, parse_host
-from eap.net.connections import OVERDUE_NS, CloseReason, Limits
+from eap.net.connections import OVERDUE_NS, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.routing.service import TransportSender
 from eap.services.transports.accepting import Listeners, ListeningSocket, connection_name
 from eap.services.transports.ams_connection import AmsConnection, ClientAddresses
 from eap.services.transports.demultiplexer import Demultiplexer
 
-LIMITS = Limits()
+LIMITS = ListenerLimits()
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class AmsTransport:
         listener: socket.socket,
         demultiplexer: Demultiplexer,
         clients: AmsClients,
-        count_dropped: Callable[[Refusal], None],
+        count_dropped: Callable[[DropReason], None],
         listeners: Listeners,
     ) -> None:
         self.count_dropped = count_dropped
@@ -120,7 +120,7 @@ class AmsTransport:
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
         """Count a connection that is not admitted (ConnectionServer)."""
         del sock, why
-        self.count_dropped(Refusal.AMS_FULL)
+        self.count_dropped(DropReason.AMS_FULL)
 
     def connection_opened(self, connection: AmsConnection) -> None:
         """Add the connection (PacketHandler)."""
@@ -139,7 +139,7 @@ class AmsTransport:
     def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
         """Count an answer: no requests are sent on accepted connections (PacketHandler)."""
         del packet, connection
-        self.count_dropped(Refusal.AMS_UNASKED)
+        self.count_dropped(DropReason.AMS_UNASKED)
 
     def _assign_address(self, host: str) -> tuple[NetId, int]:
         return self._clients.addresses.next(host, self._demultiplexer.has)
@@ -255,7 +255,7 @@ class AmsUplink(ReconnectingLink):
         *,
         sources: Collection[str],
         claims: dict[tuple[str, int], AmsUplink],
-        count_dropped: Callable[[Refusal], None],
+        count_dropped: Callable[[DropReason], None],
         may_be_client: Callable[[], bool] = bool,
         overdue_ns: int = OVERDUE_NS,
     ) -> None:
@@ -436,7 +436,7 @@ class AmsUplinks:
         self,
         router: UplinkRouter,
         sources: Collection[str],
-        count_dropped: Callable[[Refusal], None],
+        count_dropped: Callable[[DropReason], None],
     ) -> None:
         self._router = router
         self._sources = sources

@@ -32,7 +32,7 @@ from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
 from eap.pd.link import FrameChannel, FrameOrigin, OutFrame
-from eap.runtime.discards import DiscardCounters, Refusal
+from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.services.transports.demultiplexer import Demultiplexer
 
 _MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
@@ -60,7 +60,7 @@ class DrainedChannel(Protocol):
         """Return the descriptor to watch."""
 
 
-MailboxHandler: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], Refusal | None]
+MailboxHandler: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], DropReason | None]
 """Handles a frame of type 5; returns the reason if it is dropped."""
 
 
@@ -77,7 +77,7 @@ class FrameIntake:
     def __init__(
         self,
         stations: Sequence[str],
-        counters: DiscardCounters,
+        counters: DropCounters,
         from_ns: int,
         mailbox: MailboxHandler,
     ) -> None:
@@ -89,13 +89,13 @@ class FrameIntake:
     def receive(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Handle, or count, one frame that arrived at *at_ns* on the monotonic clock."""
         if at_ns < self._from_ns:
-            reason: Refusal | None = Refusal.STALE
+            reason: DropReason | None = DropReason.STALE
         elif size < EtherCatHeader.SIZE:
-            reason = Refusal.TRUNCATED
+            reason = DropReason.TRUNCATED
         elif data[1] >> 4 == _MAILBOX:  # the four upper bits of the header
             reason = self.mailbox(data, size, at_ns, origin)
         else:
-            reason = Refusal.WRONG_TYPE
+            reason = DropReason.WRONG_TYPE
         if reason is not None:
             for station in self._stations:
                 self._counters.count(station, reason)
@@ -178,7 +178,7 @@ class FrameHandler(Protocol):
 
     def receive(
         self, frame: bytes, connection: str, send: Callable[[str, bytes], object]
-    ) -> Refusal | None:
+    ) -> DropReason | None:
         """Handle a frame of *connection*, answered by *send*; return the reason if dropped."""
 
     def connection_closed(self, connection: str) -> None:
@@ -197,15 +197,15 @@ def aoe_packet(data: Buffer) -> bytes | None:
     return packet if packet is not None and len(packet) >= AmsHeader.SIZE else None
 
 
-def refusal_of(data: Buffer) -> Refusal:
+def refusal_of(data: Buffer) -> DropReason:
     """Return why a frame of type 5 is dropped that is for no station and no gateway."""
     try:
         decode_frame(data)
     except MalformedError:
-        return Refusal.MAILBOX  # an unknown mailbox protocol
+        return DropReason.MAILBOX  # an unknown mailbox protocol
     except CodecError:
-        return Refusal.TRUNCATED
-    return Refusal.MAILBOX
+        return DropReason.TRUNCATED
+    return DropReason.MAILBOX
 
 
 class FrameCounters:
@@ -262,12 +262,12 @@ class MailboxIntake:
 
     def receive(
         self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin
-    ) -> Refusal | None:
+    ) -> DropReason | None:
         """Handle a frame; return the reason if it is dropped."""
         del at_ns
         sender = origin.sender_of(data)
         if not sender:
-            return Refusal.MAILBOX
+            return DropReason.MAILBOX
         frame, is_for_many = data[:size], self._is_for_many(data)
         packet = aoe_packet(frame) if self._is_aoe_here else None
         if packet is not None:
@@ -279,14 +279,14 @@ class MailboxIntake:
 
     def drop_reason(
         self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin
-    ) -> Refusal | None:
+    ) -> DropReason | None:
         """Return why a frame is dropped that another intake handles, without handling it."""
         del at_ns, origin
         if aoe_packet(data[:size]) is not None:
             return None
         reason = refusal_of(data[:size])
         is_taken = self._gateway.is_there and not self._is_for_many(data)
-        return None if is_taken and reason is Refusal.MAILBOX else reason
+        return None if is_taken and reason is DropReason.MAILBOX else reason
 
 
 class ChannelSender:

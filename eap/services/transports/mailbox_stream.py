@@ -22,10 +22,10 @@ from typing import Protocol, TypeAlias
 from eap.codec.ams import StateFlags
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxHeader
-from eap.net.connections import OWN_HOST, Activity, CloseReason, Limits
+from eap.net.connections import OWN_HOST, Activity, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.runtime.handover import PassedConnection, PortName, pass_connection
 from eap.services.tasks import TaskSet
 from eap.services.transports.accepting import (
@@ -239,7 +239,7 @@ class MailboxStreams:
         self,
         demultiplexer: Demultiplexer,
         gateway: FrameHandler,
-        count_dropped: Callable[[Refusal], None],
+        count_dropped: Callable[[DropReason], None],
         source: str = "",
         *,
         is_aoe_here: bool = True,
@@ -327,7 +327,7 @@ class MailboxStreams:
                 head += await reader.readexactly(EtherCatHeader.SIZE - 1)
                 header = EtherCatHeader.decode(head)
                 if header.type != FrameType.MAILBOX or header.length < MailboxHeader.SIZE:
-                    self._count_dropped(Refusal.TCP_TYPE)
+                    self._count_dropped(DropReason.TCP_TYPE)
                     return
                 frame = head + await reader.readexactly(header.length)
             except asyncio.IncompleteReadError:
@@ -348,7 +348,7 @@ class MailboxStreams:
             await asyncio.sleep(0)  # a fast sender must not keep the loop from other connections
 
 
-LIMITS = Limits()
+LIMITS = ListenerLimits()
 _PEEK_PAUSE_S = 0.02
 
 logger = logging.getLogger(__name__)
@@ -374,7 +374,7 @@ class TcpTransport:
         listener: socket.socket,
         takers: tuple[PortName, ...],
         link: socket.socket,
-        count_dropped: Callable[[Refusal], None],
+        count_dropped: Callable[[DropReason], None],
         streams: MailboxStreams,
         listeners: Listeners,
     ) -> None:
@@ -408,22 +408,22 @@ class TcpTransport:
                 self._dispatch(sock, connection.host, frame_type)
         finally:
             if connection.closed_for is CloseReason.OVERDUE:
-                self._count_dropped(Refusal.TCP_SLOW)
+                self._count_dropped(DropReason.TCP_SLOW)
 
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
         """Count a connection that is not admitted (ConnectionServer)."""
         del sock, why
-        self._count_dropped(Refusal.TCP_FULL)
+        self._count_dropped(DropReason.TCP_FULL)
 
     def _dispatch(self, sock: socket.socket, host: str, frame_type: int) -> None:
         if frame_type != FrameType.PROCESS_DATA:
-            reason = Refusal.WRONG_TYPE
+            reason = DropReason.WRONG_TYPE
         elif not self._takers:
-            reason = Refusal.TCP_OFF
+            reason = DropReason.TCP_OFF
         elif pass_connection(self._link, sock, PassedConnection(self._takers, host)):
             return
         else:
-            reason = Refusal.ENGINE_BUSY
+            reason = DropReason.ENGINE_BUSY
         logger.debug("TCP connection from %s closed: %s", host or "this host", reason)
         self._count_dropped(reason)
 

@@ -23,15 +23,15 @@ from eap.ams.mqtt.network import (
 from eap.ams.spec import MqttSpec, RoutingSpec
 from eap.ams.transport_table import Transport
 from eap.net.mqtt import Handlers, MqttLink
-from eap.runtime.discards import DiscardCounters, Refusal
+from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import mqtt_transport_name
 
 _REFUSALS = {
-    Drop.TOPIC: Refusal.MQTT_TOPIC,
-    Drop.BROKEN: Refusal.MQTT_BROKEN,
-    Drop.LENGTH: Refusal.AMS_LENGTH,
-    Drop.FULL: Refusal.MQTT_FULL,
+    Drop.TOPIC: DropReason.MQTT_TOPIC,
+    Drop.BROKEN: DropReason.MQTT_BROKEN,
+    Drop.LENGTH: DropReason.AMS_LENGTH,
+    Drop.FULL: DropReason.MQTT_FULL,
 }
 
 logger = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 def open_mqtt_transports(
     routing: Mapping[str, RoutingSpec],
     routers: Mapping[str, StationRouter],
-    counters: DiscardCounters,
+    counters: DropCounters,
 ) -> list[MqttTransport]:
     """Return the MQTT transports of all stations, to be served.
 
@@ -80,7 +80,7 @@ class MqttTransport:
     """
 
     def __init__(
-        self, spec: MqttSpec, router: StationRouter, count_dropped: Callable[[Refusal], None], *,
+        self, spec: MqttSpec, router: StationRouter, count_dropped: Callable[[DropReason], None], *,
         learns: bool = True,
     ) -> None:  # fmt: skip
         self.name = mqtt_transport_name(spec)
@@ -129,7 +129,7 @@ class MqttTransport:
         self._act(self._network.receive_message(topic, payload, now_ns, is_retained=is_retained))
 
     def _overrun(self) -> None:
-        self._count_dropped(Refusal.MQTT_FULL)
+        self._count_dropped(DropReason.MQTT_FULL)
 
     def _act(self, actions: Iterable[Action]) -> None:
         for action in actions:

@@ -8,7 +8,7 @@ from typing import Any
 
 from eap.ads.endpoint import AmsAnswer, response_to
 from eap.codec.ams import AmsHeader, AmsTcpHeader, encode_with_prefix
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.transports.ams_connection import MAX_REQUESTS, AmsConnection
 
 
@@ -80,7 +80,7 @@ class _Receiver:
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
         pass
 
-    def count_dropped(self, reason: Refusal) -> None:
+    def count_dropped(self, reason: DropReason) -> None:
         self.refused += 1
 
     def answer(self) -> None:

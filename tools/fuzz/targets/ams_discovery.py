@@ -21,7 +21,7 @@ from eap.codec.amsdiscovery import (
 )
 from eap.errors import CodecError
 from eap.ids import NetId
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.runtime.store import StationFile
 from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
@@ -85,7 +85,7 @@ def fuzz_one(data: bytes) -> None:
 async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     """Answer *data* from this host twice: the second time changes nothing."""
     routes = StationRoutes(_Router(), RoutingSpec(users=users), _Store())
-    refused: list[Refusal] = []
+    refused: list[DropReason] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         route_admin = RouteAdmin([routes])
         requests = RouterRequests(sock, [OWN])

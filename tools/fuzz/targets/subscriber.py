@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
-from eap.pd.poll import REQUESTERS_PER_CYCLE, Requests, questions_of
+from eap.pd.poll import REQUESTERS_PER_CYCLE, PollRequests, questions_of
 from eap.pd.spec import (
     PortKind,
     PortSpec,
     RxAlternateSpec,
     RxPdSpec,
+    SentVariableSpec,
     StationSpec,
-    TakenVariableSpec,
     TxFrameSpec,
     TxPdSpec,
     VariableSpec,
     Writer,
 )
 from eap.pd.subscriber import Subscriber
-from eap.pd.words import DISCARDS, FrameWord, RxWord, StationWord
+from eap.pd.words import PD_DROP_REASONS, FrameWord, RxWord, StationWord
 
 _SIZES = {1: 1, 2: 2, 0x03E9: 1, 0x1234: 4}
 """PDs to subscribe to, those of the golden vectors among them, and their octets."""
@@ -30,7 +30,7 @@ _CYCLE_INPUTS = 40
 
 def _shifted(name: str, size: int) -> tuple[RxAlternateSpec, ...]:
     """The same variable behind three bits, in another version and, told by the length, in this."""
-    variables = TakenVariableSpec("", "BIT3"), TakenVariableSpec(name, f"BLOCK({size})")
+    variables = SentVariableSpec("", "BIT3"), SentVariableSpec(name, f"BLOCK({size})")
     return RxAlternateSpec(0, variables), RxAlternateSpec(1, variables)
 
 
@@ -49,9 +49,9 @@ def _block(name: str, pd_id: int, size: int) -> RxPdSpec:
 
 
 _LIES_OTHERWISE = (
-    TakenVariableSpec("", "BIT3"),
-    TakenVariableSpec("level", "BIT8"),
-    TakenVariableSpec("on", "BOOL"),
+    SentVariableSpec("", "BIT3"),
+    SentVariableSpec("level", "BIT8"),
+    SentVariableSpec("on", "BOOL"),
 )
 _SPEC = StationSpec(
     "fuzzed",
@@ -75,7 +75,7 @@ _SPEC = StationSpec(
 _LAYOUT = plan_layout(_SPEC)
 _IMAGE = format_image(memoryview(bytearray(_LAYOUT.size)), _LAYOUT, 1)
 _DIRECTORY = bytes(_IMAGE.memory[_LAYOUT.directory_offset :])
-_REQUESTS = Requests([f"v{_REQUEST}"])
+_REQUESTS = PollRequests([f"v{_REQUEST}"])
 _QUESTIONS = questions_of(_IMAGE)
 _SUBSCRIBER = Subscriber(
     _IMAGE, zip(_SPEC.subscriptions, _LAYOUT.rx, strict=True), 1_000_000, _REQUESTS, _QUESTIONS
@@ -129,7 +129,7 @@ def _run_cycle(now_ns: int) -> None:
 
 def _counted() -> int:
     words = _IMAGE.words
-    total = sum(words[StationWord.DISCARDED : StationWord.DISCARDED + len(DISCARDS)])
+    total = sum(words[StationWord.DISCARDED : StationWord.DISCARDED + len(PD_DROP_REASONS)])
     for place in _LAYOUT.rx:
         first = words[place.words + RxWord.TRACKER]
         total += words[first + RxWord.RECEIVED] + words[first + RxWord.REORDERED]

@@ -30,8 +30,8 @@ from eap.pd.spec import (
     PortSpec,
     RxAlternateSpec,
     RxPdSpec,
+    SentVariableSpec,
     StationSpec,
-    TakenVariableSpec,
     TriggerSpec,
     TxFrameSpec,
     TxPdSpec,
@@ -278,7 +278,7 @@ def test_filled_dictionary_reads_back_into_a_blank_station(station: StationSpec)
 
 
 def test_alternates_stay_with_what_is_laid_out_as_before():
-    alternates = (RxAlternateSpec(7, (TakenVariableSpec("limit", "UINT"),)),)
+    alternates = (RxAlternateSpec(7, (SentVariableSpec("limit", "UINT"),)),)
     ports = empty()
     receiver(ports["eap0"])
     spec = read_back(BLANK, ports)

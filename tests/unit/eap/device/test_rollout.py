@@ -20,8 +20,8 @@ from eap.device.rollout import (
 from eap.pd.spec import (
     RxAlternateSpec,
     RxPdSpec,
+    SentVariableSpec,
     StationSpec,
-    TakenVariableSpec,
     TriggerSpec,
     TxFrameSpec,
     TxPdSpec,
@@ -152,7 +152,7 @@ def test_the_receiver_goes_first_and_once_more():
     assert running == new
     assert without_alternates(way[0].spec) == new["b"]
     assert way[0].spec.subscriptions[0].alternates == (
-        RxAlternateSpec(0, (TakenVariableSpec("a1.n", "UINT"),)),
+        RxAlternateSpec(0, (SentVariableSpec("a1.n", "UINT"),)),
     )
 
 

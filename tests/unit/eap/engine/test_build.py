@@ -18,14 +18,14 @@ from eap.engine.build import REST_NS, EngineBuses, EnginePlant
 from eap.engine.rebuild import EngineStation
 from eap.net import connections, tcpport
 from eap.net.busport import SegmentSocket
-from eap.net.connections import Limits
+from eap.net.connections import ListenerLimits
 from eap.net.image_file import ImageFile, open_image
 from eap.pd.report import station_status
 from eap.pd.spec import Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 from eap.runtime.busfile import load_or_raise
-from eap.runtime.discards import DiscardCounters
+from eap.runtime.drop_counters import DropCounters
 from eap.runtime.engine_messages import EngineMessage, EngineStarted, SetState
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import NO_DESCRIPTOR, BusSocket, Handover, PassedConnection, PortName
@@ -59,7 +59,7 @@ class Running:
 
     def discards(self) -> dict:
         names = ["left", "right"]
-        with DiscardCounters(self.folder.discards("engine"), names) as counters:
+        with DropCounters(self.folder.discards("engine"), names) as counters:
             return counters.stats()
 
 
@@ -143,7 +143,7 @@ def test_frames_of_a_passed_connection_reach_the_port_behind_it(start, shared):
 
 @pytest.mark.net
 def test_host_over_its_share_loses_its_silent_connection_to_a_port(start, shared, monkeypatch):
-    monkeypatch.setattr(tcpport, "LIMITS", Limits(total=2, reserved=0, per_host=1))
+    monkeypatch.setattr(tcpport, "LIMITS", ListenerLimits(total=2, reserved=0, per_host=1))
     monkeypatch.setattr(connections, "FRESH_NS", 0)
     stations = [left(), right(eap_port(2, tcp=True))]
     running = start(stations, shared(*stations))

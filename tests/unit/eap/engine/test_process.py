@@ -18,7 +18,7 @@ import pytest
 from eap.engine import process as engine_process
 from eap.engine import process as module
 from eap.engine.build import EnginePlant
-from eap.engine.process import Arrivals, StopFlag, run_cycles
+from eap.engine.process import CycleWaiter, StopFlag, run_cycles
 from eap.net.image_file import open_image
 from eap.net.ticker import Ticker
 from eap.pd.words import StationWord
@@ -201,7 +201,7 @@ def test_only_who_has_something_is_served(ticker, pipes):
         read: lambda now_ns, read=read: served.append((os.read(read, 1), now_ns))
         for read, _ in pipes
     }
-    arrivals = Arrivals(ticker, handlers)
+    arrivals = CycleWaiter(ticker, handlers)
     before_ns = time.monotonic_ns()
     os.write(pipes[1][1], b"x")
     assert not arrivals.wait(in_ms(10_000))
@@ -225,7 +225,7 @@ def test_what_never_ends_gets_its_share_and_cycles_theirs(ticker, pipes, monkeyp
         busy += 1
 
     os.write(pipes[0][1], b"x")  # and nobody reads it
-    arrivals = Arrivals(ticker, {pipes[0][0]: never_ready})
+    arrivals = CycleWaiter(ticker, {pipes[0][0]: never_ready})
     end_ns = in_ms(500)
     cycles = late = 0
     while time.monotonic_ns() < end_ns:
@@ -243,7 +243,7 @@ def test_a_wait_for_the_next_window_is_no_deadline(ticker, pipes, monkeypatch):
     monkeypatch.setattr(module, "SHARE_NS", 0)
     os.write(pipes[0][1], b"x")
     served = []
-    arrivals = Arrivals(ticker, {pipes[0][0]: served.append})
+    arrivals = CycleWaiter(ticker, {pipes[0][0]: served.append})
     deadline_ns = time.monotonic_ns() + LATER_NS
     while len(served) < 3:
         assert not arrivals.wait(deadline_ns)

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from eap.codec.pd import decode_frame_header
 from eap.engine.build import EnginePlant
-from eap.engine.rebuild import MOST_WAITING, EngineStation, Successor, has_tcp, sends_to
+from eap.engine.rebuild import MOST_WAITING, EngineStation, StationReplacement, has_tcp, sends_to
 from eap.errors import EngineRefusedError, EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.image_file import ImageFile, create_image, open_image
@@ -307,7 +307,7 @@ def test_nothing_that_is_written_at_the_moment_is_lost(place, tmp_path):
     engine.start(0)
     engine.handle_timeout(10 * MS)
     program = open_image(tmp_path / "left.image")
-    successor = Successor(place, replace(place.station.spec, frames=()))
+    successor = StationReplacement(place, replace(place.station.spec, frames=()))
     with program.image.writing(Writer.APPLICATION):
         program.image.write("running", True)
     assert not program.retired
@@ -330,7 +330,7 @@ def test_a_program_that_stopped_in_the_middle_of_writing_leaves_what_it_had_writ
         engine.handle_timeout(20 * MS)
         with program.image.writing(Writer.APPLICATION):
             program.image.write("running", False)
-            before = Successor(place, replace(place.station.spec, frames=())).take_over(
+            before = StationReplacement(place, replace(place.station.spec, frames=())).take_over(
                 engine, 20 * MS
             )
         assert before.inputs is not place.station.inputs
@@ -340,11 +340,11 @@ def test_a_program_that_stopped_in_the_middle_of_writing_leaves_what_it_had_writ
 
 
 def test_an_image_that_is_not_used_is_removed(place, tmp_path):
-    Successor(place, replace(place.station.spec, frames=())).discard()
+    StationReplacement(place, replace(place.station.spec, frames=())).discard()
     with pytest.raises(EngineRefusedError):
-        Successor(place, replace(place.station.spec, ports=()))
+        StationReplacement(place, replace(place.station.spec, ports=()))
     with pytest.raises(KeyError):
-        Successor(place, replace(place.station.spec, variables=()))
+        StationReplacement(place, replace(place.station.spec, variables=()))
     assert [path.name for path in tmp_path.iterdir()] == ["left.image"]
 
 
@@ -395,7 +395,7 @@ def test_destinations_by_tcp_come_and_go_while_the_station_runs(tmp_path, listen
     engine.start(0)
 
     def configure(*destinations):
-        Successor(place, sending(*destinations)).take_over(engine, engine.next_timeout())
+        StationReplacement(place, sending(*destinations)).take_over(engine, engine.next_timeout())
         place.settle_tcp()
 
     def accept(listener):

@@ -17,8 +17,8 @@ from eap.net.connections import (
     CloseReason,
     Connection,
     ConnectionTable,
-    Limits,
     Listener,
+    ListenerLimits,
     host_of,
 )
 from tests.support.examples import examples
@@ -46,7 +46,7 @@ class Scene:
 
     def __init__(self, total: int = 6, reserved: int = 2, per_host: int = 3) -> None:
         self.table = ConnectionTable()
-        self.listener = self.table.add_listener("here", Limits(total, reserved, per_host))
+        self.listener = self.table.add_listener("here", ListenerLimits(total, reserved, per_host))
 
     def admit(
         self, peer: Peer, now_ns: int = 100 * S, spare: int = 100
@@ -136,7 +136,7 @@ def test_connection_that_was_just_accepted_is_spared_while_another_host_holds_mo
 def test_burst_of_this_host_leaves_descriptors_to_other_listeners() -> None:
     scene = Scene(reserved=0)
     oldest, *_ = scene.fill(*(Peer(OWN_HOST, at_ns=100 * S - 6 + n) for n in range(6)))
-    control = scene.table.add_listener("control", Limits())
+    control = scene.table.add_listener("control", ListenerLimits())
     found = scene.table.admit(control, Peer("process 7"), 100 * S, spare_descriptors=0)
     assert found == ("", oldest)
 
@@ -175,7 +175,7 @@ def test_host_with_many_connections_does_not_displace_those_of_others() -> None:
 
 def test_short_descriptors_take_places_of_any_listener() -> None:
     scene = Scene()
-    other = scene.table.add_listener("there", Limits())
+    other = scene.table.add_listener("there", ListenerLimits())
     greedy = [Peer(A, at_ns=number) for number in range(3)]
     for each in greedy:
         scene.table.admit(other, each, S, spare_descriptors=100)
@@ -233,8 +233,8 @@ class Use(RuleBasedStateMachine):
         self.now_ns = 100 * S
         self.table = ConnectionTable()
         self.listeners = [
-            self.table.add_listener("small", Limits(6, 2, 3)),
-            self.table.add_listener("large", Limits(10, 3, 4)),
+            self.table.add_listener("small", ListenerLimits(6, 2, 3)),
+            self.table.add_listener("large", ListenerLimits(10, 3, 4)),
         ]
         self.open: dict[Peer, Listener] = {}
         self.refused = self.evicted = 0

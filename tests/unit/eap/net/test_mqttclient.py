@@ -16,13 +16,13 @@ from paho.mqtt.reasoncodes import ReasonCode
 from eap.ams.mqtt.network import Publish
 from eap.ams.spec import TlsSpec
 from eap.net import mqttclient
-from eap.net.mqttclient import Client, Inbox, MqttError, describe, is_too_new, make_client
+from eap.net.mqttclient import Inbox, MqttClient, MqttError, describe, is_too_new, make_client
 
 WILL = Publish("hall/1/info", b"gone", 2, is_retained=True)
 REFUSED = ReasonCode(PacketTypes.CONNACK, "Not authorized")
 
 
-def client(**more: object) -> Client:
+def client(**more: object) -> MqttClient:
     settings = {"login": None, "tls": None, "will": WILL, "keepalive_s": 10, "is_old": False}
     return make_client("127.0.3.41", 1883, "one", **{**settings, **more})
 

@@ -16,14 +16,14 @@ from eap.net.bpf import MAX_ADDRESSES
 from eap.net.neighbour import (
     ArpProber,
     ArpSighting,
-    Neighbour,
+    KernelRoute,
+    NeighbourEntry,
     NeighbourState,
     NeighbourTable,
-    Route,
     RouteKind,
 )
 from eap.net.packetsocket import open_arp
-from eap.pd.monitor import Evidence
+from eap.pd.monitor import ProbeResult
 from tests.unit.eap.net.conftest import ip
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
@@ -49,32 +49,32 @@ def set_state(state, address=THERE):
 def test_own_addresses_have_no_neighbour(table):
     for address in ("10.77.0.1", "127.0.0.1", "127.5.5.5"):
         assert table.route(address).kind is RouteKind.LOCAL
-        assert table.look(address) is Evidence.BLIND
+        assert table.look(address) is ProbeResult.BLIND
 
 
 def test_routes(table):
     index = socket.if_nametoindex("left")
-    assert table.route(THERE) == Route(RouteKind.DIRECT, index, THERE)
+    assert table.route(THERE) == KernelRoute(RouteKind.DIRECT, index, THERE)
     assert table.route(THERE, "10.77.0.1").kind is RouteKind.DIRECT
-    assert table.route("10.88.3.4") == Route(RouteKind.GATEWAY, index, "10.77.0.254")
+    assert table.route("10.88.3.4") == KernelRoute(RouteKind.GATEWAY, index, "10.77.0.254")
     for nowhere in ("10.99.0.1", "192.0.2.1", "10.77.0.255", "239.0.0.1"):
         assert table.route(nowhere).kind is RouteKind.NONE
-        assert table.look(nowhere) is Evidence.BLIND
+        assert table.look(nowhere) is ProbeResult.BLIND
 
 
 def test_no_entry_is_nothing_new(table):
     assert table.neighbour(THERE, socket.if_nametoindex("left")) is None
-    assert table.look(THERE) is Evidence.PENDING
+    assert table.look(THERE) is ProbeResult.PENDING
 
 
 @pytest.mark.parametrize(
     ("state", "evidence"),
     [
-        ("reachable", Evidence.SEEN),
-        ("stale", Evidence.PENDING),
-        ("failed", Evidence.ABSENT),
-        ("permanent", Evidence.BLIND),
-        ("noarp", Evidence.BLIND),
+        ("reachable", ProbeResult.SEEN),
+        ("stale", ProbeResult.PENDING),
+        ("failed", ProbeResult.ABSENT),
+        ("permanent", ProbeResult.BLIND),
+        ("noarp", ProbeResult.BLIND),
     ],
 )
 def test_states(table, state, evidence):
@@ -82,11 +82,11 @@ def test_states(table, state, evidence):
     assert table.look(THERE, "10.77.0.1") is evidence
     entry = table.neighbour(THERE, socket.if_nametoindex("left"))
     known = None if state == "failed" else MAC  # a failed one has lost its address
-    assert entry == Neighbour(NeighbourState[state.upper()], known)
+    assert entry == NeighbourEntry(NeighbourState[state.upper()], known)
 
 
 def test_behind_a_gateway_only_that_the_gateway_is_gone(table):
-    for state, evidence in (("reachable", Evidence.BLIND), ("failed", Evidence.ABSENT)):
+    for state, evidence in (("reachable", ProbeResult.BLIND), ("failed", ProbeResult.ABSENT)):
         set_state(state, "10.77.0.254")
         assert table.look("10.88.3.4") is evidence
 

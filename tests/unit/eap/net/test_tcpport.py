@@ -9,7 +9,7 @@ import pytest
 
 from eap.ids import InterfaceUri
 from eap.net import tcpport
-from eap.net.connections import CloseReason, Limits
+from eap.net.connections import CloseReason, ListenerLimits
 from eap.net.ipsocket import open_tcp_listener
 from eap.net.loopback import LoopbackLines
 from eap.net.tcp import TcpReceiver
@@ -135,7 +135,7 @@ def test_answers_that_nobody_reads_are_returned_and_counted(plant):
 
 
 def test_port_evicts_unused_connections_and_closes_unfinished_ones(monkeypatch):
-    monkeypatch.setattr(tcpport, "LIMITS", Limits(total=2, reserved=0))
+    monkeypatch.setattr(tcpport, "LIMITS", ListenerLimits(total=2, reserved=0))
     port, peers = TcpPort(HERE), []
 
     def connect(host, now_ns):

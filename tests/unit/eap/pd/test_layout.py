@@ -28,8 +28,8 @@ from eap.pd.spec import (
     CounterSource,
     RxAlternateSpec,
     RxPdSpec,
+    SentVariableSpec,
     StationSpec,
-    TakenVariableSpec,
     TriggerSpec,
     TxFrameSpec,
     TxPdSpec,
@@ -214,7 +214,7 @@ ALTERNATE_TYPES = ("BOOL", "BIT3", "BIT8", "USINT", "UINT24", "LREAL", "STRING(3
 
 def alternate(version: int, *variables: str) -> RxAlternateSpec:
     """Another layout, its variables written as ``name:type``."""
-    rows = (TakenVariableSpec(*variable.split(":", 1)) for variable in variables)
+    rows = (SentVariableSpec(*variable.split(":", 1)) for variable in variables)
     return RxAlternateSpec(version, tuple(rows))
 
 

@@ -10,10 +10,10 @@ from eap.ids import MacAddr
 from eap.pd.monitor import (
     DEFAULT_POLICY,
     USUAL_POLICY,
-    Evidence,
     MonitorTarget,
     PresenceChanged,
     PresenceTracker,
+    ProbeResult,
     SubscriberMonitor,
     SubscriberPresence,
 )
@@ -92,8 +92,8 @@ def test_comes_back() -> None:
     while event := run.monitor.next_event():
         events.append(event)
     assert events == [
-        PresenceChanged("a", UNKNOWN, MISSING, Evidence.MISSED, None),
-        PresenceChanged("a", MISSING, PRESENT, Evidence.SEEN, THEIRS),
+        PresenceChanged("a", UNKNOWN, MISSING, ProbeResult.MISSED, None),
+        PresenceChanged("a", MISSING, PRESENT, ProbeResult.SEEN, THEIRS),
     ]
 
 
@@ -162,7 +162,7 @@ def test_claims_of_many_hosts_take_bounded_memory() -> None:
 def test_who_looks_instead_of_asking_says_at_once() -> None:
     run = Run(target())
     assert run.monitor.probes_to_send(0) == ["a"]
-    run.monitor.receive_evidence("a", Evidence.ABSENT, 0)
+    run.monitor.receive_evidence("a", ProbeResult.ABSENT, 0)
     assert run.presence() is MISSING
     assert run.monitor.probes_to_send(SECOND - 1) == []
     assert run.monitor.probes_to_send(SECOND) == ["a"]
@@ -177,7 +177,7 @@ def test_forgotten_targets_are_not_asked_for() -> None:
     assert run.presence() is UNKNOWN
     run.monitor.receive_reply("a", THEIRS, run.now_ns)
     run.monitor.receive_claim("a", THEIRS, run.now_ns)
-    run.monitor.receive_evidence("a", Evidence.SEEN, run.now_ns)
+    run.monitor.receive_evidence("a", ProbeResult.SEEN, run.now_ns)
     assert run.monitor.next_event().name == "b"
     assert run.monitor.next_event() is None
 
@@ -222,9 +222,9 @@ def test_whatever_happens_a_target_goes_on_being_asked_for(
             case "claim":
                 monitor.receive_claim(name, OTHER, now_ns)
             case "blind":
-                monitor.receive_evidence(name, Evidence.BLIND, now_ns)
+                monitor.receive_evidence(name, ProbeResult.BLIND, now_ns)
             case "absent":
-                monitor.receive_evidence(name, Evidence.ABSENT, now_ns)
+                monitor.receive_evidence(name, ProbeResult.ABSENT, now_ns)
             case "add":
                 monitor.add(target(name, 700), now_ns)
                 watched.add(name)
@@ -237,8 +237,8 @@ def test_whatever_happens_a_target_goes_on_being_asked_for(
     assert all(run.presence(name) is PRESENT for name in watched)
 
 
-SEEN, MISSED, ABSENT = Evidence.SEEN, Evidence.MISSED, Evidence.ABSENT
-PENDING, BLIND = Evidence.PENDING, Evidence.BLIND
+SEEN, MISSED, ABSENT = ProbeResult.SEEN, ProbeResult.MISSED, ProbeResult.ABSENT
+PENDING, BLIND = ProbeResult.PENDING, ProbeResult.BLIND
 UNKNOWN, PRESENT, MISSING = (
     SubscriberPresence.UNKNOWN,
     SubscriberPresence.PRESENT,
@@ -246,7 +246,7 @@ UNKNOWN, PRESENT, MISSING = (
 )
 
 
-def run(*rounds: Evidence, judge: PresenceTracker | None = None) -> list[SubscriberPresence]:
+def run(*rounds: ProbeResult, judge: PresenceTracker | None = None) -> list[SubscriberPresence]:
     """Return what each of *rounds*, one a second, made of the presence."""
     judge = judge or PresenceTracker(SECOND, 0)
     found = []
@@ -320,12 +320,12 @@ def test_long_intervals_are_trusted_for_longer() -> None:
     ("rounds", "doubt"),
     [((SEEN,), False), ((SEEN, MISSED), True), ((ABSENT,), False), ((ABSENT, SEEN), True)],
 )
-def test_doubt_is_one_round_that_disagrees(rounds: tuple[Evidence, ...], doubt: bool) -> None:
+def test_doubt_is_one_round_that_disagrees(rounds: tuple[ProbeResult, ...], doubt: bool) -> None:
     judge = PresenceTracker(SECOND, 0)
     run(*rounds, judge=judge)
     assert judge.in_doubt is doubt
 
 
 @given(st.lists(st.sampled_from([MISSED, ABSENT, PENDING, BLIND])))
-def test_never_present_without_having_been_seen(rounds: list[Evidence]) -> None:
+def test_never_present_without_having_been_seen(rounds: list[ProbeResult]) -> None:
     assert PRESENT not in run(*rounds)

@@ -12,7 +12,7 @@ from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
 from eap.pd.engine import Engine
 from eap.pd.image import Image
-from eap.pd.poll import REQUESTERS_PER_CYCLE, PollQuestion, Requests, questions_of, requests_at
+from eap.pd.poll import REQUESTERS_PER_CYCLE, OutgoingPoll, PollRequests, questions_of, requests_at
 from eap.pd.report import station_status
 from eap.pd.spec import (
     REQUESTER,
@@ -35,7 +35,7 @@ CLIENT, MILL, LATHE = "5.0.0.1.1.1", "5.0.0.2.1.1", "5.0.0.3.1.1"
 
 
 def test_requests_are_taken_once_and_by_sender():
-    requests = Requests(["a", "b"])
+    requests = PollRequests(["a", "b"])
     assert requests.take() == {}
     assert requests.add("left", ["a"])
     assert requests.add("right", ["b"])
@@ -45,7 +45,7 @@ def test_requests_are_taken_once_and_by_sender():
 
 
 def test_more_requesters_than_a_cycle_answers_are_turned_away():
-    requests = Requests(["a"])
+    requests = PollRequests(["a"])
     taken = [requests.add(f"10.0.0.{n}", ["a"]) for n in range(REQUESTERS_PER_CYCLE + 1)]
     assert taken == [True] * REQUESTERS_PER_CYCLE + [False]
     assert requests.add("10.0.0.0", ["a"])  # it has a place already
@@ -60,7 +60,7 @@ class Asked:
         spec = desk(trigger, answers=("a", "b"))
         self.image = image_of(spec)
         (self.slot,) = self.image.layout.tx
-        self.question: PollQuestion = questions_of(self.image)["request"]
+        self.question: OutgoingPoll = questions_of(self.image)["request"]
 
     def send(self, now_ns: int) -> None:
         if self.slot.by_schedule:
@@ -138,7 +138,7 @@ def test_a_question_goes_on_when_the_station_is_configured_anew():
 
 
 def test_requests_that_wait_are_answered_by_the_station_as_it_is_configured_then():
-    before, after = Requests(["old", "both"]), Requests(["both", "new"])
+    before, after = PollRequests(["old", "both"]), PollRequests(["both", "new"])
     before.add("left", ["old", "both"])
     before.add("right", ["old"])
     after.follow(before)

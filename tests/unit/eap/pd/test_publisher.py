@@ -3,8 +3,8 @@ from __future__ import annotations
 from eap.codec.pd import iter_pds
 from eap.ids import NetId
 from eap.pd.image import Image, Inputs
-from eap.pd.poll import Requests
-from eap.pd.publisher import ANSWERS_KEPT, Answerer, Publisher
+from eap.pd.poll import PollRequests
+from eap.pd.publisher import ANSWERS_KEPT, PollResponder, Publisher
 from eap.pd.report import station_status
 from eap.pd.spec import (
     REQUESTER,
@@ -245,9 +245,9 @@ class Server:
         self.image = image_of(self.spec)
         self.inputs = Inputs(self.image)
         self.wire = Labelled()
-        self.requests = Requests(["r", "t"])
+        self.requests = PollRequests(["r", "t"])
         layout = self.image.layout
-        self.answerer = Answerer(
+        self.answerer = PollResponder(
             self.image,
             self.inputs,
             NetId.parse(PEER),

@@ -13,9 +13,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import PdFrameHeader
 from eap.ids import NetId
-from eap.pd.poll import REQUESTERS_PER_CYCLE, Requests
+from eap.pd.poll import REQUESTERS_PER_CYCLE, PollRequests
 from eap.pd.report import quality, station_status
-from eap.pd.spec import RxAlternateSpec, RxPdSpec, Substitute, TakenVariableSpec
+from eap.pd.spec import RxAlternateSpec, RxPdSpec, SentVariableSpec, Substitute
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import RxState, RxWord
 from tests.support.cyclic import MS, OWN, PEER, SECOND, Receiver, give, octets, received
@@ -104,7 +104,7 @@ def test_the_version_can_be_ignored():
 
 
 def test_an_alternate_is_told_by_version_and_length():
-    other = RxAlternateSpec(2, (TakenVariableSpec("", "BOOL"), TakenVariableSpec("x", "UINT")))
+    other = RxAlternateSpec(2, (SentVariableSpec("", "BOOL"), SentVariableSpec("x", "UINT")))
     r = receiver(alternates=(other,))
     r.give(octets([(7, b"\xff\x34\x12", 2, 50)], cycle=1), MS)
     assert (r.image.read("x"), quality(r.image, r.slot("r"))) == (0x1234, 50)
@@ -117,7 +117,7 @@ def test_an_alternate_is_told_by_version_and_length():
 
 
 def test_an_alternate_is_preferred_to_ignoring_the_version():
-    other = RxAlternateSpec(2, (TakenVariableSpec("y", "UINT"), TakenVariableSpec("x", "UINT")))
+    other = RxAlternateSpec(2, (SentVariableSpec("y", "UINT"), SentVariableSpec("x", "UINT")))
     pd = RxPdSpec("r", "eap0", 7, ("x", "y"), version=3, ignore_version=True, alternates=(other,))
     r = Receiver(pd, variables=received("x:UINT", "y:UINT"))
     for version, values in ((3, [1, 2]), (2, [2, 1]), (4, [1, 2])):
@@ -126,7 +126,7 @@ def test_an_alternate_is_preferred_to_ignoring_the_version():
 
 
 def test_an_older_frame_of_an_alternate_leaves_the_newer_data():
-    r = receiver(alternates=(RxAlternateSpec(4, (TakenVariableSpec("x", "UINT"),)),))
+    r = receiver(alternates=(RxAlternateSpec(4, (SentVariableSpec("x", "UINT"),)),))
     for cycle, version, data in ((1, 4, b"aa"), (3, 3, b"cc"), (2, 4, b"bb")):
         r.give(octets([(7, data, version)], cycle=cycle), cycle * MS)
     assert r.image.read("x") == int.from_bytes(b"cc", "little")
@@ -436,14 +436,14 @@ class PartingTrackers(RuleBasedStateMachine):
 TestPartingTrackers = PartingTrackers.TestCase
 
 
-def asking(*names: str) -> tuple[Receiver, Requests]:
+def asking(*names: str) -> tuple[Receiver, PollRequests]:
     """A receiver of r and s, of which those called *names* are requests."""
     r = Receiver(
         RxPdSpec("r", "eap0", 1, ("x",), PEER),
         RxPdSpec("s", "eap0", 2, ("y",)),
         variables=received("x:UINT", "y:UINT"),
     )
-    requests = Requests(names)
+    requests = PollRequests(names)
     pairs = zip(r.spec.subscriptions, r.image.layout.rx, strict=True)
     r.subscriber = Subscriber(r.image, list(pairs), MS, requests)
     r.subscriber.open(0)

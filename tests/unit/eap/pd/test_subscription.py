@@ -5,11 +5,18 @@ import pytest
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import FIRST_PD
 from eap.pd.address import SourceWatch
-from eap.pd.poll import PollQuestion
+from eap.pd.poll import OutgoingPoll
 from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import RxPdSpec, Substitute, TxFrameSpec, TxPdSpec, VariableSpec, Writer
-from eap.pd.subscription import FramePlan, RefusedPd, RxSubscription, SubstituteValue, TakenPd, walk
-from eap.pd.words import Discard, FrameWord, RxWord
+from eap.pd.subscription import (
+    AcceptedPd,
+    DroppedPd,
+    FramePlan,
+    RxSubscription,
+    SubstituteValue,
+    walk,
+)
+from eap.pd.words import FrameWord, PdDropReason, RxWord
 from tests.support.cyclic import MS, PEER, Receiver, image_of, octets, received, station, written
 
 
@@ -24,7 +31,7 @@ def subscription(*, polled: bool = False, **options: object) -> tuple[RxSubscrip
         )
     )
     (slot,) = image.layout.rx
-    question = PollQuestion(image.words, image.layout.tx[0], ["in"]) if polled else None
+    question = OutgoingPoll(image.words, image.layout.tx[0], ["in"]) if polled else None
     made = RxSubscription(spec, slot, SubstituteValue(image, slot), question)
     timing = Timing(step=1, sender_cycle_ns=MS, own_cycle_ns=MS)
     made.tracker = SequenceTracker(image.words, slot.words, timing)
@@ -34,14 +41,14 @@ def subscription(*, polled: bool = False, **options: object) -> tuple[RxSubscrip
 def test_version_and_length_have_to_fit():
     made, _ = subscription()
     assert made.mismatch(3, 2, b"") is None
-    assert made.mismatch(4, 2, b"") is made.mismatch(4, 3, b"") is Discard.VERSION
-    assert made.mismatch(3, 3, b"") is Discard.LENGTH
+    assert made.mismatch(4, 2, b"") is made.mismatch(4, 3, b"") is PdDropReason.VERSION
+    assert made.mismatch(3, 3, b"") is PdDropReason.LENGTH
 
 
 def test_the_version_may_be_of_no_interest_but_never_the_length():
     made, _ = subscription(ignore_version=True)
     assert made.mismatch(4, 2, b"") is None
-    assert made.mismatch(4, 3, b"") is Discard.LENGTH
+    assert made.mismatch(4, 3, b"") is PdDropReason.LENGTH
 
 
 def test_what_comes_by_itself_is_too_old_when_nothing_has_come_for_so_long():
@@ -109,9 +116,9 @@ def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
         100,
         pds,
         [
-            TakenPd(one, 0, source=14, target=200, size=10),
-            TakenPd(one, 0, source=24, target=210, size=12),
-            TakenPd(one, 0, source=36, target=300, size=9),
+            AcceptedPd(one, 0, source=14, target=200, size=10),
+            AcceptedPd(one, 0, source=24, target=210, size=12),
+            AcceptedPd(one, 0, source=36, target=300, size=9),
         ],
         [],
         watch=WATCH,
@@ -126,8 +133,8 @@ def test_each_tracker_has_its_own_copies():
     plan = FramePlan(
         100,
         [(b"\x01\0\0\0\0\0", 0), (b"\x02\0\0\0\0\0", 0)],
-        [TakenPd(one, 3, 14, 200, 8), TakenPd(other, 4, 22, 208, 8)],
-        [RefusedPd((1,))],
+        [AcceptedPd(one, 3, 14, 200, 8), AcceptedPd(other, 4, 22, 208, 8)],
+        [DroppedPd((1,))],
         watch=WATCH,
         roaming=[other],
         publisher=bytes([5, 23, 91, 23, 1, 1]),
@@ -170,14 +177,14 @@ def test_each_pd_with_its_slot():
 
 @pytest.mark.parametrize("size", range(len(FRAME)))
 def test_every_frame_that_is_cut_off_is_dropped(size):
-    assert walked(FRAME, size) is Discard.TRUNCATED
+    assert walked(FRAME, size) is PdDropReason.TRUNCATED
 
 
 def test_what_is_no_process_data_is_told_apart():
-    assert walked(EtherCatHeader(0, 0, 1).encode() + bytes(20)) is Discard.WRONG_TYPE
+    assert walked(EtherCatHeader(0, 0, 1).encode() + bytes(20)) is PdDropReason.WRONG_TYPE
 
 
 def test_more_pds_than_fit_are_not_looked_for():
     many = bytearray(FRAME)
     many[8:10] = b"\xff\xff"
-    assert walked(bytes(many)) is Discard.COUNT_TOO_LARGE
+    assert walked(bytes(many)) is PdDropReason.COUNT_TOO_LARGE

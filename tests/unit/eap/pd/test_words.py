@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from eap.pd.words import (
     BIN_OF_US,
-    DISCARDS,
     HISTOGRAM_BINS,
+    PD_DROP_REASONS,
     REASONS,
     FrameWord,
     RxWord,
@@ -19,7 +19,7 @@ from eap.pd.words import (
 )
 
 ARRAYS = {
-    "DISCARDED": len(DISCARDS),
+    "DISCARDED": len(PD_DROP_REASONS),
     "LATENESS": HISTOGRAM_BINS,
     "REASON": len(REASONS),
     "JITTER": HISTOGRAM_BINS,

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 import eap
-from eap.engine.rebuild import EngineStation, Successor
+from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.net.image_file import ImageFile, create_image, prepare_image
 from eap.pd.engine import Engine
@@ -67,7 +67,7 @@ class Runner:
         file = create_image(path, plan_layout(station))
         self._place = EngineStation(Station(station, file.image, file.wake_waiters), file)
         self._engine = Engine([self._place.station])
-        self.successors: queue.SimpleQueue[Successor] = queue.SimpleQueue()
+        self.successors: queue.SimpleQueue[StationReplacement] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -87,7 +87,7 @@ class Runner:
 
     def configure(self, station: StationSpec) -> None:
         """Run another specification soon."""
-        self.successors.put(Successor(self._place, station))
+        self.successors.put(StationReplacement(self._place, station))
 
     @property
     def station(self) -> Station:

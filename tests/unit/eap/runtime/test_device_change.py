@@ -14,7 +14,7 @@ from eap.pd.spec import (
     PortKind,
     PortSpec,
     RxAlternateSpec,
-    TakenVariableSpec,
+    SentVariableSpec,
     VariableSpec,
     Writer,
 )
@@ -95,7 +95,7 @@ def test_rollback_takes_the_objects_of_then(spec, dictionaries):
 def test_rollback_with_alternates(stations):
     right = stations[1]
     (pd,) = right.subscriptions
-    alternate = RxAlternateSpec(9, (TakenVariableSpec("ticks", "UINT"),))
+    alternate = RxAlternateSpec(9, (SentVariableSpec("ticks", "UINT"),))
     both = replace(right, subscriptions=(replace(pd, alternates=(alternate,)),))
     dictionaries = {"eap0": EapDictionary(right, "eap0")}
     fill_all(dictionaries, {})

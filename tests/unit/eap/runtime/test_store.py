@@ -21,7 +21,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import read_back
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.device import DeviceState
-from eap.pd.spec import RxAlternateSpec, TakenVariableSpec
+from eap.pd.spec import RxAlternateSpec, SentVariableSpec
 from eap.runtime import store as module
 from eap.runtime.durable import seal
 from eap.runtime.store import (
@@ -251,7 +251,7 @@ def test_file_before_the_one_that_was_applied_is_an_edited_one(stations, caplog)
 
 def tolerant(spec):
     """The same, taking another layout as well."""
-    alternate = RxAlternateSpec(9, (TakenVariableSpec("ticks", "UINT"),))
+    alternate = RxAlternateSpec(9, (SentVariableSpec("ticks", "UINT"),))
     return replace(spec, subscriptions=(replace(spec.subscriptions[0], alternates=(alternate,)),))
 
 

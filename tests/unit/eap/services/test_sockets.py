@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from eap.ams.spec import RoutingSpec
 from eap.codec.ethercat import EAP_PORT
-from eap.runtime.discards import DiscardCounters
+from eap.runtime.drop_counters import DropCounters
 from eap.runtime.handover import Handover
 from eap.runtime.store import StationStore
 from eap.services.routing.station_routes import StationRoutes
@@ -39,7 +39,7 @@ def script_on(tmp_path):
             with ExitStack() as resources:
                 names = [each.name for each in stations]
                 sockets = resources.enter_context(SharedSockets(stations, tmp_path / "control"))
-                counters = resources.enter_context(DiscardCounters(tmp_path / "counts", names))
+                counters = resources.enter_context(DropCounters(tmp_path / "counts", names))
                 handover = Handover(1, "", "", "", stations, sockets.descriptions)
                 handover = _with_own_descriptors(handover)
                 routers = {

@@ -11,7 +11,7 @@ import pytest
 
 from eap.control.protocol import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.errors import ControlError, TornReadError
-from eap.net.connections import Activity, CloseReason, Limits
+from eap.net.connections import Activity, CloseReason, ListenerLimits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.services.control import control_server
@@ -231,7 +231,7 @@ def test_there_are_limits_on_subscriptions(methods):
 def test_listener_is_full_of_subscribers_and_has_room_when_one_leaves(
     methods, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(control_server, "LIMITS", Limits(total=2, reserved=0, per_host=3))
+    monkeypatch.setattr(control_server, "LIMITS", ListenerLimits(total=2, reserved=0, per_host=3))
     listeners = Listeners()
 
     async def ask(reader, writer, method):

@@ -14,10 +14,10 @@ from eap.od.profiles.eap1000 import EapLive
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import (
-    DISCARD_INDEX,
+    PD_DROP_INDEX,
     REASON_INDEX,
-    Discard,
     FrameWord,
+    PdDropReason,
     Reason,
     RxWord,
     StationWord,
@@ -79,7 +79,7 @@ def test_counters_of_the_station(values, files):
     words = files["left"].image.words
     words[StationWord.CYCLE] = 70_000
     words[StationWord.LATENESS_MAX_NS] = 12_345
-    words[StationWord.DISCARDED + DISCARD_INDEX[Discard.UNKNOWN_ID]] = 9
+    words[StationWord.DISCARDED + PD_DROP_INDEX[PdDropReason.UNKNOWN_ID]] = 9
     left = values["left"]
     assert number(left, EapLive.STATION_CYCLE) == 70_000
     assert number(left, EapLive.STATION_LATENESS_MAX) == 12_345
@@ -123,7 +123,7 @@ def test_pds_that_are_received(values, files):
     image.words[pd.words + RxWord.ARRIVED_IN_CYCLE] = 3
     image.words[pd.words + RxWord.STATE] = 1
     image.words[pd.words + RxWord.JITTER_MAX_US] = 1 << 40
-    image.words[pd.words + RxWord.DISCARDED + DISCARD_INDEX[Discard.VERSION]] = 2
+    image.words[pd.words + RxWord.DISCARDED + PD_DROP_INDEX[PdDropReason.VERSION]] = 2
     assert number(right, EapLive.RX_RECEIVED, "left-state") == 7
     assert number(right, EapLive.RX_LOST, "left-state") == 1 << 40
     assert number(right, EapLive.RX_CYCLE_INDEX, "left-state") == 2

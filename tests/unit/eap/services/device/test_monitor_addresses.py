@@ -10,7 +10,7 @@ import pytest
 from eap.errors import EnvironmentalError
 from eap.ids import Destination
 from eap.net.neighbour import NeighbourTable
-from eap.pd.monitor import Evidence
+from eap.pd.monitor import ProbeResult
 from eap.runtime.handover import Handover, PortName
 from eap.services.device import monitoring as monitor_ways
 from eap.services.device.monitoring import (
@@ -56,16 +56,16 @@ def test_nobody_listens(endpoint, closed):
     send(endpoint, closed)
     assert endpoint.hear(5 * SECOND) == {key_of(closed)}
     assert endpoint.hear(5 * SECOND) == set()
-    assert endpoint.look(closed, 5 * SECOND) is Evidence.ABSENT
+    assert endpoint.look(closed, 5 * SECOND) is ProbeResult.ABSENT
 
 
 def test_refusal_holds_until_frames_went_on_without_another(endpoint, closed):
     endpoint.watch([closed])
     send(endpoint, closed)
     endpoint.hear(5 * SECOND)
-    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS - 1) is Evidence.ABSENT
-    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS) is Evidence.BLIND  # our own machine
-    assert endpoint.look(closed, 5 * SECOND) is Evidence.BLIND
+    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS - 1) is ProbeResult.ABSENT
+    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS) is ProbeResult.BLIND  # our own machine
+    assert endpoint.look(closed, 5 * SECOND) is ProbeResult.BLIND
 
 
 def test_targets_that_nobody_watches_are_not_told(endpoint, closed):
@@ -80,7 +80,7 @@ def test_a_target_that_stays_keeps_its_refusal(endpoint, closed):
     send(endpoint, closed)
     endpoint.hear(5 * SECOND)
     endpoint.watch([closed, Destination.parse("127.9.2.9:9")])
-    assert endpoint.look(closed, 5 * SECOND) is Evidence.ABSENT
+    assert endpoint.look(closed, 5 * SECOND) is ProbeResult.ABSENT
 
 
 def test_nothing_is_asked_of_the_kernel_before_there_is_a_target(endpoint, closed):
@@ -108,7 +108,7 @@ def test_listener_of_this_machine_is_unknown(endpoint):
         endpoint.watch([target])
         send(endpoint, target)
         assert endpoint.hear(SECOND) == set()
-        assert endpoint.look(target, SECOND) is Evidence.BLIND
+        assert endpoint.look(target, SECOND) is ProbeResult.BLIND
 
 
 def test_usual_port_has_no_need_to_be_named():
@@ -138,5 +138,5 @@ def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog,
     with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
         endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
         endpoint = endpoints.udp[PortName("left", "eap0")]
-        assert endpoint.look(closed, 0) is Evidence.BLIND
+        assert endpoint.look(closed, 0) is ProbeResult.BLIND
     assert "forbidden; subscribers on UDP are known to be missing by ICMP alone" in caplog.text

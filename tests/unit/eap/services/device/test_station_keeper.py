@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
-from eap.pd.spec import RxAlternateSpec, StationSpec, TakenVariableSpec
+from eap.pd.spec import RxAlternateSpec, SentVariableSpec, StationSpec
 from eap.runtime.store import (
     Configuration,
     StationFile,
@@ -199,7 +199,7 @@ def versions() -> tuple[StationSpec, StationSpec]:
 
 def tolerant(spec: StationSpec) -> StationSpec:
     """The same with an alternate."""
-    alternate = RxAlternateSpec(77, (TakenVariableSpec("ticks", "UINT"),))
+    alternate = RxAlternateSpec(77, (SentVariableSpec("ticks", "UINT"),))
     return replace(spec, subscriptions=(replace(spec.subscriptions[0], alternates=(alternate,)),))
 
 

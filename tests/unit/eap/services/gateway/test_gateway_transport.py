@@ -8,7 +8,7 @@ from typing import Any
 from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import decode_frame
 from eap.ids import NetId
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.gateway.gateway import Settings
 from eap.services.gateway.gateway_transport import GatewayTransport
 
@@ -52,7 +52,7 @@ def test_the_first_station_with_a_bus_has_the_gateway() -> None:
 
 def test_without_a_bus_nobody_answers() -> None:
     transport = GatewayTransport([])
-    assert transport.receive(UPLOAD, "me", lambda *each: None) is Refusal.MAILBOX
+    assert transport.receive(UPLOAD, "me", lambda *each: None) is DropReason.MAILBOX
     transport.connection_closed("me")
     asyncio.run(transport.wait_below("me", 1))
 
@@ -61,7 +61,7 @@ def test_a_protocol_that_nobody_knows_is_refused_by_a_mailbox_error() -> None:
     transport = GatewayTransport([(Gateway(), "udp:a")])
     sent = []
     frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
-    assert transport.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
+    assert transport.receive(frame, "me", lambda *each: sent.append(each)) is DropReason.MAILBOX
     assert sent == [("me", bytes.fromhex("0a50 0400 e903 00 00 0100 0200"))]
 
 
@@ -71,7 +71,7 @@ def test_a_silent_gateway_does_not_refuse_a_protocol_either() -> None:
     frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
     sent = []
     transport = GatewayTransport([(gateway, "udp:a")])
-    assert transport.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
+    assert transport.receive(frame, "me", lambda *each: sent.append(each)) is DropReason.MAILBOX
     assert not sent
 
 
@@ -79,11 +79,11 @@ def test_a_gateway_that_is_stopped_turns_frames_away() -> None:
     gateway = Gateway()
     gateway.is_open = False
     transport = GatewayTransport([(gateway, "udp:a")])
-    assert transport.receive(UPLOAD, "me", lambda *each: None) is Refusal.GATEWAY_OFF
+    assert transport.receive(UPLOAD, "me", lambda *each: None) is DropReason.GATEWAY_OFF
     assert gateway.turned_away == 1
     assert not gateway.heard
 
 
 def test_a_frame_that_is_cut_is_counted() -> None:
     transport = GatewayTransport([(Gateway(), "udp:a")])
-    assert transport.receive(UPLOAD[:-2], "me", lambda *each: None) is Refusal.TRUNCATED
+    assert transport.receive(UPLOAD[:-2], "me", lambda *each: None) is DropReason.TRUNCATED

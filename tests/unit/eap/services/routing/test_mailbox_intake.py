@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ams.transport_table import Transport
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports.mailbox_frames import ChannelSender, MailboxIntake
 from tests.support import aoe
@@ -35,7 +35,7 @@ class Wire:
         return self._sender
 
 
-def tell(wire: Wire, frame: bytes, *, for_many: bool = False, room: int = 0) -> Refusal | None:
+def tell(wire: Wire, frame: bytes, *, for_many: bool = False, room: int = 0) -> DropReason | None:
     there = station(TARGET)
     sender = ChannelSender(wire)
     there.add_transport(Transport("link", room), sender)
@@ -68,7 +68,7 @@ def test_answer_has_the_headers_and_the_size_that_its_wire_wants():
 
 def test_who_has_no_address_gets_no_answer():
     wire = Wire(sender="")
-    assert tell(wire, ask()) is Refusal.MAILBOX
+    assert tell(wire, ask()) is DropReason.MAILBOX
     assert wire.sent == []
 
 
@@ -93,17 +93,17 @@ def test_stranger_is_told_unless_many_were_asked(for_many, answers):
 
 
 def test_what_is_not_taken_has_a_reason():
-    assert tell(Wire(), ask(kind=3)) is Refusal.MAILBOX
+    assert tell(Wire(), ask(kind=3)) is DropReason.MAILBOX
 
 
 @pytest.mark.parametrize(
     ("frame", "behind", "for_many", "reason"),
     [
         (ask(), [], False, None),
-        (ask()[:-1], [], False, Refusal.TRUNCATED),
-        (ask(kind=3), [], False, Refusal.MAILBOX),
+        (ask()[:-1], [], False, DropReason.TRUNCATED),
+        (ask(kind=3), [], False, DropReason.MAILBOX),
         (ask(kind=3), ["a gateway"], False, None),
-        (ask(kind=3), ["a gateway"], True, Refusal.MAILBOX),
+        (ask(kind=3), ["a gateway"], True, DropReason.MAILBOX),
     ],
 )
 def test_frame_that_another_intake_takes_is_only_judged(frame, behind, for_many, reason):

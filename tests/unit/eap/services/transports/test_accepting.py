@@ -11,7 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.net.connections import CloseReason, Limits
+from eap.net.connections import CloseReason, ListenerLimits
 from eap.services.transports import accepting
 from eap.services.transports.accepting import (
     Listeners,
@@ -24,7 +24,7 @@ from tests.support.eventually import eventually
 
 pytestmark = pytest.mark.net
 
-LIMITS = Limits(total=2, reserved=0)
+LIMITS = ListenerLimits(total=2, reserved=0)
 
 
 class Echo:

@@ -19,7 +19,7 @@ from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.net.connections import CloseReason
 from eap.net.tcp import set_stream_options
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.transports import ams_connection
 from eap.services.transports.ams_connection import (
     AmsConnection,
@@ -55,7 +55,7 @@ class Taker:
         self.waiting: list[bytes] = []
         self.seen: list[bytes] = []
         self.answers: list[bytes] = []
-        self.refused: list[Refusal] = []
+        self.refused: list[DropReason] = []
         self.why = ""
         self.closed = asyncio.Event()
 
@@ -80,7 +80,7 @@ class Taker:
         self.why = why
         self.closed.set()
 
-    def count_dropped(self, reason: Refusal) -> None:
+    def count_dropped(self, reason: DropReason) -> None:
         self.refused.append(reason)
 
     def answer(self, number: int = 0) -> None:
@@ -221,7 +221,7 @@ def test_wrong_lengths_are_answered_and_the_connection_goes_on(flags: int) -> No
             assert [(await hear(reader))[0] for _ in range(3)] == [0xE, 0xE, 0xE]
         assert (await hear(reader))[:2] == (0, 9)
 
-    assert talk(script).refused == [Refusal.AMS_LENGTH] * 3
+    assert talk(script).refused == [DropReason.AMS_LENGTH] * 3
 
 
 @pytest.mark.parametrize("octets", [b"GET / HTTP/1.1\r\n", prefixed(b""), prefixed(b"", length=31)])
@@ -237,7 +237,7 @@ def test_what_is_no_ams_packet_ends_the_connection_when_all_has_been_answered(oc
         assert await reader.read() == b""
 
     taker = talk(script, is_slow=True)
-    assert taker.refused == [Refusal.AMS_TYPE]
+    assert taker.refused == [DropReason.AMS_TYPE]
     assert taker.why.startswith("no AMS packets: AmsTcpHeader")
 
 
@@ -277,7 +277,7 @@ def test_who_wants_to_serve_a_port_is_sent_away(port, is_ours, why) -> None:
         assert await reader.read() == b""
 
     taker = talk(script, is_ours=is_ours)
-    assert taker.refused == [Refusal.AMS_TYPE]
+    assert taker.refused == [DropReason.AMS_TYPE]
     assert taker.why.startswith(f"no AMS packets: {why}")
 
 
@@ -307,7 +307,7 @@ def test_packet_that_is_not_finished_ends_the_connection() -> None:
                 return
 
     taker = talk(script, patience_s=0.1)
-    assert taker.refused == [Refusal.AMS_SLOW]
+    assert taker.refused == [DropReason.AMS_SLOW]
     assert taker.why.startswith("too slow")
 
 
@@ -362,7 +362,7 @@ def test_client_that_takes_nothing_is_disconnected() -> None:
                 return
         raise AssertionError("everything was taken")
 
-    assert talk(script, patience_s=0.1).refused == [Refusal.AMS_SLOW]
+    assert talk(script, patience_s=0.1).refused == [DropReason.AMS_SLOW]
 
 
 def test_notifications_do_not_pile_up() -> None:
@@ -378,7 +378,7 @@ def test_notifications_do_not_pile_up() -> None:
         # The buffers of both kernels hold some as well.
         assert sent < ams_connection.MAX_UNSENT + (16 << 20)
 
-    assert talk(script).refused == [Refusal.AMS_SLOW]
+    assert talk(script).refused == [DropReason.AMS_SLOW]
 
 
 def test_client_that_breaks_off_costs_nothing() -> None:
@@ -416,7 +416,7 @@ def test_who_leaves_without_taking_its_answers_is_let_go() -> None:
         await eventually(lambda: taker.seen)
         await taker.closed.wait()
 
-    assert talk(script, patience_s=0.1, grows=20).refused in ([], [Refusal.AMS_SLOW])
+    assert talk(script, patience_s=0.1, grows=20).refused in ([], [DropReason.AMS_SLOW])
 
 
 def test_dead_peers_are_looked_for() -> None:

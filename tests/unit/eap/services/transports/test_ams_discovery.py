@@ -17,7 +17,7 @@ from eap.codec.amsdiscovery import (
     encode_version,
 )
 from eap.ids import NetId
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.routing.remote_routers import RouterRequests
 from eap.services.transports.ams_discovery import AmsDiscovery, RouterName
 from tests.support.vectors import load
@@ -134,7 +134,7 @@ def test_datagrams_are_answered_to_their_senders(sock):
         loop.remove_reader(sock.fileno())
 
     asyncio.run(run())
-    assert refused == [Refusal.AMS_DISCOVERY] * 2
+    assert refused == [DropReason.AMS_DISCOVERY] * 2
 
 
 def test_what_comes_to_a_network_is_answered_from_the_address(sock):
@@ -179,4 +179,4 @@ def test_answers_to_own_questions_are_none_of_tools(sock):
         return found
 
     assert len(asyncio.run(run())) == 1
-    assert refused == [Refusal.AMS_DISCOVERY]
+    assert refused == [DropReason.AMS_DISCOVERY]

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from eap.net.connections import Limits
-from eap.runtime.discards import Refusal
+from eap.net.connections import ListenerLimits
+from eap.runtime.drop_counters import DropReason
 from eap.services.transports import accepting
 from eap.services.transports import ams_tcp as ams_door
 from eap.services.transports.accepting import Listeners
@@ -38,9 +38,9 @@ async def hear(reader) -> bytes:
 
 def play(
     script, *, patience_s: float = 5, stations: Sequence[EchoStation] = ()
-) -> tuple[list[Refusal], list[EchoStation]]:
+) -> tuple[list[DropReason], list[EchoStation]]:
     """Run ``script(connect, door)`` while a door serves stations, by default two."""
-    refused: list[Refusal] = []
+    refused: list[DropReason] = []
     there = list(stations) or [EchoStation(target) for target in TARGETS]
 
     async def run():
@@ -171,7 +171,7 @@ def test_client_that_dies_leaves_the_others_alone():
 
 def test_silent_connections_make_room_for_others(monkeypatch):
     monkeypatch.setattr(accepting, "host_of", lambda peer, own: "10.0.0.1")
-    monkeypatch.setattr(ams_door, "LIMITS", Limits(total=3, reserved=0))
+    monkeypatch.setattr(ams_door, "LIMITS", ListenerLimits(total=3, reserved=0))
 
     async def script(connect, transport):
         async def ask(reader, writer):
@@ -195,7 +195,7 @@ def test_silent_connections_make_room_for_others(monkeypatch):
         for _, writer in clients:
             writer.close()
 
-    assert play(script)[0] == [Refusal.AMS_FULL]
+    assert play(script)[0] == [DropReason.AMS_FULL]
 
 
 def test_client_that_breaks_the_rules_is_disconnected():
@@ -206,7 +206,7 @@ def test_client_that_breaks_the_rules_is_disconnected():
             assert await reader.read() == b""
             writer.close()
 
-    assert play(script, patience_s=0.1)[0] == [Refusal.AMS_TYPE, Refusal.AMS_SLOW]
+    assert play(script, patience_s=0.1)[0] == [DropReason.AMS_TYPE, DropReason.AMS_SLOW]
 
 
 def test_answers_that_nobody_asked_for_are_counted():
@@ -217,7 +217,7 @@ def test_answers_that_nobody_asked_for_are_counted():
         writer.close()
 
     refused, stations = play(script)
-    assert refused == [Refusal.AMS_UNASKED]
+    assert refused == [DropReason.AMS_UNASKED]
     assert len(stations[0].seen) == 1
 
 

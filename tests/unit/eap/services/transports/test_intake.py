@@ -15,7 +15,7 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.net.ipsocket import prepare_receiver
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
-from eap.runtime.discards import DiscardCounters, Refusal
+from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.services.transports.mailbox_frames import (
     MAX_BACKOFF,
     MAX_FRUITLESS,
@@ -36,12 +36,12 @@ UNKNOWN = memoryview(EtherCatHeader(0, 0, 7).encode())
 
 @pytest.fixture
 def counters(tmp_path):
-    with DiscardCounters(tmp_path / "discards", ["a", "b"]) as counters:
+    with DropCounters(tmp_path / "discards", ["a", "b"]) as counters:
         yield counters
 
 
-def refuse(data, size, at_ns, origin) -> Refusal | None:
-    return Refusal.MAILBOX
+def refuse(data, size, at_ns, origin) -> DropReason | None:
+    return DropReason.MAILBOX
 
 
 def test_each_frame_is_counted_once_at_every_station(counters):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.transports import mailbox_frames
 from eap.services.transports.mailbox_frames import (
     FrameCounters,
@@ -24,12 +24,12 @@ def test_aoe_to_address_0_is_taken(frame):
 @pytest.mark.parametrize(
     ("frame", "reason"),
     [
-        (aoe.frame(PACKET, address=1001), Refusal.MAILBOX),
-        (aoe.frame(PACKET, kind=3), Refusal.MAILBOX),
-        (aoe.frame(PACKET, kind=9), Refusal.MAILBOX),
-        (aoe.frame(PACKET)[:-1], Refusal.TRUNCATED),
-        (aoe.frame(b"too short"), Refusal.MAILBOX),
-        (b"\x00\x50", Refusal.TRUNCATED),
+        (aoe.frame(PACKET, address=1001), DropReason.MAILBOX),
+        (aoe.frame(PACKET, kind=3), DropReason.MAILBOX),
+        (aoe.frame(PACKET, kind=9), DropReason.MAILBOX),
+        (aoe.frame(PACKET)[:-1], DropReason.TRUNCATED),
+        (aoe.frame(b"too short"), DropReason.MAILBOX),
+        (b"\x00\x50", DropReason.TRUNCATED),
     ],
 )
 def test_others_are_not_taken(frame, reason):

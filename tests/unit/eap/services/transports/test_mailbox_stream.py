@@ -12,7 +12,7 @@ from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
 from eap.ids import NetId
 from eap.net.connections import OWN_HOST
-from eap.runtime.discards import Refusal
+from eap.runtime.drop_counters import DropReason
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import mailbox_stream
 from eap.services.transports.mailbox_stream import MailboxStreams, StreamConnection
@@ -29,10 +29,10 @@ def ask(body: bytes = b"abc", number: int = 1) -> bytes:
     return aoe.frame(aoe.packet(TARGET, 4, body, invoke_id=number))
 
 
-def talk(script, there=None) -> list[Refusal]:
+def talk(script, there=None) -> list[DropReason]:
     """Run ``script(reader, writer)`` on a connection that is being served."""
     there = there or station(TARGET)
-    refused: list[Refusal] = []
+    refused: list[DropReason] = []
     streams = MailboxStreams(demultiplexer(there), GatewayTransport([]), refused.append)
     there.add_transport(Transport("link", 2000, is_stream=True), streams)
 
@@ -90,7 +90,7 @@ def test_what_is_no_mailbox_frame_ends_the_connection(octets):
         assert (await hear(reader)).error == 0
         assert await asyncio.wait_for(reader.read(), 5) == b""
 
-    assert talk(script) == [Refusal.TCP_TYPE]
+    assert talk(script) == [DropReason.TCP_TYPE]
 
 
 def test_frame_that_is_not_taken_is_counted_and_the_connection_goes_on():
@@ -98,7 +98,7 @@ def test_frame_that_is_not_taken_is_counted_and_the_connection_goes_on():
         writer.write(aoe.frame(b"x" * 10, kind=3) + ask())
         assert (await hear(reader)).error == 0
 
-    assert talk(script) == [Refusal.MAILBOX]
+    assert talk(script) == [DropReason.MAILBOX]
 
 
 def test_client_that_breaks_off_costs_nothing():
@@ -127,7 +127,7 @@ def test_client_that_takes_nothing_is_disconnected(monkeypatch):
 
 def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
     here, there = station("2.2.2.2.2.1"), station(TARGET)
-    refused: list[Refusal] = []
+    refused: list[DropReason] = []
     near, far = (
         MailboxStreams(demultiplexer(each), GatewayTransport([]), refused.append)
         for each in (here, there)

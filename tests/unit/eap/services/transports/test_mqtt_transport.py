@@ -13,7 +13,7 @@ from eap.ams.spec import MqttSpec, RoutingSpec
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand
 from eap.ids import NetId
-from eap.runtime.discards import DiscardCounters, Refusal
+from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.services.transports.mqtt_transport import MqttTransport, open_mqtt_transports
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.busads import until
@@ -39,7 +39,7 @@ class Place:
 
     def __init__(self, net_id: NetId, *specs: MqttSpec, learns: bool = True) -> None:
         self.router = station(str(net_id), name=f"of {net_id[0]}")
-        self.refused: list[Refusal] = []
+        self.refused: list[DropReason] = []
         self.transports = [
             MqttTransport(each, self.router, self.refused.append, learns=learns)
             for each in specs or (spec(),)
@@ -237,7 +237,7 @@ def test_stations_get_the_doors_of_their_plant_file(tmp_path):
     async def story():
         routers = {"a": station("5.1.1.1.2.1"), "b": station("6.1.1.1.2.1")}
         routing = {"a": RoutingSpec(mqtt=(spec("x"), spec("y"))), "b": RoutingSpec()}
-        with DiscardCounters(tmp_path / "counters", [*routers]) as counters:
+        with DropCounters(tmp_path / "counters", [*routers]) as counters:
             transports = open_mqtt_transports(routing, routers, counters)
             transports[0]._overrun()
             assert counters.stats() == {"a": {"mqtt_full": 1}, "b": {}}
@@ -256,7 +256,7 @@ def test_mqtt_door_learns_in_the_networks_that_the_plant_file_names(tmp_path):
     async def story():
         one, two = station("5.1.1.1.2.1"), Place(TWO, spec("y"), spec("x"))
         told = RoutingSpec(mqtt=(spec("x"), spec("y")), learn=("mqtt:y",))
-        with DiscardCounters(tmp_path / "counters", ["a"]) as counters:
+        with DropCounters(tmp_path / "counters", ["a"]) as counters:
             transports = open_mqtt_transports({"a": told}, {"a": one}, counters)
             tasks = [asyncio.ensure_future(transport.serve()) for transport in transports]
             async with running(two):

@@ -12,8 +12,8 @@ import pytest
 from eap.ams.transport_table import Transport
 from eap.codec.ethercat import EtherCatHeader
 from eap.net import connections
-from eap.net.connections import OWN_HOST, Activity, Limits
-from eap.runtime.discards import Refusal
+from eap.net.connections import OWN_HOST, Activity, ListenerLimits
+from eap.runtime.drop_counters import DropReason
 from eap.runtime.handover import PortName, take_connection
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import accepting
@@ -60,8 +60,8 @@ class Scene:
 
 def play(
     script: Callable[[Scene], Awaitable[None]], takers=OWNERS, patience_s: float = 5
-) -> list[Refusal]:
-    refused: list[Refusal] = []
+) -> list[DropReason]:
+    refused: list[DropReason] = []
 
     async def run():
         services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -107,9 +107,9 @@ def test_type_4_goes_to_the_engine_with_its_first_frame():
 @pytest.mark.parametrize(
     ("kind", "takers", "reason"),
     [
-        (5, OWNERS, Refusal.TCP_TYPE),
-        (4, (), Refusal.TCP_OFF),
-        (7, OWNERS, Refusal.WRONG_TYPE),
+        (5, OWNERS, DropReason.TCP_TYPE),
+        (4, (), DropReason.TCP_OFF),
+        (7, OWNERS, DropReason.WRONG_TYPE),
     ],
 )
 def test_others_are_closed_with_a_reason(kind, takers, reason):
@@ -145,7 +145,7 @@ def test_a_fault_ends_one_connection_only(monkeypatch, caplog):
 
 
 def test_connection_with_a_frame_goes_before_silent_ones(monkeypatch):
-    monkeypatch.setattr(tcp_door, "LIMITS", Limits(total=2, reserved=0))
+    monkeypatch.setattr(tcp_door, "LIMITS", ListenerLimits(total=2, reserved=0))
     monkeypatch.setattr(connections, "FRESH_NS", 0)
     monkeypatch.setattr(accepting, "host_of", lambda peer, own: "10.0.0.1")
     question = aoe.frame(aoe.packet(TARGET, 4, b""))
@@ -163,7 +163,7 @@ def test_connection_with_a_frame_goes_before_silent_ones(monkeypatch):
         for each in (writer, other, late):
             each.close()
 
-    assert play(script) == [Refusal.TCP_FULL]
+    assert play(script) == [DropReason.TCP_FULL]
 
 
 def test_subscribed_connection_is_known_as_such():
@@ -186,7 +186,7 @@ def test_frame_that_stays_unfinished_ends_the_connection(octets):
     async def script(scene):
         assert await scene.send(octets) == b""
 
-    assert play(script, patience_s=0.05) == [Refusal.TCP_SLOW]
+    assert play(script, patience_s=0.05) == [DropReason.TCP_SLOW]
 
 
 def test_silent_connection_is_kept():
@@ -197,7 +197,7 @@ def test_silent_connection_is_kept():
         assert await asyncio.wait_for(reader.readexactly(8), 5)
         writer.close()
 
-    assert play(script, patience_s=0.05) == [Refusal.TCP_SLOW]
+    assert play(script, patience_s=0.05) == [DropReason.TCP_SLOW]
 
 
 def test_who_leaves_before_a_frame_is_not_counted():
@@ -208,7 +208,7 @@ def test_who_leaves_before_a_frame_is_not_counted():
             await writer.wait_closed()
         assert await scene.send(frame(7)) == b""
 
-    assert play(script) == [Refusal.WRONG_TYPE]
+    assert play(script) == [DropReason.WRONG_TYPE]
 
 
 def test_a_gone_engine_link_closes_the_connection():
@@ -216,4 +216,4 @@ def test_a_gone_engine_link_closes_the_connection():
         scene.engine.close()
         assert await scene.send(frame(4)) == b""
 
-    assert play(script) == [Refusal.ENGINE_BUSY]
+    assert play(script) == [DropReason.ENGINE_BUSY]

@@ -12,7 +12,7 @@ from eap.closeable import Closeable
 from eap.errors import EnvironmentalError
 
 
-class Refusal(StrEnum):
+class DropReason(StrEnum):
     """Why a frame or a connection went no further."""
 
     MAILBOX = auto()
@@ -61,11 +61,11 @@ class Refusal(StrEnum):
     """One router or one message by MQTT more than there is room for."""
 
 
-_REFUSALS = tuple(Refusal)
-_COLUMN = {reason: index for index, reason in enumerate(_REFUSALS)}
+_DROP_REASONS = tuple(DropReason)
+_COLUMN = {reason: index for index, reason in enumerate(_DROP_REASONS)}
 
 
-class DiscardCounters(Closeable):
+class DropCounters(Closeable):
     """One 64-bit word for each station and reason; each process has its own file.
 
     Raises:
@@ -73,7 +73,7 @@ class DiscardCounters(Closeable):
     """
 
     def __init__(self, path: Path, stations: Sequence[str]) -> None:
-        size = 8 * len(_REFUSALS) * max(1, len(stations))
+        size = 8 * len(_DROP_REASONS) * max(1, len(stations))
         try:
             with path.open("ab") as file:
                 os.posix_fallocate(file.fileno(), 0, size)  # no SIGBUS on a full disk
@@ -85,9 +85,9 @@ class DiscardCounters(Closeable):
                 f"{path}: the counters cannot be made: {exc.strerror}"
             ) from None
         self._words = memoryview(self._map).cast("Q")
-        self._row = {name: row * len(_REFUSALS) for row, name in enumerate(stations)}
+        self._row = {name: row * len(_DROP_REASONS) for row, name in enumerate(stations)}
 
-    def count(self, station: str, reason: Refusal, number: int = 1) -> None:
+    def count(self, station: str, reason: DropReason, number: int = 1) -> None:
         """Add *number* to one counter."""
         self._words[self._row[station] + _COLUMN[reason]] += number
 
@@ -108,7 +108,7 @@ class DiscardCounters(Closeable):
         self._map.close()
 
 
-class Tally:
+class DropCounterFeed:
     """Carries what a driver counts by name in a dict over to *counters* of all *stations*.
 
     *reason_of* says which counter a name belongs to, None for none.
@@ -116,10 +116,10 @@ class Tally:
 
     def __init__(
         self,
-        counters: DiscardCounters,
+        counters: DropCounters,
         stations: Sequence[str],
         source: Mapping[str, int],
-        reason_of: Callable[[str], Refusal | None],
+        reason_of: Callable[[str], DropReason | None],
     ) -> None:
         self._counters = counters
         self._stations = stations

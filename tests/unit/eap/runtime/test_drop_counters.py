@@ -5,30 +5,32 @@ from __future__ import annotations
 import pytest
 
 from eap.errors import EnvironmentalError
-from eap.runtime.discards import DiscardCounters, Refusal, Tally
+from eap.runtime.drop_counters import DropCounterFeed, DropCounters, DropReason
 
 
 def test_counts_by_station_and_reason_survive_a_restart(tmp_path):
     path = tmp_path / "discards"
-    with DiscardCounters(path, ["a", "b"]) as counters:
-        counters.count("a", Refusal.MAILBOX)
-        counters.count("a", Refusal.MAILBOX, 2)
-        counters.count("b", Refusal.ENGINE_BUSY)
-    with DiscardCounters(path, ["a", "b"]) as counters:
+    with DropCounters(path, ["a", "b"]) as counters:
+        counters.count("a", DropReason.MAILBOX)
+        counters.count("a", DropReason.MAILBOX, 2)
+        counters.count("b", DropReason.ENGINE_BUSY)
+    with DropCounters(path, ["a", "b"]) as counters:
         assert counters.stats() == {"a": {"mailbox": 3}, "b": {"engine_busy": 1}}
-        counters.count("b", Refusal.STALE, 5)
+        counters.count("b", DropReason.STALE, 5)
         assert counters.stats()["b"] == {"stale": 5, "engine_busy": 1}
 
 
 def test_a_file_that_cannot_be_made_is_named(tmp_path):
     with pytest.raises(EnvironmentalError, match="nowhere"):
-        DiscardCounters(tmp_path / "nowhere" / "discards", ["a"])
+        DropCounters(tmp_path / "nowhere" / "discards", ["a"])
 
 
 def test_a_tally_carries_over_what_has_come_since(tmp_path):
     source = {"other_vlan": 2}
-    with DiscardCounters(tmp_path / "discards", ["a", "b"]) as counters:
-        tally = Tally(counters, ["a"], source, lambda n: None if n == "own" else Refusal(n))
+    with DropCounters(tmp_path / "discards", ["a", "b"]) as counters:
+        tally = DropCounterFeed(
+            counters, ["a"], source, lambda n: None if n == "own" else DropReason(n)
+        )
         tally.publish()
         source |= {"other_vlan": 5, "stale": 1, "own": 7}
         tally.publish()
@@ -37,7 +39,7 @@ def test_a_tally_carries_over_what_has_come_since(tmp_path):
 
 
 def test_an_unknown_station_is_a_mistake_of_ours(tmp_path):
-    with DiscardCounters(tmp_path / "discards", []) as counters:
+    with DropCounters(tmp_path / "discards", []) as counters:
         assert counters.stats() == {}
         with pytest.raises(KeyError):
-            counters.count("a", Refusal.MAILBOX)
+            counters.count("a", DropReason.MAILBOX)
