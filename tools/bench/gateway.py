@@ -95,7 +95,7 @@ def late_figures(
     What the echo adds, a machine adds that has no idle core any more, whoever keeps it busy.
     """
     name = f"lateness of the engine, {{}}: {CLIENTS} clients at the gateway, of those at an echo"
-    detail = "{}, {} µs; {} µs while nobody is asked"
+    detail = "{}, {} µs; {} µs without clients"
     figures = [
         at_most(
             name.format(key),
@@ -107,7 +107,10 @@ def late_figures(
         for key in ("p50", "p99")
     ]
     longest = f"{gateway['max']}, {echo['max']} and {nobody['max']} µs"
-    return [*figures, report("the same, max: gateway, echo and nobody", longest, gateway["max"])]
+    return [
+        *figures,
+        report("the same, max: gateway, echo and no clients", longest, gateway["max"]),
+    ]
 
 
 def plant() -> str:

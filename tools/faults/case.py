@@ -113,7 +113,7 @@ CASES = (
         _one(FaultKind.EMERGENCY, 100, slave="drive", code=0x8611),
     ),
     Case(
-        "`drive` sends a TxPDO that nobody asked for",
+        "`drive` sends an unsolicited TxPDO",
         _one(FaultKind.TX_PDO, 100, slave="drive", object="0x1A00"),
     ),
     Case(

@@ -40,7 +40,7 @@ def test_files_are_reported() -> None:
 def test_lateness_is_compared_with_that_beside_an_echo() -> None:
     nobody, echo, gateway = ({"p50": us, "p99": 9 * us, "max": 20 * us} for us in (5, 10, 13))
     p50, p99, longest = late_figures(nobody, echo, gateway)
-    assert p50.measured == "1.30 (13, 10 µs; 5 µs while nobody is asked)"
+    assert p50.measured == "1.30 (13, 10 µs; 5 µs without clients)"
     assert (p50.decision, p99.decision) == (Decision.OK, Decision.OK)
     assert longest.measured == "260, 200 and 100 µs"
     assert late_figures(nobody, nobody, gateway)[0].decision is Decision.MISSED
