@@ -1,10 +1,45 @@
+"""Pending requests, their invoke IDs, and packets that run in a circle."""
+
 from __future__ import annotations
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.inflight import InFlight, Pending
+from eap.ams.inflight import MAX_PASSED, InFlight, InvokeIds, LoopDetector, Pending, is_marked
 from eap.ams.routes import Route
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
+
+
+def test_ids_are_marked_and_differ() -> None:
+    ids = InvokeIds(123_456_789)
+    given = [ids.allocate(()) for _ in range(10_000)]
+    assert len(set(given)) == len(given)
+    assert all(map(is_marked, given))
+    assert all(0 < each < 1 << 32 for each in given)
+
+
+def test_ids_of_clients_who_count_are_not_marked() -> None:
+    assert not any(map(is_marked, range(100_000)))
+    high = [each for each in range(1 << 31, (1 << 31) + 100_000) if is_marked(each)]
+    assert len(high) < 1000
+
+
+def test_taken_ids_are_left_out_and_numbers_come_round() -> None:
+    first = InvokeIds(5).allocate(())
+    assert InvokeIds(5).allocate({first}) == InvokeIds(6).allocate(())
+    last = InvokeIds((1 << 22) - 2)
+    assert last.allocate(()) & (1 << 22) - 1 == (1 << 22) - 1
+    assert last.allocate(()) & (1 << 22) - 1 == 0
+    assert is_marked(last.allocate(()))
+
+
+def test_only_the_latest_packets_are_known() -> None:
+    loop_detector = LoopDetector()
+    for number in range(MAX_PASSED + 1):
+        loop_detector.add(number, b"addresses")
+    assert (0, b"addresses") not in loop_detector
+    assert (1, b"addresses") in loop_detector
+    assert (1, b"others") not in loop_detector
+
 
 ONE, TWO, LINK = Endpoint("tcp", "1"), Endpoint("tcp", "2"), Endpoint("link", "6")
 ROUTE = Route(NetId(b"target"), "far", LINK)

@@ -1,11 +1,33 @@
+"""Reports on routes, advice, and hop reports."""
+
 from __future__ import annotations
+
+import pytest
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.record import Traffic
-from eap.ams.report import Obstacle, RouteState, report_route
+from eap.ams.report import (
+    MAX_REPORT,
+    HopQuestion,
+    HopReport,
+    Obstacle,
+    RouteReport,
+    RouteState,
+    advise,
+    decode_report,
+    encode_report,
+    report_of,
+    report_route,
+)
+from eap.ams.spec import AccessRule, ObjectRange
+from eap.ams.spec import AccessService as Service
 from eap.ams.transport_table import Transport
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
+from eap.errors import CodecError
+from eap.ids import NetId
 from tests.support.ams import Ams, parse
-from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, Station, route
+from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, ROUTER, Station, route
 
 TCP = Endpoint("tcp", "1")
 ASKED = Ams(FAR_DEVICE, CLIENT)
@@ -93,3 +115,122 @@ def test_route_of_a_client_is_forgotten_with_its_door() -> None:
     assert report(station)[1:3] == (RouteState.DOWN, "this station has no door link")
     station.router.add_transport(Transport("link"))
     assert report(station).state is RouteState.UNKNOWN
+
+
+TARGET, OWN = NetId.parse(FAR), NetId.parse(ROUTER)
+HOP = Endpoint("udp:eap0", "10.0.0.6:34980")
+UP = RouteReport(route(FAR, HOP, "island"), RouteState.UP, "", 1, Traffic(), "island")
+DOWN = UP._replace(state=RouteState.DOWN, why="it does not answer")
+
+
+def test_answers_are_answers() -> None:
+    assert advise(0, TARGET, UP, OWN, is_own=False)[:2] == (True, "answers")
+    found = advise(AdsError.TARGET_PORT, TARGET, UP, OWN, is_own=False)
+    assert found[:2] == (True, "is there; error 0x6 (nothing has that AMS port)")
+
+
+CLIENT_ADVICE = UP._replace(state=RouteState.CLIENT, why="not listening: refused")
+BEYOND = DOWN._replace(next_name="near")
+
+
+@pytest.mark.parametrize(
+    ("error", "report", "text", "hint"),
+    [
+        (7, None, f"there is no route to {FAR}", "eapctl routes add"),
+        (0x1B, DOWN, f"island ({HOP}) is down: it does not answer", "in the same network"),
+        (0x1B, BEYOND, f"near ({HOP}) is down: it does not answer", "in the same network"),
+        (
+            0x1B,
+            CLIENT_ADVICE,
+            f"island ({HOP}) is a client, not listening: refused",
+            "nothing is wrong",
+        ),
+        (0x1B, UP, f"the way is cut behind island ({HOP})", "eapctl trace"),
+        (0x719, UP, f"no answer from island ({HOP}) in time", f"add one to {ROUTER}"),
+        (7, UP, f"island ({HOP}) knows no way to {FAR}", f"needs a route to {FAR}"),
+        (0x723, UP, "access rules forbid to ask for its state", "under access in the plant"),
+    ],
+)
+def test_what_is_wrong_is_told_with_what_to_do(
+    error: int, report: RouteReport | None, text: str, hint: str
+) -> None:
+    found = advise(error, TARGET, report, OWN, is_own=False)
+    assert (found.is_reached, found.text) == (False, text)
+    assert hint in found.hint
+
+
+def test_other_errors_are_told_as_they_are() -> None:
+    found = advise(0x701, TARGET, UP, OWN, is_own=False)
+    assert found.text == (
+        f"island ({HOP}) or somebody behind it answers: error 0x701 (it does not know that service)"
+    )
+    found = advise(4, TARGET, None, OWN, is_own=True)
+    assert found.text.startswith("this station itself answers: error 0x4")
+
+
+LAPTOP = Endpoint("tcp", "10.0.0.5:49152")
+SOURCE = NetId.parse("192.168.0.9.1.1")
+
+
+def ask(station: Station, net_id: str, port: int, endpoint: Endpoint = LAPTOP) -> HopReport:
+    target = NetId.parse(net_id)
+    location = station.router.locate(AmsHeader(target, port, SOURCE, 1, 4), endpoint)
+    return report_of("island", NetId.parse(ROUTER), target, location, station.now_ns)
+
+
+def test_question_on_the_wire() -> None:
+    question = HopQuestion(NetId.parse(FAR), 1001, 2)
+    assert question.encode() == bytes.fromhex("060101010101 e903 02 00")
+
+
+def test_what_is_here() -> None:
+    here = ask(Station(rules=()), "5.1.1.1.2.1", 0xFFFF)
+    assert (here.station, here.net_id, here.is_here, here.why) == ("island", ROUTER, True, "")
+    assert here.may[Service.READ] is True
+    assert here.may[Service.WRITE] is False
+    missing = ask(Station(), "5.1.1.1.2.1", 7)
+    assert missing.why == "nothing has port 7 of 5.1.1.1.2.1"
+
+
+def test_what_is_behind_a_route() -> None:
+    objects = AccessRule("objects", objects=(ObjectRange(0x8000, 0x8000),))
+    near = NetId.parse("6.2.2.2.1.1")
+    far = route("10.6.6.6.1.1", LINK, "far", router=near, real=NetId.parse(FAR))
+    onward = ask(Station([far], rules=(objects,)), "10.6.6.6.3.1", 1001)
+    assert (onward.is_here, onward.route, onward.next_net_id) == (False, "far", str(near))
+    assert (onward.transport, onward.address, onward.state, onward.why) == (*LINK, "unknown", "")
+    assert onward.target == "6.1.1.1.3.1"
+    assert onward.may[Service.WRITE] is None
+
+
+def test_why_nothing_goes_there() -> None:
+    station = Station([route(FAR, LINK, "far")])
+    assert ask(station, "9.9.9.9.1.1", 1).why == "no route to 9.9.9.9.1.1"
+    back = ask(station, FAR, 1, LINK)
+    assert (back.route, back.why) == ("far", "route far leads back to where it came from")
+    station.router.hop_down(*LINK, "cable pulled", 1)
+    down = ask(station, FAR, 1)
+    assert (down.state, down.why) == ("down", "far (10.0.0.6 by link) is down: cable pulled")
+
+
+def test_reports_survive_the_wire() -> None:
+    report = ask(Station([route(FAR, LINK, "far")]), FAR, 1)
+    data = encode_report(report)
+    assert len(data) < MAX_REPORT
+    assert decode_report(data) == report
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff",
+        b"[]",
+        b'{"station": "x", "net_id": "1.2"}',
+        b'{"station": 5}',
+        b'{"station": "\\u001b[2J", "net_id": "1.2.3.4.5.6"}',
+    ],
+)
+def test_what_is_no_report(data: bytes) -> None:
+    with pytest.raises(CodecError):
+        decode_report(data)

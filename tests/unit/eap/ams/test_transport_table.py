@@ -1,12 +1,22 @@
+"""None"""
+
 from __future__ import annotations
 
 import pytest
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import FragmentAssembler
+from eap.ams.record import Outcome
 from eap.ams.transport_table import Forward, Reply, Transport, TransportTable
 from eap.codec.ams import decode_packet
 from tests.support.ams import Ams
+
+
+def test_outcomes_have_the_names_that_people_read() -> None:
+    assert sorted(Outcome) == [
+        "answered", "denied", "dropped", "failed", "interrupted", "late", "loop", "restored",
+    ]  # fmt: skip
+
 
 PACKET = Ams("5.1.1.1.1.1:851", "6.1.1.1.1.1:3000", body=bytes(range(100))).octets()
 WIDE, NARROW = Endpoint("tcp", "1"), Endpoint("box", "1")

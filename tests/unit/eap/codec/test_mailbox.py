@@ -1,3 +1,5 @@
+"""None"""
+
 from __future__ import annotations
 
 import pytest
@@ -10,6 +12,7 @@ from eap.codec.mailbox import (
     MailboxErrorReply,
     MailboxHeader,
     MailboxType,
+    VoeHeader,
     aoe_packet_in,
     decode_frame,
     decode_message,
@@ -18,6 +21,7 @@ from eap.codec.mailbox import (
     encode_plain_frame,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
+from tests.support.vectors import load_message
 from tests.support.wirerecords import records
 
 headers = records(MailboxHeader)
@@ -146,3 +150,21 @@ def test_aoe_packet_is_found_where_a_frame_has_one(
     except CodecError:
         expected = None
     assert aoe_packet_in(frame) == expected
+
+
+def test_voe_header_matches_wire_layout() -> None:
+    assert VoeHeader(2, 0x1234).encode() == bytes.fromhex("02000000 3412")
+
+
+@given(records(VoeHeader), st.integers(0, VoeHeader.SIZE - 1))
+def test_round_trip_and_every_prefix_is_truncated(header: VoeHeader, cut: int) -> None:
+    assert VoeHeader.decode(header.encode() + b"data") == header
+    with pytest.raises(TruncatedError, match="VoeHeader"):
+        VoeHeader.decode(header.encode()[:cut])
+
+
+def test_vector() -> None:
+    octets = load_message("voe")
+    header = VoeHeader.decode(octets)
+    assert header == VoeHeader(0x1164, 1)
+    assert header.encode() + b"\1\2" == octets

@@ -1,3 +1,5 @@
+"""Network of AMS routers behind an MQTT broker."""
+
 from __future__ import annotations
 
 import pytest
@@ -7,6 +9,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.mqtt import network as mqtt_network
+from eap.ams.mqtt import network as mqtt_peers
 from eap.ams.mqtt.messages import FIRST_PORT, Info, encode_info
 from eap.ams.mqtt.network import (
     CONFIRM_NS,
@@ -14,6 +17,7 @@ from eap.ams.mqtt.network import (
     MAX_PACKET,
     REFRESH_NS,
     Action,
+    Change,
     Drop,
     Dropped,
     HopDown,
@@ -21,19 +25,142 @@ from eap.ams.mqtt.network import (
     MqttNetwork,
     PacketReceived,
     PeerClosed,
+    Peers,
     Publish,
     Subscribe,
     Warn,
 )
-from eap.ams.routes import Route, RouteTable
+from eap.ams.routes import Origin, Route, RouteTable
 from eap.ams.spec import MqttSpec
 from eap.ids import NetId
 from tests.support.ams import NOTIFICATION, Ams, parse
 
-OWN, FAR = "5.1.1.1.1.1", "6.1.1.1.1.1"
-DEVICE, TOOL = f"{OWN}:10000", f"{FAR}:33000"
-REQUEST = Ams(DEVICE, TOOL).octets()
+OWN, FAR, NEAR = (NetId.parse(each) for each in ("5.1.1.1.1.1", "6.1.1.1.1.1", "6.1.1.1.9.1"))
+DOOR = "mqtt:hall"
 HERE, GONE = Info("far", is_online=True), Info("far", is_online=False)
+
+
+def peers_with(table: RouteTable | None = None) -> Peers:
+    return Peers(OWN, DOOR, RouteTable() if table is None else table)
+
+
+def test_router_comes_and_goes() -> None:
+    peers = peers_with()
+    told = [peers.update(FAR, each, 1) for each in (HERE, HERE, GONE, GONE, HERE)]
+    assert told == [Change.UP, Change.NOTHING, Change.DOWN, Change.NOTHING, Change.UP]
+    assert len(peers) == 1
+
+
+def test_router_that_was_never_there_may_have_a_route_all_the_same() -> None:
+    assert peers_with().update(FAR, GONE, 1) is Change.DOWN
+
+
+def test_route_is_learned_and_expires() -> None:
+    table = RouteTable()
+    peers_with(table).update(FAR, HERE, 5)
+    (route,) = table
+    assert route == Route(
+        FAR, "far", Endpoint(DOOR, str(FAR)), Origin.LEARNED, 4,
+        expires_at_ns=5 + EXPIRY_NS, is_probed=False,
+    )  # fmt: skip
+    assert table.expire(5 + EXPIRY_NS) == [route]
+
+
+def test_route_is_renewed_now_and_then_and_when_its_name_changes() -> None:
+    table = RouteTable()
+    peers = peers_with(table)
+    peers.update(FAR, HERE, 0)
+    version = table.version
+    peers.update(FAR, HERE, REFRESH_NS // 3)
+    assert table.version == version
+    peers.update(FAR, HERE, REFRESH_NS)
+    assert [each.expires_at_ns for each in table] == [REFRESH_NS + EXPIRY_NS]
+    peers.update(FAR, HERE._replace(name=""), REFRESH_NS + 1)
+    assert [each.name for each in table] == [str(FAR)]
+
+
+def test_nothing_is_learned_that_is_not_to_be_learned() -> None:
+    table = RouteTable([Route(FAR, "configured", Endpoint(DOOR, str(FAR)))])
+    peers = peers_with(table)
+    assert peers.update(FAR, HERE, 0) is Change.UP
+    peers.update(NEAR, HERE._replace(is_unidirectional=True), 0)
+    assert [each.origin for each in table] == [Origin.STATIC]
+    table = RouteTable()
+    assert Peers(OWN, DOOR, table, learns=False).update(FAR, HERE, 0) is Change.UP
+    assert not len(table)
+
+
+def test_hops_that_nothing_probes_are_awaited() -> None:
+    table = RouteTable([
+        Route(FAR, "far", Endpoint(DOOR, str(FAR)), is_probed=False),
+        Route(NEAR, "near", Endpoint(DOOR, str(NEAR)), is_probed=False),
+        Route(OWN, "probed", Endpoint(DOOR, str(OWN))),
+        Route(OWN, "elsewhere", Endpoint("mqtt:line", str(OWN)), is_probed=False),
+    ])  # fmt: skip
+    peers = peers_with(table)
+    assert peers.missing() == [str(FAR), str(NEAR)]
+    peers.update(FAR, HERE, 0)
+    peers.update(NetId.parse("7.1.1.1.1.1"), HERE, 0)
+    assert peers.missing() == [str(NEAR)]
+    peers.update(FAR, GONE, 0)
+    assert peers.missing() == [str(FAR), str(NEAR)]
+
+
+def test_other_routers_of_this_computer_get_their_own_net_id_only() -> None:
+    table = RouteTable()
+    peers_with(table).update(NetId.parse("5.1.1.1.7.1"), HERE, 0)
+    assert [each.octets for each in table] == [6]
+
+
+def test_silent_routers_are_forgotten_and_their_routes_too() -> None:
+    table = RouteTable()
+    peers = peers_with(table)
+    peers.update(FAR, HERE, 1)
+    peers.update(NEAR, GONE, 2)
+    third = NetId.parse("7.1.1.1.1.1")
+    peers.update(third, HERE, 10)
+    assert peers.forget(5, 12) == ([FAR], [NEAR])
+    assert len(peers) == 1
+    assert [each.net_id for each in table.expire(12)] == [FAR]
+    assert [each.net_id for each in table] == [third]
+
+
+def test_route_that_somebody_added_meanwhile_is_not_forgotten() -> None:
+    table = RouteTable()
+    peers = peers_with(table)
+    peers.update(FAR, HERE, 1)
+    table.add(Route(FAR, "added", Endpoint(DOOR, str(FAR)), Origin.ADDED))
+    peers.forget(5, 12)
+    assert table.expire(12) == []
+    assert [each.name for each in table] == ["added"]
+
+
+def test_sender_is_behind_the_router_that_is_nearest() -> None:
+    peers = peers_with()
+    assert peers.address_of(NetId.parse("6.1.1.1.9.7")) == "6.1.1.1.9.7"
+    peers.update(FAR, HERE, 0)
+    peers.update(NEAR, HERE, 0)
+    assert peers.address_of(NEAR) == "6.1.1.1.9.1"
+    assert peers.address_of(NetId.parse("6.1.1.1.9.7")) == "6.1.1.1.9.1"
+    assert peers.address_of(NetId.parse("6.1.1.1.2.1")) == "6.1.1.1.1.1"
+    peers.update(FAR, GONE, 0)
+    assert peers.address_of(NetId.parse("6.1.1.1.2.1")) == "6.1.1.1.9.1"
+    assert peers.address_of(NetId.parse("6.1.2.1.2.1")) == "6.1.2.1.2.1"
+
+
+def test_there_is_room_for_so_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_peers, "MAX_PEERS", 1)
+    table = RouteTable()
+    peers = peers_with(table)
+    peers.update(FAR, HERE, 0)
+    assert peers.update(NEAR, HERE, 0) is Change.IGNORED
+    assert peers.update(FAR, GONE, 0) is Change.DOWN
+    assert len(table) == 1
+
+
+OWN_ID, FAR_ID = "5.1.1.1.1.1", "6.1.1.1.1.1"
+DEVICE, TOOL = f"{OWN_ID}:10000", f"{FAR_ID}:33000"
+REQUEST = Ams(DEVICE, TOOL).octets()
 SECOND = 1_000_000_000
 
 
@@ -44,7 +171,7 @@ class Place:
         spec = MqttSpec(network="hall", host="broker", **settings)
         self.table = RouteTable()
         self.network = MqttNetwork(
-            spec, NetId.parse(OWN), "island-01", transport="mqtt:hall", table=self.table
+            spec, NetId.parse(OWN_ID), "island-01", transport="mqtt:hall", table=self.table
         )
         self.now_ns = 100 * SECOND
         self.first = self.network.connected(self.now_ns)
@@ -56,7 +183,7 @@ class Place:
         return self.hear(f"{net_id}/info", encode_info(info), **more)
 
     def asked(self, payload: bytes, topic: str = "ams") -> list[Action]:
-        return self.hear(f"{OWN}/{topic}", payload)
+        return self.hear(f"{OWN_ID}/{topic}", payload)
 
     def wait(self, seconds: float) -> list[Action]:
         self.now_ns += int(seconds * SECOND)
@@ -65,14 +192,14 @@ class Place:
 
 def own_info(*, is_retained: bool = True) -> Publish:
     payload = encode_info(Info("island-01", is_online=True))
-    return Publish(f"hall/{OWN}/info", payload, 2, is_retained)
+    return Publish(f"hall/{OWN_ID}/info", payload, 2, is_retained)
 
 
 def test_subscribes_first_then_tells_of_itself_and_leaves_a_will() -> None:
     place = Place()
-    assert place.first == [Subscribe((f"hall/{OWN}/ams/#", "hall/+/info")), own_info()]
+    assert place.first == [Subscribe((f"hall/{OWN_ID}/ams/#", "hall/+/info")), own_info()]
     will = place.network.will()
-    assert (will.topic, will.qos, will.is_retained) == (f"hall/{OWN}/info", 2, True)
+    assert (will.topic, will.qos, will.is_retained) == (f"hall/{OWN_ID}/info", 2, True)
     assert b">false<" in will.payload
     place.network.disconnected()
     assert place.network.next_timeout() is None
@@ -82,15 +209,18 @@ def test_subscribes_first_then_tells_of_itself_and_leaves_a_will() -> None:
 
 def test_router_that_comes_is_a_hop_and_one_that_goes_is_none() -> None:
     place = Place()
-    assert place.hear_of(FAR, HERE) == [HopUp(FAR)]
-    assert place.hear_of(FAR, HERE) == []
+    assert place.hear_of(FAR_ID, HERE) == [HopUp(FAR_ID)]
+    assert place.hear_of(FAR_ID, HERE) == []
     assert [each.name for each in place.table] == ["far"]
-    assert place.hear_of(FAR, GONE) == [HopDown(FAR, "it told that it is gone"), PeerClosed(FAR)]
+    assert place.hear_of(FAR_ID, GONE) == [
+        HopDown(FAR_ID, "it told that it is gone"),
+        PeerClosed(FAR_ID),
+    ]
 
 
 def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
     place = Place()
-    place.hear_of(FAR, HERE)
+    place.hear_of(FAR_ID, HERE)
     place.hear_of("7.1.1.1.1.1", GONE)
     place.hear_of("8.1.1.1.1.1", HERE)
     place.network.disconnected()
@@ -100,7 +230,7 @@ def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
     assert place.network.next_timeout() == place.now_ns + CONFIRM_NS
     assert place.wait(29) == []
     assert place.wait(1) == [
-        HopDown(FAR, "it is gone without a word"), PeerClosed(FAR), HopUp(FAR),
+        HopDown(FAR_ID, "it is gone without a word"), PeerClosed(FAR_ID), HopUp(FAR_ID),
         HopUp("7.1.1.1.1.1"), Subscribe(("hall/+/info",)),
     ]  # fmt: skip
     place.table.expire(place.now_ns)
@@ -109,43 +239,43 @@ def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
 
 def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
     place = Place()
-    far = NetId.parse(FAR)
-    place.table.add(Route(far, "far", Endpoint("mqtt:hall", FAR), is_probed=False))
+    far = NetId.parse(FAR_ID)
+    place.table.add(Route(far, "far", Endpoint("mqtt:hall", FAR_ID), is_probed=False))
     place.network.disconnected()
-    missing = HopDown(FAR, "it has not told of itself yet")
+    missing = HopDown(FAR_ID, "it has not told of itself yet")
     assert place.network.connected(place.now_ns) == [missing, *place.first]
     assert place.wait(30)[0] == missing
-    assert place.hear_of(FAR, HERE) == [HopUp(FAR)]
+    assert place.hear_of(FAR_ID, HERE) == [HopUp(FAR_ID)]
     place.wait(REFRESH_NS / SECOND)
     place.wait(REFRESH_NS / SECOND)
     gone = place.wait(REFRESH_NS / SECOND)
     assert gone[:4] == [
-        HopDown(FAR, "it is gone without a word"), PeerClosed(FAR), HopUp(FAR), missing,
+        HopDown(FAR_ID, "it is gone without a word"), PeerClosed(FAR_ID), HopUp(FAR_ID), missing,
     ]  # fmt: skip
 
 
 def test_all_are_asked_for_now_and_then() -> None:
     place = Place()
     place.wait(30)
-    place.hear_of(FAR, HERE)
+    place.hear_of(FAR_ID, HERE)
     assert place.network.next_timeout() == place.now_ns + REFRESH_NS
     assert place.wait(120) == [Subscribe(("hall/+/info",))]
     place.wait(120)
-    assert place.wait(120)[0] == HopDown(FAR, "it is gone without a word")
+    assert place.wait(120)[0] == HopDown(FAR_ID, "it is gone without a word")
 
 
 def test_without_retained_messages_who_is_new_is_told_of_this_router() -> None:
     place = Place(no_retain=True)
     assert place.first[1] == own_info(is_retained=False)
     assert not place.network.will().is_retained
-    assert place.hear_of(FAR, HERE) == [HopUp(FAR)]  # told a moment ago: soon again
+    assert place.hear_of(FAR_ID, HERE) == [HopUp(FAR_ID)]  # told a moment ago: soon again
     assert place.network.next_timeout() == place.now_ns + SECOND
     assert place.wait(1) == [own_info(is_retained=False)]
     place.now_ns += SECOND
-    assert place.hear_of(FAR, HERE) == []  # that was its answer
+    assert place.hear_of(FAR_ID, HERE) == []  # that was its answer
     assert place.hear_of("7.1.1.1.1.1", HERE)[1:] == [own_info(is_retained=False)]
     place.now_ns += 30 * SECOND
-    assert place.hear_of(FAR, HERE) == [own_info(is_retained=False)]
+    assert place.hear_of(FAR_ID, HERE) == [own_info(is_retained=False)]
     assert own_info(is_retained=False) in place.wait(REFRESH_NS / SECOND)
 
 
@@ -153,7 +283,7 @@ def test_two_routers_without_retained_messages_meet_and_fall_silent() -> None:
     one, two = Place(no_retain=True), Place(no_retain=True)
     two.network = MqttNetwork(
         MqttSpec(network="hall", host="broker", no_retain=True),
-        NetId.parse(FAR), "island-02", transport="mqtt:hall", table=two.table,
+        NetId.parse(FAR_ID), "island-02", transport="mqtt:hall", table=two.table,
     )  # fmt: skip
     two.now_ns += 60 * SECOND
     one.now_ns = two.now_ns
@@ -170,8 +300,8 @@ def test_two_routers_without_retained_messages_meet_and_fall_silent() -> None:
         for place in (one, two):
             place.now_ns += SECOND // 2
             sent[place] += place.network.handle_timeout(place.now_ns)
-    assert [str(each.net_id) for each in one.table] == [FAR]
-    assert [str(each.net_id) for each in two.table] == [OWN]
+    assert [str(each.net_id) for each in one.table] == [FAR_ID]
+    assert [str(each.net_id) for each in two.table] == [OWN_ID]
     assert count <= 4  # of the one that was there the first time, one is by the clock
 
 
@@ -186,24 +316,24 @@ def test_late_will_of_an_earlier_connection_is_corrected() -> None:
 
 def test_second_router_with_the_net_id_is_named_once() -> None:
     place = Place()
-    assert place.hear_of(OWN, Info("island-01", is_online=True)) == []
-    assert place.hear_of(OWN, Info("before", is_online=True), is_retained=True) == []
-    (warning,) = place.hear_of(OWN, Info("twin", is_online=True))
+    assert place.hear_of(OWN_ID, Info("island-01", is_online=True)) == []
+    assert place.hear_of(OWN_ID, Info("before", is_online=True), is_retained=True) == []
+    (warning,) = place.hear_of(OWN_ID, Info("twin", is_online=True))
     assert warning == Warn(
-        f"'twin' tells that it has the NetID {OWN}, which is this station's;"
+        f"'twin' tells that it has the NetID {OWN_ID}, which is this station's;"
         " each router of a network needs one of its own"
     )
-    assert place.hear_of(OWN, Info("twin", is_online=True)) == []
+    assert place.hear_of(OWN_ID, Info("twin", is_online=True)) == []
 
 
 @pytest.mark.parametrize("prefix", [b"", bytes.fromhex("0000 25000000")], ids=["bare", "prefixed"])
 def test_packet_arrives_and_its_answer_has_its_form(prefix: bytes) -> None:
     place = Place()
     asked = Ams(DEVICE, TOOL, body=b"asked")
-    assert place.asked(prefix + asked.octets()) == [PacketReceived(asked.octets(), FAR)]
+    assert place.asked(prefix + asked.octets()) == [PacketReceived(asked.octets(), FAR_ID)]
     answer = asked.answer(b"gives").octets()
-    assert place.network.message_for(FAR, answer) == Publish(
-        f"hall/{FAR}/ams/res", prefix + answer, 0
+    assert place.network.message_for(FAR_ID, answer) == Publish(
+        f"hall/{FAR_ID}/ams/res", prefix + answer, 0
     )
 
 
@@ -212,17 +342,17 @@ def test_who_was_not_heard_yet_gets_the_form_of_the_settings(
     is_prefixed: bool, length: int
 ) -> None:
     place = Place(is_prefixed=is_prefixed, qos=1)
-    sent = place.network.message_for(FAR, Ams(TOOL, DEVICE).octets())
-    assert (sent.topic, len(sent.payload), sent.qos) == (f"hall/{FAR}/ams", length, 1)
+    sent = place.network.message_for(FAR_ID, Ams(TOOL, DEVICE).octets())
+    assert (sent.topic, len(sent.payload), sent.qos) == (f"hall/{FAR_ID}/ams", length, 1)
     note = Ams(TOOL, DEVICE, command=NOTIFICATION).octets()
-    assert place.network.message_for(FAR, note).topic == f"hall/{FAR}/ams/res"
+    assert place.network.message_for(FAR_ID, note).topic == f"hall/{FAR_ID}/ams/res"
 
 
 def test_client_behind_the_router_asks_and_is_answered() -> None:
     place = Place()
-    asked = Ams(f"{FAR}:851", "192.168.0.9.1.1:33000")
-    sent = parse(place.network.message_for(FAR, asked.octets()).payload)
-    assert sent.source == f"{OWN}:{FIRST_PORT}"
+    asked = Ams(f"{FAR_ID}:851", "192.168.0.9.1.1:33000")
+    sent = parse(place.network.message_for(FAR_ID, asked.octets()).payload)
+    assert sent.source == f"{OWN_ID}:{FIRST_PORT}"
     (arrived,) = place.asked(sent.answer().octets(), "ams/res")
     assert isinstance(arrived, PacketReceived)
     assert parse(arrived.packet) == asked.answer()
@@ -237,8 +367,8 @@ def test_answers_go_to_the_router_that_the_sender_is_behind() -> None:
     place = Place()
     asked = Ams(DEVICE, "6.1.1.1.3.1:1001").octets()
     assert place.asked(asked) == [PacketReceived(asked, "6.1.1.1.3.1")]
-    place.hear_of(FAR, HERE)
-    assert place.asked(asked) == [PacketReceived(asked, FAR)]
+    place.hear_of(FAR_ID, HERE)
+    assert place.asked(asked) == [PacketReceived(asked, FAR_ID)]
 
 
 def test_one_way_station_tells_so() -> None:
@@ -260,12 +390,12 @@ def test_too_long_a_request_is_answered_and_too_long_an_answer_is_not() -> None:
 @pytest.mark.parametrize(
     ("topic", "payload", "more", "reason", "text"),
     [
-        (f"{OWN}/ams", b"short", {}, Drop.BROKEN, "broken packet"),
-        (f"{FAR}/info", b"<info>", {}, Drop.BROKEN, "broken info"),
-        (f"{FAR}/ams", REQUEST, {}, Drop.TOPIC, "topic nobody knows"),
+        (f"{OWN_ID}/ams", b"short", {}, Drop.BROKEN, "broken packet"),
+        (f"{FAR_ID}/info", b"<info>", {}, Drop.BROKEN, "broken info"),
+        (f"{FAR_ID}/ams", REQUEST, {}, Drop.TOPIC, "topic nobody knows"),
         ("nonsense", b"", {}, Drop.TOPIC, "topic nobody knows"),
-        (f"{OWN}/ams/res", REQUEST, {}, Drop.TOPIC, "request on the topic for answers"),
-        (f"{OWN}/ams", REQUEST, {"is_retained": True}, Drop.TOPIC, "retained packet"),
+        (f"{OWN_ID}/ams/res", REQUEST, {}, Drop.TOPIC, "request on the topic for answers"),
+        (f"{OWN_ID}/ams", REQUEST, {"is_retained": True}, Drop.TOPIC, "retained packet"),
     ],
 )
 def test_what_comes_to_nothing_is_counted_and_said_once(
@@ -282,7 +412,7 @@ def test_routers_and_senders_have_limits(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(mqtt_network, "MAX_SENDERS", 2)
     monkeypatch.setattr("eap.ams.mqtt.network.MAX_PEERS", 1)
     place = Place()
-    place.hear_of(FAR, HERE)
+    place.hear_of(FAR_ID, HERE)
     assert place.hear_of("7.1.1.1.1.1", HERE)[0] == Dropped(Drop.FULL)
     for number in (7, 8):
         assert len(place.asked(Ams(DEVICE, f"{number}.1.1.1.1.1:1").octets())) == 1
@@ -301,7 +431,7 @@ def test_sender_that_nobody_told_of_is_forgotten_when_silent_for_an_hour() -> No
     assert PeerClosed("8.1.1.1.1.1") not in place.wait(REFRESH_NS / SECOND)
 
 
-@given(st.sampled_from([f"{OWN}/ams", f"{OWN}/ams/res", f"{FAR}/info", f"{OWN}/info"]),
+@given(st.sampled_from([f"{OWN_ID}/ams", f"{OWN_ID}/ams/res", f"{FAR_ID}/info", f"{OWN_ID}/info"]),
        st.binary(max_size=80), st.booleans())  # fmt: skip
 def test_no_message_raises(topic: str, payload: bytes, is_retained: bool) -> None:
     place = Place()
