@@ -144,7 +144,7 @@ def gateway_view(row: GatewayRow) -> Iterator[TextTable | str]:
     settings = row.settings
     served = ", ".join(row.served) or "no socket"
     silent = ", silent" if settings.silent else ""
-    dropped = f", {count(row.turned_away, 'frame')} dropped" if row.turned_away else ""
+    dropped = f", {count(row.dropped, 'frame')} dropped" if row.dropped else ""
     yield (
         f"{row.station}/{row.port}: {row.state} at {served};"
         f" answers within {settings.answer_ms} ms{silent}{dropped}"

@@ -28,7 +28,7 @@ TURN_S = 30.0
 """Limit for the wait for a turn at a mailbox."""
 MARGIN_S = 10.0
 """Beyond the time-out of a mailbox message: those of other protocols may go first."""
-PATIENCE_S = 5.0
+WAIT_UP_S = 5.0
 """Limit for the wait for a bus that is not up yet, or whose engine starts again."""
 TRANSFER_S = 5.0
 """Limit for datagrams."""
@@ -298,7 +298,7 @@ class GatewayRow(Document, frozen=True, kw_only=True):
     port: str
     served: list[str]
     state: Literal["running", "stopped"]
-    turned_away: int
+    dropped: int
     settings: GatewaySettings
     clients: list[GatewayClientRow]
     slaves: list[MailboxFigures]

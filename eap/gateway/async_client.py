@@ -28,7 +28,7 @@ from eap.gateway.conversations import (
     GatewayConversations,
     PendingRequest,
 )
-from eap.gateway.slaves import NOT_TOLD, MasterSlave, read_sizes, read_slaves
+from eap.gateway.slaves import NO_DICTIONARY, MasterSlave, read_sizes, read_slaves
 
 T = TypeVar("T")
 
@@ -66,7 +66,7 @@ class AsyncGatewayClient:
         self, host: str, port: int = PORT, *, timeout_s: float = TIMEOUT_S, tries: int = TRIES
     ) -> None:
         self.mailboxes: dict[int, MailboxSizes] = {}
-        self._master_tells = True
+        self._has_dictionary = True
         self._place = host, port
         self._link = _Datagrams(
             GatewayConversations(
@@ -185,10 +185,10 @@ class AsyncGatewayClient:
 
     async def _sizes_or_default(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave, for messages that may as well be shorter."""
-        if self._master_tells:
-            with suppress(*NOT_TOLD):
+        if self._has_dictionary:
+            with suppress(*NO_DICTIONARY):
                 return await self.sizes_of(address)
-            self._master_tells = False  # each question would wait for as long
+            self._has_dictionary = False  # each question would wait for as long
         return self.mailboxes.get(address, MailboxSizes())
 
     async def converse(self, address: int, conversation: Conversation[T]) -> T:

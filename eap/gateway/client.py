@@ -39,7 +39,7 @@ from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.async_client import PORT, TIMEOUT_S, TRIES, AsyncGatewayClient, silence
 from eap.gateway.conversations import GatewayConversation, GatewayConversations
-from eap.gateway.slaves import NOT_TOLD, MasterSlave, read_sizes, read_slaves
+from eap.gateway.slaves import NO_DICTIONARY, MasterSlave, read_sizes, read_slaves
 
 T = TypeVar("T")
 
@@ -78,7 +78,7 @@ class GatewayClient(Closeable):
         tries: int = TRIES,
     ) -> None:
         self.mailboxes: dict[int, MailboxSizes] = {}
-        self._master_tells = True
+        self._has_dictionary = True
         self._is_stream = tcp
         self._rest = b""
         kind = socket.SOCK_STREAM if tcp else socket.SOCK_DGRAM
@@ -213,10 +213,10 @@ class GatewayClient(Closeable):
 
     def _sizes_or_default(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave, for messages that may as well be shorter."""
-        if self._master_tells:
-            with suppress(*NOT_TOLD):
+        if self._has_dictionary:
+            with suppress(*NO_DICTIONARY):
                 return self.sizes_of(address)
-            self._master_tells = False  # each question would wait for as long
+            self._has_dictionary = False  # each question would wait for as long
         return self.mailboxes.get(address, MailboxSizes())
 
     def converse(

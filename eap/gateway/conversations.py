@@ -238,8 +238,8 @@ class GatewayConversations:
                 queue.late.append(_LateReplies(request, None, request.sends, until_ns))
             queue.conversations.remove(conversation)
         if was_sent and not request.is_taken and request.ask.type in ABORT_MESSAGES:
-            farewell = ABORT_MESSAGES[request.ask.type]
-            frame = encode_plain_frame(farewell.type, address.number, 0, farewell.request)
+            abort = ABORT_MESSAGES[request.ask.type]
+            frame = encode_plain_frame(abort.type, address.number, 0, abort.request)
             self._frames.append(self._numbered(address.number, frame))
         self._advance(address, now_ns)
         for queue in list(address.queues.values()):

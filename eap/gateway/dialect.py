@@ -96,13 +96,13 @@ class ReadFile(msgspec.Struct, frozen=True):
     name: str
 
 
-class TalkVoe(msgspec.Struct, frozen=True):
+class ExchangeVoe(msgspec.Struct, frozen=True):
     """Hand a message of a vendor's protocol on."""
 
     body: bytes
 
 
-Task: TypeAlias = ReadSdo | WriteSdo | ReadIdn | WriteIdn | ReadFile | TalkVoe
+Task: TypeAlias = ReadSdo | WriteSdo | ReadIdn | WriteIdn | ReadFile | ExchangeVoe
 
 
 class DialectFailure(IntEnum):
@@ -227,7 +227,7 @@ def _decode_foe(body: bytes) -> Task:
 def _decode_voe(body: bytes) -> Task:
     if len(body) < VoeHeader.SIZE:
         raise _short("VoE", body, VoeHeader.SIZE)
-    return TalkVoe(body)
+    return ExchangeVoe(body)
 
 
 _DECODERS = {

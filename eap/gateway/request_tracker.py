@@ -141,7 +141,7 @@ class RequestTracker:
         is_full = len(client.waiting) >= limits.in_flight
         if is_full or self._in_flight >= limits.in_flight_in_all:
             return RequestAdmission.CROWDED
-        if not self._pay(client, now_ns):
+        if not self._spend_credit(client, now_ns):
             return RequestAdmission.TOO_FAST
         client.waiting.add(frame)
         client.counts.requests += 1
@@ -178,20 +178,20 @@ class RequestTracker:
     def _client(self, endpoint: Endpoint, now_ns: int) -> _TrackedClient | None:
         client = self._clients.pop(endpoint, None)
         if client is None:
-            if len(self._clients) >= self._limits.clients and not self._make_room():
+            if len(self._clients) >= self._limits.clients and not self._forget_idle():
                 return None
             client = _TrackedClient(self._limits.rate, now_ns)
         self._clients[endpoint] = client  # at the end: the one in front has been silent longest
         return client
 
-    def _make_room(self) -> bool:
+    def _forget_idle(self) -> bool:
         for endpoint, client in self._clients.items():
             if not client.waiting:
                 del self._clients[endpoint]
                 return True
         return False
 
-    def _pay(self, client: _TrackedClient, now_ns: int) -> bool:
+    def _spend_credit(self, client: _TrackedClient, now_ns: int) -> bool:
         rate = self._limits.rate
         if not rate:
             return True
@@ -221,7 +221,7 @@ class Ticket:
         self._endpoint = endpoint
         self._frame = frame
 
-    def give_back(self) -> None:
+    def release(self) -> None:
         """The request waits no more; harmless the second time."""
         tracker, self._tracker = self._tracker, None
         if tracker is not None:

@@ -227,7 +227,7 @@ _NOT_BEGUN = Busy(0, 100)
 _SUBINDEX = 5
 """Where it stands in an SDO request, CoE header included."""
 
-_ASK_AGAIN = frozenset((Cause.BUSY, Cause.TOO_FAST))
+_TEMPORARY = frozenset((Cause.BUSY, Cause.TOO_FAST))
 
 
 class GatewayError(EapError):
@@ -238,14 +238,14 @@ class GatewayError(EapError):
         self.cause = cause
 
 
-class Answer(NamedTuple):
+class ErrorReply(NamedTuple):
     """A message that goes back."""
 
     type: MailboxType
     body: bytes
 
 
-def refuse(kind: MailboxType, request: bytes, cause: Cause, text: str = "") -> Answer:
+def error_reply(kind: MailboxType, request: bytes, cause: Cause, text: str = "") -> ErrorReply:
     """Return the error that answers a request.
 
     Args:
@@ -254,19 +254,19 @@ def refuse(kind: MailboxType, request: bytes, cause: Cause, text: str = "") -> A
         cause: Why it is refused.
         text: More than *cause* says, where the protocol has room for words.
     """
-    error_replier = _REFUSERS.get(kind)
+    error_replier = _ERROR_ENCODERS.get(kind)
     if error_replier is None:
         return mailbox_error(cause.mailbox)
     body = error_replier(request, cause, text or cause.text)
-    return mailbox_error(cause.mailbox) if body is None else Answer(kind, body)
+    return mailbox_error(cause.mailbox) if body is None else ErrorReply(kind, body)
 
 
-def mailbox_error(detail: int) -> Answer:
+def mailbox_error(detail: int) -> ErrorReply:
     """Return an error of the mailbox itself."""
-    return Answer(MailboxType.ERR, MailboxErrorReply(detail=detail).encode())
+    return ErrorReply(MailboxType.ERR, MailboxErrorReply(detail=detail).encode())
 
 
-def _refuse_coe(request: bytes, cause: Cause, text: str) -> bytes | None:
+def _coe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     if len(request) < CoeHeader.SIZE:
         return None
@@ -280,16 +280,16 @@ def _refuse_coe(request: bytes, cause: Cause, text: str) -> bytes | None:
     return encode_abort(int.from_bytes(request[3:_SUBINDEX], "little"), subindex, code)
 
 
-def _refuse_foe(request: bytes, cause: Cause, text: str) -> bytes | None:
+def _foe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     words = text.encode() + b"\0"
     if not request:
         return None
-    if cause in _ASK_AGAIN:  # no end of the transfer, only of patience
+    if cause in _TEMPORARY:  # no end of the transfer, only of patience
         return encode_foe(FoeOpcode.BUSY, _NOT_BEGUN.number, words)
     return encode_foe(FoeOpcode.ERROR, cause.foe, words)
 
 
-def _refuse_soe(request: bytes, cause: Cause, text: str) -> bytes | None:
+def _soe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     opcode = request[0] & 0x07 if len(request) >= SoeHeader.SIZE else 0
     if opcode not in {SoeOpcode.READ_REQUEST, SoeOpcode.WRITE_REQUEST}:
@@ -304,7 +304,7 @@ def _refuse_soe(request: bytes, cause: Cause, text: str) -> bytes | None:
     )
 
 
-def _refuse_aoe(request: bytes, cause: Cause, text: str) -> bytes | None:
+def _aoe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     try:
         asked = AmsHeader.decode(request)
@@ -313,9 +313,9 @@ def _refuse_aoe(request: bytes, cause: Cause, text: str) -> bytes | None:
     return response_to(asked, AmsAnswer(error_code=cause.ads))
 
 
-_REFUSERS = {
-    MailboxType.AOE: _refuse_aoe,
-    MailboxType.COE: _refuse_coe,
-    MailboxType.FOE: _refuse_foe,
-    MailboxType.SOE: _refuse_soe,
+_ERROR_ENCODERS = {
+    MailboxType.AOE: _aoe_error,
+    MailboxType.COE: _coe_error,
+    MailboxType.FOE: _foe_error,
+    MailboxType.SOE: _soe_error,
 }

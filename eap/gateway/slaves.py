@@ -13,7 +13,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.gateway.requests import VIRTUAL_BIT
 from eap.od.abort import SdoAbortError
 
-NOT_TOLD = (SdoAbortError, MailboxRefusedError, MailboxTimeoutError)
+NO_DICTIONARY = (SdoAbortError, MailboxRefusedError, MailboxTimeoutError)
 """Errors of a master that has no dictionary, or is silent at address 0."""
 
 
@@ -77,7 +77,7 @@ def read_sizes(address: int) -> Conversation[MailboxSizes]:
     """
     try:
         slaves = yield from read_slaves()
-    except NOT_TOLD as exc:
+    except NO_DICTIONARY as exc:
         exc.add_note(
             f"the mailbox of slave {address} has to be known, and the master does not tell it: put"
             f" its sizes into mailboxes[{address}]"

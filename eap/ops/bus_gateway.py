@@ -21,7 +21,7 @@ from eap.codec.soe import SoeErrorCode
 from eap.errors import ConfigError, EapError
 from eap.gateway.client import GatewayClient
 from eap.gateway.requests import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
-from eap.gateway.slaves import NOT_TOLD, MasterSlave
+from eap.gateway.slaves import NO_DICTIONARY, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.ops.bus_session import Begin, Slave, choose, no_mailbox
 from eap.runtime.bus_status import FrameCounts
@@ -58,7 +58,7 @@ class GatewayBus:
         """
         try:
             self._slaves = self._client.slaves()
-        except NOT_TOLD as exc:
+        except NO_DICTIONARY as exc:
             raise BusError(
                 f"the gateway does not list its slaves: {exc}; use a station address, such as 1001"
             ) from exc

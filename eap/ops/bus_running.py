@@ -108,7 +108,7 @@ class RunningBus:
 
     def forget(self) -> None:
         """Have the running master forget faults that are over."""
-        self._call(words.BUS_FORGET, words.PATIENCE_S)
+        self._call(words.BUS_FORGET, words.WAIT_UP_S)
 
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name; raise BusError if that is not one."""
@@ -159,7 +159,7 @@ class RunningBus:
         return count_frames(self._describe())
 
     def _describe(self) -> BusReport:
-        return self._call(words.BUS_DESCRIBE, words.PATIENCE_S, wait=True)
+        return self._call(words.BUS_DESCRIBE, words.WAIT_UP_S, wait=True)
 
     def _step(self, step: Step) -> StepReplies:
         if isinstance(step, Sleep):

@@ -183,7 +183,7 @@ class StationDevices:
                 with suppress(ImageError):  # its readers get the error
                     image.catch_up()  # an engine that died may have retired no buffer
             for device in self.by_station.values():
-                await device.tell_again()
+                await device.resend()
 
 
 def _set_access(station: StationSpec, router: StationRouter, spec: RoutingSpec) -> None:
@@ -255,7 +255,7 @@ class Services:
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(clients, devices, providers)
         methods = self._methods(images, buses, devices, gateways, audit)
-        server = ControlServer(methods, buses, audit.write_request, begin=audit.begin_request)
+        server = ControlServer(methods, buses, audit.write_request, announce=audit.begin_request)
         async with asyncio.TaskGroup() as group:
             control = partial(server.serve, self._listener, self._listeners)
             tasks = [group.create_task(_keep_serving(control))]
@@ -390,9 +390,9 @@ class Services:
             if is_required:
                 router.require_record(partial(audit.begin, name))
         for owner, gateway in gateways.items():
-            gateway.guard.on_audit.append(partial(audit.write, owner.station))
+            gateway.admission.on_audit.append(partial(audit.write, owner.station))
             if is_required:
-                gateway.guard.before_change = partial(audit.begin, owner.station)
+                gateway.admission.before_change = partial(audit.begin, owner.station)
         return audit
 
     def _ams_addresses(self) -> dict[str, str]:

@@ -157,7 +157,7 @@ class Sequences(RuleBasedStateMachine):
             self.engine.failure = None
             if self.engine.gone:
                 ((self.engine.spec, self.engine.state),) = effective("demo", (PLANT_FILE,))
-                self.loop.run_until_complete(self.device.tell_again())
+                self.loop.run_until_complete(self.device.resend())
 
     @rule(
         what=st.sampled_from(DOWNLOADS),

@@ -182,11 +182,11 @@ def test_stop_and_start(plant: Appliance, client: Client) -> None:
     client._sock.send(frame(1001, VENDOR))
     assert client.is_silent()
     (row,) = plant.request("gateway_status", station="mill", port="bus0")
-    assert (row["state"], row["turned_away"]) == ("stopped", before["turned_away"] + 1)
+    assert (row["state"], row["dropped"]) == ("stopped", before["dropped"] + 1)
     discarded = {
         station["name"]: station["discarded"] for station in plant.request("status")["stations"]
     }
-    assert discarded["mill"]["gateway_off"] == row["turned_away"]
+    assert discarded["mill"]["gateway_off"] == row["dropped"]
     values = plant.request("read", station="mill", names=["bus0.state"])["values"]
     assert values == {"bus0.state": 8}
     plant.command("gateway", "start", "mill")

@@ -25,7 +25,7 @@ from eap.codec.soe import SoeAttribute
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import MasterDictionary
 from eap.gateway.error_table import Cause
-from eap.gateway.requests import refuse
+from eap.gateway.requests import error_reply
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.od.profiles.master1100 import MasterLive
@@ -146,10 +146,10 @@ class FakeGateway:
         if header.address == 0 and self.is_master_silent:
             return []
         if header.address == self.aborts_for:
-            refusal = refuse(header.type, bytes(body), Cause.NO_SLAVE)
+            refusal = error_reply(header.type, bytes(body), Cause.NO_SLAVE)
             return [_frame(MailboxHeader(0, header.address, type=refusal.type), refusal.body)]
         if header.address and len(body) + MailboxHeader.SIZE > self._sizes.to_slave:
-            refusal = refuse(header.type, bytes(body), Cause.TOO_LONG)
+            refusal = error_reply(header.type, bytes(body), Cause.TOO_LONG)
             return [_frame(MailboxHeader(0, header.address, type=refusal.type), refusal.body)]
         box = self._boxes.get(header.address)
         if box is None or (header.address == 0 and not self.has_master):

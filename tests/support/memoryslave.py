@@ -18,7 +18,7 @@ from eap.gateway.request_tracker import MemoryBudget, MemoryShare
 from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway.sessions import SessionCodec
 from eap.services.slaves.access import LocalSlave
-from eap.services.slaves.bus_client import BusClient, MailboxTurn
+from eap.services.slaves.bus_client import BusClient, MailboxLock
 from tests.support.mailbox import Line, open_line
 
 T = TypeVar("T")
@@ -26,7 +26,7 @@ CLIENT = Endpoint("udp:eap0", "127.0.0.1:1")
 
 
 class MemoryMailbox:
-    """The bus of one slave; stands for BusClient, and for its only MailboxTurn.
+    """The bus of one slave; stands for BusClient, and for its only MailboxLock.
 
     Attributes:
         asked: Requests that the slave got.
@@ -43,7 +43,7 @@ class MemoryMailbox:
         station: int,
         conversation: Conversation[T],
         requester: Hashable,
-        turn_s: float | None = None,
+        lock_s: float | None = None,
     ) -> T:
         try:
             return await drive_async(conversation, self.exchange)
@@ -51,10 +51,10 @@ class MemoryMailbox:
             self.abandon()
             raise
 
-    async def open_turn(
-        self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
-    ) -> MailboxTurn:
-        return cast("MailboxTurn", self)
+    async def lock_mailbox(
+        self, station: int, kind: MailboxType, requester: Hashable, lock_s: float | None = None
+    ) -> MailboxLock:
+        return cast("MailboxLock", self)
 
     async def exchange(self, ask: MailboxRequest) -> MailboxMessage:
         self.asked.append(ask.request)

@@ -44,7 +44,7 @@ def begin_answer(command: int, body: bytes, perform: Perform) -> AmsAnswer | Awa
     if isinstance(request, AmsAnswer):
         return request
     if request.sum_group:
-        return _go_through(Outcomes(request), request.operations, perform)
+        return _perform_all(Outcomes(request), request.operations, perform)
     outcome = perform(request.operations[0])
     if isinstance(outcome, OperationOutcome):
         return _encode(command, outcome)
@@ -65,7 +65,7 @@ def _encode(command: int, outcome: OperationOutcome) -> AmsAnswer:
     return AmsAnswer(encode_outcome(command, outcome), why=outcome.why)
 
 
-async def _go_through(
+async def _perform_all(
     outcomes: Outcomes, operations: Sequence[Operation], perform: Perform
 ) -> AmsAnswer:
     for number, operation in enumerate(operations, start=1):

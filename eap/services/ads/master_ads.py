@@ -48,7 +48,7 @@ from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.slaves.bus_client import BusClient, BusView
 from eap.services.tasks import TaskSet
 
-LOOK_S = 0.05
+POLL_S = 0.05
 """Shortest time between two looks of notifications at the bus: states change slowly."""
 _ERROR = 0x10
 _NO_LINK = 0x01
@@ -58,7 +58,7 @@ _TRIES = 1
 _COUNTING = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.BRD))
 """Every slave adds one to the address of these."""
 
-Look: TypeAlias = Callable[[], Awaitable[None]]
+Refresh: TypeAlias = Callable[[], Awaitable[None]]
 """Brings what notifications show up to date; raises EapError."""
 Send: TypeAlias = Callable[[Endpoint, bytes], object]
 """Sends a packet to a client, and does not wait for that."""
@@ -182,7 +182,7 @@ class MasterAds:
             control=states.control,
         )
         notifications = self._device.notifications
-        self._sender = NotificationSender(notifications, self._look, send, net_id, DEVICE_PORT)
+        self._sender = NotificationSender(notifications, self._refresh, send, net_id, DEVICE_PORT)
 
     async def perform(self, operation: Operation, client: AdsClient) -> OperationOutcome:
         """Do one operation; raise AdsRefusedError or EapError."""
@@ -210,7 +210,7 @@ class MasterAds:
             raise AdsRefusedError(AdsError.SIZE)
         return answer
 
-    async def _look(self) -> None:
+    async def _refresh(self) -> None:
         await self._view.confirm()
         for index in self._watched:
             await self._provider.refresh(index)
@@ -221,17 +221,17 @@ class NotificationSender:
 
     Args:
         table: The notifications.
-        look: Looks at the bus.
+        refresh: Updates the description of the bus.
         send: Reaches the clients.
         net_id: Of the bus port.
         port: AMS port of the master.
     """
 
     def __init__(
-        self, table: NotificationTable, look: Look, send: Send, net_id: NetId, port: int
+        self, table: NotificationTable, refresh: Refresh, send: Send, net_id: NetId, port: int
     ) -> None:
         self._table = table
-        self._look = look
+        self._refresh = refresh
         self._send = send
         self._net_id = net_id
         self._port = port
@@ -245,11 +245,11 @@ class NotificationSender:
 
     async def _run(self) -> None:
         while (due_ns := self._table.next_timeout()) is not None:
-            await asyncio.sleep(max(LOOK_S, (due_ns - monotonic_ns()) / 1e9))
+            await asyncio.sleep(max(POLL_S, (due_ns - monotonic_ns()) / 1e9))
             if self._table.next_timeout() is None:
                 return
             try:
-                await self._look()
+                await self._refresh()
             except EapError as exc:
                 logger.debug("notifications of %s wait: %s", self._net_id, exc)
                 continue
@@ -304,12 +304,14 @@ class RawCommands:
         """Return the commands as they came back, from the replies to :meth:`accesses`."""
         slaves = replies[0].wkc
         return b"".join(
-            _behind_slaves(head, slaves).encode() + reply.data + WorkingCounter(reply.wkc).encode()
+            _returned_header(head, slaves).encode()
+            + reply.data
+            + WorkingCounter(reply.wkc).encode()
             for head, reply in zip(self._heads, replies[1:], strict=True)
         )
 
 
-def _behind_slaves(head: DatagramHeader, slaves: int) -> DatagramHeader:
+def _returned_header(head: DatagramHeader, slaves: int) -> DatagramHeader:
     """Return the header as it is behind all slaves."""
     adp = head.adp + slaves if head.command in _COUNTING else head.adp
     return DatagramHeader(

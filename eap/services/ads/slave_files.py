@@ -31,7 +31,7 @@ ANSWER_S = 3.0
 """How long one request may take."""
 IDLE_S = 30.0
 """A file without requests for so long is closed: other clients may wait for the slave."""
-LEFT_S = 2.0
+ABANDONED_S = 2.0
 """A file without requests for so long gives way to the next one of its owner.
 
 Shorter than ANSWER_S, so that the next one has its turn at its first request; longer than the
@@ -104,7 +104,7 @@ class SlaveFiles:
         item = self._find(station, client, offset)
         self._end_idle(item)
         try:
-            return await self._do(item, offset, group, length, data)
+            return await self._handle(item, offset, group, length, data)
         finally:
             if offset in self._open:
                 self._begin_idle(offset)
@@ -120,8 +120,8 @@ class SlaveFiles:
         is_write: bool,
     ) -> bytes:
         owner = client.net_id
-        self._replace_left(owner, station)
-        self._check_room(owner)
+        self._drop_abandoned(owner, station)
+        self._check_limits(owner)
         text = _text(name)
         stream = access.open_file(text, password, is_write=is_write)
         handle = self._new_handle()
@@ -129,7 +129,7 @@ class SlaveFiles:
         try:
             await _in_time(stream.wait_open(), "")
         except AdsRefusedError:
-            if not stream.has_turn:
+            if not stream.has_lock:
                 self._drop(handle)
                 why = f"another file goes to slave {station} or comes from it"
                 raise AdsRefusedError(AdsError.BUSY, why) from None
@@ -140,7 +140,7 @@ class SlaveFiles:
         self._begin_idle(handle)
         return handle.to_bytes(_HANDLE_SIZE, "little")
 
-    async def _do(
+    async def _handle(
         self, item: _OpenFile, handle: int, group: int, length: int, data: bytes
     ) -> bytes:
         stream = item.stream
@@ -155,7 +155,7 @@ class SlaveFiles:
                     raise AdsRefusedError(AdsError.ACCESS, f"{item.name} is being {done}")
                 if not stream.is_write:
                     return await _in_time(stream.read(length), item.name)
-                if stream.is_whole:
+                if stream.is_finished:
                     raise AdsRefusedError(AdsError.STATE, f"{item.name} is being closed")
                 await _in_time(stream.write(data), item.name)
             case _:
@@ -172,26 +172,26 @@ class SlaveFiles:
                 raise
         self._drop(handle)
 
-    def _replace_left(self, owner: NetId, station: int) -> None:
+    def _drop_abandoned(self, owner: NetId, station: int) -> None:
         """Give up files of *owner* at a slave that it has left open, now or when it is time."""
         loop = asyncio.get_running_loop()
         for handle, item in list(self._open.items()):
             if (item.owner, item.station) != (owner, station) or item.idle_since_s is None:
                 continue
-            left_at_s = item.idle_since_s + LEFT_S
+            left_at_s = item.idle_since_s + ABANDONED_S
             if left_at_s <= loop.time():
-                self._give_up_left(handle, item.idle_since_s)
-            elif item.stream.has_turn:
-                loop.call_at(left_at_s, self._give_up_left, handle, item.idle_since_s)
+                self._drop_if_abandoned(handle, item.idle_since_s)
+            elif item.stream.has_lock:
+                loop.call_at(left_at_s, self._drop_if_abandoned, handle, item.idle_since_s)
 
-    def _give_up_left(self, handle: int, since_s: float) -> None:
+    def _drop_if_abandoned(self, handle: int, since_s: float) -> None:
         """Give a file up if there was no request for it since then."""
         item = self._open.get(handle)
         if item is not None and item.idle_since_s == since_s:
             logger.info("%s given up: %s left it open and opens another one", item.name, item.owner)
             self._drop(handle)
 
-    def _check_room(self, owner: NetId) -> None:
+    def _check_limits(self, owner: NetId) -> None:
         of_client = sum(item.owner == owner for item in self._open.values())
         if of_client >= MAX_OF_CLIENT or len(self._open) >= MAX_OPEN:
             why = f"{len(self._open)} files are open, {of_client} of them by {owner}"

@@ -310,7 +310,7 @@ class EapAds(AdsService):
             return self._change(perform)
         outcome = perform()
         if outcome.result == AdsError.BUSY and not isinstance(operation, Write):
-            return _try_again(perform)
+            return _retry_busy(perform)
         return outcome
 
     async def _change(self, perform: Callable[[], OperationOutcome]) -> OperationOutcome:
@@ -322,7 +322,7 @@ class EapAds(AdsService):
             return OperationOutcome(AdsError.BUSY, why=str(exc))
 
 
-async def _try_again(perform: Callable[[], OperationOutcome]) -> OperationOutcome:
+async def _retry_busy(perform: Callable[[], OperationOutcome]) -> OperationOutcome:
     """Wait for a writer in the middle of writing; one that died there is told."""
     for _ in range(_BUSY_PAUSES):
         await asyncio.sleep(_BUSY_PAUSE_S)

@@ -55,7 +55,7 @@ class ImageVariables:
         self._first_bit = 8 * image.layout.samples.first
 
     @contextmanager
-    def shown(self, sample: bytes) -> Iterator[None]:
+    def reading(self, sample: bytes) -> Iterator[None]:
         """Read from *sample*, of one cycle, for the length of a block."""
         self._sample = sample
         try:
@@ -107,7 +107,7 @@ class StationSymbols(AdsSpace):
         """The image that was the newest when somebody looked last."""
         return self._file.image
 
-    def look(self) -> SymbolSpace:
+    def refresh(self) -> SymbolSpace:
         """Go over to the newest image; return the symbols there, or refuse with NOT_READY."""
         try:
             file = self._station.file
@@ -121,19 +121,19 @@ class StationSymbols(AdsSpace):
 
     def read(self, group: int, offset: int, length: int) -> bytes:
         """Return what the newest symbols say."""
-        return self.look().read(group, offset, length)
+        return self.refresh().read(group, offset, length)
 
     def write(self, group: int, offset: int, data: bytes) -> None:
         """Write to the newest image."""
-        self.look().write(group, offset, data)
+        self.refresh().write(group, offset, data)
 
     def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
         """Return what belongs to a name."""
-        return self.look().read_write(group, offset, length, data)
+        return self.refresh().read_write(group, offset, length, data)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
         """Return what gives a value."""
-        return self.look().watch(group, offset, length)
+        return self.refresh().watch(group, offset, length)
 
     def _table(self) -> SymbolTable:
         variables = map(_variable, self.image.layout.variables)
@@ -153,16 +153,16 @@ def _variable(place: VariableSlot) -> SymbolVariable:
 Send: TypeAlias = Callable[[Endpoint, bytes], object]
 """Sends a packet to a client, and does not wait for that."""
 
-_LOOK_NS = 200_000_000
+_POLL_NS = 200_000_000
 """How often at least services says that it wants samples."""
-_WANTED_NS = 1_000_000_000
+_SAMPLE_LEASE_NS = 1_000_000_000
 """How long the engine goes on for services that are gone."""
-_CYCLE_TAKES_NS = 200_000
+_CYCLE_TIME_NS = 200_000
 """How long after its time a cycle has mostly ended."""
-_SOON_NS = 1_000_000
-_AT_ONCE = 500
+_SHORT_PAUSE_NS = 1_000_000
+_MAX_VALUES = 500
 """Values after which others of this process have a turn."""
-_IDLE_NS = 10_000_000
+_ENGINE_PAUSE_NS = 10_000_000
 """How soon to look again while the engine does not run."""
 
 logger = logging.getLogger(__name__)
@@ -188,7 +188,7 @@ class NotificationPump:
         self._devices: list[_Device] = []
         self._wake = asyncio.Event()
         self._samples: ImageSamples | None = None
-        self._told = 0
+        self._last_cycle = 0
         """The last cycle that was looked at."""
 
     def add(self, table: NotificationTable, net_id: NetId, port: int) -> None:
@@ -201,10 +201,10 @@ class NotificationPump:
         loop = asyncio.get_running_loop()
         while True:
             try:
-                delay_ns = self.look(monotonic_ns(), time_ns())
+                delay_ns = self.advance(monotonic_ns(), time_ns())
             except Exception:
                 logger.exception("notifications of station %s", self._symbols.image.layout.station)
-                delay_ns = _LOOK_NS
+                delay_ns = _POLL_NS
             timer = None
             if delay_ns is not None:
                 timer = loop.call_later(delay_ns / 1e9, self._wake.set)
@@ -213,7 +213,7 @@ class NotificationPump:
             if timer is not None:
                 timer.cancel()
 
-    def look(self, now_ns: int, unix_ns: int) -> int | None:
+    def advance(self, now_ns: int, unix_ns: int) -> int | None:
         """Tell what is due; return in how many nanoseconds to look again, None if not at all.
 
         Args:
@@ -224,26 +224,26 @@ class NotificationPump:
             self._samples = None
             return None
         try:
-            self._symbols.look()
+            self._symbols.refresh()
         except AdsRefusedError as exc:
             logger.debug("notifications wait: %s", exc)
-            return _LOOK_NS
+            return _POLL_NS
         image = self._symbols.image
         if self._samples is None:
-            self._told = image.words[StationWord.CYCLE]
+            self._last_cycle = image.words[StationWord.CYCLE]
         if self._samples is None or self._samples.image is not image:
             self._samples = ImageSamples(image)
-        is_done = self._tell(self._samples, unix_ns - now_ns)
-        self._samples.want(2 + _WANTED_NS // (1000 * image.layout.cycle_us))
-        return self._delay_ns(now_ns) if is_done else _SOON_NS
+        is_done = self._send_due(self._samples, unix_ns - now_ns)
+        self._samples.want(2 + _SAMPLE_LEASE_NS // (1000 * image.layout.cycle_us))
+        return self._delay_ns(now_ns) if is_done else _SHORT_PAUSE_NS
 
-    def _tell(self, samples: ImageSamples, unix_at_0_ns: int) -> bool:
+    def _send_due(self, samples: ImageSamples, unix_at_0_ns: int) -> bool:
         """Go through the cycles since the last look; return whether that was all of them."""
-        room = _AT_ONCE
-        for cycle in samples.since(self._told):
-            if room <= 0:
+        budget = _MAX_VALUES
+        for cycle in samples.since(self._last_cycle):
+            if budget <= 0:
                 return False
-            self._told = cycle
+            self._last_cycle = cycle
             at_ns, due_ns = samples.ran_at_ns(cycle), self._due_ns()
             if due_ns is None:
                 return True
@@ -251,11 +251,11 @@ class NotificationPump:
                 continue
             sample = samples.read(cycle)
             if sample is not None:
-                with self._symbols.store.shown(sample):
-                    room -= self._tell_of_cycle(at_ns, to_filetime(at_ns + unix_at_0_ns))
+                with self._symbols.store.reading(sample):
+                    budget -= self._send_cycle(at_ns, to_filetime(at_ns + unix_at_0_ns))
         return True
 
-    def _tell_of_cycle(self, at_ns: int, time: int) -> int:
+    def _send_cycle(self, at_ns: int, time: int) -> int:
         """Tell of one cycle; return how many values were looked at, at most."""
         looked_at = 0
         for table, net_id, port in self._devices:
@@ -279,6 +279,6 @@ class NotificationPump:
         cycle_ns = 1000 * image.layout.cycle_us
         ran_ns = image.words[StationWord.CYCLE_AT_NS]
         cycles = max(1, -(-(due_ns - ran_ns) // cycle_ns))
-        delay_ns = ran_ns + cycles * cycle_ns + _CYCLE_TAKES_NS - now_ns
-        soon_ns = _SOON_NS if delay_ns > -cycle_ns - _IDLE_NS else _IDLE_NS
-        return min(max(delay_ns, soon_ns), _LOOK_NS)
+        delay_ns = ran_ns + cycles * cycle_ns + _CYCLE_TIME_NS - now_ns
+        soon_ns = _SHORT_PAUSE_NS if delay_ns > -cycle_ns - _ENGINE_PAUSE_NS else _ENGINE_PAUSE_NS
+        return min(max(delay_ns, soon_ns), _POLL_NS)

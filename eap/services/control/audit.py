@@ -139,7 +139,7 @@ _MAX_CLIENTS = 1024
 """More than can be new at once: invented addresses do not make known clients forgotten."""
 _PLAIN = 8
 """Octets of a value that is written as it is; of longer ones there is a digest."""
-_TELL_AFTER_S = 1.0
+_REPORT_S = 1.0
 _COMPLETE = 0x100
 
 _CONTROL_RATES = SourceRates(
@@ -196,8 +196,8 @@ class Audit:
         self._now = now
         self._limiters: dict[tuple[str, str], SourceRateLimiter] = {}
         self._skipped: dict[_Client, int] = {}
-        self._untold = 0
-        self._untold_since = 0.0
+        self._unreported = 0
+        self._unreported_since = 0.0
 
     @property
     def path(self) -> Path:
@@ -208,12 +208,12 @@ class Audit:
         """Write what was left out and what was lost, until cancelled."""
         try:
             while True:
-                await asyncio.sleep(_TELL_AFTER_S)
-                self.tell_skipped()
-                self.tell_lost()
+                await asyncio.sleep(_REPORT_S)
+                self.write_skipped()
+                self.write_lost()
         finally:
-            self.tell_skipped()
-            self.tell_lost()
+            self.write_skipped()
+            self.write_lost()
 
     def report(self) -> dict[str, Any]:
         """Return what ``status`` says."""
@@ -222,13 +222,13 @@ class Audit:
     def begin(self, station: str, entry: AuditEntry) -> str:
         """Write down what a station is going to change; return why that cannot be done."""
         client = station, entry.endpoint.transport, host_of(entry.endpoint)
-        if not all(self._take(client) for _ in entry.operations):
+        if not all(self._allow(client) for _ in entry.operations):
             return TOO_MANY
         head = self._head(station, entry)
-        lines = [head | _begins(each) for each in entry.operations]
-        return "" if self._append(lines, are_counted=False) else self._why_required()
+        lines = [head | _intent_fields(each) for each in entry.operations]
+        return "" if self._append(lines, are_counted=False) else self._refusal_text()
 
-    def begin_request(self, who: str, station: str, words: dict[str, Any]) -> str:
+    def begin_request(self, who: str, station: str, fields: dict[str, Any]) -> str:
         """Write down what a client of the control socket changes, or is refused, if required.
 
         Returns:
@@ -237,15 +237,15 @@ class Audit:
         if not self.is_required:
             return ""
         why = TOO_MANY
-        if self._take((station, CONTROL, who)):
-            line = self._request_head(who, station) | words | {"begins": True}
+        if self._allow((station, CONTROL, who)):
+            line = self._request_head(who, station) | fields | {"begins": True}
             if self._append([line], are_counted=False):
                 return ""
-            why = self._why_required()
-        self._write_limited(who, station, words | {"error": why})
+            why = self._refusal_text()
+        self._write_limited(who, station, fields | {"error": why})
         return why
 
-    def _why_required(self) -> str:
+    def _refusal_text(self) -> str:
         return f"the audit is required and cannot be written: {self.lost.error}"
 
     def write(self, station: str, entry: AuditEntry) -> None:
@@ -255,34 +255,34 @@ class Audit:
         lines = []
         for each in entry.operations:
             has_begun = self.is_required and each.decision.is_allowed
-            if has_begun or self._take(client):
-                lines.append(head | _words(each))
+            if has_begun or self._allow(client):
+                lines.append(head | _result_fields(each))
             else:
                 self._skip(client)
         if lines:
             self._append(lines)
 
-    def write_request(self, who: str, station: str, words: dict[str, Any]) -> None:
+    def write_request(self, who: str, station: str, fields: dict[str, Any]) -> None:
         """Write down what a client of the control socket did, or was refused.
 
         If that is required, :meth:`begin_request` has limited it already.
         """
         if self.is_required:
-            self._append([self._request_head(who, station) | words])
+            self._append([self._request_head(who, station) | fields])
         else:
-            self._write_limited(who, station, words)
+            self._write_limited(who, station, fields)
 
-    def _write_limited(self, who: str, station: str, words: dict[str, Any]) -> None:
+    def _write_limited(self, who: str, station: str, fields: dict[str, Any]) -> None:
         client = station, CONTROL, who
-        if self._take(client):
-            self._append([self._request_head(who, station) | words])
+        if self._allow(client):
+            self._append([self._request_head(who, station) | fields])
         else:
             self._skip(client)
 
     def _request_head(self, who: str, station: str) -> dict[str, Any]:
         return {"time": self._time(), "station": station, "transport": CONTROL, "from": who}
 
-    def tell_skipped(self) -> None:
+    def write_skipped(self) -> None:
         """Write how many lines were left out, for each client that had some."""
         skipped, self._skipped = self._skipped, {}
         lines = [
@@ -298,7 +298,7 @@ class Audit:
         if lines:
             self._append(lines)
 
-    def _take(self, client: _Client) -> bool:
+    def _allow(self, client: _Client) -> bool:
         """Take one line for a client; return whether the rates allow it."""
         station, transport, who = client
         now = self._clock()
@@ -314,7 +314,7 @@ class Audit:
     def _skip(self, client: _Client) -> None:
         """Count a line that is left out."""
         if client not in self._skipped and len(self._skipped) >= _MAX_CLIENTS:
-            self.tell_skipped()
+            self.write_skipped()
         self._skipped[client] = self._skipped.get(client, 0) + 1
 
     def _head(self, station: str, entry: AuditEntry) -> dict[str, Any]:
@@ -333,9 +333,9 @@ class Audit:
     def _time(self) -> str:
         return _text_of(self._now())
 
-    def tell_lost(self) -> None:
+    def write_lost(self) -> None:
         """Write how many lines were lost, if there are such, and the file can be written again."""
-        if self._untold:
+        if self._unreported:
             self._append([])
 
     def _append(self, lines: list[dict[str, Any]], *, are_counted: bool = True) -> bool:
@@ -346,16 +346,18 @@ class Audit:
             are_counted: Whether they are lost when they cannot be written: a change has been made,
                 or refused, that is not recorded.
         """
-        head = [self._lost_line()] if self._untold else []
+        head = [self._lost_line()] if self._unreported else []
         data = b"".join(msgspec.json.encode(line) + b"\n" for line in (*head, *lines))
         try:
             self._file.append(data)
         except OSError as exc:
             self._lose(len(lines) if are_counted else 0, exc.strerror or str(exc))
             return False
-        if self._untold:
-            logger.warning("audit %s: written again; %d lines are lost", self.path, self._untold)
-        self._untold = 0
+        if self._unreported:
+            logger.warning(
+                "audit %s: written again; %d lines are lost", self.path, self._unreported
+            )
+        self._unreported = 0
         self.lost = self.lost._replace(error="")
         return True
 
@@ -366,15 +368,15 @@ class Audit:
         self.lost = self.lost._replace(error=error)
         if count:
             now = self._now()
-            self._untold_since = self._untold_since if self._untold else now
-            self._untold += count
+            self._unreported_since = self._unreported_since if self._unreported else now
+            self._unreported += count
             self.lost = Lost(self.lost.lines + count, self.lost.since or now, now, error)
 
     def _lost_line(self) -> dict[str, Any]:
         return {
             "time": self._time(),
-            "lost": self._untold,
-            "since": _text_of(self._untold_since),
+            "lost": self._unreported,
+            "since": _text_of(self._unreported_since),
             "until": _text_of(self.lost.until or 0.0),
             "error": self.lost.error,
         }
@@ -384,15 +386,15 @@ def _text_of(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds")
 
 
-def _begins(each: AuditedOperation) -> dict[str, Any]:
+def _intent_fields(each: AuditedOperation) -> dict[str, Any]:
     decision = each.decision
     said = {"service": decision.service, "allowed": True, "why": decision.why, "begins": True}
-    return dict(operation_words(each.operation)) | said
+    return dict(operation_fields(each.operation)) | said
 
 
-def _words(each: AuditedOperation) -> dict[str, Any]:
+def _result_fields(each: AuditedOperation) -> dict[str, Any]:
     decision, result = each.decision, each.result
-    return dict(operation_words(each.operation)) | {
+    return dict(operation_fields(each.operation)) | {
         "service": decision.service,
         "allowed": decision.is_allowed,
         "why": decision.why,
@@ -401,7 +403,7 @@ def _words(each: AuditedOperation) -> dict[str, Any]:
     }
 
 
-def operation_words(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]]:
+def operation_fields(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]]:
     """Yield what was to be done."""
     yield "operation", type(operation).__name__
     if isinstance(operation, AddRoute):

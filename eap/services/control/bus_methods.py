@@ -24,7 +24,7 @@ from eap.errors import ControlError, EapError
 from eap.pd.spec import PortKind, StationSpec
 from eap.runtime.engine_messages import BusReport
 from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
-from eap.services.slaves.bus_client import BusClient, MailboxTurn
+from eap.services.slaves.bus_client import BusClient, MailboxLock
 from eap.services.slaves.segment_link import SegmentLink
 from eap.suggest import suggest
 
@@ -87,11 +87,11 @@ class Buses:
             raise ControlError(reason, code=ErrorCode.REFUSED) from None
 
 
-class _Held:
+class _OpenMailbox:
     """A conversation that a connection has open, with its turn."""
 
     def __init__(
-        self, turn: MailboxTurn, kind: MailboxType, opened: records.BusOpenParameters
+        self, turn: MailboxLock, kind: MailboxType, opened: records.BusOpenParameters
     ) -> None:
         self.turn = turn
         self.kind = kind
@@ -104,7 +104,7 @@ class BusConnection:
 
     def __init__(self, buses: Buses) -> None:
         self._buses = buses
-        self._held: dict[int, _Held] = {}
+        self._open_mailboxes: dict[int, _OpenMailbox] = {}
         self._last = 0
         self._methods = dict(
             (
@@ -132,12 +132,12 @@ class BusConnection:
 
     def opened(self, number: int) -> records.BusOpenParameters | None:
         """Return how a conversation was opened, None if it is not open."""
-        held = self._held.get(number)
+        held = self._open_mailboxes.get(number)
         return held.opened if held is not None else None
 
     def close(self) -> None:
         """End what is open."""
-        for number in list(self._held):
+        for number in list(self._open_mailboxes):
             self._abandon(number)
 
     async def _describe(self, wanted: records.BusDescribeParameters) -> BusReport:
@@ -146,18 +146,18 @@ class BusConnection:
 
     async def _open(self, wanted: records.BusOpenParameters) -> records.OpenConversation:
         client = self._buses.find(wanted)
-        if len(self._held) >= records.MAX_CONVERSATIONS:
+        if len(self._open_mailboxes) >= records.MAX_CONVERSATIONS:
             reason = f"this connection has {records.MAX_CONVERSATIONS} conversations open"
             raise ControlError(f"{reason}, which is the limit", code=ErrorCode.BUSY)
         kind = records.kind_of(wanted.protocol)
         try:
             async with asyncio.timeout(records.TURN_S):
-                turn = await client.open_turn(wanted.slave, kind, id(self))
+                turn = await client.lock_mailbox(wanted.slave, kind, id(self))
         except TimeoutError:
             reason = f"slave {wanted.slave}: others talk {kind.name} with it all the while"
             raise ControlError(reason, code=ErrorCode.BUSY) from None
         self._last += 1
-        self._held[self._last] = _Held(turn, kind, wanted)
+        self._open_mailboxes[self._last] = _OpenMailbox(turn, kind, wanted)
         self._begin_idle(self._last)
         return records.OpenConversation(self._last)
 
@@ -198,9 +198,9 @@ class BusConnection:
         await self._buses.find(wanted).forget()
         return records.Done()
 
-    def _of(self, number: int) -> _Held:
+    def _of(self, number: int) -> _OpenMailbox:
         try:
-            return self._held[number]
+            return self._open_mailboxes[number]
         except KeyError:
             raise _unknown(
                 f"no conversation {number} is open on this connection; one in which nothing is"
@@ -209,17 +209,17 @@ class BusConnection:
 
     def _begin_idle(self, number: int) -> None:
         loop = asyncio.get_running_loop()
-        self._held[number].idle = loop.call_later(records.IDLE_S, self._abandon, number)
+        self._open_mailboxes[number].idle = loop.call_later(records.IDLE_S, self._abandon, number)
 
-    def _end_idle(self, held: _Held) -> None:
+    def _end_idle(self, held: _OpenMailbox) -> None:
         if held.idle is not None:
             held.idle.cancel()
 
     def _abandon(self, number: int) -> None:
         self._drop(number).turn.abandon()
 
-    def _drop(self, number: int) -> _Held:
-        held = self._held.pop(number)
+    def _drop(self, number: int) -> _OpenMailbox:
+        held = self._open_mailboxes.pop(number)
         self._end_idle(held)
         return held
 
@@ -327,7 +327,7 @@ def gateway_row(owner: PortName, gateway: MailboxGateway, served: list[str]) -> 
         port=owner.port,
         served=served,
         state="running" if gateway.is_open else "stopped",
-        turned_away=gateway.turned_away,
+        dropped=gateway.dropped,
         settings=records.GatewaySettings(
             round(settings.answer_s * 1000),
             settings.is_silent,

@@ -51,14 +51,14 @@ from eap.gateway.requests import operation_of
 from eap.net.connections import Activity, ListenerLimits
 from eap.od.abort import SdoAbortError
 from eap.runtime.bus_errors import to_record
-from eap.services.control.audit import operation_words
+from eap.services.control.audit import operation_fields
 from eap.services.control.bus_methods import BusConnection, Buses
 from eap.services.control.methods import Methods, Watch
 from eap.services.transports.accepting import Listeners, ListeningSocket, TaskConnection, process_of
 
-TellChange: TypeAlias = Callable[[str, str, dict[str, Any]], None]
+RecordChange: TypeAlias = Callable[[str, str, dict[str, Any]], None]
 """Called with who it was, station, and what is told of the change."""
-BeginChange: TypeAlias = Callable[[str, str, dict[str, Any]], str]
+AnnounceChange: TypeAlias = Callable[[str, str, dict[str, Any]], str]
 """Called likewise before a change; returns why it may not be done, empty if it may."""
 _CHANGES = frozenset(
     (
@@ -68,13 +68,13 @@ _CHANGES = frozenset(
         *("routing_apply", "routing_rollback"),
     )
 )
-_UNTOLD = frozenset(("password", "spec", "xml", "routing"))
+_HIDDEN = frozenset(("password", "spec", "xml", "routing"))
 """Parameters that are secret, or as long as a plant file."""
-_READING = frozenset((1, 4, 7))
+_READ_COMMANDS = frozenset((1, 4, 7))
 """Datagrams that only read: APRD, FPRD, BRD (ETG.1000.4)."""
 _EEPROM_OWNER, _EEPROM_CONTROL, _EEPROM_READ = 0x0500, 0x0502, "0001"
 """Registers, and how the command begins that reads (ETG.1000.4)."""
-_MAX_WORDS = 200
+_MAX_TEXT = 200
 
 
 def peer_of(connection: socket.socket) -> str:
@@ -95,26 +95,26 @@ def change_of(
     params = request.params
     if request.method == "bus_ask":
         number = params.get("conversation")
-        talk = opened(number) if isinstance(number, int) else None
-        return None if talk is None else _said(talk, params)
-    if request.method not in _CHANGES or (request.method == "bus_transfer" and _only_reads(params)):
+        conversation = opened(number) if isinstance(number, int) else None
+        return None if conversation is None else _conversation_change(conversation, params)
+    if request.method not in _CHANGES or (request.method == "bus_transfer" and _are_reads(params)):
         return None
-    told = {key: _shortened(value) for key, value in params.items() if key not in _UNTOLD}
+    told = {key: _shortened(value) for key, value in params.items() if key not in _HIDDEN}
     station = str(told.pop("station", "") or str(told.get("target", "")).partition("/")[0])
     return station, {"operation": request.method, "asked": told}
 
 
-def refusal_in(result: Any, talk: BusOpenParameters | None = None) -> str:
+def error_in_result(result: Any, conversation: BusOpenParameters | None = None) -> str:
     """Return why a result says that it was not done, empty if it was.
 
     Args:
         result: Of a request.
-        talk: How the conversation was opened that it is an answer of, if it is one.
+        conversation: How the conversation was opened that it is an answer of, if it is one.
     """
-    if talk is not None and isinstance(result, MailboxData):
+    if conversation is not None and isinstance(result, MailboxData):
         from eap.services.gateway.admission import error_in  # plants without buses have none
 
-        kind, answer = kind_of(talk.protocol), bytes.fromhex(result.data)
+        kind, answer = kind_of(conversation.protocol), bytes.fromhex(result.data)
         code = error_in(kind, answer)
         if code and kind is MailboxType.COE:
             head = SdoHeader.decode(answer, CoeHeader.SIZE)
@@ -125,32 +125,34 @@ def refusal_in(result: Any, talk: BusOpenParameters | None = None) -> str:
     return "; ".join(result.refused) if isinstance(result, ApplyAnswer) else ""
 
 
-def _said(talk: BusOpenParameters, params: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
+def _conversation_change(
+    conversation: BusOpenParameters, params: Mapping[str, Any]
+) -> tuple[str, dict[str, Any]] | None:
     try:
         body = bytes.fromhex(params["request"])
     except (KeyError, TypeError, ValueError):
         return None
-    operation = operation_of(kind_of(talk.protocol), body)
-    if operation is None or params.get("listen") or _is_reading(operation):
+    operation = operation_of(kind_of(conversation.protocol), body)
+    if operation is None or params.get("listen") or _is_read(operation):
         return None
-    name = f"{talk.station}/{talk.port}/{talk.slave}"
-    return talk.station, {"name": name} | dict(operation_words(operation))
+    name = f"{conversation.station}/{conversation.port}/{conversation.slave}"
+    return conversation.station, {"name": name} | dict(operation_fields(operation))
 
 
-def _is_reading(operation: Operation) -> bool:
+def _is_read(operation: Operation) -> bool:
     is_lookup = isinstance(operation, ReadWrite) and operation.group == IndexGroup.FOE_OPEN_READ
     return is_lookup or isinstance(operation, Read)
 
 
-def _only_reads(params: Mapping[str, Any]) -> bool:
+def _are_reads(params: Mapping[str, Any]) -> bool:
     rows = params.get("datagrams")
-    return not isinstance(rows, list) or all(map(_is_reading_row, rows))
+    return not isinstance(rows, list) or all(map(_is_read_row, rows))
 
 
-def _is_reading_row(row: Any) -> bool:
+def _is_read_row(row: Any) -> bool:
     """Say whether a datagram changes nothing; an EEPROM is read by writing a command."""
     match row:
-        case [command, *_] if command in _READING:
+        case [command, *_] if command in _READ_COMMANDS:
             return True
         case [_, _, place, data, *_]:
             is_command = place == _EEPROM_CONTROL and str(data).startswith(_EEPROM_READ)
@@ -160,7 +162,7 @@ def _is_reading_row(row: Any) -> bool:
 
 def _shortened(value: Any) -> Any:
     text = str(value)
-    return value if len(text) <= _MAX_WORDS else f"{text[:_MAX_WORDS]}…"
+    return value if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
 
 
 LIMITS = ListenerLimits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
@@ -175,15 +177,15 @@ class ControlServer:
         self,
         methods: Methods,
         buses: Buses,
-        tell: TellChange | None = None,
+        record: RecordChange | None = None,
         *,
-        begin: BeginChange | None = None,
+        announce: AnnounceChange | None = None,
         slow_reader_s: float = SLOW_READER_S,
     ) -> None:
         self._methods = methods
         self._buses = buses
-        self._tell = tell
-        self._begin = begin
+        self._record = record
+        self._announce = announce
         self._slow_reader_s = slow_reader_s
         self._listening: ListeningSocket[ControlConnection] | None = None
 
@@ -218,9 +220,9 @@ class ControlServer:
         bus = BusConnection(self._buses)
         try:
             peer = peer_of(sock)
-            tell = self._tell and partial(self._tell, peer)
-            begin = self._begin and partial(self._begin, peer)
-            client = _Client(self._methods, bus, writer, self._slow_reader_s, tell, begin)
+            record = self._record and partial(self._record, peer)
+            announce = self._announce and partial(self._announce, peer)
+            client = _Client(self._methods, bus, writer, self._slow_reader_s, record, announce)
             connection.subscriptions = client.subscriptions
             await client.run(reader)
         except* (OSError, TimeoutError) as group:
@@ -314,12 +316,12 @@ class _Client:
         bus: BusConnection,
         writer: asyncio.StreamWriter,
         slow_reader_s: float,
-        tell: Callable[[str, dict[str, Any]], None] | None,
-        begin: Callable[[str, dict[str, Any]], str] | None,
+        record: Callable[[str, dict[str, Any]], None] | None,
+        announce: Callable[[str, dict[str, Any]], str] | None,
     ) -> None:
         self._methods = methods
-        self._begin = begin
-        self._tell = tell
+        self._announce = announce
+        self._record = record
         self._bus = bus
         self._writer = writer
         self._slow_reader_s = slow_reader_s
@@ -360,7 +362,7 @@ class _Client:
                 await self._subscribe(number, request.params, group)
                 return
             async with reader.while_there():
-                result = await self._call_and_tell(request)
+                result = await self._call_audited(request)
         except TimeoutError:
             raise
         except ControlError as exc:
@@ -382,26 +384,26 @@ class _Client:
         else:
             await self.send(encode_result(number, result))
 
-    async def _call_and_tell(self, request: Request) -> Any:
+    async def _call_audited(self, request: Request) -> Any:
         """Have a change written down when it is known how it came out, before it is answered."""
-        change = None if self._tell is None else change_of(request, self._bus.opened)
-        if change is None or self._tell is None:
+        change = None if self._record is None else change_of(request, self._bus.opened)
+        if change is None or self._record is None:
             return await self._call(request)
-        station, words = change
-        talk = None
+        station, fields = change
+        conversation = None
         if request.method == "bus_ask":
-            talk = self._bus.opened(request.params["conversation"])
-        if self._begin is not None and (why := self._begin(station, words)):
+            conversation = self._bus.opened(request.params["conversation"])
+        if self._announce is not None and (why := self._announce(station, fields)):
             raise ControlError(why, code=ErrorCode.REFUSED)
         error: str | None = None  # as long as nobody knows
         try:
             result = await self._call(request)
-            error = refusal_in(result, talk)
+            error = error_in_result(result, conversation)
         except EapError as exc:
             error = str(exc)
             raise
         finally:
-            self._tell(station, words | {"error": error})
+            self._record(station, fields | {"error": error})
         return result
 
     async def _call(self, request: Request) -> Any:

@@ -62,7 +62,7 @@ class Methods:
                     control.VARIABLES.served_by(self._variables),
                     control.READ.served_by(self._read),
                     control.WRITE.served_by(self._write),
-                    control.STOP.served_by(self._ask_to_stop),
+                    control.STOP.served_by(self._stop_appliance),
                 )
             ),
             **(more or {}),
@@ -127,7 +127,7 @@ class Methods:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
         return control.Written(len(values))
 
-    def _ask_to_stop(self, wanted: control.NoParameters) -> control.Stopping:
+    def _stop_appliance(self, wanted: control.NoParameters) -> control.Stopping:
         del wanted
         self._stop()
         return control.Stopping(stopping=True)

@@ -338,7 +338,7 @@ class MasterView:
         with suppress(EapError, TimeoutError):
             async with asyncio.timeout(FACTS_ANSWER_S):
                 return await self._bus.converse(
-                    slave.station, _ask_facts(), requester="dictionary of the master"
+                    slave.station, _query_facts(), requester="dictionary of the master"
                 )
         return SlaveFacts()
 
@@ -485,7 +485,7 @@ def _register_age_s(index: int) -> float:
     return LINKS_FRESH_S if index in _OF_CONFIGURED else FRESH_S
 
 
-def _ask_facts() -> Conversation[SlaveFacts]:
+def _query_facts() -> Conversation[SlaveFacts]:
     device_type = yield from coe_client.upload(_DEVICE_TYPE, 0)
     try:
         yield from coe_client.upload(_HISTORY, 0)

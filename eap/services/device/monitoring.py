@@ -156,7 +156,7 @@ def key_of(target: Destination) -> tuple[str, int]:
     return target.host, target.port or EAP_PORT
 
 
-LOOK_NS = 200_000_000
+POLL_NS = 200_000_000
 """How often at least it is looked whether frames go elsewhere; answers wait as long at most."""
 
 
@@ -208,7 +208,7 @@ class SubscriberWatch:
         self._images: dict[str, Image] = {}
         self._rows: dict[str, _Row] = {}
         self._monitor = SubscriberMonitor(0)
-        self._asked: dict[tuple[ArpProber, IPv4Address], list[str]] = {}
+        self._pending: dict[tuple[ArpProber, IPv4Address], list[str]] = {}
 
     async def run(self) -> None:
         """Go on until cancelled."""
@@ -237,17 +237,17 @@ class SubscriberWatch:
 
     def step(self, now_ns: int) -> int:
         """Do what there is to do; return when the next step is due."""
-        self._follow(now_ns)
-        self._hear(now_ns)
+        self._follow_frames(now_ns)
+        self._receive_replies(now_ns)
         for name in self._monitor.probes_to_send(now_ns):
-            evidence = self._ask(self._rows[name])
+            evidence = self._probe(self._rows[name])
             if evidence is not None:
                 self._monitor.receive_evidence(name, evidence, now_ns)
-        self._tell()
+        self._publish()
         due_ns = self._monitor.next_timeout()
-        return now_ns + LOOK_NS if due_ns is None else min(due_ns, now_ns + LOOK_NS)
+        return now_ns + POLL_NS if due_ns is None else min(due_ns, now_ns + POLL_NS)
 
-    def _follow(self, now_ns: int) -> None:
+    def _follow_frames(self, now_ns: int) -> None:
         """Look which frames are monitored and where they go."""
         changed = False
         for station, holder in self._holders.items():
@@ -264,7 +264,7 @@ class SubscriberWatch:
                 self._monitor.add(row.target, now_ns)
                 changed = True
         if changed:
-            self._listen()
+            self._watch_targets()
 
     def _replace(self, station: str, image: Image) -> None:
         """Follow the frames of *image*; what is known of those that stay as they were is kept."""
@@ -280,14 +280,14 @@ class SubscriberWatch:
         for name in before.keys() - self._rows.keys():
             self._monitor.remove(name)
 
-    def _listen(self) -> None:
+    def _watch_targets(self) -> None:
         """Have each way listen to what is said of its targets."""
-        self._asked = {}
+        self._pending = {}
         targets: dict[UdpSubscriberProbe, list[Destination]] = {}
         for row in self._rows.values():
             if hop_prober := self._hop_prober(row):
                 key = hop_prober, IPv4Address(row.place.monitor_ip)
-                self._asked.setdefault(key, []).append(row.name)
+                self._pending.setdefault(key, []).append(row.name)
             endpoint = self._endpoints.udp.get(row.port)
             if endpoint is not None and (target := _ip_of(row)) is not None:
                 targets.setdefault(endpoint, []).append(target)
@@ -295,14 +295,14 @@ class SubscriberWatch:
             endpoint.watch(targets.get(endpoint, ()))
         for hop_prober in set(self._endpoints.arp.values()):
             try:
-                hop_prober.watch(address for each, address in self._asked if each is hop_prober)
+                hop_prober.watch(address for each, address in self._pending if each is hop_prober)
             except EnvironmentalError as exc:
                 logger.warning("%s", exc)
 
-    def _hear(self, now_ns: int) -> None:
+    def _receive_replies(self, now_ns: int) -> None:
         for hop_prober in set(self._endpoints.arp.values()):
             for heard in hop_prober.drain():
-                for name in self._asked.get((hop_prober, heard.address), ()):
+                for name in self._pending.get((hop_prober, heard.address), ()):
                     if heard.is_claim:
                         self._monitor.receive_claim(name, heard.mac, now_ns)
                     else:
@@ -318,7 +318,7 @@ class SubscriberWatch:
     def _rows_by_udp(self) -> Iterator[_Row]:
         return (row for row in self._rows.values() if row.port in self._endpoints.udp)
 
-    def _ask(self, row: _Row) -> ProbeResult | None:
+    def _probe(self, row: _Row) -> ProbeResult | None:
         """Ask for the subscriber of *row*; return what is known at once, None if it may answer."""
         if hop_prober := self._hop_prober(row):
             return (
@@ -338,9 +338,9 @@ class SubscriberWatch:
             return None
         return self._endpoints.arp.get(row.port)
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         while event := self._monitor.next_event():
-            _log(event, self._rows[event.name])
+            _log_change(event, self._rows[event.name])
         for row in self._rows.values():
             row.words[row.place.words + FrameWord.PRESENCE] = self._monitor.presence(row.name)
 
@@ -353,7 +353,7 @@ def _ip_of(row: _Row) -> Destination | None:
     return target
 
 
-def _log(event: PresenceChanged, row: _Row) -> None:
+def _log_change(event: PresenceChanged, row: _Row) -> None:
     level = logging.WARNING if event.new is SubscriberPresence.MISSING else logging.INFO
     other = ""
     if event.new is SubscriberPresence.MISSING and event.answered_by not in {None, row.target.mac}:

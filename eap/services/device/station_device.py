@@ -73,7 +73,9 @@ class StationDevice:
         self._requested: int | None = None
         self._changed: StationSpec | None = None
         self._checked: StationSpec | DeviceFault = keeper.spec
-        self._machine = EapStateMachine(self._recall, _Recalled(self._recall))
+        self._machine = EapStateMachine(
+            self._confirmed_spec, _ConfirmedActions(self._confirmed_spec)
+        )
         for dictionary in self.dictionaries.values():
             self._machine.serve(dictionary)
             dictionary.on_request = self._note_request
@@ -94,10 +96,10 @@ class StationDevice:
 
     def findings(self) -> list[dict[str, Any]]:
         """Return as findings of ``status`` that what runs is not what a start would bring back."""
-        unkept = self._keeper.unkept
-        if unkept is None:
+        unsaved = self._keeper.unsaved
+        if unsaved is None:
             return []
-        reason, _, remedy = unkept.reason.removeprefix(f"station {self.name}: ").rpartition("; ")
+        reason, _, remedy = unsaved.reason.removeprefix(f"station {self.name}: ").rpartition("; ")
         state = self._keeper.state.name
         return [
             {
@@ -105,7 +107,7 @@ class StationDevice:
                 "where": self.name,
                 "what": f"{reason}; after a start it is as it was before",
                 "advice": f"{remedy}, then 'eapctl state {self.name} {state}'",
-                "since": unkept.since,
+                "since": unsaved.since,
             }
         ]
 
@@ -118,9 +120,9 @@ class StationDevice:
         """Return the rights with which clients reach the dictionaries."""
         return self._machine.od_state or OdState.PREOP
 
-    async def tell_again(self) -> None:
+    async def resend(self) -> None:
         """Tell the engine what it is to run, which it may have missed."""
-        await self._jobs.run(self._keeper.tell_again)
+        await self._jobs.run(self._keeper.resend)
 
     def upload(self, port: str, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Return an entry, or a whole object from *subindex* on; raise SdoAbortError."""
@@ -153,7 +155,7 @@ class StationDevice:
 
     async def request_state(self, wanted: int) -> StateResult:
         """Go to the state numbered *wanted* as far as possible."""
-        return await self._jobs.run(lambda: self._go(wanted))
+        return await self._jobs.run(lambda: self._go_to(wanted))
 
     async def plan(self, spec: StationSpec) -> Plan:
         """Return what it takes to run *spec*."""
@@ -179,7 +181,7 @@ class StationDevice:
         def plan() -> Plan:
             return make_rollback(self.spec, self.dictionaries, self._keeper.previous, spec)
 
-        return await self._jobs.run(lambda: self._change(plan, self._keeper.take_back))
+        return await self._jobs.run(lambda: self._change(plan, self._keeper.roll_back))
 
     def _plan(self, spec: StationSpec) -> Plan:
         return make_plan(self.spec, self.dictionaries, spec, {})
@@ -210,7 +212,7 @@ class StationDevice:
         result = write()
         self._is_written = self._is_written or self._requested is None
         if self._requested is not None:
-            fault = (await self._go(self._requested)).fault
+            fault = (await self._go_to(self._requested)).fault
             if fault is not None:
                 raise SdoAbortError(AbortCode.DEVICE_STATE, _CONTROL, 1, fault.text)
         elif self._changed is not None:
@@ -221,17 +223,17 @@ class StationDevice:
                 raise SdoAbortError(AbortCode.PARAMETER, exc.index, exc.subindex, exc.text) from exc
         return result
 
-    async def _go(self, wanted: int) -> StateResult:
+    async def _go_to(self, wanted: int) -> StateResult:
         """Have the engine go first; then the state machine does what the engine did."""
         state = self._machine.status.state
         try:
             if wanted in _STATES:
-                await self._lead(state, DeviceState(wanted))
+                await self._request_engine(state, DeviceState(wanted))
         except DeviceFault as exc:
             self._checked = exc
         return self._machine.request(wanted)
 
-    async def _lead(self, state: DeviceState, wanted: DeviceState) -> None:
+    async def _request_engine(self, state: DeviceState, wanted: DeviceState) -> None:
         self._checked = self.spec
         is_untouched = self._incomplete is not None and not self._is_written
         if state is DeviceState.PREOP and wanted is not state and not is_untouched:
@@ -248,7 +250,7 @@ class StationDevice:
             raise DeviceFault(FaultCode.PORT, reason)
         return spec
 
-    def _recall(self) -> StationSpec:
+    def _confirmed_spec(self) -> StationSpec:
         """Return what the engine took, or raise why it did not."""
         if isinstance(self._checked, DeviceFault):
             raise self._checked
@@ -262,18 +264,18 @@ class StationDevice:
         self._changed = self._read_back()
 
 
-class _Recalled:
+class _ConfirmedActions:
     """The actions of a state machine whose transitions the engine has made already."""
 
     def __init__(self, recall: Callable[[], StationSpec]) -> None:
-        self._recall = recall
+        self._confirmed_spec = recall
 
     def start_sending(self, spec: StationSpec) -> None:
         """Nothing: the engine has it."""
 
     def start_receiving(self) -> None:
         """Raise DeviceFault if the engine did not go there."""
-        self._recall()
+        self._confirmed_spec()
 
     def stop_receiving(self) -> None:
         """Nothing: the engine has stopped."""

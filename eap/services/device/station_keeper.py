@@ -77,7 +77,7 @@ class EngineClient:
 logger = logging.getLogger(__name__)
 
 
-class Unkept(NamedTuple):
+class Unsaved(NamedTuple):
     """Why a configuration is not kept, and since when, as Unix time."""
 
     reason: str
@@ -114,7 +114,7 @@ class StationKeeper:
         cause: Which change that was.
         undone: Whether it was taken back.
         on_change: Called with a new specification once it runs.
-        unkept: Why what runs is not what a start would bring back; None while both agree.
+        unsaved: Why what runs is not what a start would bring back; None while both agree.
     """
 
     def __init__(
@@ -131,12 +131,12 @@ class StationKeeper:
         self.cause = ""
         self.undone = False
         self.on_change: Callable[[StationSpec], None] | None = None
-        self.unkept: Unkept | None = None
+        self.unsaved: Unsaved | None = None
         self._store = store
         self._engine = engine
         self._base = digest_of(spec)
         self._applied = ""
-        self._is_unsure = False
+        self._is_engine_unknown = False
         stored = store.read()
         if stored is not None:
             self._base, self._applied = stored.base, stored.applied
@@ -165,23 +165,25 @@ class StationKeeper:
         is_other = spec != self.spec or objects != (self.objects or objects)
         if is_other and (not cause or cause != self.cause or self.undone):
             cause = cause or new_cause()
-            record = replace(record, previous=self._before(), cause=cause, undone=False)
+            record = replace(
+                record, previous=self._running_configuration(), cause=cause, undone=False
+            )
         bare = without_alternates(spec)
         if applied and (bare == spec or bare != without_alternates(self.spec)):
             record = replace(record, applied=digest_of(bare))
         await self._run(record)
 
-    async def take_back(self, spec: StationSpec, objects: dict[str, Any]) -> None:
+    async def roll_back(self, spec: StationSpec, objects: dict[str, Any]) -> None:
         """Run *spec*: what ran before the last change, or a step on the way there or from there.
 
-        What ran until now is what another :meth:`take_back` brings.  Raises as :meth:`change`.
+        What ran until now is what another :meth:`roll_back` brings.  Raises as :meth:`change`.
         """
         record = replace(self._record(), spec=spec, objects=objects)
         if without_alternates(spec) != without_alternates(self.spec):
-            record = replace(record, previous=self._before(), undone=not self.undone)
+            record = replace(record, previous=self._running_configuration(), undone=not self.undone)
         await self._run(record)
 
-    def _before(self) -> Configuration:
+    def _running_configuration(self) -> Configuration:
         """Return what runs, as something to go back to."""
         spec = without_alternates(self.spec)
         return Configuration(base=self._base, spec=spec, objects=self.objects)
@@ -190,13 +192,13 @@ class StationKeeper:
         spec = record.spec
         try:
             await self._save(record)
-            if spec != self.spec or self._is_unsure:
+            if spec != self.spec or self._is_engine_unknown:
                 await self._engine.configure(self.spec.name, spec)
         except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
-            self._is_unsure = isinstance(exc, EngineGoneError)
+            self._is_engine_unknown = isinstance(exc, EngineGoneError)
             await self._save_back()
             raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
-        self._is_unsure = False
+        self._is_engine_unknown = False
         self.objects, self.previous, self._applied = record.objects, record.previous, record.applied
         self.cause, self.undone = record.cause, record.undone
         if spec != self.spec:
@@ -211,7 +213,7 @@ class StationKeeper:
             DeviceFault: the engine does not go up there; what goes down is down in any case.
         """
         if state is self.state:
-            if self.unkept is not None:
+            if self.unsaved is not None:
                 await self._save_back()
             return
         try:
@@ -219,12 +221,12 @@ class StationKeeper:
         except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
             if state > self.state:
                 raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
-            self._is_unsure = True
+            self._is_engine_unknown = True
             logger.warning("station %s, on the way to %s: %s", self.spec.name, state.name, exc)
         self.state = state
         await self._save_back()
 
-    async def tell_again(self) -> None:
+    async def resend(self) -> None:
         """Tell the engine what it is to run, which it may have missed.
 
         It may have read what was kept just before that changed, and services may have been killed
@@ -236,7 +238,7 @@ class StationKeeper:
         except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
             logger.warning("station %s, after a start: %s", self.spec.name, exc)
         else:
-            self._is_unsure = False
+            self._is_engine_unknown = False
 
     def _record(self) -> Stored:
         return Stored(
@@ -254,7 +256,7 @@ class StationKeeper:
         # Other clients do not wait for the disk.
         await asyncio.to_thread(self._store.save, record)
         self._kept = record
-        self.unkept = None
+        self.unsaved = None
 
     async def _save_back(self) -> None:
         """Keep what runs; if something else stays kept, log it once and show it until it is not."""
@@ -262,6 +264,6 @@ class StationKeeper:
         try:
             await self._save(record)
         except EnvironmentalError as exc:
-            if self.unkept is None and record != self._kept:
+            if self.unsaved is None and record != self._kept:
                 logger.warning("%s; after a start it will be as it was before", exc)
-                self.unkept = Unkept(str(exc), time())
+                self.unsaved = Unsaved(str(exc), time())

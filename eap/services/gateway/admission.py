@@ -27,7 +27,7 @@ from eap.ids import NetId
 from eap.od.abort import SdoAbortError
 from eap.services.gateway.sessions import GatewayReply
 
-NOBODY = NetId(bytes(6))
+NO_SOURCE = NetId(bytes(6))
 """Source NetID of clients, which have none here."""
 MASTER_PORT = 0xFFFF
 """AMS port by which rules name the master itself."""
@@ -65,7 +65,7 @@ class RequestDecision(msgspec.Struct, frozen=True):
         return self.decision is None or self.decision.is_allowed
 
 
-class Guard:
+class GatewayAdmission:
     """Judges requests.
 
     Args:
@@ -86,19 +86,19 @@ class Guard:
         """Return whether an operation is a read where the client may read everything."""
         if not isinstance(operation, Read):
             return False
-        return self._access().grants(endpoint, NOBODY, *target).may_read
+        return self._access().grants(endpoint, NO_SOURCE, *target).may_read
 
-    def admission(
+    def decide(
         self, endpoint: Endpoint, target: RuleTarget, operation: Operation, *, by_rule: bool = False
     ) -> Decision:
         """Decide on an operation; *by_rule*: a change only if a rule says so."""
-        decision = self._access().grants(endpoint, NOBODY, *target).decide(operation)
+        decision = self._access().grants(endpoint, NO_SOURCE, *target).decide(operation)
         if by_rule and decision.service is not AccessService.READ and not decision.is_by_rule:
             why = "only a rule allows it for several slaves at once"
             return decision._replace(is_allowed=False, why=why)
-        return self._record_first(endpoint, target, operation, decision)
+        return self._record_intent(endpoint, target, operation, decision)
 
-    def _record_first(
+    def _record_intent(
         self, endpoint: Endpoint, target: RuleTarget, operation: Operation, decision: Decision
     ) -> Decision:
         """Return the verdict on a change when it has been recorded, where that is required."""
@@ -111,7 +111,7 @@ class Guard:
             return decision
         return decision._replace(is_allowed=False, is_recordable=False, why=why)
 
-    def tell(
+    def record(
         self,
         endpoint: Endpoint,
         target: RuleTarget,
@@ -137,10 +137,10 @@ class Guard:
 
 
 def _entry(endpoint: Endpoint, target: RuleTarget, audited: AuditedOperation) -> AuditEntry:
-    return AuditEntry(endpoint, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
+    return AuditEntry(endpoint, AmsHeader(*target, NO_SOURCE, 0, 0), "", (audited,))
 
 
-def reason_of_refusal(decision: Decision | None) -> Cause:
+def denial_cause(decision: Decision | None) -> Cause:
     """Return why a request with this verdict is refused."""
     is_recordable = decision is None or decision.is_recordable
     return Cause.DENIED if is_recordable else Cause.NOT_RECORDED

@@ -19,10 +19,10 @@ from eap.codec.mailbox import MailboxType
 from eap.errors import EapError, MalformedError
 from eap.gateway.dialect import (
     DialectFailure,
+    ExchangeVoe,
     ReadFile,
     ReadIdn,
     ReadSdo,
-    TalkVoe,
     Task,
     WriteIdn,
     WriteSdo,
@@ -33,7 +33,7 @@ from eap.gateway.dialect import (
 from eap.gateway.error_table import Cause, cause_of_result
 from eap.gateway.requests import GatewayError, idn, sdo
 from eap.od.abort import SdoAbortError
-from eap.services.gateway.admission import Guard, RuleTarget, reason_of_refusal
+from eap.services.gateway.admission import GatewayAdmission, RuleTarget, denial_cause
 from eap.services.gateway.sessions import MasterSession, cause_of, text_of
 from eap.services.slaves.access import RemoteAccessError, SlaveAccess
 
@@ -71,14 +71,14 @@ class DialectHandler:
     """Carries out requests of the dialect.
 
     Args:
-        guard: Access rules and audit.
-        room: Octets of the longest answer.
+        admission: Access rules and audit.
+        max_size: Octets of the longest answer.
         answer_s: Limit for an answer.
     """
 
-    def __init__(self, guard: Guard, room: int, answer_s: float) -> None:
-        self._guard = guard
-        self._room = room - _LONGEST_HEAD
+    def __init__(self, admission: GatewayAdmission, max_size: int, answer_s: float) -> None:
+        self._admission = admission
+        self._max_size = max_size - _LONGEST_HEAD
         self._answer_s = answer_s
 
     async def answer(
@@ -113,18 +113,18 @@ class DialectHandler:
         self, task: Task, endpoint: Endpoint, target: RuleTarget, find: FindTarget
     ) -> bytes:
         operation = operation_of(task)
-        decision = self._guard.admission(endpoint, target, operation)
+        decision = self._admission.decide(endpoint, target, operation)
         result: int | None = AdsError.GENERAL
         try:
             if not decision.is_allowed:
-                raise _refusal(GatewayError(reason_of_refusal(decision)))
+                raise _dialect_error(GatewayError(denial_cause(decision)))
             subject = await find()
             if isinstance(subject, Cause):
-                raise _refusal(GatewayError(subject))
+                raise _dialect_error(GatewayError(subject))
             data = await self._perform(task, subject)
             result = 0
         finally:
-            self._guard.tell(endpoint, target, operation, decision, result)
+            self._admission.record(endpoint, target, operation, decision, result)
         return data
 
     async def _perform(self, task: Task, subject: DialectTarget) -> bytes:
@@ -133,7 +133,7 @@ class DialectHandler:
             async with asyncio.timeout(self._answer_s):
                 if isinstance(subject, MasterSession):
                     return await _perform_by_master(task, subject)
-                data = await perform(task, subject, self._room)
+                data = await perform(task, subject, self._max_size)
         except TimeoutError:
             raise DialectError(
                 DialectFailure.NO_RESPONSE, Cause.TIMEOUT.text, cause=Cause.TIMEOUT
@@ -141,14 +141,14 @@ class DialectHandler:
         except DialectError:
             raise
         except EapError as exc:
-            raise _refusal(exc) from None
-        if len(data) > self._room:
-            raise _too_long(self._room)
+            raise _dialect_error(exc) from None
+        if len(data) > self._max_size:
+            raise _too_long(self._max_size)
         return data
 
 
-async def perform(task: Task, access: SlaveAccess, room: int) -> bytes:
-    """Carry out a task at a slave; return what was read, at most a little more than *room* octets.
+async def perform(task: Task, access: SlaveAccess, max_size: int) -> bytes:
+    """Carry out a task at a slave; return the data, at most a little more than *max_size* bytes.
 
     Raises:
         EapError: as SlaveAccess does.
@@ -163,18 +163,18 @@ async def perform(task: Task, access: SlaveAccess, room: int) -> bytes:
         case WriteIdn(number, drive, element, data):
             await access.write_elements(number, element, data, drive=drive)
         case ReadFile(name):
-            return await _read_file(name, access, room)
-        case TalkVoe(body):
+            return await _read_file(name, access, max_size)
+        case ExchangeVoe(body):
             return await access.exchange_vendor(body)
     return b""
 
 
-async def _read_file(name: str, access: SlaveAccess, room: int) -> bytes:
+async def _read_file(name: str, access: SlaveAccess, max_size: int) -> bytes:
     if not name:
         raise DialectError(DialectFailure.FILE_NAME, "no file name")
     file = access.open_file(name, 0, is_write=False)
     try:
-        return await file.read(room + 1)
+        return await file.read(max_size + 1)
     finally:
         file.close()
 
@@ -189,14 +189,14 @@ async def _perform_by_master(task: Task, master: MasterSession) -> bytes:
     raise DialectError(DialectFailure.NOT_SUPPORTED, "the master has only a CoE dictionary")
 
 
-def _refusal(error: EapError) -> DialectError:
+def _dialect_error(error: EapError) -> DialectError:
     text = str(error)
     match error:
         case SdoAbortError():
             return DialectError(DialectFailure.GENERAL, text, error.code)
         case MailboxRefusedError():  # the dialect has no mailbox errors
             return DialectError(DialectFailure.NOT_SUPPORTED, text)
-        case RemoteAccessError() if not error.is_of_way:
+        case RemoteAccessError() if not error.is_routing_error:
             return DialectError(cause_of_result(error.result).dialect, text)
         case SoeError() | FoeError():
             return DialectError(cause_of(error).dialect, text)
@@ -204,8 +204,8 @@ def _refusal(error: EapError) -> DialectError:
     return DialectError(cause.dialect, text_of(error) or cause.text, cause=cause)
 
 
-def _too_long(room: int) -> DialectError:
-    text = f"more than {room} octets do not fit one packet of this dialect"
+def _too_long(max_size: int) -> DialectError:
+    text = f"more than {max_size} octets do not fit one packet of this dialect"
     return DialectError(DialectFailure.GENERAL, text)
 
 

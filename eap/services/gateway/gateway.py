@@ -50,10 +50,10 @@ from eap.ids import NetId
 from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.gateway.admission import (
     MASTER_PORT,
-    Guard,
+    GatewayAdmission,
     RequestDecision,
     RuleTarget,
-    reason_of_refusal,
+    denial_cause,
     result_of,
 )
 from eap.services.gateway.dialect_handler import DialectHandler, DialectTarget
@@ -66,7 +66,7 @@ from eap.services.gateway.sessions import (
     SessionKey,
     SessionTable,
     cause_of,
-    refusals,
+    error_replies,
 )
 from eap.services.gateway.transfer_codecs import FileCodec
 from eap.services.slaves.access import LocalSlave, SlaveAccess
@@ -81,7 +81,7 @@ STALL_S = 2.0
 OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
 """Returns access to a slave, or the master, of another station."""
 
-_NOT_TAKEN = {RequestAdmission.CROWDED: Cause.CROWDED, RequestAdmission.TOO_FAST: Cause.TOO_FAST}
+_REJECTIONS = {RequestAdmission.CROWDED: Cause.CROWDED, RequestAdmission.TOO_FAST: Cause.TOO_FAST}
 
 _BY_TCP = f"{TransportKind.TCP}:"
 """Prefix of the names of TCP transports."""
@@ -97,7 +97,7 @@ class Settings(NamedTuple):
     answer_s: float = ANSWER_S
     is_silent: bool = False
     """It sends no errors of its own, and answers only as slaves do."""
-    room: int = 1486
+    max_size: int = 1486
     """Octets of the longest answer behind its headers: one datagram takes it."""
     limits: ClientLimits = ClientLimits()
     name: str = ""
@@ -119,11 +119,11 @@ class MailboxGateway:
         statistics: Requests and answers by slave and protocol.
         tracker: Requests by client.
         memory: Octets of objects and messages that are under way.
-        file_memory: Octets of files that are fetched ahead; without room fewer are.
-        guard: Access rules and audit.
+        file_memory: Octets of files that are fetched ahead; without max_size fewer are.
+        admission: Access rules and audit.
         settings: As given.
         is_open: Whether it takes requests.
-        turned_away: Frames that were dropped while it did not.
+        dropped: Frames that were dropped while it did not.
     """
 
     def __init__(
@@ -139,22 +139,22 @@ class MailboxGateway:
         self.memory, self.file_memory = MemoryBudget(), MemoryBudget()
         self._encoder = ReplyEncoder(self.tracker, settings.name, is_silent=settings.is_silent)
         self.statistics = self._encoder.statistics
-        self.guard = Guard(access)
+        self.admission = GatewayAdmission(access)
         self.settings = settings
         self.is_open = True
-        self.turned_away = 0
+        self.dropped = 0
         self._bus = bus
         self._master = RuleTarget(settings.net_id, MASTER_PORT)
         self._open_master = open_master
         self._addresses = addresses
         self._open_remote = open_remote
-        self._dialect = DialectHandler(self.guard, settings.room, settings.answer_s)
+        self._dialect = DialectHandler(self.admission, settings.max_size, settings.answer_s)
         self._masters: SessionTable[MasterSession] = SessionTable()
         self._slaves: SessionTable[ClientSession] = SessionTable()
         self._tasks = TaskSet(f"gateway {settings.name}")
         self._count = 0
         self._listeners = EoeListeners()
-        bus.listen(self._take_unsolicited)
+        bus.listen(self._forward_unsolicited)
 
     def start(self) -> None:
         """Take requests, again."""
@@ -192,13 +192,13 @@ class MailboxGateway:
             return None
         request = GatewayRequest(header, bytes(body), endpoint, send)
         if admission is not RequestAdmission.TAKEN:
-            self._encoder.refuse(request, _NOT_TAKEN[admission])
+            self._encoder.reply_error(request, _REJECTIONS[admission])
             return None
-        if self._answer_at_once(request, key, now_ns):
+        if self._answer_cached(request, key, now_ns):
             return None
         request = replace(request, ticket=Ticket(self.tracker, endpoint, key))
         task = self._tasks.start(self._serve(request))
-        task.add_done_callback(lambda _: request.give_back())
+        task.add_done_callback(lambda _: request.release())
         return task
 
     def connection_closed(self, endpoint: Endpoint) -> None:
@@ -229,22 +229,22 @@ class MailboxGateway:
             return
         address = request.header.address
         if request.header.type is MailboxType.ERR:
-            self._encoder.refuse(request, Cause.SERVICE)
+            self._encoder.reply_error(request, Cause.SERVICE)
             return
         stations = () if address == MASTER_ADDRESS else await self._stations()
         match self._addresses.resolve(address, stations):
             case GroupAddress(members):
                 if not members:
-                    self._encoder.refuse(request, Cause.NO_SLAVE)
+                    self._encoder.reply_error(request, Cause.NO_SLAVE)
                     return
                 found = ((self._addresses.resolve(each, stations), each) for each in members)
                 await asyncio.gather(
-                    *(self._ask(request, one, each, is_group=True) for one, each in found)
+                    *(self._handle(request, one, each, is_group=True) for one, each in found)
                 )
             case destination:
-                await self._ask(request, destination, address)
+                await self._handle(request, destination, address)
 
-    def _answer_at_once(self, request: GatewayRequest, key: bytes, start_ns: int) -> bool:
+    def _answer_cached(self, request: GatewayRequest, key: bytes, start_ns: int) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
         header, body, endpoint = request.header, request.body, request.endpoint
         if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
@@ -253,20 +253,20 @@ class MailboxGateway:
             return False  # what came first is answered first
         operation = operation_of(MailboxType.COE, body)
         key_of_session = SessionKey(endpoint, MASTER_ADDRESS, MailboxType.COE)
-        master = self._masters.take(key_of_session, self._open_master)
+        master = self._masters.get(key_of_session, self._open_master)
         if not master.is_ready(operation):
             return False
         self.tracker.answered(endpoint, key)
-        authorized = self._admission(endpoint, MASTER_ADDRESS, self._master, operation)
+        authorized = self._decide(endpoint, MASTER_ADDRESS, self._master, operation)
         replies = (
-            master.ask_now(body)
+            master.handle_now(body)
             if authorized.is_allowed
-            else refusals(MailboxType.COE, body, reason_of_refusal(authorized.decision))
+            else error_replies(MailboxType.COE, body, denial_cause(authorized.decision))
         )
         self._finish(request, authorized, MASTER_ADDRESS, replies, start_ns)
         return True
 
-    async def _ask(
+    async def _handle(
         self,
         request: GatewayRequest,
         destination: Destination,
@@ -280,32 +280,32 @@ class MailboxGateway:
         operation = operation_of(kind, body)
         station = destination.station if isinstance(destination, SlaveAddress) else address
         target = self._target(destination)
-        authorized = self._admission(endpoint, station, target, operation, by_rule=is_group)
+        authorized = self._decide(endpoint, station, target, operation, by_rule=is_group)
         if authorized.is_allowed:
             is_step = operation is None
-            replies = await self._ask_allowed(request, destination, station, is_step=is_step)
+            replies = await self._forward(request, destination, station, is_step=is_step)
         else:
-            replies = refusals(kind, body, reason_of_refusal(authorized.decision))
+            replies = error_replies(kind, body, denial_cause(authorized.decision))
         self._finish(request, authorized, address, replies, start_ns)
 
-    async def _ask_allowed(
+    async def _forward(
         self, request: GatewayRequest, destination: Destination, station: int, *, is_step: bool
     ) -> list[GatewayReply]:
         kind, body, endpoint = request.header.type, request.body, request.endpoint
         key = SessionKey(endpoint, station, kind)
         match destination:
             case MasterAddress():
-                return await self._masters.take(key, self._open_master).ask(kind, body)
+                return await self._masters.get(key, self._open_master).handle(kind, body)
             case SlaveAddress():
-                return await self._ask_slave(request, key, is_step=is_step)
+                return await self._forward_to_slave(request, key, is_step=is_step)
             case RemoteAddress():
-                sizes = MailboxSizes.of_data(self.settings.room)
+                sizes = MailboxSizes.of_data(self.settings.max_size)
                 begin = partial(self._begin, key, self._open_remote(destination), sizes)
-                return await self._slaves.take(key, begin).ask(body, is_step=is_step)
+                return await self._slaves.get(key, begin).handle(body, is_step=is_step)
             case GroupAddress():  # a group within a group
-                return refusals(kind, body, Cause.NO_SLAVE)
+                return error_replies(kind, body, Cause.NO_SLAVE)
 
-    def _admission(
+    def _decide(
         self,
         endpoint: Endpoint,
         station: int,
@@ -314,9 +314,9 @@ class MailboxGateway:
         *,
         by_rule: bool = False,
     ) -> RequestDecision:
-        if operation is None or self.guard.may_read(endpoint, target, operation):
+        if operation is None or self.admission.may_read(endpoint, target, operation):
             return RequestDecision(station, target, None, None)
-        decision = self.guard.admission(endpoint, target, operation, by_rule=by_rule)
+        decision = self.admission.decide(endpoint, target, operation, by_rule=by_rule)
         return RequestDecision(station, target, operation, decision)
 
     def _finish(
@@ -330,7 +330,7 @@ class MailboxGateway:
         """Tell the audit, count, and answer from *address*."""
         operation, decision = authorized.operation, authorized.decision
         if operation is not None and decision is not None:
-            self.guard.tell(
+            self.admission.record(
                 request.endpoint, authorized.target, operation, decision, result_of(replies)
             )
         took_ns = monotonic_ns() - start_ns
@@ -345,26 +345,26 @@ class MailboxGateway:
                 return RuleTarget(self.settings.net_id, station)
         return self._master
 
-    async def _ask_slave(
+    async def _forward_to_slave(
         self, request: GatewayRequest, key: SessionKey, *, is_step: bool
     ) -> list[GatewayReply]:
         kind, body, station = key.kind, request.body, key.address
         slave = await self._find(station)
         if isinstance(slave, Cause):
-            return refusals(kind, body, slave)
-        cause = find_refusal(kind, body, slave)
+            return error_replies(kind, body, slave)
+        cause = check_slave(kind, body, slave)
         if cause is not None:
-            return refusals(kind, body, cause)
+            return error_replies(kind, body, cause)
         if kind is MailboxType.EOE:
             address, now_ns = request.header.address, monotonic_ns()
-            self._listeners.note(station, request.endpoint, address, request.send, now_ns)
-        session = self._slaves.take(key, partial(self._begin_local, key, slave))
+            self._listeners.add(station, request.endpoint, address, request.send, now_ns)
+        session = self._slaves.get(key, partial(self._begin_local, key, slave))
         sizes = session.codec.sizes
         if (sizes.to_slave, sizes.to_master) != (slave.to_slave, slave.to_master):
             self._slaves.drop(key)  # the mailbox is another one than before, as in BOOT
-            session = self._slaves.take(key, partial(self._begin_local, key, slave))
-        replies = await session.ask(body, is_step=is_step)
-        if isinstance(session.codec, FileCodec) and session.codec.waits_for_turn:
+            session = self._slaves.get(key, partial(self._begin_local, key, slave))
+        replies = await session.handle(body, is_step=is_step)
+        if isinstance(session.codec, FileCodec) and session.codec.waits_for_lock:
             self._end_stalls(key)
         return replies
 
@@ -392,7 +392,7 @@ class MailboxGateway:
         return self._begin(key, self._open_local(slave, key.endpoint), sizes)
 
     def _open_local(self, slave: SlaveDescription, endpoint: Endpoint) -> LocalSlave:
-        return LocalSlave(self._bus, slave, endpoint, turn_s=self.settings.answer_s)
+        return LocalSlave(self._bus, slave, endpoint, lock_s=self.settings.answer_s)
 
     def _begin(self, key: SessionKey, access: SlaveAccess, sizes: MailboxSizes) -> ClientSession:
         answer_s = self.settings.answer_s
@@ -415,11 +415,11 @@ class MailboxGateway:
                 )  # fmt: skip
                 session.close()
 
-    def _take_unsolicited(self, message: Unsolicited) -> None:
+    def _forward_unsolicited(self, message: Unsolicited) -> None:
         """Send an Ethernet frame of a slave to the clients that talk EoE to it."""
         if message.type != MailboxType.EOE:
             return
-        for listener in self._listeners.of(message.station, monotonic_ns()):
+        for listener in self._listeners.of_slave(message.station, monotonic_ns()):
             self._encoder.send(listener.send, listener.address, MailboxType.EOE, message.data)
 
     async def _serve_dialect(self, request: GatewayRequest, kind: MailboxType) -> None:
@@ -446,11 +446,11 @@ class MailboxGateway:
                 slave = await self._find(station)
                 if isinstance(slave, Cause):
                     return slave
-                return find_refusal(kind, b"", slave) or self._open_local(slave, endpoint)
+                return check_slave(kind, b"", slave) or self._open_local(slave, endpoint)
         return Cause.NO_SLAVE
 
 
-def find_refusal(kind: MailboxType, body: bytes, slave: SlaveDescription) -> Cause | None:
+def check_slave(kind: MailboxType, body: bytes, slave: SlaveDescription) -> Cause | None:
     """Return why a request does not even go to the slave that it is for."""
     if not slave.to_slave:
         return cause_of(no_mailbox(slave))

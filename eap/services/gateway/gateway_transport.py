@@ -22,18 +22,18 @@ class GatewayTransport:
     """One socket or listener, and the gateway behind it.
 
     Args:
-        behind: Gateways of the stations there, and by what name each knows the door; a frame does
+        gateways: Gateways of the stations there, and by what name each knows the door; a frame does
             not say which one it is for, so the first is asked.
     """
 
-    def __init__(self, behind: Sequence[tuple[MailboxGateway, str]]) -> None:
+    def __init__(self, gateways: Sequence[tuple[MailboxGateway, str]]) -> None:
         self._gateway: MailboxGateway | None = None
         self._name = ""
-        if behind:
-            self._gateway, self._name = behind[0]
+        if gateways:
+            self._gateway, self._name = gateways[0]
 
     @property
-    def is_there(self) -> bool:
+    def has_gateway(self) -> bool:
         """Whether there is any gateway behind."""
         return self._gateway is not None
 
@@ -50,7 +50,7 @@ class GatewayTransport:
         if self._gateway is None:
             return refusal_of(frame)
         if not self._gateway.is_open:
-            self._gateway.turned_away += 1
+            self._gateway.dropped += 1
             return DropReason.GATEWAY_OFF
 
         def answer(frame: bytes) -> None:
@@ -62,7 +62,7 @@ class GatewayTransport:
             return DropReason.TRUNCATED
         except MalformedError:
             if not self._gateway.settings.is_silent:
-                _refuse_type(frame, answer)
+                _reply_unknown_type(frame, answer)
             return DropReason.MAILBOX
         return None
 
@@ -83,7 +83,7 @@ class GatewayTransport:
             await self._gateway.wait_below(Endpoint(self._name, connection), count)
 
 
-def _refuse_type(frame: bytes, answer: Callable[[bytes], None]) -> None:
+def _reply_unknown_type(frame: bytes, answer: Callable[[bytes], None]) -> None:
     """Say that nobody speaks the protocol of a frame."""
     kind, body = mailbox_error(MailboxError.UNSUPPORTED_PROTOCOL)
     address = int.from_bytes(frame[_ADDRESS], "little")

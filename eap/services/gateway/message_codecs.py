@@ -211,9 +211,9 @@ class EoeListeners:
     """The listeners of all slaves of a bus."""
 
     def __init__(self) -> None:
-        self._of: dict[int, OrderedDict[Endpoint, EoeListener]] = {}
+        self._by_station: dict[int, OrderedDict[Endpoint, EoeListener]] = {}
 
-    def note(
+    def add(
         self,
         station: int,
         endpoint: Endpoint,
@@ -222,15 +222,15 @@ class EoeListeners:
         now_ns: int,
     ) -> None:
         """Note that a client talks to a slave; the one that did so least lately makes room."""
-        of_slave = self._of.setdefault(station, OrderedDict())
+        of_slave = self._by_station.setdefault(station, OrderedDict())
         of_slave[endpoint] = EoeListener(address, send, now_ns + LISTENS_NS)
         of_slave.move_to_end(endpoint)
         if len(of_slave) > MAX_LISTENERS:
             of_slave.popitem(last=False)
 
-    def of(self, station: int, now_ns: int) -> list[EoeListener]:
+    def of_slave(self, station: int, now_ns: int) -> list[EoeListener]:
         """Return the clients that receive the frames of a slave now."""
-        of_slave = self._of.get(station)
+        of_slave = self._by_station.get(station)
         if of_slave is None:
             return []
         for endpoint in [
@@ -241,7 +241,7 @@ class EoeListeners:
 
     def forget(self, endpoint: Endpoint) -> None:
         """Forget a client whose connection is closed."""
-        for of_slave in self._of.values():
+        for of_slave in self._by_station.values():
             of_slave.pop(endpoint, None)
 
 

@@ -70,7 +70,7 @@ def open_gateways(
             partial(
                 MasterSession,
                 provider.dictionary,
-                settings.room,
+                settings.max_size,
                 provider.refresh,
                 provider.is_fresh,
             ),

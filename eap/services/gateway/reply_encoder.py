@@ -15,7 +15,7 @@ from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_p
 from eap.gateway import dialect
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker, Ticket
-from eap.services.gateway.sessions import GatewayReply, refusals
+from eap.services.gateway.sessions import GatewayReply, error_replies
 from eap.services.rate_limits import caused_by
 
 Send: TypeAlias = Callable[[bytes], None]
@@ -67,7 +67,7 @@ class _StatisticsRow:
         self.errors: dict[Cause, int] = {}
         self.last_error: Cause | None = None
 
-    def note(self, reasons: Sequence[Cause | None], took_ns: int) -> None:
+    def count(self, reasons: Sequence[Cause | None], took_ns: int) -> None:
         """Count one request with its answers."""
         self.requests += 1
         before = self.replies
@@ -90,7 +90,7 @@ class GatewayStatistics:
     def __init__(self) -> None:
         self._rows: dict[tuple[int, MailboxType], _StatisticsRow] = {}
 
-    def note(
+    def count(
         self, station: int, kind: MailboxType, reasons: Sequence[Cause | None], took_ns: int
     ) -> None:
         """Count one request; *reasons* has None for each message that a slave answered with."""
@@ -99,7 +99,7 @@ class GatewayStatistics:
             if len(self._rows) >= _MAX_ROWS:
                 return
             row = self._rows[station, kind] = _StatisticsRow()
-        row.note(reasons, took_ns)
+        row.count(reasons, took_ns)
 
     def report(self) -> list[dict[str, Any]]:
         """Return all rows as plain values."""
@@ -118,7 +118,7 @@ class GatewayStatistics:
         ]
 
 
-class RefusalLog:
+class ErrorLog:
     """The lines of one gateway; *name* is that of the bus port."""
 
     def __init__(self, name: str) -> None:
@@ -147,10 +147,10 @@ class GatewayRequest(msgspec.Struct, frozen=True):
     ticket: Ticket | None = None
     """None if it was not taken."""
 
-    def give_back(self) -> None:
+    def release(self) -> None:
         """Note that it waits no more."""
         if self.ticket is not None:
-            self.ticket.give_back()
+            self.ticket.release()
 
 
 class ReplyEncoder:
@@ -168,7 +168,7 @@ class ReplyEncoder:
     def __init__(self, tracker: RequestTracker, name: str, *, is_silent: bool) -> None:
         self.statistics = GatewayStatistics()
         self._tracker = tracker
-        self._log = RefusalLog(name)
+        self._log = ErrorLog(name)
         self._is_silent = is_silent
         self._counters = bytearray(_ADDRESSES)
 
@@ -183,12 +183,12 @@ class ReplyEncoder:
         """Answer a request from *address*; it is counted for *station*."""
         reasons = [each.reason for each in replies]
         kind = request.header.type
-        self.statistics.note(station, kind, reasons, took_ns)
-        self._note_refusals(request, kind, reasons)
-        if replies and replies[0].is_again:
-            self._note_repeated(request.endpoint)
+        self.statistics.count(station, kind, reasons, took_ns)
+        self._count_errors(request, kind, reasons)
+        if replies and replies[0].is_repeat:
+            self._count_repeat(request.endpoint)
         if address == request.header.address:  # not one of many
-            request.give_back()
+            request.release()
         for reply in replies:
             if reply.reason is not None and self._is_silent:
                 continue
@@ -204,28 +204,28 @@ class ReplyEncoder:
     ) -> None:
         """Answer a request of the high-nibble dialect; *reason* is why *body* is an error."""
         address = request.header.address
-        self.statistics.note(address, kind, [reason], took_ns)
-        self._note_refusals(request, kind, [reason])
-        request.give_back()
+        self.statistics.count(address, kind, [reason], took_ns)
+        self._count_errors(request, kind, [reason])
+        request.release()
         if not (self._is_silent and reason is not None):
             request.send(encode_frame(dialect.encode_header(kind, address), body))
 
-    def refuse(self, request: GatewayRequest, reason: Cause) -> None:
+    def reply_error(self, request: GatewayRequest, reason: Cause) -> None:
         """Answer with an error."""
         address, kind = request.header.address, request.header.type
-        self.answer(request, address, address, refusals(kind, request.body, reason), 0)
+        self.answer(request, address, address, error_replies(kind, request.body, reason), 0)
 
     def send(self, send: Send, address: int, kind: MailboxType, body: bytes) -> None:
         """Send a message from *address*, counted as those of one slave are."""
         counter = self._counters[address] = next_counter(self._counters[address])
         send(encode_plain_frame(kind, address, counter, body))
 
-    def _note_repeated(self, endpoint: Endpoint) -> None:
+    def _count_repeat(self, endpoint: Endpoint) -> None:
         counts = self._tracker.counts_of(endpoint)
         if counts is not None:
             counts.repeated += 1
 
-    def _note_refusals(
+    def _count_errors(
         self, request: GatewayRequest, kind: MailboxType, reasons: Iterable[Cause | None]
     ) -> None:
         """Count what the gateway answers itself, and log it."""

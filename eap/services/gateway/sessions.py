@@ -25,7 +25,7 @@ from eap.codec.mailbox import MailboxError, MailboxType
 from eap.errors import CodecError, EapError, TruncatedError
 from eap.gateway import error_table
 from eap.gateway.error_table import Cause, cause_of_result
-from eap.gateway.requests import GatewayError, mailbox_error, operation_of, refuse
+from eap.gateway.requests import GatewayError, error_reply, mailbox_error, operation_of
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 from eap.services.slaves.access import RemoteAccessError
@@ -47,7 +47,7 @@ class GatewayReply(msgspec.Struct, frozen=True):
     body: bytes
     reason: Cause | None = None
     """Of the gateway's own refusal; None for an answer of the slave."""
-    is_again: bool = False
+    is_repeat: bool = False
     """True for the answer to a repeated step of a transfer, the same as to the step itself."""
 
 
@@ -110,7 +110,7 @@ class ClientSession:
         """Whether a transfer is under way."""
         return self.codec.is_running
 
-    async def ask(self, body: bytes, *, is_step: bool) -> list[GatewayReply]:
+    async def handle(self, body: bytes, *, is_step: bool) -> list[GatewayReply]:
         """Return the answers to a request, which may be none.
 
         Args:
@@ -124,11 +124,11 @@ class ClientSession:
                 async with asyncio.timeout_at(now_s + self._answer_s):
                     await self._lock.acquire()
             except TimeoutError:
-                return self._refuse(body, Cause.TIMEOUT)
+                return self._error_replies(body, Cause.TIMEOUT)
         else:
             await self._lock.acquire()  # without waiting, and without the price of a time-out
         try:
-            return await self._ask(body, now_s + times * self._answer_s, is_step=is_step)
+            return await self._handle(body, now_s + times * self._answer_s, is_step=is_step)
         finally:
             self._lock.release()
 
@@ -138,11 +138,11 @@ class ClientSession:
         self.codec.reset()
         self._replies = None
 
-    async def _ask(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[GatewayReply]:
+    async def _handle(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[GatewayReply]:
         if self._is_repeated(body):
-            return [replace(each, is_again=True) for each in self._replies or ()]
+            return [replace(each, is_repeat=True) for each in self._replies or ()]
         if is_step and not self.is_running:
-            return self._refuse(body, Cause.SERVICE, "no transfer is under way")
+            return self._error_replies(body, Cause.SERVICE, "no transfer is under way")
         self._stop_timer()
         self._request, self._replies = body, None
         replies = await self._answer(body, deadline_s)
@@ -171,23 +171,23 @@ class ClientSession:
                 answers = await self.codec.answer(body)
         except TimeoutError:
             self.close()
-            return self._refuse(body, Cause.TIMEOUT)
+            return self._error_replies(body, Cause.TIMEOUT)
         except MailboxRefusedError as exc:
             self.codec.reset()
             return [GatewayReply(*mailbox_error(exc.detail))]
         except CodecError as exc:
             is_cut = isinstance(exc, TruncatedError)
-            return self._refuse(body, Cause.TOO_SHORT if is_cut else Cause.SERVICE)
+            return self._error_replies(body, Cause.TOO_SHORT if is_cut else Cause.SERVICE)
         except EapError as exc:
             self.close()
-            return self._refuse(body, cause_of(exc), text_of(exc))
+            return self._error_replies(body, cause_of(exc), text_of(exc))
         except BaseException:
             self.close()
             raise
         return [GatewayReply(self._kind, answer) for answer in answers]
 
-    def _refuse(self, body: bytes, reason: Cause, text: str = "") -> list[GatewayReply]:
-        return refusals(self._kind, body, reason, text)
+    def _error_replies(self, body: bytes, reason: Cause, text: str = "") -> list[GatewayReply]:
+        return error_replies(self._kind, body, reason, text)
 
     def _stop_timer(self) -> None:
         if self._timer is not None:
@@ -195,9 +195,11 @@ class ClientSession:
             self._timer = None
 
 
-def refusals(kind: MailboxType, body: bytes, reason: Cause, text: str = "") -> list[GatewayReply]:
+def error_replies(
+    kind: MailboxType, body: bytes, reason: Cause, text: str = ""
+) -> list[GatewayReply]:
     """Return the error that answers a request."""
-    return [GatewayReply(*refuse(kind, body, reason, text), reason=reason)]
+    return [GatewayReply(*error_reply(kind, body, reason, text), reason=reason)]
 
 
 def cause_of(error: EapError) -> Cause:
@@ -205,7 +207,7 @@ def cause_of(error: EapError) -> Cause:
     match error:
         case GatewayError():
             return error.cause
-        case RemoteAccessError() if error.is_of_way:
+        case RemoteAccessError() if error.is_routing_error:
             return cause_of_result(error.result)
         case RemoteAccessError():
             return Cause.SERVICE
@@ -246,7 +248,7 @@ class SessionTable(Generic[S]):
     def __init__(self) -> None:
         self._open: dict[SessionKey, S] = {}
 
-    def take(self, key: SessionKey, begin: Callable[[], S]) -> S:
+    def get(self, key: SessionKey, begin: Callable[[], S]) -> S:
         """Return the session of *key*, a new one if there is none."""
         session = self._open.pop(key, None)
         if session is None:
@@ -294,7 +296,7 @@ class MasterSession:
 
     Args:
         dictionary: Of the master.
-        room: Octets of the longest answer behind its mailbox header.
+        max_size: Octets of the longest answer behind its mailbox header.
         refresh: Sees to it that what an object shows is not old; it gets the object's index.
         is_fresh: Says whether that is so already.
     """
@@ -304,33 +306,33 @@ class MasterSession:
     def __init__(
         self,
         dictionary: ObjectDictionary,
-        room: int,
+        max_size: int,
         refresh: Callable[[int], Awaitable[None]],
         is_fresh: Callable[[int], bool],
     ) -> None:
         self._dictionary = dictionary
         self._refresh = refresh
         self._is_fresh = is_fresh
-        self._server = CoeServer(dictionary, _op, MailboxSizes.of_data(room))
+        self._server = CoeServer(dictionary, _op, MailboxSizes.of_data(max_size))
 
-    async def ask(self, kind: MailboxType, body: bytes) -> list[GatewayReply]:
+    async def handle(self, kind: MailboxType, body: bytes) -> list[GatewayReply]:
         """Return the answers to a request."""
         if kind is not MailboxType.COE:
-            return refusals(kind, body, Cause.NO_PROTOCOL)
+            return error_replies(kind, body, Cause.NO_PROTOCOL)
         await self._refresh(_index_of(operation_of(kind, body)))
-        return self.ask_now(body)
+        return self.handle_now(body)
 
     def is_ready(self, operation: Operation | None) -> bool:
         """Say whether the answer to a request by CoE, which does *operation*, need not wait."""
         return self._is_fresh(_index_of(operation))
 
-    def ask_now(self, body: bytes) -> list[GatewayReply]:
+    def handle_now(self, body: bytes) -> list[GatewayReply]:
         """Return the answers to a request by CoE that is ready."""
         try:
             answers = self._server.receive_message(body, 0)
         except MailboxRefusedError as exc:
             if exc.detail == MailboxError.SIZE_TOO_SHORT:
-                return [GatewayReply(*refuse(MailboxType.COE, body, Cause.TOO_SHORT))]
+                return [GatewayReply(*error_reply(MailboxType.COE, body, Cause.TOO_SHORT))]
             return [GatewayReply(*mailbox_error(exc.detail))]
         return [GatewayReply(MailboxType.COE, answer) for answer in answers]
 

@@ -268,9 +268,9 @@ class FileCodec:
         return math.inf if since_s is None else since_s
 
     @property
-    def waits_for_turn(self) -> bool:
+    def waits_for_lock(self) -> bool:
         """Whether this file waits for those of other clients."""
-        return self._file is not None and not self._file.has_turn
+        return self._file is not None and not self._file.has_lock
 
     def is_step(self, body: bytes) -> bool:
         """Return whether a request is a packet, or confirms one."""

@@ -24,7 +24,7 @@ from eap.codec.soe import Idn
 from eap.errors import EapError
 from eap.gateway.error_table import cause_of_result
 from eap.runtime.engine_messages import SlaveDescription, no_mailbox
-from eap.services.slaves.bus_client import BusClient, MailboxTurn
+from eap.services.slaves.bus_client import BusClient, MailboxLock
 from eap.services.slaves.file_stream import AHEAD, FileStream, LocalFile
 from eap.services.tasks import TaskSet
 
@@ -92,13 +92,13 @@ class RemoteAccessError(EapError):
 
     Attributes:
         result: Error of ADS.
-        is_of_way: Whether the slave was not reached; every other error is its own refusal.
+        is_routing_error: Whether the slave was not reached; every other error is its own refusal.
     """
 
     def __init__(self, result: int) -> None:
         super().__init__(AdsError.words_of(result))
         self.result = result
-        self.is_of_way = not cause_of_result(result).is_from_slave
+        self.is_routing_error = not cause_of_result(result).is_from_slave
 
 
 class SlaveAccess(Protocol):
@@ -169,7 +169,7 @@ class LocalSlave:
         bus: Its bus.
         slave: As the engine describes it.
         requester: Client; the operations of several clients take turns.
-        turn_s: Limit for the wait for a turn, which MailboxBusyError ends; None for no limit.
+        lock_s: Limit for the wait for a turn, which MailboxBusyError ends; None for no limit.
     """
 
     def __init__(
@@ -178,12 +178,12 @@ class LocalSlave:
         slave: SlaveDescription,
         requester: Hashable,
         *,
-        turn_s: float | None = None,
+        lock_s: float | None = None,
     ) -> None:
         self.bus = bus
         self._slave = slave
         self._requester = requester
-        self._turn_s = turn_s
+        self._lock_s = lock_s
 
     async def sizes(self) -> MailboxSizes:
         """Return the sizes of the slave's mailboxes; raise NoMailboxError if none is open."""
@@ -200,8 +200,8 @@ class LocalSlave:
         self, index: int, subindex: int, *, complete: bool = False
     ) -> ObjectStream:
         """Begin to read as :meth:`read_object` does; the stream is closed by the caller."""
-        turn = await self.bus.open_turn(
-            self._slave.station, MailboxType.COE, self._requester, self._turn_s
+        turn = await self.bus.lock_mailbox(
+            self._slave.station, MailboxType.COE, self._requester, self._lock_s
         )
         try:
             begin = coe_client.begin_upload(index, subindex, complete=complete)
@@ -253,8 +253,10 @@ class LocalSlave:
     ) -> LocalFile:
         """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
         # By the file, not by the requester: two of its files take turns like those of two.
-        open_turn = partial(self.bus.open_turn, self._slave.station, MailboxType.FOE)
-        return LocalFile(name, password, self._sizes(), open_turn, is_write=is_write, ahead=ahead)
+        lock_mailbox = partial(self.bus.lock_mailbox, self._slave.station, MailboxType.FOE)
+        return LocalFile(
+            name, password, self._sizes(), lock_mailbox, is_write=is_write, ahead=ahead
+        )
 
     async def exchange_vendor(self, message: bytes) -> bytes:
         """Return the answer to a VoE message, both with their VoE headers."""
@@ -289,10 +291,10 @@ class LocalSlave:
 
     async def _converse(self, conversation: Conversation[T]) -> T:
         station = self._slave.station
-        return await self.bus.converse(station, conversation, self._requester, self._turn_s)
+        return await self.bus.converse(station, conversation, self._requester, self._lock_s)
 
 
-def _end_turn(turn: MailboxTurn, task: asyncio.Task[object]) -> None:
+def _end_turn(turn: MailboxLock, task: asyncio.Task[object]) -> None:
     if task.cancelled():
         turn.abandon()
     turn.close()

@@ -32,7 +32,7 @@ from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
-from eap.control.bus import BRING_S, MARGIN_S, PATIENCE_S, TRANSFER_S
+from eap.control.bus import BRING_S, MARGIN_S, TRANSFER_S, WAIT_UP_S
 from eap.errors import EapError, EngineGoneError
 from eap.runtime.engine_messages import (
     BringSlaves,
@@ -147,7 +147,7 @@ class MailboxQueues:
         """Return whether a turn begins without waiting."""
         return mailbox not in self._waiting
 
-    async def take(self, mailbox: Hashable, client: Hashable) -> None:
+    async def acquire(self, mailbox: Hashable, client: Hashable) -> None:
         """Wait for a turn, which lasts until :meth:`release`; cancelling it gives up the wait."""
         if self.is_free(mailbox):
             self._waiting[mailbox] = {}
@@ -176,7 +176,7 @@ class MailboxQueues:
         del self._waiting[mailbox]
 
 
-class MailboxTurn:
+class MailboxLock:
     """A turn at the mailbox of one slave in one protocol; :meth:`close` ends it."""
 
     def __init__(
@@ -193,7 +193,7 @@ class MailboxTurn:
         self._kind = kind
         self._release = release
         self._is_open = True
-        self._is_unused = True
+        self._is_idle = True
 
     async def exchange(self, request: MailboxRequest) -> MailboxMessage:
         """Do one step of a conversation.
@@ -202,17 +202,17 @@ class MailboxTurn:
             BusError: as the engine's master says.
             EngineGoneError: there is no engine, or not the one with which it began.
         """
-        self._is_unused = False
-        limit_s = (request.delay_ns + request.timeout_ns) / _S + MARGIN_S
+        self._is_idle = False
+        limit_s = (request.delay_ns + request.timeout_ns) / _NS_PER_S + MARGIN_S
         reply = await self._link.request(lambda number: self._step(number, request), limit_s)
         return reply.message or MailboxMessage(self._kind, b"")
 
     def abandon(self) -> None:
         """Close it in the middle, and have the slave end the transfer that was begun."""
-        farewell = ABORT_MESSAGES.get(self._kind)
-        if self._is_open and not self._is_unused and farewell is not None:
+        abort = ABORT_MESSAGES.get(self._kind)
+        if self._is_open and not self._is_idle and abort is not None:
             with suppress(EngineGoneError):
-                self._link.send(lambda number: self._step(number, farewell))
+                self._link.send(lambda number: self._step(number, abort))
         self.close()
 
     def close(self) -> None:
@@ -228,8 +228,8 @@ class MailboxTurn:
 T = TypeVar("T")
 
 DESCRIBE_S = 1.0
-_LOOK_S = 0.05
-_S = 1_000_000_000
+_POLL_S = 0.05
+_NS_PER_S = 1_000_000_000
 
 
 class BusClient:
@@ -276,18 +276,18 @@ class BusClient:
         """Return the report of the bus once it is up.
 
         Raises:
-            BusError: it is not after PATIENCE_S, with the reason.
+            BusError: it is not after WAIT_UP_S, with the reason.
             EngineGoneError: there is no engine all the while.
         """
-        await self._be_up()
+        await self._wait_up()
         return await self.describe()
 
-    async def _be_up(self) -> None:
+    async def _wait_up(self) -> None:
         """Wait until the bus is up; raises as :meth:`wait_up` does."""
         if self.view.latest.is_up:
             return
         loop = asyncio.get_running_loop()
-        end_s = loop.time() + PATIENCE_S
+        end_s = loop.time() + WAIT_UP_S
         while True:
             error: EapError
             try:
@@ -300,31 +300,31 @@ class BusClient:
                 error = BusError(f"{self.name} is not up: {bus.fault or 'it begins'}")
             if loop.time() >= end_s:
                 raise error
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_POLL_S)
 
-    async def open_turn(
+    async def lock_mailbox(
         self,
         station: int,
         kind: MailboxType,
         requester: Hashable,
-        turn_s: float | None = None,
-    ) -> MailboxTurn:
-        """Wait for a turn at the mailbox of a slave, no longer than *turn_s* if that is given.
+        lock_s: float | None = None,
+    ) -> MailboxLock:
+        """Wait for a turn at the mailbox of a slave, no longer than *lock_s* if that is given.
 
         Raises:
             MailboxBusyError: others had it all the time.
             BusError, EngineGoneError: as :meth:`wait_up` does.
         """
-        await self._be_up()
+        await self._wait_up()
         mailbox = station, kind
         try:
-            async with asyncio.timeout(None if self._queues.is_free(mailbox) else turn_s):
-                await self._queues.take(mailbox, requester)
+            async with asyncio.timeout(None if self._queues.is_free(mailbox) else lock_s):
+                await self._queues.acquire(mailbox, requester)
         except TimeoutError:
             raise MailboxBusyError(
-                f"slave {station}: the {kind.name} transfers of other clients took {turn_s:g} s"
+                f"slave {station}: the {kind.name} transfers of other clients took {lock_s:g} s"
             ) from None
-        return MailboxTurn(
+        return MailboxLock(
             self._link, self._number, station, kind, lambda: self._queues.release(mailbox)
         )
 
@@ -333,22 +333,22 @@ class BusClient:
         station: int,
         conversation: Conversation[T],
         requester: Hashable,
-        turn_s: float | None = None,
+        lock_s: float | None = None,
     ) -> T:
         """Drive a conversation with a slave to its end; return its result.
 
         Raises:
-            MailboxBusyError: its turn did not come within *turn_s*.
+            MailboxBusyError: its turn did not come within *lock_s*.
             BusError: the slave has no mailbox, does not answer, or refuses; as its class says.
             SdoAbortError: it refuses an SDO.
             EngineGoneError: there is no engine, or not the one with which it began.
         """
-        turn: MailboxTurn | None = None
+        turn: MailboxLock | None = None
 
         async def exchange(request: MailboxRequest) -> MailboxMessage:
             nonlocal turn
             if turn is None:
-                turn = await self.open_turn(station, request.type, requester, turn_s)
+                turn = await self.lock_mailbox(station, request.type, requester, lock_s)
             return await turn.exchange(request)
 
         try:
@@ -363,11 +363,11 @@ class BusClient:
 
     async def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; return its result or raise what went wrong."""
-        await self._be_up()
+        await self._wait_up()
 
         async def exchange(step: Step) -> StepReplies:
             if isinstance(step, Sleep):
-                await asyncio.sleep(step.duration_ns / _S)
+                await asyncio.sleep(step.duration_ns / _NS_PER_S)
                 return StepReplies((), monotonic_ns())
             return StepReplies(await self.transfer(step), monotonic_ns())
 
@@ -380,7 +380,7 @@ class BusClient:
             FrameLostError: nothing came back.
             EngineGoneError: there is no engine.
         """
-        await self._be_up()
+        await self._wait_up()
         datagrams = tuple(accesses)
         reply = await self._link.request(
             lambda number: ExchangeDatagrams(id=number, bus=self._number, datagrams=datagrams),
@@ -396,7 +396,7 @@ class BusClient:
             BusError: there is no such slave, or several refuse.
             EngineGoneError: there is no engine.
         """
-        await self._be_up()
+        await self._wait_up()
         await self._link.request(
             lambda number: BringSlaves(id=number, bus=self._number, station=station, target=target),
             BRING_S,

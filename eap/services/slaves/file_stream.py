@@ -22,16 +22,16 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import DATA_OVERHEAD, FoeOpcode
 from eap.errors import EapError
 from eap.runtime.foe_restart import PAUSE_S, Restarts
-from eap.services.slaves.bus_client import MailboxTurn
+from eap.services.slaves.bus_client import MailboxLock
 from eap.services.tasks import TaskSet
 
 AHEAD = 64 << 10
 """Octets that are read before the reader wants them, unless it says otherwise."""
-BEHIND = 64 << 10
+MAX_UNSENT = 64 << 10
 """Octets that are taken from the writer before they have gone on."""
-KEPT = 16 << 20
+MAX_KEPT = 16 << 20
 """Bytes of a file on its way to a slave that are kept, to begin anew if the bus interrupts it."""
-ALL_KEPT = 64 << 20
+MAX_ALL_KEPT = 64 << 20
 """Bytes of all files together; one that finds no room goes on, but does not begin anew."""
 _CHANGED = "the slave's file has changed while the bus was interrupted"
 _ACK = bytes((FoeOpcode.ACK,))
@@ -55,9 +55,9 @@ class FileStream(ABC):
         is_write: As given.
         sizes: Of the slave's mailboxes, known when the file is open.
         progress: Octets that the slave has, or has given.
-        has_turn: Whether it is its turn at the slave; before, other files are moved.
+        has_lock: Whether it is its turn at the slave; before, other files are moved.
         is_open: Whether the slave has opened it.
-        is_whole: Whether nothing more will be written to it.
+        is_finished: Whether nothing more will be written to it.
         is_complete: Whether all of it was moved.
         stalled_since_s: Time of the loop since which the slave waits for the reader or writer; None
             while it need not.
@@ -67,7 +67,7 @@ class FileStream(ABC):
         self.is_write = is_write
         self.sizes = sizes
         self.progress = Progress()
-        self.has_turn = self.is_open = self.is_whole = self.is_complete = False
+        self.has_lock = self.is_open = self.is_finished = self.is_complete = False
         self.name = name
         self.buffer = bytearray()
         """Octets read that are not fetched yet, or written that have not gone on."""
@@ -86,26 +86,26 @@ class FileStream(ABC):
 
     async def wait_open(self) -> None:
         """Wait until the slave has opened the file."""
-        await self._until(lambda: self.is_open)
+        await self._wait_until(lambda: self.is_open)
 
     async def read(self, size: int) -> bytes:
         """Return the next *size* octets, fewer only at the end."""
         self._wanted = size
         self.notify()
-        await self._until(lambda: len(self.buffer) >= size)
-        return self.cut(size)
+        await self._wait_until(lambda: len(self.buffer) >= size)
+        return self.pop(size)
 
     async def write(self, data: bytes) -> None:
         """Take *data* when most of what came before has gone on."""
-        await self._until(lambda: len(self.buffer) < BEHIND)
+        await self._wait_until(lambda: len(self.buffer) < MAX_UNSENT)
         self.buffer += data
         self.notify()
 
     async def finish(self) -> None:
         """Wait until the slave has all that was written."""
-        self.is_whole = True
+        self.is_finished = True
         self.notify()
-        await self._until(lambda: self.is_complete)
+        await self._wait_until(lambda: self.is_complete)
 
     def close(self) -> None:
         """Give the file up if it is not complete, at the slave too."""
@@ -116,28 +116,28 @@ class FileStream(ABC):
     async def move(self) -> None:
         """Move the whole file; raise EapError.  Cancelling it ends it at the slave too."""
 
-    def notify(self, *, has_turn: bool = False, is_open: bool = False) -> None:
+    def notify(self, *, has_lock: bool = False, is_open: bool = False) -> None:
         """Let everything that waits for a change look again."""
-        self.has_turn |= has_turn
+        self.has_lock |= has_lock
         self.is_open |= is_open
         self._changed.set()
         self._changed = asyncio.Event()
 
-    def cut(self, size: int) -> bytes:
+    def pop(self, size: int) -> bytes:
         """Take octets out of the buffer."""
         data = bytes(self.buffer[:size])
         del self.buffer[:size]
         self.notify()
         return data
 
-    async def wait_room(self) -> None:
+    async def wait_space(self) -> None:
         """Wait until more is to be read: once there was no room, until there is for a half."""
         if len(self.buffer) >= max(self._ahead, self._wanted):
-            await self._stall(lambda: len(self.buffer) < max(self._ahead // 2, self._wanted))
+            await self._wait_stalled(lambda: len(self.buffer) < max(self._ahead // 2, self._wanted))
 
     async def wait_data(self, size: int) -> None:
         """Wait for octets that go to the slave, fewer than *size* only at the end."""
-        await self._stall(lambda: self.is_whole or len(self.buffer) >= size)
+        await self._wait_stalled(lambda: self.is_finished or len(self.buffer) >= size)
 
     async def run(self) -> None:
         """Move the file, and let its reader or writer know the end."""
@@ -151,7 +151,7 @@ class FileStream(ABC):
                 self._error = BusError(f"file {self.name!r}: the transfer was given up")
             self.notify()
 
-    async def _stall(self, is_so: Callable[[], bool]) -> None:
+    async def _wait_stalled(self, is_so: Callable[[], bool]) -> None:
         """Wait for the reader or writer."""
         if not is_so():
             self.stalled_since_s = asyncio.get_running_loop().time()
@@ -160,7 +160,7 @@ class FileStream(ABC):
             finally:
                 self.stalled_since_s = None
 
-    async def _until(self, is_so: Callable[[], bool]) -> None:
+    async def _wait_until(self, is_so: Callable[[], bool]) -> None:
         """Wait until it is so, or the transfer has ended; raise what has ended it."""
         await self._wait(lambda: is_so() or self.has_ended)
         if self._error is not None:
@@ -174,8 +174,8 @@ class FileStream(ABC):
 class FileHistory:
     """Beginning of a file that was moved already, for a transfer that begins anew.
 
-    Of a file that is written the data is kept, as far as KEPT, and given to the slave again.  Of
-    one that is read a hash is enough: what the reader has already is read again and compared.
+    The data of a written file is kept, up to MAX_KEPT, and sent to the slave again.  For a file
+    that is read a hash is enough: what the reader has already is read again and compared.
     """
 
     all_kept = 0
@@ -193,7 +193,7 @@ class FileHistory:
         if self._is_kept and self.can_rewind:
             self._data += data
             FileHistory.all_kept += len(data)
-            if len(self._data) > KEPT or FileHistory.all_kept > ALL_KEPT:
+            if len(self._data) > MAX_KEPT or FileHistory.all_kept > MAX_ALL_KEPT:
                 self.can_rewind = False
                 self.forget()
 
@@ -202,7 +202,7 @@ class FileHistory:
         FileHistory.all_kept -= len(self._data)
         self._data.clear()
 
-    def fresh(self, data: bytes) -> bytes:
+    def new_part(self, data: bytes) -> bytes:
         """Return what is new of *data*; raise BusError if the rest is not as it was."""
         known = min(len(data), self._size - self._repeated)
         if known:
@@ -237,7 +237,7 @@ class LocalFile(FileStream):
         name: Of the file, at the slave.
         password: Up to 32 bits.
         sizes: Of the slave's mailboxes.
-        open_turn: Waits for the file's turn at the slave; the file itself is the requester.
+        lock_mailbox: Waits for the file's turn at the slave; the file itself is the requester.
         is_write: Whether it goes to the slave.
         ahead: As AHEAD.
     """
@@ -247,14 +247,14 @@ class LocalFile(FileStream):
         name: str,
         password: int,
         sizes: MailboxSizes,
-        open_turn: Callable[[Hashable], Awaitable[MailboxTurn]],
+        lock_mailbox: Callable[[Hashable], Awaitable[MailboxLock]],
         *,
         is_write: bool,
         ahead: int = AHEAD,
     ) -> None:
         super().__init__(name, sizes, is_write=is_write, ahead=ahead)
         self._password = password
-        self._open_turn = open_turn
+        self._open_turn = lock_mailbox
         self._history = FileHistory(is_kept=is_write)
 
     async def move(self) -> None:
@@ -278,11 +278,11 @@ class LocalFile(FileStream):
     async def _move_once(self) -> None:
         room = self.sizes.to_slave - DATA_OVERHEAD
         turn = await self._open_turn(self)
-        self.notify(has_turn=True)
+        self.notify(has_lock=True)
 
         async def exchange(request: MailboxRequest) -> MailboxMessage:
             if not self.is_write:
-                await self.wait_room()
+                await self.wait_space()
             message = await turn.exchange(request)
             if self.is_write and message.data[:1] == _ACK:
                 self.notify(is_open=True)
@@ -301,14 +301,16 @@ class LocalFile(FileStream):
     def _begin(self) -> Conversation[int]:
         name, sizes, password, progress = self.name, self.sizes, self._password, self.progress
         if self.is_write:
-            return foe_client.write(name, self._give, sizes, password=password, progress=progress)
+            return foe_client.write(
+                name, self._next_data, sizes, password=password, progress=progress
+            )
         return foe_client.read(name, self._take, sizes, password=password, progress=progress)
 
     def _take(self, data: bytes) -> None:
-        self.buffer += self._history.fresh(data)
+        self.buffer += self._history.new_part(data)
         self.notify(is_open=True)
 
-    def _give(self, size: int) -> bytes:
-        data = self.cut(size)
+    def _next_data(self, size: int) -> bytes:
+        data = self.pop(size)
         self._history.keep(data)
         return data

@@ -38,12 +38,12 @@ STEP_S = 5.0
 PAUSE_S = 0.02
 """Pause before a station that is busy gets the request again."""
 _HANDLE_SIZE = 4
-_GIVE_UP = b"\1"
+_ABORT = b"\1"
 LONGEST_ANSWER = 0x20002
 """Octets of the longest answer: a list of all indexes there can be."""
-SHORT = 1 << 10
+SHORT_WRITE = 1 << 10
 """Octets of an object that goes to a slave in a few messages."""
-LONG_TIMES = 5
+LONG_WRITE_FACTOR = 5
 """Answer times that writing a longer one may take."""
 _COMPLETE = 0x100
 _ADDRESSES, _SLAVES = 0xF020, 0x8000
@@ -100,14 +100,15 @@ class RemoteSlave:
         if self._port == DEVICE_PORT:
             raise RemoteAccessError(AdsError.SERVICE)  # a master has no mailbox
         try:
-            index = _SLAVES + await self._number()
+            index = _SLAVES + await self._slave_number()
             return MailboxSizes(
-                await self._word(index, _TO_SLAVE), await self._word(index, _TO_MASTER)
+                await self._read_number(index, _TO_SLAVE),
+                await self._read_number(index, _TO_MASTER),
             )
         except ValueError:
             raise RemoteAccessError(AdsError.NOT_READY) from None
         except RemoteAccessError as exc:
-            if exc.is_of_way:
+            if exc.is_routing_error:
                 raise
             # The master's dictionary refused, which says nothing about the slave.
             raise RemoteAccessError(AdsError.SERVICE) from None
@@ -117,7 +118,7 @@ class RemoteSlave:
         try:
             await self.perform(ReadState())
         except RemoteAccessError as exc:
-            if exc.is_of_way:
+            if exc.is_routing_error:
                 raise
 
     async def read_object(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
@@ -147,7 +148,7 @@ class RemoteSlave:
             raise SdoAbortError(AbortCode.NO_COMPLETE_ACCESS, index, subindex, detail)
         offset = _sdo_offset(index, subindex, complete=complete)
         # The other station answers when its slave has all of it.
-        times = LONG_TIMES if len(data) > SHORT else 1
+        times = LONG_WRITE_FACTOR if len(data) > SHORT_WRITE else 1
         try:
             await self.perform(
                 Write(IndexGroup.SDO, offset, data), timeout_s=times * self._answer_s
@@ -252,7 +253,7 @@ class RemoteSlave:
             raise RemoteAccessError(outcome.result)
         return outcome.data
 
-    async def _number(self) -> int:
+    async def _slave_number(self) -> int:
         """Return the number of the slave in the lists of its master."""
         for number in range(_LISTS):
             offset = _sdo_offset(_ADDRESSES + number, 0, complete=True)
@@ -267,7 +268,7 @@ class RemoteSlave:
                 break
         raise RemoteAccessError(AdsError.TARGET_PORT)
 
-    async def _word(self, index: int, subindex: int) -> int:
+    async def _read_number(self, index: int, subindex: int) -> int:
         read = Read(IndexGroup.SDO, _sdo_offset(index, subindex, complete=False), 2)
         return int.from_bytes(await self.perform(read, port=DEVICE_PORT), "little")
 
@@ -311,19 +312,19 @@ class RemoteFile(FileStream):
         try:
             await super().run()
         finally:
-            await self._leave()
+            await self._close_remote()
 
     async def _open(self) -> None:
         sizes = await self._slave.sizes()
         self.sizes.set(sizes.to_slave, sizes.to_master)
-        self._check_wanted()  # a slave may forget its old file as soon as a new one is begun
+        self._check_open()  # a slave may forget its old file as soon as a new one is begun
         group = IndexGroup.FOE_OPEN_WRITE if self.is_write else IndexGroup.FOE_OPEN_READ
-        opened = await self._ask(group, self._password, _HANDLE_SIZE, self.name.encode())
+        opened = await self._request_block(group, self._password, _HANDLE_SIZE, self.name.encode())
         self._handle = int.from_bytes(opened, "little")
-        self.notify(has_turn=True, is_open=True)
-        self._check_wanted()
+        self.notify(has_lock=True, is_open=True)
+        self._check_open()
 
-    def _check_wanted(self) -> None:
+    def _check_open(self) -> None:
         if self._is_closed:
             raise RemoteAccessError(AdsError.ABORTED)
 
@@ -331,8 +332,8 @@ class RemoteFile(FileStream):
         size = self.sizes.to_master - DATA_OVERHEAD
         is_last = False
         while not is_last:
-            await self.wait_room()
-            data = await self._ask(IndexGroup.FOE_READ, self._handle, size)
+            await self.wait_space()
+            data = await self._request_block(IndexGroup.FOE_READ, self._handle, size)
             self.buffer += data
             self.progress.done += len(data)
             self.notify()
@@ -340,25 +341,27 @@ class RemoteFile(FileStream):
             size = min(2 * size, BLOCK)
 
     async def _drain(self) -> None:
-        while self.buffer or not self.is_whole:
+        while self.buffer or not self.is_finished:
             await self.wait_data(1)
             if block := bytes(self.buffer[:BLOCK]):
-                await self._ask(IndexGroup.FOE_WRITE, self._handle, 0, block)
+                await self._request_block(IndexGroup.FOE_WRITE, self._handle, 0, block)
                 self.progress.done += len(block)
-                self.cut(len(block))
-        await self._ask(IndexGroup.FOE_CLOSE, self._handle)
+                self.pop(len(block))
+        await self._request_block(IndexGroup.FOE_CLOSE, self._handle)
 
-    async def _leave(self) -> None:
+    async def _close_remote(self) -> None:
         """Close the file there; what was written of it does not count unless it is complete."""
         if not self.is_open or (self.is_write and self.is_complete):
             return
         last = ReadWrite(IndexGroup.FOE_CLOSE, self._handle, 0, b"")
         if self.is_write:
-            last = ReadWrite(IndexGroup.FOE_PROGRESS, self._handle, 0, _GIVE_UP)
+            last = ReadWrite(IndexGroup.FOE_PROGRESS, self._handle, 0, _ABORT)
         with suppress(RemoteAccessError):
             await self._slave.perform(last)
 
-    async def _ask(self, group: int, offset: int, length: int = 0, data: bytes = b"") -> bytes:
+    async def _request_block(
+        self, group: int, offset: int, length: int = 0, data: bytes = b""
+    ) -> bytes:
         """Send a request, and again as long as the answer is BUSY and the file is wanted."""
         while True:
             try:
@@ -382,21 +385,21 @@ def _soe_offset(idn: int, elements: int, drive: int) -> int:
 def _sdo_error(
     error: RemoteAccessError, index: int, subindex: int
 ) -> RemoteAccessError | SdoAbortError:
-    if error.is_of_way:
+    if error.is_routing_error:
         return error
     return SdoAbortError(cause_of_result(error.result).sdo, index, subindex)
 
 
 def _soe_error(error: RemoteAccessError) -> RemoteAccessError | SoeError:
     code = cause_of_result(error.result).soe
-    if error.is_of_way or code is SoeErrorCode.GENERAL:
+    if error.is_routing_error or code is SoeErrorCode.GENERAL:
         return error
     return SoeError(name_of(code), code=code)
 
 
 def _foe_error(error: RemoteAccessError) -> RemoteAccessError | FoeError:
     """Return the refusal with an FoE code; errors of the way to the slave stay as they are."""
-    if error.is_of_way:
+    if error.is_routing_error:
         return error
     code = cause_of_result(error.result).foe
     text = f"{name_of_foe(code)}: ADS error 0x{error.result:x} ({AdsError.name_of(error.result)})"

@@ -173,7 +173,7 @@ class FrameHandler(Protocol):
     """Handler of frames that are not AoE to a station: the gateways, if there are any."""
 
     @property
-    def is_there(self) -> bool:
+    def has_gateway(self) -> bool:
         """Whether there is a gateway."""
 
     def receive(
@@ -285,7 +285,7 @@ class MailboxIntake:
         if aoe_packet(data[:size]) is not None:
             return None
         reason = refusal_of(data[:size])
-        is_taken = self._gateway.is_there and not self._is_for_many(data)
+        is_taken = self._gateway.has_gateway and not self._is_for_many(data)
         return None if is_taken and reason is DropReason.MAILBOX else reason
 
 

@@ -39,7 +39,7 @@ from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway.gateway import MailboxGateway, Settings
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.gateway.sessions import MasterSession
-from eap.services.slaves.bus_client import BusClient, BusDescription, MailboxTurn
+from eap.services.slaves.bus_client import BusClient, BusDescription, MailboxLock
 from eap.services.slaves.remote_slave import RemoteSlave
 from tools.fuzz.messages import cut
 
@@ -50,7 +50,7 @@ _STATION = 1001
 _VIRTUAL = 0x9001
 """A slave of another station."""
 _ADDRESSES = (_STATION, 0, 0xFFFF, _STATION | 0x8000, 7, _VIRTUAL)
-_SETTINGS = Settings(NetId(b"\1\2\3\4\5\6"), room=60, limits=ClientLimits(4, clients=1))
+_SETTINGS = Settings(NetId(b"\1\2\3\4\5\6"), max_size=60, limits=ClientLimits(4, clients=1))
 _EVERYTHING = (AccessRule("all", allow=True, services=(AccessService.READ, AccessService.WRITE)),)
 
 
@@ -74,12 +74,12 @@ class _Conversation:
     def __init__(self, box: MailboxServer) -> None:
         self._box = box
 
-    async def exchange(self, ask: MailboxRequest) -> MailboxMessage:
-        if not ask.listen:
-            octets = encode_message(MailboxHeader(0, 0, type=ask.type), ask.request)
+    async def exchange(self, handle: MailboxRequest) -> MailboxMessage:
+        if not handle.listen:
+            octets = encode_message(MailboxHeader(0, 0, type=handle.type), handle.request)
             self._box.receive_message(octets, 0)
-        if not ask.expects_reply:
-            return MailboxMessage(ask.type, b"")
+        if not handle.expects_reply:
+            return MailboxMessage(handle.type, b"")
         reply = self._box.next_message(0)
         if reply is None:
             raise MailboxTimeoutError("nothing comes")
@@ -123,17 +123,17 @@ class _Link:
     async def confirm(self) -> BusDescription:
         return await self.current()
 
-    async def open_turn(
-        self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
-    ) -> MailboxTurn:
-        return cast("MailboxTurn", _Conversation(self._box))
+    async def lock_mailbox(
+        self, station: int, kind: MailboxType, requester: Hashable, lock_s: float | None = None
+    ) -> MailboxLock:
+        return cast("MailboxLock", _Conversation(self._box))
 
     async def converse(
         self,
         station: int,
         conversation: Conversation[T],
         requester: Hashable,
-        turn_s: float | None = None,
+        lock_s: float | None = None,
     ) -> T:
         return await drive_async(conversation, _Conversation(self._box).exchange)
 
@@ -185,7 +185,9 @@ async def _serve(data: bytes) -> None:
     link = RemoteSlave(_send_requests, _STATION, answer_s=1)
     gateway = MailboxGateway(
         cast("BusClient", _Link(dictionary)),
-        lambda: MasterSession(dictionary, _SETTINGS.room, _nothing, lambda index: bool(index & 1)),
+        lambda: MasterSession(
+            dictionary, _SETTINGS.max_size, _nothing, lambda index: bool(index & 1)
+        ),
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,
         AddressMap({_VIRTUAL: RemoteAddress(_SETTINGS.net_id, 1001)}),

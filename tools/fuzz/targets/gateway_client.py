@@ -54,11 +54,11 @@ def _exchange(
     place: GatewayConversation,
     kind: MailboxType,
     bodies: Iterator[bytes],
-    ask: MailboxRequest,
+    handle: MailboxRequest,
 ) -> MailboxMessage:
     """Answer a request with one message after the other; then let the time run out."""
     now_ns = 0
-    request = core.request(place, ask, now_ns)
+    request = core.request(place, handle, now_ns)
     for _ in range(_MAX_STEPS):
         if request.is_done:
             return request.result()

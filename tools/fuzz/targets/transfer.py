@@ -6,7 +6,7 @@ from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestTracker
-from eap.gateway.requests import operation_of, refuse
+from eap.gateway.requests import error_reply, operation_of
 from tools.fuzz.messages import cut
 
 _WAYS = tuple(Endpoint("door", str(number)) for number in range(5))
@@ -19,7 +19,7 @@ def fuzz_one(data: bytes) -> None:
     for kind in MailboxType:
         for number, body in enumerate(messages):
             operation_of(kind, body)
-            answer = refuse(kind, body, _CAUSES[number % len(_CAUSES)])
+            answer = error_reply(kind, body, _CAUSES[number % len(_CAUSES)])
             if answer.type not in {kind, MailboxType.ERR} or not answer.body:
                 raise AssertionError(f"{kind.name}: {answer}")
     _check_accounting(messages)

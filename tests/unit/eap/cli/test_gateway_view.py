@@ -11,7 +11,7 @@ ROW = {
     "port": "bus0",
     "served": ["udp://10.0.0.1:34980", "tcp://10.0.0.1:34980"],
     "state": "running",
-    "turned_away": 0,
+    "dropped": 0,
     "settings": {
         "answer_ms": 900, "silent": False, "in_flight": 32, "rate": 0, "clients": 256,
     },
@@ -66,7 +66,7 @@ def test_of_many_clients_the_latest_are_shown_and_those_with_transfers():
 
 
 def test_one_that_is_stopped_and_silent():
-    quiet = ROW | {"state": "stopped", "turned_away": 3, "served": [], "clients": [], "slaves": []}
+    quiet = ROW | {"state": "stopped", "dropped": 3, "served": [], "clients": [], "slaves": []}
     quiet["settings"] = ROW["settings"] | {"silent": True}
     assert shown(quiet) == (
         "mixer/bus0: stopped at no socket; answers within 900 ms, silent, 3 frames dropped\n"

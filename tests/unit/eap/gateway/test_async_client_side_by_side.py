@@ -243,8 +243,8 @@ def test_cancelled_transfer_leaves_no_reply_for_the_next_one() -> None:
         read.cancel()
         with pytest.raises(asyncio.CancelledError):
             await read
-        _, farewell = await gateway.request()
-        assert farewell[0] == 5, "an FoE error ends the transfer at the slave"
+        _, abort = await gateway.request()
+        assert abort[0] == 5, "an FoE error ends the transfer at the slave"
         again = asyncio.ensure_future(client.foe_read(1001, "new"))
         await asyncio.sleep(0)
         gateway.reply(1001, MailboxType.FOE, b"\3\0\1\0\0\0old")

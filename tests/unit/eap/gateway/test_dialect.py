@@ -12,10 +12,10 @@ from eap.errors import CodecError, MalformedError
 from eap.gateway import dialect
 from eap.gateway.dialect import (
     DialectFailure,
+    ExchangeVoe,
     ReadFile,
     ReadIdn,
     ReadSdo,
-    TalkVoe,
     WriteIdn,
     WriteSdo,
 )
@@ -31,7 +31,7 @@ TASKS = {
     "soe_read_idn_32_drive1_element_0_name": (1001, ReadIdn(32, 1, Element.NAME)),
     "soe_write_idn_32_1000": (1001, WriteIdn(32, 0, Element.VALUE, bytes.fromhex("e8030000"))),
     "foe_read_firmware_bin": (1001, ReadFile("firmware.bin")),
-    "voe_vendor_0x1164_type_1_data_01_02": (1001, TalkVoe(bytes.fromhex("6411000001000102"))),
+    "voe_vendor_0x1164_type_1_data_01_02": (1001, ExchangeVoe(bytes.fromhex("6411000001000102"))),
 }
 VECTORS = {vector.name.partition("/")[2]: vector for vector in load("high_nibble_dialect")}
 
@@ -125,7 +125,7 @@ def test_what_is_not_understood_says_what_was_expected(kind, octets, why) -> Non
         ("01 05 2000", ReadIdn(32, 0, Element.VALUE), "e8030000", "02 05 2000 e8030000"),
         ("02 05 2000 e8030000", WriteIdn(32, 0, Element.VALUE, b""), "", "04 05 2000"),
         ("01 00000000 66", ReadFile("f"), "0102", "03 00000000 0102"),
-        ("64110000 0100 01", TalkVoe(b""), "64110000 0100 02", "64110000 0100 02"),
+        ("64110000 0100 01", ExchangeVoe(b""), "64110000 0100 02", "64110000 0100 02"),
     ],
 )
 def test_what_is_done(request_, task, data, answer) -> None:

@@ -13,7 +13,7 @@ from eap.codec.foe import Busy, FoeErrorCode, FoeOpcode, decode_message, text_of
 from eap.codec.mailbox import MailboxError, MailboxType
 from eap.codec.soe import SoeErrorCode, SoeHeader, error_code_of
 from eap.gateway.error_table import Cause
-from eap.gateway.requests import refuse
+from eap.gateway.requests import error_reply
 from eap.ids import NetId
 
 COE, FOE, SOE, VOE, EOE, AOE = (
@@ -39,25 +39,25 @@ MAILBOX = {
     ],
 )
 def test_an_sdo_is_aborted(reason, code) -> None:
-    answer = refuse(COE, UPLOAD, reason)
+    answer = error_reply(COE, UPLOAD, reason)
     assert answer == (COE, bytes.fromhex("0020 80 1810 02" + code))
 
 
 def test_sdo_information_has_an_error_of_its_own() -> None:
-    answer = refuse(COE, bytes.fromhex("0080 03 00 0000 1810"), Cause.TIMEOUT)
+    answer = error_reply(COE, bytes.fromhex("0080 03 00 0000 1810"), Cause.TIMEOUT)
     assert answer == (COE, bytes.fromhex("0080 07 00 0000 00000405"))
 
 
 def test_an_idn_is_refused() -> None:
-    answer = refuse(SOE, bytes.fromhex("a1 40 2000"), Cause.TIMEOUT)
+    answer = error_reply(SOE, bytes.fromhex("a1 40 2000"), Cause.TIMEOUT)
     header = SoeHeader.decode(answer.body)
     assert (header.opcode, header.error, header.drive, header.idn) == (2, 1, 5, 32)
     assert error_code_of(answer.body) == SoeErrorCode.GENERAL
-    assert refuse(SOE, bytes.fromhex("03 40 2000"), Cause.TOO_LONG).body[0] & 0x17 == 0x14
+    assert error_reply(SOE, bytes.fromhex("03 40 2000"), Cause.TOO_LONG).body[0] & 0x17 == 0x14
 
 
 def test_a_file_transfer_ends_with_words() -> None:
-    answer = refuse(FOE, bytes.fromhex("01 00 00000000 66"), Cause.NO_SLAVE, "no slave 1009")
+    answer = error_reply(FOE, bytes.fromhex("01 00 00000000 66"), Cause.NO_SLAVE, "no slave 1009")
     header, body = decode_message(answer.body)
     assert (header.opcode, header.number) == (FoeOpcode.ERROR, FoeErrorCode.NOT_FOUND)
     assert text_of(body) == "no slave 1009"
@@ -67,7 +67,7 @@ def test_a_file_transfer_ends_with_words() -> None:
     ("reason", "words"), [(Cause.BUSY, "another client"), (Cause.TOO_FAST, "a second")]
 )
 def test_whose_file_has_to_wait_is_asked_for_patience(reason, words) -> None:
-    header, body = decode_message(refuse(FOE, bytes.fromhex("01 00 00000000 66"), reason).body)
+    header, body = decode_message(error_reply(FOE, bytes.fromhex("01 00 00000000 66"), reason).body)
     assert header.opcode is FoeOpcode.BUSY
     assert Busy.of(header.number) == Busy(0, 100)
     assert words in text_of(body)
@@ -76,7 +76,7 @@ def test_whose_file_has_to_wait_is_asked_for_patience(reason, words) -> None:
 def test_an_ams_packet_comes_back() -> None:
     slave, client = NetId.parse("1.2.3.4.5.6"), NetId.parse("6.5.4.3.2.1")
     asked = AmsHeader(slave, 1001, client, 7, AmsCommand.READ, StateFlags.ADS, invoke_id=99)
-    answer = refuse(AOE, encode_packet(asked, bytes(12)), Cause.TIMEOUT)
+    answer = error_reply(AOE, encode_packet(asked, bytes(12)), Cause.TIMEOUT)
     header, body = decode_packet(answer.body)
     assert (header.target, header.target_port, header.invoke_id) == (client, 7, 99)
     assert (header.error_code, bytes(body)) == (AdsError.TIMEOUT, b"")
@@ -85,21 +85,21 @@ def test_an_ams_packet_comes_back() -> None:
 @pytest.mark.parametrize(("reason", "octets"), MAILBOX.items())
 def test_what_has_no_error_of_its_own_gets_that_of_the_mailbox(reason, octets) -> None:
     expected = MailboxType.ERR, bytes.fromhex(octets)
-    assert refuse(VOE, b"anything", reason) == expected
-    assert refuse(EOE, b"", reason) == expected
-    assert refuse(AOE, b"short", reason) == expected
-    assert refuse(COE, b"", reason) == expected
-    assert refuse(COE, b"\0\x50", reason) == expected
-    assert refuse(SOE, b"\x05\0\0\0", reason) == expected
-    assert refuse(FOE, b"", reason) == expected
+    assert error_reply(VOE, b"anything", reason) == expected
+    assert error_reply(EOE, b"", reason) == expected
+    assert error_reply(AOE, b"short", reason) == expected
+    assert error_reply(COE, b"", reason) == expected
+    assert error_reply(COE, b"\0\x50", reason) == expected
+    assert error_reply(SOE, b"\x05\0\0\0", reason) == expected
+    assert error_reply(FOE, b"", reason) == expected
 
 
 def test_protocol_that_is_not_spoken_is_refused_in_that_protocol() -> None:
-    soe = refuse(SOE, bytes.fromhex("a1 40 2000"), Cause.NO_PROTOCOL)
+    soe = error_reply(SOE, bytes.fromhex("a1 40 2000"), Cause.NO_PROTOCOL)
     header = SoeHeader.decode(soe.body)
     assert (soe.type, header.opcode, header.error, header.drive, header.idn) == (SOE, 2, 1, 5, 32)
     assert error_code_of(soe.body) == SoeErrorCode.NO_IDN
-    foe = refuse(FOE, bytes.fromhex("01 00 00000000 66"), Cause.NO_PROTOCOL)
+    foe = error_reply(FOE, bytes.fromhex("01 00 00000000 66"), Cause.NO_PROTOCOL)
     header, body = decode_message(foe.body)
     assert (foe.type, header.opcode) == (FOE, FoeOpcode.ERROR)
     assert text_of(body) == "it does not speak this protocol"
@@ -109,13 +109,13 @@ def test_time_outs_missing_slaves_and_protocols_and_lengths_differ_in_every_prot
     requests = {COE: UPLOAD, SOE: bytes.fromhex("01 40 2000"), FOE: b"\1\0\0\0\0\0f", VOE: bytes(6)}
     reasons = (Cause.NO_SLAVE, Cause.NO_PROTOCOL, Cause.TIMEOUT, Cause.TOO_LONG)
     for kind, request in requests.items():
-        answers = [refuse(kind, request, reason) for reason in reasons]
+        answers = [error_reply(kind, request, reason) for reason in reasons]
         assert all(one != other for one, other in itertools.combinations(answers, 2))
 
 
 def test_every_request_has_an_answer() -> None:
     for reason, kind, size in itertools.product(Cause, MailboxType, range(8)):
-        answer = refuse(kind, bytes((0x21,)) * size, reason)
+        answer = error_reply(kind, bytes((0x21,)) * size, reason)
         assert answer.type in {kind, MailboxType.ERR}
         assert answer.body
         assert reason.text

@@ -67,7 +67,7 @@ def test_a_ticket_is_given_back_once() -> None:
     tracker = RequestTracker()
     tracker.admit(A, b"a", 0)
     ticket = Ticket(tracker, A, b"a")
-    ticket.give_back()
+    ticket.release()
     assert tracker.admit(A, b"a", 1) is RequestAdmission.TAKEN
-    ticket.give_back()
+    ticket.release()
     assert tracker.waiting(A) == 1

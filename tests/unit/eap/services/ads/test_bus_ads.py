@@ -255,7 +255,7 @@ def test_operation_that_takes_too_long_is_answered_in_time(monkeypatch):
 
 def test_slave_that_is_busy_does_not_hold_up_others():
     async def scene(client, engine):
-        talk = await client.bus.open_turn(1001, MailboxType.COE, "somebody else")
+        talk = await client.bus.lock_mailbox(1001, MailboxType.COE, "somebody else")
         waiting = asyncio.ensure_future(client.do(1001, VENDOR))
         assert await client.good(SENSOR, VENDOR) == VENDOR_ID
         assert not waiting.done()

@@ -97,7 +97,7 @@ def test_state_request_that_fails_is_logged(caplog):
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch):
-    monkeypatch.setattr(master_ads, "LOOK_S", 0.001)
+    monkeypatch.setattr(master_ads, "POLL_S", 0.001)
 
 
 def samples(client) -> list[tuple[int, bytes]]:

@@ -75,8 +75,8 @@ class Bench:
         )
         return self.table.add(CLIENT, asked, source, self.engine.now_ns)
 
-    def look(self) -> int | None:
-        return self.pump.look(self.engine.now_ns, self.engine.now_ns + UNIX_AT_0)
+    def refresh(self) -> int | None:
+        return self.pump.advance(self.engine.now_ns, self.engine.now_ns + UNIX_AT_0)
 
     def told(self) -> list[tuple[int, int]]:
         """Return time in cycles and value of all samples since the last call."""
@@ -106,125 +106,125 @@ def bench(engine, images):
 
 def test_nobody_looks_while_nobody_listens(bench):
     bench.engine.run(3)
-    assert bench.look() is None
+    assert bench.refresh() is None
     assert bench.engine.image.words[StationWord.SAMPLED_UNTIL] == 0
 
 
 def test_every_cycle_is_told_with_its_own_time(bench):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     bench.engine.run(5)
-    bench.look()
+    bench.refresh()
     assert bench.told() == [(n, n) for n in range(1, 6)]
     bench.engine.run()
-    bench.look()
+    bench.refresh()
     assert bench.told() == [(6, 6)]
 
 
 def test_as_many_cycles_are_told_as_are_kept(bench):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     count = bench.engine.image.layout.samples.count
     bench.engine.run(count + 10)
-    bench.look()
+    bench.refresh()
     assert bench.told() == [(n, n) for n in range(11, count + 11)]
 
 
 def test_others_have_a_turn_while_many_are_told(bench):
     for _ in range(300):
         bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     bench.engine.run(5)
-    assert bench.look() == MS
+    assert bench.refresh() == MS
     assert {cycle for cycle, _ in bench.told()} == {1, 2}
-    assert bench.look() == MS
-    assert bench.look() > MS
+    assert bench.refresh() == MS
+    assert bench.refresh() > MS
     assert {cycle for cycle, _ in bench.told()} == {3, 4, 5}
 
 
 def test_only_what_is_due_is_told_and_looked_for(bench):
     bench.engine.run()
     bench.watch("ticks", cycle_ns=5 * CYCLE)
-    assert bench.look() == CYCLE + 200_000 - MS
+    assert bench.refresh() == CYCLE + 200_000 - MS
     bench.engine.run()
-    delay_ns = bench.look()
+    delay_ns = bench.refresh()
     assert bench.told() == [(2, 2)]
     assert 3 * CYCLE < delay_ns <= 5 * CYCLE
     bench.engine.run(10)
-    bench.look()
+    bench.refresh()
     assert bench.told() == [(6, 6), (11, 11)]
 
 
 def test_changes_are_told(bench, images):
     bench.watch("running", TransMode.SERVER_ON_CHANGE, size=1)
-    bench.look()
+    bench.refresh()
     for _ in range(3):
         bench.engine.run(2)
-        bench.look()
+        bench.refresh()
     assert bench.told() == [(1, 0)]
 
 
 def test_the_end_of_the_last_one_is_the_end_of_looking(bench):
     handle = bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     bench.table.delete(CLIENT, handle)
-    assert bench.look() is None
+    assert bench.refresh() is None
 
 
 def test_connection_that_is_gone_is_told_nothing(bench):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     bench.table.forget(WAY)
     bench.engine.run(2)
-    assert bench.look() is None
+    assert bench.refresh() is None
     assert bench.told() == []
 
 
 def test_engine_that_does_not_run_is_looked_at_less_often(bench):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     now_ns = bench.engine.now_ns
-    assert bench.pump.look(now_ns + 2 * CYCLE, now_ns) == MS
-    assert bench.pump.look(now_ns + 9 * CYCLE, now_ns) == 10 * MS
+    assert bench.pump.advance(now_ns + 2 * CYCLE, now_ns) == MS
+    assert bench.pump.advance(now_ns + 9 * CYCLE, now_ns) == 10 * MS
     bench.engine.run(2)  # as if by another one
-    bench.look()
+    bench.refresh()
     assert bench.told() == [(1, 1), (2, 2)]
 
 
 def test_samples_are_wanted_for_a_second_from_each_look(bench):
     bench.watch("ticks", cycle_ns=10**12)
-    bench.look()
+    bench.refresh()
     bench.engine.run(7)
-    assert bench.look() == 200 * MS
+    assert bench.refresh() == 200 * MS
     assert bench.engine.image.words[StationWord.SAMPLED_UNTIL] == 7 + 102
 
 
 def test_new_layout_is_followed(bench, stations, files):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     bench.engine.run()
-    bench.look()
+    bench.refresh()
     spec = replace(stations[0], variables=(*stations[0].variables, VariableSpec("more", "UDINT")))
     with create_image(files["left"].path, plan_layout(spec)) as fresh:
         bench.engine.attach(fresh)
-        bench.look()
+        bench.refresh()
         bench.engine.run(2)
-        bench.look()
+        bench.refresh()
         assert bench.told() == [(1, 1), (2, 2), (3, 3)]
 
 
 def test_the_last_one_whose_variable_is_gone_ends(bench, stations, files):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     spec = replace(stations[0], variables=stations[0].variables[1:], sources=(), frames=())
     with create_image(files["left"].path, plan_layout(spec)) as fresh:
         bench.engine.attach(fresh)
-        bench.look()
+        bench.refresh()
         for cycle in (1, 2):
             fresh.image.words[StationWord.CYCLE] = cycle
             bench.engine.sampler.end_cycle(cycle, cycle * CYCLE)
-        assert bench.look() == 0
-        assert bench.look() is None
+        assert bench.refresh() == 0
+        assert bench.refresh() is None
     ((_, packet),) = bench.sent
     ((sample,),) = [stamp.samples for stamp in decode_notification(decode_packet(packet)[1])]
     assert sample.data == b""
@@ -232,24 +232,24 @@ def test_the_last_one_whose_variable_is_gone_ends(bench, stations, files):
 
 def test_sample_that_is_overwritten_while_it_is_read_is_missed(bench, monkeypatch):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     bench.engine.run(3)
     read = ImageSamples.read
     monkeypatch.setattr(ImageSamples, "read", lambda self, n: None if n == 2 else read(self, n))
-    bench.look()
+    bench.refresh()
     assert bench.told() == [(1, 1), (3, 3)]
 
 
 def test_image_that_is_gone_is_waited_for(bench, files, stations):
     bench.watch("ticks")
-    bench.look()
+    bench.refresh()
     files["left"].path.unlink()
     files["left"].retire()
-    assert bench.look() == 200 * MS
+    assert bench.refresh() == 200 * MS
     with create_image(files["left"].path, plan_layout(stations[0])) as fresh:
         bench.engine.attach(fresh)
         fresh.image.words[StationWord.CYCLE_AT_NS] = bench.engine.now_ns
-        assert bench.look() is not None
+        assert bench.refresh() is not None
 
 
 def test_whoever_is_added_is_told_soon(bench):
@@ -269,7 +269,7 @@ def test_whoever_is_added_is_told_soon(bench):
 def test_fault_is_logged_and_others_are_told_later(bench, caplog, monkeypatch):
     caplog.set_level(logging.ERROR)
     bench.watch("ticks")
-    monkeypatch.setattr(bench.symbols, "look", lambda: 1 // 0)
+    monkeypatch.setattr(bench.symbols, "refresh", lambda: 1 // 0)
 
     async def run():
         serving = asyncio.ensure_future(bench.pump.serve())

@@ -11,7 +11,7 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import NetId
 from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.ads import slave_files
-from eap.services.slaves.file_stream import BEHIND
+from eap.services.slaves.file_stream import MAX_UNSENT
 from tests.support.busads import Client, play
 
 DISK, OTHER = 1001, 1002
@@ -177,7 +177,7 @@ def test_file_is_closed_by_a_close_with_data(data):
 
 
 def test_file_left_open_gives_way_to_the_next_one_of_its_owner(monkeypatch):
-    monkeypatch.setattr(slave_files, "LEFT_S", 0.02)
+    monkeypatch.setattr(slave_files, "ABANDONED_S", 0.02)
 
     async def scene(client, engine):
         left = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -191,7 +191,7 @@ def test_file_left_open_gives_way_to_the_next_one_of_its_owner(monkeypatch):
 
 
 def test_file_left_open_does_not_count_when_its_owner_opens_the_next_one(monkeypatch):
-    monkeypatch.setattr(slave_files, "LEFT_S", 0)
+    monkeypatch.setattr(slave_files, "ABANDONED_S", 0)
     monkeypatch.setattr(slave_files, "MAX_OF_CLIENT", 1)
 
     async def scene(client, engine):
@@ -203,7 +203,7 @@ def test_file_left_open_does_not_count_when_its_owner_opens_the_next_one(monkeyp
 
 
 def test_file_left_open_does_not_give_way_to_other_clients(monkeypatch):
-    monkeypatch.setattr(slave_files, "LEFT_S", 0)
+    monkeypatch.setattr(slave_files, "ABANDONED_S", 0)
     monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
@@ -217,13 +217,13 @@ def test_file_left_open_does_not_give_way_to_other_clients(monkeypatch):
 
 
 def test_file_in_use_does_not_give_way_to_the_next_one_of_its_owner(monkeypatch):
-    monkeypatch.setattr(slave_files, "LEFT_S", 0.05)
+    monkeypatch.setattr(slave_files, "ABANDONED_S", 0.05)
     monkeypatch.setattr(slave_files, "ANSWER_S", 0.1)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         hold_mailboxes(engine)
-        block = bytes(BEHIND + 1)
+        block = bytes(MAX_UNSENT + 1)
         await client.ask(DISK, WRITE, handle, block, 0)
         closing = asyncio.ensure_future(client.do(DISK, ReadWrite(CLOSE, handle, 0, b"")))
         await asyncio.sleep(0)
@@ -254,7 +254,7 @@ def test_file_of_a_slow_slave_is_busy_until_it_goes_on(monkeypatch):
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         hold_mailboxes(engine)
-        block = bytes(BEHIND + 1000)
+        block = bytes(MAX_UNSENT + 1000)
         await client.ask(DISK, WRITE, handle, block, 0)
         for group, data in ((WRITE, b"more"), (CLOSE, b"")):
             late = await client.do(DISK, ReadWrite(group, handle, 0, data))

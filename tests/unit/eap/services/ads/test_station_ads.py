@@ -98,4 +98,4 @@ def test_notifications_leave_by_the_router(ads, router, sender, stations, files)
     ((sample,),) = [stamp.samples for stamp in decode_notification(told.body)]
     assert sample == (int.from_bytes(added[4:], "little"), bytes(2))
     router.connection_closed("ams-tcp", CONNECTION)
-    assert ads.pump.look(monotonic_ns(), 0) is None
+    assert ads.pump.advance(monotonic_ns(), 0) is None

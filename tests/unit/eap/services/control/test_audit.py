@@ -73,15 +73,15 @@ def lines(audit: Audit) -> list[dict[str, Any]]:
 
 
 def test_clients_of_the_control_socket_have_lines_and_limits(audit: Audit, clock: Clock) -> None:
-    words = {"operation": "od_write", "error": ""}
+    fields = {"operation": "od_write", "error": ""}
     for _ in range(BURST + 2):
-        audit.write_request("uid 0, pid 7", "island-01", words)
-    audit.write_request("uid 0, pid 8", "island-01", words)
+        audit.write_request("uid 0, pid 7", "island-01", fields)
+    audit.write_request("uid 0, pid 8", "island-01", fields)
     clock.now += 1
-    audit.tell_skipped()
+    audit.write_skipped()
     told = lines(audit)
     head = {"time": "2023-11-14T22:13:20.250+00:00", "station": "island-01", "transport": "control"}
-    assert told[0] == head | {"from": "uid 0, pid 7"} | words
+    assert told[0] == head | {"from": "uid 0, pid 7"} | fields
     assert [each["from"] for each in told].count("uid 0, pid 7") == BURST + 1
     assert told[-2] == told[0] | {"from": "uid 0, pid 8"}
     assert told[-1] == head | {"from": "uid 0, pid 7", "skipped": 2}
@@ -157,8 +157,8 @@ def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: C
     audit.write("island-01", entry(count=BURST + 20))
     audit.write("island-01", entry(endpoint=Endpoint("ams-tcp", "10.0.0.6:1")))
     assert len(lines(audit)) == BURST + 1
-    audit.tell_skipped()
-    audit.tell_skipped()
+    audit.write_skipped()
+    audit.write_skipped()
     assert lines(audit)[BURST + 1 :] == [
         {
             "time": "2023-11-14T22:13:20.250+00:00",
@@ -199,7 +199,7 @@ def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None
     for number in range(1100):
         endpoint = Endpoint("ams-tcp", f"10.1.{number // 250}.{number % 250}:1")
         audit.write("island-01", entry(endpoint=endpoint))
-    audit.tell_skipped()
+    audit.write_skipped()
     skipped = {line["from"]: line["skipped"] for line in lines(audit) if "skipped" in line}
     assert skipped["10.0.0.5"] == 1
     assert len(lines(audit)) - len(skipped) == BURST + module.NEW_RATE.burst - 1
@@ -240,11 +240,11 @@ def test_audit_counts_what_cannot_be_written_and_says_so_when_it_can_again(
     times = "2023-11-14T22:15:00.000+00:00", "2023-11-14T22:15:05.000+00:00"
     unix = 1_700_000_100.0, 1_700_000_105.0
     assert audit.lost == (3, *unix, "No space left on device")
-    audit.tell_lost()
+    audit.write_lost()
     assert audit.lost.lines == 3
     file.error = ""
     clock.now += 5
-    audit.tell_lost()
+    audit.write_lost()
     assert audit.lost == (3, *unix, "")
     audit.write("island-01", entry())
     first, second = lines(audit)
@@ -302,10 +302,10 @@ def test_required_audit_limits_the_lines_of_a_control_client_that_it_refuses(
     tmp_path: Path, clock: Clock
 ) -> None:
     audit = required(AuditFile(tmp_path / "audit.jsonl"), clock)
-    words = {"operation": "od_write"}
-    found = [audit.begin_request("uid 0, pid 7", "island-01", words) for _ in range(BURST + 3)]
+    fields = {"operation": "od_write"}
+    found = [audit.begin_request("uid 0, pid 7", "island-01", fields) for _ in range(BURST + 3)]
     assert found == [""] * BURST + [module.TOO_MANY] * 3
-    audit.tell_skipped()
+    audit.write_skipped()
     assert len(lines(audit)) == BURST + 1
     assert lines(audit)[-1]["skipped"] == 3
 

@@ -198,7 +198,7 @@ def test_datagrams_and_states():
         answer = await connection.call("bus_bring", WHERE | {"state": "INIT"})
         assert answer == {"state": "INIT"}
         assert (await connection.call("bus_describe", WHERE))["slaves"][0]["state"] == 1
-        with pytest.raises(BusError, match="no slave 1009"):
+        with pytest.raises(BusError, match="unknown slave 1009"):
             await connection.call("bus_bring", WHERE | {"slave": 1009, "state": "INIT"})
 
     play(scene)

@@ -11,7 +11,7 @@ import pytest
 from eap.control.bus import BusOpenParameters, MailboxData
 from eap.control.device import ApplyAnswer, StateAnswer, StateError
 from eap.control.protocol import Request
-from eap.services.control.control_server import change_of, peer_of, refusal_in
+from eap.services.control.control_server import change_of, error_in_result, peer_of
 
 
 def opened(protocol: str = "coe") -> BusOpenParameters:
@@ -104,7 +104,7 @@ def test_a_conversation_that_is_not_open() -> None:
     ],
 )
 def test_refusals_that_are_results(result: Any, text: str) -> None:
-    assert refusal_in(result) == text
+    assert error_in_result(result) == text
 
 
 @pytest.mark.parametrize(
@@ -119,6 +119,6 @@ def test_refusals_that_are_results(result: Any, text: str) -> None:
     ],
 )
 def test_what_a_slave_refuses(protocol: str, data: str, is_error: bool) -> None:
-    text = refusal_in(MailboxData(data), opened(protocol))
+    text = error_in_result(MailboxData(data), opened(protocol))
     assert bool(text) == is_error
     assert protocol != "coe" or not is_error or "read-only entry (0x06010002)" in text

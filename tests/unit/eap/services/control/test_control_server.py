@@ -72,17 +72,17 @@ class Talk:
 
 
 def test_requests_are_answered_in_order(methods):
-    async def talk():
+    async def conversation():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             for number in range(3):
                 client.say(f'{{"v":1,"id":{number},"method":"hello"}}')
             assert [(await client.hear())["id"] for _ in range(3)] == [0, 1, 2]
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_refusals_keep_the_connection(methods):
-    async def talk():
+    async def conversation():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             client.say("what?")
             assert (await client.hear())["error"]["code"] == "bad_request"
@@ -94,7 +94,7 @@ def test_refusals_keep_the_connection(methods):
             assert (await client.ask("stop"))["error"]["code"] == "internal"
             assert (await client.ask("hello"))["result"]["plant"] == "demo"
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_changes_are_told_before_they_are_answered(images):
@@ -105,7 +105,7 @@ def test_changes_are_told_before_they_are_answered(images):
     methods = Methods({}, images, status=torn, stop=lambda: None, more=more)
     told = []
 
-    async def talk():
+    async def conversation():
         server = ControlServer(methods, NO_BUSES, lambda *line: told.append(line))
         async with Talk(server) as client:
             await client.ask("hello")
@@ -114,7 +114,7 @@ def test_changes_are_told_before_they_are_answered(images):
             await client.ask("request_state", target="left", state="OP")
             return first, told[1]
 
-    first, second = asyncio.run(talk())
+    first, second = asyncio.run(conversation())
     assert first[:2] == second[:2] == (f"uid {os.getuid()}, pid {os.getpid()}", "left")
     assert "object does not exist" in first[2]["error"]
     assert second[2] == {
@@ -128,15 +128,18 @@ def test_change_that_cannot_be_recorded_is_refused(images):
         {}, images, status=torn, stop=lambda: None, more={"od_write": lambda params: done.append(1)}
     )
 
-    async def talk():
+    async def conversation():
         server = ControlServer(
-            methods, NO_BUSES, lambda *line: told.append(line), begin=lambda *_: "the disk is full"
+            methods,
+            NO_BUSES,
+            lambda *line: told.append(line),
+            announce=lambda *_: "the disk is full",
         )
         async with Talk(server) as client:
             await client.ask("hello")
             return await client.ask("od_write", target="left")
 
-    error = asyncio.run(talk())["error"]
+    error = asyncio.run(conversation())["error"]
     assert (error["code"], error["message"]) == ("refused", "the disk is full")
     assert not done
     assert not told  # what refuses it writes that down
@@ -148,27 +151,27 @@ def test_refusals_of_dictionaries_carry_their_abort_code(images):
 
     methods = Methods({}, images, status=torn, stop=lambda: None, more={"od_read": refuse})
 
-    async def talk():
+    async def conversation():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             error = (await client.ask("od_read"))["error"]
             assert (error["code"], error["detail"]) == ("abort", 0x06020000)
             assert error["message"].startswith("0x2000:01: object does not exist")
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_a_line_without_end_is_refused_and_ends_the_connection(methods):
-    async def talk():
+    async def conversation():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             client.say(b"x" * (MAX_LINE + 1))
             assert str(MAX_LINE) in (await client.hear())["error"]["message"]
             assert await client.reader.read() == b""
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_subscriptions_run_beside_requests_until_unsubscribed(methods):
-    async def talk():
+    async def conversation():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             answer = await client.ask("subscribe", station="left", names=["name"], period_ms=10)
             number = answer["result"]["subscription"]
@@ -188,7 +191,7 @@ def test_subscriptions_run_beside_requests_until_unsubscribed(methods):
             again = await client.ask("unsubscribe", subscription=number)
             assert again["error"]["code"] == "unknown_name"
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 @pytest.mark.parametrize(
@@ -202,7 +205,7 @@ def test_a_subscription_outlives_what_cannot_be_read(methods, monkeypatch, exc, 
     def fail(self):
         raise exc
 
-    async def talk():
+    async def conversation():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             with monkeypatch.context() as patch:
                 patch.setattr(Watch, "next_event", fail)
@@ -212,11 +215,11 @@ def test_a_subscription_outlives_what_cannot_be_read(methods, monkeypatch, exc, 
                 pass
             assert event["values"] == {"name": "abc"}
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_there_are_limits_on_subscriptions(methods):
-    async def talk():
+    async def conversation():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             for _ in range(MAX_SUBSCRIPTIONS):
                 answer = await client.ask("subscribe", station="left", on="change", names=["name"])
@@ -225,7 +228,7 @@ def test_there_are_limits_on_subscriptions(methods):
             answer = await client.ask("subscribe", station="left")
             assert answer["error"]["code"] == "busy"
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_listener_is_full_of_subscribers_and_has_room_when_one_leaves(
@@ -241,7 +244,7 @@ def test_listener_is_full_of_subscribers_and_has_room_when_one_leaves(
         writer.write(json.dumps(line).encode() + b"\n")
         return json.loads(await reader.readline())
 
-    async def talk():
+    async def conversation():
         with socket.socket(socket.AF_UNIX) as listener:
             path = str(tmp_path / "control")
             listener.bind(path)
@@ -264,11 +267,11 @@ def test_listener_is_full_of_subscribers_and_has_room_when_one_leaves(
             serving.cancel()
             await asyncio.wait([serving])
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_line_that_stays_unfinished_makes_its_client_late(methods):
-    async def talk():
+    async def conversation():
         ours, theirs = socket.socketpair()
         connection = ControlConnection("")
         server = ControlServer(methods, NO_BUSES)
@@ -283,22 +286,22 @@ def test_line_that_stays_unfinished_makes_its_client_late(methods):
             connection.close(CloseReason.OVERDUE)
             await asyncio.wait([serving])
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_who_does_not_read_is_disconnected(methods):
-    async def talk():
+    async def conversation():
         server = ControlServer(methods, NO_BUSES, slow_reader_s=0.05)
         ours, theirs = socket.socketpair()
         with ours:
             ours.sendall(b'{"v":1,"method":"variables","params":{"station":"left"}}\n' * 2000)
             await asyncio.wait_for(serve_client(server, theirs), 10)
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_a_listener_serves_many(methods, tmp_path):
-    async def talk():
+    async def conversation():
         with socket.socket(socket.AF_UNIX) as listener:
             listener.bind(str(tmp_path / "control"))
             listener.listen()
@@ -314,7 +317,7 @@ def test_a_listener_serves_many(methods, tmp_path):
             serving.cancel()
             await asyncio.wait([serving])
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 class Slow:
@@ -341,7 +344,7 @@ STATUS = b'{"v":1,"id":1,"method":"status"}\n'
 
 @pytest.mark.parametrize("rest", [b"", STATUS * 3, b'{"v":1'])
 def test_who_leaves_is_not_waited_for(files, rest):
-    async def talk():
+    async def conversation():
         slow = Slow()
         methods = Methods({}, files, status=slow.wait, stop=lambda: None)
         server = ControlServer(methods, NO_BUSES)
@@ -353,11 +356,11 @@ def test_who_leaves_is_not_waited_for(files, rest):
         await asyncio.wait_for(serving, 10)
         assert slow.outcomes == ["cancelled"]
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_who_only_stops_sending_gets_answers(files):
-    async def talk():
+    async def conversation():
         slow = Slow()
         methods = Methods({}, files, status=slow.wait, stop=lambda: None)
         ours, theirs = socket.socketpair()
@@ -372,11 +375,11 @@ def test_who_only_stops_sending_gets_answers(files):
             assert ours.recv(100) == b'{"v":1,"id":1,"result":{}}\n'
         assert slow.outcomes == ["answered"]
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_what_was_sent_before_leaving_is_done(files):
-    async def talk():
+    async def conversation():
         stopped = []
         methods = Methods({}, files, status=torn, stop=lambda: stopped.append(True))
         ours, theirs = socket.socketpair()
@@ -385,11 +388,11 @@ def test_what_was_sent_before_leaving_is_done(files):
         await asyncio.wait_for(serve_client(ControlServer(methods, NO_BUSES), theirs), 5)
         assert stopped == [True]
 
-    asyncio.run(talk())
+    asyncio.run(conversation())
 
 
 def test_errors_of_a_bus_keep_kind_and_detail(methods):
-    async def talk():
+    async def conversation():
         engine = FakeEngine(FakeBus(LoopBus("drive")))
         link = EngineLink(engine.services)
         port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1")
@@ -402,11 +405,11 @@ def test_errors_of_a_bus_keep_kind_and_detail(methods):
             answer = await client.ask("bus_ask", conversation=1, request="00")
             assert answer["error"]["code"] == "bus"
             assert answer["error"]["kind"] == "BusError"
-            assert "no slave 1009" in answer["error"]["message"]
+            assert "unknown slave 1009" in answer["error"]["message"]
             engine.buses[0].line.fault(kind="refuse", slave="drive", state="SAFEOP", code=0x1B)
             error = (await client.ask("bus_bring", **where, state="SAFEOP"))["error"]
             assert (error["kind"], error["detail"]) == ("AlStatusError", 2 << 16 | 0x1B)
         link.close()
         engine.close()
 
-    asyncio.run(talk())
+    asyncio.run(conversation())

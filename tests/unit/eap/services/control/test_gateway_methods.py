@@ -29,7 +29,7 @@ PORT = PortName("left", "eap0")
 class Gateway:
     def __init__(self) -> None:
         self.is_open = True
-        self.turned_away = 0
+        self.dropped = 0
         self.settings = Settings(NetId.parse("5.1.1.1.3.1"))
         self.tracker = RequestTracker()
         self.statistics = GatewayStatistics()
@@ -77,7 +77,7 @@ def ask(gateways):
 
 def test_what_is_told_of_a_gateway(ask, gateways) -> None:
     gateways[FIRST].tracker.admit(HERE, b"request", 0)
-    gateways[FIRST].statistics.note(1001, MailboxType.COE, [None], 2000)
+    gateways[FIRST].statistics.count(1001, MailboxType.COE, [None], 2000)
     first, second = ask("status", station="left")
     assert first["served"] == ["udp://127.0.9.1:34980", "ethernet://eth0"]
     assert second["served"] == ["tcp://127.0.9.1:34981"]

@@ -376,7 +376,9 @@ def test_provider_serves_a_dictionary_that_is_fresh() -> None:
             assert read(0xF020, 1, OdState.OP) == b"\xe9\x03"
             assert read(0xA000, 1, OdState.OP) == b"\2\0"
             session = MasterSession(provider.dictionary, 1000, provider.refresh, provider.is_fresh)
-            (reply,) = await session.ask(MailboxType.COE, bytes.fromhex("0020 40 0080 01 00000000"))
+            (reply,) = await session.handle(
+                MailboxType.COE, bytes.fromhex("0020 40 0080 01 00000000")
+            )
             assert reply.body.hex() == "0030" + "4b" + "0080" + "01" + "e9030000"
         finally:
             link.close()

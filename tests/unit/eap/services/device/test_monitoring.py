@@ -24,7 +24,7 @@ from eap.pd.spec import TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord
 from eap.runtime.handover import PortName
 from eap.services.device.monitoring import (
-    LOOK_NS,
+    POLL_NS,
     SubscriberProbes,
     SubscriberWatch,
     UdpSubscriberProbe,
@@ -179,7 +179,7 @@ def test_what_is_known_of_a_frame_that_stays_is_kept(endpoint, closed):
 
 def test_nothing_to_monitor_is_looked_for_now_and_then(endpoint):
     watch = SubscriberWatch({"a": Holder()}, SubscriberProbes({}, {PORT: endpoint}))
-    assert watch.step(SECOND) == SECOND + LOOK_NS
+    assert watch.step(SECOND) == SECOND + POLL_NS
 
 
 def test_errors_are_taken_as_they_come(endpoint, closed):
@@ -238,7 +238,7 @@ def test_arp_tells_who_is_there_and_who_is_gone(ends):
     watch = SubscriberWatch({"a": holder}, SubscriberProbes({PORT: hop_prober}, {}))
     watch.step(SECOND)
     host.answer()
-    watch.step(SECOND + LOOK_NS)
+    watch.step(SECOND + POLL_NS)
     assert (holder.status(), holder.state()) == ("present", 0)
     for half in range(3, 12):
         watch.step(half * SECOND // 2)

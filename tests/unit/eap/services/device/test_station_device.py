@@ -160,7 +160,7 @@ def test_engine_that_does_not_change_its_state(spec):
         engine.failure = EngineGoneError("gone")
         assert await device.request_state(2) == (2, None)
         engine.calls.clear()
-        await device.tell_again()
+        await device.resend()
 
     asyncio.run(script())
     assert engine.calls == ["configure left", "left PREOP"]

@@ -131,7 +131,7 @@ def test_what_cannot_be_kept_does_not_run(keeper, engine, changed, monkeypatch):
     with pytest.raises(DeviceFault, match="disk full"):
         asyncio.run(keeper.change(changed, NEW))
     assert engine.calls == []
-    assert keeper.unkept is None  # what runs is still what was kept
+    assert keeper.unsaved is None  # what runs is still what was kept
 
 
 def test_engine_that_went_away_is_told_again(keeper, engine, spec, changed):
@@ -140,11 +140,11 @@ def test_engine_that_went_away_is_told_again(keeper, engine, spec, changed):
         asyncio.run(keeper.change(changed, NEW))
     engine.spec = changed  # it had been started with it
     engine.failure = EngineRefusedError("not yet")
-    asyncio.run(keeper.tell_again())
-    asyncio.run(keeper.tell_again())
+    asyncio.run(keeper.resend())
+    asyncio.run(keeper.resend())
     assert engine.spec == spec
     engine.spec, engine.state = changed, DeviceState.PREOP  # it missed what came before its start
-    asyncio.run(keeper.tell_again())
+    asyncio.run(keeper.resend())
     assert (engine.spec, engine.state) == (spec, DeviceState.OP)
 
 
@@ -174,7 +174,7 @@ def test_way_up_can_fail_and_way_down_cannot(keeper, engine, caplog):
     with pytest.raises(DeviceFault, match="still gone"):
         asyncio.run(keeper.change_state(DeviceState.OP))
     assert keeper.state is kept().state is DeviceState.PREOP
-    asyncio.run(keeper.tell_again())
+    asyncio.run(keeper.resend())
     assert engine.state is DeviceState.PREOP
 
 
@@ -225,9 +225,9 @@ def test_way_back_and_forth(engine):
     asyncio.run(keeper.change(new, NEW, cause="1"))
     for goal, objects, undone in ((old, OLD, True), (new, NEW, False), (old, OLD, True)):
         before = Configuration(base=digest_of(old), spec=keeper.spec, objects=keeper.objects)
-        asyncio.run(keeper.take_back(tolerant(keeper.spec), keeper.objects))
-        asyncio.run(keeper.take_back(tolerant(goal), objects))
-        asyncio.run(keeper.take_back(goal, objects))
+        asyncio.run(keeper.roll_back(tolerant(keeper.spec), keeper.objects))
+        asyncio.run(keeper.roll_back(tolerant(goal), objects))
+        asyncio.run(keeper.roll_back(goal, objects))
         assert keeper.previous == before
         assert (keeper.cause, keeper.undone) == ("1", undone)
         again = going(keeper.spec, engine)
@@ -238,7 +238,7 @@ def test_change_that_was_taken_back_is_made_again(engine):
     old, new = versions()
     keeper = going(old, engine)
     asyncio.run(keeper.change(new, NEW, cause="1"))
-    asyncio.run(keeper.take_back(old, OLD))
+    asyncio.run(keeper.roll_back(old, OLD))
     asyncio.run(keeper.change(new, NEW, cause="1"))
     assert (keeper.previous.spec, keeper.undone) == (old, False)
 
@@ -267,6 +267,6 @@ def test_state_that_cannot_be_kept_is_shown_until_it_is(keeper, monkeypatch, cap
         for state in (DeviceState.SAFEOP, DeviceState.PREOP):
             asyncio.run(keeper.change_state(state))
     assert len(caplog.records) == 1
-    assert keeper.unkept.reason.endswith("No space left on device; make room there")
+    assert keeper.unsaved.reason.endswith("No space left on device; make room there")
     asyncio.run(keeper.change_state(DeviceState.PREOP))
-    assert (keeper.unkept, kept().state) == (None, DeviceState.PREOP)
+    assert (keeper.unsaved, kept().state) == (None, DeviceState.PREOP)

@@ -29,7 +29,7 @@ from eap.gateway.error_table import Cause
 from eap.gateway.requests import GatewayError
 from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway import sessions as module
-from eap.services.gateway.gateway import find_refusal
+from eap.services.gateway.gateway import check_slave
 from eap.services.gateway.message_codecs import codec_for
 from eap.services.gateway.sessions import (
     ClientSession,
@@ -73,11 +73,11 @@ def play(
         )
         session = ClientSession(kind, codec, answer_s=answer_s, idle_s=idle_s)
 
-        async def ask(body: str, *, is_step: bool = False) -> list[str]:
-            replies = await session.ask(bytes.fromhex(body), is_step=is_step)
+        async def handle(body: str, *, is_step: bool = False) -> list[str]:
+            replies = await session.handle(bytes.fromhex(body), is_step=is_step)
             return [each.body.hex() for each in replies]
 
-        await scene(ask, session)
+        await scene(handle, session)
         session.close()
 
     asyncio.run(run())
@@ -86,16 +86,16 @@ def play(
 def test_session_repeated_segment_is_answered_once_more() -> None:
     station = Station(bytes(range(200)))
 
-    async def scene(ask: Ask, session: ClientSession) -> None:
-        (first,) = await ask(UPLOAD)
+    async def scene(handle: Ask, session: ClientSession) -> None:
+        (first,) = await handle(UPLOAD)
         assert first.startswith("0030" + "41" + "0080" + "01" + "c8000000")
         assert session.is_running
         got = bytes.fromhex(first)[10:]
-        (part,) = await session.ask(bytes.fromhex(SEGMENT), is_step=True)
-        (again,) = await session.ask(bytes.fromhex(SEGMENT), is_step=True)
-        assert (part.is_again, again) == (False, replace(part, is_again=True))
+        (part,) = await session.handle(bytes.fromhex(SEGMENT), is_step=True)
+        (again,) = await session.handle(bytes.fromhex(SEGMENT), is_step=True)
+        assert (part.is_repeat, again) == (False, replace(part, is_repeat=True))
         got += part.body[3:]
-        (last,) = await ask("0020 70 00000000000000")
+        (last,) = await handle("0020 70 00000000000000")
         got += bytes.fromhex(last)[3:]
         assert got[:200] == bytes(range(200))
         assert not session.is_running
@@ -105,11 +105,11 @@ def test_session_repeated_segment_is_answered_once_more() -> None:
 
 
 def test_session_transfer_without_next_step_is_given_up() -> None:
-    async def scene(ask: Ask, session: ClientSession) -> None:
-        await ask(UPLOAD)
+    async def scene(handle: Ask, session: ClientSession) -> None:
+        await handle(UPLOAD)
         assert session.is_running
         await eventually(lambda: not session.is_running)
-        (reply,) = await session.ask(bytes.fromhex(SEGMENT), is_step=True)
+        (reply,) = await session.handle(bytes.fromhex(SEGMENT), is_step=True)
         assert reply.reason is Cause.SERVICE
         assert reply.body.hex()[4:6] == "80"
 
@@ -119,8 +119,8 @@ def test_session_transfer_without_next_step_is_given_up() -> None:
 def test_session_begins_anew_with_a_request_that_begins() -> None:
     station = Station(bytes(200))
 
-    async def scene(ask: Ask, session: ClientSession) -> None:
-        assert await ask(UPLOAD) == await ask(UPLOAD)
+    async def scene(handle: Ask, session: ClientSession) -> None:
+        assert await handle(UPLOAD) == await handle(UPLOAD)
         assert len(station.asked) == 2
 
     play(COE, station, scene)
@@ -145,16 +145,16 @@ def test_session_begins_anew_with_a_request_that_begins() -> None:
 def test_session_refuses_in_the_name_of_the_gateway(
     kind: MailboxType, body: str, result: int, cause: Cause
 ) -> None:
-    async def scene(ask: Ask, session: ClientSession) -> None:
-        (reply,) = await session.ask(bytes.fromhex(body), is_step=False)
+    async def scene(handle: Ask, session: ClientSession) -> None:
+        (reply,) = await session.handle(bytes.fromhex(body), is_step=False)
         assert reply.reason is cause
 
     play(kind, Station(result=result), scene)
 
 
 def test_session_general_refusal_of_a_remote_element_keeps_its_bytes() -> None:
-    async def scene(ask: Ask, session: ClientSession) -> None:
-        assert await ask("03 40 2000 01") == ["14402000" + "0b80"]
+    async def scene(handle: Ask, session: ClientSession) -> None:
+        assert await handle("03 40 2000 01") == ["14402000" + "0b80"]
 
     play(SOE, Station(result=0x7FF), scene)
 
@@ -164,8 +164,8 @@ def test_session_answers_in_time_for_a_station_that_does_not(kind: MailboxType, 
     station = Station()
     station.hangs = True
 
-    async def scene(ask: Ask, session: ClientSession) -> None:
-        (reply,) = await session.ask(bytes.fromhex(body), is_step=False)
+    async def scene(handle: Ask, session: ClientSession) -> None:
+        (reply,) = await session.handle(bytes.fromhex(body), is_step=False)
         assert reply.reason is Cause.TIMEOUT
         assert not session.is_running
 
@@ -176,9 +176,9 @@ def test_session_answers_in_time_for_requests_that_wait() -> None:
     station = Station()
     station.hangs = True
 
-    async def scene(ask: Ask, session: ClientSession) -> None:
+    async def scene(handle: Ask, session: ClientSession) -> None:
         async with asyncio.timeout(4):  # not ten times as long as an answer may take
-            asked = [session.ask(bytes.fromhex(UPLOAD), is_step=False) for _ in range(10)]
+            asked = [session.handle(bytes.fromhex(UPLOAD), is_step=False) for _ in range(10)]
             answers = await asyncio.gather(*asked)
         assert {reply.reason for (reply,) in answers} == {Cause.TIMEOUT}
 
@@ -219,7 +219,7 @@ class Codec:
 def test_session_passes_a_mailbox_error_of_the_slave() -> None:
     codec = Codec(MailboxRefusedError("no", detail=4))
     session = ClientSession(COE, codec, answer_s=0.5)
-    (reply,) = asyncio.run(session.ask(b"\0\x20\x40", is_step=False))
+    (reply,) = asyncio.run(session.handle(b"\0\x20\x40", is_step=False))
     assert (reply.type, reply.body) == (MailboxType.ERR, bytes.fromhex("0100 0400"))
     assert reply.reason is None
     assert codec.resets == 1
@@ -229,7 +229,7 @@ def test_session_request_that_is_cancelled_leaves_nothing_behind() -> None:
     async def run() -> None:
         codec = Codec(asyncio.CancelledError())
         with pytest.raises(asyncio.CancelledError):
-            await ClientSession(COE, codec, answer_s=0.5).ask(b"", is_step=False)
+            await ClientSession(COE, codec, answer_s=0.5).handle(b"", is_step=False)
         assert codec.resets == 1
 
     asyncio.run(run())
@@ -238,7 +238,7 @@ def test_session_request_that_is_cancelled_leaves_nothing_behind() -> None:
 @pytest.mark.parametrize(("is_long", "cause"), [(False, Cause.TIMEOUT), (True, None)])
 def test_session_last_step_of_a_download_may_take_longer(is_long: bool, cause: Cause) -> None:
     session = ClientSession(COE, Codec(is_long=is_long), answer_s=0.2)
-    (reply,) = asyncio.run(session.ask(b"\0\x20\1", is_step=False))
+    (reply,) = asyncio.run(session.handle(b"\0\x20\1", is_step=False))
     assert reply.reason is cause
 
 
@@ -264,11 +264,11 @@ def test_cause_of_an_error(error: EapError, cause: Cause) -> None:
 
 
 def test_find_refusal_of_what_does_not_even_go_to_the_slave() -> None:
-    assert find_refusal(COE, bytes(58), SLAVE) is None
-    assert find_refusal(COE, bytes(59), SLAVE) is Cause.TOO_LONG
-    assert find_refusal(SOE, b"", SLAVE) is Cause.NO_PROTOCOL
+    assert check_slave(COE, bytes(58), SLAVE) is None
+    assert check_slave(COE, bytes(59), SLAVE) is Cause.TOO_LONG
+    assert check_slave(SOE, b"", SLAVE) is Cause.NO_PROTOCOL
     closed = replace(SLAVE, to_slave=0, to_master=0)
-    assert find_refusal(COE, b"", closed) is Cause.NO_MAILBOX
+    assert check_slave(COE, b"", closed) is Cause.NO_MAILBOX
 
 
 # Tables of sessions
@@ -289,30 +289,30 @@ def key(endpoint: Endpoint = HERE, address: int = 1001) -> SessionKey:
 
 def test_session_table_keeps_a_clients_session() -> None:
     sessions: SessionTable[Session] = SessionTable()
-    first = sessions.take(key(), Session)
-    assert sessions.take(key(), Session) is first
-    other = sessions.take(key(THERE), Session)
+    first = sessions.get(key(), Session)
+    assert sessions.get(key(), Session) is first
+    other = sessions.get(key(THERE), Session)
     assert other is not first
     assert sessions.of_slave(1001, COE) == [(key(), first), (key(THERE), other)]
     assert sessions.of_slave(1001, FOE) == sessions.of_slave(1002, COE) == []
     sessions.close_of(HERE)
     assert first.is_closed
-    assert sessions.take(key(), Session) is not first
+    assert sessions.get(key(), Session) is not first
 
 
 def test_session_table_lists_running_transfers() -> None:
     sessions: SessionTable[Session] = SessionTable()
-    sessions.take(key(), Session)
-    sessions.take(key(THERE), lambda: Session(is_running=True))
+    sessions.get(key(), Session)
+    sessions.get(key(THERE), lambda: Session(is_running=True))
     assert list(sessions.running()) == [key(THERE)]
 
 
 def test_session_table_drops_the_oldest_unless_it_is_running(monkeypatch) -> None:
     monkeypatch.setattr(module, "MAX_SESSIONS", 2)
     sessions: SessionTable[Session] = SessionTable()
-    running = sessions.take(key(address=1), lambda: Session(is_running=True))
-    idle = sessions.take(key(address=2), Session)
-    last = sessions.take(key(address=3), Session)
+    running = sessions.get(key(address=1), lambda: Session(is_running=True))
+    idle = sessions.get(key(address=2), Session)
+    last = sessions.get(key(address=3), Session)
     assert [each.is_closed for each in (running, idle, last)] == [False, True, False]
     sessions.close()
     assert running.is_closed

@@ -25,10 +25,10 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Element
 from eap.gateway.dialect import (
     DialectFailure,
+    ExchangeVoe,
     ReadFile,
     ReadIdn,
     ReadSdo,
-    TalkVoe,
     Task,
     WriteIdn,
     WriteSdo,
@@ -38,7 +38,7 @@ from eap.ids import NetId
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, variable
-from eap.services.gateway.admission import Guard, RuleTarget
+from eap.services.gateway.admission import GatewayAdmission, RuleTarget
 from eap.services.gateway.dialect_handler import (
     DialectError,
     DialectHandler,
@@ -61,7 +61,7 @@ HERE = Endpoint("udp:eap0", "127.0.0.1:1")
 
 
 def handler(room: int = 100, answer_s: float = 1.0, *rules: AccessRule) -> DialectHandler:
-    return DialectHandler(Guard(lambda: AccessList(rules)), room + HEAD, answer_s)
+    return DialectHandler(GatewayAdmission(lambda: AccessList(rules)), room + HEAD, answer_s)
 
 
 def perform(task: Task, subject: DialectTarget, room: int = 100, answer_s: float = 1.0) -> bytes:
@@ -82,7 +82,7 @@ def failure(task: Task, subject: Any, room: int = 100, answer_s: float = 1.0) ->
         (ReadIdn(32, 1, Element.VALUE), AccessService.READ),
         (WriteIdn(32, 1, Element.VALUE, b"1"), AccessService.WRITE),
         (ReadFile("f"), AccessService.READ),
-        (TalkVoe(b""), AccessService.RAW),
+        (ExchangeVoe(b""), AccessService.RAW),
     ],
 )
 def test_operation_of_a_task_names_its_service(task: Task, service: AccessService) -> None:
@@ -97,7 +97,7 @@ def test_operation_of_a_task_names_its_service(task: Task, service: AccessServic
         (WriteSdo(0x6040, 0, b"\6\0"), Write(IndexGroup.SDO, 0x6040_0000, b"\6\0")),
         (ReadIdn(32, 1, Element.NAME), Read(IndexGroup.SOE, 0x0102_0020, LONGEST_ANSWER)),
         (WriteIdn(32, 0, Element.VALUE, b"1"), Write(IndexGroup.SOE, 0x0040_0020, b"1")),
-        (TalkVoe(MESSAGE), ReadWrite(IndexGroup.VOE, 0, LONGEST_ANSWER, MESSAGE)),
+        (ExchangeVoe(MESSAGE), ReadWrite(IndexGroup.VOE, 0, LONGEST_ANSWER, MESSAGE)),
     ],
 )
 def test_dialect_task_is_one_operation_at_a_remote_slave(task: Task, operation: Operation) -> None:
@@ -154,7 +154,7 @@ def test_dialect_failure_of_an_error(
             None,
             Cause.SERVICE,
         ),
-        (TalkVoe(MESSAGE), 0x7FF, DialectFailure.GENERAL, None, Cause.SERVICE),
+        (ExchangeVoe(MESSAGE), 0x7FF, DialectFailure.GENERAL, None, Cause.SERVICE),
         (ReadFile(""), 0, DialectFailure.FILE_NAME, None, Cause.SERVICE),
     ],
 )
@@ -244,18 +244,18 @@ def test_dialect_request_that_is_refused_reaches_nothing() -> None:
         reached.append(True)
         return station.link()
 
-    async def ask(body: str, *rules: AccessRule) -> tuple[bytes, Cause | None]:
+    async def handle(body: str, *rules: AccessRule) -> tuple[bytes, Cause | None]:
         octets = bytes.fromhex(body)
         return await handler(100, 1.0, *rules).answer(MailboxType.COE, octets, HERE, BUS, find)
 
     async def run() -> None:
         rule = AccessRule("no", allow=False)
-        answer, cause = await ask("0020 40 1810 01 0000", rule)
+        answer, cause = await handle("0020 40 1810 01 0000", rule)
         assert (answer.hex(), cause) == ("00208018100102000106", Cause.DENIED)
-        answer, cause = await ask("0020 e0 1810 01 0000")
+        answer, cause = await handle("0020 e0 1810 01 0000")
         assert (answer.hex(), cause) == ("00208018100101000405", Cause.SERVICE)
         assert not reached
-        answer, cause = await ask("0020 40 1810 01 0000")
+        answer, cause = await handle("0020 40 1810 01 0000")
         assert (answer.hex(), cause) == ("00304318100161626364", None)
 
     asyncio.run(run())

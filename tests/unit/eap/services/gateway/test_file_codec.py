@@ -32,7 +32,7 @@ class Files:
         access = bus.link(answer_s=answer_s)
         self.codec = FileCodec(access, MailboxSizes(), memory_share(), answer_s / 3)
 
-    async def ask(self, opcode: int, number: int, body: bytes = b"") -> tuple[int, int, bytes]:
+    async def handle(self, opcode: int, number: int, body: bytes = b"") -> tuple[int, int, bytes]:
         """Return opcode, number and body of an answer, when it is another one than BUSY."""
         while (answer := await self.once(opcode, number, body))[0] == BUSY:
             pass
@@ -46,16 +46,16 @@ class Files:
 
     async def write(self, content: bytes, name: bytes = b"a.bin") -> None:
         """Write a whole file."""
-        assert (await self.ask(WRITE, 0, name))[:2] == (ACK, 0)
+        assert (await self.handle(WRITE, 0, name))[:2] == (ACK, 0)
         ends = range(0, len(content) + 1, ROOM)
         for number, at in enumerate(ends, start=1):
-            answer = await self.ask(DATA, number, content[at : at + ROOM])
+            answer = await self.handle(DATA, number, content[at : at + ROOM])
             assert answer[:2] == (ACK, number)
 
     async def read(self, name: bytes = b"a.bin") -> bytes:
         """Read a whole file."""
         content, number = b"", 0
-        opcode, got, data = await self.ask(READ, 0, name)
+        opcode, got, data = await self.handle(READ, 0, name)
         while True:
             number += 1
             assert (opcode, got) == (DATA, number)
@@ -64,7 +64,7 @@ class Files:
                 last = encode_message(FoeOpcode.ACK, number)
                 assert await self.codec.answer(last) == []
                 return content
-            opcode, got, data = await self.ask(ACK, number)
+            opcode, got, data = await self.handle(ACK, number)
 
 
 def play(scene: Callable[[Bus, FakeEngine], Awaitable[None]]) -> None:
@@ -98,7 +98,7 @@ def test_what_the_slave_refuses(opcode: FoeOpcode, name: bytes, code: FoeErrorCo
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
         for _ in range(2):  # asking again is another try
-            assert (await desk.ask(opcode, 0, name))[:2] == (ERROR, code)
+            assert (await desk.handle(opcode, 0, name))[:2] == (ERROR, code)
             assert not desk.codec.is_running
         assert await desk.read() == b"first file"
 
@@ -107,7 +107,7 @@ def test_what_the_slave_refuses(opcode: FoeOpcode, name: bytes, code: FoeErrorCo
 
 def test_a_password() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        assert await Files(bus).ask(READ, 42, b"locked.bin") == (DATA, 1, b"secret")
+        assert await Files(bus).handle(READ, 42, b"locked.bin") == (DATA, 1, b"secret")
 
     play(scene)
 
@@ -115,9 +115,9 @@ def test_a_password() -> None:
 def test_a_slave_that_takes_no_more() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
-        await desk.ask(WRITE, 0, b"small.bin")
+        await desk.handle(WRITE, 0, b"small.bin")
         for number in range(1, 22):
-            opcode, code, _ = await desk.ask(DATA, number, bytes(ROOM if number < 21 else 1))
+            opcode, code, _ = await desk.handle(DATA, number, bytes(ROOM if number < 21 else 1))
             if opcode == ERROR:
                 break
         assert (opcode, code) == (ERROR, FoeErrorCode.DISK_FULL)
@@ -135,8 +135,8 @@ def test_a_slave_that_takes_no_more() -> None:
 def test_a_step_out_of_order(opcode: FoeOpcode, number: int, code: FoeErrorCode) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
-        await desk.ask(WRITE, 0, b"a.bin")
-        assert (await desk.ask(opcode, number))[:2] == (ERROR, code)
+        await desk.handle(WRITE, 0, b"a.bin")
+        assert (await desk.handle(opcode, number))[:2] == (ERROR, code)
         assert await desk.read() == b"first file"
 
     play(scene)
@@ -146,11 +146,11 @@ def test_file_codec_reader_that_is_busy_gets_its_packet_again() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
         await desk.write(CONTENT[: 3 * ROOM])
-        first = await desk.ask(READ, 0, b"a.bin")
+        first = await desk.handle(READ, 0, b"a.bin")
         assert await desk.once(BUSY, 0) == first
-        second = await desk.ask(ACK, 1)
+        second = await desk.handle(ACK, 1)
         assert second == (DATA, 2, CONTENT[ROOM : 2 * ROOM])
-        assert (await desk.ask(ACK, 1))[:2] == (ERROR, FoeErrorCode.PACKET_NUMBER)
+        assert (await desk.handle(ACK, 1))[:2] == (ERROR, FoeErrorCode.PACKET_NUMBER)
         assert not desk.codec.is_running
 
     play(scene)
@@ -159,7 +159,7 @@ def test_file_codec_reader_that_is_busy_gets_its_packet_again() -> None:
 def test_file_codec_ends_a_transfer_with_an_unknown_opcode() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
-        await desk.ask(READ, 0, b"a.bin")
+        await desk.handle(READ, 0, b"a.bin")
         (answer,) = await desk.codec.answer(bytes.fromhex("09 00 00000000"))
         assert answer == encode_message(ERROR, FoeErrorCode.ILLEGAL)
         assert not desk.codec.is_running
@@ -170,9 +170,9 @@ def test_file_codec_ends_a_transfer_with_an_unknown_opcode() -> None:
 def test_a_packet_longer_than_the_mailbox() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
-        await desk.ask(WRITE, 0, b"a.bin")
+        await desk.handle(WRITE, 0, b"a.bin")
         with pytest.raises(GatewayError) as caught:
-            await desk.ask(DATA, 1, bytes(ROOM + 1))
+            await desk.handle(DATA, 1, bytes(ROOM + 1))
         assert caught.value.cause is Cause.TOO_LONG
 
     play(scene)
@@ -188,11 +188,11 @@ def test_who_has_to_wait_is_told_busy(goes_on: bool) -> None:
             assert (await desk.once(WRITE, 0, b"a.bin"))[0] == BUSY
         if goes_on:
             engine.release()
-            assert (await desk.ask(WRITE, 0, b"a.bin"))[0] == ACK
+            assert (await desk.handle(WRITE, 0, b"a.bin"))[0] == ACK
             engine.holds = True
             assert (await desk.once(DATA, 1, b"written"))[0] == BUSY
             engine.release()
-            assert (await desk.ask(DATA, 1, b"written"))[0] == ACK
+            assert (await desk.handle(DATA, 1, b"written"))[0] == ACK
         else:
             assert await desk.codec.answer(encode_message(FoeOpcode.ERROR, 0x8000)) == []
             engine.release()
@@ -212,7 +212,7 @@ def test_a_station_that_vanishes(opcode: FoeOpcode) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         await Files(bus).write(CONTENT)
         desk = Files(bus, answer_s=0.1)
-        await desk.ask(opcode, 0, b"a.bin")
+        await desk.handle(opcode, 0, b"a.bin")
         bus.is_gone = True
         with pytest.raises(RemoteAccessError) as caught:
             await go_on(desk)
@@ -225,8 +225,8 @@ def test_a_station_that_vanishes(opcode: FoeOpcode) -> None:
 def test_what_was_begun_and_left_does_not_count() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
-        await desk.ask(WRITE, 0, b"a.bin")
-        await desk.ask(DATA, 1, bytes(ROOM))
+        await desk.handle(WRITE, 0, b"a.bin")
+        await desk.handle(DATA, 1, bytes(ROOM))
         desk.codec.reset()
         assert await Files(bus).read() == b"first file"
 
@@ -237,8 +237,8 @@ def test_another_file_ends_the_one_before() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
         await desk.write(CONTENT)
-        assert (await desk.ask(READ, 0, b"a.bin"))[0] == DATA
-        assert (await desk.ask(READ, 0, b"small.bin")) == (DATA, 1, b"")
+        assert (await desk.handle(READ, 0, b"a.bin"))[0] == DATA
+        assert (await desk.handle(READ, 0, b"small.bin")) == (DATA, 1, b"")
         assert await desk.read() == CONTENT
 
     play(scene)

@@ -78,7 +78,7 @@ class Desk:
         self.bus = BusClient(self._link, 0, PORT)
         self.gateway = MailboxGateway(
             self.bus,
-            lambda: MasterSession(MASTER, settings.room, nothing, lambda index: next(turns)),
+            lambda: MasterSession(MASTER, settings.max_size, nothing, lambda index: next(turns)),
             lambda: AccessList(rules),
             settings,
             AddressMap({0x9000: SlaveAddress(1001), 0x9001: RemoteAddress(ELSEWHERE_BUS, 1003)}),
@@ -89,7 +89,7 @@ class Desk:
         self.asked.append(slave)
         return self.station.link()
 
-    async def ask(
+    async def handle(
         self, kind: MailboxType, address: int, octets: str | bytes, endpoint: Endpoint = HERE
     ) -> list[tuple[MailboxHeader, bytes]]:
         """Return the answers to a request."""
@@ -108,7 +108,7 @@ class Desk:
         self, kind: MailboxType, address: int, octets: str | bytes, endpoint: Endpoint = HERE
     ) -> str:
         """Return the only answer, in hex, of the protocol that was asked."""
-        ((header, body),) = await self.ask(kind, address, octets, endpoint)
+        ((header, body),) = await self.handle(kind, address, octets, endpoint)
         assert header.type is kind
         assert header.address == address
         return body.hex(" ")
@@ -167,7 +167,7 @@ def test_each_protocol_of_a_slave() -> None:
         assert (await desk.one(FOE, 1001, "01 00 00000000" + b"firmware.bin".hex())).startswith(
             "03 00 01 00 00 00 66 69"
         )
-        assert await desk.ask(FOE, 1001, "04 00 01000000") == []
+        assert await desk.handle(FOE, 1001, "04 00 01000000") == []
         assert (await desk.one(EOE, 1001, "06000000"))[:2] == "07"
 
     play(scene)
@@ -177,7 +177,7 @@ def test_gateway_counts_its_answers() -> None:
     async def scene(desk: Desk) -> None:
         counters = []
         for _ in range(9):
-            ((header, _),) = await desk.ask(COE, 1001, VENDOR)
+            ((header, _),) = await desk.handle(COE, 1001, VENDOR)
             counters.append(header.counter)
         assert counters == [(counters[0] - 1 + step) % 7 + 1 for step in range(9)]
 
@@ -209,7 +209,7 @@ def test_what_cannot_be_done_is_answered_in_the_protocol_of_the_request(
     kind, address, octets, answer
 ) -> None:
     async def scene(desk: Desk) -> None:
-        ((header, body),) = await desk.ask(kind, address, octets)
+        ((header, body),) = await desk.handle(kind, address, octets)
         assert (header.type, body) == (answer[0], bytes.fromhex(answer[1]))
 
     play(scene, bus="coe")
@@ -224,7 +224,7 @@ def test_a_slave_without_mailbox() -> None:
 
 def test_a_slave_that_is_silent_is_answered_for_in_time() -> None:
     async def scene(desk: Desk) -> None:
-        await desk.ask(COE, 1001, VENDOR)
+        await desk.handle(COE, 1001, VENDOR)
         desk.engine.buses[0].line.fault(kind="mailbox", slave="drive")
         assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 04 05"
         (row,) = desk.gateway.statistics.report()
@@ -236,7 +236,7 @@ def test_a_slave_that_is_silent_is_answered_for_in_time() -> None:
 
 def test_silence_where_it_is_wanted() -> None:
     async def scene(desk: Desk) -> None:
-        assert await desk.ask(COE, 1009, VENDOR) == []
+        assert await desk.handle(COE, 1009, VENDOR) == []
         assert await desk.one(COE, 1001, "0020 40 9999 00 00000000")
 
     play(scene, settings=Settings(NET_ID, is_silent=True))
@@ -257,11 +257,11 @@ def test_the_masters_dictionary() -> None:
         name = await desk.one(COE, 0, "0020 40 0810 00 00000000")
         assert bytes.fromhex(name).endswith(b"m" * 300)
         assert (await desk.one(COE, 0, "0080 01 00 0000 0100"))[:8] == "00 80 02"
-        ((header, body),) = await desk.ask(SOE, 0, "01 40 2000")
+        ((header, body),) = await desk.handle(SOE, 0, "01 40 2000")
         assert (header.type, body) == (SOE, bytes.fromhex("12 40 2000 0110"))
-        ((header, body),) = await desk.ask(FOE, 0, "01 00 00000000 66")
+        ((header, body),) = await desk.handle(FOE, 0, "01 00 00000000 66")
         assert (header.type, body[:6]) == (FOE, bytes.fromhex("05 00 00800000"))
-        ((header, body),) = await desk.ask(VOE, 0, "64110000 0100")
+        ((header, body),) = await desk.handle(VOE, 0, "64110000 0100")
         assert (header.type, body) == (MailboxType.ERR, bytes.fromhex("0100 0200"))
 
     play(scene)
@@ -270,7 +270,7 @@ def test_the_masters_dictionary() -> None:
 def test_all_slaves_answer_for_themselves() -> None:
     async def scene(desk: Desk) -> None:
         answers = {
-            header.address: body.hex() for header, body in await desk.ask(COE, 0xFFFF, VENDOR)
+            header.address: body.hex() for header, body in await desk.handle(COE, 0xFFFF, VENDOR)
         }
         assert set(answers) == {1001, 1002, 1003}
         assert all(each.startswith("003043181001") for each in answers.values())
@@ -282,7 +282,7 @@ def test_all_slaves_of_a_bus_that_is_down_are_answered_for() -> None:
     async def scene(desk: Desk) -> None:
         desk.engine.buses[0].is_up = False
         desk.engine.say_hello()
-        ((header, body),) = await desk.ask(COE, 0xFFFF, VENDOR)
+        ((header, body),) = await desk.handle(COE, 0xFFFF, VENDOR)
         assert (header.address, body[-4:]) == (0xFFFF, bytes.fromhex("00000206"))
         assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
 
@@ -325,7 +325,7 @@ def test_virtual_addresses_stand_for_slaves_here_and_elsewhere() -> None:
 
 def test_errors_are_counted_for_their_client() -> None:
     async def scene(desk: Desk) -> None:
-        await desk.ask(COE, 1009, VENDOR)
+        await desk.handle(COE, 1009, VENDOR)
         await desk.one(COE, 1001, VENDOR)
         counts = desk.gateway.tracker.counts_of(HERE)
         assert (counts.requests, counts.errors) == (2, 1)
@@ -355,7 +355,7 @@ def test_ethernet_frames_of_a_slave_go_to_who_talks_to_it() -> None:
         desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, COE, b"an emergency")))
         desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1002, EOE, b"of another slave")))
         desk.engine.tell(UnsolicitedMessage(1, Unsolicited(1001, EOE, b"of another bus")))
-        await desk.ask(COE, 1001, VENDOR)
+        await desk.handle(COE, 1001, VENDOR)
         (back,) = heard
         header, body = decode_frame(back)
         assert (header.type, header.address, bytes(body)) == (EOE, 1001, b"an Ethernet frame")

@@ -21,12 +21,12 @@ WRITE = "0020 2b 4060 00 06000000"
 
 def test_writing_to_all_takes_a_rule() -> None:
     async def scene(desk: Desk) -> None:
-        for header, body in await desk.ask(COE, 0xFFFF, WRITE):
+        for header, body in await desk.handle(COE, 0xFFFF, WRITE):
             assert header.address == 1001
             assert body.hex().startswith("002080406000000001")
 
     async def allowed(desk: Desk) -> None:
-        ((_, body),) = await desk.ask(COE, 0xFFFF, WRITE)
+        ((_, body),) = await desk.handle(COE, 0xFFFF, WRITE)
         assert body.hex().startswith("0030604060")
 
     play(scene)
@@ -70,12 +70,12 @@ def test_a_rule_opens_one_object() -> None:
 def test_changes_and_refusals_are_audited() -> None:
     async def scene(desk: Desk) -> None:
         entries: list[AuditEntry] = []
-        desk.gateway.guard.on_audit.append(entries.append)
+        desk.gateway.admission.on_audit.append(entries.append)
         await desk.one(COE, 1001, VENDOR, ELSEWHERE)
         assert not entries
         await desk.one(COE, 1001, WRITE, ELSEWHERE)
         await desk.one(COE, 1001, WRITE)
-        await desk.ask(COE, 0xFFFF, WRITE)
+        await desk.handle(COE, 0xFFFF, WRITE)
         told = [
             (each.endpoint, each.header.target_port, each.operations[0].result) for each in entries
         ]
@@ -103,9 +103,9 @@ def test_a_file_elsewhere_is_judged_when_it_is_opened() -> None:
 def test_the_audit_tells_how_a_change_came_out() -> None:
     async def scene(desk: Desk) -> None:
         entries: list[AuditEntry] = []
-        desk.gateway.guard.on_audit.append(entries.append)
+        desk.gateway.admission.on_audit.append(entries.append)
         await desk.one(COE, 1001, "0020 2b 5555 00 06000000")
-        await desk.ask(COE, 1009, WRITE)
+        await desk.handle(COE, 1009, WRITE)
         await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 4060 00 0600"))
         await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 5555 00 0600"))
         operations = [each.operations[0] for each in entries]

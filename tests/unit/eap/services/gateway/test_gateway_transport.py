@@ -19,7 +19,7 @@ class Gateway:
     def __init__(self) -> None:
         self.is_open = True
         self.settings = Settings(NetId.parse("10.0.0.1.3.1"))
-        self.turned_away = 0
+        self.dropped = 0
         self.heard: list[Any] = []
 
     def receive(self, frame, endpoint, send) -> None:
@@ -80,7 +80,7 @@ def test_a_gateway_that_is_stopped_turns_frames_away() -> None:
     gateway.is_open = False
     transport = GatewayTransport([(gateway, "udp:a")])
     assert transport.receive(UPLOAD, "me", lambda *each: None) is DropReason.GATEWAY_OFF
-    assert gateway.turned_away == 1
+    assert gateway.dropped == 1
     assert not gateway.heard
 
 

@@ -84,11 +84,11 @@ def test_two_clients_transfers_do_not_mix() -> None:
         content = b""
         body = bytes.fromhex("01 00 00000000") + name
         while True:
-            ((_, packet),) = await desk.ask(FOE, 1001, body)
+            ((_, packet),) = await desk.handle(FOE, 1001, body)
             content += packet[6:]
             body = bytes((4, 0)) + packet[2:6]
             if len(packet) < 1024 - 6:
-                await desk.ask(FOE, 1001, body)
+                await desk.handle(FOE, 1001, body)
                 return content
 
     async def scene(desk: Desk) -> None:
@@ -107,7 +107,7 @@ def test_who_has_to_wait_too_long_is_told_that_the_slave_is_busy() -> None:
         await desk.one(FOE, 1001, "02 00 00000000" + FILE)
         answer = await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
         assert answer.startswith("06 00 00 00 64 00")
-        await desk.ask(FOE, 1001, "05 00 00800000")
+        await desk.handle(FOE, 1001, "05 00 00800000")
         assert (await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)).startswith("03")
 
     play(scene, settings=Settings(NET_ID, answer_s=0.2))

@@ -12,9 +12,9 @@ from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
-from eap.gateway.requests import refuse
+from eap.gateway.requests import error_reply
 from eap.ids import NetId
-from eap.services.gateway.admission import Guard, RuleTarget, reason_of_refusal, result_of
+from eap.services.gateway.admission import GatewayAdmission, RuleTarget, denial_cause, result_of
 from eap.services.gateway.sessions import GatewayReply
 
 TARGET = RuleTarget(NetId.parse("5.1.1.1.3.1"), 1001)
@@ -24,22 +24,24 @@ READ, WRITE = Read(IndexGroup.SDO, 0x1018_0001, 4), Write(IndexGroup.SDO, 0x6040
 
 def test_rules_that_change_count_at_once() -> None:
     rules: list[AccessRule] = []
-    guard = Guard(lambda: AccessList(tuple(rules)))
-    assert guard.admission(HERE, TARGET, WRITE).is_allowed
-    assert not guard.admission(HERE, TARGET, WRITE, by_rule=True).is_allowed
-    assert guard.admission(HERE, TARGET, READ, by_rule=True).is_allowed
-    assert not guard.admission(ELSEWHERE, TARGET, WRITE).is_allowed
+    admission = GatewayAdmission(lambda: AccessList(tuple(rules)))
+    assert admission.decide(HERE, TARGET, WRITE).is_allowed
+    assert not admission.decide(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert admission.decide(HERE, TARGET, READ, by_rule=True).is_allowed
+    assert not admission.decide(ELSEWHERE, TARGET, WRITE).is_allowed
     rules.append(AccessRule("all", services=(AccessService.WRITE,)))
-    assert guard.admission(HERE, TARGET, WRITE, by_rule=True).is_allowed
-    assert guard.admission(ELSEWHERE, TARGET, WRITE).is_allowed
+    assert admission.decide(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert admission.decide(ELSEWHERE, TARGET, WRITE).is_allowed
 
 
 def test_the_audit_is_told_of_changes_and_refusals() -> None:
-    guard = Guard(AccessList)
+    admission = GatewayAdmission(AccessList)
     told: list[AuditEntry] = []
-    guard.on_audit.append(told.append)
+    admission.on_audit.append(told.append)
     for endpoint, operation in ((HERE, READ), (HERE, WRITE), (ELSEWHERE, WRITE)):
-        guard.tell(endpoint, TARGET, operation, guard.admission(endpoint, TARGET, operation), 0)
+        admission.record(
+            endpoint, TARGET, operation, admission.decide(endpoint, TARGET, operation), 0
+        )
     assert [
         (each.endpoint, each.header.target_port, each.operations[0].result) for each in told
     ] == [
@@ -49,15 +51,15 @@ def test_the_audit_is_told_of_changes_and_refusals() -> None:
 
 
 def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
-    guard = Guard(AccessList)
+    admission = GatewayAdmission(AccessList)
     recorded: list[AuditEntry] = []
-    guard.before_change = lambda entry: recorded.append(entry) or "the audit cannot be written"  # type: ignore[func-returns-value]
-    decision = guard.admission(HERE, TARGET, WRITE)
+    admission.before_change = lambda entry: recorded.append(entry) or "the audit cannot be written"  # type: ignore[func-returns-value]
+    decision = admission.decide(HERE, TARGET, WRITE)
     assert (decision.is_allowed, decision.why) == (False, "the audit cannot be written")
-    assert reason_of_refusal(decision) is Cause.NOT_RECORDED
-    assert reason_of_refusal(guard.admission(ELSEWHERE, TARGET, WRITE)) is Cause.DENIED
-    assert guard.admission(HERE, TARGET, READ).is_allowed
-    assert not guard.admission(ELSEWHERE, TARGET, WRITE).is_allowed
+    assert denial_cause(decision) is Cause.NOT_RECORDED
+    assert denial_cause(admission.decide(ELSEWHERE, TARGET, WRITE)) is Cause.DENIED
+    assert admission.decide(HERE, TARGET, READ).is_allowed
+    assert not admission.decide(ELSEWHERE, TARGET, WRITE).is_allowed
     assert [each.operations[0].operation for each in recorded] == [WRITE]
 
 
@@ -80,6 +82,6 @@ def test_how_a_request_came_out(kind: MailboxType, body: str, result: int) -> No
 
 
 def test_how_a_request_came_out_that_the_gateway_answers() -> None:
-    refusal = refuse(MailboxType.COE, bytes(10), Cause.TIMEOUT)
+    refusal = error_reply(MailboxType.COE, bytes(10), Cause.TIMEOUT)
     assert result_of([GatewayReply(*refusal, reason=Cause.TIMEOUT)]) == AdsError.TIMEOUT
     assert result_of([]) is None

@@ -36,7 +36,7 @@ def objects(memory: int = 1 << 20) -> tuple[ObjectCodec, MemoryMailbox]:
     return ObjectCodec(slave, SIZES, memory_share(memory)), mailbox
 
 
-async def ask(codec: ObjectCodec, body: str) -> list[str]:
+async def handle(codec: ObjectCodec, body: str) -> list[str]:
     return [each.hex() for each in await codec.answer(bytes.fromhex(body))]
 
 
@@ -54,7 +54,7 @@ def play_remote(
 ) -> None:
     async def run() -> None:
         codec = ObjectCodec(station.link(), MailboxSizes.of_data(100), memory_share())
-        await scene(lambda body: ask(codec, body))
+        await scene(lambda body: handle(codec, body))
         codec.reset()
 
     asyncio.run(run())
@@ -80,13 +80,13 @@ def test_object_codec_reads_to_the_end_before_the_client_does() -> None:
     async def scene(codec: ObjectCodec, mailbox: MemoryMailbox) -> None:
         await lead(codec, coe_client.download(TEXT, 0, b"y" * 300, SIZES))
         mailbox.asked.clear()
-        (first,) = await ask(codec, "0020 40 0020 00 00000000")
+        (first,) = await handle(codec, "0020 40 0020 00 00000000")
         assert first.startswith("00304100200" + "02c010000")
         for _ in range(50):
             await asyncio.sleep(0)
         sent = len(mailbox.asked)
         assert sent == 10
-        await ask(codec, UPLOAD_SEGMENT)
+        await handle(codec, UPLOAD_SEGMENT)
         assert len(mailbox.asked) == sent
         assert codec.is_running
 
@@ -95,11 +95,11 @@ def test_object_codec_reads_to_the_end_before_the_client_does() -> None:
 
 def test_object_codec_writes_when_the_last_segment_is_there() -> None:
     async def scene(codec: ObjectCodec, mailbox: MemoryMailbox) -> None:
-        assert await ask(codec, "0020 21 0020 00 0a000000 0102") == ["00306000200000000000"]
+        assert await handle(codec, "0020 21 0020 00 0a000000 0102") == ["00306000200000000000"]
         assert not mailbox.asked
         last = "0020 01 030405060708090a"
         assert codec.completes_write(bytes.fromhex(last))
-        assert await ask(codec, last) == ["0030" + "20" + "00" * 7]
+        assert await handle(codec, last) == ["0030" + "20" + "00" * 7]
         assert mailbox.asked
         assert not codec.is_running
 
@@ -128,8 +128,8 @@ def test_object_codec_aborts_with_the_code_of_the_slave_or_its_own(
     async def run() -> None:
         codec, _ = objects(memory=1000)
         for step in steps[:-1]:
-            await ask(codec, step)
-        (answer,) = await ask(codec, steps[-1])
+            await handle(codec, step)
+        (answer,) = await handle(codec, steps[-1])
         assert answer[:6] == "002080"
         assert bytes.fromhex(answer)[6:] == code.to_bytes(4, "little")
         assert not codec.is_running
@@ -140,9 +140,9 @@ def test_object_codec_aborts_with_the_code_of_the_slave_or_its_own(
 def test_object_codec_is_given_up_by_an_abort() -> None:
     async def scene(codec: ObjectCodec, mailbox: MemoryMailbox) -> None:
         await lead(codec, coe_client.download(TEXT, 0, b"y" * 300, SIZES))
-        await ask(codec, "0020 40 0020 00 00000000")
+        await handle(codec, "0020 40 0020 00 00000000")
         assert codec.is_running
-        assert await ask(codec, "0020 80 0020 00 00000000") == []
+        assert await handle(codec, "0020 80 0020 00 00000000") == []
         assert not codec.is_running
         await eventually(lambda: mailbox.is_abandoned)
 
@@ -176,11 +176,11 @@ def test_object_codec_knows_segments(body: str, is_step: bool) -> None:
 def test_remote_download_in_segments_is_one_write() -> None:
     station = Station()
 
-    async def scene(ask: Callable[[str], Awaitable[list[str]]]) -> None:
+    async def scene(handle: Callable[[str], Awaitable[list[str]]]) -> None:
         answer = ["0030" + "60" + "0080" + "01" + "00000000"]
-        assert await ask("0020 21 0080 01 0c000000 0102") == answer
+        assert await handle("0020 21 0080 01 0c000000 0102") == answer
         assert not station.asked
-        assert await ask("0020 01 0102030405060708090a") == ["0030" + "20" + "00" * 7]
+        assert await handle("0020 01 0102030405060708090a") == ["0030" + "20" + "00" * 7]
         (written,) = station.asked
         assert written == Write(
             IndexGroup.SDO, 0x8000_0001, bytes.fromhex("0102 0102030405060708090a")
@@ -190,9 +190,9 @@ def test_remote_download_in_segments_is_one_write() -> None:
 
 
 def test_remote_download_that_is_refused_is_aborted() -> None:
-    async def scene(ask: Callable[[str], Awaitable[list[str]]]) -> None:
+    async def scene(handle: Callable[[str], Awaitable[list[str]]]) -> None:
         answer = ["0020" + "80" + "0080" + "01" + "02000106"]
-        assert await ask("0020 2b 0080 01 0600 0000") == answer
+        assert await handle("0020 2b 0080 01 0600 0000") == answer
 
     play_remote(Station(result=AdsError.ACCESS), scene)
 
@@ -200,8 +200,8 @@ def test_remote_download_that_is_refused_is_aborted() -> None:
 def test_remote_download_without_size_has_the_size_of_the_entry() -> None:
     station = Station(b"\0\0")
 
-    async def scene(ask: Callable[[str], Awaitable[list[str]]]) -> None:
-        await ask("0020 22 0080 01 06000000")
+    async def scene(handle: Callable[[str], Awaitable[list[str]]]) -> None:
+        await handle("0020 22 0080 01 06000000")
         assert station.asked[-1] == Write(IndexGroup.SDO, 0x8000_0001, b"\6\0")
 
     play_remote(station, scene)
@@ -210,12 +210,12 @@ def test_remote_download_without_size_has_the_size_of_the_entry() -> None:
 def test_remote_sdo_information_comes_in_fragments() -> None:
     station = Station(bytes(120))
 
-    async def scene(ask: Callable[[str], Awaitable[list[str]]]) -> None:
-        first, last = await ask("0080 01 00 0000 0100")
+    async def scene(handle: Callable[[str], Awaitable[list[str]]]) -> None:
+        first, last = await handle("0080 01 00 0000 0100")
         assert first[4:12] == "82000100"
         assert last[4:12] == "02000000"
         assert len(first) // 2 - 6 + len(last) // 2 - 6 == 120
         station.result = AdsError.NOT_FOUND
-        assert await ask("0080 03 00 0000 5555") == ["0080" + "07000000" + "00000206"]
+        assert await handle("0080 03 00 0000 5555") == ["0080" + "07000000" + "00000206"]
 
     play_remote(station, scene)

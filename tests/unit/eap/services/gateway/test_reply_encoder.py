@@ -9,12 +9,12 @@ from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker
 from eap.services.gateway.reply_encoder import (
+    ErrorLog,
     GatewayRequest,
     GatewayStatistics,
-    RefusalLog,
     ReplyEncoder,
 )
-from eap.services.gateway.sessions import GatewayReply, refusals
+from eap.services.gateway.sessions import GatewayReply, error_replies
 
 HERE = Endpoint("udp:eap0", "127.0.0.1:1")
 NEAR, THERE = Endpoint("udp:eap0", "10.0.0.8:1"), Endpoint("udp:eap0", "10.0.0.9:1")
@@ -54,8 +54,8 @@ def test_reply_encoder_counts_the_messages_of_each_slave(request_, sent):
 @pytest.mark.parametrize("is_silent", [False, True])
 def test_errors_are_counted_whether_they_are_sent_or_not(request_, sent, is_silent):
     gateway, tracker = encoder(is_silent=is_silent)
-    gateway.refuse(request_, Cause.CROWDED)
-    gateway.answer(request_, 0, 0, refusals(COE, bytes(10), Cause.DENIED), 0)
+    gateway.reply_error(request_, Cause.CROWDED)
+    gateway.answer(request_, 0, 0, error_replies(COE, bytes(10), Cause.DENIED), 0)
     gateway.answer_dialect(request_, COE, b"no", Cause.DENIED, 0)
     assert len(sent) == (0 if is_silent else 3)
     assert tracker.counts_of(HERE).errors == 3
@@ -66,11 +66,11 @@ def test_errors_are_counted_whether_they_are_sent_or_not(request_, sent, is_sile
 
 def test_statistics_have_a_row_for_each_slave_and_protocol() -> None:
     statistics = GatewayStatistics()
-    statistics.note(1001, MailboxType.COE, [None], 2_000_000)
-    statistics.note(1001, MailboxType.COE, [None, None], 4_000_000)
-    statistics.note(1001, MailboxType.COE, [Cause.TIMEOUT], 900_000_000)
-    statistics.note(0, MailboxType.FOE, [Cause.NO_PROTOCOL], 1)
-    statistics.note(1001, MailboxType.FOE, [], 1)
+    statistics.count(1001, MailboxType.COE, [None], 2_000_000)
+    statistics.count(1001, MailboxType.COE, [None, None], 4_000_000)
+    statistics.count(1001, MailboxType.COE, [Cause.TIMEOUT], 900_000_000)
+    statistics.count(0, MailboxType.FOE, [Cause.NO_PROTOCOL], 1)
+    statistics.count(1001, MailboxType.FOE, [], 1)
     master, coe, foe = statistics.report()
     assert coe == {
         "address": 1001,
@@ -89,12 +89,12 @@ def test_statistics_have_a_row_for_each_slave_and_protocol() -> None:
 def test_statistics_of_every_address_there_is_are_bounded() -> None:
     statistics = GatewayStatistics()
     for address in range(6000):
-        statistics.note(address, MailboxType.COE, [Cause.NO_SLAVE], 1)
+        statistics.count(address, MailboxType.COE, [Cause.NO_SLAVE], 1)
     assert len(statistics.report()) == 4096
 
 
 def test_refusal_log_names_client_address_and_cause(caplog):
-    log = RefusalLog("mill/bus0")
+    log = ErrorLog("mill/bus0")
     log.write(NEAR, 1001, MailboxType.COE, Cause.DENIED)
     log.write(NEAR, 1009, MailboxType.COE, Cause.NO_SLAVE)
     (line,) = caplog.messages
@@ -105,7 +105,7 @@ def test_refusal_log_names_client_address_and_cause(caplog):
 
 
 def test_refusal_log_client_that_asks_again_is_the_same_cause_and_another_is_not(caplog):
-    log = RefusalLog("mill/bus0")
+    log = ErrorLog("mill/bus0")
     again = NEAR._replace(connection="10.0.0.8:2")
     for endpoint in (NEAR, again, THERE):
         log.write(endpoint, 1001, MailboxType.COE, Cause.DENIED)

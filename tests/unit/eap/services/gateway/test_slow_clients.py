@@ -90,7 +90,7 @@ def test_file_read_slowly_leaves_the_slave_to_other_clients() -> None:
         for _ in range(3):
             other = await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)
             assert other == first
-            assert await desk.ask(FOE, 1001, "05 00 00800000", ALSO_HERE) == []
+            assert await desk.handle(FOE, 1001, "05 00 00800000", ALSO_HERE) == []
         second = await desk.one(FOE, 1001, "04 00 01000000")
         assert bytes.fromhex(first)[6:] + bytes.fromhex(second)[6:] == content[: 2 * 1012]
 

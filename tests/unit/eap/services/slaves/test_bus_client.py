@@ -64,7 +64,7 @@ def test_conversation():
         assert await client.converse(SENSOR, vendor(), "me") == b"\x5a\x0e\0\0"
         with pytest.raises(SdoAbortError):
             await client.converse(SENSOR, coe_client.upload(0x5555, 0), "me")
-        with pytest.raises(BusError, match="no slave 1009"):
+        with pytest.raises(BusError, match="unknown slave 1009"):
             await client.converse(1009, vendor(), "me")
 
     play(scene)
@@ -175,10 +175,10 @@ def test_who_leaves_in_the_middle_of_a_file_leaves_the_slave_usable():
 
 def test_turn_that_was_not_used_is_given_back_without_a_word():
     async def scene(client, engine):
-        talk = await client.open_turn(DRIVE, MailboxType.FOE, 1)
+        talk = await client.lock_mailbox(DRIVE, MailboxType.FOE, 1)
         talk.abandon()
         talk.close()
-        await asyncio.wait_for(client.open_turn(DRIVE, MailboxType.FOE, 2), 1)
+        await asyncio.wait_for(client.lock_mailbox(DRIVE, MailboxType.FOE, 2), 1)
         assert not engine.of(ExchangeMailbox)
 
     play(scene, "drive")
@@ -226,7 +226,7 @@ def test_bus_that_is_not_up_is_waited_for(monkeypatch):
         engine.buses[0].is_up = False
         engine.say_hello()
         await settle()
-        monkeypatch.setattr(bus_client, "PATIENCE_S", 0.1)
+        monkeypatch.setattr(bus_client, "WAIT_UP_S", 0.1)
         with pytest.raises(BusError, match="left/bus0 is not up: no frame comes back"):
             await client.converse(SENSOR, vendor(), 1)
         assert not (await client.describe()).is_up
@@ -242,7 +242,7 @@ def test_engine_that_is_gone(monkeypatch):
             await client.converse(SENSOR, vendor(), 1)
         with pytest.raises(EngineGoneError):
             await client.describe(0.05)
-        monkeypatch.setattr(bus_client, "PATIENCE_S", 0.1)
+        monkeypatch.setattr(bus_client, "WAIT_UP_S", 0.1)
         with pytest.raises(EngineGoneError):
             await client.wait_up()
 

@@ -64,7 +64,7 @@ def test_file_is_read_ahead_but_not_to_its_end():
 
     async def scene(file):
         await file.wait_open()
-        assert (file.has_turn, file.is_open) == (True, True)
+        assert (file.has_lock, file.is_open) == (True, True)
         for _ in range(1000):
             await asyncio.sleep(0)
         assert AHEAD <= file.progress.done < AHEAD + 1024
@@ -213,7 +213,7 @@ def test_transfer_of_another_file_after_a_fault_of_the_bus_is_an_error(soon):
     play(scene, turn)
 
 
-@pytest.mark.parametrize("limit", ["KEPT", "ALL_KEPT"])
+@pytest.mark.parametrize("limit", ["MAX_KEPT", "MAX_ALL_KEPT"])
 def test_transfer_too_long_to_be_kept_is_given_up(soon, monkeypatch, limit):
     monkeypatch.setattr(file_stream, limit, 10_000)
 

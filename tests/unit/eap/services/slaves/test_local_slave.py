@@ -31,7 +31,7 @@ def play(
     scene: Callable[[SlaveAccess, FakeEngine], Awaitable[None]],
     *,
     bus: str = "drive",
-    turn_s: float | None = None,
+    lock_s: float | None = None,
     **fields: int,
 ) -> None:
     async def run() -> None:
@@ -41,7 +41,7 @@ def play(
         try:
             found, *_ = (await mailboxes.view.current()).slaves.values()
             slave = replace(found, **fields)
-            await scene(LocalSlave(mailboxes, slave, "me", turn_s=turn_s), engine)
+            await scene(LocalSlave(mailboxes, slave, "me", lock_s=lock_s), engine)
         finally:
             link.close()
             engine.close()
@@ -134,7 +134,7 @@ def test_local_slave_passes_messages_of_vendors() -> None:
 def test_local_slave_without_turn_is_busy() -> None:
     async def scene(slave: SlaveAccess, engine: FakeEngine) -> None:
         assert isinstance(slave, LocalSlave)
-        other = await slave.bus.open_turn(1001, MailboxType.COE, "other")
+        other = await slave.bus.lock_mailbox(1001, MailboxType.COE, "other")
         with pytest.raises(MailboxBusyError):
             await slave.read_object(0x1018, 1)
         request = bytes.fromhex("0020 40 1810 01 00000000")
@@ -142,7 +142,7 @@ def test_local_slave_without_turn_is_busy() -> None:
         other.close()
         assert await slave.read_object(0x1018, 1)
 
-    play(scene, turn_s=0.01)
+    play(scene, lock_s=0.01)
 
 
 def test_local_slave_without_mailbox_has_no_sizes() -> None:

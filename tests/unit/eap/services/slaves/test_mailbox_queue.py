@@ -14,7 +14,7 @@ from devicebus.mailbox.conversation import MailboxRequest
 from eap.codec.mailbox import MailboxType
 from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.bus_client import MailboxQueues, MailboxTurn
+from eap.services.slaves.bus_client import MailboxLock, MailboxQueues
 from tests.support.eventually import settle
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
@@ -30,7 +30,7 @@ def play(scene, kind=MailboxType.COE):
         link = EngineLink(engine.services)
         given = []
         try:
-            await scene(MailboxTurn(link, 0, 1001, kind, lambda: given.append(1)), engine, given)
+            await scene(MailboxLock(link, 0, 1001, kind, lambda: given.append(1)), engine, given)
         finally:
             link.close()
             engine.close()
@@ -87,7 +87,7 @@ def test_mailbox_queues_alternate_between_clients():
     order = []
 
     async def use(queues, client):
-        await queues.take("x", client)
+        await queues.acquire("x", client)
         order.append(client)
         await asyncio.sleep(0)
         queues.release("x")
@@ -105,10 +105,10 @@ def test_mailbox_queues_alternate_between_clients():
 def test_mailbox_queues_of_other_mailboxes_are_free():
     async def play():
         queues = MailboxQueues()
-        await queues.take("x", 1)
-        await asyncio.wait_for(queues.take("y", 1), 1)
+        await queues.acquire("x", 1)
+        await asyncio.wait_for(queues.acquire("y", 1), 1)
         queues.release("x")
-        await asyncio.wait_for(queues.take("x", 2), 1)
+        await asyncio.wait_for(queues.acquire("x", 2), 1)
 
     asyncio.run(play())
 
@@ -116,15 +116,15 @@ def test_mailbox_queues_of_other_mailboxes_are_free():
 def test_mailbox_queues_pass_a_turn_on_when_its_client_leaves():
     async def play():
         queues = MailboxQueues()
-        await queues.take("x", 1)
-        leaving = asyncio.ensure_future(queues.take("x", 2))
-        staying = asyncio.ensure_future(queues.take("x", 3))
+        await queues.acquire("x", 1)
+        leaving = asyncio.ensure_future(queues.acquire("x", 2))
+        staying = asyncio.ensure_future(queues.acquire("x", 3))
         await asyncio.sleep(0)
         leaving.cancel()
         queues.release("x")
         await asyncio.wait_for(staying, 1)
-        late = asyncio.ensure_future(queues.take("x", 4))
-        last = asyncio.ensure_future(queues.take("x", 5))
+        late = asyncio.ensure_future(queues.acquire("x", 4))
+        last = asyncio.ensure_future(queues.acquire("x", 5))
         await asyncio.sleep(0)
         queues.release("x")
         late.cancel()  # it has its turn already, and does not take it
