@@ -1,7 +1,7 @@
-"""The distributed clock of one slave: local time, system time, and the loop that steers it.
+"""Distributed clock of one slave: local time, system time, control loop, SYNC0 and SYNC1.
 
-ETG.1000.4, distributed clocks.  All times are nanoseconds; the clock never asks what time it is.
-Latch inputs, a part that not every controller has, are missing.
+ETG.1000.4, distributed clocks.  All times are nanoseconds; the caller passes the time.  Latch
+inputs, which are optional in a controller, are missing.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ _U64 = 1 << 64
 _PHASE_SHIFT = 3
 _RATE_SHIFT = 8
 _LOCKED_NS = 100_000
-"""Larger errors come from offsets, not from the quartz."""
+"""Larger differences come from offsets, not from the drift of the quartz."""
 _MAX_PPB = 1_000_000
-"""The largest frequency error that the loop can take out, as an ESC's own limit is near 0.1 %."""
+"""Maximum frequency correction of the loop: the limit of an ESC is near 0.1 %."""
 _SYNC_OUT, _SYNC0, _SYNC1 = 0x01, 0x02, 0x04
 _SYNC0_PENDING, _SYNC1_PENDING, _START_IS_PAST = 0x01, 0x02, 0x04
 
 
 class Clock:
-    """Local time that runs *drift_ppm* fast, and the registers that a master sees of it.
+    """Clock whose local time runs *drift_ppm* fast, with its DC registers.
 
     Args:
-        memory: Of the ESC.
+        memory: Memory of the ESC.
         drift_ppm: Deviation of the slave's quartz.
-        local_start_ns: What the clock shows when it is switched on.
+        local_start_ns: Local time at power-on.
     """
 
     __slots__ = ("_base_local", "_base_now", "_drift_ppb", "_last_write_ns", "_memory", "_rate_ppb",
@@ -49,12 +49,12 @@ class Clock:
         memory[Register.DC_SPEED_FILTER] = 12
 
     def set_drift(self, drift_ppm: float, now_ns: int) -> None:
-        """Change the quartz's deviation from now on."""
+        """Change the deviation of the quartz at *now_ns*."""
         self._rebase(now_ns, 0)
         self._drift_ppb = round(drift_ppm * 1000)
 
     def local_time(self, now_ns: int) -> int:
-        """Return what the slave's own clock shows."""
+        """Return the local time of the slave."""
         if self._base_now is None:
             self._base_now = now_ns
         elapsed = now_ns - self._base_now
@@ -67,10 +67,10 @@ class Clock:
         return (self.local_time(now_ns) + self._get(Register.DC_SYSTEM_TIME_OFFSET, 8)) % _U64
 
     def refresh(self, now_ns: int) -> None:
-        """Put the current times into the registers, before a master reads them.
+        """Update the time registers before a master reads them.
 
-        It gets the system time at which its frame passed the reference clock, so that all slaves
-        that keep the time answer the same.
+        The register holds the system time at which the frame passed the reference clock, so that
+        all synchronized slaves answer the same.
         """
         time_ns = self.system_time(now_ns)
         delay = self._get(Register.DC_SYSTEM_TIME_DELAY, 4)
@@ -88,7 +88,7 @@ class Clock:
         self._memory[Register.DC_ACTIVATION_STATUS] = pending
 
     def latch(self, now_ns: int, port_delays: tuple[int | None, ...]) -> None:
-        """Note when a frame passed; a delay of None is a port that it did not pass."""
+        """Latch the receive times of a frame; a delay of None is a port that it did not pass."""
         for port, delay in enumerate(port_delays):
             if delay is not None:
                 at = Register.DC_RECEIVE_TIME + 4 * port
@@ -96,7 +96,7 @@ class Clock:
         self._set(Register.DC_RECEIVE_TIME_ECAT, self.local_time(now_ns + (port_delays[0] or 0)), 8)
 
     def steer(self, data: bytes, now_ns: int) -> None:
-        """Compare with the reference clock's time that a master distributes, and follow it."""
+        """Compare the system time with a distributed reference time, and correct the clock."""
         size = 8 if len(data) >= 8 else 4
         modulus = 1 << 8 * size
         received = int.from_bytes(data[:size], "little")
@@ -116,13 +116,13 @@ class Clock:
         self._last_write_ns = now_ns
 
     def restart_loop(self) -> None:
-        """Forget what the loop has learnt, as a write to its parameters does."""
+        """Reset the control loop, as a write to its parameters does."""
         self._last_write_ns = None
 
     def activate(self, now_ns: int) -> None:
-        """Start or stop SYNC0 and SYNC1, as the activation register now says.
+        """Start or stop SYNC0 and SYNC1 by the activation register.
 
-        A start time that lies in the past starts nothing, as it does not in a controller either.
+        A start time in the past starts nothing, as in a controller.
         """
         self._sync0_seen = self._sync1_seen = 0
         self._start_ns = None
@@ -137,16 +137,16 @@ class Clock:
 
     @property
     def sync0_is_active(self) -> bool:
-        """Whether SYNC0 is switched on with a cycle and begins, or has begun."""
+        """True if SYNC0 is active with a cycle time and a start time that was accepted."""
         return self._start_ns is not None
 
     @property
     def sync1_is_active(self) -> bool:
-        """Whether SYNC1 runs beside SYNC0."""
+        """True if SYNC1 is active as well."""
         return self._start_ns is not None and self._has(_SYNC1)
 
     def take_sync0(self, now_ns: int) -> int:
-        """Return how many SYNC0 pulses came since the last time."""
+        """Return the number of SYNC0 pulses since the last call."""
         if self._start_ns is None:
             return 0
         cycle = self._get(Register.DC_SYNC0_CYCLE, 4)
@@ -155,7 +155,7 @@ class Clock:
         return max(0, fresh)
 
     def take_sync1(self, now_ns: int) -> int:
-        """Return how many SYNC1 pulses came since the last time."""
+        """Return the number of SYNC1 pulses since the last call."""
         if self._start_ns is None or not self.sync1_is_active:
             return 0
         pulses = _pulses(*self._sync1_times(self._start_ns), self.system_time(now_ns))
@@ -163,9 +163,9 @@ class Clock:
         return max(0, fresh)
 
     def _sync1_times(self, start_ns: int) -> tuple[int, int]:
-        """Return when SYNC1 first comes, and its period.
+        """Return the time of the first SYNC1 pulse, and the period of SYNC1.
 
-        It follows a SYNC0 by the SYNC1 cycle time; the SYNC0 pulses meanwhile start none.
+        SYNC1 follows a SYNC0 pulse by the SYNC1 cycle time; SYNC0 pulses meanwhile start no other.
         """
         sync0 = self._get(Register.DC_SYNC0_CYCLE, 4)
         sync1 = self._get(Register.DC_SYNC1_CYCLE, 4)

@@ -1,4 +1,4 @@
-"""What a simulated slave is apart from its controller: objects, mailbox, behaviour."""
+"""Application of a simulated slave, without its controller: objects, mailbox, behaviour."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from eap.od.model import Entry, OdObject, OdState
 
 
 class FaultyDictionary(ObjectDictionary):
-    """Refuses every access to the objects in *aborts* with the code beside them."""
+    """Object dictionary with faults: accesses to the objects in *aborts* fail with their code."""
 
     def __init__(self, objects: Iterable[OdObject] = ()) -> None:
         super().__init__(objects)
         self.aborts: dict[int, int] = {}
 
     def upload(self, index: int, subindex: int, state: OdState) -> bytes:
-        """Return the bytes of one entry."""
+        """Return the encoded value of one entry."""
         self._check(index, subindex)
         return super().upload(index, subindex, state)
 
     def download(self, index: int, subindex: int, data: bytes, state: OdState) -> None:
-        """Write the bytes of one entry."""
+        """Write the encoded value of one entry."""
         self._check(index, subindex)
         super().download(index, subindex, data, state)
 
@@ -52,25 +52,25 @@ _OD_STATES = {AlState.SAFEOP: OdState.SAFEOP, AlState.OP: OdState.OP}
 
 
 class Behaviour(Protocol):
-    """What a device does with its outputs and where its inputs come from."""
+    """Behaviour of a device: its inputs as a function of outputs and time."""
 
     def step(self, state: AlState, now_ns: int) -> None:
-        """Look at the outputs' entries and set those of the inputs; outputs count in OP only."""
+        """Set the entries of the inputs; entries of the outputs are valid in OP only."""
 
 
 class Device:
-    """A device as its slave state machine sees it.
+    """Device behind a slave state machine.
 
     Args:
-        name: For people.
-        dictionary: Its objects, whether a master can read them or not.
-        mailbox: None for one without a mailbox.
-        behaviour: None for one whose inputs change by downloads only.
-        has_boot: Whether it knows the state BOOT.
+        name: Name for messages.
+        dictionary: Its objects, also without CoE.
+        mailbox: None for a device without a mailbox.
+        behaviour: None for a device whose inputs change by downloads only.
+        has_boot: True if it supports the state BOOT.
         output_channel, input_channel: Sync managers of the process data.
-        needs_sync0: Whether it refuses OP without SYNC0.
-        identification: What a master gets that asks for the device's ID.
-        channels: The entries of its inputs and outputs by name.
+        needs_sync0: True if it refuses OP without SYNC0.
+        identification: Device ID for a master that requests it.
+        channels: Entries of its inputs and outputs by name.
     """
 
     def __init__(
@@ -100,14 +100,14 @@ class Device:
         self.process_data = ProcessData(dictionary)
         self._overrides: dict[tuple[int, int], _Override] = {}
         self.al_state = AlState.INIT
-        """Kept by the slave's state machine."""
+        """AL state, set by the slave's state machine."""
 
     def od_state(self) -> OdState:
-        """Return the state whose rights count in the dictionary."""
+        """Return the state whose access rights apply in the dictionary."""
         return _OD_STATES.get(self.al_state, OdState.PREOP)
 
     def step(self, now_ns: int) -> None:
-        """Let the device act once; what is overridden stays as it is."""
+        """Run the behaviour once; overridden entries stay unchanged."""
         if self._overrides:
             self._keep()
         if self.behaviour is not None:
@@ -116,11 +116,11 @@ class Device:
                 self._keep()
 
     def override(self, index: int, subindex: int, value: object) -> None:
-        """Let an entry keep *value*, whatever the device or the master puts there.
+        """Hold an entry at *value*, whatever the device or the master writes.
 
         Raises:
-            ValueError: it is no value of that entry.
-            SdoAbortError: there is no such entry.
+            ValueError: the value does not fit the entry.
+            SdoAbortError: the entry does not exist.
         """
         entry = self.dictionary.entry(index, subindex)
         octets = entry.kind.encode(value)
@@ -130,9 +130,9 @@ class Device:
         self._keep()
 
     def release(self, index: int, subindex: int) -> bool:
-        """End :meth:`override`; return whether there was one.
+        """End :meth:`override`; return false if there was none.
 
-        The entry has the value from before until device or master puts another one there.
+        The entry gets its earlier value back until the device or the master writes it.
         """
         found = self._overrides.pop((index, subindex), None)
         if found is not None:
@@ -140,7 +140,7 @@ class Device:
         return found is not None
 
     def report_error(self, code: int, *, axis: int = 0) -> None:
-        """Send an emergency by each protocol that has them; code 0 says that it is over."""
+        """Send an emergency by CoE and SoE; code 0 reports the end."""
         if _ERROR_REGISTER in self.dictionary:
             self.dictionary.entry(_ERROR_REGISTER, 0).octets = bytes((code != 0,))
         servers = self.mailbox.protocols.values() if self.mailbox else ()

@@ -1,6 +1,6 @@
-"""The EEPROM behind an ESC and the registers by which a master reaches it (ETG.1000.4).
+"""EEPROM behind an ESC and its registers (ETG.1000.4).
 
-A command takes its time: until then the controller is busy and takes no other.
+A command takes time: until its end the controller is busy and accepts no other.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ _DURATION: dict[int, int] = {
 
 
 class Eeprom:
-    """An image of words; what lies behind it reads as erased.
+    """EEPROM image; words behind its end read as erased.
 
     Args:
-        memory: Of the ESC.
-        image: Bytes, changed by writes.
+        memory: Memory of the ESC.
+        image: Content, changed by writes.
 
     Attributes:
-        extra_ns: A fault: how much longer each command takes.
-        is_broken: A fault: no command is acknowledged.
-        busy_until_ns: When the command under way is done; None while there is none.
+        extra_ns: Fault: additional time of each command.
+        is_broken: Fault: no command is acknowledged.
+        busy_until_ns: End of the command under way; None without one.
     """
 
     __slots__ = ("_control", "_memory", "busy_until_ns", "extra_ns", "image", "is_broken")
@@ -54,18 +54,18 @@ class Eeprom:
         self._load(power_on=True)
 
     @property
-    def is_masters(self) -> bool:
-        """Whether the master may use the interface now."""
+    def is_with_master(self) -> bool:
+        """True while the interface is assigned to the master."""
         return not self._memory[Register.EEPROM_CONFIGURATION] & _OWNED_BY_PDI
 
     def ownership_written(self) -> None:
-        """The master gave the interface away, or took it by force (bit 1)."""
+        """Handle a write that assigns the interface to the PDI, or forces it back (bit 1)."""
         memory = self._memory
         if memory[Register.EEPROM_CONFIGURATION] & 2:
             memory[Register.EEPROM_PDI_ACCESS] = 0
 
     def control_written(self, now_ns: int) -> None:
-        """Begin with the command that was written to the control register."""
+        """Start the command that was written to the control register."""
         at = Register.EEPROM_CONTROL
         control = int.from_bytes(self._memory[at : at + 2], "little")
         command = control >> 8 & 7
@@ -81,8 +81,8 @@ class Eeprom:
             self.busy_until_ns = now_ns + _DURATION[command] + self.extra_ns
             self._status(_BUSY | control & _COMMAND)
 
-    def settle(self, now_ns: int) -> None:
-        """Finish the command that is done by now."""
+    def finish_command(self, now_ns: int) -> None:
+        """Finish the command if its time is over."""
         if self.busy_until_ns is None or now_ns < self.busy_until_ns:
             return
         self.busy_until_ns = None
@@ -104,7 +104,7 @@ class Eeprom:
     def _load(self, *, power_on: bool = False) -> None:
         """Load the configuration words; an image with a wrong check sum loads nothing.
 
-        The alias is taken over at power-on only.
+        The alias is loaded at power-on only.
         """
         memory = self._memory
         if not sii.is_intact(self.image):

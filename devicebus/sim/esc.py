@@ -1,7 +1,9 @@
-"""A slave controller as the wire sees it: registers, memory and what touching them does.
+"""EtherCAT slave controller (ESC): registers, memory, and the effects of accesses to them.
 
-*read* and *write* are what a datagram does; they answer whether the working counter goes up.  The
-slave's application uses the sync managers and :meth:`Esc.set_al_status`, and looks at *al_event*.
+Datagrams use *read* and *write*, whose result decides the working counter.  The slave's application
+uses the sync managers and :meth:`Esc.set_al_status`, and reads *al_event*.  A datagram counts as
+executed when at least one of its bytes was read or written: a write to FMMU 6 of an ESC without
+FMMU 6 leaves the working counter unchanged.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlEvent, Register
 
 REGISTERS = int(Register.MEMORY)
-"""Bytes of the register space."""
+"""Size of the register space in bytes."""
 
 _READ = (
     (0x0000, 0x000A), (0x0010, 0x0014), (0x0020, 0x0022), (0x0030, 0x0032), (0x0040, 0x0041),
@@ -44,14 +46,14 @@ _WRITE_DC = (
 
 
 class AccessMap(NamedTuple):
-    """One byte a register: 1 where it can be read, written."""
+    """Access rights: one byte per register byte, 1 if readable or writable."""
 
     readable: bytes
     writable: bytes
 
 
 def access_map(fmmus: int, sync_managers: int, *, has_dc: bool) -> AccessMap:
-    """Return what an ESC with so many FMMUs and sync managers lets a master read and write."""
+    """Return the master's access rights of an ESC with so many FMMUs and sync managers."""
     channels = range(Register.SYNC_MANAGER, Register.SYNC_MANAGER + 8 * sync_managers, 8)
     units = range(Register.FMMU, Register.FMMU + 16 * fmmus, 16)
     read = [*_READ, *((at, at + 16) for at in units), *((at, at + 8) for at in channels)]
@@ -67,7 +69,7 @@ def access_map(fmmus: int, sync_managers: int, *, has_dc: bool) -> AccessMap:
 
 
 def _writable_of_channels(channels: Iterable[int]) -> Iterator[tuple[int, int]]:
-    # Status and PDI control belong to the slave.
+    # The status byte (offset 5) and PDI control (offset 7) are writable by the slave only.
     for at in channels:
         yield at, at + 5
         yield at + 6, at + 7
@@ -87,7 +89,7 @@ _DEVICE_EMULATION = 0x01
 
 
 class EscSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """What kind of controller it is; the defaults are those of a common one."""
+    """Type and features of a controller; the defaults are those of a common one."""
 
     type: int = 0x11
     revision: int = 0
@@ -95,26 +97,27 @@ class EscSettings(msgspec.Struct, frozen=True, kw_only=True):
     fmmus: int = 8
     sync_managers: int = 16
     ram: int = 8192
-    """Bytes of process data memory."""
+    """Size of the process data memory in bytes."""
     port_descriptor: int = 0x0F
-    """Two bits a port: 0 none, 1 not configured, 2 E-bus, 3 MII."""
+    """Two bits per port: 0 none, 1 not configured, 2 E-bus, 3 MII."""
     has_dc: bool = True
     drift_ppm: float = 0.0
     local_start_ns: int = 0
-    """What its clock shows when it is switched on."""
+    """Local time of its clock at power-on."""
 
 
 class Esc:
-    """One controller with its EEPROM *image*.
+    """Controller with its EEPROM *image*.
 
     Attributes:
-        al_event: Bits of the AL event register: what the application has not seen yet.
+        al_event: Bits of the AL event register that the application has not handled yet.
         ecat_event: Bits of the ECAT event register, for the master.
-        loops_changed: The master has written how ports are to be closed; for the wiring.
-        event_mask: Which of them go into the event field of datagrams.
-        windows: The active FMMUs.
-        port_delays: How long after entering the segment a frame reaches each port; None where none
-            comes; set by the wiring.
+        loops_changed: True after a write to the loop control of the ports, until the wiring is
+            updated.
+        event_mask: ECAT events that go into the event field of datagrams.
+        windows: Active FMMUs.
+        port_delays: Time from a frame's entry into the segment to its arrival at each port; None
+            for a port without arrival; set by the wiring.
     """
 
     def __init__(self, image: bytes, settings: EscSettings | None = None) -> None:
@@ -124,7 +127,7 @@ class Esc:
 
     @property
     def image(self) -> bytes:
-        """What its EEPROM holds."""
+        """EEPROM image."""
         return bytes(self._image)
 
     @image.setter
@@ -132,7 +135,7 @@ class Esc:
         self._image[:] = image
 
     def power_on(self) -> None:
-        """Begin with the values after a reset; the EEPROM keeps its content."""
+        """Reset registers and memory; the EEPROM keeps its content."""
         given = self.settings
         self.memory = bytearray(REGISTERS + given.ram)
         self._readable, self._writable = access_map(
@@ -173,26 +176,26 @@ class Esc:
 
     @property
     def alias(self) -> int | None:
-        """The second address, while DL control enables it."""
+        """Station alias, None unless DL control enables it."""
         enabled = self.memory[Register.DL_CONTROL + 3] & 1
         return self._word(Register.STATION_ALIAS) if enabled else None
 
     @property
     def emulates_device(self) -> bool:
-        """Whether AL status follows AL control without an application."""
+        """True in device emulation: AL status mirrors AL control without an application."""
         return bool(self.memory[Register.ESC_CONFIGURATION] & _DEVICE_EMULATION)
 
     @property
     def irq(self) -> int:
-        """What this controller adds to the event field of every datagram."""
+        """Bits that this controller ORs into the event field of every datagram."""
         return self.event_mask & self._events()
 
     def loop_control(self, port: int) -> int:
-        """Return how the master wants a port: 0 automatic, 1 closes by itself, 2 open, 3 closed."""
+        """Return the loop control of a port: 0 auto, 1 auto close, 2 open, 3 closed."""
         return self.memory[Register.DL_CONTROL + 1] >> 2 * port & 3
 
     def set_dl_status(self, status: int) -> None:
-        """Show the state of the ports; a change is an event, a link that went is counted."""
+        """Set DL status; a change is an event, a lost link is counted."""
         at = Register.DL_STATUS
         old = self._word(at)
         if status == old:
@@ -204,11 +207,11 @@ class Esc:
                 self.count_error(Register.LOST_LINK + port)
 
     def count_error(self, counter: int) -> None:
-        """Count up one of the error counters, which stop at 255."""
+        """Increment an error counter; it stops at 255."""
         self.memory[counter] = min(self.memory[counter] + 1, 0xFF)
 
     def set_al_status(self, status: int, code: int) -> None:
-        """Show where the slave stands: state with error bit, and why."""
+        """Set AL status with its error bit, and the AL status code."""
         at = Register.AL_STATUS
         octets = status.to_bytes(2, "little") + bytes(2) + code.to_bytes(2, "little")
         if self.memory[at : at + 6] != octets:
@@ -216,7 +219,7 @@ class Esc:
             self.ecat_event |= _EVENT_AL
 
     def read(self, address: int, length: int, now_ns: int) -> bytes | None:
-        """Return what a master reads, None if nothing of it exists or may be read now."""
+        """Return the data of a master's read, None if no byte exists or is readable now."""
         end = address + length
         if address >= REGISTERS:
             return self._read_memory(address, end)
@@ -238,7 +241,7 @@ class Esc:
         return data
 
     def write(self, address: int, data: bytes, now_ns: int) -> bool:
-        """Do what a master's write does; return whether anything was written."""
+        """Execute a master's write; return false if no byte was written."""
         end = address + len(data)
         if address >= REGISTERS:
             return self._write_memory(address, data, now_ns)
@@ -262,7 +265,7 @@ class Esc:
         return True
 
     def peek(self, address: int, length: int) -> bytes:
-        """Return bytes as they are, with no effect."""
+        """Return bytes without the effects of a read."""
         return bytes(self.memory[address : address + length])
 
     def _refresh(self, page: int, now_ns: int) -> None:
@@ -271,7 +274,7 @@ class Esc:
             self.clock.refresh(now_ns + (self.port_delays[0] or 0))
             return
         if page == 0x05:
-            self.eeprom.settle(now_ns)
+            self.eeprom.finish_command(now_ns)
             return
         at = Register.ECAT_EVENT
         memory[at : at + 2] = self._events().to_bytes(2, "little")
@@ -279,8 +282,8 @@ class Esc:
         memory[at : at + 4] = self.al_event.to_bytes(4, "little")
 
     def _takes_eeprom(self, now_ns: int) -> bool:
-        self.eeprom.settle(now_ns)
-        return self.eeprom.is_masters and self.eeprom.busy_until_ns is None
+        self.eeprom.finish_command(now_ns)
+        return self.eeprom.is_with_master and self.eeprom.busy_until_ns is None
 
     def _events(self) -> int:
         full = sum(1 << 4 + n for n, each in enumerate(self.channels[:8]) if each.is_full)
@@ -416,7 +419,7 @@ class Esc:
 
 
 def _find_areas(guards: tuple[SyncChannel, ...]) -> dict[tuple[int, int], SyncChannel]:
-    """Return the sync managers by area, but for those that another one overlaps."""
+    """Return the sync managers by area, without overlapping ones."""
     return {
         (each.start, each.end): each
         for each in guards

@@ -1,7 +1,10 @@
-"""Faults of a segment: by a script, or by command while it runs.
+"""Faults of a simulated segment, by script or by command, and the commands of a running segment.
 
-What hits frames is counted in frames, what hits slaves begins and ends at a time, so that a run can
-be repeated exactly.
+Faults of frames are counted in frames and faults of slaves have a start and an end time, so that a
+run is repeatable.
+
+A command is one JSON object.  With ``set`` or ``release`` it concerns an entry, otherwise it is a
+fault; ``"end": true`` ends the fault that it describes.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ def _mailbox(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> N
 
 
 def _foe(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
-    """Be busy with every message, or refuse every request with a code."""
+    """FoE fault: BUSY after every message, or an error code for every request."""
     del now_ns
     mailbox = slave.device.mailbox
     server = mailbox.protocols.get(MailboxType.FOE) if mailbox else None
@@ -55,9 +58,9 @@ def _sdo(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
 
 
 def _emergency(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
-    """Report an error code, and with the end of the fault that there is none any more.
+    """Emergency fault: report an error code, and code 0 at the end of the fault.
 
-    The axis of a drive fails besides, until it is reset.
+    The axis of a drive fails as well, until it is reset.
     """
     del now_ns
     device = slave.device
@@ -70,7 +73,7 @@ def _emergency(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) ->
 
 
 def _tx_pdo(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
-    """Send a TxPDO through the mailbox that nobody asked for."""
+    """TxPDO fault: send an unsolicited TxPDO through the mailbox."""
     del now_ns
     mailbox = slave.device.mailbox
     server = mailbox.protocols.get(MailboxType.COE) if mailbox else None
@@ -81,7 +84,7 @@ def _tx_pdo(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> No
 
 
 def _eeprom(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) -> None:
-    """Slow the EEPROM down; without a delay it acknowledges nothing."""
+    """EEPROM fault: delay each command; without a delay no command is acknowledged."""
     del now_ns
     eeprom = slave.esc.eeprom
     eeprom.extra_ns = 1000 * spec.delay_us if on else 0
@@ -121,15 +124,15 @@ SLAVE_FAULTS: dict[FaultKind, Callable[[SimulatedSlave, FaultSpec, int, bool], N
 
 
 def find_entry(device: Device, text: str) -> tuple[int, int]:
-    """Return index and subindex of an entry.
+    """Return index and subindex of the entry that *text* names.
 
     Args:
-        device: Whose entry it is.
-        text: The name of an input or output, that of any other entry, or index and subindex such
-            as ``0x6000:01``; of an index that begins with a letter, 0x or the subindex too.
+        device: Device with the entry.
+        text: Name of an input or output, name of another entry, or index and subindex such as
+            ``0x6000:01``; an index that begins with a letter needs 0x or a subindex.
 
     Raises:
-        ValueError: there is none, or several of that name.
+        ValueError: no entry, or several entries, have this name.
     """
     if text in device.channels:
         return device.channels[text]
@@ -148,8 +151,8 @@ def find_entry(device: Device, text: str) -> tuple[int, int]:
         known = ", ".join(device.channels) or "none"
         raise ValueError(f"{device.name} has no entry {text!r} (inputs and outputs: {known})")
     if len(named) > 1:
-        places = ", ".join(map(str, named))
-        raise ValueError(f"{device.name} has several entries {text!r}: {places}")
+        names = ", ".join(map(str, named))
+        raise ValueError(f"{device.name} has several entries {text!r}: {names}")
     return named[0]
 
 
@@ -158,7 +161,7 @@ _ON_FRAMES = frozenset((FaultKind.LOSS, FaultKind.DELAY, FaultKind.CORRUPT, Faul
 
 
 class Outgoing(NamedTuple):
-    """A frame on its way back; *origin* is what it was received with."""
+    """Frame on its way back; *origin* is the value that it was received with."""
 
     frame: bytearray
     side: SegmentEnd
@@ -166,11 +169,11 @@ class Outgoing(NamedTuple):
 
 
 class FaultySegment:
-    """A segment to which things happen.
+    """Segment with faults.
 
     Args:
-        segment: The segment.
-        script: Faults with their times, counted from the first call that has a time.
+        segment: Segment without faults.
+        script: Faults with their times, counted from the first call with a time.
     """
 
     def __init__(self, segment: SimulatedSegment, script: Iterable[FaultSpec] = ()) -> None:
@@ -186,7 +189,7 @@ class FaultySegment:
         self._returning: list[tuple[int, int, Outgoing]] = []
 
     def check(self, spec: FaultSpec) -> None:
-        """Raise ValueError if there is no such slave, object or state."""
+        """Raise ValueError for an unknown slave, object or state."""
         needs_slave = spec.kind not in _ON_FRAMES or spec.kind is FaultKind.CORRUPT
         if needs_slave and spec.slave not in self._numbers:
             known = ", ".join(self._numbers)
@@ -202,10 +205,10 @@ class FaultySegment:
             raise ValueError(f"fault refuse: no state {spec.state!r} (one of {known})")
 
     def begin(self, spec: FaultSpec, now_ns: int) -> None:
-        """Let a fault happen now or, if it has a time, then; *at_ms* counts from now.
+        """Start a fault now, or at *at_ms* from now.
 
         Raises:
-            ValueError: there is no such slave, object or state.
+            ValueError: the slave, object or state is unknown.
         """
         self.check(spec)
         at = now_ns + spec.at_ms * _MS
@@ -220,23 +223,23 @@ class FaultySegment:
         self._switch(spec, now_ns, on=False)
 
     def set_value(self, slave: str, entry: str, value: object, now_ns: int) -> None:
-        """Let an entry of a slave keep *value*, whatever changes it otherwise.
+        """Hold an entry of a slave at *value*.
 
         Args:
-            slave: Its name.
-            entry: Name of an input, an output or another entry, or such as ``0x6000:1``.
-            value: Of the entry's type.
-            now_ns: The time.
+            slave: Name of the slave.
+            entry: Name of an input, output or other entry, or index and subindex (``0x6000:1``).
+            value: Value of the entry's type.
+            now_ns: Present time.
 
         Raises:
-            ValueError: there is no such slave or entry, or it has no such value.
+            ValueError: slave or entry are unknown, or the value does not fit.
         """
         found = self._slave(slave)
         found.device.override(*find_entry(found.device, entry), value)
         found.offer_inputs(now_ns)
 
     def release(self, slave: str, entry: str, now_ns: int) -> None:
-        """End :meth:`set_value`; raise ValueError if there was none."""
+        """End :meth:`set_value`; raise ValueError if the entry was not set."""
         found = self._slave(slave)
         if not found.device.release(*find_entry(found.device, entry)):
             raise ValueError(f"{slave}: {entry} was not set")
@@ -255,7 +258,7 @@ class FaultySegment:
         side: SegmentEnd = SegmentEnd.PRIMARY,
         origin: Any = None,
     ) -> None:
-        """Let a frame enter; what comes back is in :meth:`frames_to_send`."""
+        """Handle a frame from the master; :meth:`frames_to_send` returns it when it is back."""
         self.handle_timeout(now_ns)
         delay_ns = 0
         change_wkc = False
@@ -277,20 +280,20 @@ class FaultySegment:
         heapq.heappush(self._returning, entry)
 
     def frames_to_send(self, now_ns: int) -> list[Outgoing]:
-        """Take the frames that are back."""
+        """Return and remove the frames that are back."""
         ready = []
         while self._returning and self._returning[0][0] <= now_ns:
             ready.append(heapq.heappop(self._returning)[2])
         return ready
 
     def next_timeout(self) -> int | None:
-        """Return when something is due: a frame, a fault, or a slave."""
+        """Return the time of the next frame, fault or slave timer."""
         times = [self.segment.next_timeout()]
         times += [queue[0][0] for queue in (self._due, self._returning) if queue]
         return min((at for at in times if at is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Let faults begin and end, and slaves look at the time."""
+        """Start and end faults, and handle the timers of slaves."""
         if self._started_ns is None:
             self._started_ns = now_ns
             for spec in self._script:
@@ -326,7 +329,7 @@ class FaultySegment:
 
 
 def spoil_working_counters(frame: bytearray) -> None:
-    """Make every working counter of a whole frame one too small."""
+    """Decrement every working counter of a frame."""
     offset = EtherCatHeader.SIZE
     while offset + OVERHEAD <= len(frame):
         header = DatagramHeader.decode(frame, offset)
@@ -339,7 +342,7 @@ def spoil_working_counters(frame: bytearray) -> None:
 
 
 class EntryValue(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An entry of a slave and the value that it is to keep."""
+    """Entry of a slave and the value to hold."""
 
     slave: str
     entry: str
@@ -347,7 +350,7 @@ class EntryValue(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class EntryName(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An entry of a slave that may change again."""
+    """Entry of a slave to release."""
 
     slave: str
     entry: str
@@ -362,19 +365,19 @@ class _ReleaseCommand(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class FaultCommand(FaultSpec, frozen=True, forbid_unknown_fields=True):
-    """A fault; with *end* it is over."""
+    """Fault command; *end* ends the fault."""
 
     end: bool = False
 
 
 def execute_command(segment: FaultySegment, command: object, now_ns: int) -> None:
-    """Do what *command* says, a JSON object that is decoded.
+    """Execute *command*, a decoded JSON object.
 
     Raises:
-        ValueError: it says nothing that can be done; the text says why.
+        ValueError: the command is invalid; the text has the reason.
     """
     if not isinstance(command, dict):
-        raise ValueError("a command is a JSON object")  # noqa: TRY004  the person's, not ours
+        raise ValueError("a command is a JSON object")  # noqa: TRY004  invalid user input
     try:
         if "set" in command:
             entry = msgspec.convert(command, _SetCommand).set

@@ -1,6 +1,6 @@
-"""FMMUs: which bits of the logical memory are which bits of a slave (ETG.1000.4).
+"""FMMUs: mapping of logical addresses to the memory of a slave (ETG.1000.4).
 
-Units on whole bytes, which is almost all of them, are copied as bytes; the others bit by bit.
+FMMUs on whole bytes, which are almost all, are copied as bytes; the others are shifted and masked.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from devicebus.wire.register import FMMU_READ, FMMU_WRITE, Fmmu, Register
 
 
 class EscMemory(Protocol):
-    """What FMMUs map to: a slave controller, or whatever stands for one."""
+    """Memory behind FMMUs: a slave controller."""
 
     def read(self, address: int, length: int, now_ns: int) -> bytes | None:
-        """Read as a master does; None where it must not."""
+        """Read as a master does; None if not readable."""
 
     def write(self, address: int, data: bytes, now_ns: int) -> bool:
-        """Write as a master does; return whether anything was written."""
+        """Write as a master does; return false if no byte was written."""
 
     def peek(self, address: int, length: int) -> bytes:
-        """Read with no effect."""
+        """Read without the effects of a master's read."""
 
 
 class FmmuWindow(NamedTuple):
-    """One active FMMU; *first* and *last* are bytes of the logical memory."""
+    """Active FMMU; *first* and *last* are logical addresses of bytes."""
 
     first: int
     last: int
@@ -38,7 +38,7 @@ class FmmuWindow(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether it maps whole bytes to whole bytes."""
+        """True if it maps whole bytes to whole bytes."""
         return not self.first_bit and not self.physical_bit and not self.bits % 8
 
 
@@ -65,25 +65,25 @@ def _window(unit: Fmmu) -> FmmuWindow:
 
 
 class FmmuSlice(NamedTuple):
-    """What a window shares with a datagram."""
+    """Overlap of an FMMU window with a datagram."""
 
     first: int
-    """Its bytes in the data, up to *end*."""
+    """Offset in the data, up to *end*."""
     end: int
     physical: int
-    """Its bytes in the memory, *size* of them."""
+    """Address in the memory, for *size* bytes."""
     size: int
     mask: int
-    """As many ones as it has bits; 0 for whole bytes on both sides."""
+    """Mask of its bits; 0 for whole bytes on both sides."""
     shift: int
-    """Bits in front of it in the data."""
+    """Bit offset in the data."""
     physical_shift: int
-    """Bits in front of it in the memory."""
+    """Bit offset in the memory."""
 
 
 def find_slices(windows: Iterable[FmmuWindow], address: int, size: int) -> tuple[FmmuSlice, ...]:
-    """Return what *windows* map of ``address`` to ``address + size``."""
-    pieces = []
+    """Return the overlaps of *windows* with ``address`` to ``address + size``."""
+    slices = []
     for window in windows:
         begin = 8 * (window.first - address) + window.first_bit
         start = max(begin, 0)
@@ -92,7 +92,7 @@ def find_slices(windows: Iterable[FmmuWindow], address: int, size: int) -> tuple
             continue
         first, shift = divmod(start, 8)
         offset, physical_shift = divmod(window.physical_bit + start - begin, 8)
-        pieces.append(
+        slices.append(
             FmmuSlice(
                 first,
                 first + (shift + bits + 7) // 8,
@@ -103,44 +103,46 @@ def find_slices(windows: Iterable[FmmuWindow], address: int, size: int) -> tuple
                 physical_shift,
             )
         )
-    return tuple(pieces)
+    return tuple(slices)
 
 
 def read_slices(
-    memory: EscMemory, pieces: Iterable[FmmuSlice], now_ns: int
+    memory: EscMemory, slices: Iterable[FmmuSlice], now_ns: int
 ) -> list[tuple[FmmuSlice, bytes]]:
-    """Read what can be read, to be inserted later: a datagram's own data is written first."""
-    found = []
-    for piece in pieces:
-        octets = memory.read(piece.physical, piece.size, now_ns)
+    """Read the readable slices, for insertion after the write: LRW writes the received data."""
+    data_read = []
+    for part in slices:
+        octets = memory.read(part.physical, part.size, now_ns)
         if octets is not None:
-            found.append((piece, octets))
-    return found
+            data_read.append((part, octets))
+    return data_read
 
 
-def insert_slices(frame: bytearray, start: int, found: Iterable[tuple[FmmuSlice, bytes]]) -> None:
-    """Put what :func:`read_slices` found into the data at *start* of *frame*."""
-    for piece, octets in found:
-        first, end = start + piece.first, start + piece.end
-        if not piece.mask:
+def insert_slices(
+    frame: bytearray, start: int, data_read: Iterable[tuple[FmmuSlice, bytes]]
+) -> None:
+    """Insert the result of :func:`read_slices` into the data at *start* of *frame*."""
+    for part, octets in data_read:
+        first, end = start + part.first, start + part.end
+        if not part.mask:
             frame[first:end] = octets
             continue
-        value = int.from_bytes(octets, "little") >> piece.physical_shift & piece.mask
-        old = int.from_bytes(frame[first:end], "little") & ~(piece.mask << piece.shift)
-        frame[first:end] = (old | value << piece.shift).to_bytes(end - first, "little")
+        value = int.from_bytes(octets, "little") >> part.physical_shift & part.mask
+        old = int.from_bytes(frame[first:end], "little") & ~(part.mask << part.shift)
+        frame[first:end] = (old | value << part.shift).to_bytes(end - first, "little")
 
 
 def write_slices(
-    memory: EscMemory, pieces: Iterable[FmmuSlice], frame: bytearray, start: int, now_ns: int
+    memory: EscMemory, slices: Iterable[FmmuSlice], frame: bytearray, start: int, now_ns: int
 ) -> bool:
-    """Write from the data at *start* of *frame*; return whether anything was written."""
+    """Write from the data at *start* of *frame*; return false if no byte was written."""
     written = False
-    for piece in pieces:
-        octets = bytes(frame[start + piece.first : start + piece.end])
-        if piece.mask:
-            value = int.from_bytes(octets, "little") >> piece.shift & piece.mask
-            old = int.from_bytes(memory.peek(piece.physical, piece.size), "little")
-            old &= ~(piece.mask << piece.physical_shift)
-            octets = (old | value << piece.physical_shift).to_bytes(piece.size, "little")
-        written |= memory.write(piece.physical, octets, now_ns)
+    for part in slices:
+        octets = bytes(frame[start + part.first : start + part.end])
+        if part.mask:
+            value = int.from_bytes(octets, "little") >> part.shift & part.mask
+            old = int.from_bytes(memory.peek(part.physical, part.size), "little")
+            old &= ~(part.mask << part.physical_shift)
+            octets = (old | value << part.physical_shift).to_bytes(part.size, "little")
+        written |= memory.write(part.physical, octets, now_ns)
     return written

@@ -1,7 +1,7 @@
-"""Process data of a slave: the PDOs that its object dictionary assigns, packed and unpacked.
+"""Process data of a slave by PDO assignment and mapping of its dictionary (ETG.1000.6).
 
-0x1C12 and 0x1C13 name the PDOs, each PDO the entries with their bits (ETG.1000.6).  The plan is
-made when the slave leaves PreOp; from then on the dictionary refuses to change it.
+0x1C12 and 0x1C13 assign the PDOs, each PDO maps entries with their bit lengths.  The mapping is
+evaluated when the slave leaves PREOP; from then on the dictionary refuses changes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _OCTETS = tuple(bytes((value,)) for value in range(0x100))
 
 
 class MappedEntry(NamedTuple):
-    """An entry and the bits of the process data that it has; None is padding."""
+    """Mapped entry with its bits in the process data; None is padding."""
 
     entry: Entry | None
     start: int
@@ -26,7 +26,7 @@ class MappedEntry(NamedTuple):
 
 
 class _ByteRun(NamedTuple):
-    """An entry on whole bytes, *first* to *end*."""
+    """Entry on whole bytes, *first* to *end*."""
 
     entry: Entry
     first: int
@@ -34,44 +34,44 @@ class _ByteRun(NamedTuple):
 
 
 class _BitRun(NamedTuple):
-    """What shares the bytes from *first* to *end*: entries, and the shift and mask of each."""
+    """Entries that share the bytes from *first* to *end*, each with shift and mask."""
 
-    places: tuple[tuple[Entry, int, int], ...]
+    fields: tuple[tuple[Entry, int, int], ...]
     first: int
     end: int
     is_small: bool
-    """Whether every entry is one byte, as those of digital inputs and outputs are."""
+    """True if every entry is one byte, as those of digital inputs and outputs are."""
 
 
 class PdoMapping:
-    """All outputs or all inputs, or one PDO.
+    """Mapping of all outputs, of all inputs, or of one PDO.
 
     Attributes:
-        parts: What is mapped, in order.
-        size: Bytes.
+        entries: Mapped entries in order.
+        size: Size in bytes.
     """
 
-    def __init__(self, parts: Iterable[MappedEntry] = ()) -> None:
-        self.parts = tuple(parts)
-        self.size = (sum(part.bits for part in self.parts) + 7) // 8
-        self._runs = tuple(_runs(self.parts))
+    def __init__(self, entries: Iterable[MappedEntry] = ()) -> None:
+        self.entries = tuple(entries)
+        self.size = (sum(mapped.bits for mapped in self.entries) + 7) // 8
+        self._runs = tuple(_runs(self.entries))
 
     def unpack(self, data: bytes) -> None:
-        """Give the bytes of *data* to the entries."""
+        """Set the entries from *data*."""
         for run in self._runs:
             if isinstance(run, _ByteRun):
                 run.entry.octets = data[run.first : run.end]
                 continue
             word = int.from_bytes(data[run.first : run.end], "little")
             if run.is_small:
-                for entry, shift, mask in run.places:
+                for entry, shift, mask in run.fields:
                     entry.octets = _OCTETS[word >> shift & mask]
                 continue
-            for entry, shift, mask in run.places:
+            for entry, shift, mask in run.fields:
                 entry.octets = (word >> shift & mask).to_bytes(entry.kind.size, "little")
 
     def pack(self) -> bytes:
-        """Return the bytes of all entries."""
+        """Return the process data of all entries."""
         pieces = []
         for run in self._runs:
             size = run.end - run.first
@@ -81,20 +81,20 @@ class PdoMapping:
                 continue
             word = 0
             if run.is_small:
-                for entry, shift, mask in run.places:
+                for entry, shift, mask in run.fields:
                     word |= (entry.octets[0] & mask) << shift
             else:
-                for entry, shift, mask in run.places:
+                for entry, shift, mask in run.fields:
                     word |= (int.from_bytes(entry.octets, "little") & mask) << shift
             pieces.append(word.to_bytes(size, "little"))
         return b"".join(pieces)
 
 
 class ProcessData:
-    """Outputs and inputs of one slave, as its dictionary maps them now.
+    """Outputs and inputs of one slave.
 
     Attributes:
-        outputs, inputs: The plans; :meth:`configure` makes them.
+        outputs, inputs: Mappings, evaluated by :meth:`configure`.
     """
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
@@ -103,16 +103,16 @@ class ProcessData:
         self.inputs = PdoMapping()
 
     def configure(self) -> None:
-        """Read assignment and mapping; what maps an entry that does not exist counts as padding."""
+        """Evaluate assignment and mapping; a mapped entry that does not exist is padding."""
         self.outputs = self._plan(self._numbers(OUTPUTS))
         self.inputs = self._plan(self._numbers(INPUTS))
 
     def read_pdo(self, index: int) -> bytes | None:
-        """Return the bytes of one PDO, assigned or not; None if it is not there."""
+        """Return the data of one PDO, assigned or not; None if it does not exist."""
         return self._plan([index]).pack() if index in self._dictionary else None
 
     def write_pdo(self, index: int, data: bytes) -> bool:
-        """Give the bytes of one PDO to its entries; return False if it has not this size."""
+        """Set the entries of one PDO; return False for another size."""
         plan = self._plan([index])
         if index not in self._dictionary or len(data) != plan.size:
             return False
@@ -120,16 +120,16 @@ class ProcessData:
         return True
 
     def _plan(self, pdos: Iterable[int]) -> PdoMapping:
-        parts = []
+        entries = []
         end = 0
         for pdo in pdos:
             for mapping in self._numbers(pdo):
                 bits = mapping & 0xFF
-                parts.append(
+                entries.append(
                     MappedEntry(self._entry(mapping >> 16, mapping >> 8 & 0xFF), end, bits)
                 )
                 end += bits
-        return PdoMapping(parts)
+        return PdoMapping(entries)
 
     def _numbers(self, index: int) -> list[int]:
         if index not in self._dictionary:
@@ -147,27 +147,27 @@ class ProcessData:
         return self._dictionary[index].entries.get(subindex)
 
 
-def _runs(parts: Iterable[MappedEntry]) -> Iterator[_ByteRun | _BitRun]:
-    """Take together what shares bytes; what has bytes of its own is copied as a whole."""
-    places: list[tuple[Entry, int, int]] = []
+def _runs(entries: Iterable[MappedEntry]) -> Iterator[_ByteRun | _BitRun]:
+    """Group entries that share bytes; an entry with bytes of its own is copied as a whole."""
+    fields: list[tuple[Entry, int, int]] = []
     first = end = 0
-    for part in parts:
+    for mapped in entries:
         aligned = end == 8 * first
-        end = part.start + part.bits
-        if aligned and part.entry is not None and part.bits == 8 * part.entry.kind.size:
-            yield _ByteRun(part.entry, first, end // 8)
+        end = mapped.start + mapped.bits
+        if aligned and mapped.entry is not None and mapped.bits == 8 * mapped.entry.kind.size:
+            yield _ByteRun(mapped.entry, first, end // 8)
             first = end // 8
             continue
-        if part.entry is not None:
-            mask = min((1 << part.bits) - 1, (1 << 8 * part.entry.kind.size) - 1)
-            places.append((part.entry, part.start - 8 * first, mask))
+        if mapped.entry is not None:
+            mask = min((1 << mapped.bits) - 1, (1 << 8 * mapped.entry.kind.size) - 1)
+            fields.append((mapped.entry, mapped.start - 8 * first, mask))
         if not end % 8:
-            yield _bits(places, first, end // 8)
-            places, first = [], end // 8
+            yield _bits(fields, first, end // 8)
+            fields, first = [], end // 8
     if end > 8 * first:
-        yield _bits(places, first, (end + 7) // 8)
+        yield _bits(fields, first, (end + 7) // 8)
 
 
-def _bits(places: list[tuple[Entry, int, int]], first: int, end: int) -> _BitRun:
-    is_small = all(entry.kind.size == 1 and not entry.is_text for entry, _, _ in places)
-    return _BitRun(tuple(places), first, end, is_small)
+def _bits(fields: list[tuple[Entry, int, int]], first: int, end: int) -> _BitRun:
+    is_small = all(entry.kind.size == 1 and not entry.is_text for entry, _, _ in fields)
+    return _BitRun(tuple(fields), first, end, is_small)

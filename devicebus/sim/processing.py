@@ -1,7 +1,7 @@
-"""What the controllers on a frame's way do with its datagrams (ETG.1000.4).
+"""Processing of a frame's datagrams by the controllers on its path (ETG.1000.4).
 
-The controllers are asked datagram by datagram instead of slave by slave, which no slave can tell
-apart, so that a datagram for one slave costs nothing at the others.
+The order is datagram by datagram instead of slave by slave.  The result is the same, and a datagram
+for one slave costs nothing at the others.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SIZE = _HEADER.size
 _MORE, _CIRCULATING, _LENGTH = 0x8000, 0x4000, 0x07FF
 _ADDRESS_END = Register.DL_CONTROL + 4
 _MASK_END = Register.ECAT_EVENT_MASK + 2
-"""Behind the registers of a controller's addresses, and of the events that it shows."""
+"""Ends of the registers of station addresses, and of the ECAT event mask."""
 _READS = frozenset((Command.APRD, Command.FPRD, Command.BRD, Command.APRW, Command.FPRW,
                     Command.BRW))  # fmt: skip
 _WRITES = frozenset((Command.APWR, Command.FPWR, Command.BWR, Command.APRW, Command.FPRW,
@@ -42,11 +42,11 @@ _LOGICAL = frozenset((Command.LRD, *_LOGICAL_WRITES))
 _NOP, _LAST, _LWR = int(Command.NOP), int(Command.FRMW), int(Command.LWR)
 _CAN_READ, _CAN_WRITE = attrgetter("can_read"), attrgetter("can_write")
 _MAX_PLANS = 64
-"""A master that sends other logical addresses in every frame gains nothing by plans."""
+"""Limit for cached plans, for a master that sends other logical addresses in every frame."""
 
 
 class _LogicalAccess(NamedTuple):
-    """What of a logical datagram concerns one controller."""
+    """Part of a logical datagram that one controller reads and writes."""
 
     esc: Esc
     reads: tuple[FmmuSlice, ...]
@@ -54,12 +54,12 @@ class _LogicalAccess(NamedTuple):
 
 
 class Chain:
-    """The controllers that work on frames entering at one side, in their order.
+    """Controllers on the path of frames from one end, in the order of the frame.
 
     Args:
-        escs: In the order of the frame.
-        closed_at: Index of the first one without a link at port 0, which marks frames as
-            circulating and takes those out that are marked already.
+        escs: Controllers in the order of the frame.
+        closed_at: Index of the first one without a link at port 0, which sets the circulating bit
+            and destroys frames that have it already.
     """
 
     def __init__(self, escs: Sequence[Esc], *, closed_at: int | None = None) -> None:
@@ -71,7 +71,7 @@ class Chain:
         self._planned: list[tuple[FmmuWindow, ...]] = []
 
     def process(self, frame: bytearray, now_ns: int) -> bool:
-        """Work on *frame* in place; return False if a controller takes it out of the ring."""
+        """Process *frame* in place; return False if a controller destroys it as circulating."""
         if len(frame) < EtherCatHeader.SIZE:
             return True
         header = EtherCatHeader.decode(frame)
@@ -158,7 +158,7 @@ class Chain:
     def _read_multiple_write(
         self, command: int, adp: int, ado: int, data: bytearray, now_ns: int
     ) -> int:
-        """One controller reads, all others write what the frame holds as it passes them."""
+        """Execute ARMW or FRMW: the addressed controller is read, the others are written."""
         count = 0
         readers = self._addressed(Command.FPRD if command == Command.FRMW else command, adp)
         for esc in self._escs:
@@ -187,15 +187,15 @@ class Chain:
         return count
 
     def _plan(self, where: tuple[int, int]) -> tuple[_LogicalAccess, ...]:
-        """Return who takes part in datagrams of this address and length; kept for the next one."""
+        """Return the accesses of a logical datagram by address and length, cached."""
         windows = [esc.windows for esc in self._escs]
         if windows != self._planned or len(self._plans) >= _MAX_PLANS:
             self._plans.clear()
             self._planned = windows
         plan = self._plans.get(where)
         if plan is None:
-            shares = (_logical_access(esc, *where) for esc in self._escs if esc.windows)
-            plan = self._plans[where] = tuple(each for each in shares if each is not None)
+            accesses = (_logical_access(esc, *where) for esc in self._escs if esc.windows)
+            plan = self._plans[where] = tuple(each for each in accesses if each is not None)
         return plan
 
     def _add_irq(self, frame: bytearray, at: int) -> None:

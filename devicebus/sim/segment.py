@@ -1,7 +1,11 @@
-"""A segment: slaves, the cables between them, and frames that pass.
+"""Simulated segment: slaves, cables, and the path of frames through them.
 
-A frame begins at its EtherCAT header; Ethernet and UDP are for drivers.  The caller brings the
-time, so that a run can be repeated exactly.
+A controller forwards a frame from port to port in the order 0, 3, 1, 2 and processes it at port 0;
+a port without a link loops it back.  The order of the slaves, branches, the reach behind a cut
+cable, and the ring with a second line to the master follow from this rule.
+
+A frame begins at its EtherCAT header; Ethernet and UDP belong to drivers.  The caller passes the
+time, so that a run is repeatable.
 """
 
 from __future__ import annotations
@@ -15,39 +19,39 @@ from devicebus.sim.slave import SimulatedSlave
 from devicebus.wire.register import Register
 
 FORWARD_NS = 300
-"""From a frame's arrival at one port to its way out of the next."""
+"""Delay from the arrival at a port to the exit at the next."""
 CABLE_NS = 50
 _NEXT_PORT = {0: 3, 3: 1, 1: 2, 2: 0}
 
 PortAt: TypeAlias = "tuple[int, int]"
-"""Number of a slave and one of its ports."""
+"""Number of a slave, and one of its ports."""
 
 
 class SegmentEnd(IntEnum):
-    """An end of the segment at the master; the secondary exists in a ring only."""
+    """End of the segment at the master; the secondary end exists in a ring only."""
 
     PRIMARY = 0
     SECONDARY = 1
 
 
 class FramePath(NamedTuple):
-    """What happens to a frame that enters at one side."""
+    """Path of a frame that enters at one end."""
 
     order: tuple[int, ...]
-    """The slaves that work on it."""
+    """Slaves that process the frame, in order."""
     arrivals: dict[PortAt, int]
-    """Nanoseconds from its entering to its arrival at each port that it comes through."""
+    """Time from its entry to its arrival at each port, in ns."""
     exit: SegmentEnd
     closed_at: int | None
-    """Index in *order* of the first slave that has no link at port 0."""
+    """Index in *order* of the first slave without a link at port 0."""
 
 
 Links: TypeAlias = Mapping[PortAt, "PortAt | SegmentEnd"]
-"""What each port is joined to; ports without a link are missing."""
+"""Other end of each port's cable; ports without a link are missing."""
 
 
 def trace_path(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> FramePath:
-    """Follow a frame from the port where it enters until it leaves the segment."""
+    """Return the path of a frame from the port where it enters until it leaves the segment."""
     order: list[int] = []
     arrivals: dict[PortAt, int] = {}
     closed_at = None
@@ -72,7 +76,7 @@ def trace_path(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> FrameP
 
 
 def dl_status(joined: frozenset[int]) -> int:
-    """Return the DL status of a powered controller whose ports *joined* have a link."""
+    """Return the DL status of a powered controller with a link at the ports *joined*."""
     status = 0x0007
     for port in range(4):
         closed = port not in joined
@@ -82,15 +86,16 @@ def dl_status(joined: frozenset[int]) -> int:
 
 
 POLL_NS = 1_000_000
-"""Period in which slaves look at the time on their own, MAX_POLLED of them at once."""
+"""Period of the timers of slaves, MAX_POLLED slaves at once."""
 MAX_POLLED = 64
-"""Of 200 slaves each looks at the time every 4 ms: all of them would take half of a processor."""
+"""Limit per period: with 200 slaves each timer is checked every 4 ms; all at once would use half
+of a processor."""
 CATCH_UP_NS = 20_000_000
-"""Time in which a caller that was late hands over the frames that wait."""
+"""Time in which a late caller passes the frames that wait."""
 
 
 class Cable(NamedTuple):
-    """Joins port 0 of slave *child* to a port of slave *parent*; both are numbers."""
+    """Cable from port 0 of slave number *child* to a port of slave number *parent*."""
 
     child: int
     parent: int
@@ -98,12 +103,12 @@ class Cable(NamedTuple):
 
 
 class SimulatedSegment:
-    """Slaves in a tree; the first one's port 0 is the master's.
+    """Slaves in a tree; port 0 of the first is connected to the master.
 
     Args:
-        slaves: Numbered from 0.
-        cables: One for each slave but the first; left out, a line through ports 1.
-        ring_end: The port that a second line joins to the master; None without a ring.
+        slaves: Slaves, numbered from 0.
+        cables: One for each slave but the first; by default a line through ports 1.
+        ring_end: Port with the second line to the master; None without a ring.
         cable_ns: Delay of each cable.
     """
 
@@ -124,68 +129,68 @@ class SimulatedSegment:
         self._cut: set[int] = set()
         self._poll_at_ns: int | None = None
         self._next_polled = 0
-        self._rewire()
+        self._update_wiring()
 
     def cut(self, child: int) -> None:
-        """Cut the cable at port 0 of slave *child*; for 0 the one to the master."""
+        """Cut the cable at port 0 of slave *child*; 0 is the cable to the master."""
         self._cut.add(child)
-        self._rewire()
+        self._update_wiring()
 
     def mend(self, child: int) -> None:
-        """Join that cable again."""
+        """Reconnect that cable."""
         self._cut.discard(child)
-        self._rewire()
+        self._update_wiring()
 
     def switch(self, number: int, *, on: bool) -> None:
         """Switch a slave off or on."""
         self.slaves[number].switch(on=on)
-        self._rewire()
+        self._update_wiring()
 
     def process_frame(
         self, frame: bytearray, now_ns: int, side: SegmentEnd = SegmentEnd.PRIMARY
     ) -> SegmentEnd | None:
-        """Let *frame* pass; what the slaves write is in it afterwards.
+        """Pass *frame* through the segment, modified in place.
 
         Returns:
-            Where it comes out, None if it is lost.
+            End at which it comes out, None if it is lost.
         """
         self.handle_timeout(now_ns)
         chain = self._chains[side]
         if chain is None:
             return None
         survives = chain.process(frame, now_ns)
-        self._let_run(side, now_ns)
+        self._run_slaves(side, now_ns)
         path = self._paths[side]
         return path.exit if survives and path is not None else None
 
     def break_frame(self, frame: bytearray, now_ns: int, side: SegmentEnd, number: int) -> None:
-        """Let a frame break on the cable in front of slave *number*, as the others see it.
+        """Damage a frame on the cable in front of slave *number*.
 
-        Those in front have taken it as it was; the slave counts an error, those behind a forwarded
-        one, and none of these takes it.
+        The slaves in front process it; the slave counts an error, those behind a forwarded error,
+        and none of these processes it.
         """
         self.handle_timeout(now_ns)
         path = self._paths[side]
         if path is None or number not in path.order:
             return
-        place = path.order.index(number)
+        position = path.order.index(number)
         reached = self._reached[side]
-        Chain([slave.esc for slave in reached[:place]]).process(frame, now_ns)
-        self._let_run(side, now_ns)
-        reached[place].esc.count_error(Register.RX_ERROR)
-        for slave in reached[place + 1 :]:
+        Chain([slave.esc for slave in reached[:position]]).process(frame, now_ns)
+        self._run_slaves(side, now_ns)
+        reached[position].esc.count_error(Register.RX_ERROR)
+        for slave in reached[position + 1 :]:
             slave.esc.count_error(Register.FORWARDED_RX_ERROR)
 
     def next_timeout(self) -> int | None:
-        """Return when :meth:`handle_timeout` has something to do."""
+        """Return the next time for :meth:`handle_timeout`."""
         times = [at for slave in self.slaves if (at := slave.next_timeout()) is not None]
         if not times:
             return None
-        # Slaves look at the time once in a while only: an earlier call would change nothing.
+        # Timers of slaves are checked once per POLL_NS: an earlier call has no effect.
         return max(min(times), self._poll_at_ns or 0)
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Let slaves look at the time; more often than every millisecond costs nothing."""
+        """Handle the timers of slaves; calls within POLL_NS cost nothing."""
         if self._poll_at_ns is not None and now_ns < self._poll_at_ns:
             return
         self._poll_at_ns = now_ns + POLL_NS
@@ -196,30 +201,30 @@ class SimulatedSegment:
             slave.handle_timeout(now_ns)
 
     def postpone_timeouts(self, now_ns: int) -> None:
-        """Take frames first that waited while the caller did not run.
+        """Process frames that waited while the caller did not run before any timer.
 
-        Slaves are hardware: a watchdog does not run out because the process of the simulation was
-        late to hand over outputs that had come in time.
+        A watchdog must not expire because the simulation's process was late to pass outputs that
+        had arrived in time.
         """
         self._poll_at_ns = now_ns + CATCH_UP_NS
 
-    def _let_run(self, side: SegmentEnd, now_ns: int) -> None:
-        rewire = False
+    def _run_slaves(self, side: SegmentEnd, now_ns: int) -> None:
+        is_changed = False
         for slave in self._reached[side]:
             esc = slave.esc
             if esc.al_event:
                 slave.run(now_ns)
-            rewire |= esc.loops_changed
-        if rewire:
-            self._rewire()
+            is_changed |= esc.loops_changed
+        if is_changed:
+            self._update_wiring()
 
-    def _rewire(self) -> None:
+    def _update_wiring(self) -> None:
         links = self._links()
         self._paths: list[FramePath | None] = [None, None]
         self._chains: list[Chain | None] = [None, None]
         self._reached: list[tuple[SimulatedSlave, ...]] = [(), ()]
-        for end, side in [(place, side) for place, side in links.items() if side in _SIDES]:
-            assert isinstance(side, SegmentEnd)  # noqa: S101  chosen so
+        for end, side in [(position, side) for position, side in links.items() if side in _SIDES]:
+            assert isinstance(side, SegmentEnd)  # noqa: S101  by the filter
             path = trace_path(links, end, self._cable_ns)
             reached = tuple(self.slaves[number] for number in path.order)
             self._paths[side] = path
@@ -241,8 +246,8 @@ class SimulatedSegment:
         if self.slaves and 0 not in self._cut and self._is_open(0, 0):
             links[0, 0] = SegmentEnd.PRIMARY
         for child, parent, port in self._cables:
-            whole = child not in self._cut
-            if whole and self._is_open(child, 0) and self._is_open(parent, port):
+            is_connected = child not in self._cut
+            if is_connected and self._is_open(child, 0) and self._is_open(parent, port):
                 links[child, 0] = (parent, port)
                 links[parent, port] = (child, 0)
         if self._ring_end is not None and self._is_open(*self._ring_end):

@@ -1,6 +1,6 @@
-"""A simulated slave: the state machine of ETG.1000.6 between a controller and a device.
+"""Simulated slave: EtherCAT state machine (ETG.1000.6) between a controller and a device.
 
-It acts when its controller has an event or when a time has come, and never waits.
+It runs on events of its controller and on timers, and never blocks.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ ALLOWED: dict[AlState, frozenset[AlState]] = {
     AlState.OP: frozenset((AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP)),
     AlState.BOOT: frozenset((AlState.INIT, AlState.BOOT)),
 }
-"""To which states a master may ask from each."""
+"""Allowed requests of a master in each state."""
 
 
 def check_mailbox(esc: Esc) -> bool:
-    """Whether sync managers 0 and 1 are two mailboxes in the right directions, side by side."""
+    """Return true if sync managers 0 and 1 are mailboxes in the right directions, apart."""
     receive, send = esc.channels[:2]
     if not (_is_mailbox(receive) and _is_mailbox(send)):
         return False
@@ -36,7 +36,7 @@ def check_mailbox(esc: Esc) -> bool:
 
 
 def check_process_data(esc: Esc, device: Device) -> AlStatusCode:
-    """Return why the sync managers of the process data do not fit the mapping, or NO_ERROR."""
+    """Return the AL status code for process data sync managers that do not fit, or NO_ERROR."""
     sides = (
         (device.output_channel, True, device.process_data.outputs.size,
          AlStatusCode.OUTPUT_CONFIGURATION),
@@ -55,7 +55,7 @@ def check_process_data(esc: Esc, device: Device) -> AlStatusCode:
 
 
 def check_clock(esc: Esc, device: Device) -> AlStatusCode:
-    """Return why the distributed clock is not set up as the device needs it, or NO_ERROR."""
+    """Return the AL status code for a clock without the required SYNC0, or NO_ERROR."""
     asked = esc.memory[Register.DC_ACTIVATION] & 0x02
     if (asked or device.needs_sync0) and not esc.clock.sync0_is_active:
         return AlStatusCode.DC_SYNC_CONFIGURATION
@@ -63,7 +63,7 @@ def check_clock(esc: Esc, device: Device) -> AlStatusCode:
 
 
 def _meet(buffered: SyncChannel, other: SyncChannel) -> bool:
-    """Whether a channel lies where the three buffers of *buffered* are."""
+    """Return true if *other* overlaps the three buffers of *buffered*."""
     end = buffered.start + _BUFFERS * buffered.length
     other_end = other.start + (1 if other.is_mailbox else _BUFFERS) * other.length
     return other.length > 0 and buffered.start < other_end and other.start < end
@@ -74,7 +74,7 @@ def _is_mailbox(channel: SyncChannel) -> bool:
 
 
 OUTPUTS_TIMEOUT_NS = 200_000_000
-"""How long a slave on its way to OP waits for the first outputs (ESI default, back to SafeOp)."""
+"""Time-out for the first outputs on the way to OP (ESI default for back to SafeOp)."""
 
 _IDENTIFY = 0x20
 _AL_CONTROL, _SM_ACTIVATION = int(AlEvent.AL_CONTROL), int(AlEvent.SM_ACTIVATION)
@@ -85,13 +85,13 @@ _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
 class SimulatedSlave:
-    """One slave of a segment.
+    """Slave of a simulated segment.
 
     Attributes:
         esc: Its controller.
-        device: What it is.
-        is_powered: False for one that is switched off; set by :meth:`switch`.
-        refused_states: Fault: AL status code with which it refuses each state that is in here.
+        device: Its application.
+        is_powered: False while it is switched off; set by :meth:`switch`.
+        refused_states: Fault: AL status code of each refused state.
     """
 
     def __init__(self, esc: Esc, device: Device) -> None:
@@ -100,9 +100,9 @@ class SimulatedSlave:
         self.is_powered = True
         self.refused_states: dict[AlState, int] = {}
         self._protocols = dict(device.mailbox.protocols) if device.mailbox else {}
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self.device.al_state = AlState.INIT
         self._code = 0
         self._has_outputs = False
@@ -110,7 +110,7 @@ class SimulatedSlave:
 
     @property
     def state(self) -> AlState:
-        """Where it stands."""
+        """Present AL state."""
         return self.device.al_state
 
     @property
@@ -119,17 +119,17 @@ class SimulatedSlave:
         return self._code
 
     def switch(self, *, on: bool) -> None:
-        """Switch the slave off, or on again with everything but its EEPROM forgotten."""
+        """Switch the slave off, or on again with its EEPROM content only."""
         if on and not self.is_powered:
             self.esc.power_on()
-            self._forget()
+            self._reset()
         self.is_powered = on
 
     def run(self, now_ns: int) -> None:
-        """Act on what the controller has seen since the last time."""
+        """Handle the events of the controller since the last call."""
         event, self.esc.al_event = self.esc.al_event, 0
         if event & _AL_CONTROL:
-            self._obey(now_ns)
+            self._handle_al_control(now_ns)
         if event & _SM_ACTIVATION:
             self._check_channels()
         if event & _MAILBOX_EVENTS and self._has_mailbox():
@@ -139,7 +139,7 @@ class SimulatedSlave:
             self._exchange(now_ns)
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Act on the time: watchdog, a late first output, messages that a server has ready."""
+        """Handle timers: watchdog, time-out of the first outputs, messages of mailbox servers."""
         if not self.is_powered:
             return
         if self.esc.watchdog.check(now_ns) and self.state is AlState.OP:
@@ -157,28 +157,28 @@ class SimulatedSlave:
             self._offer_inputs(now_ns)
 
     def next_timeout(self) -> int | None:
-        """Return when :meth:`handle_timeout` has something to do."""
+        """Return the next time for :meth:`handle_timeout`."""
         if not self.is_powered:
             return None
         times = [at for at in (self.esc.watchdog.deadline_ns, self._deadline_ns) if at is not None]
         return min(times, default=None)
 
     def offer_inputs(self, now_ns: int) -> None:
-        """Show the master what has changed apart from its frames."""
+        """Update the input area after a change that no frame caused."""
         if self.is_powered and self.state in _WITH_PROCESS_DATA:
             self._offer_inputs(now_ns)
 
     def _is_sync_pulse(self, now_ns: int) -> bool:
-        """Whether inputs are to be latched: by SYNC1 where it runs, else by SYNC0."""
+        """Return true if inputs are latched now: by SYNC1 if active, otherwise by SYNC0."""
         clock = self.esc.clock
         sync0 = clock.take_sync0(now_ns)
         return clock.take_sync1(now_ns) > 0 if clock.sync1_is_active else sync0 > 0
 
     def fail(self, code: int) -> None:
-        """Report an error of its own; in OP it falls back to SAFEOP."""
+        """Report an application error; in OP the slave falls back to SAFEOP."""
         self._refuse(code)
 
-    def _obey(self, now_ns: int) -> None:
+    def _handle_al_control(self, now_ns: int) -> None:
         at = Register.AL_CONTROL
         control = int.from_bytes(self.esc.memory[at : at + 2], "little")
         requested = control & 0x0F
@@ -211,7 +211,7 @@ class SimulatedSlave:
         self.esc.set_al_status(control & 0x1F, 0)
 
     def _prepare(self, target: AlState, now_ns: int) -> int:
-        """Return the code that forbids *target*; begin to wait if it depends on outputs."""
+        """Return the AL status code that forbids *target*; start to wait if outputs are needed."""
         before = self.state
         if before is target:
             return 0
@@ -271,20 +271,20 @@ class SimulatedSlave:
         self.esc.set_al_status(self.state | ERROR, code)
 
     def _check_channels(self) -> None:
-        """The master has changed a sync manager: that must not happen under running data."""
+        """Handle a changed sync manager, which is an error while it carries data."""
         if self.esc.emulates_device:
             return
         if self._has_mailbox() and not check_mailbox(self.esc):
             boot = self.state is AlState.BOOT
-            self._fall(AlState.INIT, AlStatusCode.MAILBOX_BOOT if boot else
+            self._fall_back(AlState.INIT, AlStatusCode.MAILBOX_BOOT if boot else
                        AlStatusCode.MAILBOX_PREOP)  # fmt: skip
             return
         if self.state in _WITH_PROCESS_DATA:
             code = check_process_data(self.esc, self.device)
             if code:
-                self._fall(AlState.PREOP, code)
+                self._fall_back(AlState.PREOP, code)
 
-    def _fall(self, state: AlState, code: int) -> None:
+    def _fall_back(self, state: AlState, code: int) -> None:
         self.esc.watchdog.stop()
         self._deadline_ns = None
         self.device.al_state = state
@@ -296,7 +296,7 @@ class SimulatedSlave:
     def _serve_mailbox(self, event: int) -> None:
         mailbox = self.device.mailbox
         send = self.esc.channels[1]
-        assert mailbox is not None  # noqa: S101  asked by the caller
+        assert mailbox is not None  # noqa: S101  checked by the caller
         if event & send.event and not send.is_full:
             mailbox.handle_read()
         if send.repeat_request != send.repeat_acknowledge:
@@ -309,7 +309,7 @@ class SimulatedSlave:
     def _move_messages(self, now_ns: int) -> None:
         mailbox = self.device.mailbox
         receive, send = self.esc.channels[:2]
-        assert mailbox is not None  # noqa: S101  asked by the caller
+        assert mailbox is not None  # noqa: S101  checked by the caller
         if mailbox.is_ready:
             request = receive.take()
             if request is not None:

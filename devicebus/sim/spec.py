@@ -1,6 +1,6 @@
-"""A simulated bus as data: what bus files describe and devices are built from.
+"""Description of a simulated bus: content of bus files, from which devices are built.
 
-Plain structs without behaviour, so that any loader can make them.  Units are in the names.
+Plain structs without behaviour, for any loader.  Names contain the units.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Value: TypeAlias = bool | int | float | str
 
 
 class DeviceKind(Enum):
-    """Which builder of ``devicebus.sim.devices`` makes it."""
+    """Kind of a device: selects a builder of ``devicebus.sim.devices``."""
 
     COUPLER = "coupler"
     DIGITAL = "digital"
@@ -32,7 +32,7 @@ class DeviceKind(Enum):
 
 
 class AccessKind(Enum):
-    """Rights of an entry, by state where they differ."""
+    """Access rights of an entry, by state where they differ."""
 
     READ = "ro"
     WRITE = "wo"
@@ -41,7 +41,7 @@ class AccessKind(Enum):
 
 
 class ChannelSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """One input or output of the process data, and the entry that holds it."""
+    """Input or output of the process data, with the entry that holds it."""
 
     name: str
     type: str = "BOOL"
@@ -52,23 +52,23 @@ class ChannelSpec(msgspec.Struct, frozen=True, kw_only=True):
     noise: float = 0.0
     """Inputs: largest deviation from *value*, in steps of the type."""
     values: tuple[float, ...] = ()
-    """Inputs: what they show one after the other, again and again."""
+    """Inputs: sequence of values, repeated."""
     csv: str = ""
-    """Inputs: the same from a file with one value a line."""
+    """Inputs: sequence from a file with one value per line."""
     follows: str = ""
-    """Inputs: the output of this slave that they show."""
+    """Inputs: name of an output of this slave whose value they take."""
     bits: Annotated[int, Meta(ge=0, le=255)] = 0
-    """In the PDO; 0 for those of its type."""
+    """Bit length in the PDO; 0 for that of its type."""
     pdo: U16 = 0
-    """The PDO that maps it; left out, 0x1A00 for inputs and 0x1600 for outputs."""
+    """PDO that maps it; by default 0x1A00 for inputs and 0x1600 for outputs."""
     assigned: bool = True
-    """Whether that PDO is part of the process data until a master assigns others."""
+    """True if that PDO is assigned by default."""
     period_ms: Annotated[int, Meta(ge=1, le=3_600_000)] = 10
-    """How long each value of *values*, of *csv* or of the noise lasts."""
+    """Duration of each value of *values*, *csv* or noise."""
 
 
 class EntrySpec(msgspec.Struct, frozen=True, kw_only=True):
-    """One subindex of an object of its own."""
+    """Subindex of an ObjectSpec."""
 
     subindex: U8
     name: str
@@ -80,7 +80,7 @@ class EntrySpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """An object: a variable with *type*, or a record with *entries*."""
+    """Object: a variable with *type*, or a record with *entries*."""
 
     index: U16
     name: str
@@ -93,7 +93,7 @@ class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FileSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """A file that FoE reads and writes."""
+    """File for FoE."""
 
     name: str
     max_size: Size = 4 << 20
@@ -103,11 +103,11 @@ class FileSpec(msgspec.Struct, frozen=True, kw_only=True):
     boot_only: bool = False
     not_in_boot: bool = False
     checksum: bool = False
-    """Whether what is written must end with the CRC-32 of what is in front of it."""
+    """True if written content must end with the CRC-32 of the bytes before it."""
 
 
 class MailboxSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """The mailbox and its protocols; *size* bytes each way."""
+    """Mailbox and its protocols; *size* in bytes for each direction."""
 
     size: MailboxSize = 256
     coe: bool = True
@@ -119,43 +119,43 @@ class MailboxSpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ClockSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """The distributed clock."""
+    """Distributed clock."""
 
     drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
     start_ns: Annotated[int, Meta(ge=0, le=(1 << 63) - 1)] = 0
-    """What it shows when it is switched on."""
+    """Local time at power-on."""
     needs_sync0: bool = False
 
 
 class SlaveSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """One slave; *after* names the slave that its port 0 is wired to, the one before if empty."""
+    """Slave; *after* names the slave at its port 0, by default the one before."""
 
     name: str
     kind: DeviceKind
     vendor: U32 = 0x0000_0E5A
     product: U32 = 0
-    """0: the number of the kind."""
+    """0: default of the kind."""
     revision: U32 = 0x0001_0000
     serial: U32 = 0
     alias: U16 = 0
     after: str = ""
     port: Port = 1
-    """Of the slave before."""
+    """Port of the slave named by *after*."""
     mailbox: MailboxSpec | None = MailboxSpec()
     clock: ClockSpec | None = ClockSpec()
     boot: bool = True
     axes: Annotated[int, Meta(ge=1, le=8)] = 1
-    """Kind ``drive``: how many axes it has."""
+    """Kind ``drive``: number of axes."""
     inputs: tuple[ChannelSpec, ...] = ()
     outputs: tuple[ChannelSpec, ...] = ()
     objects: tuple[ObjectSpec, ...] = ()
     files: tuple[FileSpec, ...] = ()
     esi: str = ""
-    """Kind ``esi``: the file of the vendor, beside the bus file."""
+    """Kind ``esi``: ESI file of the vendor, in the folder of the bus file."""
 
 
 class FaultKind(Enum):
-    """What can go wrong; what each needs beside its kind is in docs/simulator.md."""
+    """Kind of a fault; docs/simulator.md lists the fields that each kind needs."""
 
     LOSS = "loss"
     DELAY = "delay"
@@ -175,30 +175,30 @@ class FaultKind(Enum):
 
 
 class FaultSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """One fault, from *at_ms* after the start for *for_ms*; without an end it stays."""
+    """Fault from *at_ms* after the start for *for_ms*; without *for_ms* it stays."""
 
     kind: FaultKind
     slave: str = ""
     at_ms: Annotated[int, Meta(ge=0, le=86_400_000)] = 0
     for_ms: Annotated[int, Meta(ge=1, le=86_400_000)] | None = None
     every: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
-    """Frames: every how many-th is hit."""
+    """Frames: period, in frames."""
     delay_us: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
     object: str = ""
     code: U32 = 0
     """SDO abort code, AL status code, FoE error code, or error code of an emergency."""
     axis: Annotated[int, Meta(ge=0, le=7)] = 0
-    """Of a drive, for its emergency."""
+    """Axis of a drive, for its emergency."""
     state: str = ""
     drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
 
 
 class BusSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """A segment."""
+    """Simulated bus."""
 
     bus: str
     slaves: tuple[SlaveSpec, ...]
     ring: bool = False
-    """Whether the last slave's next port leads back to the master."""
+    """True if the last slave's next port is connected to the master."""
     cable_ns: Annotated[int, Meta(ge=0, le=1_000_000)] = 50
     faults: tuple[FaultSpec, ...] = ()

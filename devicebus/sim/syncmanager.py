@@ -1,8 +1,8 @@
-"""One sync manager: who may touch its area of the memory, and when (ETG.1000.4).
+"""Sync manager channel: guarded access to its memory area, and the process data watchdog.
 
-In both modes an access opens with the first byte and is complete with the last.  A mailbox then
-belongs to the other side; a buffered area has three buffers, so that neither side ever waits and
-nobody sees half of what the other writes.
+ETG.1000.4: in both modes an access begins with the first byte and is complete with the last.  A
+mailbox then belongs to the other side.  A buffered area has three buffers, so that neither side
+waits or reads a partial write.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from devicebus.wire.register import Register, SmStatus
 _BUFFERED_EMPTY = 0x30
 _WRITTEN, _READ, _FULL = map(int, SmStatus)
 _NEXT_BUFFER = (0x10, 0x20, 0x00, 0x00)
-"""Bits 4 and 5 of the status by what they are now; 3 is before the first buffer."""
+"""Next value of status bits 4 and 5 by the present one; 3 is before the first buffer."""
 _ACTIVATE, _STATUS, _PDI_CONTROL = 6, 5, 7
 
 
 class SyncChannel:
-    """Sync manager *number* over the memory of an ESC.
+    """Sync manager *number* in the memory of an ESC.
 
     Attributes:
-        start, end: Its area.
-        is_enabled: Whether it guards the area.
-        is_mailbox: Mailbox mode, else three buffers.
-        master_writes: Direction.
-        watches: Whether writes to it feed the process data watchdog.
-        is_stuck: A fault: what the master wrote is never taken.
+        start, end: Memory area.
+        is_enabled: True if it guards the area.
+        is_mailbox: True for mailbox mode, false for three buffers.
+        master_writes: True if the master writes the area.
+        watches: True if writes trigger the process data watchdog.
+        is_stuck: Fault: data written by the master is never read.
     """
 
     __slots__ = ("_buffer", "_dirty", "_memory", "_open", "_register", "_setting", "_status_at",
@@ -42,7 +42,7 @@ class SyncChannel:
         self.configure()
 
     def configure(self) -> bool:
-        """Take over the registers; return whether anything but the repeat bit has changed."""
+        """Load the registers; return true if anything but the repeat bit has changed."""
         at = self._register
         octets = self._memory[at : at + 8]
         setting = bytes((*octets[:5], octets[_ACTIVATE] & 1, octets[_PDI_CONTROL] & 1))
@@ -67,27 +67,27 @@ class SyncChannel:
 
     @property
     def length(self) -> int:
-        """Bytes of the area, 0 while disabled."""
+        """Length of the area in bytes, 0 while disabled."""
         return self.end - self.start if self.is_enabled else 0
 
     @property
     def is_full(self) -> bool:
-        """Whether a mailbox holds a message."""
+        """True if the mailbox holds a message."""
         return bool(self._memory[self._status_at] & _FULL)
 
     @property
     def is_locked(self) -> bool:
-        """Whether the slave keeps the master out."""
+        """True if the slave has deactivated the channel."""
         return bool(self._memory[self._register + _PDI_CONTROL] & 1)
 
     @property
     def repeat_request(self) -> int:
-        """The bit by which a master asks for the last message again."""
+        """Repeat request bit, toggled by the master (activate, bit 1)."""
         return self._memory[self._register + _ACTIVATE] >> 1 & 1
 
     @property
     def repeat_acknowledge(self) -> int:
-        """The bit by which the slave says that it sent the last message again."""
+        """Repeat acknowledge bit of the slave (PDI control, bit 1)."""
         return self._memory[self._register + _PDI_CONTROL] >> 1 & 1
 
     def acknowledge_repeat(self) -> None:
@@ -144,7 +144,7 @@ class SyncChannel:
         return self.event
 
     def take(self) -> bytes | None:
-        """Return what the master wrote since the last time, None if nothing or not everything."""
+        """Return data that the master wrote since the last call, None without a complete write."""
         if not self._dirty or self.is_stuck:
             return None
         self._dirty = False
@@ -154,7 +154,7 @@ class SyncChannel:
         return bytes(self._memory[self.start : self.end])
 
     def put(self, data: bytes) -> bool:
-        """Offer *data* to the master; return False while a mailbox is still full."""
+        """Provide *data* for the master; return False while a mailbox is still full."""
         octets = data.ljust(self.length, b"\0")[: self.length]
         if self.is_mailbox:
             if self.is_full:
@@ -170,7 +170,7 @@ class SyncChannel:
         return True
 
     def discard(self) -> None:
-        """Empty a mailbox, whoever filled it."""
+        """Empty a mailbox."""
         self._dirty = False
         self._set_status(0)
 
@@ -184,15 +184,15 @@ class SyncChannel:
 
 _WATCHDOG_STATUS = int(Register.WATCHDOG_STATUS)
 _TICK_NS = 40
-"""The ESC counts in steps of 25 MHz."""
+"""The watchdog divider counts periods of 25 MHz."""
 
 
 class Watchdog:
-    """Fed by every complete write to a sync manager that is watched.
+    """Process data watchdog, triggered by every complete write to a watched sync manager.
 
     Attributes:
-        deadline_ns: When it runs out; None while nothing has fed it or it is switched off.
-        timeout_ns: How long outputs may stay away; 0 switches the watchdog off.
+        deadline_ns: Time of its expiry; None before the first trigger or while it is disabled.
+        timeout_ns: Watchdog time; 0 disables the watchdog.
     """
 
     __slots__ = ("_memory", "deadline_ns", "timeout_ns")
@@ -207,24 +207,24 @@ class Watchdog:
         self.configure()
 
     def configure(self) -> None:
-        """Take over the registers."""
+        """Load the registers."""
         at, memory = Register.WATCHDOG_DIVIDER, self._memory
         divider = int.from_bytes(memory[at : at + 2], "little") + 2
         at = Register.WATCHDOG_PROCESS_DATA
         self.timeout_ns = divider * _TICK_NS * int.from_bytes(memory[at : at + 2], "little")
 
     def feed(self, now_ns: int) -> None:
-        """Outputs have come."""
+        """Restart the watchdog: outputs were written."""
         self.deadline_ns = now_ns + self.timeout_ns if self.timeout_ns else None
         self._memory[_WATCHDOG_STATUS] = 1
 
     def stop(self) -> None:
-        """Outputs are not expected any more."""
+        """Stop the watchdog: outputs are not expected any more."""
         self.deadline_ns = None
         self._memory[_WATCHDOG_STATUS] = 1
 
     def check(self, now_ns: int) -> bool:
-        """Return whether it has run out just now."""
+        """Return true once at its expiry, and count it."""
         if self.deadline_ns is None or now_ns < self.deadline_ns:
             return False
         self.deadline_ns = None

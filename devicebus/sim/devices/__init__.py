@@ -1,5 +1,6 @@
-"""Simulated devices: from a description to a device with its EEPROM.
+"""Builders of simulated devices, from a description to a device with its EEPROM.
 
-Every kind has an object dictionary inside, also where no mailbox shows it to a master: process data
-is mapped from there.
+Every kind has an object dictionary, also without a mailbox: process data is mapped from it.
+``build``: segment and slaves; ``objects``: dictionary; ``siibuild``: EEPROM image; ``protocols``:
+mailbox; ``drive``: CiA 402 drive; ``esi``: devices from ESI files; ``signal``: changing inputs.
 """

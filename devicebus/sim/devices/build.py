@@ -1,4 +1,4 @@
-"""From the description of a bus to a segment that frames can pass."""
+"""Builder of a simulated segment from the description of a bus, and the kinds of devices."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from eap.codec import datatypes
 from eap.od.dictionary import ObjectDictionary
 
 MODULAR_DEVICE = 5001
-"""Object 0x1000 of everything without a profile of its own (ETG.5001)."""
+"""Object 0x1000 of devices without a profile (ETG.5001)."""
 _PRODUCTS = {kind: number for number, kind in enumerate(DeviceKind, 1)}
 
 
 def complete(spec: SlaveSpec, resources: Mapping[str, bytes]) -> SlaveSpec:
-    """Return *spec* with everything that its kind adds.
+    """Return *spec* completed with the objects and channels of its kind.
 
     Raises:
         ValueError: the description of the vendor is missing or cannot be used.
@@ -51,11 +51,10 @@ def complete(spec: SlaveSpec, resources: Mapping[str, bytes]) -> SlaveSpec:
 
 
 def _padding(channels: Iterable[ChannelSpec]) -> Iterator[ChannelSpec]:
-    """Yield what fills the last byte of each PDO.
+    """Yield the padding of the last byte of each PDO.
 
-    Real devices with an application of their own do so, and masters count them reliably: SOEM
-    expects too small a working counter of slaves that share a byte.  Devices from an ESI file have
-    what the file says.
+    Real devices with an application pad their PDOs, and SOEM expects too small a working counter of
+    slaves that share a byte.  Devices from an ESI file have the padding of the file.
     """
     ends: dict[int, int] = {}
     for channel in channels:
@@ -67,17 +66,17 @@ def _padding(channels: Iterable[ChannelSpec]) -> Iterator[ChannelSpec]:
 
 
 def device_type(spec: SlaveSpec) -> int:
-    """Return what object 0x1000 says."""
+    """Return the value of object 0x1000."""
     return drive.DEVICE_TYPE if spec.kind is DeviceKind.DRIVE else MODULAR_DEVICE
 
 
 def behave(
     spec: SlaveSpec, dictionary: ObjectDictionary, resources: Mapping[str, bytes]
 ) -> tuple[Behaviour | None, dict[int, list[SoeParameter]]]:
-    """Return the behaviour of a device, if it has one, and the IDNs of each of its axes.
+    """Return the behaviour of a device, or None, and the IDNs of each of its axes.
 
     Raises:
-        ValueError: an input cannot get its values from where it should.
+        ValueError: the source of an input is invalid.
     """
     if spec.kind is DeviceKind.DRIVE:
         axes = drive.Axes(drive.Drive(dictionary, axis) for axis in range(spec.axes))
@@ -94,15 +93,15 @@ _NONE: Mapping[str, bytes] = {}
 def build_slave(
     spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE, *, ports: Iterable[int] = (0, 1)
 ) -> SimulatedSlave:
-    """Make one slave.
+    """Build one slave.
 
     Args:
-        spec: What it is.
-        resources: The files that *spec* names.
-        ports: Those that it has.
+        spec: Description of the slave.
+        resources: Content of the files named in *spec*.
+        ports: Its ports.
 
     Raises:
-        ValueError: a data type, a value or an entry in *spec* cannot be.
+        ValueError: a data type, a value or an entry in *spec* is invalid.
     """
     spec = complete(spec, resources)
     dictionary = build_dictionary(spec, device_type(spec))
@@ -133,10 +132,10 @@ def build_slave(
 
 
 def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> SimulatedSegment:
-    """Make all slaves of *bus* and wire them.
+    """Build and connect all slaves of *bus*.
 
     Raises:
-        ValueError: a slave cannot be made as described, or is wired to one that comes later.
+        ValueError: the description of a slave is invalid, or it is connected to a later slave.
     """
     numbers = {spec.name: number for number, spec in enumerate(bus.slaves)}
     cables = []
@@ -157,7 +156,7 @@ def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Simul
 
 
 def _channels(spec: SlaveSpec) -> dict[str, tuple[int, int]]:
-    """Return the entries of inputs and outputs by those names that only one of them has."""
+    """Return the entries of inputs and outputs by their names, without ambiguous names."""
     channels = (*spec.inputs, *spec.outputs)
     found = (*object_ids_of(spec.inputs, INPUTS), *object_ids_of(spec.outputs, OUTPUTS))
     counts = Counter(channel.name for channel in channels)

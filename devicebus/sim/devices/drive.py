@@ -1,8 +1,8 @@
-"""A servo drive of the profile CiA 402: its objects, and the axes behind them.
+"""Servo drive of the profile CiA 402: state machine, objects, axes, and IDNs of SoE.
 
-The objects of each axis lie 0x800 above those of the axis before (ETG.6010).  An axis has no
-inertia: enabled, it is where it was told to be (cyclic position, mode 8), or moves as fast as it
-was told to (cyclic velocity, mode 9).
+The objects of each axis are 0x800 above those of the axis before (ETG.6010).  An axis has no
+inertia: once enabled it is at its target position (cyclic position, mode 8), or moves at its target
+velocity (cyclic velocity, mode 9).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _VOLTAGE = 0x0010
 
 
 class DriveState(IntEnum):
-    """The states, as the status word shows them in bits 0 to 3, 5 and 6."""
+    """States of an axis with the values of status word bits 0 to 3, 5 and 6."""
 
     SWITCH_ON_DISABLED = 0x40
     READY_TO_SWITCH_ON = 0x21
@@ -37,7 +37,7 @@ class DriveState(IntEnum):
 
 
 class DriveCommand(Enum):
-    """What a control word asks for."""
+    """Commands of a control word."""
 
     SHUTDOWN = auto()
     SWITCH_ON = auto()
@@ -46,7 +46,7 @@ class DriveCommand(Enum):
     QUICK_STOP = auto()
     FAULT_RESET = auto()
     FAULT = auto()
-    """From inside the drive."""
+    """Transition caused by the drive itself."""
 
 
 _S, _C = DriveState, DriveCommand
@@ -72,10 +72,10 @@ TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
 
 
 class DriveStateMachine:
-    """One axis.
+    """State machine of one axis.
 
     Attributes:
-        state: Where it stands.
+        state: Present state.
     """
 
     def __init__(self) -> None:
@@ -84,27 +84,27 @@ class DriveStateMachine:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether it follows its set points."""
+        """True while the axis follows its set points."""
         return self.state is DriveState.OPERATION_ENABLED
 
     @property
     def status_word(self) -> int:
-        """The status word."""
+        """Status word of the present state."""
         return self.state | _REMOTE | _VOLTAGE
 
     def control(self, word: int) -> None:
-        """Act on a control word."""
+        """Execute a control word."""
         rising = word & ~self._control_word & FAULT_RESET_BIT
         self._control_word = word
         self.process(DriveCommand.FAULT_RESET if rising else command_of(word))
 
     def process(self, command: DriveCommand) -> None:
-        """Change the state if *command* means anything in it."""
+        """Execute *command* if the present state allows it."""
         self.state = TRANSITIONS.get((self.state, command), self.state)
 
 
 def command_of(word: int) -> DriveCommand:
-    """Return what the bits 0 to 3 of a control word ask for."""
+    """Return the command in bits 0 to 3 of a control word."""
     if not word & 0x02:
         return DriveCommand.DISABLE_VOLTAGE
     if not word & 0x04:
@@ -116,12 +116,12 @@ def command_of(word: int) -> DriveCommand:
 
 CYCLIC_POSITION, CYCLIC_VELOCITY = 8, 9
 DEVICE_TYPE = 0x0002_0192
-"""Object 0x1000: servo drive of profile 402."""
+"""Value of object 0x1000: servo drive of profile 402."""
 _MODES = 1 << CYCLIC_POSITION - 1 | 1 << CYCLIC_VELOCITY - 1
 _NS = 1_000_000_000
 AXIS_OBJECTS = 0x800
 AXIS_PDOS = 0x10
-"""Between the PDOs of two axes."""
+"""Distance between the PDOs of two axes."""
 _RX_PDO, _TX_PDO = 0x1600, 0x1A00
 FOLLOWING_ERROR = 0x8611
 NO_WINDOW = 0xFFFF_FFFF
@@ -178,7 +178,7 @@ def _moved(item: ObjectSpec, axis: int) -> ObjectSpec:
 
 
 def _mapped(channel: ChannelSpec, pdo: int, axis: int) -> ChannelSpec:
-    """The channels of the first axis have the plain names, the others a number behind them."""
+    """Return a channel of an axis; names of axes after the first have a number."""
     return msgspec.structs.replace(
         channel,
         name=f"{channel.name}_{axis}" if axis else channel.name,
@@ -188,22 +188,22 @@ def _mapped(channel: ChannelSpec, pdo: int, axis: int) -> ChannelSpec:
 
 
 class Axes:
-    """The axes of one drive; a Behaviour of devicebus.sim.device."""
+    """Axes of one drive; a Behaviour of devicebus.sim.device."""
 
     def __init__(self, drives: Iterable[Drive]) -> None:
         self.drives = tuple(drives)
 
     def step(self, state: AlState, now_ns: int) -> None:
-        """Let every axis act."""
+        """Run every axis."""
         for drive in self.drives:
             drive.step(state, now_ns)
 
 
 class Drive:
-    """One axis behind the objects of *dictionary*.
+    """Axis behind the objects of *dictionary*.
 
     Args:
-        dictionary: Of the device.
+        dictionary: Dictionary of the device.
         axis: Number of the axis.
 
     Attributes:
@@ -221,24 +221,24 @@ class Drive:
 
     def step(self, state: AlState, now_ns: int) -> None:
         """Follow the control word and the set points; out of OP the axis is switched off."""
-        self._obey(self.entry(0x6040).value if state is AlState.OP else 0)
+        self._execute(self.entry(0x6040).value if state is AlState.OP else 0)
         elapsed = 0 if self._stepped_ns is None else now_ns - self._stepped_ns
         self._stepped_ns = now_ns
         self._move(elapsed)
         self._show()
 
     def entry(self, index: int) -> Entry:
-        """Return one of the variables of the profile."""
+        """Return the entry of a profile object."""
         return self._dictionary.entry(index + self._offset, 0)
 
     def command(self, word: int) -> None:
-        """Act on a control word that did not come as process data."""
+        """Execute a control word from outside of the process data."""
         self.entry(0x6040).value = word
-        self._obey(word)
+        self._execute(word)
         self._show()
 
     def fail(self, error_code: int) -> None:
-        """Let the axis fail with an error code of the profile, until it is reset."""
+        """Put the axis into Fault with an error code of the profile."""
         self.entry(0x603F).value = error_code
         self.machine.process(DriveCommand.FAULT)
         self._show()
@@ -246,10 +246,10 @@ class Drive:
             self.report(error_code)
 
     def reset(self) -> None:
-        """Leave the fault."""
+        """Reset the fault."""
         self._end_fault(lambda: self.machine.process(DriveCommand.FAULT_RESET))
 
-    def _obey(self, word: int) -> None:
+    def _execute(self, word: int) -> None:
         self._end_fault(lambda: self.machine.control(word))
 
     def _end_fault(self, act: Callable[[], None]) -> None:
@@ -311,7 +311,7 @@ _IN_MDT = ("S-0-0134", "S-0-0047")
 
 
 def parameters(drive: Drive, version: str) -> list[SoeParameter]:
-    """Return the IDNs of *drive*, whose software has *version*."""
+    """Return the IDNs of *drive* with software version *version*."""
     return [*_lists(version), *_words(drive), *_set_points(drive)]
 
 
@@ -401,7 +401,7 @@ def _check_enabled(drive: Drive) -> None:
 
 
 def _home(drive: Drive) -> bool:
-    """Call the place where the axis is 0; an axis that was switched off meanwhile fails."""
+    """Set the present position to 0; an axis that was disabled meanwhile fails."""
     if drive.machine.is_enabled:
         drive.entry(0x607A).value = drive.entry(0x6064).value = 0
     return drive.machine.is_enabled

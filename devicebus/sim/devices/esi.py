@@ -1,6 +1,6 @@
-"""A device from its vendor's description: an ESI file (ETG.2000).
+"""Import of a device from its vendor's ESI file (ETG.2000).
 
-Read are identity, mailbox, PDOs and the object dictionary.  Addresses of sync managers are not: the
+Identity, mailbox, PDOs and object dictionary are imported.  Addresses of sync managers are not: the
 simulated controller has its own.
 """
 
@@ -37,7 +37,7 @@ _MAX_SUBINDEX = 0xFF
 
 
 class _SubItem(NamedTuple):
-    """One subindex of a data type."""
+    """Subindex of a data type (ESI element SubItem)."""
 
     subindex: int
     name: str
@@ -47,19 +47,19 @@ class _SubItem(NamedTuple):
 
 
 def number(text: str) -> int:
-    """Read ``#x1A00`` or ``6656``, as ESI files write numbers; raise ValueError otherwise."""
+    """Parse a number of an ESI file, ``#x1A00`` or ``6656``; raise ValueError otherwise."""
     stripped = text.strip().lower()
     digits = stripped.removeprefix("#x")
     return int(digits, 10 if digits == stripped else 16)
 
 
 def text_at(element: Element, path: str, default: str) -> str:
-    """Return the text at *path*, or *default* where there is none."""
+    """Return the text at *path*, or *default*."""
     return (element.findtext(path) or default).strip()
 
 
 def type_of(name: str, bits: int) -> str:
-    """Return the type of that name if it has so many bits, else one that has room for them."""
+    """Return the type *name* if it has *bits* bits, otherwise a type that holds them."""
     try:
         kind = datatypes.parse(name)
     except ValueError:
@@ -77,10 +77,10 @@ def type_of(name: str, bits: int) -> str:
 
 
 def objects(device: Element) -> Iterator[ObjectSpec]:
-    """Yield the objects that a device describes.
+    """Yield the objects of a device description.
 
     Raises:
-        ValueError: a number is none.
+        ValueError: a number is invalid.
     """
     types = {
         text_at(each, "Name", ""): each
@@ -103,7 +103,7 @@ def objects(device: Element) -> Iterator[ObjectSpec]:
 
 
 def _sub_items(kind: Element | None, types: dict[str, Element]) -> Iterator[_SubItem]:
-    """Yield the subindexes from 1 on of a data type; nothing if it has none."""
+    """Yield the subindexes of a data type from 1 on."""
     for item in () if kind is None else kind.iterfind("SubItem"):
         name = text_at(item, "Type", "")
         bits = number(text_at(item, "BitSize", "0"))
@@ -146,7 +146,7 @@ def _entries(item: Element, parts: list[_SubItem]) -> Iterator[EntrySpec]:
 
 
 def _base(name: str, types: dict[str, Element]) -> str:
-    """Return the type behind a name that the file gives it, such as an enumeration's."""
+    """Return the base type of a type that the file defines, such as an enumeration."""
     found = types.get(name)
     return name if found is None else text_at(found, "BaseType", name)
 
@@ -163,7 +163,7 @@ def _access(item: Element) -> AccessKind:
 
 
 def _value(info: Element | None, kind_name: str) -> Value | None:
-    """Return what an entry starts with; None where nothing is told that fits its type."""
+    """Return the initial value of an entry; None without one that fits its type."""
     if info is None:
         return None
     kind = datatypes.parse(kind_name)
@@ -188,10 +188,10 @@ _MINIMUM_MAILBOX = 32
 
 
 def complete(spec: SlaveSpec, xml: bytes) -> SlaveSpec:
-    """Return *spec* with what the file says; the product code in *spec* chooses among devices.
+    """Return *spec* completed by the file; the product code in *spec* selects the device.
 
     Raises:
-        ValueError: the file is no ESI file, or describes no such device.
+        ValueError: the file is no ESI file, or does not describe the device.
     """
     root = _parse(xml, spec.esi)
     device = _choose(root, spec)
@@ -249,7 +249,7 @@ def _mailbox(device: Element) -> MailboxSpec | None:
 
 
 def _channels(pdos: Iterable[Element]) -> Iterator[ChannelSpec]:
-    """Yield what the PDOs map; those without a sync manager are there to be assigned."""
+    """Yield the mapped entries of all PDOs; PDOs without a sync manager can be assigned."""
     for pdo in pdos:
         index = number(text_at(pdo, "Index", "0"))
         assigned = "Sm" in pdo.attrib

@@ -1,7 +1,7 @@
-"""The object dictionary of a simulated device, from its description.
+"""Object dictionary of a simulated device, from its description.
 
-Identity, mailbox types and PDO objects are made here for all kinds of devices, so that every slave
-describes itself in the same way.
+Identity, sync manager types, PDO mapping and PDO assignment are built in the same way for all kinds
+of devices.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from eap.od.model import (
 
 RX_PDO, TX_PDO = 0x1600, 0x1A00
 PDOS = 0x200
-"""How many PDOs each direction may have."""
+"""Limit for the PDOs of each direction."""
 RX_ASSIGN, TX_ASSIGN = 0x1C12, 0x1C13
 MAX_ASSIGNED = 8
-"""PDOs that a sync manager may carry, unless it carries more from the start."""
+"""Minimum limit for the PDOs of a sync manager."""
 SPARE_ENTRIES = 8
-"""What a PDO may map beside what it maps from the start."""
+"""Entries that a PDO can map in addition to its default mapping."""
 MIN_ROOM = 32
-"""Bytes that a direction may take at least, whatever it takes from the start."""
+"""Minimum limit for the process data of a direction, in bytes."""
 _MAX_ENTRIES = 254
 _PDO_MAPPING = 0x21
 
@@ -46,13 +46,13 @@ _PDO_MAPPING = 0x21
 def mapping(
     index: int, mapped: Sequence[tuple[int, int, int]], dictionary: ObjectDictionary
 ) -> OdObject:
-    """Make a PDO of entries (index, subindex, bits), in which nothing is padded.
+    """Return the mapping object of a PDO of entries (index, subindex, bits), without padding.
 
     Only the sync manager begins and ends on whole bytes: PDOs of one bit follow each other bit by
-    bit, as those of real digital terminals do.  A master may change it in PreOp.
+    bit, as in real digital terminals.  A master may change the mapping in PREOP.
 
     Raises:
-        ValueError: there is no such PDO, or it maps too much.
+        ValueError: the index is no PDO, or the PDO maps too much.
     """
     if not (0 <= index - RX_PDO < PDOS or 0 <= index - TX_PDO < PDOS):
         raise ValueError(f"0x{index:04X} is no PDO (0x1600 to 0x17FF, 0x1A00 to 0x1BFF)")
@@ -71,7 +71,7 @@ def mapping(
 
 
 def assignment(index: int, pdos: Sequence[int], dictionary: ObjectDictionary) -> OdObject:
-    """Make the list of PDOs of a sync manager; a master may change it in PreOp."""
+    """Return the assignment object of a sync manager; a master may change it in PREOP."""
     limit = max(MAX_ASSIGNED, len(pdos))
     count = Entry("SubIndex 000", "USINT", RW_PREOP, len(pdos), maximum=limit)
     entries = {0: count, **_numbered(index, pdos, limit, "UINT", count)}
@@ -168,7 +168,7 @@ _IDENTITY_TYPE = 0x23
 
 
 def object_ids_of(channels: Sequence[ChannelSpec], base: int) -> list[ObjectId]:
-    """Return the entry of each of *channels*; those that name none count up from *base*:01."""
+    """Return the entry of each of *channels*; by default they count up from *base*:01."""
     found = []
     free = 0
     for channel in channels:
@@ -181,10 +181,10 @@ def object_ids_of(channels: Sequence[ChannelSpec], base: int) -> list[ObjectId]:
 
 
 def build_dictionary(spec: SlaveSpec, device_type: int) -> ObjectDictionary:
-    """Make the dictionary of the device that *spec* describes.
+    """Build the dictionary of the device that *spec* describes.
 
     Raises:
-        ValueError: a data type, a value or an entry in it cannot be.
+        ValueError: a data type, a value or an entry is invalid.
     """
     dictionary = FaultyDictionary(_identity(spec, device_type))
     for each in spec.objects:
@@ -202,7 +202,7 @@ def _add_side(
     first_pdo: int,
     access: Access,
 ) -> None:
-    """Add the entries of one direction, the PDOs that map them, and which of these count."""
+    """Add the entries of one direction, the PDOs that map them, and their assignment."""
     pdos: dict[int, list[tuple[int, int, int]]] = {}
     assigned: dict[int, bool] = {}
     for channel, (index, subindex) in zip(channels, object_ids_of(channels, base), strict=True):
@@ -259,7 +259,7 @@ def _entry(spec: ObjectSpec | EntrySpec) -> Entry:
 
 
 def _limit(kind: DataType, limit: float | None) -> float | None:
-    """Return *limit* as a value of its type; raise ValueError if it is none."""
+    """Return *limit* as a value of its type; raise ValueError if it does not fit."""
     if limit is None or kind.scalar_range is None:
         return None
     number = limit if isinstance(kind.scalar_range[0], float) else int(limit)

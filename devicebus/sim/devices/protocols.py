@@ -1,4 +1,4 @@
-"""The mailbox of a simulated device: the servers that its description asks for."""
+"""Mailbox of a simulated device: servers of the described protocols, and a host behind EoE."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ class _Addresses(NamedTuple):
 
 
 class EthernetHost:
-    """One host behind a slave's mailbox.
+    """Host behind EoE that answers ARP and ping.
 
     Args:
-        settings: Returns its IP settings; without an address it answers nothing.
+        settings: Returns its IP settings; without an address it does not answer.
     """
 
     def __init__(self, settings: Callable[[], IpSettings]) -> None:
         self._settings = settings
 
     def receive_frame(self, frame: bytes) -> list[bytes]:
-        """Return the answers to an Ethernet frame without check sequence."""
+        """Return the answers to an Ethernet frame (without check sequence)."""
         settings = self._settings()
         if settings.ip is None or len(frame) < _ETHERNET:
             return []
@@ -118,7 +118,7 @@ def build_mailbox(
     device: Device,
     drives: Mapping[int, Iterable[SoeParameter]] | None = None,
 ) -> MailboxServer:
-    """Make the servers of *device*; SoE has the IDNs of *drives*, VoE echoes."""
+    """Build the servers of *device*; SoE has the IDNs of *drives*, VoE echoes."""
     sizes = MailboxSizes(spec.size, spec.size)
     servers: dict[MailboxType, ProtocolServer] = {}
     if spec.coe:
@@ -139,7 +139,7 @@ def build_mailbox(
 
 
 def _coe(device: Device, sizes: MailboxSizes) -> CoeServer:
-    """Its PDOs go through the mailbox as well, by the number behind 0x1600 or 0x1A00."""
+    """Return the CoE server; PDO numbers in the mailbox count from 0x1600 or 0x1A00."""
     process_data = device.process_data
 
     def read_pdo(service: CoeService, number: int) -> bytes | None:
@@ -163,7 +163,7 @@ def _eoe(sizes: MailboxSizes) -> EoeServer:
 
 def _file(spec: FileSpec) -> MemoryFile:
     if spec.boot_only and spec.not_in_boot:
-        raise ValueError(f"file {spec.name} is in no state: boot_only and not_in_boot")
+        raise ValueError(f"file {spec.name} exists in no state: boot_only and not_in_boot")
     allowed = AllowedIn.OTHERS if spec.not_in_boot else AllowedIn.ANY_STATE
     return MemoryFile(
         spec.name,

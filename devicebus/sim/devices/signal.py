@@ -1,6 +1,6 @@
-"""Inputs that change by themselves: noise, recorded values, and what follows an output.
+"""Changing inputs of a simulated device: noise, recorded values, values of an output.
 
-Noise is a function of the time alone, so that a run can be repeated exactly.
+Noise is a function of the time alone, so that a run is repeatable.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _MS = 1_000_000
 
 
 class Signals:
-    """A Behaviour (devicebus.sim.device) that sets the inputs of *spec* as time goes by.
+    """Behaviour (devicebus.sim.device) that sets the inputs of *spec* by time.
 
     Raises:
-        ValueError: a file holds no numbers, or an input follows an output that is not there.
+        ValueError: a file has no numbers, or an input follows an unknown output.
     """
 
     def __init__(
@@ -55,10 +55,10 @@ class Signals:
 
 
 def read_csv(octets: bytes, name: str) -> list[float]:
-    """Return the first number of each line; lines that begin with # and empty ones are left out.
+    """Return the first number of each line, without empty lines and lines that begin with #.
 
     Raises:
-        ValueError: a line begins with no number, or there is none.
+        ValueError: a line does not begin with a number, or there is no line.
     """
     values = []
     for number, line in enumerate(octets.decode("utf-8", "replace").splitlines(), 1):
@@ -100,7 +100,7 @@ def _source(
 
 
 def _noise(name: str, number: int) -> float:
-    """Return a number from -1 to 1 that looks like chance."""
+    """Return a pseudo-random number from -1 to 1."""
     return crc32(f"{name}:{number}".encode()) / 0x7FFF_FFFF - 1
 
 

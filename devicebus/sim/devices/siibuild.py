@@ -1,4 +1,4 @@
-"""The EEPROM image of a simulated device, made from its description and dictionary."""
+"""EEPROM image of a simulated device, from its description and dictionary."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from eap.od.dictionary import ObjectDictionary
 PDI_SPI = 0x0805
 PDI_DIGITAL = 0x0004
 DEVICE_EMULATION = 0x0100
-"""In word 0 the high byte is the ESC configuration."""
+"""ESC configuration, the high byte of word 0."""
 IMAGE_SIZE = 2048
 RAM = 8192
 _FIRST = 0x1000
@@ -46,13 +46,13 @@ _MII = 1
 
 
 class _Strings:
-    """The texts of an image, each once, by the number that other categories use."""
+    """String category of an image; other categories refer to its strings by number."""
 
     def __init__(self, *texts: str) -> None:
         self.texts = list(texts)
 
     def number(self, text: str) -> int:
-        """Return the number of *text*, 0 if it cannot be told."""
+        """Return the number of *text*, 0 if it cannot be stored."""
         if text in self.texts:
             return self.texts.index(text) + 1
         try:
@@ -66,7 +66,7 @@ class _Strings:
 
 
 class SyncManagerLayout(NamedTuple):
-    """Where the sync managers lie, and which of them carry outputs and inputs."""
+    """Addresses of the sync managers, and the numbers of those for outputs and inputs."""
 
     channels: tuple[SiiSyncManager, ...]
     output_channel: int
@@ -76,9 +76,9 @@ class SyncManagerLayout(NamedTuple):
 def plan_channels(
     mailbox: MailboxSpec | None, output_size: int, input_size: int
 ) -> SyncManagerLayout:
-    """Place mailboxes and process data; each buffered area has room for its three buffers.
+    """Assign addresses to mailboxes and process data, with three buffers for each buffered area.
 
-    There is room as well for what a master may map beside.
+    The areas also hold the process data that a master can map in addition.
 
     Raises:
         ValueError: the memory of a controller is too small.
@@ -111,14 +111,14 @@ def build_image(
     emulates: bool,
     ports: Iterable[int] = (0, 1),
 ) -> bytes:
-    """Return the image: 2 KiB, or as many as it takes.
+    """Return the image, of at least 2 KiB.
 
     Args:
-        spec: What the slave is.
+        spec: Description of the slave.
         dictionary: Its objects, for the PDOs.
         layout: Its sync managers.
-        emulates: Whether its controller needs no application.
-        ports: Those that it has.
+        emulates: True for device emulation.
+        ports: Its ports.
     """
     mailbox = spec.mailbox
     size = mailbox.size if mailbox else 0
@@ -159,7 +159,7 @@ def build_image(
 
 
 def _fill(image: Sii) -> bytes:
-    """Return the bytes of an EEPROM that is large enough, which says how large it is."""
+    """Return the image padded to the size of its EEPROM, with that size set."""
     octets = sii.encode(image)
     size = IMAGE_SIZE
     while size < len(octets):
@@ -228,7 +228,7 @@ def _pdos(
 
 
 def _rank(assigned: list[int], index: int) -> int:
-    """PDOs that are assigned come first, in the order in which they lie in the data."""
+    """Sort key: assigned PDOs come first, in the order of the process data."""
     return assigned.index(index) if index in assigned else len(assigned)
 
 

@@ -30,14 +30,14 @@ def command(eeprom, memory, what, word=0, *, write_enable=0, data=b""):
     control = EepromControl(write_enable=write_enable, command=what)
     memory[Register.EEPROM_CONTROL : Register.EEPROM_CONTROL + 2] = control.encode()
     eeprom.control_written(0)
-    eeprom.settle(WRITE_NS)
+    eeprom.finish_command(WRITE_NS)
     return EepromControl.decode(memory, Register.EEPROM_CONTROL)
 
 
 def test_power_on_loads_configuration_and_alias(eeprom, memory):
     assert memory[0x0140:0x0142] == b"\x08\x0e"
     assert memory[0x0012:0x0014] == b"\x34\x12"
-    assert eeprom.is_masters
+    assert eeprom.is_with_master
 
 
 def test_read_gives_eight_octets(eeprom, memory):
@@ -56,11 +56,11 @@ def test_command_takes_its_time(eeprom, memory, what, took_ns):
     memory[0x0502:0x0504] = control.encode()
     memory[0x0508:0x050A] = b"\x55\xaa"
     eeprom.control_written(1000)
-    eeprom.settle(1000 + took_ns - 1)
+    eeprom.finish_command(1000 + took_ns - 1)
     status = EepromControl.decode(memory, Register.EEPROM_CONTROL)
     assert (status.busy, status.command) == (1, what)
     assert eeprom.busy_until_ns == 1000 + took_ns
-    eeprom.settle(1000 + took_ns)
+    eeprom.finish_command(1000 + took_ns)
     status = EepromControl.decode(memory, Register.EEPROM_CONTROL)
     assert (status.busy, status.command, eeprom.busy_until_ns) == (0, 0, None)
     assert (eeprom.image[:2] == b"\x55\xaa") is (what is EepromCommand.WRITE)
@@ -112,7 +112,7 @@ def test_interface_is_given_away_and_taken_by_force(eeprom, memory):
     memory[0x0500] = 1
     memory[0x0501] = 1
     eeprom.ownership_written()
-    assert (eeprom.is_masters, memory[0x0501]) == (False, 1)
+    assert (eeprom.is_with_master, memory[0x0501]) == (False, 1)
     memory[0x0500] = 2
     eeprom.ownership_written()
-    assert (eeprom.is_masters, memory[0x0501]) == (True, 0)
+    assert (eeprom.is_with_master, memory[0x0501]) == (True, 0)

@@ -180,7 +180,7 @@ def test_esi_entry_of_odd_length_keeps_its_bits(bits, kind):
         16,
         bits,
     ]
-    slave.device.process_data.inputs.parts[1].entry.octets = bytes((0xFF,)) * 9
+    slave.device.process_data.inputs.entries[1].entry.octets = bytes((0xFF,)) * 9
     assert slave.device.process_data.inputs.pack() == ((1 << bits) - 1 << 16).to_bytes(
         (16 + bits + 7) // 8, "little"
     )

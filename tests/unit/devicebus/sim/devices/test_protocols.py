@@ -156,7 +156,7 @@ def test_file_that_is_not_there_in_boot():
     device, mailbox = make(MailboxSpec(foe=True), (FileSpec(name="f", not_in_boot=True),))
     device.al_state = AlState.BOOT
     assert foe(mailbox, b"\1\0\0\0\0\0f") == FoeErrorCode.NOT_IN_BOOTSTRAP
-    with pytest.raises(ValueError, match="file f is in no state"):
+    with pytest.raises(ValueError, match="file f exists in no state"):
         make(MailboxSpec(foe=True), (FileSpec(name="f", not_in_boot=True, boot_only=True),))
 
 
