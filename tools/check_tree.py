@@ -61,6 +61,7 @@ FORBIDDEN = (
 UNFINISHED = re.compile(r"\b(?:TO[D]O|FIX[M]E)\b(?!\W{0,3}#\d)")
 NAMED = re.compile(r"`((?:tests|config|eap|devicebus|docs|tools)/[\w./-]*\w)/?`")
 MODULE = re.compile(r"`((?:eap|devicebus)(?:\.[A-Za-z_]\w*)+)`")
+PROGRAM = re.compile(r"`(?!(?:tests|eap|devicebus|docs|tools)/)(?:\w+/)*(\w+\.py)`")
 PAGES = ("CONTRIBUTING.md", "README.md")
 """Pages beside those in ``docs/``."""
 LOOSE_TASK = re.compile(r"(?<!group)\.create_task\(|\bensure_future\(")
@@ -128,6 +129,7 @@ def check(root: Path) -> list[Violation]:
             found += check_text(name, text)
             if name.suffix == ".md" and name.parts[0] in {"docs", *PAGES}:
                 found += check_named(root, name, text)
+                found += check_programs(files, name, text)
     return sorted(found)
 
 
@@ -178,6 +180,17 @@ def check_named(root: Path, page: PurePosixPath, text: str) -> Iterator[Violatio
         for match in MODULE.finditer(line):
             if not _is_module(root, match[1]):
                 yield Violation(page, number, f"no module {match[1]}", "where it is now")
+
+
+def check_programs(
+    files: list[PurePosixPath], page: PurePosixPath, text: str
+) -> Iterator[Violation]:
+    """Yield the Python files that a page names by their last parts and that do not exist."""
+    names = {name.name for name in files}
+    for number, line in enumerate(text.splitlines(), 1):
+        for match in PROGRAM.finditer(line):
+            if match[1] not in names:
+                yield Violation(page, number, f"no file {match[1]}", "where it is now")
 
 
 def _is_module(root: Path, name: str) -> bool:

@@ -58,6 +58,11 @@ def test_pages_name_files_that_exist(tmp_path):
     ]
 
 
+def test_pages_name_programs_that_exist_in_any_folder(tmp_path):
+    grow(tmp_path, "tools/demo.py", "README.md", text="`demo.py`, `python -m x`\nand `gone.py`")
+    assert found(tmp_path) == ["README.md:2: no file gone.py, expected where it is now"]
+
+
 def test_pages_name_modules_that_exist(tmp_path):
     grow(tmp_path, "eap/pd/image.py", text="LIMIT = 1\n\nclass Image: ...\n\ndef open_it(): ...\n")
     grow(tmp_path, "eap/__init__.py", text="def attach(): ...\n")
