@@ -44,7 +44,7 @@ def play(devices, script):
     asyncio.run(run())
 
 
-def test_each_has_its_state_and_says_who_it_is(devices):
+def test_each_device_has_its_state_and_identity(devices):
     assert {name: each.status.state for name, each in devices.by_station.items()} == {
         "left": DeviceState.OP,
         "right": DeviceState.PREOP,
@@ -89,7 +89,7 @@ def test_sources_follow_the_configuration(devices, files, stations):
     play(devices, script)
 
 
-def test_engine_that_was_started_again_is_told(images, engine, stations):
+def test_restarted_engine_is_synchronized(images, engine, stations):
     devices = StationDevices("demo", stations[:1], {}, images, engine, "1.2")
 
     async def script():
@@ -104,7 +104,7 @@ def test_engine_that_was_started_again_is_told(images, engine, stations):
     assert engine.calls.count("configure left") == 2
 
 
-def test_engine_that_runs_already_is_told_what_it_may_have_missed(stations, images, files, engine):
+def test_running_engine_is_synchronized(stations, images, files, engine):
     files["left"].image.words[StationWord.CYCLE_AT_NS] = monotonic_ns()
     spec = replace(stations[0], cycle_us=20_000)
     states = {"left": DeviceState.SAFEOP}

@@ -113,7 +113,7 @@ def test_new_engine_fails_what_waits():
     play(scene)
 
 
-def test_who_leaves_cancels():
+def test_cancelled_request_is_cancelled_at_the_engine():
     async def scene(engine, link):
         engine.holds = True
         asked = asyncio.ensure_future(link.request(describe(), 60))
@@ -131,7 +131,7 @@ def test_who_leaves_cancels():
     play(scene, FakeBus(LoopBus("drive")))
 
 
-def test_nobody_takes_messages():
+def test_engine_that_reads_no_messages_is_gone():
     async def scene(engine, link):
         asyncio.get_running_loop().remove_reader(engine._sock)
         with pytest.raises(EngineGoneError, match="accepts no requests"):
@@ -140,7 +140,7 @@ def test_nobody_takes_messages():
     play(scene)
 
 
-def test_octets_that_are_no_answer(caplog):
+def test_invalid_message_is_logged_and_dropped(caplog):
     async def scene(engine, link):
         engine._sock.send(b"what")
         engine._send(EngineStarted(2))

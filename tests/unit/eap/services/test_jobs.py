@@ -19,7 +19,7 @@ def play(script):
     return asyncio.run(run())
 
 
-def test_one_after_the_other():
+def test_jobs_run_one_at_a_time():
     order = []
 
     async def job(number):
@@ -35,7 +35,7 @@ def test_one_after_the_other():
     assert order == [(word, n) for n in range(3) for word in ("begin", "end")]
 
 
-def test_failure_is_told_to_who_waits():
+def test_job_failure_is_raised_to_its_client():
     async def fail():
         raise ZeroDivisionError
 
@@ -48,7 +48,7 @@ def test_failure_is_told_to_who_waits():
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_what_has_begun_is_finished_though_nobody_waits(caplog, fails):
+def test_running_job_is_finished_after_its_client_disconnects(caplog, fails):
     done = []
 
     async def script(jobs):
@@ -74,7 +74,7 @@ def test_what_has_begun_is_finished_though_nobody_waits(caplog, fails):
     assert said is fails
 
 
-def test_what_has_not_begun_is_left_out_when_nobody_waits():
+def test_waiting_job_is_dropped_when_its_client_disconnects():
     async def script(jobs):
         done = []
         go_on = asyncio.Event()
@@ -90,7 +90,7 @@ def test_what_has_not_begun_is_left_out_when_nobody_waits():
     assert play(script) == []
 
 
-def test_there_is_a_limit(monkeypatch):
+def test_job_queue_is_limited(monkeypatch):
     monkeypatch.setattr(module, "MAX_WAITING", 1)
 
     async def script(jobs):

@@ -80,7 +80,7 @@ class Services:
 
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_it_answers_counts_and_ends_when_asked(tmp_path, stations, number):
+def test_services_answers_counts_and_ends_on_request(tmp_path, stations, number):
     with Services(tmp_path, stations, os.getpid()) as services:
         with services.connect() as client:  # before it runs: the listener is the supervisor's
             assert client.request("hello")["stations"] == ["left", "right"]
@@ -118,7 +118,7 @@ def say_ok(octets: bytes) -> bytes:
     return msgspec.json.encode({"id": msgspec.json.decode(octets)["id"], "ok": True})
 
 
-def test_it_asks_engine_and_segment(tmp_path, stations):
+def test_services_reads_engine_and_segment(tmp_path, stations):
     port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
     station = msgspec.structs.replace(stations[0], ports=(*stations[0].ports, port))
     where = {"station": "left", "port": "bus0"}

@@ -10,7 +10,7 @@ def takes(allowance: RateLimiter, now_s: float) -> int:
     return count
 
 
-def test_a_burst_and_what_comes_back() -> None:
+def test_rate_limiter_allows_a_burst_and_refills() -> None:
     allowance = RateLimiter(10, 2.0, 100.0)
     assert takes(allowance, 100.0) == 10
     assert takes(allowance, 100.4) == 0

@@ -140,7 +140,7 @@ def test_tcp_is_answered(script_on):
     script_on(script, left())
 
 
-def test_what_is_not_taken_is_counted_at_every_station_behind(script_on):
+def test_dropped_frame_is_counted_at_every_station(script_on):
     async def script(counters):
         with client() as sock:
             sock.sendto(aoe.frame(b"x" * 10, kind=3), (LEFT, EAP_PORT))

@@ -44,7 +44,7 @@ def test_errors_are_answers():
     assert [each.error_code for each in answers] == [6, 7]
 
 
-def test_whoever_waits_no_longer_is_told_so_and_a_late_answer_is_dropped():
+def test_local_client_time_out_is_an_error_and_drops_the_late_answer():
     access_filter = asyncio.Event()
 
     async def slow(request):

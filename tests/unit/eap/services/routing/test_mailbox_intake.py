@@ -57,7 +57,7 @@ def test_answer_goes_to_the_sender():
     assert aoe.answer(frame).data == b"\4cba"
 
 
-def test_answer_has_the_headers_and_the_size_that_its_wire_wants():
+def test_answer_has_the_headers_and_minimum_size_of_its_channel():
     wire = Wire(b"!", 90)
     tell(wire, ask())
     ((_, frame),) = wire.sent
@@ -66,7 +66,7 @@ def test_answer_has_the_headers_and_the_size_that_its_wire_wants():
     assert aoe.answer(frame[5:]).data == b"\4cba"
 
 
-def test_who_has_no_address_gets_no_answer():
+def test_frame_without_sender_address_gets_no_answer():
     wire = Wire(sender="")
     assert tell(wire, ask()) is DropReason.MAILBOX
     assert wire.sent == []
@@ -86,13 +86,13 @@ def test_frame_that_the_network_does_not_take():
 
 
 @pytest.mark.parametrize(("for_many", "answers"), [(False, 1), (True, 0)])
-def test_stranger_is_told_unless_many_were_asked(for_many, answers):
+def test_unknown_target_is_answered_unless_frame_was_multicast(for_many, answers):
     wire = Wire()
     assert tell(wire, ask("9.9.9.9.9.9"), for_many=for_many) is None
     assert len(wire.sent) == answers
 
 
-def test_what_is_not_taken_has_a_reason():
+def test_dropped_frame_has_a_reason():
     assert tell(Wire(), ask(kind=3)) is DropReason.MAILBOX
 
 
@@ -106,7 +106,7 @@ def test_what_is_not_taken_has_a_reason():
         (ask(kind=3), ["a gateway"], True, DropReason.MAILBOX),
     ],
 )
-def test_frame_that_another_intake_takes_is_only_judged(frame, behind, for_many, reason):
+def test_drop_reason_does_not_handle_the_frame(frame, behind, for_many, reason):
     gateway = GatewayTransport([(object(), name) for name in behind])
     sender = ChannelSender(Wire())
     intake = MailboxIntake(demultiplexer(station(TARGET)), gateway, sender, lambda data: for_many)

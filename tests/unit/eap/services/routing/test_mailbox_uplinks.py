@@ -89,7 +89,7 @@ def play(script) -> Scene:
     return asyncio.run(run())
 
 
-def test_what_is_sent_makes_a_connection_and_waits_for_it():
+def test_uplink_send_opens_a_connection_and_keeps_the_data():
     async def script(scene):
         assert scene.uplinks.send(scene.address, b"one,") is None
         assert scene.uplinks.send(scene.address, b"two,") is None
@@ -133,7 +133,7 @@ def test_connection_that_breaks_is_made_again_at_once():
     play(script)
 
 
-def test_nobody_misses_a_connection_on_which_nothing_is_asked():
+def test_uplink_without_pending_requests_is_not_reopened():
     async def script(scene):
         scene.hops.awaited = False
         scene.uplinks.send(scene.address, b"x")

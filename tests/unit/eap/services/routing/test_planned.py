@@ -58,7 +58,7 @@ def test_hops(hop, endpoint):
         (TransportKind.ETHERNET, "02-00-00-00-0A-01", "02:00:00:00:0a:01"),
     ],
 )
-def test_each_address_is_written_in_one_way(kind, text, address):
+def test_to_endpoint_normalizes_addresses(kind, text, address):
     assert to_endpoint(HopSpec(kind, "eap0", text)).connection == address
 
 
@@ -73,7 +73,7 @@ def test_each_address_is_written_in_one_way(kind, text, address):
         (TransportKind.ETHERNET, "01:01:05:04:00:00"),
     ],
 )
-def test_what_is_no_address_of_a_station_is_refused(kind, text):
+def test_to_endpoint_rejects_invalid_addresses(kind, text):
     with pytest.raises(ValueError, match=r"10\.0|0x10|mill|239|01:01|02:00"):
         to_endpoint(HopSpec(kind, "eap0", text))
 
@@ -87,7 +87,7 @@ def test_addresses_of_the_station_are_this_host():
     assert not access.grants(endpoint, THERE, THERE, 1).may_read
 
 
-def test_network_that_may_ask_nothing_is_refused_whatever_the_rules_say():
+def test_unidirectional_network_is_denied_before_other_rules():
     brokers = (
         MqttSpec(network="hall", host="b", is_unidirectional=True),
         MqttSpec(network="line", host="b"),

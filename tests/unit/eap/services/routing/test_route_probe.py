@@ -44,7 +44,7 @@ def test_targets(text: str, address: str) -> None:
         ("1.2.3.4.5.600", "has an octet above 255"),
     ],
 )
-def test_what_is_no_target_is_refused(text: str, reason: str) -> None:
+def test_find_target_rejects_unknown_names(text: str, reason: str) -> None:
     with pytest.raises(ControlError, match=reason):
         find_target(Left().router, DIRECTORY, text)
 
@@ -72,7 +72,7 @@ def probe(
     return asyncio.run(while_serving(script(), left.router))
 
 
-def test_answer_is_measured_and_told() -> None:
+def test_probe_reports_round_trip_and_state() -> None:
     found = probe(RIGHT, data=bytes.fromhex("00000000 0500 0000"))
     assert (found.ok, found.text, found.state, found.name) == (
         True, "answers: RUN", "RUN", "right"
@@ -90,7 +90,7 @@ def test_odd_answers_are_answers(data: str, text: str) -> None:
     assert (found.ok, found.text) == (True, text)
 
 
-def test_errors_are_told_with_what_to_do() -> None:
+def test_probe_reports_errors_with_a_hint() -> None:
     found = probe(RIGHT, data=b"", error=7)
     assert (found.ok, found.rtt_us, found.error) == (False, None, 7)
     assert "knows no way to 127.0.9.2.1.1" in found.text
@@ -127,7 +127,7 @@ def test_request_beyond_a_router_that_finds_a_fault_names_it(monkeypatch) -> Non
     assert probe(RIGHT, data=b"", error=0x1B).text.startswith("the way is cut behind right")
 
 
-def test_search_for_a_fault_that_takes_too_long_is_given_up(monkeypatch) -> None:
+def test_probe_limits_the_time_of_the_fault_search(monkeypatch) -> None:
     async def find(router, *address):
         await asyncio.Event().wait()
 
@@ -137,7 +137,7 @@ def test_search_for_a_fault_that_takes_too_long_is_given_up(monkeypatch) -> None
     assert "no answer from right" in probe(target, more=BEYOND).text
 
 
-def test_silence_is_told() -> None:
+def test_probe_reports_a_time_out() -> None:
     found = probe(RIGHT)
     assert found.error == 0x719
     assert "no answer from right" in found.text

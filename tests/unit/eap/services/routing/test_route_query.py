@@ -55,7 +55,7 @@ def ask(operation: Operation) -> AmsAnswer:
 
 
 @pytest.mark.parametrize(("further", "station"), [(0, "island-01"), (1, "island-02")])
-def test_a_question_is_answered_or_handed_on(further: int, station: str) -> None:
+def test_hop_query_is_answered_or_forwarded(further: int, station: str) -> None:
     question = HopQuestion(TARGET, 1001, further)
     answer = ask(ReadWrite(G.ROUTE_QUERY, 0, 4096, question.encode()))
     outcome = decode_outcome(9, answer.error_code, answer.data)
@@ -69,18 +69,18 @@ def test_a_question_is_answered_or_handed_on(further: int, station: str) -> None
         ReadWrite(G.ROUTE_QUERY, 0, 10, HopQuestion(TARGET, 1001).encode()),
     ],
 )
-def test_questions_that_are_too_short_and_answers_that_are_too_long(operation: Operation) -> None:
+def test_hop_query_of_wrong_size_is_an_error(operation: Operation) -> None:
     assert ask(operation).data == bytes.fromhex("05070000 00000000")
 
 
 @pytest.mark.parametrize(
     "operation", [ReadState(), Read(G.ROUTE_QUERY, 0, 4), ReadWrite(G.SYMBOL_HANDLE, 0, 4, b"x")]
 )
-def test_everything_else_is_for_who_stands_behind(operation: Operation) -> None:
+def test_other_requests_go_to_the_system_service(operation: Operation) -> None:
     assert ask(operation).data.startswith(b"rest")
 
 
-def test_ports_and_clients_are_those_of_who_stands_behind() -> None:
+def test_ports_and_clients_are_those_of_the_system_service() -> None:
     rest = Rest()
     here = service(rest)
     assert here.ports is rest.ports

@@ -56,7 +56,7 @@ def test_router_in_a_row() -> None:
         ("", ["right", "plc"]),
     ],
 )  # fmt: skip
-def test_routes_are_found_by_what_is_told_of_them(match: str, names: list[str]) -> None:
+def test_routes_filter_matches_all_shown_texts(match: str, names: list[str]) -> None:
     left = Left()
     plc = Route(
         NetId.parse("9.9.9.9.1.1"), "plc", Endpoint("ams-tcp:10.0.0.9", "10.0.0.9"), Origin.ADDED
@@ -68,7 +68,7 @@ def test_routes_are_found_by_what_is_told_of_them(match: str, names: list[str]) 
     assert [each.name for each in row(left, match=match, first=1, count=1).routes] == names[1:]
 
 
-def test_warnings_and_circles_are_told() -> None:
+def test_warnings_and_loops_are_listed() -> None:
     left = Left()
     shadowed = Route(FAR, "other", Endpoint("udp:eap0", "127.0.9.3:34980"), Origin.ADDED)
     left.router.add_route(shadowed)
@@ -101,7 +101,7 @@ def test_requests_and_connections_of_a_running_router() -> None:
     assert row(left, requests=0).requests == []
 
 
-def test_all_of_a_route_is_told() -> None:
+def test_route_row_has_all_fields() -> None:
     route = Route(
         FAR, "far", HOP, Origin.LEARNED, 6, is_unidirectional=True, expires_at_ns=61 * 10**9,
         real=NetId.parse("9.9.9.9.1.1"), timeout_ns=900_000_000, is_probed=False,
@@ -117,7 +117,7 @@ def test_all_of_a_route_is_told() -> None:
     assert (late.rtt_us, late.expires_s, late.origin) == (1, 0, "derived")
 
 
-def test_all_of_a_connection_is_told() -> None:
+def test_connection_row_has_all_fields() -> None:
     found = connection_row(ConnectionReport(HOP, TRAFFIC), 8 * 10**9)
     assert (found.transport, found.address, found.since_s, found.net_ids) == (*HOP, 3, [str(FAR)])
     assert (found.octets_in, found.octets_out, found.took_us) == (90, 80, 1500)
@@ -125,7 +125,7 @@ def test_all_of_a_connection_is_told() -> None:
     assert connection_row(ConnectionReport(HOP, new), 8 * 10**9).took_us is None
 
 
-def test_all_of_a_request_is_told() -> None:
+def test_request_row_has_all_fields() -> None:
     endpoint = Endpoint("ams-tcp", "127.0.0.1:1")
     trace = Trace(10**9, Outcome.ANSWERED, endpoint, HOP, HEADER, 6, 2_000_000, "no such port")
     found = request_row(trace, 4 * 10**9)

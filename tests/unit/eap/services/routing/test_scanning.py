@@ -137,7 +137,7 @@ def test_stations_ports_and_slaves_are_listed() -> None:
     }
 
 
-def test_a_dead_station_is_there_with_what_the_plant_file_says() -> None:
+def test_scan_dead_station_is_listed_as_in_the_plant_file() -> None:
     line, first = plant()
     line.dead.add("island-02")
     here, dead = look(first)
@@ -161,7 +161,7 @@ def test_a_bus_that_is_down_says_so() -> None:
     assert bus["slaves"] == [{"address": 1001, "name": "drive", "state": None}]
 
 
-def test_stations_that_only_routes_tell_of() -> None:
+def test_scan_lists_stations_that_only_routes_lead_to() -> None:
     line, first = plant(to(3), to(4))
     line.add(3, serve=Devices(3))
     line.dead.add("island-04")
@@ -186,7 +186,7 @@ def test_default_routes_are_no_stations() -> None:
     assert [each.name for each in scan_targets(Directory([]), [everything, to(3)])] == ["island-03"]
 
 
-def test_a_station_that_takes_its_time_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scan_slow_station_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scanning, "STATION_TIMEOUT_S", 0.05)
 
     class Slow(Station):

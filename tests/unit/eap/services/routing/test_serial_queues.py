@@ -53,7 +53,7 @@ def play(script):
     return answers
 
 
-def test_what_is_at_hand_is_answered_at_once():
+def test_queue_finishes_immediate_answers_at_once():
     async def script(queues, slow):
         queues.put(1, StubService(lambda each: AmsAnswer(each.body)), request(b"x"))
         assert asyncio.all_tasks() == {asyncio.current_task()}
@@ -78,7 +78,7 @@ def test_requests_of_a_client_to_a_port_keep_their_order_and_others_overtake():
     assert [ticket for ticket, _ in play(script)] == [4, 5, 1, 2, 3, 6]
 
 
-def test_crowd_is_turned_away(monkeypatch):
+def test_queue_answers_excess_requests_with_an_error(monkeypatch):
     monkeypatch.setattr(service_module, "MAX_WAITING", 2)
 
     async def script(queues, slow):
@@ -112,7 +112,7 @@ def test_octets_that_wait_are_limited_and_free_again(monkeypatch):
     ] * 3
 
 
-def test_what_waits_for_a_turn_is_forgotten_with_its_connection():
+def test_queue_drops_waiting_requests_of_a_closed_connection():
     async def script(queues, slow):
         for ticket, endpoint in ((1, ONE), (2, ONE), (3, OTHER), (4, OTHER)):
             queues.put(ticket, StubService(slow), request(str(ticket).encode(), endpoint))
@@ -146,7 +146,7 @@ def test_service_that_fails_is_answered_for_and_the_next_request_served(caplog):
     assert caplog.messages == [f"AoE request from {aoe.CLIENT} failed"] * 3
 
 
-def test_what_is_under_way_at_the_end_is_given_up():
+def test_queue_close_cancels_running_requests():
     async def script(queues, slow):
         queues.put(1, StubService(slow), request())
         await settle()

@@ -24,5 +24,5 @@ def test_services(service):
 @pytest.mark.parametrize(
     "sender", [AmsClients, ChannelSender, RecordingSender, LocalClient, MailboxStreams]
 )
-def test_carriers(sender):
+def test_senders(sender):
     assert [*signature(sender.send).parameters] == [*signature(TransportSender.send).parameters]

@@ -50,7 +50,7 @@ def test_first_that_has_the_port_answers(table) -> None:
         table.add(NetId.parse("9.9.9.9.9.9"), one)
 
 
-def test_what_is_at_hand_comes_with_the_time_it_took(table) -> None:
+def test_immediate_answer_comes_with_its_time(table) -> None:
     answer = AmsAnswer(b"now")
     table.add(DEVICE, Ready(answer, 1))
     found, took_ns = table.answer_now(request(1), b"")
@@ -61,12 +61,12 @@ def test_what_is_at_hand_comes_with_the_time_it_took(table) -> None:
 @pytest.mark.parametrize(
     "service", [StubService(echo, 1), Ready(None, 1), Ready(ValueError("oh"), 1), StubService(echo)]
 )
-def test_all_else_is_answered_in_the_usual_way(table, service) -> None:
+def test_requests_without_immediate_answer_return_none(table, service) -> None:
     table.add(DEVICE, service)
     assert table.answer_now(request(1), b"") is None
 
 
-def test_all_are_told_who_is_gone(table) -> None:
+def test_client_gone_notifies_all_services(table) -> None:
     services = [StubService(), StubService()]
     table.add(ROUTER, services[0])
     table.add(DEVICE, services[1])

@@ -95,7 +95,7 @@ class PromptService(StubService):
         return AmsAnswer(b"now " + body) if body[:4] == b"fast" else None
 
 
-def test_what_a_service_has_at_hand_is_answered_without_its_lane(scene):
+def test_immediate_answer_bypasses_the_queue(scene):
     scene.service.ports.clear()
     scene.station.add_service(DEVICE, PromptService())
     for number, body in enumerate((b"fast", b"slow", b"fail")):
@@ -107,7 +107,7 @@ def test_what_a_service_has_at_hand_is_answered_without_its_lane(scene):
     assert (traffic.requests, traffic.answers) == (3, 3)
 
 
-def test_what_is_at_hand_does_not_overtake_what_its_client_asked_before(scene):
+def test_immediate_answer_does_not_overtake_earlier_requests_of_its_client(scene):
     access_filter = asyncio.Event()
 
     async def wait(request):
@@ -127,7 +127,7 @@ def test_what_is_at_hand_does_not_overtake_what_its_client_asked_before(scene):
     assert [each.body for each in scene.sent] == [b"now fast of another", b"slow", b"fast"]
 
 
-def test_long_answer_goes_in_fragments_where_the_door_is_narrow(scene):
+def test_long_answer_is_fragmented_by_a_transport_with_small_packets(scene):
     scene.ask(endpoint=Endpoint("narrow", "peer"), body=b"x" * 100)
     assert [each.command for each in scene.sent] == [0x0902] * 5
 
@@ -150,7 +150,7 @@ def test_audit_is_kept_before_the_answer_leaves():
     assert (sent, len(scene.sent)) == ([0], 1)
 
 
-def test_source_of_this_station_is_believed_to_programs_of_this_host_only(scene):
+def test_own_source_net_id_is_accepted_from_this_host_only(scene):
     packet = Ams(f"{DEVICE}:65535", f"{ROUTER}:300", command=aoe.READ_STATE).octets()
     scene.station.receive(packet, "ams-tcp", "10.0.0.9:4711#1")
     scene.station.receive(packet, "ams-tcp", "127.0.0.1:4711#2")
@@ -166,7 +166,7 @@ def test_request_goes_on_and_its_answer_comes_back(scene):
     assert (connection, answer.invoke_id, answer.body) == ("peer", 5, b"far")
 
 
-def test_what_a_door_cannot_send_is_answered_and_named(scene, caplog):
+def test_send_failure_of_a_transport_is_answered_and_logged(scene, caplog):
     scene.add_route()
     scene.station.add_transport(Transport("dead"), sender := RecordingSender())
     sender.error = "no cable"
@@ -178,7 +178,7 @@ def test_what_a_door_cannot_send_is_answered_and_named(scene, caplog):
     assert "dead end (hop by dead): no cable (0x1b)" in caplog.text
 
 
-def test_hop_that_is_down_is_answered_for_at_once_until_it_is_up(scene):
+def test_requests_to_a_hop_that_is_down_fail_at_once_until_it_is_up(scene):
     scene.add_route()
     scene.ask(FAR)
     scene.station.hop_down("out", None, "no link")
@@ -212,7 +212,7 @@ def test_time_is_up_at_a_hop_and_at_a_service():
     assert [(each.error, each.invoke_id) for each in scene.sent[1:]] == [(0x719, 1), (0x719, 2)]
 
 
-def test_hops_are_asked_for_life_from_the_moment_there_is_a_route(scene):
+def test_hops_are_probed_as_soon_as_there_is_a_route(scene):
     async def script():
         await asyncio.sleep(0)
         scene.station.add_route(Route(NetId.parse("7.7.7.7.1.1"), "far", HOP))
@@ -224,12 +224,12 @@ def test_hops_are_asked_for_life_from_the_moment_there_is_a_route(scene):
     assert (probe.target, probe.command) == ("7.7.7.7.1.1:10000", 4)
 
 
-def test_services_are_told_of_a_connection_that_is_closed(scene):
+def test_services_are_notified_of_a_closed_connection(scene):
     scene.station.connection_closed("in", "peer")
     assert scene.service.gone == [Endpoint("in", "peer")]
 
 
-def test_services_are_told_of_a_hop_that_has_been_dead_for_long(scene, monkeypatch):
+def test_services_are_notified_of_a_hop_dead_for_long(scene, monkeypatch):
     now_ns = 0
     monkeypatch.setattr(station_router, "monotonic_ns", lambda: now_ns)
     scene.station.add_route(Route(NetId.parse("7.7.7.7.1.1"), "far", HOP))
@@ -255,7 +255,7 @@ def test_notifications_go_to_their_clients_and_pass(scene):
     assert (scene.sent[4].target, scene.sent[4].command) == (FAR, 7)
 
 
-def test_door_that_is_removed_takes_with_it_who_waits_there(scene):
+def test_removed_transport_answers_its_pending_requests(scene):
     scene.add_route()
     scene.ask(FAR)
     scene.station.remove_transport("out")
@@ -291,7 +291,7 @@ def test_reader_waits_while_too_many_of_its_requests_do(scene):
     assert len(scene.sent) == 2
 
 
-def test_traces_are_told_to_whoever_wants_them(scene):
+def test_traces_reach_all_observers(scene):
     traces = []
     scene.station.on_trace.append(traces.append)
     scene.ask("9.9.9.9.1.1:1")
@@ -305,7 +305,7 @@ def test_station_knows_its_net_ids(scene):
         scene.station.add_service(NetId.parse("2.2.2.2.2.2"), scene.service)
 
 
-def test_whoever_follows_the_routes_is_told_of_each() -> None:
+def test_route_observers_are_notified_of_each_change() -> None:
     scene = Scene()
     told: list[Endpoint] = []
     scene.station.on_routes.append(told.append)

@@ -82,7 +82,7 @@ def test_an_added_route_is_there_again_after_a_new_start():
         ({"name": "other", "net_id": "6.1.2.3.1.1"}, "5.1.2.3.1.1"),
     ],
 )
-def test_a_route_takes_the_place_of_the_one_of_its_name_or_net_id(change, replaces):
+def test_added_route_replaces_that_of_its_name_or_net_id(change, replaces):
     house = House()
     asyncio.run(house.routes.add(PLC))
     new = replace(PLC, **change)
@@ -105,7 +105,7 @@ def test_a_route_takes_the_place_of_the_one_of_its_name_or_net_id(change, replac
         ({"hop": HopSpec(TransportKind.UDP, "gone", "1.1.1.1:1")}, "there is no door udp:gone"),
     ],
 )
-def test_a_route_that_cannot_be_changes_nothing(change, reason):
+def test_impossible_route_changes_nothing(change, reason):
     house = House()
     asyncio.run(house.routes.add(PLC))
     before = list(house.router.table)
@@ -123,7 +123,7 @@ def test_a_default_route_can_be_added():
     assert house.router.table.find(NetId.parse("99.0.0.2.1.1"))[0].name == "default"
 
 
-def test_there_are_not_more_than_so_many(monkeypatch):
+def test_added_routes_are_limited(monkeypatch):
     house = House()
     asyncio.run(house.routes.add(PLC))
     monkeypatch.setattr("eap.services.routing.station_routes.MAX_ADDED", 1)
@@ -161,7 +161,7 @@ def test_only_added_routes_are_removed(text, reason):
     assert len(house.router.table) == 4
 
 
-def test_a_door_and_an_address_choose_what_is_removed():
+def test_remove_selects_by_transport_and_address():
     house = House()
     asyncio.run(house.routes.add(PLC))
     with pytest.raises(ControlError, match="no route 'plc' was added"):
@@ -199,7 +199,7 @@ def test_a_route_that_stays_is_not_touched():
     assert touched == ["saw", "10.0.0.3.1.1"]
 
 
-def test_what_cannot_be_taken_is_told_and_kept_for_later(caplog):
+def test_impossible_stored_route_is_logged_and_kept(caplog):
     House().store.save([replace(PLC, hop=HopSpec(TransportKind.UDP, "gone", "1.1.1.1:1"))])
     house = House(
         RoutingSpec(routes=(replace(STATIC, hop=HopSpec(TransportKind.UDP, "gone", "x")),))
@@ -215,7 +215,7 @@ def learned(house, net_id="8.1.1.1.1.1", name="seen", now_ns=0):
     return house.routes.learn(NetId.parse(net_id), name, "10.0.0.9", now_ns)
 
 
-def test_who_answered_has_a_route_for_ten_minutes():
+def test_learned_route_expires_after_ten_minutes():
     house = House()
     assert learned(house, name="seen\n")
     [route] = [each for each in house.router.table if each.origin is Origin.LEARNED]
@@ -227,7 +227,7 @@ def test_who_answered_has_a_route_for_ten_minutes():
 
 
 @pytest.mark.parametrize("net_id", ["10.0.0.1.7.7", "10.0.0.2.7.7", "5.1.2.3.9.9"])
-def test_nobody_makes_a_route_in_place_of_another_by_an_answer(net_id):
+def test_learned_route_does_not_replace_other_routes(net_id):
     house = House()
     asyncio.run(house.routes.add(PLC))
     assert not learned(house, net_id)
@@ -245,7 +245,7 @@ def test_learn_sources_decide_which_answers_to_scans_are_learned():
     assert not learned(House(RoutingSpec(learn=())))
 
 
-def test_a_default_route_is_no_reason_not_to_learn():
+def test_learn_accepts_routes_beside_a_default_route():
     house = House()
     asyncio.run(house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0)))
     assert learned(house, name="")
@@ -267,7 +267,7 @@ class SlowStore(StationFile):
         self.written.append([each.name for each in value])
 
 
-def test_packets_do_not_wait_for_the_disk_but_changes_and_who_asked_do():
+def test_changes_wait_for_the_disk_and_packets_do_not():
     house = House()
     house.store = house.routes._store = SlowStore()
 

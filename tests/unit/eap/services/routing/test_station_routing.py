@@ -39,7 +39,7 @@ class House:
         return [route.name for route in self.router.table]
 
 
-def test_what_is_applied_is_in_force_at_once_and_after_a_new_start(caplog):
+def test_applied_routing_is_in_force_at_once_and_after_a_restart(caplog):
     house = House()
     assert house.routing.applied is None
     changes = ["route mill: removed", "route saw: added", "access rule a: added"]
@@ -51,7 +51,7 @@ def test_what_is_applied_is_in_force_at_once_and_after_a_new_start(caplog):
     assert "station left: routes and access rules are as applied last" in caplog.text
 
 
-def test_who_edits_the_plant_file_has_the_last_word(caplog):
+def test_edited_plant_file_replaces_applied_routing(caplog):
     asyncio.run(House().routing.apply(OTHER, "1"))
     edited = House(RoutingSpec())
     assert edited.names() == []
@@ -62,7 +62,7 @@ def test_who_edits_the_plant_file_has_the_last_word(caplog):
     assert caplog.text == ""
 
 
-def test_a_file_that_says_what_was_applied_is_nothing_to_speak_of(caplog):
+def test_plant_file_equal_to_applied_routing_is_not_logged(caplog):
     asyncio.run(House().routing.apply(OTHER, "1"))
     assert House(OTHER).names() == ["saw"]
     assert caplog.text == ""
@@ -91,7 +91,7 @@ def test_steps_of_one_change_are_taken_back_together():
     assert house.names() == ["mill"]
 
 
-def test_what_is_the_same_is_no_change():
+def test_apply_of_the_same_routing_changes_nothing():
     house = House()
     assert asyncio.run(house.routing.apply(FILE, "1")) == []
     assert house.routing.applied is None
@@ -108,7 +108,7 @@ def test_a_broker_does_not_change_while_it_runs():
     assert house.routing.applied is None
 
 
-def test_what_cannot_be_kept_is_not_in_force(monkeypatch):
+def test_routing_that_cannot_be_stored_is_not_in_force(monkeypatch):
     monkeypatch.setenv("EAP_STATE_DIR", "/dev/null/x")
     house = House()
     with pytest.raises(EnvironmentalError, match="routes and access rules cannot be kept"):

@@ -41,7 +41,7 @@ def play(script):
     asyncio.run(run())
 
 
-def test_it_rings_when_something_is_due_and_not_before():
+def test_timer_fires_at_the_due_time():
     async def script(clock):
         clock.timer.start()
         clock.set(10_000)
@@ -53,7 +53,7 @@ def test_it_rings_when_something_is_due_and_not_before():
     play(script)
 
 
-def test_what_is_overdue_does_not_keep_the_loop_busy():
+def test_timer_overdue_does_not_keep_the_loop_busy():
     async def script(clock):
         clock.timer.start()
         clock.set(-1000)
@@ -64,7 +64,7 @@ def test_what_is_overdue_does_not_keep_the_loop_busy():
     play(script)
 
 
-def test_a_moment_is_the_same_for_all_that_ask_for_one():
+def test_timer_set_soon_is_shared():
     async def script(clock):
         clock.timer.start()
         clock.set(10_000)
@@ -78,7 +78,7 @@ def test_a_moment_is_the_same_for_all_that_ask_for_one():
     play(script)
 
 
-def test_it_is_silent_before_it_begins_and_after_its_end():
+def test_timer_does_not_fire_before_start_and_after_stop():
     async def script(clock):
         clock.set(1)
         clock.timer.set_soon()
@@ -93,7 +93,7 @@ def test_it_is_silent_before_it_begins_and_after_its_end():
     play(script)
 
 
-def test_what_was_due_before_it_begins_is_not_forgotten():
+def test_timer_start_handles_what_was_due_before():
     async def script(clock):
         clock.set(1)
         clock.timer.start()

@@ -54,7 +54,7 @@ def test_each_outcome_has_its_level(caplog):
     )
 
 
-def test_trace_log_hop_that_is_down_is_one_cause_whoever_asks_for_what(caplog):
+def test_trace_log_hop_that_is_down_is_one_cause_for_all_requests(caplog):
     asked = [
         trace(),
         trace(connection="10.0.0.9:40001"),
@@ -64,7 +64,7 @@ def test_trace_log_hop_that_is_down_is_one_cause_whoever_asks_for_what(caplog):
     assert causes(caplog, *asked) == 1
 
 
-def test_trace_log_other_causes_are_told_apart(caplog):
+def test_trace_log_other_causes_are_distinct(caplog):
     asked = [
         trace(),
         trace(hop=Endpoint("udp:eap0", "10.0.0.3:34980")),
@@ -89,7 +89,7 @@ def test_trace_log_packet_without_a_request_is_logged(caplog):
     assert caplog.messages == ["island: no way (0x1b)"]
 
 
-def test_what_was_answered_without_an_error_of_the_header_has_no_code(caplog):
+def test_trace_log_answer_without_header_error_has_no_code(caplog):
     caplog.set_level(logging.INFO)
     TraceLog("island").write(trace(Outcome.ANSWERED)._replace(error_code=0, text="no way"))
     assert caplog.messages == ["island: no way"]

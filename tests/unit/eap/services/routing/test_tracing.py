@@ -34,7 +34,7 @@ def names(traced: TraceResult) -> list[str]:
     return [each.report.station for each in traced.hops]
 
 
-def test_every_router_on_the_way_says_where_it_goes_on() -> None:
+def test_trace_lists_every_router_with_its_next_hop() -> None:
     _, first = line_of_three()
     traced = follow(first)
     assert names(traced) == ["island-01", "island-02", "island-03"]
@@ -55,14 +55,14 @@ def test_routers_need_routes_to_their_neighbours_only() -> None:
     assert not traced.why
 
 
-def test_what_is_here_needs_no_hop() -> None:
+def test_trace_local_target_has_one_hop() -> None:
     _, first = line_of_three()
     traced = follow(first, NetId.parse("5.1.1.1.3.1"))
     assert names(traced) == ["island-01"]
     assert traced.states is not None
 
 
-def test_a_dead_hop_is_named_with_who_does_not_reach_it() -> None:
+def test_trace_names_a_dead_hop_and_the_router_before_it() -> None:
     line, first = line_of_three()
     line.dead.add("island-03")
     traced = follow(first)
@@ -119,7 +119,7 @@ def test_trace_several_stations_known_to_be_dead_names_the_first() -> None:
     assert follow(first, LAST).why == why
 
 
-def test_trace_hop_that_is_lost_meanwhile_is_named_and_no_circle() -> None:
+def test_trace_hop_lost_meanwhile_is_named_and_is_no_loop() -> None:
     line, first = line_of_three()
     second = line.stations["island-02"]
     request, sent = first.request, count()
@@ -143,7 +143,7 @@ def test_a_missing_route_and_a_missing_port() -> None:
     assert missing.why == "island-03: nothing has port 1009 of 5.1.1.3.3.1"
 
 
-def test_a_circle_is_named() -> None:
+def test_trace_names_a_loop() -> None:
     line = Line()
     first = line.add(1, to(2), to(9, 2))
     line.add(2, to(3), to(9, 3))
@@ -153,7 +153,7 @@ def test_a_circle_is_named() -> None:
     assert traced.why == "island-01: the routes run in a circle, it was on the way already"
 
 
-def test_a_router_that_is_not_ours_is_opaque_and_its_target_is_asked_all_the_same() -> None:
+def test_trace_router_of_another_make_is_opaque_and_target_is_read() -> None:
     line, first = line_of_three()
     line.stations["island-02"].is_ours = False
     traced = follow(first)
@@ -164,7 +164,7 @@ def test_a_router_that_is_not_ours_is_opaque_and_its_target_is_asked_all_the_sam
     assert traced.states is not None
 
 
-def test_a_router_that_is_silent_may_pass_requests_on_all_the_same() -> None:
+def test_trace_silent_router_may_forward_requests() -> None:
     line, first = line_of_three()
     line.stations["island-03"].is_ours = False
     line.stations["island-03"].serve = silent_router
@@ -180,7 +180,7 @@ def silent_router(port: int, command: int, body: bytes) -> AmsAnswer:
     return run_state(port, command, body)
 
 
-def test_access_rules_that_refuse_the_question_are_named() -> None:
+def test_trace_names_access_rules_that_deny_the_query() -> None:
     line = Line()
     first = line.add(1, to(2))
     closed = AccessRule("closed", allow=False)

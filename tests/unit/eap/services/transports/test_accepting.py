@@ -201,7 +201,7 @@ def test_connection_that_is_closed_before_it_begins_is_not_served():
     asyncio.run(run())
 
 
-def test_listener_that_fails_is_asked_again(monkeypatch):
+def test_listener_accepts_again_after_an_error(monkeypatch):
     monkeypatch.setattr(accepting, "_PAUSE_S", 0.0)
     asked = []
 

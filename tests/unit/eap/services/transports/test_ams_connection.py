@@ -174,7 +174,7 @@ def test_several_requests_are_under_way_and_answered_in_any_order() -> None:
     talk(script, is_slow=True)
 
 
-def test_who_sends_ahead_of_too_many_answers_is_not_read_from() -> None:
+def test_connection_with_many_pending_requests_is_not_read() -> None:
     async def script(reader, writer, taker):
         count = ams_connection.MAX_REQUESTS
         for n in range(3 * count):
@@ -225,7 +225,7 @@ def test_wrong_lengths_are_answered_and_the_connection_goes_on(flags: int) -> No
 
 
 @pytest.mark.parametrize("octets", [b"GET / HTTP/1.1\r\n", prefixed(b""), prefixed(b"", length=31)])
-def test_what_is_no_ams_packet_ends_the_connection_when_all_has_been_answered(octets) -> None:
+def test_invalid_packet_closes_the_connection_after_pending_answers(octets) -> None:
     async def script(reader, writer, taker):
         writer.write(ask() + ask() + octets)
         await eventually(lambda: taker.refused)
@@ -241,7 +241,7 @@ def test_what_is_no_ams_packet_ends_the_connection_when_all_has_been_answered(oc
     assert taker.why.startswith("no AMS packets: AmsTcpHeader")
 
 
-def test_client_that_asks_gets_an_address_that_nobody_else_has() -> None:
+def test_client_gets_a_unique_ams_address() -> None:
     addresses = []
 
     async def script(reader, writer, taker):
@@ -271,7 +271,7 @@ def test_client_that_asks_gets_an_address_that_nobody_else_has() -> None:
     ("port", "is_ours", "why"),
     [(30012, False, "programs cannot serve AMS port 30012"), (0, True, "a router that asks")],
 )
-def test_who_wants_to_serve_a_port_is_sent_away(port, is_ours, why) -> None:
+def test_request_to_serve_a_port_closes_the_connection(port, is_ours, why) -> None:
     async def script(reader, writer, taker):
         writer.write(prefixed(port.to_bytes(2, "little"), reserved=0x1000))
         assert await reader.read() == b""
@@ -281,7 +281,7 @@ def test_who_wants_to_serve_a_port_is_sent_away(port, is_ours, why) -> None:
     assert taker.why.startswith(f"no AMS packets: {why}")
 
 
-def test_answers_are_told_from_requests() -> None:
+def test_answers_and_requests_are_handled_apart() -> None:
     async def script(reader, writer, taker):
         writer.write(ask(flags=5) + ask(b"x", 2))
         assert (await hear(reader))[1] == 2
@@ -290,7 +290,7 @@ def test_answers_are_told_from_requests() -> None:
     assert (len(taker.answers), len(taker.seen)) == (1, 1)
 
 
-def test_who_wants_no_answer_gets_none() -> None:
+def test_no_return_request_gets_no_answer() -> None:
     async def script(reader, writer, taker):
         writer.write(ask(flags=NO_RETURN) + ask(b"x", 2))
         assert (await hear(reader))[1] == 2
@@ -351,7 +351,7 @@ def test_packets_that_wait_for_their_turn_are_not_slow() -> None:
     assert talk(script, patience_s=0.1, is_slow=True).refused == []
 
 
-def test_client_that_takes_nothing_is_disconnected() -> None:
+def test_connection_is_closed_when_client_stops_reading() -> None:
     async def script(reader, writer, taker):
         reader._limit = 1  # so that it stops reading
         for _ in range(2000):
@@ -394,7 +394,7 @@ def test_client_that_breaks_off_costs_nothing() -> None:
     assert talk(script, is_slow=True).refused == []
 
 
-def test_who_has_only_closed_its_sending_side_is_still_answered() -> None:
+def test_half_closed_connection_is_still_answered() -> None:
     async def script(reader, writer, taker):
         writer.write(ask(b"last") + ask(b"one"))
         writer.write_eof()
@@ -408,7 +408,7 @@ def test_who_has_only_closed_its_sending_side_is_still_answered() -> None:
     assert talk(script, is_slow=True).why == "closed by the peer"
 
 
-def test_who_leaves_without_taking_its_answers_is_let_go() -> None:
+def test_half_closed_client_that_does_not_read_is_disconnected() -> None:
     async def script(reader, writer, taker):
         reader._limit = 1
         writer.write(ask(bytes(100_000)) * 8)

@@ -68,7 +68,7 @@ def test_every_router_of_the_address_names_itself(sock):
     ]
 
 
-def test_the_number_of_the_question_comes_back(sock):
+def test_answer_has_the_invoke_id_of_the_request(sock):
     header = DiscoveryHeader(0, 0xDEADBEEF, 1, NOTHING, 0)
     (answer,) = asyncio.run(discovery(sock).answers_to(encode_discovery(header), "10.0.0.5"))
     assert decode_discovery(answer).header.invoke_id == 0xDEADBEEF
@@ -77,7 +77,7 @@ def test_the_number_of_the_question_comes_back(sock):
 @pytest.mark.parametrize(
     ("sender", "is_this_host"), [("127.0.0.1", True), ("127.9.9.9", True), ("10.0.0.5", False)]
 )
-def test_a_route_is_decided_on_and_answered_once(sock, sender, is_this_host):
+def test_add_route_request_is_answered_once(sock, sender, is_this_host):
     admin = Admin(AdsError.ACCESS)
     (answer,) = asyncio.run(
         discovery(sock, LEFT, RIGHT, route_admin=admin).answers_to(ADD_ROUTE, sender)
@@ -105,7 +105,7 @@ def test_too_many_routes_are_not_answered(sock):
         encode_discovery(DiscoveryHeader(0, 0, 0x8000_0001, NOTHING, 0)),
     ],
 )
-def test_nothing_is_said_to_what_is_no_question(sock, data):
+def test_invalid_datagram_gets_no_answer(sock, data):
     assert asyncio.run(discovery(sock).answers_to(data, "10.0.0.5")) == []
 
 
@@ -137,7 +137,7 @@ def test_datagrams_are_answered_to_their_senders(sock):
     assert refused == [DropReason.AMS_DISCOVERY] * 2
 
 
-def test_what_comes_to_a_network_is_answered_from_the_address(sock):
+def test_broadcast_is_answered_from_the_unicast_address(sock):
     async def run():
         loop = asyncio.get_running_loop()
         with (
@@ -156,7 +156,7 @@ def test_what_comes_to_a_network_is_answered_from_the_address(sock):
     asyncio.run(run())
 
 
-def test_answers_to_own_questions_are_none_of_tools(sock):
+def test_answers_to_own_requests_are_not_handled_as_requests(sock):
     refused = []
 
     async def run():

@@ -68,7 +68,7 @@ def play(
     return refused, there
 
 
-def test_each_answer_goes_back_on_the_connection_of_its_question():
+def test_answer_returns_on_the_connection_of_its_request():
     """All clients look alike: the same NetID, port and numbers of requests."""
 
     async def client(connect, name):
@@ -133,7 +133,7 @@ def test_names_of_connections_do_not_come_again():
     assert {name.partition(":")[0] for name in names} == {"127.0.0.1"}
 
 
-def test_who_sends_ahead_lets_others_in_between():
+def test_client_with_many_requests_does_not_delay_others():
     async def script(connect, transport):
         greedy, writer = await connect()
         reader, other = await connect()
@@ -209,7 +209,7 @@ def test_client_that_breaks_the_rules_is_disconnected():
     assert play(script, patience_s=0.1)[0] == [DropReason.AMS_TYPE, DropReason.AMS_SLOW]
 
 
-def test_answers_that_nobody_asked_for_are_counted():
+def test_unsolicited_answers_are_counted():
     async def script(connect, transport):
         reader, writer = await connect()
         writer.write(question(b"x", flags=5) + question(b"y"))
@@ -221,7 +221,7 @@ def test_answers_that_nobody_asked_for_are_counted():
     assert len(stations[0].seen) == 1
 
 
-def test_nothing_can_be_sent_by_what_is_closed():
+def test_send_on_closed_connection_fails():
     assert AmsClients().send("127.0.0.1:1#1", (b"",)) == "the connection was closed"
 
 
@@ -258,7 +258,7 @@ def test_connection_that_cannot_be_served_gives_its_place_back(monkeypatch):
     play(script)
 
 
-def test_connections_are_closed_when_the_door_is():
+def test_connections_are_closed_with_the_listener():
     async def script(connect, transport):
         client.setblocking(False)
         loop = asyncio.get_running_loop()

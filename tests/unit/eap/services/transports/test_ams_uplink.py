@@ -131,7 +131,7 @@ def short_waits(monkeypatch):
     monkeypatch.setattr(ams_tcp, "FIRST_WAIT_S", 0.05)
 
 
-def test_what_is_sent_before_it_is_connected_goes_out_then():
+def test_uplink_sends_early_packets_when_connected():
     async def run():
         async with listening() as (plc, port), serving(port) as (uplink, router, _):
             assert uplink.send("", [packet(b"early")]) is None
@@ -145,7 +145,7 @@ def test_what_is_sent_before_it_is_connected_goes_out_then():
     asyncio.run(run())
 
 
-def test_answers_and_requests_of_the_peer_are_handed_on_and_answered():
+def test_uplink_forwards_answers_and_requests_of_the_peer():
     async def run():
         async with listening() as (plc, port), serving(port) as (uplink, router, _):
             reader, writer = await plc.take()
@@ -246,7 +246,7 @@ def test_connection_that_is_lost_is_opened_again():
     asyncio.run(run())
 
 
-def test_peer_that_says_nonsense_is_left():
+def test_uplink_closes_after_invalid_packets():
     async def run():
         async with listening() as (plc, port), serving(port) as (_, router, refused):
             _, writer = await plc.take()
@@ -260,7 +260,7 @@ def test_peer_that_says_nonsense_is_left():
     asyncio.run(run())
 
 
-def test_long_answers_are_taken_and_longer_ones_are_errors_at_once():
+def test_uplink_forwards_long_answers_and_rejects_longer_ones():
     async def run():
         async with listening() as (plc, port), serving(port) as (_, router, refused):
             _, writer = await plc.take()
@@ -275,7 +275,7 @@ def test_long_answers_are_taken_and_longer_ones_are_errors_at_once():
     asyncio.run(run())
 
 
-def test_peer_that_takes_nothing_is_read_from_and_left_after_a_while():
+def test_uplink_closes_when_the_peer_stops_reading():
     async def run():
         async with listening() as (plc, port), serving(port, overdue_ns=400_000_000) as (
             uplink, router, refused,
@@ -296,7 +296,7 @@ def test_peer_that_takes_nothing_is_read_from_and_left_after_a_while():
     asyncio.run(run())
 
 
-def test_name_that_is_not_known_is_said():
+def test_uplink_to_unknown_host_name_reports_it():
     async def run():
         async with serving(1, "a..b") as (_, router, _):
             await router.until("a..b: no address: 'a..b' is not a host name")

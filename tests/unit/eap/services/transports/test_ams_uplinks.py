@@ -132,14 +132,14 @@ def test_two_stations_have_a_connection_each():
         asyncio.run(run(*there))
 
 
-def test_routes_by_other_doors_are_for_others():
+def test_uplinks_ignore_routes_of_other_transports():
     router = Router(route("eap0", transport="udp:"))
     AmsUplinks(router, [], [].append)
     router.add(route("eap0", transport="ams-tcp"))
     assert router.transports == {}
 
 
-def test_address_that_is_none_is_said(caplog):
+def test_uplinks_log_an_invalid_address(caplog):
     router = Router(route("plc:nothing"))
     AmsUplinks(router, [], [].append)
     assert router.transports == {}

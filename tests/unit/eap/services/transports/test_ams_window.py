@@ -45,7 +45,7 @@ def test_long_requests_fill_it_and_so_do_those_for_long_answers() -> None:
         assert not window.is_full
 
 
-def test_what_is_not_answered_does_not_wait() -> None:
+def test_window_ignores_packets_without_answer() -> None:
     window = AmsWindow()
     window.note_incoming(request(flags=4 | 2))
     window.note_incoming(request(command=8))

@@ -63,7 +63,7 @@ def test_request_for_others_goes_where_the_best_route_is(stations, sender):
     assert [each.stats().in_flight for each in stations] == [1, 1]
 
 
-def test_answers_and_notifications_go_to_who_asked(stations, sender):
+def test_answers_and_notifications_go_to_the_requesting_station(stations, sender):
     _, second = stations
     second.add_route(route("7.7.7.7.1.1"))
     demultiplexer(*stations).receive(ask(FAR, command=ADD_NOTIFICATION, body=bytes(40)), "peer")
@@ -82,7 +82,7 @@ def test_answers_and_notifications_go_to_who_asked(stations, sender):
     assert (ended[0], ended[1].command) == ("hop", DELETE_NOTIFICATION)
 
 
-def test_fragments_are_put_together_before_anybody_is_asked(stations, sender):
+def test_fragments_are_reassembled_before_a_station_is_chosen(stations, sender):
     way_in = demultiplexer(*stations)
     packet = ask("2.2.2.2.2.1:65535", body=b"x" * 100)
     for fragment in iter_fragments(packet, 1, 40):
@@ -101,14 +101,14 @@ def test_fragments_are_put_together_before_anybody_is_asked(stations, sender):
     assert len(sender.sent) == 2
 
 
-def test_what_was_for_all_is_answered_by_who_is_meant_only(stations, sender):
+def test_multicast_is_answered_by_its_target_only(stations, sender):
     way_in = demultiplexer(*stations)
     way_in.receive(ask("2.2.2.2.2.1:65535"), "peer", is_broadcast=True)
     way_in.receive(ask("9.9.9.9.1.1:1"), "peer", is_broadcast=True)
     assert [each.source for _, each in sender.sent] == ["2.2.2.2.2.1:65535"]
 
 
-def test_each_station_has_its_own_name_for_a_door(stations, sender):
+def test_each_station_has_its_own_name_of_the_transport(stations, sender):
     stations[1].remove_transport("link")
     stations[1].add_transport(Transport("other"), sender)
     way_in = Demultiplexer([(stations[0], "link"), (stations[1], "other")])

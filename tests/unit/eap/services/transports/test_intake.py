@@ -55,7 +55,7 @@ def test_each_frame_is_counted_once_at_every_station(counters):
     assert counters.stats() == {"a": expected, "b": expected}
 
 
-def test_what_is_taken_is_not_counted(counters):
+def test_accepted_frame_is_not_counted(counters):
     taken = []
     intake = FrameIntake(["a", "b"], counters, 100, lambda *frame: taken.append(frame))
     intake.receive(MAILBOX, 8, 99, NOBODY)
@@ -93,13 +93,13 @@ class Line:
         return self.looks - before
 
 
-def test_a_frame_now_and_then_is_taken_by_one_look():
+def test_poller_drains_once_for_a_rare_frame():
     line = Line(0, 10 * QUICK_NS, 20 * QUICK_NS)
     drain = BusyPoller(line, line.clock)
     assert [line.wake(drain, at_ns) for at_ns in line.arrivals_ns[:]] == [1, 1, 1]
 
 
-def test_the_next_of_quick_frames_is_waited_for():
+def test_poller_polls_after_quick_frames():
     line = Line(0, QUICK_NS // 2, QUICK_NS // 2 + SPIN_LIMIT_NS // 2)
     drain = BusyPoller(line, line.clock)
     assert line.wake(drain, 0) == 1
@@ -109,7 +109,7 @@ def test_the_next_of_quick_frames_is_waited_for():
     assert 0 <= late_ns < 5000, "given up as long after the last frame as promised"
 
 
-def test_each_time_in_vain_more_frames_are_not_waited_for():
+def test_poller_backs_off_after_fruitless_polls():
     line = Line()
     drain = BusyPoller(line, line.clock)
     line.wake(drain, 0)
@@ -120,7 +120,7 @@ def test_each_time_in_vain_more_frames_are_not_waited_for():
     assert max(rests) == MAX_BACKOFF
 
 
-def test_a_frame_that_came_is_a_reason_to_wait_for_the_next_again():
+def test_poller_resets_its_backoff_after_a_frame():
     line = Line()
     drain = BusyPoller(line, line.clock)
     line.wake(drain, 0)
@@ -139,7 +139,7 @@ def test_a_frame_that_came_is_a_reason_to_wait_for_the_next_again():
     assert last == 1, "but not for ever"
 
 
-def test_frames_that_never_end_leave_time_for_others():
+def test_poller_limits_the_frames_of_a_poll():
     line = Line(*range(0, 100_000_000, 2000))
     drain = BusyPoller(line, line.clock)
     line.wake(drain, 0)

@@ -17,7 +17,7 @@ PACKET = aoe.packet("1.1.1.1.2.1", 4, b"abc")
 
 
 @pytest.mark.parametrize("frame", [aoe.frame(PACKET), aoe.frame(PACKET, counter=0) + bytes(9)])
-def test_aoe_to_address_0_is_taken(frame):
+def test_aoe_packet_accepts_aoe_to_address_0(frame):
     assert aoe_packet(frame) == PACKET
 
 
@@ -32,7 +32,7 @@ def test_aoe_to_address_0_is_taken(frame):
         (b"\x00\x50", DropReason.TRUNCATED),
     ],
 )
-def test_others_are_not_taken(frame, reason):
+def test_aoe_packet_rejects_other_frames(frame, reason):
     assert aoe_packet(frame) is None
     assert refusal_of(frame) is reason
 

@@ -69,7 +69,7 @@ def test_frames_are_cut_by_their_length():
     assert talk(script) == []
 
 
-def test_who_has_only_closed_its_sending_side_is_still_answered():
+def test_half_closed_stream_is_still_answered():
     async def slow(request) -> AmsAnswer:
         await settle()
         return AmsAnswer(bytes(4) + request.body)
@@ -84,7 +84,7 @@ def test_who_has_only_closed_its_sending_side_is_still_answered():
 
 
 @pytest.mark.parametrize("octets", [b"\x04\x40" + bytes(4), b"\x05\x50" + bytes(5)])
-def test_what_is_no_mailbox_frame_ends_the_connection(octets):
+def test_invalid_frame_closes_the_stream(octets):
     async def script(reader, writer):
         writer.write(ask() + octets)
         assert (await hear(reader)).error == 0
@@ -93,7 +93,7 @@ def test_what_is_no_mailbox_frame_ends_the_connection(octets):
     assert talk(script) == [DropReason.TCP_TYPE]
 
 
-def test_frame_that_is_not_taken_is_counted_and_the_connection_goes_on():
+def test_dropped_frame_is_counted_and_the_stream_stays_open():
     async def script(reader, writer):
         writer.write(aoe.frame(b"x" * 10, kind=3) + ask())
         assert (await hear(reader)).error == 0
@@ -110,7 +110,7 @@ def test_client_that_breaks_off_costs_nothing():
     assert talk(script) == []
 
 
-def test_client_that_takes_nothing_is_disconnected(monkeypatch):
+def test_stream_is_closed_when_client_stops_reading(monkeypatch):
     monkeypatch.setattr(mailbox_stream, "SLOW_READER_S", 0.05)
 
     async def script(reader, writer):
@@ -125,7 +125,7 @@ def test_client_that_takes_nothing_is_disconnected(monkeypatch):
     talk(script)
 
 
-def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
+def test_hop_sends_requests_on_the_same_connection():
     here, there = station("2.2.2.2.2.1"), station(TARGET)
     refused: list[DropReason] = []
     near, far = (

@@ -111,7 +111,7 @@ def test_service_resumes_when_the_broker_does(tmp_path):
         asyncio.run(story(server))
 
 
-def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
+def test_client_reads_and_subscribes_through_two_stations(tmp_path):
     tool = "192.168.9.9.1.1:33000"
 
     async def story():
@@ -148,7 +148,7 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
 
 
 @pytest.mark.parametrize("is_prefixed", [False, True], ids=["bare", "prefixed"])
-def test_client_of_another_make_asks_and_is_asked(tmp_path, is_prefixed):
+def test_client_of_another_make_sends_and_answers_requests(tmp_path, is_prefixed):
     async def story():
         place = Place(ONE)
         async with running(place):
@@ -167,7 +167,7 @@ def test_client_of_another_make_asks_and_is_asked(tmp_path, is_prefixed):
         asyncio.run(story())
 
 
-def test_two_brokers_are_two_doors_and_a_station_between_them_passes_on(tmp_path):
+def test_station_forwards_between_two_brokers(tmp_path):
     async def story():
         one = Place(ONE, spec("near"))
         middle = Place(NetId.parse("8.1.1.1.2.1"), spec("near"), spec("far", port=1884))
@@ -186,7 +186,7 @@ def test_two_brokers_are_two_doors_and_a_station_between_them_passes_on(tmp_path
         asyncio.run(story())
 
 
-def test_nothing_is_learned_that_is_not_to_be(tmp_path):
+def test_disabled_learning_learns_nothing(tmp_path):
     async def story():
         one, two = Place(ONE, learns=False), Place(TWO)
         async with running(one, two):
@@ -198,7 +198,7 @@ def test_nothing_is_learned_that_is_not_to_be(tmp_path):
         asyncio.run(story())
 
 
-def test_what_comes_to_nothing_is_counted(tmp_path, caplog):
+def test_dropped_messages_are_counted(tmp_path, caplog):
     async def story():
         place = Place(ONE)
         asked = Ams(f"{ONE}:65535", f"{PEER}:800", body=bytes(300_000))
@@ -218,7 +218,7 @@ def test_what_comes_to_nothing_is_counted(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("qos", [1, 2])
-def test_packets_may_be_sent_with_more_care(tmp_path, qos):
+def test_packets_are_sent_with_the_configured_qos(tmp_path, qos):
     async def story():
         one, two = Place(ONE, spec(qos=qos)), Place(TWO, spec(qos=qos))
         async with running(one, two):
@@ -233,7 +233,7 @@ def test_packets_may_be_sent_with_more_care(tmp_path, qos):
         )
 
 
-def test_stations_get_the_doors_of_their_plant_file(tmp_path):
+def test_stations_get_the_mqtt_transports_of_their_plant_file(tmp_path):
     async def story():
         routers = {"a": station("5.1.1.1.2.1"), "b": station("6.1.1.1.2.1")}
         routing = {"a": RoutingSpec(mqtt=(spec("x"), spec("y"))), "b": RoutingSpec()}
@@ -252,7 +252,7 @@ def test_stations_get_the_doors_of_their_plant_file(tmp_path):
     asyncio.run(story())
 
 
-def test_mqtt_door_learns_in_the_networks_that_the_plant_file_names(tmp_path):
+def test_mqtt_transport_learns_in_the_configured_networks(tmp_path):
     async def story():
         one, two = station("5.1.1.1.2.1"), Place(TWO, spec("y"), spec("x"))
         told = RoutingSpec(mqtt=(spec("x"), spec("y")), learn=("mqtt:y",))

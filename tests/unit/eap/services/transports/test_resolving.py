@@ -12,7 +12,7 @@ from eap.services.transports.ams_tcp import resolve
 pytestmark = pytest.mark.net
 
 
-def test_address_is_itself() -> None:
+def test_resolve_returns_an_address_as_it_is() -> None:
     assert asyncio.run(resolve("10.1.2.3")) == "10.1.2.3"
 
 
@@ -34,7 +34,7 @@ def test_unknown_name_is_an_error(host: str, monkeypatch: pytest.MonkeyPatch) ->
         asyncio.run(resolve(host))
 
 
-def test_slow_name_server_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resolve_slow_name_server_does_not_block(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither who gives up waiting, nor the end of the process."""
     entered, leave = threading.Event(), threading.Event()
 

@@ -90,7 +90,7 @@ def test_others_are_refused_as_long_as_there_are_no_users(caplog):
 
 @pytest.mark.parametrize("content", ["1", "1\n", "1\r\n", "1\nmore\n"])
 @pytest.mark.parametrize("is_this_host", [True, False])
-def test_who_knows_a_password_adds_a_route(tmp_path, content, is_this_host):
+def test_user_with_password_adds_a_route(tmp_path, content, is_this_host):
     others = user(tmp_path, "x", "operator")
     found = routes(users=(others, user(tmp_path, content)))
     assert ask(found, is_this_host=is_this_host) == AdsError.NONE
@@ -103,14 +103,14 @@ def test_who_knows_a_password_adds_a_route(tmp_path, content, is_this_host):
      {"user": None}, {"password": b"11\0"}, {"user": b"operator\0"}],
 )  # fmt: skip
 @pytest.mark.parametrize("is_this_host", [True, False])
-def test_who_does_not_is_refused_from_this_host_too(tmp_path, caplog, tags, is_this_host):
+def test_wrong_password_is_denied_from_this_host_too(tmp_path, caplog, tags, is_this_host):
     found = routes(users=(user(tmp_path, "x", "operator"), user(tmp_path)))
     assert ask(found, asked(**tags), is_this_host=is_this_host) == AdsError.ACCESS
     assert found.added == ()
     assert "or the password is wrong" in caplog.text
 
 
-def test_a_password_that_cannot_be_read_lets_nobody_in(tmp_path, caplog):
+def test_unreadable_password_denies_all(tmp_path, caplog):
     found = routes(users=(AmsUser("Administrator", str(tmp_path / "gone")),))
     assert ask(found, asked(password=b"\0")) == AdsError.ACCESS
     assert "password of user Administrator: " in caplog.text
@@ -135,7 +135,7 @@ def test_a_password_that_cannot_be_read_lets_nobody_in(tmp_path, caplog):
         ({"net_id": bytes((10, 0, 0, 1, 7, 7))}, {"net_id": "10.0.0.1.7.7", "octets": 6}),
     ],
 )
-def test_what_is_left_out_is_made_up(tags, change):
+def test_missing_fields_have_defaults(tags, change):
     found = routes()
     assert ask(found, asked(**tags), is_this_host=True) == AdsError.NONE
     [spec] = found.added
@@ -153,7 +153,7 @@ def test_what_is_left_out_is_made_up(tags, change):
         ({"net_id": bytes(NetId.parse(OWN))}, "NetID 10.0.0.1.2.1 is one of this station itself"),
     ],
 )
-def test_what_cannot_be_is_refused(caplog, tags, why):
+def test_impossible_route_is_refused(caplog, tags, why):
     found = routes()
     assert ask(found, asked(**tags), is_this_host=True) == AdsError.VALUE
     assert found.added == ()
@@ -192,7 +192,7 @@ def test_all_stations_of_an_address_get_the_route():
     assert [each.added for each in both] == [(ADDED,), (ADDED,)]
 
 
-def test_who_asked_is_audited():
+def test_sender_is_audited():
     found, entries = routes(), []
     found.router.on_audit.append(entries.append)
     ask(found, asked(user=b"maria\0"))

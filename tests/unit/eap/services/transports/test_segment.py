@@ -79,7 +79,7 @@ def forward(scene: Scene, invoke_id: int = 1) -> list[tuple[str, Ams]]:
     return scene.wire.sent
 
 
-def test_who_has_a_net_id_is_asked_for_and_learned(scene):
+def test_segment_queries_and_learns_the_mac_address_of_a_net_id(scene):
     ((where, question),) = forward(scene)
     assert where == str(EAP_MULTICAST_MAC)
     assert (question.target, question.command) == (f"{THERE}:65535", AmsCommand.READ_STATE)
@@ -95,7 +95,7 @@ def test_who_has_a_net_id_is_asked_for_and_learned(scene):
 @pytest.mark.parametrize(
     "more", [{"net_id": "3.3.3.3.1.1"}, {"port": 300}, {"flags": 4}], ids=["who", "whom", "what"]
 )
-def test_only_answers_to_the_question_are_believed(scene, more):
+def test_segment_learns_from_answers_to_its_query_only(scene, more):
     forward(scene)
     scene.answer(OTHER, **more)
     assert [where for where, _ in forward(scene, 2) if where == OTHER] == []
@@ -107,7 +107,7 @@ def test_broken_packet_teaches_nothing(scene):
     assert scene.station.record.counts["dropped"] == 1
 
 
-def test_it_is_asked_again_when_time_has_passed(scene, monkeypatch):
+def test_segment_repeats_its_query(scene, monkeypatch):
     now = [10**12]
     monkeypatch.setattr(segment_module, "monotonic_ns", lambda: now[0])
     assert len(forward(scene, 1)) == 1

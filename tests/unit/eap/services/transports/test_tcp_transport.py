@@ -119,7 +119,7 @@ def test_others_are_closed_with_a_reason(kind, takers, reason):
     assert play(script, takers) == [reason]
 
 
-def test_type_5_is_answered_here():
+def test_type_5_is_answered_by_services():
     async def script(scene):
         reader, writer = await scene.connect()
         writer.write(aoe.frame(aoe.packet(TARGET, 4, b"abc")))
@@ -200,7 +200,7 @@ def test_silent_connection_is_kept():
     assert play(script, patience_s=0.05) == [DropReason.TCP_SLOW]
 
 
-def test_who_leaves_before_a_frame_is_not_counted():
+def test_connection_closed_before_a_frame_is_not_counted():
     async def script(scene):
         for _ in range(3):
             _, writer = await scene.connect()

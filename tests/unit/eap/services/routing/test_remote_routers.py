@@ -45,7 +45,7 @@ class Station:
         return name == "saw"
 
 
-def test_all_networks_are_asked_and_each_router_is_told_once():
+def test_scan_routers_asks_all_networks_and_lists_each_router_once():
     both = NeighbourScanner(MILL), NeighbourScanner(MILL._replace(address="10.1.0.2"), SAW)
     station = Station(*both)
     found = asyncio.run(scan_routers(station, "10.0.0.255", 0.5))
@@ -54,12 +54,12 @@ def test_all_networks_are_asked_and_each_router_is_told_once():
     assert [each.asked for each in both] == [[("10.0.0.255", 0.5)]] * 2
 
 
-def test_a_station_without_an_address_cannot_ask():
+def test_station_without_an_address_cannot_scan():
     with pytest.raises(EnvironmentalError, match="no IP address at which it serves AMS"):
         asyncio.run(scan_routers(Station(), "", 0.5))
 
 
-def test_a_router_is_asked_for_a_route_from_the_nearest_address():
+def test_add_remote_route_uses_the_nearest_address():
     far, near = NeighbourScanner(address="192.168.7.1"), NeighbourScanner(address="10.0.0.1")
     wanted = RemoteRouteRequest("left", NetId.parse("10.0.0.1.1.1"), "me", "secret")
     told = add_remote_route(Station(far, near), wanted, IPv4Address("10.0.0.9"), 2.0)

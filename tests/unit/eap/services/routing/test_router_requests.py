@@ -81,7 +81,7 @@ def add_remote_route(questions, answers, **more):
     return play(questions, ask, answers, **more)
 
 
-def test_who_answers_is_found_once(questions):
+def test_scan_returns_each_answering_router_once(questions):
     def answers(number):
         version = (Tag.VERSION, b"\3\1\xb8\x0f")
         yield answer(number, MILL, (Tag.HOST, b"mi\x1bll\0"), version)
@@ -99,7 +99,7 @@ def test_who_answers_is_found_once(questions):
     assert all(taken)
 
 
-def test_what_nobody_asked_for_is_not_taken(questions):
+def test_requests_ignore_unmatched_datagrams(questions):
     def answers(number):
         yield answer(number ^ 1, MILL)
         yield answer(number, MILL, service=ADD_ROUTE)
@@ -111,14 +111,14 @@ def test_what_nobody_asked_for_is_not_taken(questions):
     assert not questions.receive(answer(0, MILL), THERE)  # too late
 
 
-def test_there_are_not_more_than_so_many(questions, monkeypatch):
+def test_scan_limits_the_number_of_routers(questions, monkeypatch):
     monkeypatch.setattr(module, "MAX_ROUTERS", 1)
     _, found, _ = scan(questions, lambda number: [answer(number, MILL), answer(number, SAW)])
     assert [each.net_id for each in found] == [MILL]
 
 
 @pytest.mark.parametrize("result", [0, 0x704])
-def test_a_route_is_asked_for_as_tools_do(questions, result):
+def test_add_remote_route_sends_the_datagram_of_tools(questions, result):
     tag = Tag.RESULT, result.to_bytes(4, "little")
     question, told, _ = add_remote_route(
         questions, lambda number: [answer(number, MILL, tag, service=ADD_ROUTE)]
@@ -134,7 +134,7 @@ def test_a_route_is_asked_for_as_tools_do(questions, result):
     }
 
 
-def test_only_who_was_asked_says_what_became_of_a_route(questions):
+def test_add_remote_route_ignores_answers_of_other_hosts(questions):
     def answers(number):
         yield answer(number, MILL, (Tag.RESULT, bytes(4)), service=ADD_ROUTE)
 
@@ -142,20 +142,20 @@ def test_only_who_was_asked_says_what_became_of_a_route(questions):
     assert told is None
 
 
-def test_who_listens_at_every_address_says_where_it_is_seen(questions):
+def test_add_remote_route_from_any_address_names_the_source_address(questions):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("0.0.0.0", 0))
         question, _, _ = add_remote_route(RouterRequests(sock, [OWN]), lambda number: [])
     assert decode_text(question.find(Tag.HOST)) == "127.0.0.1"
 
 
-def test_a_network_is_asked_at_its_broadcast_address(monkeypatch):
+def test_network_of_address_is_its_broadcast_address(monkeypatch):
     assert network_of("127.9.8.7") == "127.255.255.255"
     assert network_of("0.0.0.0") == "255.255.255.255"
     monkeypatch.setattr(module, "broadcast_of", lambda address: "")
     assert network_of("127.9.8.7") == "255.255.255.255"
 
 
-def test_who_cannot_be_asked_is_named(questions):
+def test_scan_send_error_names_the_target(questions):
     with pytest.raises(EnvironmentalError, match=r"no request to 203\.0\.113\.1 from 127\.0\.0"):
         asyncio.run(questions.scan("203.0.113.1", wait_s=0))
