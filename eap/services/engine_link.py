@@ -88,6 +88,7 @@ class EngineLink:
             self.post(request)
             answer = await self._wait(future, self._loop.time() + timeout_s)
         except (asyncio.CancelledError, EngineGoneError):
+            # An engine that does not read has no use for it; the first error is reported.
             with suppress(EngineGoneError):
                 self.post(Cancel(id=request.id))
             raise
@@ -126,6 +127,7 @@ class EngineLink:
             now_s = self._loop.time()
             if future.done():
                 return future.result()
+            # Any message proves that the engine lives: a slow request is no reason to give up.
             if now_s >= end_s or (pinged_s is not None and self.received_s < pinged_s):
                 raise EngineGoneError("the engine does not answer")
             pinged_s = now_s
@@ -136,19 +138,20 @@ class EngineLink:
         return self._last_id
 
     def _receive(self) -> None:
+        # A batch, because a busy bus must not keep the loop from all other tasks.
         for _ in range(_BATCH):
             try:
-                octets = self._socket.recv(_MAX_MESSAGE)
+                message = self._socket.recv(_MAX_MESSAGE)
             except OSError:
                 return
-            if not octets:  # the supervisor has closed both ends: this process ends too
+            if not message:  # the supervisor has closed both ends: this process ends too
                 self._loop.remove_reader(self._socket)
                 return
-            self._handle(octets)
+            self._handle(message)
 
-    def _handle(self, octets: bytes) -> None:
+    def _handle(self, data: bytes) -> None:
         try:
-            message = self._decoder.decode(octets)
+            message = self._decoder.decode(data)
         except msgspec.MsgspecError as exc:
             logger.warning("message of the engine dropped: %s", exc)
             return

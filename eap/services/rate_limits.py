@@ -84,8 +84,10 @@ class SourceRateLimiter:
         """Take a token for *source*; return whether its own limit and the common one allow it."""
         own = self._sources.get(source)
         if own is not None:
+            # In order of use, so that the first entry is the one silent for longest.
             self._sources.move_to_end(source)
             return own.take(now_s) and self._known.take(now_s)
+        # Before an entry is made: a flood from invented addresses must not evict known sources.
         if not self._new.take(now_s):
             return False
         if len(self._sources) >= self._max_sources:
@@ -148,6 +150,7 @@ class LimitedLogHandler(logging.StreamHandler[TextIO]):
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line, or count it."""
         cause: Hashable = getattr(record, "cause", None)
+        # Lines that no peer can cause are not limited.
         if cause is None:
             super().emit(record)
             return

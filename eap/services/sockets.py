@@ -203,6 +203,7 @@ class MailboxTransports:
         self._network = network
         self._links = links
         self._engine = engine
+        # One set of buffers for all UDP channels: only one of them is drained at a time.
         self._batch = ReceiveBatch()
         self._from_ns = monotonic_ns()
 
@@ -212,6 +213,7 @@ class MailboxTransports:
         sender = ChannelSender(channel)
         max_size = MAX_UDP_FRAME - FRAME_OVERHEAD
         for owner in shared.owners:
+            # A hub: a packet may leave by the transport that it came by, to another address.
             transport = Transport(f"udp:{owner.port}", max_size, is_hub=True)
             self._network.routers[owner.station].add_transport(transport, sender)
             self._watch_link(shared.address, owner, transport)
@@ -222,6 +224,7 @@ class MailboxTransports:
         """Open a multicast group; each owner gets all of its frames."""
         channel = self._channel(shared)
         sender = ChannelSender(channel)
+        # An intake for each owner, not a demultiplexer: all members of a group get the frame.
         for owner in shared.owners:
             self._add_intake([owner], channel, sender, lambda data: True)
         watch_channel(channel)
@@ -255,6 +258,8 @@ class MailboxTransports:
             mailbox = MailboxIntake(segment, gateway, sender, interface.is_for_many)
             first.mailbox = mailbox.receive
             for each in others:
+                # The first intake handles a frame for all ports of the VLAN; the others only
+                # count it at their stations.
                 each.mailbox = mailbox.drop_reason
             for owner, port in ports[vlan_id].items():
                 router = network.routers[owner.station]
@@ -300,6 +305,7 @@ class MailboxTransports:
         """Open the TCP port of one gateway."""
         count_dropped = self._network.drop_counter(_stations_of(shared))
         gateway = self._network.own_gateway("tcp", shared)
+        # Without stations: the port belongs to the gateway, which gets AoE too.
         streams = MailboxStreams(Demultiplexer([]), gateway, count_dropped, is_aoe_here=False)
         return self._tcp_transport(shared, (), count_dropped, streams)
 
@@ -380,6 +386,7 @@ class AmsTransports:
         )
         discovery.watch()
         for other in network.handover.sockets:
+            # A socket that is bound to a unicast address receives no broadcasts.
             is_broadcast = other.kind is SocketKind.AMS_BROADCAST
             is_same = is_broadcast and other.address == shared.address
             if is_same and other.services_fd != NO_DESCRIPTOR:
@@ -391,6 +398,7 @@ class AmsTransports:
         """Open the AMS/TCP listener of an address; all listeners of a station are one transport."""
         network, stations = self._network, _stations_of(shared)
         for station in stations:
+            # A station with several addresses has one transport for all of its clients.
             if station not in self._stations:
                 self._stations.add(station)
                 transport = Transport(AMS_TRANSPORT, is_stream=True, is_hub=True)

@@ -42,6 +42,7 @@ class TaskSet:
 
     def start_awaited(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         """Start a task whose result, or exception, is for those that await it."""
+        # The set holds the strong reference that the loop does not.
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -101,8 +102,10 @@ class JobQueue:
         finally:
             self._waiting -= 1
         task = self._tasks.start_awaited(job())
+        # Not this coroutine: it may be cancelled before the job ends.
         task.add_done_callback(lambda _: self._lock.release())
         try:
+            # Shielded: cancelling the client must not cancel a change that has begun.
             return await asyncio.shield(task)
         except asyncio.CancelledError:
             task.add_done_callback(self._log_failure)

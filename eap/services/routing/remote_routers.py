@@ -124,6 +124,7 @@ async def add_remote_route(
         EnvironmentalError: the station has no address to send from, or sending failed.
     """
     _check(station.scanners)
+    # The longest common prefix, as in a routing table.
     nearest = min(station.scanners, key=lambda each: int(each.address) ^ int(address))
     return await nearest.add_remote_route(wanted, str(address), wait_s=wait_s)
 
@@ -183,6 +184,7 @@ class RouterRequests:
 
         def receive(answer: Discovery, sender: str) -> None:
             net_id = answer.header.net_id
+            # A router also receives its own broadcasts; a zero NetID names no router.
             if any(net_id) and net_id not in self._own and len(found) < MAX_ROUTERS:
                 # The router itself answers first; later ones answer in its place.
                 found.setdefault(net_id, _router_of(answer, sender))
@@ -212,6 +214,7 @@ class RouterRequests:
         results: list[int] = []
 
         def receive(answer: Discovery, sender: str) -> None:
+            # Any host can send a datagram, but only the requested router knows the result.
             if sender == address:
                 results.append(int.from_bytes((answer.find(Tag.RESULT) or b"")[:4], "little"))
 
@@ -235,6 +238,7 @@ class RouterRequests:
         except CodecError:
             return False
         number = answer.header.invoke_id
+        # Some routers return 0 in place of the invoke id: then the service code alone decides.
         pending = [self._waiting.get(number)] if number else [*self._waiting.values()]
         found = [
             each
@@ -255,6 +259,7 @@ class RouterRequests:
         target: tuple[str, int],
         wait_s: float,
     ) -> None:
+        # Random, so that other hosts cannot guess it; 0 means no number.
         number = secrets.randbits(32) or 1
         header = DiscoveryHeader(0, number, request.service, self._net_id, SYSTEM_PORT)
         self._waiting[number] = request

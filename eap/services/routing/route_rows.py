@@ -74,6 +74,7 @@ class RouterView:
 
     def warnings(self) -> list[str]:
         """Return the warnings about the routes."""
+        # Cached: there may be 10,000 routes to compare.
         if self._version != self.router.table.version:
             self._version = self.router.table.version
             self._warnings = self.router.table.warnings(self.router.net_ids)[:MAX_WARNINGS]
@@ -175,6 +176,7 @@ def request_row(trace: Trace, now_ns: int) -> RequestRow:
         "source": f"{header.source}:{header.source_port}",
     }  # fmt: skip
     return RequestRow(
+        # Traces have the monotonic clock, which has no meaning outside this host.
         at=round(time() - (now_ns - trace.at_ns) / _S, 3),
         outcome=trace.outcome,
         came_by="" if trace.endpoint is None else str(trace.endpoint),

@@ -73,6 +73,7 @@ async def scan(station: TracedStation, known: Sequence[ScanTarget]) -> list[Stat
         station: Router that sends the requests.
         known: Stations to scan.
     """
+    # Bounded: the requests of all stations may share their first hop, and its limits.
     slots = asyncio.Semaphore(_MAX_CONCURRENT)
 
     async def scan_one(each: ScanTarget) -> StationEntry:
@@ -99,6 +100,7 @@ class _StationScan:
         try:
             async with asyncio.timeout(STATION_TIMEOUT_S):
                 ids = await self._read_io(0, "ids")
+                # The first number of the list is the count of the devices.
                 numbers = _numbers(ids)[1 : _MAX_PORTS + 1]
                 ports = [await self._port(place, number) for place, number in enumerate(numbers)]
         except (_FailedError, TimeoutError) as exc:
@@ -106,15 +108,16 @@ class _StationScan:
             reason = await find_fault(self._router, self._known.net_id, IO_PORT) or reason
             planned = [_planned_port(port) for port in self._planned.values()]
             return StationEntry(name, net_id, planned, reason)
+        # A stable sort: EAP ports first, each kind in the order of the station.
         ports.sort(key=lambda port: port.kind != "eap")
         return StationEntry(name, net_id, ports, "")
 
     async def _port(self, place: int, number: int) -> ScannedPort:
         """Return a port; *place* is its position in the list."""
-        octets = await self._read_io(number, "net_id")
+        data = await self._read_io(number, "net_id")
         type_number = int.from_bytes(await self._read_io(number, "type"), "little")
         kind = _KINDS.get(type_number, "other")
-        net_id = NetId(octets[:6].ljust(6, b"\0"))
+        net_id = NetId(data[:6].ljust(6, b"\0"))
         planned = self._planned.get(net_id)
         name = _text(await self._read_io(number, "name"))
         interface = planned.interface if planned else await self._interface(place)
@@ -193,12 +196,12 @@ def _state(octet: bytes) -> str | None:
     return state_name(number) if number else None
 
 
-def _text(octets: bytes) -> str:
-    text = octets.partition(b"\0")[0].decode("utf-8", "replace")
+def _text(data: bytes) -> str:
+    text = data.partition(b"\0")[0].decode("utf-8", "replace")
     return "".join(
         each if each.isprintable() else "?" for each in text
     )  # control characters would reach terminals
 
 
-def _numbers(octets: bytes) -> list[int]:
-    return [int.from_bytes(octets[at : at + 2], "little") for at in range(0, len(octets) - 1, 2)]
+def _numbers(data: bytes) -> list[int]:
+    return [int.from_bytes(data[at : at + 2], "little") for at in range(0, len(data) - 1, 2)]

@@ -119,6 +119,7 @@ class ServiceTable:
 
     def answer_now(self, header: AmsHeader, body: bytes) -> tuple[AmsAnswer, int] | None:
         """Return the immediate answer to a request and its time in nanoseconds, None if none."""
+        # getattr rather than a method of the protocol: most services have none.
         answer_now: AnswerNow | None = getattr(self.find(header), "answer_now", None)
         if answer_now is None:
             return None
@@ -189,12 +190,14 @@ class SerialQueues:
         queue = self._queues.get(key)
         if queue is None:
             answer = _begin(waiting)
+            # A task would only delay an answer that is available.
             if isinstance(answer, AmsAnswer):
                 self._finish(ticket, answer)
                 return
             self._queues[key] = queue = deque()
             self._octets += len(request.body)
             self._tasks.start(self._run(key, queue, waiting, answer))
+        # Refused at once, so that the client need not wait for its time-out.
         elif len(queue) >= MAX_WAITING or self._octets + len(request.body) > MAX_OCTETS:
             self._finish(ticket, _FULL)
         else:
@@ -288,6 +291,7 @@ class LocalClient:
     ) -> AmsAnswer:
         """Send a request; return the answer, or the error in its place."""
         number = next(self._numbers)
+        # A connection for each request keeps them out of each other's queue.
         connection = str(number)
         answer: asyncio.Future[AmsAnswer] = asyncio.get_running_loop().create_future()
         self._waiting[connection] = answer

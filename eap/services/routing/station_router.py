@@ -93,6 +93,7 @@ class RouterTimer:
 
         This is cheap: the exact due time is looked up then, and not for each packet.
         """
+        # Once for any number of packets: the due time is not computed for each of them.
         if self._is_soon or self._loop is None:
             return
         self._is_soon = True
@@ -148,6 +149,7 @@ def _cause(trace: Trace, host: str) -> tuple[Hashable, ...]:
     has causes of its own, whatever the connection and the AMS port of the client.
     """
     reason = reason_of(trace)
+    # One line for a dead hop, whatever the number of its clients and requests.
     if trace.outcome is Outcome.FAILED and trace.hop is not None:
         return trace.outcome, trace.hop, trace.error_code, reason
     header = trace.header
@@ -194,6 +196,7 @@ class StationRouter:
             net_id,
             self.table,
             [],
+            # Random, so that late answers to a previous process match no request of this one.
             first_invoke_id=int.from_bytes(os.urandom(4), "little"),
             limits=limits,
             hop_prober=HopProber(net_id, self.table),
@@ -388,6 +391,7 @@ class StationRouter:
         endpoint = Endpoint(transport, connection)
         if self._router.waiting(endpoint) < count:
             return
+        # An event for each reader rather than a condition: only readers that can go on are woken.
         event = asyncio.Event()
         self._below_waiters[endpoint] = count, event
         try:
@@ -431,6 +435,7 @@ class StationRouter:
         self, header: AmsHeader, body: bytes, endpoint: Endpoint
     ) -> tuple[AmsAnswer, int] | None:
         """Return the immediate answer of a service, unless the client has pending requests."""
+        # Requests of one client to one port are answered in their order.
         if self._queues.has_work(endpoint, header):
             return None
         return self._services.answer_now(header, body)

@@ -73,6 +73,7 @@ def to_endpoint(hop: HopSpec) -> Endpoint:
         ValueError: the address is not that of one station, or does not fit the transport.
     """
     if hop.kind is TransportKind.AMS_TCP:
+        # A transport for each peer, because each has a connection and a state of its own.
         return Endpoint(f"{hop.kind}:{hop.address}", hop.address)
     address = hop.address
     if hop.kind in _ADDRESSES:
@@ -87,6 +88,7 @@ def to_endpoint(hop: HopSpec) -> Endpoint:
 
 def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
     """Return the access rules of a station; first those that close unidirectional networks."""
+    # The first matching rule decides: no rule of the plant file can open such a network.
     closed = tuple(
         AccessRule(
             f"unidirectional of {spec.network}",
@@ -244,6 +246,7 @@ class StationRoutes:
         It expires after ten minutes, and configured or added routes have precedence.
         """
         found = self.router.table.find(net_id)
+        # A NetID proves nothing: an answer must not redirect packets of this station.
         if not self._spec.learns_from(address) or self.has(net_id.station):
             return False
         if found is not None:
@@ -257,6 +260,7 @@ class StationRoutes:
             hop,
             Origin.LEARNED,
             expires_at_ns=now_ns + LEARNED_NS,
+            # A router without a route back does not answer probes, and would be marked as down.
             is_probed=False,
         )
         return self.router.add_route(route)
@@ -304,6 +308,7 @@ class StationRoutes:
 
     async def _change(self, added: dict[RouteSpec, bool], gone: Sequence[RouteSpec]) -> None:
         kept = tuple(each for each, is_kept in added.items() if is_kept)
+        # Stored before it is in force: after a power failure the answer to the client stays true.
         await asyncio.to_thread(self._store.save, kept)
         self._added = added
         for each in gone:
@@ -322,6 +327,7 @@ class StationRoutes:
                 logger.warning("route %s of the plant file is left out: %s", spec.name, exc)
                 continue
             self._configured[route.key] = spec
+            # Adding a route again would close the connection to its hop and drop pending requests.
             if before.get(route.key) != spec:
                 self.router.add_route(route)
         for key in before.keys() - self._configured.keys():

@@ -51,6 +51,7 @@ class StationRouting:
         self._name = name
         self._store = store
         self._set_access = set_access
+        # The digest tells later whether the plant file was edited since.
         self._base = digest_of(routes.spec)
         self._applied = self._usable(store.read())
         self._jobs = JobQueue(f"routing of station {name}")

@@ -148,6 +148,7 @@ async def answer_hop_query(
     report = report_of(station.name, station.net_id, question.target, location, monotonic_ns())
     if not question.further or report.is_here or report.why or not report.next_net_id:
         return report
+    # Bounded, because each router on a loop would forward the query once more.
     further = min(question.further, MAX_FURTHER) - 1
     onward = HopQuestion(NetId.parse(report.target), question.port, further)
     operation = ReadWrite(IndexGroup.ROUTE_QUERY, 0, MAX_REPORT, onward.encode())
@@ -175,6 +176,7 @@ async def trace(
     began_ns = clock()
     answer = await run_operation(station, target, port, ReadState(), timeout_s)
     took_ns = clock() - began_ns
+    # Every other error comes from the target, so the path to it is complete.
     if answer.result not in _ON_THE_WAY:
         return TraceResult(tuple(hops), answer, took_ns, "")
     if why:
@@ -214,12 +216,12 @@ async def _follow(
             why = f"{report.station}: {report.why}"
             hops[-1] = Hop(report, took_ns)
         elif any(report.net_id == each.report.net_id for each in hops):
-            why = f"{report.station}: the routes run in a circle, it was on the way already"
+            why = f"{report.station}: the routes run in a circle; it is on the path already"
         else:
             why = f"{report.station}: {report.why}" if report.why else ""
             hops.append(Hop(report, took_ns))
         if len(hops) > MAX_FURTHER:
-            why = why or f"more than {MAX_FURTHER} routers, and no end of the way"
+            why = why or f"the path has more than {MAX_FURTHER} routers"
     return hops, why
 
 
@@ -235,7 +237,7 @@ def _explain(report: HopReport) -> str:
         text = AdsError.words_of(report.error)
         return f"{_next_name(report)}: it does not answer {report.station} at {where}: {text}"
     if report.error == AdsError.ACCESS_DENIED:
-        return f"{_next_name(report)}: its access rules let {report.station} ask nothing"
+        return f"{_next_name(report)}: its access rules deny queries of {report.station}"
     return ""
 
 
@@ -294,6 +296,7 @@ def _hop_query(request: LocalRequest) -> ReadWrite | None:
         operation, *others = parse_request(request.header.command, request.body).operations
     except (AdsRefusedError, ValueError):
         return None
+    # In a sum command the query is not supported; the system service rejects it.
     if others or not isinstance(operation, ReadWrite):
         return None
     return operation if operation.group == IndexGroup.ROUTE_QUERY else None
@@ -318,6 +321,7 @@ def find_target(router: StationRouter, directory: Directory, text: str) -> AmsAd
         if text == route.name and route.octets:
             return AmsAddress(route.net_id, SYSTEM_PORT)
     try:
+        # A NetID first: it needs no entry in the directory of the plant.
         if text.count(".") == 5 and ":" not in text and "/" not in text:
             return AmsAddress(NetId.parse(text), SYSTEM_PORT)
         return directory.find(text)

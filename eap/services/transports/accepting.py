@@ -194,6 +194,7 @@ class ListeningSocket(Generic[C]):
                 return True
             except OSError as exc:
                 return self._close_unused(exc)
+            # accept() does not inherit O_NONBLOCK on Linux.
             sock.setblocking(False)
             try:
                 connection = self._server.connection_from(sock, self._host_of(sock))
@@ -206,10 +207,12 @@ class ListeningSocket(Generic[C]):
 
     def _host_of(self, sock: socket.socket) -> str:
         if self._is_local:
+            # Clients of a Unix socket have no address; one process counts as one host.
             return f"process {process_of(sock)[0]}"
         return host_of(sock.getpeername()[0], sock.getsockname()[0])
 
     def _admit(self, connection: C, sock: socket.socket, group: asyncio.TaskGroup) -> None:
+        # Each connection needs one descriptor, and the process needs some for files and the audit.
         spare = spare_descriptors(sock.fileno(), self._reserve)
         refusal, victim = self._table.admit(
             self._listener, connection, monotonic_ns(), spare_descriptors=spare
@@ -239,6 +242,7 @@ class ListeningSocket(Generic[C]):
     def _close_unused(self, error: OSError) -> bool:
         """Close an unused connection to free a descriptor; return whether there was one."""
         logger.debug("%s: %s", self._listener.name, error)
+        # Without a free descriptor accept() fails until one is closed, and would spin.
         if error.errno not in OUT_OF_DESCRIPTORS:
             return False
         victim = self._table.shed(monotonic_ns())

@@ -88,6 +88,7 @@ class SubscriptionCounter:
         """Note a received request."""
         group = packet[_GROUP]
         if group in _ITEM_SIZES and packet[_COMMAND] == _READ_WRITE and len(self._sums) < _MAX_SUMS:
+            # The connection may carry requests of several clients: both addresses and the id.
             self._sums[packet[:16] + packet[_INVOKE_ID]] = group
 
     def note_answer(self, packet: bytes) -> None:
@@ -97,6 +98,7 @@ class SubscriptionCounter:
             count = int(_is_granted(packet))
             self._add(count if command == _ADD else -count)
         elif command == _READ_WRITE and self._sums:
+            # An answer has the addresses of its request swapped.
             key = packet[8:16] + packet[:8] + packet[_INVOKE_ID]
             group = self._sums.pop(key, b"")
             if group and _is_granted(packet):
@@ -138,8 +140,8 @@ class AmsWindow:
         self.requests += 1
         self._octets += size
         if command in _READS and size >= AmsHeader.SIZE + _LENGTH.size:
-            (asked,) = _LENGTH.unpack_from(packet, AmsHeader.SIZE)
-            self._octets += min(MAX_OCTETS, asked)
+            (requested,) = _LENGTH.unpack_from(packet, AmsHeader.SIZE)
+            self._octets += min(MAX_OCTETS, requested)
             if packet[_GROUP] in _ITEM_SIZES:
                 self.subscriptions.note_request(packet)
         return False
@@ -223,6 +225,7 @@ class ClientAddresses:
             number = next(self._numbers)
             suffix = _FIRST_SUFFIX + number % (_LAST_SUFFIX - _FIRST_SUFFIX + 1)
             high, low = divmod(suffix, 0x100)
+            # Only the last two bytes vary, so the rules for the client's network still match.
             net_id = NetId.parse(f"{host}.{high}.{low}")
             if not taken(net_id):
                 return net_id, _FIRST_PORT + number % (_LAST_PORT - _FIRST_PORT + 1)
@@ -342,6 +345,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         transport = self._transport
         if transport.is_closing():
             return "the connection was closed"
+        # pause_writing() alone bounds nothing: notifications come without requests.
         if self._is_blocked and transport.get_write_buffer_size() > MAX_UNSENT:
             if not self._is_ours:
                 self.close(CloseReason.OVERDUE)
@@ -448,19 +452,20 @@ class AmsConnection(asyncio.BufferedProtocol):
         else:
             self._handler.handle_packet(piece, self)
 
-    def _answer_client(self, asked: RouterRequest) -> None:
-        port = int.from_bytes(asked.data, "little")
+    def _answer_client(self, request: RouterRequest) -> None:
+        port = int.from_bytes(request.data, "little")
         if self._assign_address is None:
-            self._break_off("a router that asks for an address")
+            self._break_off("a router requests an address")
             return
         net_id, own_port = self._assign_address(self._address)
         self._net_id = net_id = self._net_id or net_id
-        if asked.command is RouterCommand.NET_ID:
+        if request.command is RouterCommand.NET_ID:
             self._transport.write(encode_net_id(net_id))
-        elif asked.command is RouterCommand.CLOSE_PORT:
+        elif request.command is RouterCommand.CLOSE_PORT:
             self._why = "the client closed its port"
             self._has_ended = True
             self._close_when_done()
+        # Port 0 requests any port; with another one the client would be a server.
         elif port:
             self._break_off(f"programs cannot serve AMS port {port} of a router")
         else:

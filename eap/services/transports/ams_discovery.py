@@ -108,6 +108,7 @@ class RouteAdmin:
         results = []
         for station in self._stations:
             wanted = _audited(station.router.net_id, question, sender, AdsError.NONE, "")
+            # Recorded before the change, because an audit that is required must not miss it.
             if why := station.router.why_not_recorded(wanted):
                 result = AdsError.ACCESS
             else:
@@ -118,6 +119,7 @@ class RouteAdmin:
             entry = _audited(station.router.net_id, question, sender, result, why)
             for write in station.router.on_audit:
                 write(entry)
+            # All stations decide, although only one answer is sent: the first error of them.
             results.append(result)
         return next((each for each in results if each != AdsError.NONE), AdsError.NONE)
 
@@ -217,6 +219,7 @@ async def _add(station: StationRoutes, wanted: _Request) -> None:
         name=wanted.name,
         net_id=str(wanted.net_id),
         hop=hop,
+        # A tool on this host shares the first four bytes with the station: match all six then.
         octets=len(wanted.net_id) if is_here else STATION_OCTETS,
         is_probed=False,  # most tools answer no requests
         is_client=True,
@@ -303,6 +306,7 @@ class AmsDiscovery:
                 return
             except OSError:
                 continue  # ICMP error of an earlier answer
+            # Both directions use port 48899, so answers to own requests arrive here too.
             if self._requests.receive(data, sender[0]):
                 continue
             self._tasks.start(self._answer(data, sender))

@@ -289,6 +289,7 @@ class AmsUplink(ReconnectingLink):
         """Send the packets that waited (PacketHandler)."""
         self._connection = connection
         self._was_open = True
+        # Packets wait only for the first connection; after a failure they are refused at once.
         early, self._early = self._early, None
         self._router.hop_up(*self._endpoint)
         if early:
@@ -323,6 +324,7 @@ class AmsUplink(ReconnectingLink):
         self._early = None
         self._router.hop_down(*self._endpoint, reason)
         if self._is_news(reason):
+            # A tool that added a route to itself often has no listener: no fault of the plant.
             if self._may_be_client() and not self._was_open:
                 text = "%s: %s; a client added the route to it, and does not listen"
                 logger.info(text, self._router.name, reason)
@@ -340,6 +342,7 @@ class AmsUplink(ReconnectingLink):
         except OSError as exc:
             return f"{self.peer.host}: no address: {exc.strerror or exc}"
         key = host, self.peer.port
+        # Two names of one peer: it would close the older of the two connections again and again.
         other = self._claims.setdefault(key, self)
         if other is not self:
             return f"{self.peer} is {other.peer}, to which there is a route: name both alike"
@@ -384,6 +387,7 @@ class AmsUplink(ReconnectingLink):
         finally:
             connection.close("the appliance ends")
         why = self._closed.result()
+        # A router without a route back closes each connection at once.
         if loop.time() - since < 1:
             return f"{self.peer} closes connections at once: it may have no route back ({why})"
         return f"{self.peer}: {why}"

@@ -114,6 +114,7 @@ class Demultiplexer:
         return packet
 
     def _find(self, header: AmsHeader, body: bytes) -> tuple[StationRouter, str]:
+        # Pending requests first: a forwarded answer has the NetID of its client as target.
         for station, transport in self._behind:
             if station.is_waiting_for(header, body, transport):
                 return station, transport

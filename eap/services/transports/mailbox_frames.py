@@ -88,6 +88,7 @@ class FrameIntake:
 
     def receive(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Handle, or count, one frame that arrived at *at_ns* on the monotonic clock."""
+        # The timestamp of the kernel, because the socket outlives this process.
         if at_ns < self._from_ns:
             reason: DropReason | None = DropReason.STALE
         elif size < EtherCatHeader.SIZE:
@@ -220,6 +221,7 @@ class FrameCounters:
 
     def frame(self, peer: str, packet: bytes) -> bytes:
         """Return the frame of *packet* to *peer*."""
+        # pop() moves the peer to the end, so that the first entry is the one unused for longest.
         counter = next_counter(self._latest.pop(peer, 0))
         self._latest[peer] = counter
         if len(self._latest) > _MAX_PEERS:
@@ -310,15 +312,16 @@ class ChannelSender:
         for frame in frames:
             buffer = bytearray(header + frame)
             if len(buffer) < self._channel.minimum_size:
+                # Ethernet pads short frames; the Length of the EtherCAT header tells the end.
                 buffer += bytes(self._channel.minimum_size - len(buffer))
             sent.append(OutFrame(buffer, len(header), connection))
         failed = self._channel.send(sent, monotonic_ns())
         return "the network took no frame" if failed else None
 
 
-ASK_NS = 1_000_000_000
+QUERY_NS = 1_000_000_000
 """Time between two queries for a NetID without answer."""
-ASK_AGAIN_NS = 30_000_000_000
+QUERY_KNOWN_NS = 30_000_000_000
 """Time between two queries for a NetID with a known MAC address."""
 
 
@@ -346,16 +349,16 @@ class EthernetSegment:
         self._learn(data, connection)
         self._demultiplexer.receive(data, connection, is_broadcast=is_broadcast)
 
-    def find(self, net_id: NetId, now_ns: int, ask: Callable[[], object]) -> str:
-        """Return the MAC address of a NetID, empty while unknown; *ask* when a query is due."""
+    def find(self, net_id: NetId, now_ns: int, query: Callable[[], object]) -> str:
+        """Return the MAC address of a NetID, empty while unknown; call *query* when it is due."""
         if self._demultiplexer.has(net_id):
             self._demultiplexer.set_hop_connection(str(net_id), self.mac)
             return self.mac
         place = self._resolutions.get(net_id, _Resolution("", None))
-        pause_ns = ASK_AGAIN_NS if place.mac else ASK_NS
+        pause_ns = QUERY_KNOWN_NS if place.mac else QUERY_NS
         if place.asked_at_ns is None or now_ns - place.asked_at_ns >= pause_ns:
             self._resolutions[net_id] = place._replace(asked_at_ns=now_ns)
-            ask()
+            query()
         return place.mac
 
     def _learn(self, data: bytes, mac: str) -> None:
@@ -366,6 +369,7 @@ class EthernetSegment:
         except CodecError:
             return
         place = self._resolutions.get(header.source)
+        # Only an answer to the own query is evidence of a MAC address.
         if place is None or header.target_port != PROBE_PORT or not _is_response(header):
             return
         if place.mac != mac and self._demultiplexer.has(header.target):
@@ -392,7 +396,7 @@ class SegmentSender:
         mac = connection
         if ":" not in connection:
             net_id = NetId.parse(connection)
-            mac = self._segment.find(net_id, monotonic_ns(), lambda: self._ask(net_id))
+            mac = self._segment.find(net_id, monotonic_ns(), lambda: self._query(net_id))
         if not mac:
             return "its MAC address is not known yet"
         if mac != self._segment.mac:
@@ -402,7 +406,7 @@ class SegmentSender:
             loop.call_soon(self._segment.receive, packet, mac)
         return None
 
-    def _ask(self, net_id: NetId) -> None:
+    def _query(self, net_id: NetId) -> None:
         question = AmsHeader(
             net_id, DEVICE_PORT, self._net_id, PROBE_PORT, AmsCommand.READ_STATE
         ).encode()

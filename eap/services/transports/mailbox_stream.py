@@ -170,6 +170,7 @@ class _StreamUplink(ReconnectingLink):
         """Mark the hop as down, unless no answer is pending (ReconnectingLink)."""
         del has_lasted
         self._forget()
+        # A peer may close an idle connection; the next request opens it again.
         if not reason and not self._hops.is_awaited(self._address):
             return False
         self._hops.hop_down(self._address, reason or "the connection was closed")
@@ -322,10 +323,12 @@ class MailboxStreams:
         """Handle frames until the end, or until an invalid one."""
         while True:
             try:
+                # The first byte starts the time limit of a frame; silence before it may last.
                 head = await reader.readexactly(1)
                 connection.note_partial()
                 head += await reader.readexactly(EtherCatHeader.SIZE - 1)
                 header = EtherCatHeader.decode(head)
+                # A stream has no boundaries to resume at after an invalid header.
                 if header.type != FrameType.MAILBOX or header.length < MailboxHeader.SIZE:
                     self._count_dropped(DropReason.TCP_TYPE)
                     return
@@ -436,6 +439,7 @@ async def _first_type(connection: StreamConnection, sock: socket.socket) -> int:
     """
     while True:
         await wait_readable(sock)
+        # Peeked, because the descriptor may go to the engine, which reads the whole frame.
         head = sock.recv(EtherCatHeader.SIZE, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         if not head:
             raise ConnectionError("closed before the first frame")

@@ -97,6 +97,7 @@ class MqttTransport:
         )
         self._timer: asyncio.TimerHandle | None = None
         self._due_ns: int | None = None
+        # Shared: all routers of the network are behind one connection to the broker.
         router.add_transport(Transport(self.name, is_shared=True, is_hub=True), self)
         router.hop_down(self.name, None, "not connected to its broker yet")
 
@@ -135,6 +136,7 @@ class MqttTransport:
         for action in actions:
             self._do(action)
         due_ns = self._network.next_timeout()
+        # Most messages leave the next due time unchanged.
         if due_ns == self._due_ns:
             return
         self._due_ns = due_ns

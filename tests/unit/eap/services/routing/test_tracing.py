@@ -150,7 +150,7 @@ def test_trace_names_a_loop() -> None:
     line.add(3, to(1), to(9, 1))
     traced = follow(first, NetId.parse("5.1.1.9.3.1"))
     assert names(traced) == ["island-01", "island-02", "island-03"]
-    assert traced.why == "island-01: the routes run in a circle, it was on the way already"
+    assert traced.why == "island-01: the routes run in a circle; it is on the path already"
 
 
 def test_trace_router_of_another_make_is_opaque_and_target_is_read() -> None:

@@ -112,11 +112,11 @@ def test_segment_repeats_its_query(scene, monkeypatch):
     monkeypatch.setattr(segment_module, "monotonic_ns", lambda: now[0])
     assert len(forward(scene, 1)) == 1
     assert len(forward(scene, 2)) == 0
-    now[0] += segment_module.ASK_NS
+    now[0] += segment_module.QUERY_NS
     assert len(forward(scene, 3)) == 1
     scene.answer(PEER)
     assert [where for where, _ in forward(scene, 4)] == [PEER]
-    now[0] += segment_module.ASK_AGAIN_NS
+    now[0] += segment_module.QUERY_KNOWN_NS
     assert [where for where, _ in forward(scene, 5)] == [str(EAP_MULTICAST_MAC), PEER]
     scene.answer(OTHER)
     assert [where for where, _ in forward(scene, 6)] == [OTHER]
