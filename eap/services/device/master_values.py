@@ -1,9 +1,9 @@
-"""The dictionary of a master, for its mailbox gateway and for ADS (ETG.1510).
+"""Dictionary of a master, for its mailbox gateway and for ADS (ETG.1510).
 
-Reading an entry cannot wait for the bus, so a server of the dictionary brings up to date what an
-object shows before it reads it.  Slaves and their states come from the view of the bus, counters
-and registers from requests that are repeated after FRESH_S at the earliest.  What the bus counts
-and loses between two requests is not seen.
+Reading an entry cannot wait for the bus, so a server of the dictionary refreshes the values behind
+an object before it reads the object.  Slaves and their states come from the view of the bus.
+Counters, registers and objects of slaves are cached values with an age up to which they are shown;
+events of the bus between two reads of them are not seen.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ import asyncio
 import logging
 import math
 import os
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
+from itertools import islice
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from devicebus.errors import AlStatusError
@@ -88,7 +90,9 @@ class MasterDictionaryProvider:
         padded: Likewise.
 
     Attributes:
-        dictionary: To be served after :meth:`refresh`.
+        dictionary: To be served after :attr:`refresh`.
+        refresh: Refreshes the values that the object at an index shows.
+        is_fresh: Returns whether the object at an index may be read at once.
     """
 
     def __init__(
@@ -99,25 +103,18 @@ class MasterDictionaryProvider:
         full: bool = False,
         padded: bool = False,
     ) -> None:
-        self._values = MasterView(bus)
+        view = MasterView(bus)
+        self.refresh, self.is_fresh = view.refresh, view.is_fresh
         identity = DeviceIdentity(
             device_name=f"EtherCAT master {bus.name}",
             hardware_version=os.uname().machine,
             software_version=release,
         )
-        self.dictionary = MasterDictionary(self._values, identity, full=full, padded=padded)
-
-    async def refresh(self, index: int) -> None:
-        """Bring what the object at *index* shows up to date."""
-        await self._values.refresh(index)
-
-    def is_fresh(self, index: int) -> bool:
-        """Return whether what the object at *index* shows may be read at once."""
-        return self._values.is_fresh(index)
+        self.dictionary = MasterDictionary(view, identity, full=full, padded=padded)
 
 
-class AgedValue(Generic[T]):
-    """A value that is read again when it is older than its user wants.
+class CachedValue(Generic[T]):
+    """A value that is read again when it is older than its user allows.
 
     Args:
         read: Reads it.
@@ -131,6 +128,7 @@ class AgedValue(Generic[T]):
 
     def is_younger(self, age_s: float) -> bool:
         """Return whether it was read within *age_s*."""
+        # Never read and any age allowed is NaN here, which compares as too old.
         return asyncio.get_running_loop().time() < self._read_s + age_s
 
     async def refresh(self, age_s: float) -> None:
@@ -145,7 +143,7 @@ class AgedValue(Generic[T]):
 
 
 class SlaveFacts(NamedTuple):
-    """Objects of a slave that the dictionary repeats; 0 for one that does not answer soon."""
+    """Objects of a slave that the dictionary repeats; 0 for one that does not answer in time."""
 
     device_type: int = 0
     has_history: bool = False
@@ -160,13 +158,20 @@ class Detection(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """Frames in a second, and the counts from which the next ones are worked out."""
+    """Frames in a second, and the counts from which the next rates are computed."""
 
     at_s: float = 0.0
     cycles: int = 0
     frames: int = 0
     cyclic: int = 0
     acyclic: int = 0
+
+
+class BusCounters(NamedTuple):
+    """Counters of the bus, and rates since an earlier report."""
+
+    report: BusReport = BusReport(is_up=False)
+    rates: Rates = Rates()
 
 
 class MasterView:
@@ -180,11 +185,11 @@ class MasterView:
         self._bus = bus
         self._view = bus.view
         self._view.on_change.append(self._forget_facts)
-        self._counters = AgedValue(self._read_counters, BusReport(is_up=False))
-        self._registers = AgedValue(self._read_registers, dict[int, SlaveRegisters]())
-        self._facts: dict[int, SlaveFacts] = {}
+        self._counters = CachedValue(self._read_counters, BusCounters())
+        self._registers = CachedValue(self._read_registers, dict[int, SlaveRegisters]())
+        self._facts: dict[int, CachedValue[SlaveFacts]] = {}
+        """By station address, as long as the slave answers."""
         self._detection = Detection()
-        self._rates = Rates()
         self._codes: dict[int, int] = {}
         """AL status codes that were seen last."""
         self._requested: dict[int, int] = {}
@@ -197,28 +202,29 @@ class MasterView:
         self._tasks = TaskSet(f"dictionary of the master of {bus.name}")
 
     async def refresh(self, index: int) -> None:
-        """Bring what the object at *index* shows up to date; a bus that is down has no slaves."""
+        """Refresh what the object at *index* shows; a bus that is down has no slaves."""
         if self.is_fresh(index):
             return
         async with self._lock:
             with suppress(EapError):
                 await self._view.current()
-            if index in _OF_COUNTERS:
-                await self._counters.refresh(FRESH_S)
-            if index in _OF_REGISTERS:
-                await self._registers.refresh(_register_age_s(index))
-            slave = self._without_facts(index)
-            if slave is not None:
-                self._facts[slave.station] = await self._read_facts(slave)
+            for value, age_s in self._values_behind(index):
+                await value.refresh(age_s)
 
     def is_fresh(self, index: int) -> bool:
         """Return whether :meth:`refresh` has nothing to do."""
-        return (
-            self._view.is_current
-            and (index not in _OF_COUNTERS or self._counters.is_younger(FRESH_S))
-            and (index not in _OF_REGISTERS or self._registers.is_younger(_register_age_s(index)))
-            and self._without_facts(index) is None
+        return self._view.is_current and all(
+            value.is_younger(age_s) for value, age_s in self._values_behind(index)
         )
+
+    def _values_behind(self, index: int) -> Iterator[tuple[CachedValue[Any], float]]:
+        """Yield the cached values that the object at *index* shows, with their greatest ages."""
+        if index in _OF_COUNTERS:
+            yield self._counters, FRESH_S
+        if index in _OF_REGISTERS:
+            yield self._registers, LINKS_FRESH_S if index in _OF_CONFIGURED else FRESH_S
+        if index in _OF_CONFIGURED and (facts := self._facts_at(index)) is not None:
+            yield facts, math.inf
 
     @property
     def slaves(self) -> Mapping[int, SlaveDescription]:
@@ -241,8 +247,9 @@ class MasterView:
         slave = self.slaves.get(station)
         if slave is None:
             return "" if key in _TEXTS else 0
-        facts = self._facts.get(station, SlaveFacts())
-        return configured_value(slave, self._registers_of(station).dl, facts, key)
+        facts = self._facts.get(station)
+        value = SlaveFacts() if facts is None else facts.value
+        return configured_value(slave, self._registers_of(station).dl, value, key)
 
     def of_detected(self, station: int, key: MasterLive) -> Any:
         """Return the value of *key* for a slave that was found."""
@@ -276,6 +283,7 @@ class MasterView:
 
     def of_master(self, key: MasterLive) -> Any:
         """Return the value of *key* for the master itself."""
+        rates = self._counters.value.rates
         status, count = self._detection.status, len(self._detection.slaves or ())
         count = count if status == _DONE else 0
         return {
@@ -284,8 +292,8 @@ class MasterView:
             MasterLive.DETECT_RESPONSE: bytes((status, 0, 0, 0)) + count.to_bytes(2, "little"),
             MasterLive.LOST_CYCLIC: self._since_reset(0, MasterLive.LOST_CYCLIC),
             MasterLive.LOST_ACYCLIC: self._since_reset(0, MasterLive.LOST_ACYCLIC),
-            MasterLive.RATE_CYCLIC: self._rates.cyclic,
-            MasterLive.RATE_ACYCLIC: self._rates.acyclic,
+            MasterLive.RATE_CYCLIC: rates.cyclic,
+            MasterLive.RATE_ACYCLIC: rates.acyclic,
             MasterLive.STATE: max((slave.state for slave in self.slaves.values()), default=1) or 1,
             MasterLive.RESET: False,
         }.get(key, 0)
@@ -319,14 +327,16 @@ class MasterView:
     def _registers_of(self, station: int) -> SlaveRegisters:
         return self._registers.value.get(station, SlaveRegisters())
 
-    def _without_facts(self, index: int) -> SlaveDescription | None:
-        """Return the configured slave at *index* if its objects are to be read first."""
-        number = index - CONFIGURED.first
-        if index not in _OF_CONFIGURED or number >= len(self.slaves):
+    def _facts_at(self, index: int) -> CachedValue[SlaveFacts] | None:
+        """Return the objects of the configured slave at *index*, None for one without CoE."""
+        slave = next(islice(self.slaves.values(), index - CONFIGURED.first, None), None)
+        if slave is None or not (slave.to_slave and slave.protocols & SiiProtocol.COE):
             return None
-        slave = list(self.slaves.values())[number]
-        has_coe = bool(slave.to_slave and slave.protocols & SiiProtocol.COE)
-        return slave if has_coe and slave.station not in self._facts else None
+        facts = self._facts.get(slave.station)
+        if facts is None:
+            read = partial(self._read_facts, slave.station)
+            facts = self._facts[slave.station] = CachedValue(read, SlaveFacts())
+        return facts
 
     def _forget_facts(self) -> None:
         """Forget the objects of slaves that do not answer: others may come in their place."""
@@ -334,28 +344,29 @@ class MasterView:
             if not slave.state:
                 self._facts.pop(station, None)
 
-    async def _read_facts(self, slave: SlaveDescription) -> SlaveFacts:
+    async def _read_facts(self, station: int) -> SlaveFacts:
         with suppress(EapError, TimeoutError):
             async with asyncio.timeout(FACTS_ANSWER_S):
                 return await self._bus.converse(
-                    slave.station, _query_facts(), requester="dictionary of the master"
+                    station, _query_facts(), requester="dictionary of the master"
                 )
         return SlaveFacts()
 
-    async def _read_counters(self) -> BusReport:
+    async def _read_counters(self) -> BusCounters:
         try:
             report = await self._bus.describe()
         except EapError:
             report = BusReport(is_up=False)
-        now_s, last = asyncio.get_running_loop().time(), self._rates
+        now_s, last = asyncio.get_running_loop().time(), self._counters.value.rates
+        rates = last
         if not last.at_s or report.cycles < last.cycles:
-            self._rates = Rates(now_s, report.cycles, report.frames_sent)
+            rates = Rates(now_s, report.cycles, report.frames_sent)
         elif now_s - last.at_s >= _RATE_S:
             cyclic = (report.cycles - last.cycles) / (now_s - last.at_s)
             others = (report.frames_sent - last.frames) / (now_s - last.at_s) - cyclic
-            rates = round(cyclic), max(0, round(others))
-            self._rates = Rates(now_s, report.cycles, report.frames_sent, *rates)
-        return report
+            per_s = round(cyclic), max(0, round(others))
+            rates = Rates(now_s, report.cycles, report.frames_sent, *per_s)
+        return BusCounters(report, rates)
 
     async def _read_registers(self) -> dict[int, SlaveRegisters]:
         if not self.slaves:
@@ -385,7 +396,7 @@ class MasterView:
     def _counter(self, station: int, key: MasterLive) -> int:
         if key in _CRCS:
             return self._registers_of(station).errors[_CRCS.index(key)]
-        slave, counters = self.slaves.get(station), self._counters.value
+        slave, counters = self.slaves.get(station), self._counters.value.report
         if slave is not None:
             return slave.losses if key is MasterLive.ABSENCES else slave.departures
         if key is MasterLive.WKC_ERRORS:
@@ -479,10 +490,6 @@ def _detected_value(found: DetectedSlave, key: MasterLive) -> int:
         MasterLive.SERIAL: identity.serial,
         MasterLive.DL_STATUS: found.dl_word,
     }.get(key, 0)
-
-
-def _register_age_s(index: int) -> float:
-    return LINKS_FRESH_S if index in _OF_CONFIGURED else FRESH_S
 
 
 def _query_facts() -> Conversation[SlaveFacts]:

@@ -38,8 +38,8 @@ from eap.services.gateway.sessions import MasterSession, cause_of, text_of
 from eap.services.slaves.access import RemoteAccessError, SlaveAccess
 
 DialectTarget: TypeAlias = SlaveAccess | MasterSession
-FindTarget: TypeAlias = Callable[[], Awaitable[DialectTarget | Cause]]
-"""Returns a slave or the master, or why it cannot be reached."""
+FindTarget: TypeAlias = Callable[[], Awaitable[DialectTarget]]
+"""Returns a slave or the master; raises GatewayError if it cannot be reached."""
 
 _LONGEST_HEAD = CoeHeader.SIZE + SdoHeader.SIZE
 """Octets in front of what was read, in any protocol."""
@@ -118,10 +118,11 @@ class DialectHandler:
         try:
             if not decision.is_allowed:
                 raise _dialect_error(GatewayError(denial_cause(decision)))
-            subject = await find()
-            if isinstance(subject, Cause):
-                raise _dialect_error(GatewayError(subject))
-            data = await self._perform(task, subject)
+            try:
+                target_access = await find()
+            except GatewayError as exc:
+                raise _dialect_error(exc) from None
+            data = await self._perform(task, target_access)
             result = 0
         finally:
             self._admission.record(endpoint, target, operation, decision, result)

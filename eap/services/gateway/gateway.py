@@ -40,6 +40,7 @@ from eap.gateway.requests import (
     MASTER_ADDRESS,
     AddressMap,
     Destination,
+    GatewayError,
     GroupAddress,
     MasterAddress,
     RemoteAddress,
@@ -282,8 +283,12 @@ class MailboxGateway:
         target = self._target(destination)
         authorized = self._decide(endpoint, station, target, operation, by_rule=is_group)
         if authorized.is_allowed:
-            is_step = operation is None
-            replies = await self._forward(request, destination, station, is_step=is_step)
+            try:
+                replies = await self._forward(
+                    request, destination, station, is_step=operation is None
+                )
+            except GatewayError as exc:
+                replies = error_replies(kind, body, exc.cause)
         else:
             replies = error_replies(kind, body, denial_cause(authorized.decision))
         self._finish(request, authorized, address, replies, start_ns)
@@ -303,7 +308,7 @@ class MailboxGateway:
                 begin = partial(self._begin, key, self._open_remote(destination), sizes)
                 return await self._slaves.get(key, begin).handle(body, is_step=is_step)
             case GroupAddress():  # a group within a group
-                return error_replies(kind, body, Cause.NO_SLAVE)
+                raise GatewayError(Cause.NO_SLAVE)
 
     def _decide(
         self,
@@ -350,11 +355,7 @@ class MailboxGateway:
     ) -> list[GatewayReply]:
         kind, body, station = key.kind, request.body, key.address
         slave = await self._find(station)
-        if isinstance(slave, Cause):
-            return error_replies(kind, body, slave)
-        cause = check_slave(kind, body, slave)
-        if cause is not None:
-            return error_replies(kind, body, cause)
+        check_slave(kind, body, slave)
         if kind is MailboxType.EOE:
             address, now_ns = request.header.address, monotonic_ns()
             self._listeners.add(station, request.endpoint, address, request.send, now_ns)
@@ -375,8 +376,8 @@ class MailboxGateway:
             return tuple(bus.slaves) if bus.is_up else ()
         return ()
 
-    async def _find(self, station: int) -> SlaveDescription | Cause:
-        """Return a slave, or why it cannot be reached."""
+    async def _find(self, station: int) -> SlaveDescription:
+        """Return a slave; raise GatewayError if it cannot be reached."""
         try:
             bus = await self._bus.view.current()
             slave = bus.slaves.get(station)
@@ -384,8 +385,12 @@ class MailboxGateway:
                 # Clients that have just seen a slave come to PREOP send their requests at once.
                 bus = await self._bus.view.confirm()
         except EngineGoneError:
-            return Cause.BUS_DOWN
-        return bus.slaves.get(station, Cause.NO_SLAVE) if bus.is_up else Cause.BUS_DOWN
+            raise GatewayError(Cause.BUS_DOWN) from None
+        if not bus.is_up:
+            raise GatewayError(Cause.BUS_DOWN)
+        if (found := bus.slaves.get(station)) is None:
+            raise GatewayError(Cause.NO_SLAVE)
+        return found
 
     def _begin_local(self, key: SessionKey, slave: SlaveDescription) -> ClientSession:
         sizes = MailboxSizes(slave.to_slave, slave.to_master)
@@ -436,7 +441,7 @@ class MailboxGateway:
 
     async def _dialect_target(
         self, kind: MailboxType, destination: Destination, endpoint: Endpoint
-    ) -> DialectTarget | Cause:
+    ) -> DialectTarget:
         match destination:
             case MasterAddress():
                 return self._open_master()
@@ -444,18 +449,16 @@ class MailboxGateway:
                 return self._open_remote(destination)
             case SlaveAddress(station):
                 slave = await self._find(station)
-                if isinstance(slave, Cause):
-                    return slave
-                return check_slave(kind, b"", slave) or self._open_local(slave, endpoint)
-        return Cause.NO_SLAVE
+                check_slave(kind, b"", slave)
+                return self._open_local(slave, endpoint)
+        raise GatewayError(Cause.NO_SLAVE)
 
 
-def check_slave(kind: MailboxType, body: bytes, slave: SlaveDescription) -> Cause | None:
-    """Return why a request does not even go to the slave that it is for."""
+def check_slave(kind: MailboxType, body: bytes, slave: SlaveDescription) -> None:
+    """Raise GatewayError if a request cannot be sent to the slave at all."""
     if not slave.to_slave:
-        return cause_of(no_mailbox(slave))
+        raise GatewayError(cause_of(no_mailbox(slave)))
     if not slave.protocols & SiiProtocol[kind.name]:
-        return Cause.NO_PROTOCOL
+        raise GatewayError(Cause.NO_PROTOCOL)
     if len(body) + MailboxHeader.SIZE > slave.to_slave:
-        return Cause.TOO_LONG
-    return None
+        raise GatewayError(Cause.TOO_LONG)

@@ -263,12 +263,18 @@ def test_cause_of_an_error(error: EapError, cause: Cause) -> None:
     assert cause_of(error) is cause
 
 
-def test_find_refusal_of_what_does_not_even_go_to_the_slave() -> None:
-    assert check_slave(COE, bytes(58), SLAVE) is None
-    assert check_slave(COE, bytes(59), SLAVE) is Cause.TOO_LONG
-    assert check_slave(SOE, b"", SLAVE) is Cause.NO_PROTOCOL
+def refused(kind: MailboxType, body: bytes, slave: SlaveDescription) -> Cause:
+    with pytest.raises(GatewayError) as caught:
+        check_slave(kind, body, slave)
+    return caught.value.cause
+
+
+def test_check_slave_names_the_cause_of_a_request_that_cannot_be_sent() -> None:
+    check_slave(COE, bytes(58), SLAVE)
+    assert refused(COE, bytes(59), SLAVE) is Cause.TOO_LONG
+    assert refused(SOE, b"", SLAVE) is Cause.NO_PROTOCOL
     closed = replace(SLAVE, to_slave=0, to_master=0)
-    assert check_slave(COE, b"", closed) is Cause.NO_MAILBOX
+    assert refused(COE, b"", closed) is Cause.NO_MAILBOX
 
 
 # Tables of sessions

@@ -34,6 +34,7 @@ from eap.gateway.dialect import (
     WriteSdo,
 )
 from eap.gateway.error_table import Cause
+from eap.gateway.requests import GatewayError
 from eap.ids import NetId
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
@@ -240,7 +241,7 @@ def test_dialect_request_that_is_refused_reaches_nothing() -> None:
     station = Station(b"abcd")
     reached: list[bool] = []
 
-    async def find() -> DialectTarget | Cause:
+    async def find() -> DialectTarget:
         reached.append(True)
         return station.link()
 
@@ -262,8 +263,8 @@ def test_dialect_request_that_is_refused_reaches_nothing() -> None:
 
 
 def test_dialect_slave_that_cannot_be_reached() -> None:
-    async def find() -> DialectTarget | Cause:
-        return Cause.NO_SLAVE
+    async def find() -> DialectTarget:
+        raise GatewayError(Cause.NO_SLAVE)
 
     body = bytes.fromhex("0020 40 1810 01 0000")
     answer, cause = asyncio.run(handler().answer(MailboxType.COE, body, HERE, BUS, find))
