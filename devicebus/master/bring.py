@@ -83,7 +83,11 @@ def set_watchdog(station: int, timeout_ms: int) -> Procedure[None]:
 
 T = TypeVar("T")
 
-_POLL_NS = 100_000
+# A message of a conversation takes about a cycle.  Checks every 100 µs resumed the procedures of
+# 200 slaves 770,000 times during one start-up.
+_FIRST_PAUSE_NS = 100_000
+_MAX_PAUSE_NS = 2_000_000
+"""Pause between two checks of a task; it doubles from the first to this."""
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
@@ -138,8 +142,10 @@ def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedur
 
 def wait_for(task: Task[T]) -> Procedure[T]:
     """Wait within a procedure for another task; return its result."""
+    pause_ns = _FIRST_PAUSE_NS
     while not task.is_done:
-        yield Sleep(_POLL_NS)
+        yield Sleep(pause_ns)
+        pause_ns = min(2 * pause_ns, _MAX_PAUSE_NS)
     return task.result()
 
 
