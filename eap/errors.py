@@ -12,7 +12,7 @@ EapError
 │   ├── EngineGoneError     nobody runs the cycle any more
 │   ├── TornReadError       a writer stopped in the middle of writing
 │   └── WriterConflictError somebody else owns what was to be written
-├── EngineRefusedError      the engine goes on with what it ran before
+├── EngineRefusedError      the engine continues with what it ran before
 └── ControlError            a running appliance refused a request
 """
 
@@ -81,7 +81,7 @@ class WriterConflictError(ImageError):
 
 
 class EngineRefusedError(EapError):
-    """The engine does not do what it was asked for, and goes on as before; the text says why."""
+    """The engine does not do what it was asked for, and continues as before; the text says why."""
 
 
 class ControlError(EapError):

@@ -9,17 +9,17 @@ from typing import NamedTuple, Self
 from urllib.parse import parse_qsl, urlencode
 
 STATION_OCTETS = 4
-"""Octets that all NetIDs of a station usually have in common."""
+"""Bytes that all NetIDs of a station usually have in common."""
 
 
 class NetId(bytes):
-    """An AMS NetID: six octets, written ``5.23.91.23.1.1``.  Not an IP address."""
+    """An AMS NetID: six bytes, written ``5.23.91.23.1.1``.  Not an IP address."""
 
     __slots__ = ()
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read the dotted form; raise ValueError if it is not six octets."""
+        """Read the dotted form; raise ValueError if it is not six bytes."""
         octets = text.split(".")
         if len(octets) != 6 or not all(part.isascii() and part.isdigit() for part in octets):
             raise ValueError(f"{text!r} is not an AMS NetID (six numbers such as 5.23.91.23.1.1)")
@@ -30,7 +30,7 @@ class NetId(bytes):
 
     @property
     def station(self) -> bytes:
-        """The octets that it has in common with all others of its station, usually."""
+        """The bytes that it has in common with all others of its station, usually."""
         return self[:STATION_OCTETS]
 
     def __str__(self) -> str:
@@ -63,13 +63,13 @@ _MAC = re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}")
 
 
 class MacAddr(bytes):
-    """An Ethernet address: six octets, written ``01:01:05:04:00:00``."""
+    """An Ethernet address: six bytes, written ``01:01:05:04:00:00``."""
 
     __slots__ = ()
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read the form with colons or dashes; raise ValueError if it is not six octets."""
+        """Read the form with colons or dashes; raise ValueError if it is not six bytes."""
         if not _MAC.fullmatch(text):
             raise ValueError(
                 f"{text!r} is not a MAC address (six octets such as 01:01:05:04:00:00)"
@@ -78,7 +78,7 @@ class MacAddr(bytes):
 
     @property
     def is_group(self) -> bool:
-        """Whether this is a multicast or the broadcast address."""
+        """True if this is a multicast or the broadcast address."""
         return bool(self[0] & 1)
 
     def __str__(self) -> str:
@@ -188,7 +188,7 @@ class Destination(NamedTuple):
 
     @property
     def is_group(self) -> bool:
-        """Whether more than one station may listen there (multicast, or 255.255.255.255)."""
+        """True if more than one station may listen there (multicast, or 255.255.255.255)."""
         if self.kind is DestinationKind.MAC:
             return MacAddr.parse(self.host).is_group
         if self.kind is DestinationKind.NET_ID:

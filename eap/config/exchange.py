@@ -154,7 +154,7 @@ def _check_ids(index: Index, report: FindingReport) -> None:
     ids = (
         ((sent.port.net_id, sent.pd.id), sent) for sent in index.sent.values() if sent.port.net_id
     )
-    for sent, first in rules.doubles(ids):
+    for sent, first in rules.duplicates(ids):
         message = f"PD id {sent.pd.id} is used twice by publisher {sent.port.net_id}"
         message += f" (first in line {report.line_of(f'{first.pd.at}.id')})"
         report.add(f"{sent.pd.at}.id", message, "an id of its own for each PD")

@@ -25,7 +25,7 @@ from eap.ids import (
 )
 from eap.od.profiles import eap1000 as profile
 from eap.pd import rules
-from eap.pd.rules import DESTINATIONS, NAME, check_phase, doubles, is_group, is_name
+from eap.pd.rules import DESTINATIONS, NAME, check_phase, duplicates, is_group, is_name
 from eap.pd.spec import REQUESTER, PortKind
 
 IP_BROADCAST = "255.255.255.255"
@@ -279,7 +279,7 @@ def check_names(names: Iterable[tuple[str, str]], what: str, report: FindingRepo
             named.append((name, (path, name)))
         else:
             report.add(path, f"{what} name {name!r}", NAME)
-    for (path, name), (first, _) in doubles(named):
+    for (path, name), (first, _) in duplicates(named):
         message = f"{what} {name!r} exists already (line {report.line_of(first)})"
         report.add(path, message, "a name of its own")
 

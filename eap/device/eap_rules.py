@@ -332,7 +332,7 @@ def check_station(
         found.refuse(_breaches_of_frame(found.record, uris[found.port]))
     for found in pds:
         found.refuse(_breaches_of_pd(found.record, found.frame.record, spec.cycle_us))
-    for second, first in rules.doubles(((each.port, each.record.pd_id), each) for each in pds):
+    for second, first in rules.duplicates(((each.port, each.record.pd_id), each) for each in pds):
         detail = f"{second.record.pd_id} is that of {first.record.name} too"
         raise second.fault(FaultCode.PD_ID_TWICE, detail, Tx.PD_ID)
     _check_received(spec, subscriptions)
@@ -341,7 +341,7 @@ def check_station(
 
 
 def _check_unique(found: Iterable[FoundRecord], subindex: int, what: str) -> None:
-    for second, first in rules.doubles((each.record.name, each) for each in found):
+    for second, first in rules.duplicates((each.record.name, each) for each in found):
         detail = f"{what} {first.record.name} is 0x{first.at:04X} of {first.port} already"
         raise second.fault(FaultCode.NAME_TWICE, detail, subindex)
 

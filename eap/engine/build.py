@@ -112,15 +112,15 @@ class EngineBuses:
                 bus.handle_timeout(clock())
 
     def close(self) -> None:
-        """Let go of all sockets."""
+        """Close all sockets."""
         for bus in self.buses:
             bus.close()
         if self.requests is not None:
             self.requests.close()
 
-    def _make(self, given: BusSocket, place: EngineStation) -> EngineBus:
+    def _make(self, given: BusSocket, entry: EngineStation) -> EngineBus:
         port = self._handover.port(given.owner)
-        station = place.station
+        station = entry.station
         epoch_offset_ns = time.time_ns() - time.monotonic_ns() - _EPOCH_S * 1_000_000_000
         bus = EngineBus(
             port,
@@ -131,7 +131,7 @@ class EngineBuses:
             BusPort(socket.socket(fileno=given.engine_fd)),
         )
         station.connect_bus(bus)
-        place.buses[port.name] = bus
+        entry.buses[port.name] = bus
         return bus
 
 
@@ -184,7 +184,7 @@ class EnginePlant:
 
     Attributes:
         engine: Runs them.
-        rebuilds: Changes them while they run.
+        rebuilder: Changes them while they run.
         buses: The slaves below them.
         arrivals: Descriptors to wake up for besides the cycle, and what to call then.
     """
@@ -212,19 +212,19 @@ class EnginePlant:
                 self._open_interface(shared)
             elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
                 self._open_datagrams(shared)
-        self.engine = Engine([place.station for place in self._stations.values()])
-        self.rebuilds = StationRebuilder(self.engine, self._stations)
-        self._resources.callback(self.rebuilds.close)
-        self.arrivals[self.rebuilds.fileno()] = self.rebuilds.collect
+        self.engine = Engine([entry.station for entry in self._stations.values()])
+        self.rebuilder = StationRebuilder(self.engine, self._stations)
+        self._resources.callback(self.rebuilder.close)
+        self.arrivals[self.rebuilder.fileno()] = self.rebuilder.collect
         step("building buses")
-        self.buses = EngineBuses(handover, self._stations, self.rebuilds.serve)
+        self.buses = EngineBuses(handover, self._stations, self.rebuilder.serve)
         self._resources.callback(self.buses.close)
         self.arrivals.update(self.buses.arrivals)
 
     def start(self, now_ns: int) -> None:
         """Bring all stations to their states, and let programs that attach see who runs them."""
-        for place in self._stations.values():
-            place.file.image.words[StationWord.ENGINE_PID] = os.getpid()
+        for entry in self._stations.values():
+            entry.file.image.words[StationWord.ENGINE_PID] = os.getpid()
         self.engine.start(now_ns, self._handover.states)
         self.buses.start(now_ns)
 
@@ -232,10 +232,10 @@ class EnginePlant:
         """Take frames from a connection that services accepted, for all ports behind it."""
         first = passed.owners[0]
         port = self._stations[first.station].tcp_ports[first.port]
-        takers = [self._taker(owner) for owner in passed.owners]
+        handlers = [self._handler(owner) for owner in passed.owners]
         spare = spare_descriptors(connection.fileno(), descriptor_reserve())
         try:
-            receiver = TcpReceiver(connection, takers, host=passed.host)
+            receiver = TcpReceiver(connection, handlers, host=passed.host)
         except OSError:
             connection.close()  # the peer has left again
             return
@@ -260,15 +260,15 @@ class EnginePlant:
         """
         self.engine.stop()
         self.buses.rest()
-        for place in self._stations.values():
-            place.file.image.words[StationWord.ENGINE_PID] = 0
-            place.file.wake_waiters()
+        for entry in self._stations.values():
+            entry.file.image.words[StationWord.ENGINE_PID] = 0
+            entry.file.wake_waiters()
 
     def close(self) -> None:
-        """Let go of all sockets and images."""
+        """Release all sockets and images."""
         self._resources.close()
-        for place in self._stations.values():
-            place.close()
+        for entry in self._stations.values():
+            entry.close()
 
     def _open_own(self) -> None:
         """Connect the ports that need no shared socket."""
@@ -281,14 +281,14 @@ class EnginePlant:
                 self._connect(name, None)
             elif uri.scheme == "loop":
                 channel = lines.open(uri)
-                channel.takers.append(self._taker(name))
+                channel.handlers.append(self._handler(name))
                 self._station(name).connect(port.name, channel)
 
     def _open_datagrams(self, shared: SharedSocket) -> None:
         channel = UdpChannel(
             socket.socket(fileno=shared.engine_fd),
             self._batch,
-            [self._taker(owner) for owner in shared.owners],
+            [self._handler(owner) for owner in shared.owners],
         )
         self._resources.callback(channel.close)
         for owner in shared.owners:
@@ -306,13 +306,13 @@ class EnginePlant:
             station.connect(name.port, datagrams)
             return
         port = open_tcp_port(spec, datagrams)
-        place = self._stations[name.station]
-        place.tcp_ports[name.port] = port
+        entry = self._stations[name.station]
+        entry.tcp_ports[name.port] = port
         self._tallies.append(
             DropCounterFeed(self._counters, [name.station], port.closed, _tcp_reason)
         )
         station.connect(name.port, port)
-        place.settle_tcp()
+        entry.update_tcp()
 
     def _open_interface(self, shared: SharedSocket) -> None:
         interface = EthernetInterface(socket.socket(fileno=shared.engine_fd), packet_batch())
@@ -324,7 +324,7 @@ class EnginePlant:
         for owner in shared.owners:
             spec = self._handover.port(owner)
             port = interface.port(
-                self._taker(owner),
+                self._handler(owner),
                 vlan_id=spec.vlan_id,
                 priority=spec.vlan_priority,
                 join=spec.join,
@@ -336,8 +336,8 @@ class EnginePlant:
         if any(self._handover.port(owner).wake is Wake.ARRIVAL for owner in owners):
             self.arrivals[channel.fileno()] = channel.drain
 
-    def _taker(self, name: PortName) -> FrameHandler:
-        return self._station(name).takers[name.port]
+    def _handler(self, name: PortName) -> FrameHandler:
+        return self._station(name).handlers[name.port]
 
     def _station(self, name: PortName) -> Station:
         return self._stations[name.station].station

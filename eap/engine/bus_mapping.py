@@ -103,29 +103,29 @@ class BusPlanner:
 
     def __init__(self, slaves: Sequence[BusSlaveSpec], layout: ImageLayout) -> None:
         self._slaves = slaves
-        self._places = {place.name: place for place in layout.variables}
+        self._slots = {slot.name: slot for slot in layout.variables}
         self._used = [
-            (place.bit_offset, datatypes.parse(place.type).bit_length) for place in layout.variables
+            (slot.bit_offset, datatypes.parse(slot.type).bit_length) for slot in layout.variables
         ]
-        self._used += [(8 * place.offset, 8 * PdHeader.SIZE) for place in layout.rx]
+        self._used += [(8 * slot.offset, 8 * PdHeader.SIZE) for slot in layout.rx]
 
     def plan(self, bus: ProcessDataLayout) -> BusPlan:
         """Find every described entry in *bus*, the process data as the slaves have it."""
-        there = _by_entry(bus.variables)
+        by_entry = _by_entry(bus.variables)
         missing: list[str] = []
         inputs: list[Move] = []
         outputs: dict[Writer, list[Move]] = defaultdict(list)
         for slave, entry, is_output in self._entries():
-            known = there[slave.station, is_output, entry.index, entry.subindex]
+            known = by_entry[slave.station, is_output, entry.index, entry.subindex]
             if not known or known[-1].bit_length != entry.bit_length:
                 missing.append(_missing(slave, entry, known, is_output=is_output))
                 continue
             bus_bit = known.pop().bit_offset
-            place = self._places[entry.variable]
+            slot = self._slots[entry.variable]
             if is_output:
-                outputs[place.writer].append(Move(place.bit_offset, bus_bit, entry.bit_length))
+                outputs[slot.writer].append(Move(slot.bit_offset, bus_bit, entry.bit_length))
             else:
-                inputs.append(Move(bus_bit, place.bit_offset, entry.bit_length))
+                inputs.append(Move(bus_bit, slot.bit_offset, entry.bit_length))
         on_bus = [(each.bit_offset, each.bit_length) for each in bus.variables if each.is_output]
         return BusPlan(
             CopyPlan(inputs, used=self._used),
@@ -144,10 +144,10 @@ class BusPlanner:
 
 def _by_entry(variables: Iterable[ProcessVariable]) -> dict[_Entry, list[ProcessVariable]]:
     """Return the variables of each entry, the first one last."""
-    there: dict[_Entry, list[ProcessVariable]] = defaultdict(list)
+    by_entry: dict[_Entry, list[ProcessVariable]] = defaultdict(list)
     for each in variables:
-        there[each.station, each.is_output, each.index, each.subindex].insert(0, each)
-    return there
+        by_entry[each.station, each.is_output, each.index, each.subindex].insert(0, each)
+    return by_entry
 
 
 def _missing(

@@ -58,7 +58,7 @@ PER_WAKE_UP = 16
 MAX_OUTSTANDING = 1024
 MAX_PER_SLAVE = 64
 _MAX_MESSAGE = 1 << 18
-_Place = tuple[int, int]
+_SlaveKey = tuple[int, int]
 ServeStation: TypeAlias = Callable[[StationRequest, int, Callable[[EapError | None], None]], None]
 MAX_DATAGRAMS = 256
 """Datagrams of one request."""
@@ -83,7 +83,7 @@ class _PendingRequest(NamedTuple):
     """A request that is under way."""
 
     task: Task[Any]
-    place: _Place
+    slave_key: _SlaveKey
     """Bus and station, 0 for a bus as a whole."""
 
 
@@ -113,7 +113,7 @@ class BusRequestHandler:
         self._serve_station = serve_station
         self._decoder = msgspec.msgpack.Decoder(EngineRequest)
         self._pending: dict[int, _PendingRequest] = {}
-        self._places: Counter[_Place] = Counter()
+        self._per_slave: Counter[_SlaveKey] = Counter()
         sock.setblocking(False)
 
     def fileno(self) -> int:
@@ -121,7 +121,7 @@ class BusRequestHandler:
         return self._sock.fileno()
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         self._sock.close()
 
     def announce(self) -> None:
@@ -217,7 +217,7 @@ class BusRequestHandler:
         )
 
     def _exchange(self, bus: EngineBus, request: ExchangeMailbox, now_ns: int) -> None:
-        self._check_room((request.bus, request.station))
+        self._check_limits((request.bus, request.station))
         task = bus.master.converse(
             request.station,
             _one_exchange(request.request),
@@ -228,13 +228,13 @@ class BusRequestHandler:
         self._watch(bus, request, request.station, task, _with_message, now_ns)
 
     def _transfer(self, bus: EngineBus, request: ExchangeDatagrams, now_ns: int) -> None:
-        self._check_room((request.bus, 0))
+        self._check_limits((request.bus, 0))
         procedure = _one_step(check_datagrams(request.datagrams))
         task = bus.master.run(procedure, now_ns, "a transfer")
         self._watch(bus, request, 0, task, _with_replies, now_ns)
 
     def _bring(self, bus: EngineBus, request: BringSlaves, now_ns: int) -> None:
-        self._check_room((request.bus, request.station))
+        self._check_limits((request.bus, request.station))
         task = (
             bring_one(bus.master, request.station, request.target, now_ns)
             if request.station
@@ -242,11 +242,13 @@ class BusRequestHandler:
         )
         self._watch(bus, request, request.station, task, _with_nothing, now_ns)
 
-    def _check_room(self, place: _Place) -> None:
+    def _check_limits(self, slave_key: _SlaveKey) -> None:
         if len(self._pending) >= MAX_OUTSTANDING:
             raise BusError(f"{MAX_OUTSTANDING} requests are under way already")
-        if self._places[place] >= MAX_PER_SLAVE:
-            raise BusError(f"{MAX_PER_SLAVE} requests to slave {place[1]} are under way already")
+        if self._per_slave[slave_key] >= MAX_PER_SLAVE:
+            raise BusError(
+                f"{MAX_PER_SLAVE} requests to slave {slave_key[1]} are under way already"
+            )
 
     def _watch(
         self,
@@ -258,9 +260,9 @@ class BusRequestHandler:
         now_ns: int,
     ) -> None:
         """Reply when *task* is done, and keep it until then."""
-        place = request.bus, station
-        self._pending[request.id] = _PendingRequest(task, place)
-        self._places[place] += 1
+        slave_key = request.bus, station
+        self._pending[request.id] = _PendingRequest(task, slave_key)
+        self._per_slave[slave_key] += 1
 
         def done(task: Task[T]) -> None:
             if self._forget(request.id, task):
@@ -287,9 +289,9 @@ class BusRequestHandler:
         if pending is None or pending.task is not task:
             return False
         del self._pending[number]
-        self._places[pending.place] -= 1
-        if not self._places[pending.place]:
-            del self._places[pending.place]
+        self._per_slave[pending.slave_key] -= 1
+        if not self._per_slave[pending.slave_key]:
+            del self._per_slave[pending.slave_key]
         return True
 
     def _send(self, message: EngineMessage) -> bool:

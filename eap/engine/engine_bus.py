@@ -40,7 +40,7 @@ SILENT_RETRY_NS = 100_000_000
 BATCH = 16
 """Frames taken in one go; the rest waits until the cycles have had their turn."""
 _LONG_CYCLE_NS = 20_000_000
-_MOST_STALE = 4096
+_MAX_STALE = 4096
 
 
 class FaultCounts(NamedTuple):
@@ -76,8 +76,8 @@ class SlaveFaults:
 
     def of(self, station: int) -> str:
         """Return the reason why a slave is not in its target state, empty if it is."""
-        trouble = self.last(station)
-        return trouble.text if trouble.until_ns is None else ""
+        fault = self.last(station)
+        return fault.text if fault.until_ns is None else ""
 
     def last(self, station: int) -> SlaveFault:
         """Return the last fault of a slave, which may be over."""
@@ -128,9 +128,9 @@ class SlaveFaults:
         self._faults[station] = SlaveFault(text, before.since_ns if lasts else at_ns)
 
     def _end(self, station: int, at_ns: int) -> None:
-        trouble = self._faults.get(station)
-        if trouble is not None:
-            self._faults[station] = trouble._replace(until_ns=at_ns)
+        fault = self._faults.get(station)
+        if fault is not None:
+            self._faults[station] = fault._replace(until_ns=at_ns)
 
     def _remember(self, event: Event) -> None:
         if isinstance(event, SlaveLost):
@@ -199,12 +199,12 @@ class EngineBus:
         return self._port.fileno()
 
     def close(self) -> None:
-        """Let go of the wire."""
+        """Close the bus port."""
         self._port.close()
 
     def start(self, now_ns: int) -> None:
         """Begin to bring the bus up."""
-        for _ in range(_MOST_STALE):
+        for _ in range(_MAX_STALE):
             if self._take_frame() is None:
                 break  # the rest was for an engine that has died
         self._guarded(self._start, now_ns)
@@ -271,7 +271,7 @@ class EngineBus:
             if self._starting is not None and self._starting.is_done:
                 self._end_start(self._starting, now_ns)
         except Exception as exc:  # noqa: BLE001  a bus must not stop the stations
-            self._begin_anew(exc, now_ns)
+            self._restart_master(exc, now_ns)
         self._due_ns = self.master.next_timeout() if self._is_busy() else None
 
     def _start(self, now_ns: int) -> None:
@@ -288,8 +288,8 @@ class EngineBus:
             is_silent = isinstance(task.error, FrameLostError)
             self._retry_ns = now_ns + (SILENT_RETRY_NS if is_silent else RETRY_NS)
 
-    def _begin_anew(self, exc: Exception, now_ns: int) -> None:
-        """The master cannot go on: replace it."""
+    def _restart_master(self, exc: Exception, now_ns: int) -> None:
+        """The master cannot continue: replace it."""
         self.faults.take_events(self.master)
         self.faults.end_all(now_ns)
         self.master = Master(self._settings)

@@ -20,7 +20,7 @@ from eap.engine.build import EnginePlant
 from eap.errors import ConfigError, EapError, EnvironmentalError
 from eap.net import realtime
 from eap.net.ticker import Ticker
-from eap.runtime.handover import EngineOptions, Handover, take_connection
+from eap.runtime.handover import EngineOptions, Handover, receive_connection
 from eap.runtime.startup import Startup
 
 WINDOW_NS = 20_000_000
@@ -93,32 +93,32 @@ class StopFlag:
 
 
 def run_cycles(
-    plant: EnginePlant, link: socket.socket, stop: StopFlag, tell: Callable[[], None]
+    plant: EnginePlant, link: socket.socket, stop: StopFlag, notify: Callable[[], None]
 ) -> None:
-    """Run every cycle when it is due, until *stop* is set; *tell* once the stations run."""
-    engine, rebuilds = plant.engine, plant.rebuilds
+    """Run every cycle when it is due, until *stop* is set; *notify* once the stations run."""
+    engine, rebuilder = plant.engine, plant.rebuilder
     look_ns = 0
-    is_told = False
+    is_notified = False
     ticker = Ticker()
     try:
         arrivals = CycleWaiter(ticker, plant.arrivals)
         while not stop.is_set:
-            if not is_told and engine.is_under_way:
-                is_told = True
-                tell()
+            if not is_notified and engine.is_under_way:
+                is_notified = True
+                notify()
             if not arrivals.wait(engine.next_timeout()):
                 continue
             now_ns = monotonic_ns()
             engine.handle_timeout(now_ns)
-            if rebuilds.is_ready:
-                rebuilds.swap(now_ns)
+            if rebuilder.is_ready:
+                rebuilder.swap(now_ns)
             if now_ns >= look_ns:
                 look_ns = now_ns + LOOK_PERIOD_NS
                 plant.publish_discards()
                 plant.buses.publish()
-                if gc.get_count()[0] > GARBAGE and not rebuilds.is_building:
+                if gc.get_count()[0] > GARBAGE and not rebuilder.is_building:
                     gc.collect()
-                if passed := take_connection(link):
+                if passed := receive_connection(link):
                     plant.add_connection(*passed)
     finally:
         ticker.close()

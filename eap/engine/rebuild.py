@@ -40,7 +40,7 @@ def sends_to(spec: StationSpec, port: str) -> set[str]:
 
 
 def has_tcp(spec: StationSpec, port: PortSpec) -> bool:
-    """Tell whether anything goes or comes by TCP at *port*."""
+    """Return whether anything goes or comes by TCP at *port*."""
     return port.tcp or port.interface.startswith("tcp:") or bool(sends_to(spec, port.name))
 
 
@@ -53,7 +53,7 @@ def follow_station(port: TcpPort, station: Station, name: str) -> None:
     """Have *port* do what *station* wants of it at its port *name*."""
     spec = station.spec
     asks = any(pd.poll_request and pd.port == name for pd in spec.subscriptions)
-    port.follow(sends_to(spec, name), [station.takers[name]] if asks else [])
+    port.follow(sends_to(spec, name), [station.handlers[name]] if asks else [])
 
 
 class EngineStation:
@@ -66,13 +66,13 @@ class EngineStation:
         """By port."""
         self.tcp_ports: dict[str, TcpPort] = {}
 
-    def settle_tcp(self) -> None:
+    def update_tcp(self) -> None:
         """Have connections only to where the station sends now."""
         for name, port in self.tcp_ports.items():
             follow_station(port, self.station, name)
 
     def close(self) -> None:
-        """Let go of the image and of all connections."""
+        """Release the image and of all connections."""
         self.file.close()
         for port in self.tcp_ports.values():
             port.close()
@@ -86,25 +86,25 @@ class StationReplacement:
         EapError, ValueError, LookupError: the specification is not that of a station.
     """
 
-    def __init__(self, place: EngineStation, spec: StationSpec) -> None:
-        before = place.station
+    def __init__(self, entry: EngineStation, spec: StationSpec) -> None:
+        before = entry.station
         if reasons := needs_new_start(before.spec, spec):
             raise EngineRefusedError("\n".join(reasons))
-        self._place = place
-        self._file = prepare_image(place.file.path, plan_layout(spec), place.file.generation + 1)
+        self._entry = entry
+        self._file = prepare_image(entry.file.path, plan_layout(spec), entry.file.generation + 1)
         try:
             image = self._file.image
             self._images = ImageHandover(before.image, image)
             self._images.carry_words()
             self._images.carry_values(before.inputs.memory)
             self._station = Station(spec, image, self._file.wake_waiters)
-            self._tcp_ports = _new_tcp_ports(place, spec)
+            self._tcp_ports = _new_tcp_ports(entry, spec)
             self._station.prepare_handover(before, self._tcp_ports)
             self._images.commit()
             memory_of = self._station.memory_of
             self._mappings: list[tuple[EngineBus, BusMapping]] = []
             for port in spec.ports:
-                if (bus := place.buses.get(port.name)) is not None:
+                if (bus := entry.buses.get(port.name)) is not None:
                     self._mappings.append((bus, bus.prepare_mapping(port, image, memory_of)))
         except BaseException:
             self.discard()
@@ -112,7 +112,7 @@ class StationReplacement:
 
     @property
     def is_current(self) -> bool:
-        """Whether it still fits what it is to follow."""
+        """True if it still fits what it is to follow."""
         return self._images.is_current
 
     def take_over(self, engine: Engine, now_ns: int) -> Station:
@@ -121,12 +121,12 @@ class StationReplacement:
         Raises:
             EnvironmentalError: the image cannot be put in its place; nothing has changed.
         """
-        place, station = self._place, self._station
-        before = place.station
+        entry, station = self._entry, self._station
+        before = entry.station
         self._images.carry_words()
         self._images.carry_values(before.inputs.memory)
-        self._file.take_name(place.file.path)
-        place.file.retire()
+        self._file.move_to(entry.file.path)
+        entry.file.retire()
         # Who writes from now on sees that the image is retired, and writes in the new one again.
         if before.inputs.refresh():
             self._images.carry_values(before.inputs.memory)
@@ -135,10 +135,10 @@ class StationReplacement:
             bus.swap_mapping(mapping)
         engine.replace(before, station, now_ns)
         self._file.release()
-        place.file.wake_waiters()
-        place.file.close()
-        place.file, place.station = self._file, station
-        place.tcp_ports.update(self._tcp_ports)
+        entry.file.wake_waiters()
+        entry.file.close()
+        entry.file, entry.station = self._file, station
+        entry.tcp_ports.update(self._tcp_ports)
         return before
 
     def discard(self) -> None:
@@ -146,12 +146,12 @@ class StationReplacement:
         self._file.discard()
 
 
-def _new_tcp_ports(place: EngineStation, spec: StationSpec) -> dict[str, TcpPort]:
+def _new_tcp_ports(entry: EngineStation, spec: StationSpec) -> dict[str, TcpPort]:
     """Return the channels of ports that have not had any TCP so far."""
     return {
-        port.name: open_tcp_port(port, place.station.channel(port.name))
+        port.name: open_tcp_port(port, entry.station.channel(port.name))
         for port in spec.ports
-        if port.name not in place.tcp_ports and has_tcp(spec, port)
+        if port.name not in entry.tcp_ports and has_tcp(spec, port)
     }
 
 
@@ -162,7 +162,7 @@ It wakes as often as that to ask again.  Where it shares a processor with the th
 with ``--cpu``, an interval as short as such a wake-up takes (5 us were tried) leaves that thread no
 time to let go of the interpreter, and both hang.
 """
-MOST_WAITING = 64
+MAX_WAITING = 64
 _LOOK_S = 0.01
 _SWAP_NS = 1_000_000
 """A swap begins so long before a cycle, or right after it."""
@@ -180,8 +180,8 @@ class _Job:
         is_stale: Whether it has to be built again.
     """
 
-    def __init__(self, place: EngineStation, request: Configure, reply: Reply) -> None:
-        self.place = place
+    def __init__(self, entry: EngineStation, request: Configure, reply: Reply) -> None:
+        self.entry = entry
         self.request = request
         self.reply = reply
         self.successor: StationReplacement | None = None
@@ -191,19 +191,19 @@ class _Job:
         self._before: Station | None = None
         self._taken = threading.Lock()
 
-    def work(self, tell: Callable[[], object]) -> None:
-        """Build, and *tell*; clear up when the cycle's thread has done its part, and tell again."""
+    def work(self, notify: Callable[[], object]) -> None:
+        """Build and notify; then clean up after the take-over, and notify again."""
         self._taken = threading.Lock()
         self._taken.acquire()
         self._build()
         self.is_built = True
-        tell()
+        notify()
         self._taken.acquire()
         self.successor = None
         if self._before is not None:
             self._before.release()
             self._before = None
-        tell()
+        notify()
 
     def take(self, engine: Engine, now_ns: int) -> None:
         """Put the successor in its place, if there is one; note that it has to be built again."""
@@ -215,10 +215,10 @@ class _Job:
                 successor.discard()  # PDs that shared an account have parted meanwhile
             else:
                 self._put(successor, engine, now_ns)
-        self.place.settle_tcp()
+        self.entry.update_tcp()
         self._taken.release()
 
-    def give_up(self) -> None:
+    def abandon(self) -> None:
         """Do not put anything anywhere."""
         if self.is_built and self.successor is not None:
             self.successor.discard()
@@ -229,8 +229,8 @@ class _Job:
         self.is_stale = False
         try:
             spec = _read(self.request)
-            if spec != self.place.station.spec:
-                self.successor = StationReplacement(self.place, spec)
+            if spec != self.entry.station.spec:
+                self.successor = StationReplacement(self.entry, spec)
         except EngineRefusedError as exc:
             self.error = exc
         except Exception as exc:  # noqa: BLE001  the engine goes on, whatever it was given
@@ -256,11 +256,11 @@ class StationRebuilder:
         self._thread: threading.Thread | None = None
         self._done = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self.is_ready = False
-        """Whether :meth:`swap` should be called after the next cycle."""
+        """True if :meth:`swap` should be called after the next cycle."""
 
     @property
     def is_building(self) -> bool:
-        """Whether the thread runs."""
+        """True if the thread runs."""
         return self._thread is not None
 
     def fileno(self) -> int:
@@ -272,21 +272,21 @@ class StationRebuilder:
         if self._job is not None and self._thread is not None:
             while not self._job.is_built and self._thread.is_alive():
                 self._thread.join(_LOOK_S)
-            self._job.give_up()
+            self._job.abandon()
             self._thread.join()
         os.close(self._done)
 
     def serve(self, request: StationRequest, now_ns: int, reply: Reply) -> None:
         """Begin with *request*; *reply* is called when it is done, or could not be."""
-        place = self._stations.get(request.station)
-        if place is None:
+        entry = self._stations.get(request.station)
+        if entry is None:
             reply(EngineRefusedError(f"there is no station {request.station}"))
         elif isinstance(request, SetState):
-            reply(_set_state(place.station, request.state, now_ns))
-        elif len(self._waiting) >= MOST_WAITING:
-            reply(EngineRefusedError(f"{MOST_WAITING} changes wait already"))
+            reply(_set_state(entry.station, request.state, now_ns))
+        elif len(self._waiting) >= MAX_WAITING:
+            reply(EngineRefusedError(f"{MAX_WAITING} changes wait already"))
         else:
-            self._waiting.append(_Job(place, request, reply))
+            self._waiting.append(_Job(entry, request, reply))
             if self._thread is None:
                 self._begin(self._waiting.popleft())
 
@@ -327,7 +327,7 @@ class StationRebuilder:
         self._thread.start()
 
     def _work(self, job: _Job) -> None:
-        realtime.stand_behind()
+        realtime.lower_thread_priority()
         job.work(lambda: os.eventfd_write(self._done, 1))
 
 

@@ -64,7 +64,7 @@ def _by_type(offset: int, services: int, others: int) -> list[Instruction]:
     ]
 
 
-def _verdicts(role: Role) -> tuple[int, int]:
+def _actions(role: Role) -> tuple[int, int]:
     return (_ALL, 0) if role is Role.SERVICES else (0, _ALL)
 
 
@@ -83,7 +83,7 @@ def udp_filter(role: Role) -> list[Instruction]:
         (_LOAD_SIZE, 0, 0, 0),
         (_NOT_LESS, 1, 0, _UDP_HEADER + 2),
         (_RETURN, 0, 0, short),
-        *_by_type(_UDP_HEADER, *_verdicts(role)),
+        *_by_type(_UDP_HEADER, *_actions(role)),
     ]
 
 
@@ -99,7 +99,7 @@ def packet_filter(role: Role) -> list[Instruction]:
         (_LOAD_WORD, 0, 0, _PACKET_TYPE),
         (_GREATER, 0, 1, socket.PACKET_MULTICAST),
         (_RETURN, 0, 0, 0),
-        *_by_type(_ETHERNET_HEADER, *_verdicts(role)),
+        *_by_type(_ETHERNET_HEADER, *_actions(role)),
     ]
 
 

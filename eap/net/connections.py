@@ -215,13 +215,13 @@ class ConnectionTable:
             if not listener.by_host[connection.host]:
                 del listener.by_host[connection.host]
 
-    def take_overdue(self, now_ns: int, patience_ns: int = OVERDUE_NS) -> list[Connection]:
+    def remove_overdue(self, now_ns: int, timeout_ns: int = OVERDUE_NS) -> list[Connection]:
         """Forget and return the connections that have to be closed by rule 4."""
         found = []
         for listener in self.listeners:
             for each in list(listener.connections):
                 late_ns = each.late_since_ns
-                if late_ns is not None and now_ns - late_ns >= patience_ns:
+                if late_ns is not None and now_ns - late_ns >= timeout_ns:
                     listener.overdue += 1
                     self.remove(listener, each)
                     found.append(each)

@@ -66,7 +66,12 @@ class EthernetInterface:
         self._local: deque[tuple[FrameHandler, memoryview, int]] = deque()
 
     def port(
-        self, taker: FrameHandler, *, vlan_id: int = 0, priority: int = 0, join: Sequence[str] = ()
+        self,
+        handler: FrameHandler,
+        *,
+        vlan_id: int = 0,
+        priority: int = 0,
+        join: Sequence[str] = (),
     ) -> EthernetPort:
         """Return a new port that takes and sends frames of *vlan_id*; 0 is untagged.
 
@@ -80,10 +85,10 @@ class EthernetInterface:
             self._sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
         by_address = self._routes.setdefault(vlan_id, {})
         for address in (self.address, BROADCAST_MAC, *groups):
-            by_address.setdefault(_key(address), []).append(taker)
+            by_address.setdefault(_key(address), []).append(handler)
         self.has_neighbours = self._has_ports
         self._has_ports = True
-        return EthernetPort(self, taker, vlan_id, priority)
+        return EthernetPort(self, handler, vlan_id, priority)
 
     def drain(self) -> int:
         """Hand every waiting frame to the ports it is for; return how many were handed over."""
@@ -107,16 +112,16 @@ class EthernetInterface:
         """
         by_address = self._routes[sender.vlan_id]
         for frame in frames:
-            takers = by_address.get(_key(frame.buffer), ())
-            others = [taker for taker in takers if taker is not sender.taker]
+            handlers = by_address.get(_key(frame.buffer), ())
+            others = [handler for handler in handlers if handler is not sender.handler]
             if not others:
                 continue
             data = memoryview(bytes(frame.view[frame.headroom :]))
-            for taker in others:
+            for handler in others:
                 if len(self._local) >= _LOCAL_LIMIT:
                     self.discarded["local_overflow"] += 1
                 else:
-                    self._local.append((taker, data, now_ns))
+                    self._local.append((handler, data, now_ns))
 
     def sender_of(self, data: memoryview) -> str:
         """Return the source address of the frame in *data*; nothing if it is none of a station."""
@@ -131,8 +136,8 @@ class EthernetInterface:
         source: bytes = _SOURCE(self._octets, position * BUFFER_SIZE)[0]
         return source
 
-    def is_for_many(self, data: memoryview) -> bool:
-        """Tell whether the frame in *data* was addressed to a group or to all."""
+    def is_group_frame(self, data: memoryview) -> bool:
+        """Return whether the frame in *data* was addressed to a group or to all."""
         position = self._batch.position(data)
         return position is not None and bool(self._batch.octets[position * BUFFER_SIZE] & 1)
 
@@ -145,11 +150,11 @@ class EthernetInterface:
         self._sock.close()
 
     def _dispatch_one(self) -> int:
-        takers = self._takers(self._heads[0], self._tags[_TCI])
-        if not takers:
+        handlers = self._handlers(self._heads[0], self._tags[_TCI])
+        if not handlers:
             return 0
         view, size, at_ns = self._batch.arrival()
-        for take in takers:
+        for take in handlers:
             take(view, size - ETHERNET_HEADER, at_ns, self)
         return 1
 
@@ -165,17 +170,17 @@ class EthernetInterface:
                 for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):
                     take(view, size - ETHERNET_HEADER, at_ns, self)
                 return count
-        find = self._takers
+        find = self._handlers
         for view, size, at_ns, head, tag in zip(
             self._batch.views, sizes, times, heads, tags, strict=False
         ):
-            if takers := find(head, tag):
+            if handlers := find(head, tag):
                 taken += 1
-                for take in takers:
+                for take in handlers:
                     take(view, size - ETHERNET_HEADER, at_ns, self)
         return taken
 
-    def _takers(self, head: int, tag: int) -> Sequence[FrameHandler]:
+    def _handlers(self, head: int, tag: int) -> Sequence[FrameHandler]:
         """Return who takes a frame of this first word and VLAN tag; count one of no port's VLAN."""
         by_address = self._routes.get(tag & _VID)
         if by_address is None:
@@ -197,10 +202,10 @@ class EthernetPort:
     minimum_size = MINIMUM_SIZE
 
     def __init__(
-        self, interface: EthernetInterface, taker: FrameHandler, vlan_id: int, priority: int
+        self, interface: EthernetInterface, handler: FrameHandler, vlan_id: int, priority: int
     ) -> None:
         self.interface = interface
-        self.taker = taker
+        self.handler = handler
         self.vlan_id = vlan_id
         self._send = interface.sender.send
         tag = priority << 13 | vlan_id

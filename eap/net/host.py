@@ -162,7 +162,7 @@ _MAX_SIZE = 4096
 
 
 def read_password(file: Path) -> bytes:
-    """Return the first line of *file* without its end, as far as 4096 octets.
+    """Return the first line of *file* without its end, as far as 4096 bytes.
 
     Raises:
         EnvironmentalError: it cannot be read, or is no regular file.

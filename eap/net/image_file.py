@@ -32,7 +32,7 @@ from eap.pd.words import StationWord
 _libc = ctypes.CDLL(None, use_errno=True)
 _SYS_FUTEX = {"x86_64": 202, "aarch64": 98, "armv7l": 240, "riscv64": 98}.get(os.uname().machine)
 _FUTEX_WAIT, _FUTEX_WAKE = 0, 1
-_EVERYBODY = 0x7FFFFFFF
+_ALL_WAITERS = 0x7FFFFFFF
 _REPLACING_PAUSES = 20_000
 """Two seconds in all.  Replacing takes milliseconds; an engine that dies meanwhile comes back."""
 _FLOCK = struct.Struct("hhqqi4x")
@@ -79,10 +79,10 @@ class ImageFile(Closeable):
 
     @property
     def retired(self) -> bool:
-        """Whether a file of a newer layout has taken this one's place."""
+        """True if a file of a newer layout has taken this one's place."""
         return bool(self.image.words[StationWord.RETIRED])
 
-    def take_name(self, path: Path) -> None:
+    def move_to(self, path: Path) -> None:
         """Be the file at *path*; who opens it waits until :meth:`release`.
 
         Raises:
@@ -110,8 +110,8 @@ class ImageFile(Closeable):
         self.close()
 
     @property
-    def has_lost_its_name(self) -> bool:
-        """Whether another file has it, also if an engine died before it retired this one."""
+    def is_replaced(self) -> bool:
+        """True if another file has it, also if an engine died before it retired this one."""
         try:
             return not os.path.samestat(os.fstat(self._fd), self.path.stat())
         except OSError:
@@ -143,7 +143,9 @@ class ImageFile(Closeable):
 
     def wake_waiters(self) -> None:
         """Wake every process that sleeps in :meth:`wait_cycle`."""
-        _libc.syscall(_SYS_FUTEX, ctypes.byref(self._futex), _FUTEX_WAKE, _EVERYBODY, None, None, 0)
+        _libc.syscall(
+            _SYS_FUTEX, ctypes.byref(self._futex), _FUTEX_WAKE, _ALL_WAITERS, None, None, 0
+        )
 
     def wait_cycle(self, cycle: int, timeout_s: float) -> bool:
         """Sleep until the cycle counter differs from *cycle*.
@@ -195,15 +197,15 @@ def create_image(path: Path, layout: ImageLayout) -> ImageFile:
 
 def _replace(existing: ImageFile | None, fresh: ImageFile, path: Path) -> ImageFile:
     try:
-        fresh.take_name(path)
+        fresh.move_to(path)
     except EnvironmentalError:
         fresh.discard()
         raise
     if existing is not None:
         existing.retire()
-        succession = ImageHandover(existing.image, fresh.image)
-        succession.carry_words()
-        succession.carry_values(existing.image.memory)
+        handover = ImageHandover(existing.image, fresh.image)
+        handover.carry_words()
+        handover.carry_values(existing.image.memory)
     fresh.release()
     if existing is not None:
         existing.wake_waiters()
@@ -270,12 +272,12 @@ def _format(view: memoryview, layout: ImageLayout, generation: int) -> None:
 
 
 def _pause() -> None:
-    """Let a writer that was interrupted in the middle go on."""
+    """Let a writer that was interrupted in the middle continue."""
     _libc.usleep(100)
 
 
 def _lock_of(writer: Writer, kind: int) -> bytes:
-    """Return the request for the octet that stands for *writer*."""
+    """Return the request for the byte that stands for *writer*."""
     return _FLOCK.pack(kind, os.SEEK_SET, list(Writer).index(writer), 1, 0)
 
 
@@ -300,7 +302,7 @@ class StationImage:
         self._writers: set[Writer] = set()
 
     def close(self) -> None:
-        """Let go of the file, and of the right to write."""
+        """Release the file, and of the right to write."""
         self._file.close()
 
     @property
@@ -361,9 +363,9 @@ class StationImage:
         finally:
             self.release_writer(writer)
 
-    def catch_up(self) -> bool:
+    def reopen_if_replaced(self) -> bool:
         """Look for a newer image where none was announced; return whether there is one."""
-        if not self._file.has_lost_its_name:
+        if not self._file.is_replaced:
             return False
         self._move()
         return True

@@ -75,7 +75,7 @@ def own_addresses() -> list[tuple[str, str]]:
 
 
 def foreign_address(address: str) -> str:
-    """Say in one line that *address* is not this machine's."""
+    """Return in one line that *address* is not this machine's."""
     return (
         f"{address} is not an address of this machine: `ip -4 addr` lists those that are; "
         "any of 127.0.0.0/8 works within this machine"
@@ -99,7 +99,7 @@ def check_interface(name: str) -> None:
 
 
 def link_is_up(name: str) -> bool:
-    """Whether interface *name* exists, is switched on and has a live cable.
+    """Return whether interface *name* exists, is switched on and has a live cable.
 
     Raises:
         OSError: the first question of this process, and there is no descriptor for it.

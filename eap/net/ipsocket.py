@@ -162,7 +162,7 @@ def _bind(sock: socket.socket, address: str, port: int) -> None:
 
 
 def bind_failure(protocol: str, address: str, port: int, error: OSError) -> str:
-    """Say in one line why *address* could not be bound and what to do about it."""
+    """Return in one line why *address* could not be bound and what to do about it."""
     if error.errno == errno.EADDRINUSE:
         return describe_holder(protocol, address, port)
     if error.errno == errno.EADDRNOTAVAIL:
@@ -286,7 +286,7 @@ def _range(proc: Path) -> tuple[int, int]:
 
 
 def _is_ephemeral(port: int, proc: Path) -> bool:
-    """Whether the kernel may give *port* to any client that asks for none in particular."""
+    """Return whether the kernel may give *port* to any client that asks for none in particular."""
     try:
         low, high = _range(proc)
         reserved = (proc / "sys/net/ipv4/ip_local_reserved_ports").read_text().strip()

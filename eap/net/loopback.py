@@ -84,7 +84,7 @@ class LoopbackChannel:
     minimum_size = 0
 
     def __init__(self, ports: list[LoopbackChannel], faults: Faults) -> None:
-        self.takers: list[FrameHandler] = []
+        self.handlers: list[FrameHandler] = []
         self.errors: dict[str, int] = {}
         self._ports = ports
         self._faults = faults
@@ -107,7 +107,7 @@ class LoopbackChannel:
             self._queue.remove(frame)
         for frame in due:
             self._sender = frame.sender
-            for take in self.takers:
+            for take in self.handlers:
                 take(frame.data, len(frame.data), frame.due_ns, self)
         return len(due)
 

@@ -38,7 +38,7 @@ BATCH = 64
 BUFFER_SIZE = 2112
 """An Ethernet header, the largest frame that an 11-bit Length can announce, and some air."""
 STAMP_SIZE = 32
-"""Octets of control data that a time stamp takes."""
+"""Bytes of control data that a time stamp takes."""
 
 _MMSGHDR = struct.Struct("@QQQQQQQQ")  # name, namelen, iov, iovlen, control, controllen, flags, len
 _IOVEC = struct.Struct("@QQ")
@@ -86,7 +86,7 @@ class ReceiveBatch:
     The same holds for the addresses of the senders, which are kept when *with_senders*.
 
     Attributes:
-        views: The messages, each from behind *headroom* octets to the end of its memory.
+        views: The messages, each from behind *headroom* bytes to the end of its memory.
         octets: All of that memory, BUFFER_SIZE for each message.
         control: All control data, *control_size* for each message.
     """
@@ -263,7 +263,7 @@ class SendBatch:
     def _send_rest(
         self, frames: tuple[OutFrame, ...], headers: bytearray, sent: int
     ) -> list[OutFrame]:
-        """Go on behind what *sent* says went out; each frame that fails is left out."""
+        """Continue behind what *sent* says went out; each frame that fails is left out."""
         failed: list[OutFrame] = []
         done = 0
         tried_again = -1

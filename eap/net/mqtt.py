@@ -32,7 +32,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 15.0
 """Between two attempts to connect: the longest that the first wait may be, and the limit."""
 _STABLE_S = 10.0
 """How long a connection has to last to be a good one."""
-_GOODBYE_S = 0.3
+_DISCONNECT_S = 0.3
 _PROBE_S = 3.0
 _UNCONFIRMED = 16
 """Messages of QoS 1 and 2 on their way at a time."""
@@ -101,7 +101,7 @@ class MqttLink(ReconnectingLink):
             self._connections = 0
         elif self._connections > max(self._connections_before, 1):
             reason += f"; has another client the name {self._client_id!r} (client_id) too?"
-        if self._is_news(reason):  # a broker that is away for long is no flood of lines
+        if self._is_new_reason(reason):  # a broker that is away for long is no flood of lines
             logger.warning("%s: %s; trying again", self._name, reason)
         return True
 
@@ -163,7 +163,7 @@ class MqttLink(ReconnectingLink):
                 await self._read(client)
         except asyncio.CancelledError:
             with suppress(Exception):  # the broker gets to know in any case
-                async with asyncio.timeout(_GOODBYE_S):
+                async with asyncio.timeout(_DISCONNECT_S):
                     await _publish(client, self._will)
             raise
         except ExceptionGroup as group_error:

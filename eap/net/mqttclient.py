@@ -23,7 +23,7 @@ from eap.ams.spec import TlsSpec
 __all__ = ["MqttClient", "MqttError", "describe", "is_too_new", "make_client", "tls_context"]
 
 MAX_MESSAGE = 1 << 20
-"""Octets of a message; the broker is asked to keep longer ones."""
+"""Bytes of a message; the broker is asked to keep longer ones."""
 MAX_INBOX, MAX_INBOX_OCTETS = 1024, 8 << 20
 """Messages that were received and wait for their turn."""
 CONNECT_S, ANSWER_S = 3.0, 5.0
@@ -51,7 +51,7 @@ class Inbox(asyncio.Queue[Message]):
     octets = 0
 
     def full(self) -> bool:
-        """Say whether there is no room, by number or by octets."""
+        """Return whether there is no room, by number or by bytes."""
         return super().full() or self.octets >= MAX_INBOX_OCTETS
 
     def put_nowait(self, item: Message) -> None:
@@ -179,7 +179,7 @@ def make_client(
 
 
 def is_too_new(error: MqttError) -> bool:
-    """Say whether the broker may speak another version; some of them just say nothing."""
+    """Return whether the broker may speak another version; some of them just say nothing."""
     if isinstance(error, MqttConnectError):
         return _code(error) in _UNSUPPORTED
     return str(error) == "Operation timed out"  # connected, but not answered

@@ -116,7 +116,7 @@ class NeighbourTable:
         self._sequence = 0
 
     def look(self, address: str, source: str = "") -> ProbeResult:
-        """Say whether the kernel lately reached the host that has *address*.
+        """Return whether the kernel lately reached the host that has *address*.
 
         That can be told of hosts on the same network.  Addresses of this machine itself have no
         neighbour, and behind a gateway nothing can be told but that the gateway is gone.

@@ -61,7 +61,7 @@ def open_type1(interface: str, *, group: bytes = b"") -> socket.socket:
         EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
     """
     check_interface(interface)
-    sock = _deaf_socket(interface)
+    sock = _closed_socket(interface)
     try:
         bpf.attach(sock, bpf.type1_filter())
         join_type1(sock, interface, group)
@@ -72,7 +72,7 @@ def open_type1(interface: str, *, group: bytes = b"") -> socket.socket:
 
 
 def join_type1(sock: socket.socket, interface: str, group: bytes) -> None:
-    """Bind a socket of :func:`open_type1`, also anew to an interface that was made again.
+    """Bind a socket of :func:`open_type1`, also again to an interface that was made again.
 
     Raises:
         OSError: the interface is not there.
@@ -96,7 +96,7 @@ def open_arp(interface: str) -> socket.socket:
 
 
 def _open(interface: str, program: Sequence[bpf.Instruction]) -> socket.socket:
-    sock = _deaf_socket(interface)
+    sock = _closed_socket(interface)
     try:
         bpf.attach(sock, program)
         sock.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
@@ -108,7 +108,7 @@ def _open(interface: str, program: Sequence[bpf.Instruction]) -> socket.socket:
     return sock
 
 
-def _deaf_socket(interface: str) -> socket.socket:
+def _closed_socket(interface: str) -> socket.socket:
     """Return a socket of protocol 0: no foreign frame gets in before its filter is in place."""
     try:
         return socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
@@ -130,7 +130,7 @@ def _explain(interface: str, error: OSError | EnvironmentalError) -> Environment
 
 
 def missing_capability(interface: str) -> str:
-    """Say in one line what opening *interface* needs and how to get it for this run only."""
+    """Return in one line what opening *interface* needs and how to get it for this run only."""
     start = f"ethernet://{interface} needs the capability CAP_NET_RAW"
     if os.geteuid() == 0:
         cure = "root lacks it here: give it to the container (such as --cap-add=NET_RAW)"

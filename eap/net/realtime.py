@@ -51,7 +51,7 @@ def prepare(priority: int, cpus: Iterable[int] = ()) -> Report:
     return report
 
 
-def take_precedence(nice: int = -10) -> None:
+def raise_process_priority(nice: int = -10) -> None:
     """Give this process the share of a busy machine that *nice* (-20 to 19) stands for.
 
     -10 is ten times the share of an ordinary process.  Less than 0 takes CAP_SYS_NICE; without it
@@ -72,7 +72,7 @@ def die_with_parent(parent_pid: int, number: signal.Signals = signal.SIGKILL) ->
         os.kill(os.getpid(), number)
 
 
-def stand_behind() -> None:
+def lower_thread_priority() -> None:
     """Let the calling thread give way to all others of its process, and to nobody else.
 
     With SCHED_FIFO it goes one step down, for a thread of the same priority would not be

@@ -90,7 +90,7 @@ class ReconnectingLink(ABC):
         """Say after a pause whether to connect again."""
         return True
 
-    def _is_news(self, reason: str) -> bool:
+    def _is_new_reason(self, reason: str) -> bool:
         """Keep a reason; say whether it is another one than before, and worth a line in the log."""
         is_news, self.reason = reason != self.reason, reason
         return is_news

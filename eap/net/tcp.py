@@ -38,7 +38,7 @@ class TcpWriter:
         self._rest = memoryview(b"")
 
     def flush(self) -> bool:
-        """Go on with a frame that has begun; return whether there is none any more."""
+        """Continue with a frame that has begun; return whether there is none any more."""
         if self._rest:
             try:
                 self._rest = self._rest[self._sock.send(self._rest) :]
@@ -100,7 +100,7 @@ class TcpSender:
 
     A frame that has begun is always finished.  While that lasts, and while there is no connection,
     frames are lost as a whole and counted in *errors* as ``slow_peer`` and ``not_connected``.
-    What comes back goes to *takers*, and is thrown away without any.
+    What comes back goes to *handlers*, and is thrown away without any.
     """
 
     def __init__(
@@ -108,14 +108,14 @@ class TcpSender:
         destination: str,
         source: str,
         errors: dict[str, int],
-        takers: Sequence[FrameHandler] = (),
+        handlers: Sequence[FrameHandler] = (),
     ) -> None:
         where = Destination.parse(destination)
         self._destination = destination
         self._address = where.host, where.port or EAP_PORT
         self._source = source
         self._errors = errors
-        self._takers = takers
+        self._handlers = handlers
         self._sock: socket.socket | None = None
         self._connected = False
         self._writer: TcpWriter | None = None
@@ -126,11 +126,11 @@ class TcpSender:
 
     @property
     def connected(self) -> bool:
-        """Whether frames can be sent now."""
+        """True if frames can be sent now."""
         return self._connected
 
     def poll(self, now_ns: int) -> int:
-        """Go on connecting, finish a frame that has begun, notice that the peer has left.
+        """Continue connecting, finish a frame that has begun, notice that the peer has left.
 
         Returns:
             How many frames came back.
@@ -140,7 +140,7 @@ class TcpSender:
                 self._connect(now_ns)
             return 0
         if self._writer is None or not self._connected:
-            self._go_on_connecting(self._sock, now_ns)
+            self._continue_connecting(self._sock, now_ns)
             return 0
         try:
             self._writer.flush()
@@ -152,9 +152,9 @@ class TcpSender:
     def send(self, frame: OutFrame, now_ns: int) -> bool:
         """Send *frame* or begin to; return whether it is on its way."""
         if self._writer is None or not self._connected:
-            return self._lose("not_connected")
+            return self._drop("not_connected")
         try:
-            return self._writer.send(frame) or self._lose("slow_peer")
+            return self._writer.send(frame) or self._drop("slow_peer")
         except OSError as error:
             self._fail(error.errno, now_ns)
             return False
@@ -168,7 +168,7 @@ class TcpSender:
         self._writer = None
         self._receiver = None
 
-    def _lose(self, reason: str) -> bool:
+    def _drop(self, reason: str) -> bool:
         self._errors[reason] = self._errors.get(reason, 0) + 1
         return False
 
@@ -186,9 +186,9 @@ class TcpSender:
         except OSError as error:
             self._fail(error.errno, now_ns)
             return
-        self._go_on_connecting(sock, now_ns)
+        self._continue_connecting(sock, now_ns)
 
-    def _go_on_connecting(self, sock: socket.socket, now_ns: int) -> None:
+    def _continue_connecting(self, sock: socket.socket, now_ns: int) -> None:
         number = sock.connect_ex(self._address)
         if number in _CONNECTED:
             self._connected = True
@@ -199,16 +199,16 @@ class TcpSender:
             self._fail(errno.ETIMEDOUT, now_ns)
 
     def _listen(self, sock: socket.socket, now_ns: int) -> None:
-        if not self._takers:
+        if not self._handlers:
             return
         try:
-            self._receiver = TcpReceiver(sock, self._takers, self._destination, self._writer)
+            self._receiver = TcpReceiver(sock, self._handlers, self._destination, self._writer)
         except OSError as error:
             self._fail(error.errno, now_ns)
 
     def _receive(self, sock: socket.socket, now_ns: int) -> int:
         """Take what the peer says; raise OSError if it is lost."""
-        if self._receiver is None and self._takers:  # it asks for something since
+        if self._receiver is None and self._handlers:  # it asks for something since
             self._listen(sock, now_ns)
         if self._receiver is not None:
             count = self._receiver.drain(now_ns)
@@ -232,11 +232,11 @@ class TcpSender:
 
 
 class TcpReceiver:
-    """One connection whose frames go to *takers*, and answers back.
+    """One connection whose frames go to *handlers*, and answers back.
 
     Args:
         sock: The connection.
-        takers: Who takes its frames.
+        handlers: Who takes its frames.
         name: The destination of answers to them, if it has been connected to; else it gets one.
         writer: Who sends on it; else it is made.
         host: Of the peer, as the policy counts it (connections.py).
@@ -252,7 +252,7 @@ class TcpReceiver:
     def __init__(
         self,
         sock: socket.socket,
-        takers: Sequence[FrameHandler],
+        handlers: Sequence[FrameHandler],
         name: str = "",
         writer: TcpWriter | None = None,
         *,
@@ -260,7 +260,7 @@ class TcpReceiver:
     ) -> None:
         self._writer = writer or TcpWriter(sock)
         set_keepalive(sock, idle_s=5, interval_s=2)
-        self.takers = list(takers)
+        self.handlers = list(handlers)
         self.name = name or f"{CONNECTION}{next(_numbers)}"
         self.host = host
         self.closed = ""
@@ -313,7 +313,7 @@ class TcpReceiver:
         return not self.closed and self._write(frame)
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when octets wait, -1 once closed."""
+        """Return the descriptor that becomes readable when bytes wait, -1 once closed."""
         return self._sock.fileno()
 
     def close(self, reason: str = "closed here") -> None:
@@ -322,7 +322,7 @@ class TcpReceiver:
         self._sock.close()
 
     def _write(self, frame: OutFrame | None) -> bool:
-        """Send *frame*, or just go on with one that has begun."""
+        """Send *frame*, or just continue with one that has begun."""
         try:
             return self._writer.flush() if frame is None else self._writer.send(frame)
         except OSError as error:
@@ -359,7 +359,7 @@ class TcpReceiver:
             if self._end - start < size:
                 return count
             self._start += size
-            for take in self.takers:
+            for take in self.handlers:
                 take(self._view[start : start + size], size, now_ns, self)
         return limit
 

@@ -99,7 +99,7 @@ class TcpPort:
             self._receivers = [receiver for receiver in self._receivers if not receiver.closed]
             if now_ns >= self._look_ns:
                 self._look_ns = now_ns + LOOK_NS
-                for late in self._table.take_overdue(now_ns):
+                for late in self._table.remove_overdue(now_ns):
                     late.close(CloseReason.OVERDUE)
         return total
 

@@ -28,17 +28,17 @@ class UdpChannel:
     """Frames in datagrams (ETG.1005: one frame each, UDP port 34980).
 
     Serves a port's own socket, and those of multicast groups and of broadcasts, from which
-    nothing is sent: *takers* are all stations of the process that listen there.  *batch* may be
+    nothing is sent: *handlers* are all stations of the process that listen there.  *batch* may be
     shared by all channels of a process, which are drained one after the other.
     """
 
     minimum_size = 0
 
     def __init__(
-        self, sock: socket.socket, batch: ReceiveBatch, takers: Sequence[FrameHandler] = ()
+        self, sock: socket.socket, batch: ReceiveBatch, handlers: Sequence[FrameHandler] = ()
     ) -> None:
         sock.setblocking(False)
-        self.takers = list(takers)
+        self.handlers = list(handlers)
         self._sock = sock
         self._batch = batch
         self._receive = batch.reader(sock.fileno())
@@ -54,7 +54,7 @@ class UdpChannel:
             count = self._receive()
             if count == 1:
                 view, size, at_ns = self._batch.arrival()
-                for take in self.takers:
+                for take in self.handlers:
                     take(view, size, at_ns, self)
                 return total + 1
             if count < 0:
@@ -63,7 +63,7 @@ class UdpChannel:
                 break
             sizes, times = self._batch.arrivals(count)
             for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):
-                for take in self.takers:
+                for take in self.handlers:
                     take(view, size, at_ns, self)
             total += count
             if count < BATCH:
@@ -130,7 +130,7 @@ class UdpError(NamedTuple):
     """Where it was sent, as is *port*."""
     port: int
     unreachable: bool
-    """Whether it did not arrive, because nobody listens there or because of the way there."""
+    """True if it did not arrive, because nobody listens there or because of the way there."""
     reason: str
     """The errno's name, such as ECONNREFUSED."""
 
@@ -140,7 +140,7 @@ def enable_errors(sock: socket.socket) -> None:
     sock.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
 
 
-def take_errors(sock: socket.socket, limit: int = ERRORS_PER_CALL) -> list[UdpError]:
+def read_errors(sock: socket.socket, limit: int = ERRORS_PER_CALL) -> list[UdpError]:
     """Take at most *limit* errors from the queue of *sock*, without waiting."""
     found: list[UdpError] = []
     for _ in range(limit):

@@ -1,11 +1,11 @@
 """Addresses at run time: destinations and sources as words of the image, learned and watched.
 
 A word is the kind, then a MAC address, or an IPv4 address and the port.  A :class:`NetIdLearner`
-tells which MAC address a NetID stands for, from the frames of the port that has it.  A
+learns the MAC address behind a NetID from the frames of the port that has it.  A
 :class:`SourceWatch` notes the addresses that the frames of one publisher come from: a publisher ID
 is no proof of identity, as any host can put it into a frame.  Where the publisher's address is
-known, its frames are told from those of all other hosts by that address.  Where it is not, two
-hosts that send with one publisher ID are seen by the address that goes back and forth.
+configured, frames from all other addresses are distinguished by it.  Where it is not, two hosts
+that send with one publisher ID are recognized because the source address alternates.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def source_octets(text: str) -> bytes:
 
 
 def is_group_source(source: bytes) -> bool:
-    """Tell whether *source* is a group's or everybody's address, which no sender has."""
+    """Return whether *source* is a multicast or broadcast address, which no sender has."""
     if len(source) == _MAC_SIZE:
         return MacAddr(source).is_group
     address = IPv4Address(source)
@@ -73,12 +73,12 @@ def is_group_source(source: bytes) -> bool:
 
 
 def address_text(source: bytes) -> str:
-    """Return the address that a frame came from as people write it."""
+    """Return the source address of a frame in text form."""
     return str(MacAddr(source)) if len(source) == _MAC_SIZE else str(IPv4Address(source))
 
 
 def from_word(word: int) -> Destination | None:
-    """Return what :func:`to_word` made a word of, None for 0."""
+    """Return the destination that :func:`to_word` encoded, None for 0."""
     kind = _BY_NUMBER.get(word >> _KIND_SHIFT)
     if kind is None:
         return None
@@ -89,7 +89,7 @@ def from_word(word: int) -> Destination | None:
 
 
 def net_id_of(destination: str) -> NetId | None:
-    """Return the NetID that *destination* is, None if it is something else."""
+    """Return *destination* as a NetID, None if it is another kind of address."""
     try:
         kind, host, _ = Destination.parse(destination)
     except ValueError:
@@ -117,11 +117,11 @@ class SourceWatch:
     """
 
     __slots__ = (
+        "_accepting",
         "_changed_at_ns",
+        "_dropping",
         "_expected",
         "_named",
-        "_refusing",
-        "_taking",
         "_words",
         "source",
     )
@@ -131,24 +131,24 @@ class SourceWatch:
         self._words = words
         self._expected = expected
         self._named = named
-        self._taking: set[int] = set()
-        self._refusing: set[int] = set()
+        self._accepting: set[int] = set()
+        self._dropping: set[int] = set()
         self._changed_at_ns = _NEVER
 
-    def follow(self, taking: Iterable[int], refusing: Iterable[int]) -> None:
+    def follow(self, accepting: Iterable[int], dropping: Iterable[int]) -> None:
         """Note addresses for more RxPDs too, given by their first words.
 
         Args:
-            taking: Those that take PDs of these frames.
-            refusing: Those that refuse PDs because of where these frames come from.
+            accepting: Those that accept PDs of these frames.
+            dropping: Those that drop PDs because of the source of these frames.
         """
-        self._taking.update(taking)
-        self._refusing.update(refusing)
+        self._accepting.update(accepting)
+        self._dropping.update(dropping)
         if self.source is not None:
             self._note(source_word(self.source))
 
     def includes(self, source: bytes, at_ns: int) -> bool:
-        """Tell whether a frame from *source* is of this class, and note it if the address is new.
+        """Return whether a frame from *source* is of this class, and note it if the address is new.
 
         Only called for another address than :attr:`source`.
         """
@@ -159,45 +159,45 @@ class SourceWatch:
         if before is not None:
             if at_ns - self._changed_at_ns < ALTERNATION_NS:
                 other = source_word(before)
-                for first in self._taking:
+                for first in self._accepting:
                     self._words[first + RxWord.OTHER_SOURCE] = other
                     self._words[first + RxWord.OTHER_SOURCE_AT_NS] = at_ns
             self._changed_at_ns = at_ns
         return True
 
     def _note(self, word: int) -> None:
-        for first in self._taking:
+        for first in self._accepting:
             self._words[first + RxWord.SOURCE] = word
-        for first in self._refusing:
+        for first in self._dropping:
             self._words[first + RxWord.WRONG_SOURCE] = word
 
 
 LOOK_NS = 100_000_000
-"""How often the sender of one NetID's frames is looked at: addresses change rarely."""
+"""Interval between two looks at the sender of one NetID's frames: addresses change rarely."""
 _PUBLISHER = slice(2, 8)
 
 
 class NetIdLearner:
-    """Looks at the frames of a port on their way to *taker*.
+    """Looks at the frames of a port on their way to *handler*.
 
     Attributes:
-        sought: The NetIDs whose address is wanted; it may change at any time.
+        wanted: The NetIDs whose address is wanted; it may change at any time.
         learn: Called with such a NetID and the address that its frames come from.
     """
 
-    def __init__(self, taker: FrameHandler) -> None:
-        self.sought: Container[bytes] = ()
+    def __init__(self, handler: FrameHandler) -> None:
+        self.wanted: Container[bytes] = ()
         self.learn: Callable[[bytes, str], None] = forget
-        self._taker = taker
+        self._handler = handler
         self._looked_at_ns: dict[bytes, int] = {}
 
     def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
-        """Note who sent a frame, and hand it over."""
-        if self.sought and size >= _PUBLISHER.stop and data[1] >> 4 == FrameType.PROCESS_DATA:
+        """Note the sender of a frame, and hand the frame over."""
+        if self.wanted and size >= _PUBLISHER.stop and data[1] >> 4 == FrameType.PROCESS_DATA:
             publisher = bytes(data[_PUBLISHER])
-            if publisher in self.sought:
+            if publisher in self.wanted:
                 self._look(publisher, data, at_ns, origin)
-        self._taker(data, size, at_ns, origin)
+        self._handler(data, size, at_ns, origin)
 
     def _look(self, publisher: bytes, data: memoryview, at_ns: int, origin: FrameOrigin) -> None:
         looked_at_ns = self._looked_at_ns.get(publisher)
@@ -208,5 +208,5 @@ class NetIdLearner:
 
 
 def forget(net_id: bytes, sender: str) -> None:
-    """Nobody wants to know."""
+    """Ignore a learned address: the port has no publisher."""
     del net_id, sender

@@ -1,7 +1,7 @@
 """Copies of bits between two memories, planned once and made in each cycle.
 
-Moves that lie side by side on both sides become one slice; what is left at their ends, and what
-lies otherwise in its octets here and there, is copied without touching the bits beside it.
+Moves that are adjacent on both sides become one slice.  The bits left at their ends, and moves with
+another bit alignment in source and target, are copied without touching adjacent bits.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from eap.codec.wire import Buffer
 class Move(NamedTuple):
     """*bits* bits, from bit *source_bit* of one memory to bit *target_bit* of another.
 
-    Bit 0 is the lowest of the first octet.
+    Bit 0 is the lowest of the first byte.
     """
 
     source_bit: int
@@ -26,16 +26,16 @@ class Move(NamedTuple):
 
 
 Piece: TypeAlias = tuple[int, int, int]
-"""From which bit of an octet to which bit of another one, and how many."""
+"""From which bit of an byte to which bit of another one, and how many."""
 
 
 class CopyPlan:
     """Makes *moves*, in no particular order: none may write what another one reads or writes.
 
     Args:
-        moves: What is copied.
+        moves: The copies to make.
         used: If given, what else of the target means anything, as (first bit, bits).  Other bits
-            between two moves of one run, and beside one in its octet, are then copied along.
+            between two moves of one run, and beside one in its byte, are then copied along.
 
     Raises:
         ValueError: two moves write the same bit, or one is empty or begins before the memory.
@@ -83,7 +83,7 @@ class CopyPlan:
             target[where] = value.to_bytes(size, "little")
 
     def _add_octets(self, part: Move) -> None:
-        """Plan whole octets of the target."""
+        """Plan whole bytes of the target."""
         size = part.bits // 8
         first, shift = divmod(part.source_bit, 8)
         where = slice(part.target_bit // 8, part.target_bit // 8 + size)
@@ -106,7 +106,7 @@ class _Used:
             self._ends.append(max(end, self._ends[-1]) if self._ends else end)
 
     def is_free(self, first: int, end: int) -> bool:
-        """Tell whether none of the bits from *first* up to *end* is in use."""
+        """Return whether none of the bits from *first* up to *end* is in use."""
         before = bisect_right(self._starts, end - 1) if end > first else 0
         return not before or self._ends[before - 1] <= first
 
@@ -133,7 +133,7 @@ def _merge(moves: Iterable[Move]) -> list[Move]:
 
 
 def _bridge(runs: Iterable[Move], used: _Used) -> list[Move]:
-    """Widen runs to whole octets, and join them, over unused bits."""
+    """Widen runs to whole bytes, and join them, over unused bits."""
     wide: list[Move] = []
     for run in runs:
         begin, end = run.target_bit, run.target_bit + run.bits
@@ -156,7 +156,7 @@ def _delta(move: Move) -> int:
 
 
 def _split(run: Move) -> Iterator[Move]:
-    """Part a run into its whole octets of the target and what lies before and behind them."""
+    """Split a run into its whole bytes of the target, and the bits before and behind them."""
     source, target, bits = run
     head = min(-target % 8, bits)
     body = (bits - head) // 8 * 8
@@ -168,7 +168,7 @@ def _split(run: Move) -> Iterator[Move]:
 
 
 def _pieces(part: Move) -> Iterator[tuple[tuple[int, int], Piece]]:
-    """Part what lies in one octet of the target by the octets of the source."""
+    """Split the bits of one target byte by source byte."""
     source, target, bits = part
     while bits:
         size = min(8 - source % 8, bits)
@@ -178,7 +178,7 @@ def _pieces(part: Move) -> Iterator[tuple[tuple[int, int], Piece]]:
 
 @lru_cache(maxsize=1024)
 def _table(pieces: tuple[Piece, ...]) -> tuple[int, bytes]:
-    """Return which bits of the target octet stay, and what each source octet puts there."""
+    """Return the mask of target bits to keep, and the bits to set for each source byte."""
     keep = 0xFF
     table = [0] * 256
     for source_bit, target_bit, bits in pieces:

@@ -1,6 +1,6 @@
 """States of the EAP device, and faults: reasons for which it does not change its state.
 
-Rule 1: every transition is in TRANSITIONS; the refusal of another one names the possible ones.
+Rule 1: every transition is in TRANSITIONS; the error for another one names the possible ones.
 Rule 2: PreOp exchanges no process data, SafeOp sends, Op sends and receives (ETG.1005).
 Rule 3: fault codes of transitions are those of the AL status (ETG.1000.6); those of configuration
 start where that leaves room for the device's own.
@@ -29,7 +29,7 @@ class DeviceState(IntEnum):
 
     @property
     def receives(self) -> bool:
-        """True if RxPDs are taken."""
+        """True if RxPDs are received."""
         return self is DeviceState.OP
 
 
@@ -37,7 +37,7 @@ class StateRequest(Enum):
     """States that can be requested of a device."""
 
     START = auto()
-    """From Init to PreOp; only the device itself asks for it."""
+    """From Init to PreOp; only the device itself requests it."""
     PREOP = auto()
     SAFEOP = auto()
     OP = auto()

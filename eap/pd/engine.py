@@ -12,11 +12,11 @@ from eap.pd.station import Station
 from eap.pd.words import StationWord
 
 SOON_NS = 1_000_000_000
-"""A station whose cycle is longer is not waited for when the engine starts."""
+"""The start of the engine does not wait for a station whose cycle is longer."""
 
 
 class Engine:
-    """Runs each station when its cycle is due; a cycle it comes too late for is left out."""
+    """Runs each station when its cycle is due, and skips a cycle for which it is too late."""
 
     def __init__(self, stations: Sequence[Station]) -> None:
         self._stations = list(stations)
@@ -25,11 +25,11 @@ class Engine:
         self._due: list[tuple[int, int]] = []
 
     def drain_on_arrival(self, channels: Iterable[FrameChannel]) -> None:
-        """Take what these channels receive as soon as :meth:`receive` is called."""
+        """Drain these channels as soon as :meth:`receive` is called."""
         self._arrivals.extend(channels)
 
     def start(self, now_ns: int, states: Mapping[str, DeviceState] = MappingProxyType({})) -> None:
-        """Bring all stations, with the buses that they have now, to Op or what *states* says."""
+        """Bring all stations, with their present buses, to Op or to their state in *states*."""
         self._buses = [bus for station in self._stations for bus in station.buses]
         self._due = [
             (station.start(now_ns, states.get(station.spec.name, DeviceState.OP)), index)
@@ -43,7 +43,7 @@ class Engine:
         return all(each.has_run or each.cycle_ns > SOON_NS for each in self._stations)
 
     def replace(self, old: Station, new: Station, now_ns: int) -> None:
-        """Run *new*, which has the buses of *old*, in its place; its cycle counter goes on."""
+        """Run *new*, which has the buses of *old*, in its place; its cycle counter continues."""
         index = self._stations.index(old)
         self._stations[index] = new
         if new.cycle_ns != old.cycle_ns:
@@ -89,14 +89,14 @@ class Engine:
         heapreplace(self._due, (following_ns, index))
 
     def receive(self, now_ns: int) -> None:
-        """Take pending frames between cycles, of the channels that asked for it and of buses."""
+        """Receive frames between cycles: of channels drained on arrival, and of buses."""
         for channel in self._arrivals:
             channel.drain(now_ns)
         for bus in self._buses:
             bus.receive(now_ns)
 
     def _handle_bus(self, now_ns: int) -> None:
-        """Let the bus go on whose time came first."""
+        """Run the timers of the bus that is due first."""
         first, first_ns = None, now_ns + 1
         for bus in self._buses:
             bus_ns = bus.next_timeout()

@@ -1,11 +1,10 @@
 """Handover of a process image to the one that replaces it: counters, trackers and values.
 
-Rule 1: what has the same name is the same thing.  Variables keep their value if their type is the
-same too; frames and PDs keep their counters.
-Rule 2: the tracker of a publisher goes on for all subscriptions that shared it, as long as they are
-judged alike.  A subscription that listens to another publisher now keeps its sums and forgets the
-sender that it knew.
-Rule 3: everything is planned beside running cycles; when the moment comes, only octets are copied.
+Rule 1: objects are matched by name.  Variables keep their value if their type is the same too;
+frames and PDs keep their counters.
+Rule 2: a tracker continues for all subscriptions that shared it, as long as they still may share
+one.  A subscription to another publisher keeps its sums, and its tracker forgets the sender.
+Rule 3: everything is planned beside running cycles; between two cycles, only bytes are copied.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from eap.pd.words import (
 )
 
 _IN_FRAMES = {"net_id", "eap_sm"}
-"""Fields of a port that only say what its frames carry."""
+"""Fields of a port that only change the content of its frames."""
 _WHOLE = {"bus", "gateway"}
 """Fields that are too much for a line."""
 _OWN_WORDS = {
@@ -44,7 +43,7 @@ _OWN_WORDS = {
     StationWord.APPLICATION_SEQUENCE,
     StationWord.RETIRED,
 }
-"""What belongs to an image, and not to the station."""
+"""Words that belong to an image, and not to the station."""
 
 
 _SOURCE_WORDS = (
@@ -65,7 +64,7 @@ class _WordRun(NamedTuple):
 
 
 class ImageHandover:
-    """Carries what one image holds over to the next one of the same station.
+    """Transfer of words and values from one image to the next one of the same station.
 
     Args:
         old: The image that is in use.
@@ -102,7 +101,7 @@ class ImageHandover:
         self._from_others.run(others, self._new.memory)
 
     def commit(self) -> None:
-        """Note what the subscribers that were built on the new image have made of its trackers."""
+        """Adopt the trackers that the subscribers on the new image share."""
         self._received.commit()
 
 
@@ -121,11 +120,11 @@ class _Sent:
             b.words for a, b in kept if _schedules(old, a.name) != _schedules(new, b.name)
         ]
         self._moved = [b.words for a, b in kept if a.destination != b.destination]
-        self._unseen = [b.words for a, b in kept if a.target != b.target]
+        self._target_changed = [b.words for a, b in kept if a.target != b.target]
         whole = {b.name for _, b in kept if b.words not in self._changed}
         before = {pd.name: pd for pd in old.tx}
         pds = [(before[pd.name], pd) for pd in new.tx if pd.name in before]
-        self._parted = [
+        self._split = [
             (was, pd.words)
             for was, pd in pds
             if was.by_schedule and not (was.frame == pd.frame and pd.frame in whole)
@@ -140,12 +139,12 @@ class _Sent:
         _copy(self._runs, old, new)
         for first in self._moved:
             new[first + FrameWord.ADDRESS] = 0
-        for first in self._unseen:
+        for first in self._target_changed:
             new[first + FrameWord.PRESENCE] = SubscriberPresence.UNKNOWN
         for first in self._changed:
             new[first + FrameWord.PARTIAL] += new[first + FrameWord.WHOLE]
             new[first + FrameWord.WHOLE] = 0
-        for was, first in self._parted:
+        for was, first in self._split:
             count = old[was.frame_words + FrameWord.WHOLE]
             if count:
                 reason = REASON_INDEX[Reason.CYCLE if was.cyclic else Reason.DIVIDER]
@@ -167,25 +166,25 @@ class _Received:
             slot.name: (slot, tracker or slot.words)
             for slot, tracker in zip(old.layout.rx, self._shared, strict=True)
         }
-        self._heirs = [
+        self._kept = [
             (index, *before[slot.name], slot)
             for index, slot in enumerate(new.layout.rx)
             if slot.name in before
         ]
         self._runs = _joined(
-            _WordRun(was.words, slot.words, RxWord.SIZE) for _, was, _, slot in self._heirs
+            _WordRun(was.words, slot.words, RxWord.SIZE) for _, was, _, slot in self._kept
         )
         self._owners = array("q", [0] * len(new.layout.rx))
         """By RxPD of the new image: where its tracker is, as in RxWord.TRACKER."""
-        self._from_elsewhere = [
+        self._source_changed = [
             slot.words
-            for _, was, _, slot in self._heirs
+            for _, was, _, slot in self._kept
             if (was.publisher, was.port, was.source) != (slot.publisher, slot.port, slot.source)
         ]
         first_of: dict[object, int] = {}
-        for index, was, tracker, slot in self._heirs:
-            judged = tracker, _begins_anew(was, slot), _judged(slot)
-            self._owners[index] = first_of.setdefault(judged, slot.words)
+        for index, was, tracker, slot in self._kept:
+            key = tracker, _sequence_restarts(was, slot), _tracker_key(slot)
+            self._owners[index] = first_of.setdefault(key, slot.words)
         self._plan_trackers()
 
     @property
@@ -201,22 +200,22 @@ class _Received:
         _copy(self._runs, old, new)
         _copy(self._trackers, old, new)
         new[self._new_column] = self._owners
-        for first in self._strangers:
+        for first in self._restarted:
             new[first + RxWord.LAST_CYCLE] = -1
             for word in (RxWord.BEHIND, RxWord.HOLES, RxWord.SENDER):
                 new[first + word] = 0
-        for first in self._from_elsewhere:
+        for first in self._source_changed:
             for word in _SOURCE_WORDS:
                 new[first + word] = 0
 
     def _plan_trackers(self) -> None:
         sources: dict[int, int] = {}
-        self._strangers: set[int] = set()
-        for index, was, tracker, slot in self._heirs:
+        self._restarted: set[int] = set()
+        for index, was, tracker, slot in self._kept:
             owner = self._owners[index]
             sources[owner] = tracker
-            if _begins_anew(was, slot):
-                self._strangers.add(owner)
+            if _sequence_restarts(was, slot):
+                self._restarted.add(owner)
         size = RxWord.SIZE - TRACKER_START
         self._trackers = [
             _WordRun(tracker + TRACKER_START, owner + TRACKER_START, size)
@@ -225,12 +224,12 @@ class _Received:
 
 
 def _schedules(layout: ImageLayout, frame: str) -> set[tuple[str, bool, bool]]:
-    """Return what the count of a whole frame stands for."""
+    """Return the PDs that the count of a whole frame stands for, and their schedules."""
     return {(pd.name, pd.by_schedule, pd.cyclic) for pd in layout.tx if pd.frame == frame}
 
 
-def _begins_anew(was: RxSlot, slot: RxSlot) -> bool:
-    """Whether the next frame cannot be compared with the last one.
+def _sequence_restarts(was: RxSlot, slot: RxSlot) -> bool:
+    """Return whether the sequence restarts: the next frame cannot be compared with the last one.
 
     It comes from another sender, or from one that changes its rate: the gap between these
     two may be of the old rate or of the new one.
@@ -238,8 +237,8 @@ def _begins_anew(was: RxSlot, slot: RxSlot) -> bool:
     return (was.publisher, was.port, was.step) != (slot.publisher, slot.port, slot.step)
 
 
-def _judged(slot: RxSlot) -> tuple[object, ...]:
-    """Return what must be the same for all subscriptions of a tracker."""
+def _tracker_key(slot: RxSlot) -> tuple[object, ...]:
+    """Return the properties that all subscriptions of a tracker share."""
     return (
         slot.port,
         slot.publisher,
@@ -251,7 +250,7 @@ def _judged(slot: RxSlot) -> tuple[object, ...]:
 
 
 def _column(layout: ImageLayout) -> slice:
-    """Return where RxWord.TRACKER of all RxPDs lies: their blocks lie side by side."""
+    """Return the slice of RxWord.TRACKER of all RxPDs, whose blocks are adjacent."""
     if not layout.rx:
         return slice(0, 0)
     first = layout.rx[0].words + RxWord.TRACKER
@@ -259,7 +258,7 @@ def _column(layout: ImageLayout) -> slice:
 
 
 def _plan_values(old: Image, new: Image) -> tuple[CopyPlan, CopyPlan]:
-    """Return what is copied of what the engine writes, and of what others do."""
+    """Return the copies of variables that the engine writes, and of those that others write."""
     engine: list[Move] = []
     others: list[Move] = []
     for name, slot in new.slots.items():
@@ -278,7 +277,7 @@ def _plan_values(old: Image, new: Image) -> tuple[CopyPlan, CopyPlan]:
 
 
 def _joined(runs: Iterable[_WordRun]) -> list[_WordRun]:
-    """Join what lies side by side on both sides."""
+    """Join runs that are adjacent on both sides."""
     joined: list[_WordRun] = []
     for run in runs:
         if joined:
@@ -296,7 +295,7 @@ def _copy(runs: Iterable[_WordRun], old: memoryview, new: memoryview) -> None:
 
 
 def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
-    """Return what differs between the two and cannot be changed by the engine, one line each."""
+    """Return the differences that the engine cannot apply while it runs, one line each."""
     found = []
     if old.name != new.name:
         found.append(f"station {old.name} cannot become {new.name}")

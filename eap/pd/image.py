@@ -42,7 +42,7 @@ from eap.pd.words import StationWord
 READ_ATTEMPTS = 1000
 """Spread over a tenth of a second by the pauses of a mapped file: a busy host stalls that long."""
 SNAPSHOT_ATTEMPTS = 200
-"""Fewer, because who takes snapshots has other clients, and gets a copy in any case."""
+"""Fewer, because the reader of snapshots has other clients, and gets a copy in any case."""
 
 _CODES = {
     (int, 1): "b", (int, 2): "h", (int, 4): "i", (int, 8): "q", (float, 4): "f", (float, 8): "d",
@@ -60,8 +60,8 @@ class Image:
     """Named access to the memory that an :class:`ImageLayout` describes.
 
     Args:
-        memory: At least ``layout.size`` octets, already formatted.
-        layout: What lies where.
+        memory: At least ``layout.size`` bytes, already formatted.
+        layout: Offsets of words and variables.
         pause: Called between two attempts at a read; a driver gives the processor away here.
     """
 
@@ -84,7 +84,7 @@ class Image:
         return datatypes.parse(self._slot(name).type).decode(self.load(name), 0)
 
     def load(self, name: str, *, attempts: int = READ_ATTEMPTS) -> bytes:
-        """Return one variable's octets, as :meth:`encode` does those of a value.
+        """Return one variable's encoded bytes, in the form of :meth:`encode`.
 
         Raises:
             ImageError: there is none of that name; TornReadError, if it is only for now.
@@ -136,21 +136,21 @@ class Image:
     def write(self, name: str, value: Any) -> None:
         """Store one value; raise ValueError if the type cannot hold it.
 
-        The caller is the region's writer and stands inside :meth:`writing`.
+        The caller is the region's writer, inside a block of :meth:`writing`.
         """
         self.store(name, self.encode(name, value))
 
     def encode(self, name: str, value: Any) -> bytes:
-        """Return the octets of *value* for :meth:`store`; raise ValueError if it does not fit."""
+        """Return the bytes of *value* for :meth:`store`; raise ValueError if it does not fit."""
         return datatypes.parse(self._slot(name).type).encode(value)
 
     def store(self, name: str, octets: bytes) -> None:
-        """Put encoded octets in a variable's place; the caller stands inside :meth:`writing`."""
+        """Store encoded bytes in a variable, inside a block of :meth:`writing`."""
         slot = self._slot(name)
         put(self.memory, slot.bit_offset, datatypes.parse(slot.type).bit_length, octets)
 
     def storer(self, name: str) -> Callable[[Any], None]:
-        """Return what stores numbers that are known to fit in one variable, again and again."""
+        """Return a function that stores numbers in one variable; they must fit its type."""
         slot = self._slot(name)
         kind = datatypes.parse(slot.type)
         limits = kind.scalar_range
@@ -173,7 +173,7 @@ class Image:
             self.words[sequence] += 1
 
     def release(self) -> None:
-        """Let go of the places, one by one; nothing can be read or written any more."""
+        """Free the slots one by one; nothing can be read or written any more."""
         while self.slots:
             self.slots.popitem()
 
@@ -281,7 +281,7 @@ def _end_octet(slot: VariableSlot) -> int:
 
 
 def take(slot: VariableSlot, data: bytes, first_bit: int) -> bytes:
-    """Return the octets of a variable out of *data*, a copy of the image from *first_bit* on."""
+    """Return the bytes of a variable out of *data*, a copy of the image from *first_bit* on."""
     kind = datatypes.parse(slot.type)
     offset, bit = divmod(slot.bit_offset - first_bit, 8)
     if not kind.is_bits:
@@ -300,7 +300,7 @@ _APPLICATION = int(StationWord.APPLICATION_SEQUENCE)
 
 
 class Inputs:
-    """The station's variables as the cycle sees them.
+    """Copies of the variables that services and applications write, stable within a cycle.
 
     Attributes:
         memory: With variables at the same offsets as in the image.  What the engine itself writes
@@ -323,7 +323,7 @@ class Inputs:
             self.memory[region] = image.memory[region]
 
     def reload(self) -> None:
-        """Take what has been put into the image before its writers write there."""
+        """Copy the values that were put into the image before its writers write there."""
         for index, (sequence, region) in enumerate(self._regions):
             if self.memory[region] == self._image.memory[region]:
                 self._seen[index] = self._words[sequence]
@@ -370,7 +370,7 @@ _NO_CYCLE = 0
 
 
 class Sampler:
-    """The engine's side.
+    """The engine's side of the samples.
 
     Args:
         image: Where the variables and the samples are.
@@ -406,7 +406,7 @@ class Sampler:
 
 
 class ImageSamples:
-    """The side of those who read them; one in all may say what is wanted.
+    """The reader's side of the samples; only one reader may request them.
 
     Args:
         image: Where they are.

@@ -3,7 +3,7 @@
 The image is a header, the words of ``words.py``, one region of variables for each writer, and the
 directory: this layout as JSON, so that a program that attaches needs no plant file.
 
-A received PD lies in the engine's region as it travels: eight octets of PD header, then the data.
+A received PD lies in the engine's region as it travels: eight bytes of PD header, then the data.
 PDs that follow each other in a frame also follow each other here, so that one copy takes them all.
 Behind them lie the inputs of slaves, bit for bit as in their PDOs, with padding, so that a bus and
 an image of the same order are one copy; then their outputs, in the region of their writer.  Where
@@ -13,7 +13,7 @@ An RxPD may have alternates: other layouts that are taken while its sender chang
 other.  What both have goes to its place in the image, and so does the quality, which says how old
 it is; what only the RxPD has keeps its value, and its PD header in the image stays as it was.
 
-Behind all regions is room for copies of them: samples of the latest cycles, for those who ask.
+Behind all regions are samples: copies of the regions in the latest cycles, taken on request.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ WORDS_OFFSET = 64
 
 SAMPLE_HEAD = 16
 SAMPLES_FOR_US = 250_000
-"""How long ago the oldest sample is, unless that takes too much room."""
+"""Age of the oldest sample, unless that takes too much memory."""
 MIN_SAMPLES, MAX_SAMPLES = 8, 256
 SAMPLES_SIZE = 1 << 20
-"""Octets that more than MIN_SAMPLES may take."""
+"""Bytes that more than MIN_SAMPLES may take."""
 
 VAR_CTRL = ".VarCtrl"
 """Suffix of the control variable of a TxPD: bit 0 suppresses it, a rising bit 1 sends it."""
@@ -72,7 +72,7 @@ class VariableSlot(SpecRecord, frozen=True):
 
 
 class RegionSlot(SpecRecord, frozen=True):
-    """The variables of one writer, and the word that guards them; offsets in octets."""
+    """The variables of one writer, and the word that guards them; offsets in bytes."""
 
     offset: int
     size: int
@@ -80,10 +80,10 @@ class RegionSlot(SpecRecord, frozen=True):
 
 
 class SampleSlot(SpecRecord, frozen=True):
-    """Samples of all regions, one a cycle; offsets and sizes in octets.
+    """Samples of all regions, one a cycle; offsets and sizes in bytes.
 
     The sample of a cycle lies at ``offset + cycle % count * size``: the cycle and its time, which
-    take 16 octets, then the image from *first* to *last*.
+    take 16 bytes, then the image from *first* to *last*.
     """
 
     offset: int
@@ -119,7 +119,7 @@ class FrameSlot(SpecRecord, frozen=True):
 
 
 class TxSlot(SpecRecord, frozen=True):
-    """A TxPD; *frame_words* is the index of its frame's first word, *size* the data's octets."""
+    """A TxPD; *frame_words* is the index of its frame's first word, *size* the data's bytes."""
 
     name: str
     frame: str
@@ -131,17 +131,17 @@ class TxSlot(SpecRecord, frozen=True):
     words: int
     frame_words: int
     by_schedule: bool
-    """Whether cycle time or divider is its only trigger."""
+    """True if cycle time or divider is its only trigger."""
     cyclic: bool
-    """Whether that schedule is a cycle time (or each cycle), not a divider."""
+    """True if that schedule is a cycle time (or each cycle), not a divider."""
     event: bool
-    """Whether the application can send it."""
+    """True if the application can send it."""
     poll_request: str = ""
-    """The RxPD that asks for it."""
+    """The RxPD that requests it."""
 
 
 class RxSlot(SpecRecord, frozen=True):
-    """An RxPD: its PD header lies at octet *offset*, its data behind it."""
+    """An RxPD: its PD header lies at byte *offset*, its data behind it."""
 
     name: str
     port: str
@@ -157,7 +157,7 @@ class RxSlot(SpecRecord, frozen=True):
     timeout_ms: int
     substitute: Substitute
     poll_request: str = ""
-    """The TxPD that asks for it."""
+    """The TxPD that requests it."""
     alternates: tuple[AlternateSlot, ...] = ()
     source: str = ""
     """Address that its frames must come from; empty takes any."""
@@ -180,17 +180,17 @@ class ImageLayout(SpecRecord, frozen=True):
     directory_offset: int
 
     def encode(self) -> bytes:
-        """Return the directory as it stands in the image."""
+        """Return the directory as stored in the image."""
         return encode_in_steps(self)
 
     @property
     def size(self) -> int:
-        """Octets of the whole image."""
+        """Bytes of the whole image."""
         return self.directory_offset + len(self.encode())
 
 
 def plan_layout(spec: StationSpec) -> ImageLayout:
-    """Give everything in *spec* its place.
+    """Assign an offset to everything in *spec*.
 
     Raises:
         ValueError: an alternate of an RxPD does not belong to it.
@@ -286,7 +286,7 @@ def _lay_out_on_bus(
     slots: dict[str, VariableSlot],
     octets: _Allocator,
 ) -> None:
-    """Place what *writer* writes of the slaves' process data: all inputs, then outputs."""
+    """Lay out the slaves' process data that *writer* writes: all inputs, then outputs."""
     slaves = [slave for port in spec.ports if port.bus for slave in port.bus.slaves]
     sides: list[tuple[BusEntrySpec, ...]] = [slave.inputs for slave in slaves]
     sides += [slave.outputs for slave in slaves]
@@ -390,7 +390,7 @@ _QUALITY = 8 * PdHeader.SIZE - _QUALITY_BITS
 
 
 class AlternateSlot(SpecRecord, frozen=True):
-    """Another layout: *size* octets of data."""
+    """Another layout: *size* bytes of data."""
 
     version: int
     size: int
@@ -400,24 +400,24 @@ class AlternateSlot(SpecRecord, frozen=True):
     """Variables of the RxPD that it does not bring: first bit in the image, and how many."""
 
     def copy_plan(self) -> CopyPlan:
-        """Return what copies a PD of this layout, header included, to the image."""
+        """Return the plan that copies a PD of this layout, header included, to the image."""
         return CopyPlan(self.moves, used=self.untouched)
 
 
 def lay_out_alternates(
     pd: RxPdSpec, kinds: Sequence[DataType], bits: Sequence[int], offset: int
 ) -> tuple[AlternateSlot, ...]:
-    """Return where the alternates of *pd* go.
+    """Return the slots of the alternates of *pd*.
 
     Args:
         pd: The RxPD.
         kinds: Types of its variables, in PDO order.
         bits: Where they lie in the image.
-        offset: Octet of the image at which its PD header lies.
+        offset: Byte of the image at which its PD header lies.
 
     Raises:
         ValueError: an alternate brings what *pd* has not, or has as another type; or the same
-            variable twice; or it cannot be told from another layout by version and size.
+            variable twice; or version and size are those of another layout.
     """
     if not pd.alternates:
         return ()
@@ -428,8 +428,8 @@ def lay_out_alternates(
         found.append(_lay_out_alternate(pd, alternate, own, 8 * offset))
         key = found[-1].version, found[-1].size
         if key in layouts:
-            problem = f"has {key[1]} octets like another layout of that version"
-            raise _refusal(pd, alternate, problem, "another version")
+            problem = f"has {key[1]} bytes like another layout of that version"
+            raise _alternate_error(pd, alternate, problem, "another version")
         layouts.add(key)
     return tuple(found)
 
@@ -448,13 +448,15 @@ def _lay_out_alternate(
         if kind != expected:
             shown = ", ".join(f"{name} ({own[name][0].text})" for name in own)
             problem = f"brings {each.name} ({kind.text})"
-            raise _refusal(pd, alternate, problem, f"each of {shown} at most once")
+            raise _alternate_error(pd, alternate, problem, f"each of {shown} at most once")
         moves.append(Move(8 * PdHeader.SIZE + start, bit, kind.bit_length))
     untouched = tuple((bit, kind.bit_length) for kind, bit in missing.values())
     return AlternateSlot(alternate.version, plan.size, tuple(moves), untouched)
 
 
-def _refusal(pd: RxPdSpec, alternate: RxAlternateSpec, problem: str, expected: str) -> ValueError:
+def _alternate_error(
+    pd: RxPdSpec, alternate: RxAlternateSpec, problem: str, expected: str
+) -> ValueError:
     which = f"alternate of version {alternate.version} of RxPD {pd.name!r}"
     return ValueError(f"{which} {problem}, expected {expected}")
 
@@ -465,14 +467,14 @@ class Mirror(NamedTuple):
     bit_offsets: dict[str, int]
     """Of each variable, from where the slave's part begins."""
     size: int
-    """In octets."""
+    """In bytes."""
 
 
 def mirror(entries: Iterable[BusEntrySpec], types: Mapping[str, DataType]) -> Mirror:
     """Place the variables of *entries*.
 
-    What is no bit field starts on a whole octet, as everywhere in an image: behind an entry that a
-    slave has elsewhere all others are shifted.
+    A variable that is no bit field starts on a whole byte, as everywhere in an image.  Behind an
+    entry that is not aligned so on the slave, all others are shifted.
     """
     offsets: dict[str, int] = {}
     end = 0

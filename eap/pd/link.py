@@ -1,4 +1,4 @@
-"""Seam between the cyclic core and the networks: channels to other stations, buses of slaves."""
+"""Interfaces between the cyclic core and the networks: channels to stations, buses of slaves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eap.pd.words import StationWord
 
 
 class FrameOrigin(Protocol):
-    """Driver that hands a frame to a taker, and knows the sender of the frame."""
+    """Driver that hands a frame to a handler, and knows the sender of the frame."""
 
     def source_of(self, data: memoryview) -> bytes:
         """Return the address that *data* came from: MAC (6 bytes), IPv4 (4), or none (empty).
@@ -21,25 +21,25 @@ class FrameOrigin(Protocol):
     def sender_of(self, data: memoryview) -> str:
         """Return the destination by which the port's channel reaches the sender of *data*.
 
-        Only valid while the taker has it.  A reply is an ordinary frame to that destination;
+        Only valid while the handler runs.  A reply is an ordinary frame to that destination;
         there can be none when it is empty.
         """
 
 
 FrameHandler: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], None]
-"""Takes one frame: ``take(data, size, at_ns, origin)``.
+"""Handler of one frame: ``handle(data, size, at_ns, origin)``.
 
-*data* starts at the EtherCAT header and may be longer than the frame; *size* octets of it arrived.
+*data* starts at the EtherCAT header and may be longer than the frame; *size* bytes of it arrived.
 *at_ns* is the kernel's receive time on the monotonic clock.  The view is valid during the call.
 """
 
 
 class OutFrame:
-    """One frame ready to go: the octets that a channel puts on its wire, patched in place.
+    """One frame ready to go: the bytes that a channel puts on its wire, patched in place.
 
-    *buffer* holds *headroom* octets that belong to the channel (an Ethernet header, or nothing),
+    *buffer* holds *headroom* bytes that belong to the channel (an Ethernet header, or nothing),
     then the EtherCAT frame, then padding.  A channel may cache whatever it derives from the
-    object: buffer and destination never change, only the octets do.
+    object: buffer and destination never change, only the content of the buffer does.
 
     Attributes:
         oversized: Whether a channel could not send it last because it is too large for its wire.
@@ -56,10 +56,10 @@ class OutFrame:
 
 
 class FrameChannel(Protocol):
-    """One way in and out: a UDP socket, an Ethernet interface, a TCP connection, a loopback."""
+    """Transport of frames: a UDP socket, an Ethernet interface, a TCP connection, a loopback."""
 
     def drain(self, now_ns: int) -> int:
-        """Hand every waiting frame to its takers, at most a bounded number; return how many."""
+        """Hand every waiting frame to its handlers, at most a bounded number; return how many."""
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* at once, never blocking; return those that could not be sent.
@@ -68,7 +68,7 @@ class FrameChannel(Protocol):
         """
 
     def link_header(self, destination: str) -> bytes:
-        """Return the headroom octets of every frame to *destination*; empty for UDP and TCP."""
+        """Return the headroom bytes of every frame to *destination*; empty for UDP and TCP."""
 
     @property
     def minimum_size(self) -> int:
@@ -80,8 +80,8 @@ class CyclicBus(Protocol):
 
     An exchange takes a cycle, and no call waits for it: its frames leave at the end of one cycle,
     with the outputs of that cycle, and what they bring is taken at the start of the next.  No call
-    waits or raises: a bus that cannot work counts that and says why where it is asked, and the
-    cycles of all stations go on.
+    waits or raises: a bus that cannot work counts that and gives the reason in its report, and the
+    cycles of all stations continue.
     """
 
     def take_inputs(self) -> None:
@@ -113,7 +113,7 @@ TOGGLE_BIT = 0x20
 class StateChannel:
     """A channel that writes the EAP SM octet, the state of its device, into all that it sends.
 
-    Off unless a port has ``eap_sm``: older receivers take the octet for a reserved one that is 0.
+    Off unless a port has ``eap_sm``: older receivers take the byte for a reserved one that is 0.
     Where its bits lie is not public (ETG.1005); they are placed as those of the AL status.  It is
     ignored on receive.
 
@@ -133,7 +133,7 @@ class StateChannel:
         return self._channel.minimum_size
 
     def link_header(self, destination: str) -> bytes:
-        """Return what the channel puts in front."""
+        """Return the headroom of the channel."""
         return self._channel.link_header(destination)
 
     def drain(self, now_ns: int) -> int:

@@ -6,7 +6,7 @@ Rule 2: between numbers, a link with a scale or an offset, or from one type to a
 value, rounds it if the target holds whole numbers, and keeps it within the limits of its type.  A
 source that is infinite or not a number gives no value: the target keeps the old one, and the
 station counts that.
-Rule 3: every other link copies bits, whatever they mean.
+Rule 3: every other link copies bits without regard to their type.
 Rule 4: a generated value is a function of the station's time alone: of the number of cycle times
 since the first cycle, whether or not a cycle ran in each of them.  So a late or skipped cycle slows
 nothing down, and a restarted engine continues as if it had not stopped.
@@ -40,7 +40,7 @@ from eap.pd.words import StationWord
 _HELD = int(StationWord.LINKS_HELD)
 
 
-class _End(NamedTuple):
+class _LinkEnd(NamedTuple):
     """One end of a link."""
 
     slot: VariableSlot
@@ -54,12 +54,12 @@ class _End(NamedTuple):
         return slice(first, first + self.kind.size)
 
 
-class _Way(NamedTuple):
+class _BoundLink(NamedTuple):
     """A link between its ends, and the bits of the image that it reads and writes."""
 
     link: LinkSpec
-    source: _End
-    target: _End
+    source: _LinkEnd
+    target: _LinkEnd
     reads: range
     writes: range
 
@@ -86,12 +86,12 @@ class Links:
     def __init__(
         self, image: Image, memory_of: Callable[[Writer], memoryview], links: Iterable[LinkSpec]
     ) -> None:
-        def end(name: str) -> _End:
+        def end(name: str) -> _LinkEnd:
             slot = image.slots[name]
-            return _End(slot, datatypes.parse(slot.type), memory_of(slot.writer))
+            return _LinkEnd(slot, datatypes.parse(slot.type), memory_of(slot.writer))
 
-        ways = [_way(link, end(link.source), end(link.target)) for link in links]
-        self._steps = [step for stage in _stages(ways) for step in _steps(image, stage)]
+        bound = [_bind(link, end(link.source), end(link.target)) for link in links]
+        self._steps = [step for stage in _stages(bound) for step in _steps(image, stage)]
 
     @property
     def steps(self) -> int:
@@ -104,57 +104,59 @@ class Links:
             step()
 
 
-def _way(link: LinkSpec, source: _End, target: _End) -> _Way:
+def _bind(link: LinkSpec, source: _LinkEnd, target: _LinkEnd) -> _BoundLink:
     first, where = source.slot.bit_offset, target.slot.bit_offset
-    length, room = source.kind.bit_length, target.kind.bit_length
-    way = _Way(link, source, target, range(first, first + length), range(where, where + room))
-    if way.is_computed or link.swap:
-        return way
-    bits = link.bits or min(length - link.source_bit, room - link.target_bit)
-    return way._replace(
-        reads=way.reads[link.source_bit :][:bits], writes=way.writes[link.target_bit :][:bits]
+    length, available = source.kind.bit_length, target.kind.bit_length
+    each = _BoundLink(
+        link, source, target, range(first, first + length), range(where, where + available)
+    )
+    if each.is_computed or link.swap:
+        return each
+    bits = link.bits or min(length - link.source_bit, available - link.target_bit)
+    return each._replace(
+        reads=each.reads[link.source_bit :][:bits], writes=each.writes[link.target_bit :][:bits]
     )
 
 
-def _stages(ways: Iterable[_Way]) -> list[list[_Way]]:
-    """Divide *ways* so that those of one stage can run in any order, stage after stage."""
-    stages: list[list[_Way]] = []
+def _stages(bound: Iterable[_BoundLink]) -> list[list[_BoundLink]]:
+    """Divide *bound* so that those of one stage can run in any order, stage after stage."""
+    stages: list[list[_BoundLink]] = []
     read_in: dict[int, int] = {}
     written_in: dict[int, int] = {}
-    for way in ways:
-        before = [written_in[bit] for bit in way.reads if bit in written_in]
-        for bit in way.writes:
+    for each in bound:
+        before = [written_in[bit] for bit in each.reads if bit in written_in]
+        for bit in each.writes:
             before += [stage[bit] for stage in (read_in, written_in) if bit in stage]
         number = max(before, default=-1) + 1
-        for bit in way.reads:
+        for bit in each.reads:
             read_in[bit] = max(number, read_in.get(bit, 0))
-        written_in.update(dict.fromkeys(way.writes, number))
+        written_in.update(dict.fromkeys(each.writes, number))
         stages += [[] for _ in range(number + 1 - len(stages))]
-        stages[number].append(way)
+        stages[number].append(each)
     return stages
 
 
-def _steps(image: Image, stage: Iterable[_Way]) -> Iterator[Callable[[], None]]:
+def _steps(image: Image, stage: Iterable[_BoundLink]) -> Iterator[Callable[[], None]]:
     moves: dict[Writer, list[Move]] = {}
     memories: dict[Writer, memoryview] = {}
-    for way in stage:
-        source = way.source
-        if way.is_computed:
-            yield _computed(image, way)
-        elif way.link.swap:
-            yield _swapped(image.memory, way)
+    for each in stage:
+        source = each.source
+        if each.is_computed:
+            yield _computed(image, each)
+        elif each.link.swap:
+            yield _swapped(image.memory, each)
         else:
             writer = source.slot.writer
             memories[writer] = source.memory
-            move = Move(way.reads.start, way.writes.start, len(way.writes))
+            move = Move(each.reads.start, each.writes.start, len(each.writes))
             moves.setdefault(writer, []).append(move)
     for writer, memory in memories.items():
         yield partial(CopyPlan(moves[writer]).run, memory, image.memory)
 
 
-def _swapped(memory: memoryview, way: _Way) -> Callable[[], None]:
-    reversed_octets = way.source.memory[way.source.octets][::-1]
-    where = way.target.octets
+def _swapped(memory: memoryview, each: _BoundLink) -> Callable[[], None]:
+    reversed_octets = each.source.memory[each.source.octets][::-1]
+    where = each.target.octets
 
     def copy() -> None:
         memory[where] = reversed_octets
@@ -162,10 +164,10 @@ def _swapped(memory: memoryview, way: _Way) -> Callable[[], None]:
     return copy
 
 
-def _computed(image: Image, way: _Way) -> Callable[[], None]:
-    read = _reader(way.source, swap=way.link.swap)
-    value = _conversion(way.link, way.source.kind, way.target.kind)
-    store = image.storer(way.target.slot.name)
+def _computed(image: Image, each: _BoundLink) -> Callable[[], None]:
+    read = _reader(each.source, swap=each.link.swap)
+    value = _conversion(each.link, each.source.kind, each.target.kind)
+    store = image.storer(each.target.slot.name)
     words = image.words
 
     def compute() -> None:
@@ -178,7 +180,7 @@ def _computed(image: Image, way: _Way) -> Callable[[], None]:
     return compute
 
 
-def _reader(source: _End, *, swap: bool) -> Callable[[], Any]:
+def _reader(source: _LinkEnd, *, swap: bool) -> Callable[[], Any]:
     memory, kind = source.memory, source.kind
     first, shift = divmod(source.slot.bit_offset, 8)
     if kind.is_bits:
@@ -193,7 +195,7 @@ def _reader(source: _End, *, swap: bool) -> Callable[[], Any]:
 
 
 def _conversion(link: LinkSpec, source: DataType, target: DataType) -> Callable[[Any], Any]:
-    """Return what computes the target's number from a finite one of the source."""
+    """Return the function that computes the target's number from a finite one of the source."""
     low, high = target.scalar_range or (0, 0)
     rounds = isinstance(low, int)
     scale, offset = link.scale, link.offset

@@ -1,13 +1,13 @@
 """Subscriber monitoring: presence of the receivers of unicast frames (ETG.1005, FrameState bit 2).
 
-A target is asked for once an interval, sooner while the answer is in doubt, and all targets
-together at most so often a second.  Whoever drives this asks, and hands over what comes of it.
+A target is probed once an interval, sooner while its presence is in doubt.  The rate of probes to
+all targets together is limited.  The driver sends the probes and hands over their results.
 
 Presence of a target, by :class:`PresenceTracker`:
-Rule 1: a round, from one question to the next, counts for one miss or one hit at most, however much
-is heard in it.  Presence changes after several rounds that agree, or at once for what is certain.
-Rule 2: nothing is present that was not seen.  Where nothing can be told, or nothing was for long,
-the presence is unknown.
+Rule 1: a round, from one probe to the next, counts for one miss or one hit at most, even if several
+results arrive in it.  Presence changes after several rounds that agree, or at once on proof.
+Rule 2: a target is present only after it was seen.  Where no result can be had, or none was for
+long, the presence is unknown.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ class SubscriberPresence(IntEnum):
 
 
 class ProbeResult(Enum):
-    """Evidence from one question, or from traffic without one."""
+    """Result of one probe, or of observed traffic without one."""
 
     SEEN = auto()
-    """It answered, or another process that monitors it says that it is there."""
+    """It replied, or another process that monitors it reports that it is there."""
     MISSED = auto()
-    """It did not answer this time."""
+    """It did not reply this time."""
     ABSENT = auto()
-    """Its host refuses what is sent, or another process has already asked often enough, in vain."""
+    """Its host rejects frames, or another process has probed it often enough without a reply."""
     PENDING = auto()
-    """Nothing new; another process is still asking."""
+    """Nothing new; another process is still probing."""
     BLIND = auto()
-    """It cannot be told by this way."""
+    """This probe cannot determine the presence."""
 
 
 class PresencePolicy(NamedTuple):
-    """Number of rounds after which evidence counts."""
+    """Number of rounds after which results count."""
 
     misses: int = 3
     """Rounds without an answer until it is missing, or rounds blind until it is unknown."""
     hits: int = 2
-    """Rounds with an answer until what was missing is present; from unknown the first will do."""
-    trust_ns: int = 15 * _SECOND_NS
-    """How long what was told last holds when nothing new is, and at least *misses* intervals.
+    """Rounds with a reply until a missing target is present; from unknown the first is enough."""
+    valid_ns: int = 15 * _SECOND_NS
+    """Validity of the last result without a new one, and at least *misses* intervals.
 
     More than the 8 s that a kernel with its usual settings takes to check a neighbour.
     """
@@ -63,73 +63,73 @@ DEFAULT_POLICY = PresencePolicy()
 
 
 class PresenceTracker:
-    """The presence of one subscriber, asked for every *interval_ns*."""
+    """The presence of one subscriber, probed every *interval_ns*."""
 
     def __init__(
         self, interval_ns: int, now_ns: int, policy: PresencePolicy = DEFAULT_POLICY
     ) -> None:
         self.presence = SubscriberPresence.UNKNOWN
         self._policy = policy
-        self._patience_ns = max(policy.trust_ns, policy.misses * interval_ns)
-        self._told_at_ns = now_ns
+        self._valid_ns = max(policy.valid_ns, policy.misses * interval_ns)
+        self._result_at_ns = now_ns
         self._hits = self._misses = self._blind = 0
-        self._verdict: ProbeResult | None = None  # of this round
+        self._round_result: ProbeResult | None = None  # of this round
 
     def begin_round(self) -> None:
-        """Note that a new question is under way."""
-        self._verdict = None
+        """Note that a new probe is under way."""
+        self._round_result = None
 
     @property
     def in_doubt(self) -> bool:
-        """True if the next round may change something: it had better come soon."""
+        """True if the next round may change the presence, and so should come soon."""
         return bool(self._hits if self.presence is SubscriberPresence.MISSING else self._misses)
 
-    def take(self, evidence: ProbeResult, now_ns: int) -> SubscriberPresence:
-        """Count *evidence* and return the presence that follows."""
+    def take(self, result: ProbeResult, now_ns: int) -> SubscriberPresence:
+        """Enter *result* and return the presence that follows."""
         before = self.presence
-        match evidence:
+        match result:
             case ProbeResult.SEEN:
                 self._hit(now_ns)
             case ProbeResult.MISSED | ProbeResult.ABSENT:
-                self._miss(evidence, now_ns)
+                self._miss(result, now_ns)
             case ProbeResult.BLIND:
-                self._look_in_vain()
+                self._enter_unknown()
             case ProbeResult.PENDING:
-                if now_ns - self._told_at_ns > self._patience_ns:
+                if now_ns - self._result_at_ns > self._valid_ns:
                     self.presence = SubscriberPresence.UNKNOWN
         if self.presence is not before:
             self._hits = self._misses = self._blind = 0
         return self.presence
 
     def _hit(self, now_ns: int) -> None:
-        self._told_at_ns = now_ns
+        self._result_at_ns = now_ns
         self._misses = self._blind = 0
-        if self._verdict is not ProbeResult.SEEN:
-            self._verdict = ProbeResult.SEEN
+        if self._round_result is not ProbeResult.SEEN:
+            self._round_result = ProbeResult.SEEN
             self._hits += 1
         if self.presence is not SubscriberPresence.MISSING or self._hits >= self._policy.hits:
             self.presence = SubscriberPresence.PRESENT
 
-    def _miss(self, evidence: ProbeResult, now_ns: int) -> None:
-        if evidence is ProbeResult.MISSED and self._verdict is ProbeResult.SEEN:
+    def _miss(self, result: ProbeResult, now_ns: int) -> None:
+        if result is ProbeResult.MISSED and self._round_result is ProbeResult.SEEN:
             return
-        self._told_at_ns = now_ns
+        self._result_at_ns = now_ns
         self._hits = self._blind = 0
-        if self._verdict is not ProbeResult.MISSED:
-            self._verdict = ProbeResult.MISSED
+        if self._round_result is not ProbeResult.MISSED:
+            self._round_result = ProbeResult.MISSED
             self._misses += 1
-        if evidence is ProbeResult.ABSENT or self._misses >= self._policy.misses:
+        if result is ProbeResult.ABSENT or self._misses >= self._policy.misses:
             self.presence = SubscriberPresence.MISSING
 
-    def _look_in_vain(self) -> None:
-        if self._verdict is None:
-            self._verdict = ProbeResult.BLIND
+    def _enter_unknown(self) -> None:
+        if self._round_result is None:
+            self._round_result = ProbeResult.BLIND
             self._blind += 1
         if self._blind >= self._policy.misses:
             self.presence = SubscriberPresence.UNKNOWN
 
 
-_CLAIMANTS_KEPT = 64
+_MAX_CLAIMANTS = 64
 _NOT_PLANNED = -1
 
 
@@ -140,30 +140,30 @@ class MonitorTarget(NamedTuple):
     """Unique within the monitor."""
     interval_ns: int
     mac: MacAddr | None = None
-    """Where the frames go: an answer from another MAC address does not count.  None: any does."""
+    """Destination of the frames: only a reply from it counts; None accepts any."""
 
 
 class MonitorPolicy(NamedTuple):
-    """Rates and times of questions."""
+    """Rates and times of probes."""
 
     answer_ns: int = 500_000_000
-    """How long an answer may take; never longer than the interval."""
+    """Time-out of a reply; never longer than the interval."""
     retry_ns: int = _SECOND_NS
     """Interval while in doubt, if it is the shorter one."""
     claim_ns: int = 10 * _SECOND_NS
-    """How long not to ask a host that is checking whether its address is free.
+    """Time without probes to a host that is checking whether its address is free.
 
-    It would take the question for a rival's (RFC 5227 2.1.1) and give the address up; its own check
-    takes 9 s at most.
+    The host would take the probe for a rival's (RFC 5227 2.1.1) and give the address up; its own
+    check takes 9 s at most.
     """
     claimant_ns: int = 60 * _SECOND_NS
-    """Who goes on asking for longer than *claim_ns*, with no gap longer than this, monitors too."""
+    """A host that probes for longer than *claim_ns*, with no gap longer than this, is a monitor."""
     probes_per_s: int = 50
-    """Most questions in any second, to all targets together."""
+    """Maximum number of probes in any second, to all targets together."""
     presence: PresencePolicy = DEFAULT_POLICY
 
 
-USUAL_POLICY = MonitorPolicy()
+DEFAULT_MONITOR_POLICY = MonitorPolicy()
 
 
 class PresenceChanged(NamedTuple):
@@ -174,11 +174,11 @@ class PresenceChanged(NamedTuple):
     new: SubscriberPresence
     cause: ProbeResult
     answered_by: MacAddr | None
-    """Who answered last for its address; not where the frames go if it is missing all the same."""
+    """Host that replied last for the address; if the target is missing, not the destination's."""
 
 
 class _AddressClaim:
-    """Questions of one host for an address that it may want for itself."""
+    """ARP probes of one host for an address that it may claim (RFC 5227)."""
 
     __slots__ = ("first_ns", "last_ns")
 
@@ -195,21 +195,21 @@ class _Watch:
         self.answered_by: MacAddr | None = None
         self.waits = False
         self.queued = False
-        self.asked_at_ns = now_ns - target.interval_ns
+        self.probed_at_ns = now_ns - target.interval_ns
         self.due_ns = self.claimed_until_ns = now_ns
         self.claims: dict[MacAddr, _AddressClaim] = {}
 
-    def ask(self, now_ns: int) -> None:
+    def begin_probe(self, now_ns: int) -> None:
         self.tracker.begin_round()
-        self.asked_at_ns = now_ns
+        self.probed_at_ns = now_ns
         self.waits = True
         self.queued = False
 
-    def claim(self, mac: MacAddr, now_ns: int, policy: MonitorPolicy) -> bool:
+    def note_claim(self, mac: MacAddr, now_ns: int, policy: MonitorPolicy) -> bool:
         """Note a claim of *mac*; return whether to keep quiet for it."""
         known = self.claims.get(mac)
         if known is None or now_ns - known.last_ns > policy.claimant_ns:
-            if len(self.claims) >= _CLAIMANTS_KEPT:
+            if len(self.claims) >= _MAX_CLAIMANTS:
                 del self.claims[next(iter(self.claims))]
             known = self.claims[mac] = _AddressClaim(now_ns)
         known.last_ns = now_ns
@@ -219,14 +219,14 @@ class _Watch:
 
 
 class SubscriberMonitor:
-    """Decides which target is asked when, and evaluates the answers.
+    """Schedules the probes of all targets, and evaluates the results.
 
-    The driver's turn: hand over all that was heard, then :meth:`probes_to_send`, ask for each of
-    those, and come again at :meth:`next_timeout`.  What cannot be asked gets Evidence.BLIND; who
-    looks instead of asking hands over what it saw at once.
+    The driver hands over all results, calls :meth:`probes_to_send`, sends each of those probes, and
+    calls again at :meth:`next_timeout`.  A target that cannot be probed gets ProbeResult.BLIND.  A
+    driver that reads a table instead of probing hands over the result at once.
     """
 
-    def __init__(self, now_ns: int, policy: MonitorPolicy = USUAL_POLICY) -> None:
+    def __init__(self, now_ns: int, policy: MonitorPolicy = DEFAULT_MONITOR_POLICY) -> None:
         self._policy = policy
         self._watches: dict[str, _Watch] = {}
         self._heap: list[tuple[int, str]] = []
@@ -247,7 +247,7 @@ class SubscriberMonitor:
         self._watches.pop(name, None)
 
     def presence(self, name: str) -> SubscriberPresence:
-        """Return what is known of target *name*; unknown for one that is not watched."""
+        """Return the presence of target *name*; unknown for one that is not watched."""
         watch = self._watches.get(name)
         return SubscriberPresence.UNKNOWN if watch is None else watch.tracker.presence
 
@@ -259,7 +259,7 @@ class SubscriberMonitor:
         return min(times, default=None)
 
     def probes_to_send(self, now_ns: int) -> list[str]:
-        """Return the names of the targets to ask for now, first who has waited longest."""
+        """Return the names of the targets to probe now, the one that has waited longest first."""
         self.handle_timeout(now_ns)
         names = []
         while self._queue and now_ns >= self._booked_ns - self._slack_ns:
@@ -270,13 +270,13 @@ class SubscriberMonitor:
                 self._postpone(watch)
                 continue
             self._booked_ns = max(self._booked_ns, now_ns) + self._gap_ns
-            watch.ask(now_ns)
+            watch.begin_probe(now_ns)
             self._schedule(watch)
             names.append(watch.target.name)
         return names
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Judge the questions whose answer is late, and queue the targets that are due."""
+        """Enter a miss for each probe whose reply is late, and queue the targets that are due."""
         while self._heap and self._heap[0][0] <= now_ns:
             due_ns, name = heapq.heappop(self._heap)
             watch = self._watches.get(name)
@@ -301,31 +301,31 @@ class SubscriberMonitor:
             self._take(watch, ProbeResult.SEEN, now_ns)
 
     def receive_claim(self, name: str, mac: MacAddr, now_ns: int) -> None:
-        """Take note that *mac* asks whether it may take the address of target *name*.
+        """Note that *mac* probes whether the address of target *name* is free.
 
-        Other monitors ask the same way, but never stop: those are not waited for.
+        Other monitors send the same probes, but never stop: the monitor does not wait for those.
         """
         watch = self._watches.get(name)
-        if watch is not None and watch.claim(mac, now_ns, self._policy):
+        if watch is not None and watch.note_claim(mac, now_ns, self._policy):
             self._take(watch, ProbeResult.PENDING, now_ns)
 
-    def receive_evidence(self, name: str, evidence: ProbeResult, now_ns: int) -> None:
-        """Take *evidence* about target *name*; unknown names are ignored."""
+    def receive_result(self, name: str, result: ProbeResult, now_ns: int) -> None:
+        """Enter *result* for target *name*; unknown names are ignored."""
         watch = self._watches.get(name)
         if watch is not None:
-            self._take(watch, evidence, now_ns)
+            self._take(watch, result, now_ns)
 
     def next_event(self) -> PresenceChanged | None:
         """Return the next change of a presence, None when there is none."""
         return self._events.popleft() if self._events else None
 
-    def _take(self, watch: _Watch, evidence: ProbeResult, now_ns: int) -> None:
+    def _take(self, watch: _Watch, result: ProbeResult, now_ns: int) -> None:
         watch.waits = False
         old = watch.tracker.presence
-        new = watch.tracker.take(evidence, now_ns)
+        new = watch.tracker.take(result, now_ns)
         if new is not old:
             name = watch.target.name
-            self._events.append(PresenceChanged(name, old, new, evidence, watch.answered_by))
+            self._events.append(PresenceChanged(name, old, new, result, watch.answered_by))
         if not watch.queued:
             self._schedule(watch)
 
@@ -335,13 +335,13 @@ class SubscriberMonitor:
         heapq.heappush(self._heap, (watch.due_ns, watch.target.name))
 
     def _schedule(self, watch: _Watch) -> None:
-        """Note when something is to be done about *watch*: its answer is late, or it is due."""
+        """Set the time at which *watch* needs attention: its reply is late, or it is due."""
         pause_ns = watch.target.interval_ns
         if watch.waits:
             pause_ns = min(pause_ns, self._policy.answer_ns)
         elif watch.tracker.in_doubt:
             pause_ns = min(pause_ns, self._policy.retry_ns)
-        due_ns = watch.asked_at_ns + pause_ns
+        due_ns = watch.probed_at_ns + pause_ns
         if due_ns != watch.due_ns:
             watch.due_ns = due_ns
             heapq.heappush(self._heap, (due_ns, watch.target.name))

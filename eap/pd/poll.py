@@ -30,7 +30,7 @@ class PollRequests:
         self._pending: dict[str, set[str]] = {}
 
     def add(self, sender: str, names: Iterable[str]) -> bool:
-        """Note that *sender* asked with the RxPDs *names*; return whether there was room for it."""
+        """Note a request of *sender* with the RxPDs *names*; return False if the table is full."""
         pending = self._pending
         asked = pending.get(sender)
         if asked is None:
@@ -41,21 +41,21 @@ class PollRequests:
         return True
 
     def take(self) -> dict[str, set[str]]:
-        """Return the RxPDs that came, by sender, and begin anew."""
+        """Return the RxPDs that were received, by sender, and clear the table."""
         if not self._pending:
             return self._pending
         pending, self._pending = self._pending, {}
         return pending
 
     def follow(self, before: PollRequests) -> None:
-        """Go on with what *before* has noted and this one takes too."""
+        """Take over the requests of *before* that this port answers too."""
         for sender, names in before.take().items():
             if known := names & self.names:
                 self.add(sender, known)
 
 
 class OutgoingPoll:
-    """One TxPD of this station that asks others.
+    """One TxPD of this station that requests PDs of others.
 
     Args:
         words: The words of the station's image.
@@ -75,7 +75,7 @@ class OutgoingPoll:
         self._state = self._read_state()
 
     def follow(self, before: OutgoingPoll) -> None:
-        """Go on where *before* was; the words of the image have been carried over."""
+        """Continue the state of *before*; the words of the image have been carried over."""
         self._sent_at_ns, self._before_ns = before._sent_at_ns, before._before_ns
         self._waiting = {
             answer: at_ns for answer, at_ns in before._waiting.items() if answer in self._answers
@@ -92,23 +92,23 @@ class OutgoingPoll:
         for answer in self._answers:
             self._waiting.setdefault(answer, now_ns)
 
-    def waiting_since(self, answer: str) -> int | None:
-        """Return when the RxPD *answer* was first asked for since it came, None if it was not."""
+    def requested_since(self, answer: str) -> int | None:
+        """Return the time of the first request for *answer* since its arrival, None without one."""
         return self._waiting.get(answer)
 
-    def answered(self, answer: str, at_ns: int) -> int | None:
-        """Return how long the RxPD *answer* took that arrived at *at_ns*; None without a request.
+    def enter_answer(self, answer: str, at_ns: int) -> int | None:
+        """Enter that *answer* arrived at *at_ns*; return its response time, None without a request.
 
         What arrived before the last request, and is taken only now, answers the one before.
         """
-        asked_ns = self._sent_at_ns if at_ns >= self._sent_at_ns else self._before_ns
-        if not 0 < asked_ns <= at_ns:
+        request_ns = self._sent_at_ns if at_ns >= self._sent_at_ns else self._before_ns
+        if not 0 < request_ns <= at_ns:
             return None
-        if asked_ns == self._sent_at_ns:
+        if request_ns == self._sent_at_ns:
             self._waiting.pop(answer, None)
         elif answer in self._waiting:
             self._waiting[answer] = self._sent_at_ns
-        return at_ns - asked_ns
+        return at_ns - request_ns
 
     def _read_state(self) -> tuple[int, int]:
         words, slot = self._words, self._slot
@@ -117,22 +117,22 @@ class OutgoingPoll:
 
 
 class PollAnswer(NamedTuple):
-    """An RxPD that answers a question."""
+    """An RxPD that answers a poll."""
 
     name: str
-    question: OutgoingPoll
+    poll: OutgoingPoll
     words: int
     """Index of its first word."""
 
 
 def requests_at(spec: StationSpec, port: str) -> PollRequests:
-    """Return where the requests go that polled PDs of *port* wait for."""
+    """Return the table of requests for the polled PDs of *port*."""
     frames = [frame for frame in spec.frames if frame.port == port]
     return PollRequests(pd.poll_request for frame in frames for pd in frame.pds if pd.poll_request)
 
 
-def questions_of(image: Image) -> dict[str, OutgoingPoll]:
-    """Return what a station asks, by the TxPD that does it."""
+def outgoing_polls(image: Image) -> dict[str, OutgoingPoll]:
+    """Return the polls of a station, by the TxPD that sends them."""
     answers: dict[str, list[str]] = {}
     for slot in image.layout.rx:
         if slot.poll_request:

@@ -65,7 +65,7 @@ def _enter_unsent(words: memoryview, frame: FrameSlot, state: FrameState, now_ns
 
 
 class _Group:
-    """Frames that go whole, all in the same cycles: nothing is left to decide but when."""
+    """Frames that are sent whole, all in the same cycles: no decision is left but the cycle."""
 
     __slots__ = ("counters", "frames", "out", "patches", "phase", "step")
 
@@ -88,7 +88,7 @@ class Publisher:
         image: The station's process image.
         inputs: The variables as the cycle sees them.
         publisher: NetID of the port.
-        channel: Where the frames go; it decides what stands before the EtherCAT header.
+        channel: Destination of the frames; it defines the bytes before the EtherCAT header.
         frames: The port's TxFrames, each with its place and the places of its PDs.
     """
 
@@ -103,7 +103,7 @@ class Publisher:
         self._image = image
         self._inputs = inputs
         self._words = image.words
-        self.sought: dict[bytes, list[TxFrame]] = {}
+        self.wanted: dict[bytes, list[TxFrame]] = {}
         """Frames that go to a NetID, by that NetID: :meth:`learn` wants its address."""
         cycle_us = image.layout.cycle_us
         self.frames: list[TxFrame] = []
@@ -127,7 +127,7 @@ class Publisher:
         self._controls: dict[str, int] = {}
         self._groups: list[_Group] = []
         self._always: _Group | None = None
-        """All frames, when there is nothing to decide at all."""
+        """All frames, if all of them are sent in every cycle."""
         self._due: list[_Group] = []
         self._others: list[TxFrame] = []
         self._sending: list[tuple[TxFrame, Selection]] = []
@@ -135,7 +135,7 @@ class Publisher:
 
     def learn(self, net_id: bytes, destination: str) -> None:
         """Send what goes to *net_id* to *destination*, where its frames come from."""
-        changed = [frame for frame in self.sought[net_id] if frame.destination != destination]
+        changed = [frame for frame in self.wanted[net_id] if frame.destination != destination]
         for frame in changed:
             frame.retarget(destination)
             self._note_address(frame)
@@ -144,7 +144,7 @@ class Publisher:
 
     def _note_target(self, frame: TxFrame, net_id: NetId | None) -> None:
         if net_id is not None:
-            self.sought.setdefault(net_id, []).append(frame)
+            self.wanted.setdefault(net_id, []).append(frame)
         self._note_address(frame)
 
     def _note_address(self, frame: TxFrame) -> None:
@@ -161,7 +161,7 @@ class Publisher:
                 before = self._controls.get(name, control)  # a bit left set is no rising bit
                 self._controls[name] = control
                 pd.trigger.suppressed = bool(control & SUPPRESS_BIT)
-                if control & ~before & EVENT_BIT and pd.trigger.takes_events:
+                if control & ~before & EVENT_BIT and pd.trigger.accepts_events:
                     pd.trigger.raise_event()
         self._group_frames()
 
@@ -180,13 +180,13 @@ class Publisher:
             self._sending.clear()
 
     def forget(self) -> None:
-        """Begin as at a start: what is sent on change is sent first, and no event is left over."""
+        """Reset to the state at a start: on-change PDs are due at once, and no event is pending."""
         for frame in self.frames:
             for pd in frame.pds:
                 pd.trigger.forget()
 
     def follow(self, before: Publisher) -> None:
-        """Go on with the triggers of the PDs that *before* sent too."""
+        """Continue with the triggers of the PDs that *before* sent too."""
         then = dict(before.remembering())
         for name, (content, trigger) in self.remembering():
             if name in then:
@@ -199,13 +199,13 @@ class Publisher:
             self._note_address(frame)
 
     def learn_from(self, before: Publisher) -> None:
-        """Know the addresses behind NetIDs that *before* has learned."""
-        for net_id in self.sought.keys() & before.sought.keys():
-            if destination := before.sought[net_id][0].destination:
+        """Adopt the addresses behind NetIDs that *before* has learned."""
+        for net_id in self.wanted.keys() & before.wanted.keys():
+            if destination := before.wanted[net_id][0].destination:
                 self.learn(net_id, destination)
 
     def remembering(self) -> Iterator[tuple[str, tuple[tuple[object, ...], Trigger]]]:
-        """Yield the PDs that do not just follow the clock: what goes where, and the trigger."""
+        """Yield the PDs that are not sent by schedule alone: content, destination and trigger."""
         for frame in self.frames:
             for pd in frame.pds:
                 if not pd.slot.by_schedule:
@@ -214,7 +214,7 @@ class Publisher:
                     yield slot.name, (content, pd.trigger)
 
     def release(self) -> None:
-        """Let go of all frames, one by one: freeing many at once keeps others from running."""
+        """Free all frames one by one: freeing many at once would delay the cycles."""
         for container in (self._groups, self._due, self._others, self._sending):
             container.clear()
         self._always = None
@@ -240,7 +240,7 @@ class Publisher:
         return frames + [selection.out for _, selection in self._sending]
 
     def _select_others(self, cycle: int, now_ns: int) -> None:
-        """Patch those that have to be looked at one by one, and note them as being sent."""
+        """Select and patch the frames that need a decision, and note them as being sent."""
         for frame in self._others:
             chosen, skipped = frame.select(cycle, now_ns)
             if skipped:
@@ -250,9 +250,9 @@ class Publisher:
                 self._sending.append((frame, chosen))
 
     def sent(self, failed: Sequence[OutFrame], now_ns: int) -> None:
-        """Count what was sent since :meth:`frames_to_send`, all but *failed*.
+        """Count the frames sent since :meth:`frames_to_send`, all but *failed*.
 
-        Change and event triggers of what the network refused try again in the next cycle.
+        Change and event triggers of PDs that the network did not take try again in the next cycle.
         """
         words, due, sending = self._words, self._due, self._sending
         if failed:  # then each frame has to be looked at by itself
@@ -286,7 +286,7 @@ class Publisher:
         enter_skipped(self._words, (pd.slot for pd in pds), now_ns)
         for pd in pds:
             if frame.suppressed or pd.trigger.suppressed:  # else it waits for the address
-                pd.trigger.use_up_event()
+                pd.trigger.clear_event()
 
 
 def read_control(image: Image, inputs: Inputs, name: str) -> int:
@@ -324,17 +324,17 @@ class _ResponseFrame:
 
 
 class PollResponder:
-    """Answers what one port is asked.
+    """Sends the polled PDs of one port to their requesters.
 
-    All polled PDs of a TxFrame that one sender asked for go to it in one frame.
+    All polled PDs of a TxFrame that one sender requested go to it in one frame.
 
     Args:
         image: The station's process image.
         inputs: The variables as the cycle sees them.
         publisher: NetID of the port.
-        channel: Where the answers go.
+        channel: Sends the answers.
         frames: The TxFrames with their polled PDs.
-        requests: Who asked.
+        requests: Pending requests by sender.
     """
 
     def __init__(
@@ -374,7 +374,7 @@ class PollResponder:
                 pd.trigger.suppressed = bool(control & SUPPRESS_BIT)
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
-        """Return the answers to all that was asked, patched; :meth:`sent` must follow."""
+        """Return the answers to all pending requests, patched; :meth:`sent` must follow."""
         self._sending.clear()
         for sender, names in self._requests.take().items():
             for frame in self._frames:

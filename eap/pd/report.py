@@ -139,7 +139,7 @@ def quality(image: Image, slot: RxSlot) -> int:
     """Return the age of a subscription's data in units of 100 us, saturated at 65535.
 
     It is the Quality that the frame carried plus the receiver's own cycles since, and with polled
-    data the time from the request to the answer; what is left over of a unit is carried from cycle
+    data the time from the request to the answer; the rest of a unit is carried from cycle
     to cycle.
     """
     words = image.words
@@ -241,7 +241,7 @@ def _seen(
 
 
 def unsent_state(words: memoryview, first_word: int) -> FrameState:
-    """Return why the frame whose first word is at index *first_word* was not sent, 0 if it was."""
+    """Return the reason the frame with first word *first_word* was not sent, 0 if it was sent."""
     if words[first_word + FrameWord.UNSENT_AT_NS] < words[first_word + FrameWord.SENT_AT_NS]:
         return FrameState(0)
     return FrameState(words[first_word + FrameWord.UNSENT])

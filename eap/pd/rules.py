@@ -1,7 +1,7 @@
-"""Rules for what a station sends and receives, of plant file and dictionaries alike.
+"""Rules for the frames and PDs of a station, in plant file and dictionaries alike.
 
-Each function yields the breaches of a few rules that belong together.  A breach names the key of
-the plant file; the table of the profile says which entry of the dictionary that is.
+Each function yields the violations of a few related rules.  A violation names the key of the plant
+file; the table of the profile maps it to an entry of the dictionary.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from eap.pd.spec import REQUESTER, TxFrameSpec, TxPdSpec
 NAME = "a text without spaces and slashes"
 MADE_SUFFIXES = (VAR_CTRL, FRAME_CTRL)
 MAX_STREAM_FRAME = EtherCatHeader.SIZE + 0x7FF
-"""What the 11 bits of Length allow where no wire does."""
+"""Limit of the 11 bits of Length, where the wire has no lower one."""
 MIN_MONITOR_INTERVAL_MS = 100
 DESTINATIONS = {
     "udp": (DestinationKind.IP, DestinationKind.TCP),
@@ -36,11 +36,11 @@ _Item = TypeVar("_Item")
 
 
 class RuleViolation(NamedTuple):
-    """A breach of a rule."""
+    """A violation of a rule."""
 
     code: FaultCode
     key: str
-    """Of the plant file, below the section of what is checked."""
+    """Key of the plant file, below the section of the checked object."""
     message: str
     expected: str
     entry: str = ""
@@ -48,12 +48,12 @@ class RuleViolation(NamedTuple):
 
 
 def is_name(text: str) -> bool:
-    """Tell whether *text* can be the name of a station, a port, a frame, a PD or a variable."""
+    """Return whether *text* can be the name of a station, a port, a frame, a PD or a variable."""
     return _NAME.fullmatch(text) is not None
 
 
 def is_group(text: str, scheme: str) -> bool:
-    """Tell whether *text* is a multicast address that a port on *scheme* can join."""
+    """Return whether *text* is a multicast address that a port on *scheme* can join."""
     try:
         if scheme == "ethernet":
             return MacAddr.parse(text).is_group
@@ -78,7 +78,7 @@ def data_budget(scheme: str) -> int:
     return largest - _PD_OVERHEAD
 
 
-def doubles(items: Iterable[tuple[Hashable, _Item]]) -> Iterator[tuple[_Item, _Item]]:
+def duplicates(items: Iterable[tuple[Hashable, _Item]]) -> Iterator[tuple[_Item, _Item]]:
     """Yield each item whose key is that of an earlier one, with the first of that key."""
     first: dict[Hashable, _Item] = {}
     for key, item in items:

@@ -1,11 +1,11 @@
-"""Sequence trackers: lost, late and reordered frames, told from cycle counters and arrival times.
+"""Sequence trackers: lost, late and reordered frames, by cycle counters and arrival times.
 
 Rule 1: PDs that have always arrived together share one tracker; they part when they first arrive
 apart.  All members of a tracker have the same history, so the copy that starts the new tracker
 is exact, and a frame of a hundred PDs costs one tracker, not a hundred.
 Rule 2: an older counter is a reordered frame and not taken, since newer data is here already; what
 was counted as lost because of it is not lost any more.  The third in a row that fills no gap is a
-sender that counts anew, and is taken.
+sender that restarted its counter, and is taken.
 Rule 3: the same counter again counts as duplicated and is taken: some terminals never count.
 """
 
@@ -108,7 +108,7 @@ class SequenceTracker:
         return int(self._words[_ARRIVED_AT_NS])
 
     def has_taken(self, cycle: int) -> bool:
-        """Tell whether the frame entered last, with this cycle counter, was taken."""
+        """Return whether the frame entered last, with this cycle counter, was taken."""
         return bool(self._words[_LAST_CYCLE] & 0xFFFF == cycle)
 
     def enter_response(self, response_ns: int) -> None:
@@ -121,7 +121,7 @@ class SequenceTracker:
         words[_JITTER_MAX_US] = max(words[_JITTER_MAX_US], micros)
 
     def forget_sender(self) -> None:
-        """Let the next frame be the first of a sender: nothing to compare it with."""
+        """Treat the next frame as the first of a sender, which is compared with nothing."""
         self._words[_LAST_CYCLE] = -1
         self._words[_HOLES] = 0
 
@@ -131,7 +131,7 @@ class SequenceTracker:
         self._words[_STATE] = RxState.WAITING
 
     def follow(self, publisher: int) -> None:
-        """Note who sent the frame to be entered next: another sender has another counter."""
+        """Note the publisher of the next frame: another publisher has another counter."""
         if self._words[_SENDER] != publisher:
             self._words[_SENDER] = publisher
             self.forget_sender()
@@ -209,7 +209,7 @@ class SequenceTracker:
         words[_HOLES_BELOW] = position
 
     def _fills_hole(self, position: int) -> bool:
-        """Tell whether the frame at *position* was missed; its PD is not lost then."""
+        """Return whether the frame at *position* was missed; its PD is not lost then."""
         words = self._words
         steps, rest = divmod(words[_HOLES_BELOW] - position, self._step or 1)
         if rest or not 0 < steps <= REORDER_WINDOW or not words[_HOLES] >> steps - 1 & 1:

@@ -79,7 +79,7 @@ class SineSource(SpecRecord, frozen=True, tag="sine", tag_field="kind"):
 
 
 class RandomSource(SpecRecord, frozen=True, tag="random", tag_field="kind"):
-    """Random octets in each device cycle in which the variable is sent."""
+    """Random bytes in each device cycle in which the variable is sent."""
 
     variable: str
     seed: int = 0
@@ -137,7 +137,7 @@ Source = EngineSource | ServicesSource
 
 
 class OnChangeSpec(SpecRecord, frozen=True):
-    """Send when the data differs from what was sent last."""
+    """Send when the data differs from the data sent last."""
 
     timeout_ms: int = 0
     """Send again though unchanged after this time; 0 never."""
@@ -169,9 +169,9 @@ class TxPdSpec(SpecRecord, frozen=True):
     version: int = 0
     trigger: TriggerSpec = TriggerSpec()
     poll_request: str = ""
-    """Name of the RxPD, of the same port, that asks for it; all triggers are off then."""
+    """Name of the RxPD, of the same port, that requests it; all triggers are off then."""
     changeable: bool = False
-    """Whether its ID and poll request may be written in SafeOp and Op."""
+    """True if its ID and poll request may be written in SafeOp and Op."""
 
 
 class TxFrameSpec(SpecRecord, frozen=True):
@@ -189,7 +189,7 @@ class TxFrameSpec(SpecRecord, frozen=True):
     divider: int = 0
     modulo: int = 0
     changeable: bool = False
-    """Whether its destination may be written in SafeOp and Op."""
+    """True if its destination may be written in SafeOp and Op."""
     mac: str = ""
     """MAC address behind a NetID; empty if it is to be learned from what that port sends."""
     monitor_interval_ms: int = 0
@@ -208,7 +208,7 @@ class SentVariableSpec(SpecRecord, frozen=True):
 class RxAlternateSpec(SpecRecord, frozen=True):
     """Another layout of a PD that is taken as well, while its sender changes from one to the other.
 
-    What it has in common with the RxPD goes to the same variables; all others keep their values.
+    Variables that it has in common with the RxPD are received; all others keep their values.
     """
 
     version: int
@@ -237,12 +237,12 @@ class RxPdSpec(SpecRecord, frozen=True):
     alternates: tuple[RxAlternateSpec, ...] = ()
     """Each with a version and size of its own."""
     poll_request: str = ""
-    """Name of the TxPD, of the same port, that asks for it: quality and time-out count from that.
+    """Name of the TxPD, of the same port, that requests it; quality and time-out count from that.
 
     The step is 0 then.
     """
     changeable: bool = False
-    """Whether its ID, publisher and poll request may be written in SafeOp and Op."""
+    """True if its ID, publisher and poll request may be written in SafeOp and Op."""
     source: str = ""
     """Address that its frames must come from, the publisher's: a MAC address on Ethernet, else an
     IPv4 address; empty takes frames from any."""
@@ -267,7 +267,7 @@ class Wake(StrEnum):
 class BusEntrySpec(SpecRecord, frozen=True):
     """One entry of a slave's process data, in the order of its PDOs.
 
-    *variable* is its name in the process image, empty for padding and for what has no type of ours.
+    *variable* is its name in the process image, empty for padding and for types not supported.
     """
 
     variable: str
@@ -277,7 +277,7 @@ class BusEntrySpec(SpecRecord, frozen=True):
 
 
 class BusSlaveSpec(SpecRecord, frozen=True):
-    """One slave that a bus is expected to have; what is None may be anything."""
+    """One slave that a bus is expected to have; None accepts any value."""
 
     name: str
     station: int
@@ -306,12 +306,12 @@ class BusPortSpec(SpecRecord, frozen=True):
     file: str = ""
     """Absolute path of the bus file that describes it; empty if nothing is expected."""
     slaves: tuple[BusSlaveSpec, ...] = ()
-    """In the order of the line; empty takes whatever is there, without variables."""
+    """In the order of the line; empty accepts any slaves, without variables."""
     target: BusTarget = BusTarget.OP
     clocks: bool = False
-    """Whether distributed clocks are set and kept together."""
+    """True if distributed clocks are set and kept together."""
     frame_timeout_us: int = 1_000_000
-    """How long a frame may be under way at most before it is sent again."""
+    """Upper limit of the time-out after which a frame is sent again."""
     frame_retries: int = 4
     """Times that a frame that is overdue is sent again."""
 
@@ -333,7 +333,7 @@ class LinkSpec(SpecRecord, frozen=True):
     """Numbers: the target is source times *scale* plus *offset*, within the limits of its type."""
     offset: float = 0.0
     swap: bool = False
-    """Whether the octets are reversed on the way."""
+    """True if the bytes are reversed on the way."""
 
 
 class GatewayAddress(SpecRecord, frozen=True):
@@ -353,16 +353,16 @@ class GatewaySpec(SpecRecord, frozen=True):
     """The mailbox gateway of a bus port (ETG.8200)."""
 
     enabled: bool = True
-    """Whether it answers before a command starts it."""
+    """True if it answers before a command starts it."""
     port: int = 0
     """UDP and TCP port of its own at each address of the station; 0 for none."""
     answer_ms: int = 900
     silent: bool = False
-    """Whether it keeps its own errors to itself."""
+    """True if it keeps its own errors to itself."""
     full: bool = False
-    """Whether objects of slaves in the master's dictionary have all entries there are."""
+    """True if objects of slaves in the master's dictionary have all entries there are."""
     padded: bool = False
-    """Whether complete access puts entries of an even size at even octets."""
+    """True if complete access puts entries of an even size at even bytes."""
     addresses: tuple[GatewayAddress, ...] = ()
     in_flight: int = 32
     """Requests of one client that wait."""
@@ -384,16 +384,16 @@ class PortSpec(SpecRecord, frozen=True):
     join: tuple[str, ...] = ()
     """Multicast groups (MAC or IPv4) to listen to; the EAP default on Ethernet always is."""
     broadcast: bool = False
-    """Whether to listen to UDP broadcasts."""
+    """True if to listen to UDP broadcasts."""
     tcp: bool = False
-    """Whether type 4 is taken from TCP connections too."""
+    """True if type 4 is taken from TCP connections too."""
     wake: Wake = Wake.CYCLE
     eap_sm: bool = False
-    """Whether the frames sent carry the device's state in the EAP SM octet."""
+    """True if the frames sent carry the device's state in the EAP SM octet."""
     profile: int = 0
     """Device profile that the port's dictionary names in 0x1000; 0 is that of modular devices."""
     ams: bool = True
-    """Whether AMS/TCP and UDP 48899 are served at the port's IP address, if it has one."""
+    """True if AMS/TCP and UDP 48899 are served at the port's IP address, if it has one."""
     bus: BusPortSpec | None = None
     """Bus ports only, as the next one."""
     gateway: GatewaySpec | None = None
@@ -407,7 +407,7 @@ class StationSpec(SpecRecord, frozen=True):
     cycle_us: int
     ports: tuple[PortSpec, ...]
     phase_us: int = 0
-    """Where in the cycle the station runs; stations of one engine are staggered."""
+    """Offset of the station within its cycle; stations of one engine are staggered."""
     variables: tuple[VariableSpec, ...] = ()
     sources: tuple[Source, ...] = ()
     frames: tuple[TxFrameSpec, ...] = ()

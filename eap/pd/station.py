@@ -1,10 +1,10 @@
-"""One station: its process image, its ports, and what happens in each of its cycles.
+"""One station: its process image, its ports, and the steps of its cycle.
 
-The order within a cycle is written down here and nowhere else: take all pending frames, of other
-stations and of buses; apply time-outs; take the inputs that the last exchange of each bus brought;
-compute generated variables; look at what services and applications wrote; run the links; decide
-which PDs are due, patch their frames and send them; send the outputs of each bus, which starts its
-next exchange.  The engine's region is marked as changing from the first frame to the last link, so
+This module alone defines the order within a cycle: receive all pending frames, of other stations
+and of buses; apply time-outs; copy the inputs of the last exchange of each bus; compute generated
+variables; copy the variables that services and applications wrote; run the links; select the PDs
+that are due, patch their frames and send them; send the outputs of each bus, which starts its next
+exchange.  The engine's region is marked as changing from the first frame to the last link, so
 that a reader sees inputs and what follows from them in one cycle.
 """
 
@@ -22,7 +22,7 @@ from eap.pd.device import DeviceState, EapDevice
 from eap.pd.image import Image, Inputs, Sampler
 from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, StateChannel
 from eap.pd.links import Generators, Links
-from eap.pd.poll import questions_of, requests_at
+from eap.pd.poll import outgoing_polls, requests_at
 from eap.pd.publisher import FrameRow, PollResponder, Publisher
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
@@ -43,13 +43,13 @@ WAKE_FOR_CYCLES = 100
 """Cycles after the last announcement of a waiting program in which waiters are woken."""
 
 _UNREAD_FOR_US = 10_000
-"""How long frames may wait at a port without subscriptions: they will only be counted."""
+"""Interval of draining a port without subscriptions, whose frames are only counted."""
 
 
 class Station:
     """Runs the cycle of one station.
 
-    Build it, hand :attr:`takers` to the channels, :meth:`connect` them and its buses, then
+    Build it, hand :attr:`handlers` to the channels, :meth:`connect` them and its buses, then
     :meth:`start`.
 
     Args:
@@ -59,7 +59,7 @@ class Station:
 
     Attributes:
         buses: Those that take part in its cycle.
-        takers: By port: who takes the frames that its channel receives.
+        handlers: Handlers of received frames, by port.
     """
 
     def __init__(self, spec: StationSpec, image: Image, wake: Callable[[], None]) -> None:
@@ -75,7 +75,7 @@ class Station:
         self._generate = Generators(image, generated).run
         self._run_links = Links(image, self.memory_of, spec.links).run if spec.links else None
         self._computes = bool(generated or spec.links)
-        """True if anything follows from what was received."""
+        """True if variables are computed in the cycle."""
         self._has_own_variables = self._computes
         self.buses: list[CyclicBus] = []
         self._publishers: list[tuple[Publisher | PollResponder, FrameChannel]] = []
@@ -87,9 +87,9 @@ class Station:
         self._rarely: list[Callable[[int], int]] = []
         self._rarely_every = max(1, _UNREAD_FOR_US // spec.cycle_us)
         self._requests = {port.name: requests_at(spec, port.name) for port in spec.ports}
-        self._questions = questions_of(image)
-        self._closing: list[Callable[[int], None]] = [q.look for q in self._questions.values()]
-        """What ends a cycle, after everything has been sent to other stations."""
+        self._polls = outgoing_polls(image)
+        self._closing: list[Callable[[int], None]] = [q.look for q in self._polls.values()]
+        """Steps at the end of a cycle, after everything has been sent to other stations."""
         self._subscribers = {
             port.name: self._subscriber(port.name)
             for port in spec.ports
@@ -100,16 +100,16 @@ class Station:
             for subscriber in self._subscribers.values()
             if subscriber.has_timeouts
         ]
-        self.takers: dict[str, FrameHandler] = {
+        self.handlers: dict[str, FrameHandler] = {
             name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
         }
-        self._learners = {port: NetIdLearner(self.takers[port]) for port in _learning_ports(spec)}
-        self.takers.update((port, learner.take) for port, learner in self._learners.items())
+        self._learners = {port: NetIdLearner(self.handlers[port]) for port in _learning_ports(spec)}
+        self.handlers.update((port, learner.take) for port, learner in self._learners.items())
 
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
         own = [(pd, slot) for pd, slot in rows if pd.port == port]
-        return Subscriber(self.image, own, self.cycle_ns, self._requests[port], self._questions)
+        return Subscriber(self.image, own, self.cycle_ns, self._requests[port], self._polls)
 
     def connect(self, port: str, channel: FrameChannel) -> None:
         """Send the frames of *port* through *channel*, and drain it.
@@ -144,7 +144,7 @@ class Station:
         """Have the publisher of *port* learn the addresses of its NetIDs."""
         publisher = self._ports[port][1]
         if learner := self._learners.get(port):
-            learner.sought = () if publisher is None else publisher.sought
+            learner.wanted = () if publisher is None else publisher.wanted
             learner.learn = forget if publisher is None else publisher.learn
 
     def drain_also(self, channel: FrameChannel) -> None:
@@ -172,7 +172,7 @@ class Station:
     def start(self, now_ns: int, state: DeviceState = DeviceState.OP) -> int:
         """Go to *state*; return when the first cycle is due.
 
-        The cycle counter of an earlier engine goes on as if it had never stopped.
+        The cycle counter of an earlier engine continues as if it had never stopped.
         """
         words = self._words
         self._enter(state)
@@ -218,7 +218,7 @@ class Station:
                 publisher.forget()
 
     def stop(self) -> None:
-        """Nothing is taken or sent any more."""
+        """Stop receiving and sending."""
         self._enter(DeviceState.PREOP)
         for subscriber in self._subscribers.values():
             subscriber.close()
@@ -232,15 +232,15 @@ class Station:
                 requests.take()
 
     def channel(self, port: str) -> FrameChannel:
-        """Return what *port* is connected to."""
+        """Return the channel of *port*."""
         return self._ports[port][0]
 
     def prepare_handover(
         self, before: Station, channels: Mapping[str, FrameChannel] = MappingProxyType({})
     ) -> None:
-        """Be connected as *before* is, or to *channels*, and know the frames that it receives.
+        """Connect like *before*, or to *channels*, and learn the frames that it receives.
 
-        Whatever takes time is done here, while the other one runs; it is only looked at.
+        All slow work is done here, while *before* runs; it is only read.
         """
         for port, (channel, was) in before._ports.items():
             self.connect(port, channels.get(port, channel))
@@ -259,7 +259,7 @@ class Station:
     def follow(self, before: Station, now_ns: int) -> None:
         """Take the place of *before* between two of its cycles.
 
-        The image holds already what was in the other's.  Frames go on being handed to its takers.
+        The image already holds the content of the other.  Channels keep the handlers of *before*.
         """
         self._inputs.reload()
         replaced = [subscriber.handle_timeout for subscriber in self._subscribers.values()]
@@ -269,12 +269,12 @@ class Station:
             if subscriber.has_timeouts:
                 self._supervisors.append(subscriber.handle_timeout)
         self._subscribers, before._subscribers = before._subscribers, self._subscribers
-        self.takers = before.takers
+        self.handlers = before.handlers
         self._learners = before._learners
         for port, requests in self._requests.items():
             requests.follow(before._requests[port])
-        for name in self._questions.keys() & before._questions.keys():
-            self._questions[name].follow(before._questions[name])
+        for name in self._polls.keys() & before._polls.keys():
+            self._polls[name].follow(before._polls[name])
         for port, (_, publisher) in self._ports.items():
             was = before._ports[port][1]
             if publisher is not None and was is not None:
@@ -283,7 +283,7 @@ class Station:
         self._enter(before.device.state)
 
     def release(self) -> None:
-        """Let go of all that it is made of, bit by bit; it has been followed by another one."""
+        """Free all parts one by one, after another station has taken over."""
         for _, publisher in self._ports.values():
             if publisher is not None:
                 publisher.release()
@@ -324,7 +324,7 @@ class Station:
             self._wake()
 
     def _write_own_variables(self, cycle: int, now_ns: int) -> bool:
-        """Write all that the engine writes; return whether others wrote something."""
+        """Write the engine's region; return whether services or applications wrote something."""
         words = self._words
         sequence = words[_SEQUENCE]
         words[_SEQUENCE] = sequence + 1
@@ -347,7 +347,7 @@ class Station:
 
 
 def _learning_ports(spec: StationSpec) -> Iterator[str]:
-    """Yield the ports where a frame may go to a NetID, now or when it is configured anew."""
+    """Yield the ports from which a frame may go to a NetID, now or after a reconfiguration."""
     for port in spec.ports:
         is_ethernet = InterfaceUri.parse(port.interface).scheme == "ethernet"
         if port.kind is PortKind.EAP and is_ethernet:

@@ -1,7 +1,7 @@
-"""Receiving side of one EAP port: which PDs of a frame are taken, and why the others are not.
+"""Receiving side of one EAP port: accepts PDs of frames, and counts dropped PDs by reason.
 
-Nothing a publisher sends raises: what is not taken is counted under its reason.  Data goes from
-the frame straight into the process image; state and counters live there too.
+No frame of a publisher raises an exception: a dropped PD is counted under its reason.  Data goes
+from the frame straight into the process image; state and counters live there too.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from eap.pd.subscription import (
 from eap.pd.words import PD_DROP_INDEX, PdDropReason, RxState, RxWord, StationWord
 
 _KEY = struct.Struct("<10s4x6s").unpack_from
-"""EtherCAT header, publisher and count, and the header of the first PD: what tells layouts apart.
+"""EtherCAT header, publisher and count, and the header of the first PD: the key of a layout.
 
-With one PD in the frame that is all there is to compare.
+With one PD in the frame nothing else has to be compared.
 """
 _SHORTEST = FIRST_PD + PdHeader.SIZE
-"""Octets of a frame with a PD."""
+"""Minimum size of a frame with a PD."""
 _CYCLE_COUNTER = struct.Struct("<H").unpack_from
 _PDS_PLANNED = 16384
-"""PDs of all layouts kept; a plant has fewer, and who makes them up gets no more memory."""
+"""Limit of PDs in all plans: a plant has fewer, and forged frames must not exhaust memory."""
 _PLANS_PER_KEY = 16
-"""Layouts that are told apart by trying; more are learned again as they come."""
+"""Limit of layouts with one key, which are tried in turn; beyond it all are learned again."""
 _NEVER = 1 << 62
 
 _CYCLE = int(StationWord.CYCLE)
@@ -58,8 +58,8 @@ class Subscriber:
         image: The station's process image.
         subscriptions: The port's RxPDs, each with its place.
         own_cycle_ns: The station's device cycle.
-        requests: Where the requests of others go.
-        questions: What the station itself asks, by the TxPD that does it.
+        requests: Table for the requests of others.
+        polls: The station's own polls, by the TxPD that sends them.
     """
 
     def __init__(
@@ -68,9 +68,9 @@ class Subscriber:
         subscriptions: Iterable[tuple[RxPdSpec, RxSlot]],
         own_cycle_ns: int,
         requests: PollRequests,
-        questions: Mapping[str, OutgoingPoll] = MappingProxyType({}),
+        polls: Mapping[str, OutgoingPoll] = MappingProxyType({}),
     ) -> None:
-        self._table = SubscriptionTable(image, subscriptions, own_cycle_ns, requests, questions)
+        self._table = SubscriptionTable(image, subscriptions, own_cycle_ns, requests, polls)
         self._open_from_ns = _NEVER
         self._closed_reason = PdDropReason.SUPPRESSED
         self._next_timeout_ns = _NEVER
@@ -88,7 +88,7 @@ class Subscriber:
         self.open(from_ns)
 
     def close(self) -> None:
-        """Take nothing (the station left Op)."""
+        """Stop receiving: the station left Op."""
         self._open_from_ns = _NEVER
         self._closed_reason = PdDropReason.SUPPRESSED
         self._next_timeout_ns = _NEVER
@@ -98,7 +98,7 @@ class Subscriber:
         self._table.learn_from(before._table)
 
     def swap_in(self, after: Subscriber, now_ns: int) -> None:
-        """Go on with the subscriptions of *after*, which gets those of this one.
+        """Exchange the subscriptions with those of *after*.
 
         Whether this one is open stays as it is.
         """
@@ -109,20 +109,20 @@ class Subscriber:
             self._next_timeout_ns = min(self._next_timeout_ns, following_ns)
 
     def release(self) -> None:
-        """Let go of all subscriptions bit by bit."""
+        """Free all subscriptions one by one."""
         self._table.release()
 
     def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
-        """Take one EtherCAT frame of *size* octets that arrived at *at_ns* from *origin*."""
+        """Take one EtherCAT frame of *size* bytes that arrived at *at_ns* from *origin*."""
         source = origin.source_of(data)
         table = self._table
         plan = table.find_plan(data, size, source, at_ns) or table.learn(data, size, source, at_ns)
         if plan is None:
             return
         if at_ns < self._open_from_ns:
-            table.discard(self._closed_reason, len(plan.expected), plan.taken_words)
+            table.discard(self._closed_reason, len(plan.expected), plan.accepted_words)
             return
-        for tracker in plan.roaming:
+        for tracker in plan.any_publisher:
             tracker.follow(plan.publisher)
         words, memory = table.words, table.memory
         # A frame taken outside the station's own cycle has to mark the region as changing itself.
@@ -202,15 +202,13 @@ class SubscriptionTable:
         subscriptions: Iterable[tuple[RxPdSpec, RxSlot]],
         own_cycle_ns: int,
         requests: PollRequests,
-        questions: Mapping[str, OutgoingPoll],
+        polls: Mapping[str, OutgoingPoll],
     ) -> None:
         self._requests = requests
         self.memory = image.memory
         self.words = image.words
         self.subscriptions = [
-            RxSubscription(
-                spec, slot, SubstituteValue(image, slot), questions.get(spec.poll_request)
-            )
+            RxSubscription(spec, slot, SubstituteValue(image, slot), polls.get(spec.poll_request))
             for spec, slot in subscriptions
         ]
         self._by_key: dict[tuple[bytes, int], list[RxSubscription]] = {}
@@ -235,7 +233,7 @@ class SubscriptionTable:
                 self.learn(plan.example(), plan.end, plan.watch.source or b"", 0)
 
     def release(self) -> None:
-        """Let go of all subscriptions, one by one: freeing many keeps others from running."""
+        """Free all subscriptions one by one: freeing many at once would delay the cycles."""
         for container in (self._by_key, self._by_id, self._plans, self._watches):
             while container:
                 container.popitem()
@@ -284,7 +282,7 @@ class SubscriptionTable:
                 (s.tracker, s.slot.name) for s in taking if s.slot.name in self._requests.names
             ],
             answers=[(s.tracker, s.answer) for s in taking if s.answer is not None],
-            roaming={s.tracker for s in taking if not s.slot.publisher},
+            any_publisher={s.tracker for s in taking if not s.slot.publisher},
             publisher=publisher,
         )
         if self._pds_planned > _PDS_PLANNED:
@@ -304,7 +302,7 @@ class SubscriptionTable:
         taking: Iterable[RxSubscription],
         refused: Iterable[DroppedPd],
     ) -> SourceWatch:
-        """Return the watch over the frames of *publisher* that are judged as those of *source*."""
+        """Return the watch over the frames of *publisher* with the class of *source*."""
         expected = source if source in self._sources else b""
         watch = self._watches.get((publisher, expected))
         if watch is None:
@@ -326,15 +324,15 @@ class SubscriptionTable:
     def _match(
         self, publisher: bytes, header: PdHeader, source: bytes
     ) -> list[RxSubscription] | DroppedPd:
-        """Find the subscriptions that take a PD, or what to count instead."""
+        """Return the subscriptions that accept a PD, or the counters of a dropped one."""
         pd_id = header.pd_id
         candidates = self._by_key.get((publisher, pd_id), []) + self._by_key.get((b"", pd_id), [])
         if not candidates:
             others = self._by_id.get(pd_id, [])
-            return _refuse_all([(other, PdDropReason.WRONG_PUBLISHER) for other in others])
-        misfits = [(c, c.mismatch(header.version, header.length, source)) for c in candidates]
-        fitting = [candidate for candidate, reason in misfits if reason is None]
-        return fitting or _refuse_all([(c, reason) for c, reason in misfits if reason is not None])
+            return _drop_all([(other, PdDropReason.WRONG_PUBLISHER) for other in others])
+        mismatches = [(c, c.mismatch(header.version, header.length, source)) for c in candidates]
+        fitting = [candidate for candidate, reason in mismatches if reason is None]
+        return fitting or _drop_all([(c, reason) for c, reason in mismatches if reason is not None])
 
     def discard(self, reason: PdDropReason, count: int, subscriptions: Iterable[int] = ()) -> None:
         """Count *count* PDs under *reason*, for the station and for *subscriptions*."""
@@ -361,7 +359,7 @@ class SubscriptionTable:
         for tracker, answer in plan.answers:
             if not tracker.has_taken(cycle):
                 continue
-            response_ns = answer.question.answered(answer.name, at_ns)
+            response_ns = answer.poll.enter_answer(answer.name, at_ns)
             self.words[answer.words + RxWord.RESPONSE_NS] = response_ns or 0
             if response_ns is not None and tracker not in entered:
                 entered.add(tracker)
@@ -413,7 +411,7 @@ class SubscriptionTable:
         self.words[subscription.slot.words + RxWord.TRACKER] = tracker.first_word
 
     def _part_trackers(self, arriving: set[RxSubscription]) -> bool:
-        """Give PDs that arrive without the others of their tracker one of their own."""
+        """Split a tracker if only some of its PDs arrive together."""
         parted = False
         for tracker in {subscription.tracker for subscription in arriving}:
             members = [s for s in self.subscriptions if s.tracker is tracker]
@@ -421,7 +419,7 @@ class SubscriptionTable:
             if len(here) == len(members):
                 continue
             parted = True
-            # Whoever owns the block keeps it; the others move to the block of their first.
+            # The owner of the block keeps it; the others move to the block of their first.
             owner_arrives = any(s.slot.words == tracker.first_word for s in here)
             leaving = [s for s in members if s not in arriving] if owner_arrives else here
             new = tracker.part(self.words, leaving[0].slot.words)
@@ -442,7 +440,7 @@ def _take(subscription: RxSubscription, header: PdHeader, offset: int) -> Accept
     return AcceptedPd(subscription.tracker, slot.words, offset, slot.offset, size, alternate)
 
 
-def _refuse_all(reasons: list[tuple[RxSubscription, PdDropReason]]) -> DroppedPd:
+def _drop_all(reasons: list[tuple[RxSubscription, PdDropReason]]) -> DroppedPd:
     """Count a PD once for the station, and for each subscription under its own reason."""
     if not reasons:
         return _UNKNOWN_ID

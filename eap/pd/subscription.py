@@ -29,15 +29,15 @@ class RxSubscription:
     """One RxPD at run time.
 
     Args:
-        spec: What is expected.
-        slot: Where it goes.
+        spec: The expected PD.
+        slot: Its place in the image.
         substitute: What its variables hold after the time-out.
-        question: What asks for it; None if it comes by itself.
+        poll: The poll that requests it; None if it is pushed.
 
     Attributes:
-        tracker: Where its arrivals are entered; the subscriber opens it.
-        alternates: What copies another layout that is taken as well, by version and length.
-        answer: What it is to its question; None if it comes by itself.
+        tracker: Tracker of its arrivals; the subscriber opens it.
+        alternates: Copy plans of other accepted layouts, by version and length.
+        answer: Its role as an answer to *poll*; None if it is pushed.
         source: The address that its frames must come from; empty for any.
     """
 
@@ -57,10 +57,10 @@ class RxSubscription:
         spec: RxPdSpec,
         slot: RxSlot,
         substitute: SubstituteValue,
-        question: OutgoingPoll | None = None,
+        poll: OutgoingPoll | None = None,
     ) -> None:
         self.slot = slot
-        self.answer = None if question is None else PollAnswer(spec.name, question, slot.words)
+        self.answer = None if poll is None else PollAnswer(spec.name, poll, slot.words)
         self.alternates = {(each.version, each.size): each.copy_plan() for each in slot.alternates}
         self.ignore_version = spec.ignore_version
         self.timeout_ns = spec.timeout_ms * 1_000_000
@@ -69,7 +69,7 @@ class RxSubscription:
         self.tracker: SequenceTracker
 
     def mismatch(self, version: int, length: int, source: bytes) -> PdDropReason | None:
-        """Return why such a PD from the address *source* does not fit, None if it does."""
+        """Return the reason to drop such a PD from the address *source*, None to accept it."""
         if self.source and source != self.source:
             return PdDropReason.WRONG_SOURCE
         if (version, length) in self.alternates:
@@ -84,12 +84,12 @@ class RxSubscription:
         """Return when its data is too old, None as long as it was not requested again."""
         since_ns: int | None = self.tracker.arrived_at_ns
         if self.answer is not None:
-            since_ns = self.answer.question.waiting_since(self.answer.name)
+            since_ns = self.answer.poll.requested_since(self.answer.name)
         return None if since_ns is None else since_ns + self.timeout_ns
 
 
 class SubstituteValue:
-    """The octets that replace a PD's data after its time-out; with HOLD there are none."""
+    """The bytes that replace a PD's data after its time-out; with HOLD there are none."""
 
     def __init__(self, image: Image, slot: RxSlot) -> None:
         start = slot.offset + PdHeader.SIZE
@@ -98,7 +98,7 @@ class SubstituteValue:
         self._octets = _octets(image, slot)
 
     def apply(self) -> None:
-        """Put the substitute in the place of the data."""
+        """Overwrite the data with the substitute."""
         if self._octets is not None:
             self._memory[self._data] = self._octets
 
@@ -119,11 +119,11 @@ def _octets(image: Image, slot: RxSlot) -> bytes | None:
 
 
 Copy: TypeAlias = tuple[slice, slice]
-"""Octets of the frame and where they go in the image."""
+"""Bytes of the frame and where they go in the image."""
 
 
 class AcceptedPd(NamedTuple):
-    """A PD of the frame that a subscription takes: offsets of its header here and there."""
+    """A PD of the frame that a subscription accepts: offsets of its header in frame and image."""
 
     tracker: SequenceTracker
     words: int
@@ -131,13 +131,13 @@ class AcceptedPd(NamedTuple):
     source: int
     target: int
     size: int
-    """Octets, header included."""
+    """Bytes, header included."""
     alternate: CopyPlan | None = None
-    """What copies it, header included, if it is laid out otherwise than in the image."""
+    """Plan that copies it, header included, if its layout differs from the image's."""
 
 
 class DroppedPd(NamedTuple):
-    """A PD that no subscription takes: counters to add one to, and VarState words to set."""
+    """A PD that no subscription accepts: counters to add one to, and VarState words to set."""
 
     counters: tuple[int, ...]
     mismatches: tuple[tuple[int, int], ...] = ()
@@ -151,24 +151,26 @@ class FramePlan:
 
     Attributes:
         headers: Reads all PD headers but their quality from a frame, at offset FIRST_PD.
-        expected: What it must return for this plan to apply.
-        end: Octets of the frame by its Length.
+        expected: Result of *headers* for which this plan applies.
+        end: Bytes of the frame by its Length.
         is_single: Whether there is one PD in it.
         parts: For each tracker that the frame concerns, the copies to make if it agrees.
-        taken_words: First words of the RxPDs that take one of its PDs.
+        accepted_words: First words of the RxPDs that take one of its PDs.
         has_more: Whether there is anything of the next four.
         alternates: PDs that are laid out otherwise: tracker, offset in the frame, copy to make.
         refused: The PDs that no subscription takes.
-        requests: RxPDs that ask this station for something, with their trackers.
-        answers: RxPDs that this station asked for, likewise.
-        roaming: Trackers that follow any publisher.
+        requests: RxPDs that request PDs of this station, with their trackers.
+        answers: RxPDs that this station polled, likewise.
+        any_publisher: Trackers that follow any publisher.
         publisher: The frame's, as a number.
         watch: The addresses that such frames come from; it belongs to this plan if they do.
     """
 
     __slots__ = (
+        "accepted_words",
         "alternates",
         "answers",
+        "any_publisher",
         "end",
         "expected",
         "has_more",
@@ -178,8 +180,6 @@ class FramePlan:
         "publisher",
         "refused",
         "requests",
-        "roaming",
-        "taken_words",
         "watch",
     )
 
@@ -193,7 +193,7 @@ class FramePlan:
         watch: SourceWatch,
         requests: Iterable[tuple[SequenceTracker, str]] = (),
         answers: Iterable[tuple[SequenceTracker, PollAnswer]] = (),
-        roaming: Iterable[SequenceTracker] = (),
+        any_publisher: Iterable[SequenceTracker] = (),
         publisher: bytes = b"",
     ) -> None:
         """Build the plan from (header without quality, data length) of each PD and their fate."""
@@ -208,17 +208,17 @@ class FramePlan:
         self.alternates = tuple(
             (pd.tracker, pd.source, pd.alternate) for pd in taken if pd.alternate is not None
         )
-        self.taken_words = tuple(pd.words for pd in taken)
+        self.accepted_words = tuple(pd.words for pd in taken)
         self.refused = tuple(refused)
         self.requests = tuple(requests)
         self.answers = tuple(answers)
         self.has_more = bool(self.alternates or self.refused or self.requests or self.answers)
-        self.roaming = tuple(roaming)
+        self.any_publisher = tuple(any_publisher)
         self.publisher = int.from_bytes(publisher)
         self.watch = watch
 
     def copy_alternates(self, data: memoryview, cycle: int, memory: memoryview) -> None:
-        """Copy what is laid out otherwise from the frame *data* of *cycle*, if it was taken."""
+        """Copy PDs with another layout from the frame *data* of *cycle*, if they were accepted."""
         for tracker, source, alternate in self.alternates:
             if tracker.has_taken(cycle):
                 alternate.run(data[source:], memory)
@@ -266,7 +266,7 @@ assert HEADER_KEY.size == PdHeader.SIZE  # noqa: S101  the two must not drift ap
 
 
 def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | PdDropReason:
-    """Return each PD header with its offset, or why the frame is dropped as a whole."""
+    """Return each PD header with its offset, or the reason the frame is dropped as a whole."""
     try:
         ethercat = EtherCatHeader.decode(data[:size])
         if ethercat.type != FrameType.PROCESS_DATA:

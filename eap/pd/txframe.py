@@ -6,10 +6,10 @@ PD's data together from its variables are planned once.
 
 docs/triggers.md holds the truth table of the triggers, which this module follows:
 Rule 1: a frame's divider is a gate; nothing of the frame is sent while it is closed.  Events and
-changes of that time wait for it; cycle time and divider only count in the cycles that it lets by.
+changes of that time wait for it; cycle time and divider only count in cycles of an open gate.
 Rule 2: when several reasons hold at once the PD is sent once, for the first of: event, cycle or
 divider, change, change time-out.
-Rule 3: suppression beats every reason; what was due then counts as skipped, an event is used up.
+Rule 3: suppression beats every reason; a PD that was due counts as skipped, an event is cleared.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Schedule(NamedTuple):
     """Index into REASONS."""
 
     def is_due(self, cycle: int) -> bool:
-        """Tell whether *cycle* is one of them."""
+        """Return whether *cycle* is one of them."""
         return cycle % self.step == self.phase
 
 
@@ -81,15 +81,15 @@ class Trigger:
         "_sent_data",
         "_sent_for_change_ns",
         "_timeout_ns",
+        "accepts_events",
         "schedule",
         "suppressed",
-        "takes_events",
     )
 
     def __init__(self, spec: TriggerSpec, schedule: Schedule | None) -> None:
         self.schedule = schedule
         self.suppressed = False
-        self.takes_events = spec.event
+        self.accepts_events = spec.event
         self._event = False
         self._on_change = spec.on_change is not None
         self._timeout_ns = spec.on_change.timeout_ms * 1_000_000 if spec.on_change else 0
@@ -129,7 +129,7 @@ class Trigger:
             return _CHANGE_TIMEOUT
         return None
 
-    def use_up_event(self) -> None:
+    def clear_event(self) -> None:
         """Forget a raised event: the PD was sent, or skipped while suppressed."""
         self._event = False
 
@@ -142,23 +142,23 @@ class Trigger:
             self._sent_for_change_ns = now_ns
 
     def forget(self) -> None:
-        """Begin as at a start: an event is gone, and a change is what comes first."""
+        """Reset to the state at a start: no event is pending, and the next data is a change."""
         self._event = False
         self._sent_data = None
 
     def follow(self, before: Trigger, *, is_same: bool) -> None:
-        """Go on where *before* was; *is_same* tells that the PD is still sent as it was.
+        """Continue the state of *before*; *is_same* means that the PD is sent unchanged.
 
         If it is not, no subscriber has its data yet, and an on-change trigger sends it.
         """
-        self._event = before._event and self.takes_events
+        self._event = before._event and self.accepts_events
         self._sent_at_ns = before._sent_at_ns
         self._sent_for_change_ns = before._sent_for_change_ns
         self._sent_data = before._sent_data if is_same else None
 
 
 Run: TypeAlias = tuple[memoryview, int, int, int]
-"""Memory, where from, where to in the PD, how much; all three in octets, or all three in bits."""
+"""Memory, source offset, offset in the PD, size; all three in bytes, or all three in bits."""
 
 
 class Gather:
@@ -198,7 +198,7 @@ class Gather:
         return bool(self._bits)
 
     def copies(self, offset: int) -> list[tuple[slice, memoryview]]:
-        """Return what to copy to where for the whole octets of a PD that starts at *offset*."""
+        """Return the copies of whole bytes, by target slice, of a PD that starts at *offset*."""
         return [(slice(offset + first, offset + last), data) for first, last, data in self._runs]
 
     def into(self, buffer: memoryview, offset: int) -> None:
@@ -228,7 +228,7 @@ def _continues(run: Run, following: Run) -> bool:
 
 
 _SELECTIONS_KEPT = 64
-NOWHERE = "00:00:00:00:00:00"
+NO_ADDRESS = "00:00:00:00:00:00"
 """In the buffers of a frame that waits for an address: those are never sent."""
 _put_u16 = struct.Struct("<H").pack_into
 
@@ -243,7 +243,7 @@ class TxPd:
         self.trigger = trigger
         self.gather = gather
         self.data: bytes | None = None
-        """What this cycle would send, where the trigger has to see it."""
+        """Data that this cycle would send, if the trigger needs it."""
         self.reason = 0
 
     def is_due(self, cycle: int, now_ns: int) -> bool:
@@ -297,7 +297,7 @@ class TxFrame:
     ) -> None:
         self.slot = slot
         self.destination = destination
-        """Where it goes now; empty while that is not known, and then it does not go."""
+        """Current destination; empty while that is not known, and then the frame is not sent."""
         self.pds = pds
         self.gate = gate
         self.suppressed = False
@@ -306,7 +306,7 @@ class TxFrame:
         self._selections: dict[tuple[TxPd, ...], Selection] = {}
         self.whole = self._select(pds)
         self.schedule = _common_schedule(pds)
-        """When all PDs go together by the clock, None when each cycle has to find out."""
+        """Common schedule of all PDs, None if each cycle has to select them."""
 
     @property
     def is_plain(self) -> bool:
@@ -323,13 +323,13 @@ class TxFrame:
         return self.suppressed or not self.destination
 
     def retarget(self, destination: str) -> None:
-        """Send to *destination* from now on; the buffers are built anew."""
+        """Send to *destination* from now on; the buffers are rebuilt."""
         self.destination = destination
         self._selections.clear()
         self.whole = self._select(self.pds)
 
     def select(self, cycle: int, now_ns: int) -> tuple[Selection | None, list[TxPd]]:
-        """Return what to send in this cycle, if anything, and what was due but held back."""
+        """Return the selection to send in this cycle, if any, and PDs due but held back."""
         divider, modulo = self.gate
         if divider and cycle % divider != modulo:
             return None, []
@@ -348,7 +348,7 @@ class TxFrame:
         return selection
 
     def _build(self, pds: tuple[TxPd, ...]) -> OutFrame:
-        return build_frame(self._publisher, pds, self._channel, self.destination or NOWHERE)
+        return build_frame(self._publisher, pds, self._channel, self.destination or NO_ADDRESS)
 
 
 def build_frame(

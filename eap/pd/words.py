@@ -25,9 +25,9 @@ class PdDropReason(StrEnum):
     TRUNCATED = auto()
     COUNT_TOO_LARGE = auto()
     WRONG_TYPE = auto()
-    """The frame is of a type that has no business here, such as TwinCAT's undocumented 7."""
+    """The frame is of a type that is not expected here, such as TwinCAT's undocumented 7."""
     TOO_MANY_REQUESTS = auto()
-    """The data was taken, but more stations asked in one cycle than are answered in one."""
+    """The data was taken, but more stations sent requests in one cycle than are answered in one."""
     NO_SENDER = auto()
     """The data was taken, but its frame has no address to answer."""
     WRONG_SOURCE = auto()
@@ -57,9 +57,9 @@ class StationWord(IntEnum):
     """The station's own block."""
 
     CYCLE = 0
-    """Cycle counter, not wrapped; its low 16 bits travel.  With OVERRUNS it tells the time."""
+    """Cycle counter, not wrapped; frames carry its low 16 bits.  OVERRUNS completes the time."""
     CYCLE_AT_NS = 1
-    """When that cycle was due, on the monotonic clock."""
+    """Due time of that cycle on the monotonic clock."""
     FUTEX = 2
     """Low half: the cycle again when it has ended, as the word that waiting programs sleep on."""
     WAITERS = 3
@@ -69,7 +69,7 @@ class StationWord(IntEnum):
     SERVICES_SEQUENCE = 5
     APPLICATION_SEQUENCE = 6
     ENGINE_PID = 7
-    """Who writes each region, or last did."""
+    """Process that writes each region, or did last."""
     SERVICES_PID = 8
     APPLICATION_PID = 9
     RETIRED = 10
@@ -77,7 +77,7 @@ class StationWord(IntEnum):
     STATE = 11
     """Device state as AL status numbers it: 1 Init, 2 PreOp, 4 SafeOp, 8 Op."""
     STARTED_AT_NS = 12
-    """When this engine reached Op, on the monotonic clock."""
+    """Time at which this engine reached Op, on the monotonic clock."""
     RESTARTS = 13
     OVERRUNS = 14
     """Cycles left out because the engine came too late for them."""
@@ -101,16 +101,16 @@ class FrameWord(IntEnum):
     PARTIAL = 1
     """Sent otherwise."""
     SKIPPED = 2
-    """Due, but suppressed or refused by the network."""
+    """Due, but suppressed or not taken by the network."""
     SENT_AT_NS = 3
     UNSENT_AT_NS = 4
-    """When it was due last and not sent; at or after SENT_AT_NS that is how it is."""
+    """Last time that it was due and not sent; current if at or after SENT_AT_NS."""
     UNSENT = 5
     """FrameState of that time."""
     ADDRESS = 6
-    """Where it goes now, as ``eap.pd.address`` puts it; 0 while that is not known."""
+    """Current destination as a word of ``eap.pd.address``; 0 while that is not known."""
     PRESENCE = 7
-    """Whether the subscriber is there: a Presence (presence.py), written by its monitor."""
+    """SubscriberPresence as a number, written by the monitor."""
     SIZE = 8
 
 
@@ -118,7 +118,7 @@ class FrameState(IntFlag):
     """FrameState of ETG.1005."""
 
     NOT_SENT = 1
-    """When it was due last."""
+    """Not sent when it was due last."""
     OVERSIZED = 2
     """Because it is larger than its network carries."""
     SUBSCRIBER_MISSING = 4
@@ -133,7 +133,7 @@ class TxWord(IntEnum):
     """Index into REASONS of the last time it was sent on its own."""
     SENT_AT_NS = 2
     UNSENT_AT_NS = 3
-    """When it was due last and not sent; VarState follows from it (outcome.py)."""
+    """Last time that it was due and not sent; VarState follows from it (report.py)."""
     REASON = 4
     SIZE = REASON + len(REASONS)
 
@@ -141,13 +141,13 @@ class TxWord(IntEnum):
 class RxWord(IntEnum):
     """The block of an RxPD: what is its own, then the tracker that it may share.
 
-    PDs that have always arrived together share one tracker; TRACKER says whose block holds it.
+    PDs that have always arrived together share one tracker; TRACKER is the block that holds it.
     """
 
     TRACKER = 0
     """Index of the first word of the block that holds the tracker."""
     MISMATCH = 1
-    """VarState: bit 0 version, bit 1 length, of the last PD refused."""
+    """VarState: bit 0 version, bit 1 length, of the last PD dropped."""
     MISMATCH_AT_NS = 2
     RESPONSE_NS = 3
     """From a request to its answer: of the one that was taken last; 0 without a request."""
@@ -172,7 +172,7 @@ class RxWord(IntEnum):
     """Cycle counter of the last frame taken (CycleIndex), not wrapped; -1 before the first."""
     ARRIVED_AT_NS = RECEIVED + 8
     ARRIVED_IN_CYCLE = RECEIVED + 9
-    """Own cycle whose input image it refreshed: what quality counts from."""
+    """Own cycle whose input image it refreshed; the quality counts from it."""
     BEHIND = RECEIVED + 10
     """Frames in a row that came with an older counter and filled no hole."""
     HOLES = RECEIVED + 11

@@ -64,7 +64,7 @@ class AttachedStation(Closeable):
 
     def __getitem__(self, name: str) -> Any:
         """Return the value of the variable *name*."""
-        return self._current().read(self._known(name))
+        return self._current().read(self._require(name))
 
     def __setitem__(self, name: str, value: Any) -> None:
         """Write one variable; see :meth:`write`."""
@@ -84,12 +84,12 @@ class AttachedStation(Closeable):
         """
         image = self._current()
         for name in values:
-            place = image.slots[self._known(name)]
-            if place.writer is not Writer.APPLICATION:
+            slot = image.slots[self._require(name)]
+            if slot.writer is not Writer.APPLICATION:
                 raise WriterConflictError(
-                    f"station {self.name}: {name} is written by the {place.writer}, "
+                    f"station {self.name}: {name} is written by the {slot.writer}, "
                     f"not by applications",
-                    holder=place.writer,
+                    holder=slot.writer,
                 )
         if not self._writes:
             self._station.acquire_writer(Writer.APPLICATION)
@@ -102,7 +102,7 @@ class AttachedStation(Closeable):
         Raises:
             ImageError: the station sends no such PD, or its trigger does not say ``event``.
         """
-        by_event = [place.name for place in self._file.image.layout.tx if place.event]
+        by_event = [slot.name for slot in self._file.image.layout.tx if slot.event]
         if pd not in by_event:
             listed = ", ".join(by_event) or "none"
             raise ImageError(
@@ -123,7 +123,7 @@ class AttachedStation(Closeable):
         """
         image = self._current()
         before = image.words[StationWord.CYCLE]
-        while not self._file.wait_cycle(before, self._patience_s()):
+        while not self._file.wait_cycle(before, self._gone_after_s()):
             image = self._current()  # a new layout, which counts on, or the engine is gone
         return int(image.words[StationWord.CYCLE])
 
@@ -140,9 +140,9 @@ class AttachedStation(Closeable):
         image = file.image
         ran_at_ns = image.words[StationWord.CYCLE_AT_NS]
         silent_s = (monotonic_ns() - (ran_at_ns or self._opened_ns)) / 1e9
-        if silent_s > self._patience_s() and self._station.catch_up():
+        if silent_s > self._gone_after_s() and self._station.reopen_if_replaced():
             return self._current()
-        if silent_s > self._patience_s():
+        if silent_s > self._gone_after_s():
             missed = "a cycle" if ran_at_ns else "its first cycle"
             raise EngineGoneError(
                 f"station {self.name}: its engine has not run {missed} for {silent_s:.1f} s; "
@@ -150,14 +150,14 @@ class AttachedStation(Closeable):
             )
         return image
 
-    def _patience_s(self) -> float:
+    def _gone_after_s(self) -> float:
         return max(_GONE_AFTER_S, _GONE_AFTER_CYCLES * self.cycle_s)
 
-    def _known(self, name: str) -> str:
-        places = self._file.image.slots
-        if name in places:
+    def _require(self, name: str) -> str:
+        slots = self._file.image.slots
+        if name in slots:
             return name
-        raise ImageError(f"station {self.name} has no variable {name!r}{suggest(name, places)}")
+        raise ImageError(f"station {self.name} has no variable {name!r}{suggest(name, slots)}")
 
 
 def attach(station: str, *, plant: str = "") -> AttachedStation:

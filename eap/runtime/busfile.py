@@ -1,7 +1,7 @@
 """Bus files: a simulated segment in YAML, checked as a whole like a plant file.
 
 The cores read no files, so what a bus file refers to (values in CSV, device descriptions in XML)
-is read here and handed over as octets.
+is read here and handed over as bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from eap.od.dictionary import ObjectDictionary
 from eap.suggest import suggest
 
 MAX_RESOURCE = 16 << 20
-"""Octets of the largest file that a bus file may refer to."""
+"""Bytes of the largest file that a bus file may refer to."""
 
 
 class BusFile(msgspec.Struct, frozen=True):

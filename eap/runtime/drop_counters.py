@@ -32,7 +32,7 @@ class DropReason(StrEnum):
     TCP_FULL = auto()
     """More connections than there is room for."""
     TCP_TYPE = auto()
-    """A connection that went on with a frame of another type, and was closed."""
+    """A connection that continued with a frame of another type, and was closed."""
     ENGINE_BUSY = auto()
     """The engine did not take a connection that was meant for it."""
     OTHER_VLAN = auto()
@@ -42,7 +42,7 @@ class DropReason(StrEnum):
     AMS_FULL = auto()
     """More AMS/TCP connections than there is room for."""
     AMS_TYPE = auto()
-    """An AMS/TCP connection went on with what is no AMS packet, and was closed."""
+    """An AMS/TCP connection continued with what is no AMS packet, and was closed."""
     AMS_LENGTH = auto()
     """An AMS packet too long, or of another length than its header says; it was answered so."""
     AMS_SLOW = auto()
@@ -103,7 +103,7 @@ class DropCounters(Closeable):
         }
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._words.release()
         self._map.close()
 

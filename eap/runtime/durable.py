@@ -32,7 +32,7 @@ class _File(msgspec.Struct, frozen=True):
 
 
 def seal(content: bytes, version: int) -> bytes:
-    """Return the octets of a file that holds *content*, which is JSON."""
+    """Return the bytes of a file that holds *content*, which is JSON."""
     return msgspec.json.encode(_File(version, digest(content), msgspec.Raw(content)))
 
 

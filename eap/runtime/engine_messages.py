@@ -132,7 +132,7 @@ class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
     target: int
     to_slave: int = 0
     to_master: int = 0
-    """Octets of the mailboxes, 0 while none is open."""
+    """Bytes of the mailboxes, 0 while none is open."""
     mailbox_fault: ErrorRecord | None = None
     """Why none is open: a NoMailboxError, or a MailboxClosedError that will pass."""
     protocols: int = 0
@@ -141,7 +141,7 @@ class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
     """Order code in its EEPROM."""
     usual_to_slave: int = 0
     usual_to_master: int = 0
-    """Octets of the mailboxes in its EEPROM, whatever its state."""
+    """Bytes of the mailboxes in its EEPROM, whatever its state."""
     port_physics: int = 0
     """As in its EEPROM: four bits a port, 0 none, 1 MII, 3 E-bus."""
     link_preset: int = 0

@@ -1,7 +1,7 @@
 """Restart of an FoE transfer that a fault of the bus has interrupted.
 
-FoE has no way to go on in the middle of a file (ETG.1000.6), so a transfer begins anew.  A short
-silence of the bus does not come here: the master goes on with the message that was under way.
+FoE has no means to continue in the middle of a file (ETG.1000.6), so a transfer starts again.  A
+short silence of the bus needs no restart: the master repeats the message that was under way.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ _OF_THE_BUS = (FrameLostError, MailboxClosedError, WorkingCounterError)
 
 
 class Restarts:
-    """Decision after each fault whether a transfer begins anew, and the count of those that did.
+    """Decision after each fault whether a transfer starts again, and the count of those that did.
 
     Args:
-        progress: Of the transfer; set back when it begins anew.
+        progress: Of the transfer; set back when it starts again.
         can_rewind: Returns whether the data can be had from the beginning again.
         clock: Monotonic seconds.
 
     Attributes:
-        count: How often the transfer began anew.
+        count: How often the transfer began again.
         reason: The fault that interrupted it last.
     """
 
@@ -51,7 +51,7 @@ class Restarts:
         self._since_s = 0.0
 
     def allows(self, error: EapError) -> bool:
-        """Return whether the transfer is to begin anew after *error*, and count it if so.
+        """Return whether the transfer is to start again after *error*, and count it if so.
 
         One that could not even begin, since the slave is not back yet, is tried until RETURN_S.
         """

@@ -28,7 +28,7 @@ VARIABLE = "EAP_RUNTIME_DIR"
 SYSTEM_ROOT = Path("/run/eap")
 FALLBACK_PARENT = Path("/tmp")  # noqa: S108  the folder in it is private, see _require_private
 MAX_SOCKET_PATH = 107
-"""Octets of a Unix socket's path (``sun_path`` less its final zero)."""
+"""Bytes of a Unix socket's path (``sun_path`` less its final zero)."""
 
 _FLOCK = struct.Struct("hhqqi4x")
 _MAX_NAME = 60
@@ -62,7 +62,7 @@ class ApplianceInfo(msgspec.Struct):
     segments: dict[str, ProcessInfo] = {}
     """Simulated buses by ``STATION/PORT``."""
     audit_required: bool = False
-    """Whether changes that cannot be recorded are refused."""
+    """True if changes that cannot be recorded are refused."""
 
 
 def runtime_root() -> Path:
@@ -94,7 +94,7 @@ def _private_root() -> Path:
 
 
 def _can_be_written(path: Path) -> bool:
-    """Tell whether *path* is a directory in which this user may make files, or can become one."""
+    """Return whether *path* is a directory in which this user may make files, or can become one."""
     target = path if os.path.exists(path) else path.parent  # noqa: PTH110  never raises
     return os.access(target, os.W_OK | os.X_OK, effective_ids=True)
 
@@ -226,7 +226,7 @@ class ApplianceFolder(Closeable):
         return msgspec.json.decode((self.path / "appliance.json").read_bytes(), type=ApplianceInfo)
 
     def is_alive(self) -> bool:
-        """Whether a supervisor holds the lock; asking never disturbs one that is starting."""
+        """Return whether a supervisor holds the lock; the check never disturbs a start."""
         try:
             fd = os.open(self.path / "lock", os.O_RDWR | os.O_CLOEXEC)
         except OSError:
@@ -284,7 +284,7 @@ def find_running() -> list[tuple[ApplianceFolder, ApplianceInfo]]:
 
 
 def _holds_other_files(path: Path) -> bool:
-    """Whether *path* was not made by an appliance: its first file is always the lock."""
+    """Return whether *path* was not made by an appliance: its first file is always the lock."""
     try:
         return any(path.iterdir()) and not (path / "lock").exists()
     except OSError:

@@ -165,7 +165,7 @@ class Handover(InheritedRecord, frozen=True):
     directory: tuple[DirectoryStation, ...] = ()
     """The names of everything in the plant, of the stations that run elsewhere too."""
     audit_required: bool = False
-    """Whether changes that cannot be recorded are refused."""
+    """True if changes that cannot be recorded are refused."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""
@@ -204,7 +204,7 @@ def pass_connection(
     return True
 
 
-def take_connection(link: socket.socket) -> tuple[socket.socket, PassedConnection] | None:
+def receive_connection(link: socket.socket) -> tuple[socket.socket, PassedConnection] | None:
     """Return the next connection that was passed, None if there is none now."""
     flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
     try:

@@ -49,7 +49,7 @@ Step: TypeAlias = Callable[[str], None]
 """Reports the beginning of a step."""
 
 _IMPORT_PERIOD_S = 0.5
-"""Period in which a process that imports reports that it goes on."""
+"""Period in which a process that imports reports that it continues."""
 
 
 class Report(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -96,7 +96,7 @@ def no_step(text: str) -> None:
 
 
 class _Finder:
-    """Finder of modules that reports that imports go on, and keeps bytecode where nobody else does.
+    """Module finder that reports the progress of imports, and keeps bytecode that Python would not.
 
     Args:
         startup: Takes the reports.

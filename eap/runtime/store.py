@@ -63,7 +63,7 @@ class Stored(Configuration, frozen=True, kw_only=True):
     cause: str = ""
     """Which change brought it; the same at all stations that one ``apply`` changed."""
     undone: bool = False
-    """Whether *cause* was rolled back: *previous* is what it had brought."""
+    """True if *cause* was rolled back: *previous* is what it had brought."""
 
 
 class AppliedRouting(AoeRecord, frozen=True, kw_only=True):
@@ -168,11 +168,11 @@ class StationFile(Generic[T]):
             ) from None
 
     def encode(self, value: T) -> bytes:
-        """Return the octets of the file."""
+        """Return the bytes of the file."""
         return seal(msgspec.json.encode(value), VERSION)
 
     def decode(self, data: bytes) -> T:
-        """Read the octets of the file; raise ConfigError that says what is wrong with them."""
+        """Read the bytes of the file; raise ConfigError that says what is wrong with them."""
         try:
             value: T = msgspec.json.decode(unseal(data, VERSION), type=self._kind)
         except msgspec.MsgspecError as exc:
@@ -180,7 +180,7 @@ class StationFile(Generic[T]):
         return value
 
     def set_aside(self) -> bool:
-        """Let the station start as if nothing had been kept; tell whether anything was.
+        """Let the station start as if nothing had been kept; return whether anything was.
 
         Raises:
             EnvironmentalError: the file cannot be renamed.
@@ -188,7 +188,7 @@ class StationFile(Generic[T]):
         return self._rename(self.path, self._aside)
 
     def bring_back(self) -> bool:
-        """Undo ``set_aside``, unless something was kept since; tell whether that was done.
+        """Undo ``set_aside``, unless something was kept since; return whether that was done.
 
         Raises:
             EnvironmentalError: the file cannot be renamed.
@@ -234,7 +234,7 @@ class StationStore:
         )
 
     def set_aside(self) -> bool:
-        """Let the station start from the plant file alone; tell whether it was configured.
+        """Let the station start from the plant file alone; return whether it was configured.
 
         Raises:
             EnvironmentalError: a file cannot be renamed.
@@ -244,7 +244,7 @@ class StationStore:
         return self.configuration.set_aside()
 
     def bring_back(self) -> None:
-        """Undo ``set_aside`` for what was not kept anew since.
+        """Undo ``set_aside`` for what was not kept again since.
 
         Raises:
             EnvironmentalError: a file cannot be renamed.
@@ -266,7 +266,7 @@ def digest_of(spec: StationSpec | RoutingSpec) -> str:
     return digest(msgspec.json.encode(_lean(spec)))
 
 
-def settle(
+def adopt_plant_file(
     plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP
 ) -> None:
     """Make up what is stored for a start of the appliance with *stations* of the plant file.
@@ -282,11 +282,13 @@ def settle(
             continue
         base = digest_of(spec)
         if stored.applied == base:
-            made_up = replace(stored, base=base)
+            updated = replace(stored, base=base)
         else:
-            made_up = _settled(stored, Stored(base=base, spec=spec, state=state, cause=cause))
-        if made_up != stored:
-            _keep(file, made_up)
+            updated = _with_plant_file(
+                stored, Stored(base=base, spec=spec, state=state, cause=cause)
+            )
+        if updated != stored:
+            _keep(file, updated)
 
 
 def effective(
@@ -311,9 +313,9 @@ def _effective(plant: str, spec: StationSpec, state: DeviceState, cause: str) ->
     base = digest_of(spec)
     if stored.base == base:
         return Effective(stored.spec, stored.state)
-    settled = _settled(stored, Stored(base=base, spec=spec, state=state, cause=cause))
-    _keep(file, settled)
-    return Effective(settled.spec, settled.state)
+    updated = _with_plant_file(stored, Stored(base=base, spec=spec, state=state, cause=cause))
+    _keep(file, updated)
+    return Effective(updated.spec, updated.state)
 
 
 def _keep(file: StationFile[Stored], stored: Stored) -> None:
@@ -323,7 +325,7 @@ def _keep(file: StationFile[Stored], stored: Stored) -> None:
         logger.warning("%s", exc)
 
 
-def _settled(stored: Stored, file: Stored) -> Stored:
+def _with_plant_file(stored: Stored, file: Stored) -> Stored:
     """Return *stored* with what the plant file says in force."""
     bare = without_alternates(stored.spec)
     if bare == file.spec:  # the file has caught up with what was configured

@@ -173,20 +173,20 @@ class _Loop:
             if fd is not None:
                 poll.register(fd, select.POLLIN)
         while True:
-            for fd, _ in poll.poll(self._patience_ms()):
+            for fd, _ in poll.poll(self._poll_timeout_ms()):
                 if fd == end_fd:
                     return
-                if fd == command_fd and not self._take_commands():
+                if fd == command_fd and not self._receive_commands():
                     poll.unregister(fd)
             for side, sock in self._sockets.items():
-                self._pass_frames(side, sock)
+                self._forward_frames(side, sock)
 
-    def _patience_ms(self) -> float | None:
+    def _poll_timeout_ms(self) -> float | None:
         due, now_ns = self._segment.next_timeout(), time.monotonic_ns()
         self._late_ns = _NEVER_NS if due is None else max(due, now_ns) + _STALL_NS
         return None if due is None else max(0.0, (due - now_ns) / _MS)
 
-    def _pass_frames(self, side: SegmentEnd, sock: SegmentSocket) -> None:
+    def _forward_frames(self, side: SegmentEnd, sock: SegmentSocket) -> None:
         segment = self._segment
         for _ in range(_BATCH):
             arrival = sock.receive()
@@ -204,7 +204,7 @@ class _Loop:
             if arrival is None:
                 return
 
-    def _take_commands(self) -> bool:
+    def _receive_commands(self) -> bool:
         assert self._commands is not None  # noqa: S101  only called when it is readable
         taken = self._commands.take()
         for text in taken or ():
@@ -229,7 +229,7 @@ def main(handover_fd: int, startup: Startup) -> int:
     realtime.die_with_parent(handover.supervisor)
     if handover.realtime:
         # Hardware does not wait for a processor: simulated slaves answer as late as this does.
-        realtime.take_precedence()
+        realtime.raise_process_priority()
     try:
         run_for_appliance(handover, startup)
     except ConfigError as exc:

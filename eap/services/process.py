@@ -181,7 +181,7 @@ class StationDevices:
             self._has_restarted.clear()
             for image in self._images.values():
                 with suppress(ImageError):  # its readers get the error
-                    image.catch_up()  # an engine that died may have retired no buffer
+                    image.reopen_if_replaced()  # an engine that died may have retired no buffer
             for device in self.by_station.values():
                 await device.resend()
 
@@ -440,7 +440,7 @@ def main(handover_fd: int, startup: Startup) -> int:
     # A services process without supervisor would keep the ports of the next start.
     realtime.die_with_parent(handover.supervisor)
     if handover.options.realtime:
-        realtime.take_precedence()
+        realtime.raise_process_priority()
     log = LimitedLogHandler()
     logging.basicConfig(format="services: %(message)s", level=logging.INFO, handlers=[log])
     try:

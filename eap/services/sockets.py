@@ -255,7 +255,7 @@ class MailboxTransports:
             segment = EthernetSegment(network.demultiplexer("ethernet", owners), interface.address)
             sender = ChannelSender(ports[vlan_id][owners[0]])
             gateway = network.first_gateways("ethernet", owners)
-            mailbox = MailboxIntake(segment, gateway, sender, interface.is_for_many)
+            mailbox = MailboxIntake(segment, gateway, sender, interface.is_group_frame)
             first.mailbox = mailbox.receive
             for each in others:
                 # The first intake handles a frame for all ports of the VLAN; the others only
@@ -298,7 +298,7 @@ class MailboxTransports:
         )
         stations = _stations_of(shared)
         intake = FrameIntake(stations, self._network.counters, self._from_ns, mailbox.receive)
-        channel.takers.append(intake.receive)
+        channel.handlers.append(intake.receive)
         watch_channel(channel)
 
     def open_gateway_listener(self, shared: SharedSocket) -> TcpTransport:
@@ -329,18 +329,18 @@ class MailboxTransports:
         owners: Sequence[PortName],
         channel: UdpChannel,
         sender: ChannelSender,
-        is_for_many: Callable[[memoryview], bool],
+        is_group_frame: Callable[[memoryview], bool],
     ) -> None:
         network = self._network
         mailbox = MailboxIntake(
             network.demultiplexer("udp", owners),
             network.first_gateways("udp", owners),
             sender,
-            is_for_many,
+            is_group_frame,
         )
         stations = list(dict.fromkeys(owner.station for owner in owners))
         intake = FrameIntake(stations, network.counters, self._from_ns, mailbox.receive)
-        channel.takers.append(intake.receive)
+        channel.handlers.append(intake.receive)
 
     def _watch_link(self, address: str, owner: PortName, transport: Transport) -> None:
         """Watch the link of the interface with *address*, which a loopback address has not."""

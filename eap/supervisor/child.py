@@ -41,7 +41,7 @@ class StartEvent(Enum):
     """Outcome of the time that passed."""
 
     SLOW = "slow"
-    """The start takes long, and goes on."""
+    """The start takes long, and continues."""
     STUCK = "stuck"
     """There was no progress for the limit."""
 
@@ -82,7 +82,7 @@ class StartWatch:
         self._waits_for = waits_for
 
     def release(self, other: str, now_ns: int) -> None:
-        """Take note that the process *other* runs: who waited for it goes on."""
+        """Take note that the process *other* runs: who waited for it continues."""
         if self._waits_for == other:
             self._waits_for = ""
             self._progress_ns = now_ns
@@ -126,7 +126,7 @@ class StartWatch:
 
 
 _PIECE = select.PIPE_BUF
-"""Octets that whatever is ready to be written takes at once."""
+"""Bytes that whatever is ready to be written takes at once."""
 
 
 class Output:
@@ -136,11 +136,11 @@ class Output:
         fd: Where lines go.
 
     Attributes:
-        left_out: How many, since the last line that was taken.
+        dropped: How many, since the last line that was taken.
     """
 
     def __init__(self, fd: int) -> None:
-        self.left_out = 0
+        self.dropped = 0
         self._is_cut = False
         self._fd = fd
         self._poll = select.poll()
@@ -148,8 +148,8 @@ class Output:
 
     def write(self, line: str) -> None:
         """Write a line, behind a note on those that were left out before it."""
-        if self.left_out:
-            line = f"({self.left_out} lines left out here, which nobody took)\n{line}"
+        if self.dropped:
+            line = f"({self.dropped} lines left out here, which nobody took)\n{line}"
         if self._is_cut:  # a full pipe or disk took a part of the line before: it ends there
             line = f"\n{line}"
         octets = f"{line}\n".encode("utf-8", "replace")
@@ -157,11 +157,11 @@ class Output:
             piece = octets[start : start + _PIECE]
             taken = self._take(piece)
             if taken < len(piece):
-                self.left_out += 1
+                self.dropped += 1
                 if written := octets[: start + taken]:
                     self._is_cut = not written.endswith(b"\n")
                 return
-        self.left_out = 0
+        self.dropped = 0
         self._is_cut = False
 
     def _take(self, octets: bytes) -> int:
@@ -316,7 +316,7 @@ class Child:
             STDERR.write(self._last_lines[-1])
         return bool(data)
 
-    def ask_to_end(self, number: signal.Signals) -> None:
+    def send_signal(self, number: signal.Signals) -> None:
         """Send a signal, if there is a process."""
         if self._process is not None:
             self._process.send_signal(number)

@@ -34,7 +34,7 @@ from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, fold
 from eap.runtime.handover import EngineOptions, Handover, SegmentHandover
 from eap.runtime.plantfile import load_plant, require_own_buses
 from eap.runtime.startup import catch_end_signals
-from eap.runtime.store import StationStore, effective, settle
+from eap.runtime.store import StationStore, adopt_plant_file, effective
 from eap.suggest import suggest
 from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
 from eap.supervisor.sockets import SharedSockets, segments
@@ -107,9 +107,9 @@ def _run(
     first_state: DeviceState = DeviceState.OP,
 ) -> int:
     stations = plant.stations
-    settle(info.plant, stations, first_state)
+    adopt_plant_file(info.plant, stations, first_state)
     if info.plant_file:
-        _tell_what_is_kept(info.plant, stations)
+        _log_stored_differences(info.plant, stations)
     with SharedSockets(stations, folder.control_socket) as sockets:
         supervisor = Supervisor(
             info, plant, folder, sockets, options=options, first_state=first_state
@@ -117,7 +117,7 @@ def _run(
         return supervisor.run()
 
 
-def _tell_what_is_kept(plant: str, stations: Sequence[StationSpec]) -> None:
+def _log_stored_differences(plant: str, stations: Sequence[StationSpec]) -> None:
     """Say which stations start otherwise than their plant file alone would have them."""
     for spec, kept in zip(stations, effective(plant, stations), strict=True):
         if kept.spec != spec:
@@ -227,7 +227,7 @@ class Supervisor:
         self._restart_ns.pop(child, None)
         handover, descriptors = self._given[child]
         if isinstance(handover, Handover):
-            handover = what_runs_now(handover)
+            handover = with_stored_configuration(handover)
         try:
             child.start(handover, descriptors, self._clock())
         except OSError as exc:
@@ -267,7 +267,7 @@ class Supervisor:
             if child.report_fd in fired:
                 self._follow_start(child)
             if child.pid_fd in fired:
-                self._has_died(child)
+                self._handle_exit(child)
 
     def _follow_start(self, child: Child) -> None:
         running = {each.name for each in self._children if each.is_ready}
@@ -296,7 +296,7 @@ class Supervisor:
             except OSError as exc:  # the plant runs all the same
                 logger.warning("the ready line cannot be written to stdout: %s", exc.strerror)
 
-    def _has_died(self, child: Child) -> None:
+    def _handle_exit(self, child: Child) -> None:
         lived_ns = self._clock() - child.started_ns
         code, last_line = child.reap()
         if not child.watch.has_run and not child.watch.is_stuck:
@@ -344,7 +344,7 @@ class Supervisor:
                 limit_s,
                 watch.limit_ns // 1_000_000_000,
             )
-            child.ask_to_end(signal.SIGKILL)
+            child.send_signal(signal.SIGKILL)
 
     def _end_children(self) -> None:
         """End all: segments last, for the engine brings their slaves to rest."""
@@ -353,14 +353,14 @@ class Supervisor:
 
     def _end(self, children: Collection[Child], grace_ns: int) -> None:
         for child in children:
-            child.ask_to_end(signal.SIGTERM)
+            child.send_signal(signal.SIGTERM)
         deadline_ns = self._clock() + grace_ns
         while running := [child for child in children if child.pid]:
             now_ns = self._clock()
             if now_ns >= deadline_ns:
                 for child in running:
                     logger.warning("%s does not end when asked; killing it", child.name)
-                    child.ask_to_end(signal.SIGKILL)
+                    child.send_signal(signal.SIGKILL)
                 deadline_ns = now_ns + GRACE_NS
             poll = select.poll()
             for child in running:
@@ -419,7 +419,7 @@ def _given_to_segments(
     return given
 
 
-def what_runs_now(handover: Handover) -> Handover:
+def with_stored_configuration(handover: Handover) -> Handover:
     """Return *handover* with each station as it was configured last, since the plant file or now.
 
     A configuration that needs other sockets than those that were opened, or that no engine could
@@ -431,7 +431,7 @@ def what_runs_now(handover: Handover) -> Handover:
     for given, found in zip(handover.stations, stored, strict=True):
         reasons = needs_new_start(given, found.spec)
         if found.spec != given:
-            reasons = reasons or why_not_built(found.spec)
+            reasons = reasons or find_build_errors(found.spec)
         for reason in reasons:
             logger.warning("station %s: the plant file runs: %s", given.name, reason)
         specs.append(given if reasons else found.spec)
@@ -439,7 +439,7 @@ def what_runs_now(handover: Handover) -> Handover:
     return replace(handover, stations=tuple(specs), states=states)
 
 
-def why_not_built(spec: StationSpec) -> list[str]:
+def find_build_errors(spec: StationSpec) -> list[str]:
     """Return what keeps a station from being built, nothing if it can be.
 
     A configuration may have been kept that no engine ever ran: whoever kept it was killed before

@@ -35,7 +35,7 @@ from eap.pd.spec import (
     VariableSpec,
     Writer,
 )
-from eap.runtime.store import effective, settle
+from eap.runtime.store import adopt_plant_file, effective
 from eap.services.device.station_device import StationDevice
 from tests.support.examples import examples
 from tests.support.stationengine import StationEngine, make_device
@@ -140,7 +140,7 @@ class Sequences(RuleBasedStateMachine):
 
     @initialize()
     def start(self) -> None:
-        settle("demo", (PLANT_FILE,))
+        adopt_plant_file("demo", (PLANT_FILE,))
         ((spec, state),) = effective("demo", (PLANT_FILE,))
         self.engine = StationEngine(spec, state)
         self.start_services()

@@ -78,7 +78,7 @@ class Line:
         for name, spec in specs.items():
             channel = lines.open(InterfaceUri.parse("loop://line"))
             station = self.stations[name] = Station(spec, image_of(spec), lambda: None)
-            channel.takers.append(station.takers["eap0"])
+            channel.handlers.append(station.handlers["eap0"])
             station.connect("eap0", channel)
         self.engine = Engine(list(self.stations.values()))
         self.engine.start(0)

@@ -90,10 +90,10 @@ class From:
 
 
 def give(
-    taker: FrameHandler, frame: bytes, at_ns: int, sender: str = "somebody", source: bytes = b""
+    handler: FrameHandler, frame: bytes, at_ns: int, sender: str = "somebody", source: bytes = b""
 ) -> None:
     """Hand *frame* over as a driver does: in a buffer that is longer than it."""
-    taker(memoryview(frame + b"\xee" * 32), len(frame), at_ns, From(sender, source))
+    handler(memoryview(frame + b"\xee" * 32), len(frame), at_ns, From(sender, source))
 
 
 class Receiver:
@@ -150,7 +150,7 @@ class Wire:
         self.minimum_size = minimum_size
         self.sent: list[bytes] = []
         self.waiting: list[tuple[bytes, int]] = []
-        self.takers: list[FrameHandler] = []
+        self.handlers: list[FrameHandler] = []
         self.refuse = False
         self.log: list[str] = []
         self._header = header
@@ -163,8 +163,8 @@ class Wire:
         self.log.append(f"drain {now_ns}")
         frames, self.waiting = self.waiting, []
         for frame, at_ns in frames:
-            for taker in self.takers:
-                give(taker, frame, at_ns)
+            for handler in self.handlers:
+                give(handler, frame, at_ns)
         return len(frames)
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:

@@ -52,7 +52,7 @@ def assemble(spec: StationSpec, image: Image | None = None) -> tuple[Station, Wa
     wire = Watched()
     wire.image = image or image_of(spec)
     made = Station(spec, wire.image, lambda: wire.log.append("wake"))
-    wire.takers.append(made.takers["eap0"])
+    wire.handlers.append(made.handlers["eap0"])
     made.connect("eap0", wire)
     return made, wire
 

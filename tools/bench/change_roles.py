@@ -111,7 +111,7 @@ class Changer(Recorder):
 
     def handle_timeout(self, now_ns: int) -> None:
         """Run what is due, and begin the next change when it is time."""
-        is_changing = self._plant.rebuilds.is_building
+        is_changing = self._plant.rebuilder.is_building
         late_ns = now_ns - self.next_timeout()
         super().handle_timeout(now_ns)
         (self.disturbed if is_changing else self.quiet).append(late_ns)
@@ -122,7 +122,7 @@ class Changer(Recorder):
             self.changes += 1
             path = str(self._paths[self.changes % 2])
             request = Configure(id=self.changes, station="station", path=path)
-            self._plant.rebuilds.serve(request, now_ns, self._note)
+            self._plant.rebuilder.serve(request, now_ns, self._note)
 
     def _note(self, error: EapError | None) -> None:
         self.refused = self.refused or str(error or "")

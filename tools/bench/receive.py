@@ -71,7 +71,7 @@ def _frame(shape: Shape, repeats: int) -> Figure:
         with create_image(Path(folder) / "image", plan_layout(spec)) as file:
             station = Station(spec, file.image, file.wake_waiters)
             station.start(monotonic_ns())
-            learned = _best(_receiving(station.takers["eap0"], data, shape), repeats)
+            learned = _best(_receiving(station.handlers["eap0"], data, shape), repeats)
             naive = _best(_walking(file.image.memory, data[: shape.frame_size], shape), repeats)
     name = f"{shape.pds} PDs in a frame: learned layout, ratio to a naive walk that only copies"
     detail = f"{learned:.0f} to {naive:.0f} ns"

@@ -129,7 +129,7 @@ def assemble(spec: StationSpec, folder: Path, interface: str) -> Iterator[Assemb
         stack.callback(services_socket.close)
         opened = EthernetInterface(engine_socket, packet_batch())
         stack.callback(opened.close)
-        port = opened.port(station.takers["eap0"])
+        port = opened.port(station.handlers["eap0"])
         station.connect("eap0", port)
         yield Assembled(file, station, port)
 

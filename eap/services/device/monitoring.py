@@ -20,7 +20,7 @@ from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError, ImageError
 from eap.ids import Destination, DestinationKind, MacAddr
 from eap.net.neighbour import ArpProber, NeighbourTable
-from eap.net.udp import ERRORS_PER_CALL, enable_errors, take_errors
+from eap.net.udp import ERRORS_PER_CALL, enable_errors, read_errors
 from eap.pd.address import from_word
 from eap.pd.image import Image
 from eap.pd.layout import FrameSlot
@@ -75,7 +75,7 @@ class UdpSubscriberProbe:
         """
         for sock in self.sockets if self._is_enabled else ():
             for _ in range(_CALLS_PER_TURN):
-                errors = take_errors(sock)
+                errors = read_errors(sock)
                 for each in errors:
                     target = each.address, each.port
                     if each.unreachable and target in self._refused_at_ns:
@@ -242,7 +242,7 @@ class SubscriberWatch:
         for name in self._monitor.probes_to_send(now_ns):
             evidence = self._probe(self._rows[name])
             if evidence is not None:
-                self._monitor.receive_evidence(name, evidence, now_ns)
+                self._monitor.receive_result(name, evidence, now_ns)
         self._publish()
         due_ns = self._monitor.next_timeout()
         return now_ns + POLL_NS if due_ns is None else min(due_ns, now_ns + POLL_NS)
@@ -313,7 +313,7 @@ class SubscriberWatch:
         for row in self._rows_by_udp():
             target = _ip_of(row)
             if target is not None and key_of(target) in refused[self._endpoints.udp[row.port]]:
-                self._monitor.receive_evidence(row.name, ProbeResult.ABSENT, now_ns)
+                self._monitor.receive_result(row.name, ProbeResult.ABSENT, now_ns)
 
     def _rows_by_udp(self) -> Iterator[_Row]:
         return (row for row in self._rows.values() if row.port in self._endpoints.udp)

@@ -125,7 +125,7 @@ class Listeners:
         """Close overdue connections and report crowded listeners, until cancelled."""
         while True:
             await asyncio.sleep(self._overdue_ns / 4e9)
-            for connection in self.table.take_overdue(monotonic_ns(), self._overdue_ns):
+            for connection in self.table.remove_overdue(monotonic_ns(), self._overdue_ns):
                 connection.close(CloseReason.OVERDUE)
             for stats in self.stats():
                 self._report(stats)

@@ -323,7 +323,7 @@ class AmsUplink(ReconnectingLink):
         del has_lasted
         self._early = None
         self._router.hop_down(*self._endpoint, reason)
-        if self._is_news(reason):
+        if self._is_new_reason(reason):
             # A tool that added a route to itself often has no listener: no fault of the plant.
             if self._may_be_client() and not self._was_open:
                 text = "%s: %s; a client added the route to it, and does not listen"

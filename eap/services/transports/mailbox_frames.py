@@ -243,7 +243,7 @@ class MailboxIntake:
         demultiplexer: To the stations.
         gateway: For all but AoE to a station; a multicast frame goes to no gateway.
         sender: Sends the answers of the gateway.
-        is_for_many: Returns whether a frame is multicast.
+        is_group_frame: Returns whether a frame is multicast.
         is_aoe_here: Whether AoE is for the stations; otherwise the gateway gets it too.
     """
 
@@ -252,14 +252,14 @@ class MailboxIntake:
         demultiplexer: PacketReceiver,
         gateway: FrameHandler,
         sender: ChannelSender,
-        is_for_many: Callable[[memoryview], bool],
+        is_group_frame: Callable[[memoryview], bool],
         *,
         is_aoe_here: bool = True,
     ) -> None:
         self._demultiplexer = demultiplexer
         self._gateway = gateway
         self._sender = sender
-        self._is_for_many = is_for_many
+        self._is_for_many = is_group_frame
         self._is_aoe_here = is_aoe_here
 
     def receive(
@@ -270,12 +270,12 @@ class MailboxIntake:
         sender = origin.sender_of(data)
         if not sender:
             return DropReason.MAILBOX
-        frame, is_for_many = data[:size], self._is_for_many(data)
+        frame, is_group_frame = data[:size], self._is_for_many(data)
         packet = aoe_packet(frame) if self._is_aoe_here else None
         if packet is not None:
-            self._demultiplexer.receive(packet, sender, is_broadcast=is_for_many)
+            self._demultiplexer.receive(packet, sender, is_broadcast=is_group_frame)
             return None
-        if is_for_many:
+        if is_group_frame:
             return refusal_of(frame)
         return self._gateway.receive(bytes(frame), sender, self._sender.send_frame)
 

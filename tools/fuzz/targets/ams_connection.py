@@ -100,15 +100,15 @@ def _octets(piece: bytes, first: int) -> bytes:
 
 
 async def _feed(data: bytes) -> None:
-    taker, transport = _Receiver(), _Transport()
-    connection = AmsConnection("fuzz", "10.0.0.1", taker)
+    handler, transport = _Receiver(), _Transport()
+    connection = AmsConnection("fuzz", "10.0.0.1", handler)
     connection.connection_made(transport)
     at, fed, is_blocked = 0, 0, False
     while at < len(data) and not transport.is_closed:
         first = data[at]
         end = at + 1 + first % 80
         octets = _octets(data[at:end], first)
-        taker.is_slow = bool(first & 1)
+        handler.is_slow = bool(first & 1)
         if bool(first & 2) is not is_blocked:
             is_blocked = not is_blocked
             connection.pause_writing() if is_blocked else connection.resume_writing()
@@ -117,7 +117,7 @@ async def _feed(data: bytes) -> None:
             connection.buffer_updated(len(octets))
             at, fed = end, fed + len(octets)
         else:
-            taker.answer()
+            handler.answer()
             if is_blocked and first & 4:
                 is_blocked = False
                 connection.resume_writing()

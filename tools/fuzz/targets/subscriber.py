@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
-from eap.pd.poll import REQUESTERS_PER_CYCLE, PollRequests, questions_of
+from eap.pd.poll import REQUESTERS_PER_CYCLE, PollRequests, outgoing_polls
 from eap.pd.spec import (
     PortKind,
     PortSpec,
@@ -76,7 +76,7 @@ _LAYOUT = plan_layout(_SPEC)
 _IMAGE = format_image(memoryview(bytearray(_LAYOUT.size)), _LAYOUT, 1)
 _DIRECTORY = bytes(_IMAGE.memory[_LAYOUT.directory_offset :])
 _REQUESTS = PollRequests([f"v{_REQUEST}"])
-_QUESTIONS = questions_of(_IMAGE)
+_QUESTIONS = outgoing_polls(_IMAGE)
 _SUBSCRIBER = Subscriber(
     _IMAGE, zip(_SPEC.subscriptions, _LAYOUT.rx, strict=True), 1_000_000, _REQUESTS, _QUESTIONS
 )

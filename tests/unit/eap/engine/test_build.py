@@ -114,7 +114,9 @@ def test_udp_ports_share_nothing_but_the_network(start, shared):
     running = start(stations, shared(*stations))
     running.run_cycles(3)
     (take,) = [
-        take for fd, take in running.plant.arrivals.items() if fd != running.plant.rebuilds.fileno()
+        take
+        for fd, take in running.plant.arrivals.items()
+        if fd != running.plant.rebuilder.fileno()
     ]
     take(1)
     assert running.values("right")["ticks"] >= 2

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from eap.codec.pd import decode_frame_header
 from eap.engine.build import EnginePlant
-from eap.engine.rebuild import MOST_WAITING, EngineStation, StationReplacement, has_tcp, sends_to
+from eap.engine.rebuild import MAX_WAITING, EngineStation, StationReplacement, has_tcp, sends_to
 from eap.errors import EngineRefusedError, EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.image_file import ImageFile, create_image, open_image
@@ -57,8 +57,8 @@ class Running:
     def cycles(self, count=1):
         for _ in range(2 * count):
             self.plant.engine.handle_timeout(self.plant.engine.next_timeout())
-            if self.plant.rebuilds.is_ready:
-                self.plant.rebuilds.swap(self.plant.engine.next_timeout() - 1)
+            if self.plant.rebuilder.is_ready:
+                self.plant.rebuilder.swap(self.plant.engine.next_timeout() - 1)
 
     def post(self, spec, name=None):
         """Ask for *spec*; return the number of the request."""
@@ -70,17 +70,17 @@ class Running:
 
     def serve(self, request):
         now_ns = self.plant.engine.next_timeout() - 1
-        self.plant.rebuilds.serve(
+        self.plant.rebuilder.serve(
             request, now_ns, lambda error: self.answers.update({request.id: error})
         )
         return request.id
 
     def finish(self, number):
         """Wait for what was asked, with cycles in the meantime; return the error, if any."""
-        rebuilds = self.plant.rebuilds
+        rebuilder = self.plant.rebuilder
         while number not in self.answers:
-            if select.select([rebuilds], [], [], 0.001)[0]:
-                rebuilds.collect(self.plant.engine.next_timeout() - 1)
+            if select.select([rebuilder], [], [], 0.001)[0]:
+                rebuilder.collect(self.plant.engine.next_timeout() - 1)
             self.cycles()
         return self.answers[number]
 
@@ -204,7 +204,7 @@ def test_an_image_that_cannot_be_put_in_its_place_changes_nothing(running, monke
         raise EnvironmentalError(f"{path}: read-only")
 
     with monkeypatch.context() as patch:
-        patch.setattr(ImageFile, "take_name", full)
+        patch.setattr(ImageFile, "move_to", full)
         assert "read-only" in str(running.configure(wider(running.left)))
     assert list(running.folder.path.glob(".*")) == []
     assert not running.status("left")["pd"]["tx"][1:]
@@ -215,7 +215,7 @@ def test_an_image_that_cannot_be_put_in_its_place_changes_nothing(running, monke
 def test_requests_are_done_one_after_the_other_and_not_without_limit(running):
     specs = [wider(running.left), listening_more(running.right), running.left]
     numbers = [running.post(spec) for spec in specs]
-    numbers += [running.post(running.left) for _ in range(MOST_WAITING)]
+    numbers += [running.post(running.left) for _ in range(MAX_WAITING)]
     refused = [number for number in numbers if running.answers.get(number) is not None]
     assert len(refused) == 2
     assert "changes wait already" in str(running.answers[refused[0]])
@@ -242,18 +242,18 @@ def test_accounts_that_part_while_something_is_built_are_looked_at_again(running
 
 def test_the_swap_waits_for_the_next_cycle_when_that_is_near(running):
     number = running.post(wider(running.left))
-    select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
+    select.select([running.plant.rebuilder], [], [], PATIENCE_MS / 1000)
     due_ns = running.plant.engine.next_timeout()
-    running.plant.rebuilds.collect(due_ns - 100_000)
+    running.plant.rebuilder.collect(due_ns - 100_000)
     assert number not in running.answers
     running.cycles()
     assert running.answers[number] is None
-    while running.plant.rebuilds.is_building:  # it clears up what has been replaced
-        select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
-        running.plant.rebuilds.collect(due_ns)
+    while running.plant.rebuilder.is_building:  # it clears up what has been replaced
+        select.select([running.plant.rebuilder], [], [], PATIENCE_MS / 1000)
+        running.plant.rebuilder.collect(due_ns)
     number = running.post(running.left)
-    select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
-    running.plant.rebuilds.collect(running.plant.engine.next_timeout() - 2_000_000)
+    select.select([running.plant.rebuilder], [], [], PATIENCE_MS / 1000)
+    running.plant.rebuilder.collect(running.plant.engine.next_timeout() - 2_000_000)
     assert running.answers[number] is None
 
 
@@ -396,7 +396,7 @@ def test_destinations_by_tcp_come_and_go_while_the_station_runs(tmp_path, listen
 
     def configure(*destinations):
         StationReplacement(place, sending(*destinations)).take_over(engine, engine.next_timeout())
-        place.settle_tcp()
+        place.update_tcp()
 
     def accept(listener):
         while not select.select([listener], [], [], 0)[0]:

@@ -197,9 +197,9 @@ def test_peer_that_lets_something_wait_is_overdue_after_its_time() -> None:
     scene = Scene()
     slow, quick = scene.fill(Peer(A, BUSY), Peer(A))
     slow.late_since_ns = 5 * S
-    assert scene.table.take_overdue(5 * S + OVERDUE_NS - 1) == []
-    assert scene.table.take_overdue(5 * S + OVERDUE_NS) == [slow]
-    assert scene.table.take_overdue(5 * S + OVERDUE_NS) == []
+    assert scene.table.remove_overdue(5 * S + OVERDUE_NS - 1) == []
+    assert scene.table.remove_overdue(5 * S + OVERDUE_NS) == [slow]
+    assert scene.table.remove_overdue(5 * S + OVERDUE_NS) == []
     assert list(scene.listener.connections) == [quick]
     assert scene.listener.stats.overdue == 1
     scene.table.remove(scene.listener, slow)  # as its end does
@@ -301,7 +301,7 @@ class Use(RuleBasedStateMachine):
     @rule(seconds=st.integers(1, 15))
     def pass_time(self, seconds: int) -> None:
         self.now_ns += seconds * S
-        for each in self.table.take_overdue(self.now_ns):
+        for each in self.table.remove_overdue(self.now_ns):
             assert isinstance(each, Peer)
             assert each.late_since_ns is not None
             assert self.now_ns - each.late_since_ns >= OVERDUE_NS

@@ -37,7 +37,7 @@ class Listener:
         self.times.append(at_ns)
         self.senders.append(origin.sender_of(data))
         self.sources.append(MacAddr(origin.source_of(data)))
-        self.for_many.append(origin.is_for_many(data))
+        self.for_many.append(origin.is_group_frame(data))
 
     def drain(self, count):
         """Drain until *count* frames have been taken: under load they come a little later."""

@@ -17,7 +17,7 @@ class Listener:
 
     def __init__(self, lines, uri="loop://line"):
         self.channel = lines.open(InterfaceUri.parse(uri))
-        self.channel.takers.append(self.take)
+        self.channel.handlers.append(self.take)
         self.got = []
 
     def take(self, data, size, at_ns, origin):

@@ -18,7 +18,7 @@ from eap.net.mmsg import (
     count_error,
     note_receive_error,
 )
-from eap.net.udp import _socket_address, enable_errors, take_errors
+from eap.net.udp import _socket_address, enable_errors, read_errors
 from eap.pd.link import OutFrame
 
 pytestmark = pytest.mark.net
@@ -192,7 +192,7 @@ def test_refusal_of_a_frame_is_not_held_against_the_next_one(pair):
         assert not out.send(frames)
     assert out.errors == {}
     assert batch.reader(receiver.fileno())() == 5
-    assert len(take_errors(sender)) == 4
+    assert len(read_errors(sender)) == 4
 
 
 def test_what_is_refused_for_its_own_sake_is_counted_after_a_second_try(pair):

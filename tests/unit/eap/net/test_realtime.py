@@ -52,8 +52,8 @@ def prepare(priority=50, cpus="()", before="", prefix=()):
 
 
 @pytest.mark.host_root
-def test_take_precedence_is_for_those_who_may_and_no_error_for_others():
-    script = "import os\nfrom eap.net.realtime import take_precedence\ntake_precedence(-10)\n"
+def test_raise_process_priority_without_the_right_is_no_error():
+    script = "import os\nfrom eap.net.realtime import raise_process_priority as call\ncall(-10)\n"
     script += "print(os.getpriority(os.PRIO_PROCESS, 0))"
     command = [sys.executable, "-c", script]
     shares = [

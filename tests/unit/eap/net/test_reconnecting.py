@@ -32,7 +32,7 @@ class Link(ReconnectingLink):
         return self.reasons.pop(0)
 
     def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
-        self.reported.append((reason, self._is_news(reason)))
+        self.reported.append((reason, self._is_new_reason(reason)))
         return bool(reason)
 
     def _is_wanted(self) -> bool:

@@ -42,7 +42,7 @@ def plant():
     lines = LoopbackLines()
     line, far_line = (lines.open(InterfaceUri.parse("loop://line")) for _ in range(2))
     heard = Listener()
-    far_line.takers.append(heard.take)
+    far_line.handlers.append(heard.take)
     near, far = TcpPort(HERE, line), TcpPort(THERE, far_line)
     with open_tcp_listener(THERE) as listener:
         listener.settimeout(5)

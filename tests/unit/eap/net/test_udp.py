@@ -16,7 +16,7 @@ from eap.net.udp import (
     _destination,
     _socket_address,
     enable_errors,
-    take_errors,
+    read_errors,
 )
 from eap.pd.link import OutFrame
 
@@ -44,7 +44,7 @@ def process_data(number):
 def test_frames_reach_the_only_taker(channels):
     sender, receiver = channels
     got = []
-    receiver.takers.append(lambda view, size, _at, _origin: got.append(bytes(view[:size])))
+    receiver.handlers.append(lambda view, size, _at, _origin: got.append(bytes(view[:size])))
     assert sender.send([process_data(n) for n in range(3)], 0) == ()
     assert receiver.drain(0) == 3
     assert got == [bytes([n, 0x40, n]) for n in range(3)]
@@ -55,7 +55,7 @@ def test_frames_reach_the_only_taker(channels):
 def test_every_taker_of_a_shared_socket_gets_every_frame(channels):
     sender, receiver = channels
     got = []
-    receiver.takers += [
+    receiver.handlers += [
         lambda view, _size, _at, _origin: got.append(("a", view[0])),
         lambda view, _size, _at, _origin: got.append(("b", view[0])),
     ]
@@ -67,7 +67,7 @@ def test_every_taker_of_a_shared_socket_gets_every_frame(channels):
 def test_drain_is_bounded(channels):
     sender, receiver = channels
     got = []
-    receiver.takers.append(lambda view, _size, _at, _origin: got.append(view[0]))
+    receiver.handlers.append(lambda view, _size, _at, _origin: got.append(view[0]))
     frame = process_data(1)
     for _ in range(300):
         sender.send((frame,), 0)
@@ -79,7 +79,7 @@ def test_drain_is_bounded(channels):
 def test_error_about_a_frame_sent_does_not_keep_one_that_waits(channels):
     sender, receiver = channels
     got = []
-    receiver.takers.append(lambda view, size, *_: got.append(bytes(view[:size])))
+    receiver.handlers.append(lambda view, size, *_: got.append(bytes(view[:size])))
     enable_errors(receiver._sock)
     sender.send([process_data(4)], 0)
     receiver.send([OutFrame(bytearray(3), 0, "127.0.3.14:9")], 0)
@@ -118,8 +118,8 @@ def test_destination_without_a_port_goes_to_the_usual_one():
 def test_an_answer_goes_to_the_address_and_port_that_asked(channels):
     server, _ = channels
     senders, sources = [], []
-    server.takers.append(lambda view, _size, _at, origin: senders.append(origin.sender_of(view)))
-    server.takers.append(lambda view, _size, _at, origin: sources.append(origin.source_of(view)))
+    server.handlers.append(lambda view, _size, _at, origin: senders.append(origin.sender_of(view)))
+    server.handlers.append(lambda view, _size, _at, origin: sources.append(origin.source_of(view)))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(5)
         client.bind(("127.0.3.14", 0))
@@ -164,13 +164,13 @@ def test_nobody_listens(sender, closed_port):
     sender.sendto(b"frame", closed_port)
     select.select([], [], [sender], 1)
     expected = UdpError(*closed_port, True, "ECONNREFUSED")
-    assert take_errors(sender) == [expected]
-    assert take_errors(sender) == []
+    assert read_errors(sender) == [expected]
+    assert read_errors(sender) == []
 
 
 def test_taking_the_last_one_clears_what_the_next_call_would_meet(sender, closed_port):
     sender.sendto(b"frame", closed_port)
-    take_errors(sender)
+    read_errors(sender)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
         sender.sendto(b"frame", listener.getsockname())
@@ -181,7 +181,7 @@ def test_some_are_left_for_the_next_time(sender, closed_port):
     for _ in range(3):
         sender.sendto(b"frame", closed_port)
         sender.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # or the next would be refused
-    assert [len(take_errors(sender, 2)) for _ in range(3)] == [2, 1, 0]
+    assert [len(read_errors(sender, 2)) for _ in range(3)] == [2, 1, 0]
 
 
 def test_too_large_says_nothing_of_who_is_there(sender):
@@ -190,11 +190,11 @@ def test_too_large_says_nothing_of_who_is_there(sender):
         listener.bind(("127.0.0.1", 0))
         with pytest.raises(OSError, match="too long"):
             sender.sendto(bytes(65507 + 1), listener.getsockname())
-        assert all(not error.unreachable for error in take_errors(sender))
+        assert all(not error.unreachable for error in read_errors(sender))
 
 
 def test_nothing_is_queued_unless_asked_for(closed_port):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         sock.sendto(b"frame", closed_port)
-        assert take_errors(sock) == []
+        assert read_errors(sock) == []

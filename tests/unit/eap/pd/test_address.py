@@ -169,11 +169,11 @@ FRAME = octets([(1, b"\1\2")])
 class Port:
     """A learner, what it learned and what it handed over."""
 
-    def __init__(self, *sought: str) -> None:
+    def __init__(self, *wanted: str) -> None:
         self.learned: list[tuple[str, str]] = []
         self.taken: list[bytes] = []
         self.learner = NetIdLearner(lambda data, size, *_: self.taken.append(bytes(data[:size])))
-        self.learner.sought = {NetId.parse(text) for text in sought}
+        self.learner.wanted = {NetId.parse(text) for text in wanted}
         self.learner.learn = lambda net_id, mac: self.learned.append((str(NetId(net_id)), mac))
 
     def give(self, frame: bytes, sender: str, at_ns: int = 0) -> None:

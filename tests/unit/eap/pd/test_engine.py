@@ -199,7 +199,7 @@ def test_frames_are_taken_as_they_arrive_where_that_is_wanted():
     )
     made = Station(spec, image_of(spec), lambda: None)
     wire = Wire()
-    wire.takers.append(made.takers["eap0"])
+    wire.handlers.append(made.handlers["eap0"])
     made.connect("eap0", wire)
     engine = Engine([made])
     engine.drain_on_arrival([wire])

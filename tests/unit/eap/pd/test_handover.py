@@ -236,16 +236,16 @@ def test_trackers_that_have_parted_are_noticed():
     made = Station(spec, old, lambda: None)
     handover = ImageHandover(old, new)
     made.start(0)
-    give(made.takers["eap0"], octets([(1, b"\1\0"), (2, b"\2\0")], cycle=1), MS)
+    give(made.handlers["eap0"], octets([(1, b"\1\0"), (2, b"\2\0")], cycle=1), MS)
     assert handover.is_current
-    give(made.takers["eap0"], octets([(1, b"\3\0")], cycle=2), 2 * MS)
+    give(made.handlers["eap0"], octets([(1, b"\3\0")], cycle=2), 2 * MS)
     assert not handover.is_current
 
 
 def test_a_station_configured_anew_keeps_the_addresses_that_it_learned():
     made, wire = assemble(addressed())
     made.start(0)
-    take, frame = made.takers["eap0"], octets([(9, b"\0\0")])
+    take, frame = made.handlers["eap0"], octets([(9, b"\0\0")])
     take(memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
     by_id, by_mac = made.spec.frames
     moved = msgspec.structs.replace(by_mac, destination="02:00:00:00:00:06")
@@ -264,7 +264,7 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     made, _ = assemble(addressed())
     made.start(0)
     frame = octets([(9, b"\0\0")])
-    made.takers["eap0"](memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
+    made.handlers["eap0"](memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
     made.image.words[made.image.layout.frames[0].words + FrameWord.PRESENCE] = (
         SubscriberPresence.MISSING
     )
@@ -274,7 +274,7 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     (row, _) = station_status(after.image, 0)["frames"]
     assert (row["address"], row["subscriber"]) == (None, "unknown")
     other = octets([(9, b"\0\0")], publisher=THIRD)
-    after.takers["eap0"](memoryview(other), len(other), MS, From("02:00:00:00:00:09"))
+    after.handlers["eap0"](memoryview(other), len(other), MS, From("02:00:00:00:00:09"))
     assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:09"
 
     after.image.words[after.image.layout.frames[0].words + FrameWord.PRESENCE] = (
@@ -288,7 +288,7 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     assert (row["address"], row["subscriber"]) == ("02:00:00:00:00:09", "unknown")
 
     empty = succeed(after, msgspec.structs.replace(made.spec, frames=()))
-    empty.takers["eap0"](memoryview(other), len(other), 2 * SECOND, From("02:00:00:00:00:0a"))
+    empty.handlers["eap0"](memoryview(other), len(other), 2 * SECOND, From("02:00:00:00:00:0a"))
     assert station_status(empty.image, 0)["frames"] == []
 
 
@@ -337,7 +337,7 @@ def test_a_question_is_answered_across_a_change():
     made.start(0)
     made.cycle(MS, MS)
     after = succeed_with_values(made, made.spec)
-    give(after.takers["eap0"], octets([(4, b"\1\0")], cycle=1), MS + 300_000)
+    give(after.handlers["eap0"], octets([(4, b"\1\0")], cycle=1), MS + 300_000)
     status = station_status(after.image, SECOND)["pd"]["rx"][0]
     assert (status["received"], status["response_us"]["max"]) == (1, 300)
 
@@ -364,7 +364,7 @@ def test_a_gap_at_a_change_of_rate_is_of_the_old_rate_or_the_new_and_no_loss():
     slow = RxPdSpec("r", "eap0", 9, ("x",), PEER, step=2, sender_cycle_us=1000)
     made, _ = assemble(station(variables=received("x:UINT"), subscriptions=(slow,)))
     made.start(0)
-    take = made.takers["eap0"]
+    take = made.handlers["eap0"]
     for cycle in (2, 4):
         frame = octets([(9, b"\0\0")], cycle=cycle)
         take(memoryview(frame), len(frame), cycle * MS, From(""))

@@ -251,8 +251,8 @@ def test_each_alternate_knows_what_it_brings_and_what_it_does_not():
         ([alternate(2, "n:INT")], "brings n (INT)"),
         ([alternate(2, "on:BOOL", "on:BOOL")], "brings on (BOOL)"),
         ([alternate(1, "on:BOOL", ":UINT")],
-         "has 3 octets like another layout of that version, expected another version"),
-        ([alternate(2, "n:UINT"), alternate(2, ":INT")], "has 2 octets like another"),
+         "has 3 bytes like another layout of that version, expected another version"),
+        ([alternate(2, "n:UINT"), alternate(2, ":INT")], "has 2 bytes like another"),
         ([alternate(2, "n:FOO")], "'FOO' is not a data type"),
     ],
 )  # fmt: skip
@@ -335,7 +335,7 @@ def sender(version: int, layout: Mapping[str, str]) -> StationSpec:
     )
 
 
-def taker(version: int, layout: Mapping[str, str], other: RxAlternateSpec) -> StationSpec:
+def handler(version: int, layout: Mapping[str, str], other: RxAlternateSpec) -> StationSpec:
     """Takes what :func:`sender` sends, and *other* as well."""
     pace = {"publisher": PEER, "step": 1, "sender_cycle_us": 1000, "timeout_ms": 3}
     return station(
@@ -365,11 +365,11 @@ def test_a_sender_that_changes_over_in_the_middle_of_a_run_is_followed(
     old_version, new_version, new, takes_new_first
 ):
     own, other = ((new_version, new), (old_version, OLD))[:: 1 if takes_new_first else -1]
-    spec = taker(*own, other_than(own[1], *other))
+    spec = handler(*own, other_than(own[1], *other))
     lines = LoopbackLines()
     channels = [lines.open(InterfaceUri.parse("loop://line")) for _ in range(2)]
     receiving, sending = Station(spec, image_of(spec), lambda: None), None
-    channels[1].takers.append(receiving.takers["eap0"])
+    channels[1].handlers.append(receiving.handlers["eap0"])
     receiving.connect("eap0", channels[1])
     receiving.start(0)
     now = 0

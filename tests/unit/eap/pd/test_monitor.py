@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from eap.ids import MacAddr
 from eap.pd.monitor import (
+    DEFAULT_MONITOR_POLICY,
     DEFAULT_POLICY,
-    USUAL_POLICY,
     MonitorTarget,
     PresenceChanged,
     PresenceTracker,
@@ -120,7 +120,9 @@ def test_no_more_than_fifty_questions_a_second() -> None:
     run.until(20 * SECOND, lambda _: THEIRS)
     times = [at for at, _ in run.asked]
     for at in times:
-        assert sum(at <= other < at + SECOND for other in times) <= USUAL_POLICY.probes_per_s
+        assert (
+            sum(at <= other < at + SECOND for other in times) <= DEFAULT_MONITOR_POLICY.probes_per_s
+        )
     assert {name for _, name in run.asked} == {f"t{n}" for n in range(200)}  # nobody starves
     assert all(run.presence(f"t{n}") is PRESENT for n in range(200))
 
@@ -133,7 +135,7 @@ def test_a_host_that_checks_its_address_is_left_alone() -> None:
         run.monitor.receive_claim("a", THEIRS, run.now_ns)
     run.until(60 * SECOND, lambda _: THEIRS)
     times = [at for at, _ in run.asked]
-    assert times[:3] == [0, SECOND, 1600 * MS + USUAL_POLICY.claim_ns]
+    assert times[:3] == [0, SECOND, 1600 * MS + DEFAULT_MONITOR_POLICY.claim_ns]
     assert run.presence() is PRESENT
 
 
@@ -162,7 +164,7 @@ def test_claims_of_many_hosts_take_bounded_memory() -> None:
 def test_who_looks_instead_of_asking_says_at_once() -> None:
     run = Run(target())
     assert run.monitor.probes_to_send(0) == ["a"]
-    run.monitor.receive_evidence("a", ProbeResult.ABSENT, 0)
+    run.monitor.receive_result("a", ProbeResult.ABSENT, 0)
     assert run.presence() is MISSING
     assert run.monitor.probes_to_send(SECOND - 1) == []
     assert run.monitor.probes_to_send(SECOND) == ["a"]
@@ -177,7 +179,7 @@ def test_forgotten_targets_are_not_asked_for() -> None:
     assert run.presence() is UNKNOWN
     run.monitor.receive_reply("a", THEIRS, run.now_ns)
     run.monitor.receive_claim("a", THEIRS, run.now_ns)
-    run.monitor.receive_evidence("a", ProbeResult.SEEN, run.now_ns)
+    run.monitor.receive_result("a", ProbeResult.SEEN, run.now_ns)
     assert run.monitor.next_event().name == "b"
     assert run.monitor.next_event() is None
 
@@ -222,9 +224,9 @@ def test_whatever_happens_a_target_goes_on_being_asked_for(
             case "claim":
                 monitor.receive_claim(name, OTHER, now_ns)
             case "blind":
-                monitor.receive_evidence(name, ProbeResult.BLIND, now_ns)
+                monitor.receive_result(name, ProbeResult.BLIND, now_ns)
             case "absent":
-                monitor.receive_evidence(name, ProbeResult.ABSENT, now_ns)
+                monitor.receive_result(name, ProbeResult.ABSENT, now_ns)
             case "add":
                 monitor.add(target(name, 700), now_ns)
                 watched.add(name)
@@ -250,9 +252,9 @@ def run(*rounds: ProbeResult, judge: PresenceTracker | None = None) -> list[Subs
     """Return what each of *rounds*, one a second, made of the presence."""
     judge = judge or PresenceTracker(SECOND, 0)
     found = []
-    for number, evidence in enumerate(rounds, 1):
+    for number, result in enumerate(rounds, 1):
         judge.begin_round()
-        found.append(judge.take(evidence, number * SECOND))
+        found.append(judge.take(result, number * SECOND))
     return found
 
 
@@ -305,8 +307,8 @@ def test_blind_rounds_end_in_unknown() -> None:
 def test_what_was_told_last_holds_for_a_while_only() -> None:
     judge = PresenceTracker(SECOND, 0)
     judge.take(SEEN, 0)
-    assert judge.take(PENDING, DEFAULT_POLICY.trust_ns) is PRESENT
-    assert judge.take(PENDING, DEFAULT_POLICY.trust_ns + 1) is UNKNOWN
+    assert judge.take(PENDING, DEFAULT_POLICY.valid_ns) is PRESENT
+    assert judge.take(PENDING, DEFAULT_POLICY.valid_ns + 1) is UNKNOWN
 
 
 def test_long_intervals_are_trusted_for_longer() -> None:

@@ -12,7 +12,13 @@ from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
 from eap.pd.engine import Engine
 from eap.pd.image import Image
-from eap.pd.poll import REQUESTERS_PER_CYCLE, OutgoingPoll, PollRequests, questions_of, requests_at
+from eap.pd.poll import (
+    REQUESTERS_PER_CYCLE,
+    OutgoingPoll,
+    PollRequests,
+    outgoing_polls,
+    requests_at,
+)
 from eap.pd.report import station_status
 from eap.pd.spec import (
     REQUESTER,
@@ -60,14 +66,14 @@ class Asked:
         spec = desk(trigger, answers=("a", "b"))
         self.image = image_of(spec)
         (self.slot,) = self.image.layout.tx
-        self.question: OutgoingPoll = questions_of(self.image)["request"]
+        self.poll: OutgoingPoll = outgoing_polls(self.image)["request"]
 
     def send(self, now_ns: int) -> None:
         if self.slot.by_schedule:
             self.image.words[self.slot.frame_words + FrameWord.WHOLE] += 1
         else:
             self.image.words[self.slot.words + TxWord.SENT_AT_NS] = now_ns
-        self.question.look(now_ns)
+        self.poll.look(now_ns)
 
 
 def desk(trigger: TriggerSpec = TriggerSpec(), answers: tuple[str, ...] = ()) -> StationSpec:  # noqa: B008
@@ -88,53 +94,53 @@ def desk(trigger: TriggerSpec = TriggerSpec(), answers: tuple[str, ...] = ()) ->
 @pytest.mark.parametrize("trigger", [TriggerSpec(), TriggerSpec(event=True)])
 def test_an_answer_took_as_long_as_since_the_last_request(trigger):
     asked = Asked(trigger)
-    assert asked.question.answered("a", 5 * MS) is None  # nobody asked
+    assert asked.poll.enter_answer("a", 5 * MS) is None  # nobody asked
     asked.send(10 * MS)
-    asked.question.look(11 * MS)  # cycles in which nothing was sent
-    asked.question.look(12 * MS)
-    assert asked.question.answered("a", 13 * MS) == 3 * MS
-    assert asked.question.answered("b", 14 * MS) == 4 * MS
+    asked.poll.look(11 * MS)  # cycles in which nothing was sent
+    asked.poll.look(12 * MS)
+    assert asked.poll.enter_answer("a", 13 * MS) == 3 * MS
+    assert asked.poll.enter_answer("b", 14 * MS) == 4 * MS
     asked.send(20 * MS)
     # It came before the request did, and was taken behind it.
-    assert asked.question.answered("a", 19 * MS) == 9 * MS
-    assert asked.question.answered("a", 21 * MS) == 1 * MS
-    assert asked.question.answered("a", 9 * MS) is None
+    assert asked.poll.enter_answer("a", 19 * MS) == 9 * MS
+    assert asked.poll.enter_answer("a", 21 * MS) == 1 * MS
+    assert asked.poll.enter_answer("a", 9 * MS) is None
 
 
 def test_waiting_begins_with_the_first_request_that_has_no_answer():
     asked = Asked(TriggerSpec(event=True))
-    question = asked.question
-    assert question.waiting_since("a") is None
+    poll = asked.poll
+    assert poll.requested_since("a") is None
     asked.send(10 * MS)
     asked.send(20 * MS)
-    assert question.waiting_since("a") == question.waiting_since("b") == 10 * MS
-    question.answered("a", 19 * MS)
-    assert (question.waiting_since("a"), question.waiting_since("b")) == (20 * MS, 10 * MS)
-    question.answered("a", 25 * MS)
-    question.answered("b", 26 * MS)
-    assert question.waiting_since("a") is question.waiting_since("b") is None
+    assert poll.requested_since("a") == poll.requested_since("b") == 10 * MS
+    poll.enter_answer("a", 19 * MS)
+    assert (poll.requested_since("a"), poll.requested_since("b")) == (20 * MS, 10 * MS)
+    poll.enter_answer("a", 25 * MS)
+    poll.enter_answer("b", 26 * MS)
+    assert poll.requested_since("a") is poll.requested_since("b") is None
 
 
 def test_an_answer_that_comes_twice_changes_nothing_for_who_waits():
     asked = Asked(TriggerSpec(event=True))
     asked.send(10 * MS)
     asked.send(20 * MS)
-    assert asked.question.answered("a", 21 * MS) == 1 * MS
-    assert asked.question.answered("a", 19 * MS) == 9 * MS  # late, and of another way
-    assert asked.question.waiting_since("a") is None
+    assert asked.poll.enter_answer("a", 21 * MS) == 1 * MS
+    assert asked.poll.enter_answer("a", 19 * MS) == 9 * MS  # late, and of another way
+    assert asked.poll.requested_since("a") is None
 
 
 def test_a_question_goes_on_when_the_station_is_configured_anew():
     before, after = Asked(TriggerSpec(event=True)), Asked(TriggerSpec(event=True))
     before.send(10 * MS)
-    before.question.answered("b", 11 * MS)
+    before.poll.enter_answer("b", 11 * MS)
     words, first = after.image.words, after.slot.words
     words[first + TxWord.SENT_AT_NS] = 10 * MS  # carried over with all other words
-    after.question.follow(before.question)
-    after.question.look(12 * MS)  # nothing was sent in that cycle
-    assert after.question.waiting_since("a") == 10 * MS
-    assert after.question.waiting_since("b") is None
-    assert after.question.answered("a", 13 * MS) == 3 * MS
+    after.poll.follow(before.poll)
+    after.poll.look(12 * MS)  # nothing was sent in that cycle
+    assert after.poll.requested_since("a") == 10 * MS
+    assert after.poll.requested_since("b") is None
+    assert after.poll.enter_answer("a", 13 * MS) == 3 * MS
 
 
 def test_requests_that_wait_are_answered_by_the_station_as_it_is_configured_then():
@@ -149,7 +155,7 @@ def test_what_asks_and_is_asked_for_is_found_by_port():
     spec = server("mill", MILL, 71, pds=2)
     assert requests_at(spec, "eap0").names == {"asked"}
     assert requests_at(spec, "eap1").names == frozenset()
-    assert questions_of(image_of(spec)) == {}
+    assert outgoing_polls(image_of(spec)) == {}
 
 
 def server(name: str, net_id: str, pd_id: int, *, pds: int = 1, phase_us: int = 0) -> StationSpec:
@@ -210,7 +216,7 @@ class Exchange:
         for spec in (self.client, *servers):
             channel = lines.open(InterfaceUri.parse(f"loop://line{options}"))
             made = Station(spec, image_of(spec), lambda: None)
-            channel.takers += [made.takers["eap0"], self._counter(spec.name)]
+            channel.handlers += [made.handlers["eap0"], self._counter(spec.name)]
             made.connect("eap0", channel)
             self.images[spec.name] = made.image
             stations.append(made)

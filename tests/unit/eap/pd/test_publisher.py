@@ -198,7 +198,7 @@ def test_restarted_engine_goes_on_with_the_address_that_was_learned():
 
 def test_configured_mac_is_used_and_nothing_is_learned():
     sender = Sender(by_net_id(mac=THEIR_MAC))
-    assert sender.publisher.sought == {}
+    assert sender.publisher.wanted == {}
     assert sender.frames["f"]["address"] == THEIR_MAC
     assert sender.frames["f"]["destination"] == THERE
     assert [3] in sender.cycle(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ids import DestinationKind
-from eap.pd.rules import data_budget, doubles, frame_budget, is_group, is_name
+from eap.pd.rules import data_budget, duplicates, frame_budget, is_group, is_name
 
 
 @pytest.mark.parametrize(
@@ -55,4 +55,4 @@ def test_names_have_no_spaces_and_no_slashes():
 
 
 def test_doubles_are_told_with_the_first_of_their_key():
-    assert list(doubles([(1, "a"), (2, "b"), (1, "c"), (1, "d")])) == [("c", "a"), ("d", "a")]
+    assert list(duplicates([(1, "a"), (2, "b"), (1, "c"), (1, "d")])) == [("c", "a"), ("d", "a")]

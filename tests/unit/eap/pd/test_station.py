@@ -169,7 +169,7 @@ def test_two_ports_send_under_their_own_net_ids_and_take_their_own_subscriptions
     made = Station(spec, image, lambda: None)
     left, right, group = Wire(), Wire(), Wire()
     for wire, port in ((left, "left"), (right, "right"), (group, "right")):
-        wire.takers.append(made.takers[port])
+        wire.handlers.append(made.handlers[port])
     made.connect("left", left)
     made.connect("right", right)
     made.drain_also(group)
@@ -203,7 +203,7 @@ def test_frames_to_a_net_id_go_where_its_own_frames_come_from():
     made.cycle(MS, MS)
     assert [pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame)] == [2]
     frame = octets([(9, b"\0\0")])
-    made.takers["eap0"](memoryview(frame), len(frame), 2 * MS, From("02:00:00:00:00:07"))
+    made.handlers["eap0"](memoryview(frame), len(frame), 2 * MS, From("02:00:00:00:00:07"))
     wire.sent.clear()
     made.cycle(2 * MS, 2 * MS)
     assert sorted(pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame)) == [1, 2]
@@ -214,7 +214,7 @@ def test_frames_to_a_net_id_go_where_its_own_frames_come_from():
 def test_below_op_nothing_is_received_and_below_safeop_nothing_sent():
     made, wire = assemble(moody())
     made.start(0, DeviceState.PREOP)
-    take = made.takers["eap0"]
+    take = made.handlers["eap0"]
 
     def run(at: int) -> list[int]:
         give(take, octets([(7, b"\5\0")], cycle=at), at * MS)

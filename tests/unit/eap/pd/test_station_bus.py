@@ -112,7 +112,7 @@ def test_a_station_may_have_two_buses_and_nothing_else():
         links=(LinkSpec("in0", "out1"), LinkSpec("in1", "out0")),
     )
     made = Station(spec, image_of(spec), lambda: None)
-    assert made.takers == {}
+    assert made.handlers == {}
     halves = []
     for number in (0, 1):
         half = FakeBus(made, only=number)
@@ -164,7 +164,7 @@ def test_a_switch_on_one_stations_bus_opens_a_valve_on_anothers_bus():
     for spec in (left, right):
         channel = lines.open(InterfaceUri.parse("loop://between"))
         made = Station(spec, image_of(spec), lambda: None)
-        channel.takers.append(made.takers["eap0"])
+        channel.handlers.append(made.handlers["eap0"])
         made.connect("eap0", channel)
         buses.append(FakeBus(made))
         made.connect_bus(buses[-1])

@@ -56,7 +56,7 @@ def pair(options: str) -> tuple[Engine, Image, Image, LoopbackChannel, list[int]
         sources=(CounterSource("n"),),
         frames=(TxFrameSpec("f", "eap0", "10.0.0.1", (TxPdSpec("p", 7, ("n",)),)),),
     )
-    taker = station(
+    handler = station(
         "taker",
         phase_us=500,
         variables=received("n:UDINT"),
@@ -64,15 +64,15 @@ def pair(options: str) -> tuple[Engine, Image, Image, LoopbackChannel, list[int]
     )
     arrived: list[int] = []
     images, stations = [], []
-    for spec, uri in ((sender, f"loop://line{options}"), (taker, "loop://line")):
+    for spec, uri in ((sender, f"loop://line{options}"), (handler, "loop://line")):
         channel = lines.open(InterfaceUri.parse(uri))
         image = image_of(spec)
         made = Station(spec, image, lambda: None)
-        if spec is taker:
-            channel.takers.append(
+        if spec is handler:
+            channel.handlers.append(
                 lambda data, size, at_ns, _: arrived.append(int.from_bytes(data[10:12], "little"))
             )
-        channel.takers.append(made.takers["eap0"])
+        channel.handlers.append(made.handlers["eap0"])
         made.connect("eap0", channel)
         images.append(image)
         stations.append(made)
@@ -116,7 +116,7 @@ def test_a_cable_that_is_cut_and_restored_shows_a_gap_of_its_true_length():
     engine.start(0)
     for _ in range(101):
         engine.handle_timeout(engine.next_timeout())
-    takers, channel.takers = channel.takers, []
+    handlers, channel.handlers = channel.handlers, []
     qualities = []
     for _ in range(80_000):
         for _ in range(2):
@@ -126,7 +126,7 @@ def test_a_cable_that_is_cut_and_restored_shows_a_gap_of_its_true_length():
     assert qualities == list(range(10, 60_010, 10))
     row = station_status(taken, 0)["pd"]["rx"][0]
     assert (row["quality"], row["state"], row["timeouts"]) == (65_535, "stale", 1)
-    channel.takers = takers
+    channel.handlers = handlers
     for _ in range(10):
         engine.handle_timeout(engine.next_timeout())
     row = station_status(taken, 0)["pd"]["rx"][0]
@@ -150,7 +150,7 @@ class PairMachine(RuleBasedStateMachine):
             frames=(TxFrameSpec("f", "eap0", "10.0.0.1", pds),),
         )
         common = {"publisher": PEER, "sender_cycle_us": 1000}
-        taker = station(
+        handler = station(
             variables=received("x:UINT", "b:BIT3", "y:UDINT", "z:UINT"),
             subscriptions=(
                 RxPdSpec("cyclic", "eap0", 1, ("x", "b"), step=1, **common),
@@ -159,9 +159,9 @@ class PairMachine(RuleBasedStateMachine):
             ),
         )
         self.sender, self.out = assemble(sender)
-        self.taker, self.into = assemble(taker)
+        self.handler, self.into = assemble(handler)
         self.sender.start(0)
-        self.taker.start(0)
+        self.handler.start(0)
         self.now = 0
         self.delivered: dict[int, bytes] = {}
         self.arrivals: dict[int, list[int]] = {1: [], 2: [], 3: []}
@@ -201,14 +201,14 @@ class PairMachine(RuleBasedStateMachine):
                 for pd, data in iter_pds(frame):
                     self.delivered[pd.pd_id] = bytes(data)
                     self.arrivals[pd.pd_id].append(int.from_bytes(frame[10:12], "little"))
-            self.taker.cycle(self.now, self.now)
+            self.handler.cycle(self.now, self.now)
 
     @rule()
     def both_engines_are_restarted(self) -> None:
         self.sender, self.out = assemble(self.sender.spec, self.out.image)
-        self.taker, self.into = assemble(self.taker.spec, self.into.image)
+        self.handler, self.into = assemble(self.handler.spec, self.into.image)
         self.sender.start(self.now)
-        self.taker.start(self.now)
+        self.handler.start(self.now)
 
     @invariant()
     def what_was_received_is_what_was_sent_last(self) -> None:

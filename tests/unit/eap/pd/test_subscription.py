@@ -31,8 +31,8 @@ def subscription(*, polled: bool = False, **options: object) -> tuple[RxSubscrip
         )
     )
     (slot,) = image.layout.rx
-    question = OutgoingPoll(image.words, image.layout.tx[0], ["in"]) if polled else None
-    made = RxSubscription(spec, slot, SubstituteValue(image, slot), question)
+    poll = OutgoingPoll(image.words, image.layout.tx[0], ["in"]) if polled else None
+    made = RxSubscription(spec, slot, SubstituteValue(image, slot), poll)
     timing = Timing(step=1, sender_cycle_ns=MS, own_cycle_ns=MS)
     made.tracker = SequenceTracker(image.words, slot.words, timing)
     return made, image.words
@@ -62,10 +62,10 @@ def test_an_answer_is_too_old_when_it_was_asked_for_so_long_ago():
     made, words = subscription(polled=True)
     made.tracker.arrived(1, 10 * MS, 1)
     assert made.deadline_ns() is None
-    words[made.answer.question._slot.frame_words + FrameWord.WHOLE] += 1
-    made.answer.question.look(40 * MS)
+    words[made.answer.poll._slot.frame_words + FrameWord.WHOLE] += 1
+    made.answer.poll.look(40 * MS)
     assert made.deadline_ns() == 45 * MS
-    made.answer.question.answered("in", 41 * MS)
+    made.answer.poll.enter_answer("in", 41 * MS)
     assert made.deadline_ns() is None
 
 
@@ -136,12 +136,12 @@ def test_each_tracker_has_its_own_copies():
         [AcceptedPd(one, 3, 14, 200, 8), AcceptedPd(other, 4, 22, 208, 8)],
         [DroppedPd((1,))],
         watch=WATCH,
-        roaming=[other],
+        any_publisher=[other],
         publisher=bytes([5, 23, 91, 23, 1, 1]),
     )
     assert [part for part, _ in plan.parts] == [one, other]
-    assert plan.taken_words == (3, 4)
-    assert plan.roaming == (other,)
+    assert plan.accepted_words == (3, 4)
+    assert plan.any_publisher == (other,)
     assert plan.publisher == 0x05175B170101
 
 

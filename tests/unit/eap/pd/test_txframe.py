@@ -537,5 +537,5 @@ def test_a_trigger_without_reasons_has_none():
     assert trigger.reason(0, 0, None) is None
     trigger.raise_event()
     assert trigger.reason(0, 0, None) == REASON_INDEX[Reason.EVENT]
-    trigger.use_up_event()
+    trigger.clear_event()
     assert trigger.reason(0, 0, None) is None

@@ -153,7 +153,7 @@ def test_status_during_cycles_is_of_one_moment(path: Path) -> None:
         runner.pause()
         wire = Wire()
         station = runner.station
-        wire.takers = [station.takers["eap0"]]
+        wire.handlers = [station.handlers["eap0"]]
         station.connect("eap0", wire)
         end = threading.Event()
 
@@ -315,7 +315,7 @@ def test_an_image_whose_engine_died_while_it_was_replaced_is_found(
     with eap.attach("mixer") as station:
         first.stop()
         fresh = prepare_image(path, plan_layout(spec(VariableSpec("extra", "INT"))), 2)
-        fresh.take_name(path)  # and then the engine was killed
+        fresh.move_to(path)  # and then the engine was killed
         fresh.close()
         with running(path, spec(VariableSpec("extra", "INT"))):
 

@@ -17,7 +17,7 @@ from eap.runtime.handover import (
     SharedSocket,
     SocketKind,
     pass_connection,
-    take_connection,
+    receive_connection,
 )
 
 PORT = PortSpec("eap0", PortKind.EAP, "udp://127.0.0.1", "1.2.3.4.5.6")
@@ -67,25 +67,25 @@ def link():
 
 def test_descriptor_and_description_arrive_together(link):
     services, engine = link
-    assert take_connection(engine) is None
+    assert receive_connection(engine) is None
     ours, theirs = socket.socketpair()
     with ours, theirs:
         assert pass_connection(services, theirs, DESCRIPTION)
         theirs.close()
-        taken = take_connection(engine)
+        taken = receive_connection(engine)
         assert taken is not None
         connection, description = taken
         assert description == DESCRIPTION
         with connection:
             ours.sendall(b"hello")
             assert connection.recv(5) == b"hello"
-    assert take_connection(engine) is None
+    assert receive_connection(engine) is None
 
 
 def test_a_message_without_a_descriptor_is_dropped(link):
     services, engine = link
     services.send(b"{}")
-    assert take_connection(engine) is None
+    assert receive_connection(engine) is None
 
 
 def test_a_full_or_closed_link_is_told(link):
@@ -96,10 +96,10 @@ def test_a_full_or_closed_link_is_told(link):
                 break
         else:
             pytest.fail("the link never filled up")
-        while taken := take_connection(engine):
+        while taken := receive_connection(engine):
             taken[0].close()
         assert pass_connection(services, connection, DESCRIPTION)
-        taken = take_connection(engine)
+        taken = receive_connection(engine)
         assert taken is not None
         taken[0].close()
         engine.close()

@@ -32,10 +32,10 @@ from eap.runtime.store import (
     StationFile,
     StationStore,
     Stored,
+    adopt_plant_file,
     digest_of,
     effective,
     plant_folder,
-    settle,
     state_root,
 )
 from tests.support.vectors import FOLDER as VECTORS
@@ -233,7 +233,7 @@ def test_file_that_was_applied_is_not_edited_since(stations):
     assert effective("demo", (left,))[0].spec == stored.spec
     assert kept("left").read() == stored
     # Its next start is with the file that was applied, though something else runs: a rollback.
-    settle("demo", (applied,))
+    adopt_plant_file("demo", (applied,))
     assert effective("demo", (applied,))[0].spec == stored.spec
     assert kept("left").read() == replace(stored, base=digest_of(applied))
 
@@ -242,7 +242,7 @@ def test_file_before_the_one_that_was_applied_is_an_edited_one(stations, caplog)
     left, _ = stations
     stored = replace(configured(left), applied=digest_of(changed(left)))
     kept("left").save(stored)
-    settle("demo", (left,), DeviceState.PREOP)
+    adopt_plant_file("demo", (left,), DeviceState.PREOP)
     assert "the plant file was edited" in caplog.text
     assert effective("demo", (left,)) == (Effective(left, DeviceState.PREOP),)
     assert kept("left").read().previous.spec == changed(left)
@@ -284,11 +284,11 @@ def test_another_file_is_one_change_of_all_stations(stations):
 
 def test_nothing_to_settle(stations):
     left, right = stations
-    settle("demo", stations)
+    adopt_plant_file("demo", stations)
     assert not state_root().exists()
     kept("left").save(configured(left))
     before = kept("left").path.stat()
-    settle("demo", (changed(left, "edited"), right))
+    adopt_plant_file("demo", (changed(left, "edited"), right))
     after = kept("left").path.stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 

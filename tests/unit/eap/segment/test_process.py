@@ -283,6 +283,6 @@ def test_frames_that_waited_for_a_late_process_come_before_watchdogs(
     sock = StalledSocket(clock, stall_ms * 1_000_000)
     loop = segment_process._Loop(segment, {SegmentEnd.PRIMARY: sock}, None)
     monkeypatch.setattr(FaultySegment, "next_timeout", lambda _: 10**9 + 100_000_000)
-    loop._patience_ms()
-    loop._pass_frames(SegmentEnd.PRIMARY, sock)
+    loop._poll_timeout_ms()
+    loop._forward_frames(SegmentEnd.PRIMARY, sock)
     assert len(calls) == postponed

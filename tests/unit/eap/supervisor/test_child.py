@@ -100,13 +100,13 @@ def test_one_that_dies_before_it_is_ready(tmp_path, monkeypatch):
     child = make(tmp_path, monkeypatch, "import signal; signal.pause()")
     child.start(HANDOVER, [], monotonic_ns())
     assert not child.forward_output()
-    child.ask_to_end(signal.SIGKILL)
+    child.send_signal(signal.SIGKILL)
     wait(child.pid_fd)
     while child.report_fd >= 0:
         child.take_reports()
     assert not child.is_ready
     assert child.reap() == (-signal.SIGKILL, "it said nothing")
-    child.ask_to_end(signal.SIGTERM)  # nobody is there: nothing happens
+    child.send_signal(signal.SIGTERM)  # nobody is there: nothing happens
 
 
 @pytest.mark.net
@@ -131,7 +131,7 @@ def test_child_that_cannot_be_started_leaves_nothing_behind(tmp_path, monkeypatc
 def test_child_that_is_interrupted_while_it_starts_ends_without_a_traceback(tmp_path, monkeypatch):
     child = make(tmp_path, monkeypatch, READS_ITS_HANDOVER)
     child.start(HANDOVER, [], monotonic_ns())
-    child.ask_to_end(signal.SIGINT)
+    child.send_signal(signal.SIGINT)
     wait(child.pid_fd)
     assert child.reap() == (-signal.SIGTERM, "it said nothing")
 
@@ -168,12 +168,12 @@ def test_lines_go_where_somebody_reads(pipe):
     for line in ("first", "second ä", "x" * 10_000):
         output.write(line)
     assert read(pipe[0]) == f"first\nsecond ä\n{'x' * 10_000}\n"
-    assert output.left_out == 0
+    assert output.dropped == 0
 
 
 def test_what_nobody_takes_is_left_out_and_counted(pipe):
     output = Output(pipe[1])
-    while not output.left_out:
+    while not output.dropped:
         output.write("y" * 1000)
     output.write("nobody sees this")
     read(pipe[0])
@@ -187,7 +187,7 @@ def test_a_reader_that_has_gone_is_no_fault(pipe):
     os.dup2(null, pipe[0])  # closes the reading end, and leaves a descriptor to close
     os.close(null)
     output.write("nobody sees this")
-    assert output.left_out == 1
+    assert output.dropped == 1
 
 
 def test_line_after_one_that_a_full_disk_cut_begins_anew(tmp_path):
@@ -197,7 +197,7 @@ def test_line_after_one_that_a_full_disk_cut_begins_anew(tmp_path):
         with largest_file(10):
             output.write("second is long")
             output.write("third")
-        assert output.left_out == 2
+        assert output.dropped == 2
         output.write("fourth")
         output.write("fifth")
     lines = (tmp_path / "log").read_text().splitlines()
