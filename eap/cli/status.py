@@ -36,6 +36,8 @@ from eap.cli.status_findings import (
     STATES,
     Severity,
     StatusFinding,
+    StatusReport,
+    findings,
     is_special,
 )
 from eap.errors import ControlError
@@ -43,23 +45,25 @@ from eap.errors import ControlError
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
+    from eap.ops.client import ApplianceStatus
+
 
 _LEAST_INTERVAL_S = 0.1
 
 
-class Look(NamedTuple):
-    """One answer of the appliances.
+class Sample(NamedTuple):
+    """Status of the appliances at one time.
 
     Attributes:
-        now_s: Unix time of the look.
-        document: The merged answer, with its findings.
-        earlier: The document of the look before, where there is one.
-        seconds: How long ago that was.
+        now_s: Unix time of the sample.
+        document: The merged status with its findings.
+        earlier: The document of the previous sample, if there is one.
+        seconds: Time since the previous sample.
     """
 
     now_s: float
-    document: dict[str, Any]
-    earlier: dict[str, Any] | None = None
+    document: StatusReport
+    earlier: StatusReport | None = None
     seconds: float = 0.0
 
 
@@ -92,11 +96,11 @@ def status(
     """
     view = _full if full else _screen
     if not watch:
-        look = _look(plant, station)
-        output.show(look.document, lambda _: view(look))
+        sample = _take_sample(plant, station)
+        output.show(sample.document, lambda _: view(sample))
         return
     try:
-        for found in _looks(plant, station, interval_s):
+        for found in _samples(plant, station, interval_s):
             if output.is_json:
                 _write_object(found)
             else:
@@ -105,22 +109,22 @@ def status(
         return
 
 
-def _looks(plant: str | None, station: str | None, interval_s: float) -> Iterator[Look | str]:
-    """Yield a look every *interval_s*, or why there was no answer; never end."""
-    before: tuple[float, Look] | None = None
+def _samples(plant: str | None, station: str | None, interval_s: float) -> Iterator[Sample | str]:
+    """Yield a sample every *interval_s*, or the error of the request; never end."""
+    before: tuple[float, Sample] | None = None
     while True:
         start = time.monotonic()
         try:
-            look = _look(plant, station)
+            sample = _take_sample(plant, station)
         except ControlError as exc:
             before = None
             yield str(exc)
         else:
             if before is not None:
                 at, last = before
-                look = look._replace(earlier=last.document, seconds=start - at)
-            before = (start, look)
-            yield look
+                sample = sample._replace(earlier=last.document, seconds=start - at)
+            before = (start, sample)
+            yield sample
         _pause(max(0.0, start + interval_s - time.monotonic()))
 
 
@@ -128,45 +132,48 @@ def _pause(seconds: float) -> None:
     Event().wait(seconds)
 
 
-def _look(plant: str | None, station: str | None) -> Look:
+def _take_sample(plant: str | None, station: str | None) -> Sample:
     """Return the merged answer of the chosen appliances, cut down to *station* if it is given."""
-    from eap.cli.status_findings import findings
-    from eap.ops.client import connect, merge_status
+    from msgspec.structs import asdict, replace
+
+    from eap.ops.client import MergedStatus, connect
 
     with ExitStack() as stack:
         clients = [stack.enter_context(client) for client in connect(plant, station)]
-        document = merge_status([client.request("status") for client in clients])
+        status = MergedStatus.of([client.request("status") for client in clients])
     if station:
-        document["stations"] = [row for row in document["stations"] if row["name"] == station]
+        status = replace(
+            status, stations=[row for row in status.stations if row["name"] == station]
+        )
     now_s = time.time()
-    document["findings"] = [each.to_plain() for each in findings(document, now_s)]
-    return Look(now_s, document)
+    document = StatusReport(**asdict(status), findings=findings(status, now_s))
+    return Sample(now_s, document)
 
 
-def _write_object(found: Look | str) -> None:
-    if isinstance(found, Look):
+def _write_object(found: Sample | str) -> None:
+    if isinstance(found, Sample):
         write_json(found.document)
     else:
         click.echo(found, err=True)
 
 
 def _page(
-    found: Look | str, view: Callable[[Look], Iterable[RenderableType]], interval_s: float
+    found: Sample | str, view: Callable[[Sample], Iterable[RenderableType]], interval_s: float
 ) -> Iterator[RenderableType]:
 
     yield Styled(f"{time.strftime('%H:%M:%S')}, every {interval_s:g} s", style="dim")
-    if isinstance(found, Look):
+    if isinstance(found, Sample):
         yield from view(found)
     else:
         yield Styled(f"{found}; waiting for an appliance", style="bold red")
 
 
-def _screen(look: Look) -> Iterator[RenderableType]:
-    yield StatusScreen(look.document, look.now_s, look.earlier, look.seconds)
+def _screen(sample: Sample) -> Iterator[RenderableType]:
+    yield StatusScreen(sample.document, sample.now_s, sample.earlier, sample.seconds)
 
 
-def _full(look: Look) -> Iterator[RenderableType]:
-    return full_view(look.document, look.now_s)
+def _full(sample: Sample) -> Iterator[RenderableType]:
+    return full_view(sample.document, sample.now_s)
 
 
 Row = Mapping[str, Any]
@@ -190,12 +197,15 @@ class StatusScreen:
     """
 
     def __init__(
-        self, document: Row, now_s: float, earlier: Row | None = None, seconds: float = 0.0
+        self,
+        document: StatusReport,
+        now_s: float,
+        earlier: StatusReport | None = None,
+        seconds: float = 0.0,
     ) -> None:
-        findings = [StatusFinding.from_plain(row) for row in document["findings"]]
         self._document = document
-        self._findings = [each for each in findings if each.severity is not Severity.INFO]
-        self._remarks = len(findings) - len(self._findings)
+        self._findings = [each for each in document.findings if each.severity is not Severity.INFO]
+        self._remarks = len(document.findings) - len(self._findings)
         self._now_s = now_s
         self._earlier = earlier
         self._seconds = seconds
@@ -206,7 +216,7 @@ class StatusScreen:
             lines = console.render_lines(self._layout(findings, stations), options, pad=False)
             return len(lines) + _SPARE_LINES - console.height
 
-        stations, findings = len(self._document["stations"]), len(self._findings)
+        stations, findings = len(self._document.stations), len(self._findings)
         if console.is_terminal:
             while findings > _LEAST_ROWS and (lines := excess(findings, _LEAST_ROWS)) > 0:
                 findings = max(_LEAST_ROWS, findings - lines)
@@ -217,18 +227,18 @@ class StatusScreen:
     def _layout(self, findings: int, stations: int) -> RenderableType:
         from rich.console import Group
 
-        parts: list[RenderableType] = [*verdicts(self._document)]
+        parts: list[RenderableType] = [*summaries(self._document)]
         if self._findings:
             parts.append(finding_grid(self._findings[:findings], self._now_s))
         if rest := len(self._findings) - findings:
             parts.append(Styled(f"{rest} more: eapctl status --full", style="dim"))
         parts += [Styled(), self._stations(stations)]
-        if others := self._document["stations"][stations:]:
+        if others := self._document.stations[stations:]:
             parts.append(Styled(f"{count(len(others), 'more station')}, {_states(others)}"))
         parts.append(Styled())
         parts += (
             _processes(each, appliance_label(self._document, each))
-            for each in self._document["appliances"]
+            for each in self._document.appliances
         )
         remarks = f", and {count(self._remarks, 'remark')}" if self._remarks else ""
         parts.append(Styled(f"eapctl status --full: each PD, port and bus{remarks}", style="dim"))
@@ -247,7 +257,7 @@ class StatusScreen:
             Column("Dropped", rank=2, is_number=True),
             Column("Buses", rank=1, wraps=True),
         )
-        for row in self._document["stations"][:shown]:
+        for row in self._document.stations[:shown]:
             rx = row["pd"]["rx"]
             dropped = sum(row["discarded"].values())
             dropped += sum(number for each in rx for number in each["discarded"].values())
@@ -265,41 +275,42 @@ class StatusScreen:
         return table
 
     def _figure(self, station: Row, direction: str, key: str) -> str:
-        """Return a sum over all PDs: since the start, or a second where there is a look before."""
+        """Return a sum over all PDs: since the start, or per second after a previous sample."""
         total = _total(station, direction, key)
         if self._earlier is None:
             return str(total)
         before = [
             row
-            for row in self._earlier["stations"]
+            for row in self._earlier.stations
             if (row["plant"], row["name"]) == (station["plant"], station["name"])
         ]
         if not before or total < (total_before := _total(before[0], direction, key)):
-            return ""  # it was not there, or its counters started anew
-        # Not the time between the looks: counters are of a moment that the look does not know.
+            return ""  # the station is new, or its counters restarted
+        # Not the time between the samples: the counters are older than the answer by an unknown
+        # time, while the number of cycles belongs to the same moment as they do.
         seconds = _station_s(station) - _station_s(before[0])
         return f"{(total - total_before) / (seconds if seconds > 0 else self._seconds):.0f}"
 
 
-def appliance_label(document: Row, appliance: Row) -> str:
+def appliance_label(document: StatusReport, appliance: ApplianceStatus) -> str:
     """Return the plant of an appliance, with its stations where others run parts of that plant."""
-    plants = [each["plant"] for each in document["appliances"]]
-    plant: str = appliance["plant"]
+    plants = [each.plant for each in document.appliances]
+    plant: str = appliance.plant
     if plants.count(plant) == 1:
         return plant
-    return f"{plant} ({', '.join(appliance['stations'])})"
+    return f"{plant} ({', '.join(appliance.stations)})"
 
 
-def verdicts(document: Row) -> list[Styled]:
+def summaries(document: StatusReport) -> list[Styled]:
     """Return a line for each plant: the number of errors and warnings, and its parts."""
-    plants = dict.fromkeys(appliance["plant"] for appliance in document["appliances"])
-    return [_verdict(document, plant) for plant in plants]
+    plants = dict.fromkeys(appliance.plant for appliance in document.appliances)
+    return [_summary(document, plant) for plant in plants]
 
 
-def _verdict(document: Row, plant: str) -> Styled:
-    stations = [row for row in document["stations"] if row["plant"] == plant]
+def _summary(document: StatusReport, plant: str) -> Styled:
+    stations = [row for row in document.stations if row["plant"] == plant]
     pds = sum(len(row["pd"]["tx"]) + len(row["pd"]["rx"]) for row in stations)
-    counts = Counter(row["severity"] for row in document["findings"] if row["plant"] == plant)
+    counts = Counter(each.severity for each in document.findings if each.plant == plant)
     text = Styled(f"{plant}: ", style="bold")
     if errors := counts[Severity.ERROR]:
         text.append(count(errors, "error"), _BAD)
@@ -368,8 +379,8 @@ def _bad_count(number: int) -> Styled:
     return Styled(str(number), style=_BAD if number else "")
 
 
-def _processes(appliance: Row, label: str) -> RenderableType:
-    processes = dict(appliance["processes"])
+def _processes(appliance: ApplianceStatus, label: str) -> RenderableType:
+    processes = dict(appliance.processes)
     segments = list(processes.pop("segments", {}).values())
     items = [_process(name, [process]) for name, process in processes.items()]
     if segments:
@@ -393,17 +404,17 @@ def _process(name: str, processes: Sequence[Row]) -> Styled:
     return text
 
 
-def full_view(document: Row, now_s: float) -> Iterator[RenderableType]:
+def full_view(document: StatusReport, now_s: float) -> Iterator[RenderableType]:
     """Yield everything in a status *document* of *now_s*, as tables."""
-    stations = document["stations"]
-    yield from verdicts(document)
-    found = [StatusFinding.from_plain(row) for row in document["findings"]]
+    stations = document.stations
+    yield from summaries(document)
+    found = document.findings
     if faults := [each for each in found if each.severity is not Severity.INFO]:
         yield finding_grid(faults, now_s)
-    for appliance in document["appliances"]:
+    for appliance in document.appliances:
         yield ""
         yield _processes_table(appliance, appliance_label(document, appliance))
-        if listeners := appliance.get("listeners"):
+        if listeners := appliance.listeners:
             yield ""
             yield _listeners(listeners)
     yield ""
@@ -421,7 +432,7 @@ def full_view(document: Row, now_s: float) -> Iterator[RenderableType]:
         yield from (Styled(each.text(now_s)) for each in remarks)
 
 
-def _processes_table(appliance: Row, label: str) -> TextTable:
+def _processes_table(appliance: ApplianceStatus, label: str) -> TextTable:
     table = TextTable(
         f"Process of {label}",
         Column("PID", rank=1, is_number=True),
@@ -430,7 +441,7 @@ def _processes_table(appliance: Row, label: str) -> TextTable:
         Column("Files", rank=1, is_number=True),
         Column("Restarts", is_number=True),
     )
-    processes = dict(appliance["processes"])
+    processes = dict(appliance.processes)
     segments = processes.pop("segments", {})
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():

@@ -13,13 +13,16 @@ moment, and the one-screen view leaves them out.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from eap.cli.output import count, duration
 from eap.cli.output import times as times_of
+
+if TYPE_CHECKING:
+    from eap.ops.client import ApplianceStatus, MergedStatus
 
 Row = Mapping[str, Any]
 
@@ -93,26 +96,31 @@ class StatusFinding:
         parts = [f"{self.where}: {fault}{since}", *details, self.advice]
         return "; ".join(filter(None, parts))
 
-    @classmethod
-    def from_plain(cls, row: Row) -> StatusFinding:
-        """Return the finding of a *row* of a document."""
-        return cls(**{**row, "severity": Severity(row["severity"])})
 
-    def to_plain(self) -> dict[str, Any]:
-        """Return the finding as JSON has it."""
-        return asdict(self)
+@dataclass(frozen=True, slots=True)
+class StatusReport:
+    """Status of several appliances and the findings in it: the object of ``status --json``.
+
+    Its other fields are those of :class:`eap.ops.client.MergedStatus`.
+    """
+
+    version: int
+    processes: Row
+    stations: list[Row]
+    appliances: list[ApplianceStatus]
+    findings: list[StatusFinding]
 
 
-def findings(document: Row, now_s: float) -> list[StatusFinding]:
-    """Return all findings of a status *document*, errors first, then warnings."""
+def findings(status: MergedStatus, now_s: float) -> list[StatusFinding]:
+    """Return all findings of *status*, errors first, then warnings."""
     found = [
-        replace(each, plant=appliance["plant"])
-        for appliance in document["appliances"]
+        replace(each, plant=appliance.plant)
+        for appliance in status.appliances
         for each in _of_appliance(appliance)
     ]
-    for appliance in document["appliances"]:
-        plant = appliance["plant"]
-        stations = stations_of(document, appliance)
+    for appliance in status.appliances:
+        plant = appliance.plant
+        stations = _stations_of(status, appliance)
         found += [replace(each, plant=plant) for each in _of_engine(plant, stations, now_s)]
         for station in stations:
             found += [replace(each, plant=plant) for each in _of_station(station)]
@@ -120,10 +128,10 @@ def findings(document: Row, now_s: float) -> list[StatusFinding]:
     return sorted(found, key=lambda each: order.index(each.severity))
 
 
-def stations_of(document: Row, appliance: Row) -> list[Row]:
+def _stations_of(status: MergedStatus, appliance: ApplianceStatus) -> list[Row]:
     """Return the stations of one appliance: several of them may run parts of one plant."""
-    names, plant = set(appliance["stations"]), appliance["plant"]
-    return [row for row in document["stations"] if row["plant"] == plant and row["name"] in names]
+    names, plant = set(appliance.stations), appliance.plant
+    return [row for row in status.stations if row["plant"] == plant and row["name"] in names]
 
 
 def is_special(frame: Row) -> bool:
@@ -143,11 +151,11 @@ def _info(where: str, what: str) -> StatusFinding:
     return StatusFinding(Severity.INFO, where, what)
 
 
-def _of_appliance(appliance: Row) -> Iterator[StatusFinding]:
-    plant = appliance["plant"]
-    for row in appliance.get("findings", ()):
-        yield StatusFinding.from_plain(row)
-    processes = dict(appliance["processes"])
+def _of_appliance(appliance: ApplianceStatus) -> Iterator[StatusFinding]:
+    plant = appliance.plant
+    for row in appliance.findings:
+        yield StatusFinding(**{**row, "severity": Severity(row["severity"])})
+    processes = dict(appliance.processes)
     segments = processes.pop("segments", {})
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():
@@ -155,11 +163,11 @@ def _of_appliance(appliance: Row) -> Iterator[StatusFinding]:
             yield _error(f"{plant} {name}", "not running", "it is being restarted")
         elif step := process.get("step"):
             yield _warning(f"{plant} {name}", f"starting: {step}")
-    if audit := appliance.get("audit"):
+    if audit := appliance.audit:
         yield from _of_audit(f"{plant} audit", audit)
     for name, process in processes.items():
         yield from _of_descriptors(f"{plant} {name}", process.get("descriptors"))
-    for listener in appliance.get("listeners", ()):
+    for listener in appliance.listeners:
         yield from _of_listener(plant, listener)
     engine = processes["engine"]
     refused = [

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from time import monotonic
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 
@@ -194,34 +194,48 @@ def connect_station(station: str, plant: str | None) -> ControlClient:
     return first
 
 
-def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return one answer for several appliances.
+class ApplianceStatus(msgspec.Struct, frozen=True):
+    """Status of one appliance, without its stations."""
 
-    *processes* are those of the first; *appliances* lists all, each with its plant, its stations'
-    names, its processes, its findings, its audit and its listeners.  Each station has the name of
-    its plant.
+    plant: str
+    stations: list[str]
+    processes: dict[str, Any]
+    findings: list[dict[str, Any]] = []
+    audit: dict[str, Any] | None = None
+    listeners: list[dict[str, Any]] = []
+
+
+class MergedStatus(msgspec.Struct, frozen=True):
+    """Status of several appliances.
+
+    Attributes:
+        version: Of the format.
+        processes: Those of the first appliance.
+        stations: Of all appliances, each with the name of its plant.
+        appliances: All appliances.
     """
-    appliances = [
-        {
-            "plant": answer["plant"],
-            "stations": [station["name"] for station in answer["stations"]],
-            "processes": answer["processes"],
-            "findings": answer.get("findings", []),
-            "audit": answer.get("audit"),
-            "listeners": answer.get("listeners", []),
-        }
-        for answer in answers
-    ]
-    return {
-        "version": answers[0]["version"],
-        "processes": answers[0]["processes"],
-        "stations": [
+
+    version: int
+    processes: dict[str, Any]
+    stations: list[dict[str, Any]]
+    appliances: list[ApplianceStatus]
+
+    @classmethod
+    def of(cls, answers: Sequence[dict[str, Any]]) -> Self:
+        """Merge the answers of appliances to the method ``status``."""
+        appliances = [
+            msgspec.convert(
+                answer | {"stations": [station["name"] for station in answer["stations"]]},
+                ApplianceStatus,
+            )
+            for answer in answers
+        ]
+        stations = [
             {"plant": answer["plant"], **station}
             for answer in answers
             for station in answer["stations"]
-        ],
-        "appliances": appliances,
-    }
+        ]
+        return cls(answers[0]["version"], answers[0]["processes"], stations, appliances)
 
 
 def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> ControlClient:

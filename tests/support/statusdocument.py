@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from eap.cli.status_findings import findings
+import msgspec
+from msgspec.structs import asdict
+
+from eap.cli.status_findings import StatusReport, findings
+from eap.ops.client import MergedStatus
 
 NOW_S = 1_795_000_000.0
 
@@ -97,6 +101,12 @@ def frame(name: str, **more: Any) -> dict[str, Any]:
     return row | more
 
 
-def with_findings(status: dict[str, Any]) -> dict[str, Any]:
-    """Return *status* as ``eapctl`` has it: with what it found in it."""
-    return status | {"findings": [each.to_plain() for each in findings(status, NOW_S)]}
+def merged(status: dict[str, Any]) -> MergedStatus:
+    """Return *status* as the client has it."""
+    return msgspec.convert(status, MergedStatus)
+
+
+def with_findings(status: dict[str, Any]) -> StatusReport:
+    """Return *status* with its findings."""
+    found = merged(status)
+    return StatusReport(**asdict(found), findings=findings(found, NOW_S))

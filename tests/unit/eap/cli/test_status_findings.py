@@ -1,16 +1,17 @@
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
 import pytest
 
 from eap.cli.status_findings import Severity, StatusFinding, findings
-from tests.support.statusdocument import NOW_S, bus_port, document, frame, rx, tx
+from tests.support.statusdocument import NOW_S, bus_port, document, frame, merged, rx, tx
 
 
 def found(status: dict[str, Any]) -> list[tuple[str, str]]:
-    return [(each.severity.value, each.text(NOW_S)) for each in findings(status, NOW_S)]
+    return [(each.severity.value, each.text(NOW_S)) for each in findings(merged(status), NOW_S)]
 
 
 def texts(**parts: Any) -> list[str]:
@@ -27,7 +28,7 @@ def test_findings_of_a_plant_without_faults_are_none() -> None:
 
 def test_findings_are_sorted_errors_first_and_name_the_plant() -> None:
     status = document(state="SAFEOP", overruns=2, ports=[bus_port()])
-    listed = findings(status, NOW_S)
+    listed = findings(merged(status), NOW_S)
     assert [each.severity for each in listed] == [
         Severity.ERROR, Severity.WARNING, Severity.INFO, Severity.INFO,
     ]  # fmt: skip
@@ -158,11 +159,9 @@ def test_findings_of_the_services_are_taken_over() -> None:
     alarm = StatusFinding(
         Severity.ERROR, "line audit", "changes not recorded: disk full", "free space"
     )
-    status["appliances"][0]["findings"] = [alarm.to_plain()]
-    (only,) = findings(status, NOW_S)
-    assert only == StatusFinding(
-        **{**alarm.to_plain(), "severity": Severity.ERROR, "plant": "line"}
-    )
+    status["appliances"][0]["findings"] = [asdict(alarm)]
+    (only,) = findings(merged(status), NOW_S)
+    assert only == StatusFinding(**{**asdict(alarm), "severity": Severity.ERROR, "plant": "line"})
 
 
 @pytest.mark.parametrize(("cycle_us", "hangs"), [(10_000, True), (1_000_000, False)])

@@ -11,7 +11,7 @@ import pytest
 
 from devicebus.errors import AlStatusError
 from eap.errors import ControlError
-from eap.ops.client import ControlClient, connect, merge_status
+from eap.ops.client import ApplianceStatus, ControlClient, MergedStatus, connect
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
 
 pytestmark = pytest.mark.net
@@ -162,11 +162,11 @@ def test_a_socket_that_does_not_listen_is_named():
 def test_status_of_several_becomes_one():
     first = {"version": 1, "plant": "p", "processes": {"engine": {}}, "stations": [{"name": "a"}]}
     second = {"version": 1, "plant": "q", "processes": {}, "stations": [{"name": "b"}]}
-    merged = merge_status([first, second])
-    assert merged["processes"] == {"engine": {}}
-    assert [station["name"] for station in merged["stations"]] == ["a", "b"]
-    none = {"findings": [], "audit": None, "listeners": []}
-    assert merged["appliances"] == [
-        {"plant": "p", "stations": ["a"], "processes": {"engine": {}}} | none,
-        {"plant": "q", "stations": ["b"], "processes": {}} | none,
+    merged = MergedStatus.of([first, second])
+    assert merged.processes == {"engine": {}}
+    assert [station["name"] for station in merged.stations] == ["a", "b"]
+    assert [station["plant"] for station in merged.stations] == ["p", "q"]
+    assert merged.appliances == [
+        ApplianceStatus("p", ["a"], {"engine": {}}, findings=[], audit=None, listeners=[]),
+        ApplianceStatus("q", ["b"], {}, findings=[], audit=None, listeners=[]),
     ]
