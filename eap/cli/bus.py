@@ -12,9 +12,9 @@ import click
 from eap.cli.group import CommandGroup, LazyGroup
 from eap.cli.output import Renderer, times
 from eap.cli.params import (
+    BusAddress,
     BusCommand,
     CommandT,
-    Place,
     StationBus,
     bus_options,
     examples,
@@ -66,7 +66,7 @@ def bus() -> None:
 @click.command(cls=BusCommand)
 @bus_options
 @json_option("Print one object.")
-def scan(bus: Place, output: Renderer) -> None:
+def scan(bus: BusAddress, output: Renderer) -> None:
     """Show all slaves with identity, state, alias and mailbox protocols."""
     from eap.cli.bus_view import scan_tables
     from eap.ops.bus_info import scan_slaves
@@ -80,7 +80,7 @@ def scan(bus: Place, output: Renderer) -> None:
 @bus_options
 @click.argument("words", nargs=-1, metavar="[SLAVE] [INIT|PREOP|SAFEOP|OP|BOOT]")
 @json_option("Print one object.")
-def state(words: tuple[str, ...], bus: Place, output: Renderer) -> None:
+def state(words: tuple[str, ...], bus: BusAddress, output: Renderer) -> None:
     """Show or request the state of one slave, or of all slaves.
 
     The master of a running station keeps slaves in the requested state.  With --interface no master
@@ -107,7 +107,7 @@ def state(words: tuple[str, ...], bus: Place, output: Renderer) -> None:
 @click.option("--full", is_flag=True, help="Show slaves without errors too.")
 @click.option("--reset", is_flag=True, help="Clear the error counters and past faults.")
 @json_option("Print one object.")
-def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Renderer) -> None:
+def diag(slave: str | None, bus: BusAddress, full: bool, reset: bool, output: Renderer) -> None:
     """Show present and past faults of a bus.
 
     Prints a table of the states and the error counters of ports, and below it one line for each
@@ -139,7 +139,7 @@ def sii() -> None:
 @slave_argument
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @json_option("Print one object, with all bytes in hexadecimal digits.")
-def sii_dump(slave: str, file: Path | None, bus: Place, output: Renderer) -> None:
+def sii_dump(slave: str, file: Path | None, bus: BusAddress, output: Renderer) -> None:
     """Read the EEPROM and print it, or store it in FILE."""
     from eap.cli.bus_view import eeprom_lines
     from eap.ops.bus_info import read_eeprom
@@ -158,7 +158,7 @@ def sii_dump(slave: str, file: Path | None, bus: Place, output: Renderer) -> Non
 @slave_argument
 @click.argument("file", type=click.Path(exists=True, path_type=Path, dir_okay=False))
 @json_option("Print one object.")
-def sii_write(slave: str, file: Path, bus: Place, output: Renderer) -> None:
+def sii_write(slave: str, file: Path, bus: BusAddress, output: Renderer) -> None:
     """Write FILE to the EEPROM, read it back and compare.
 
     The master of a running station reads it at the next start of its plant.
@@ -189,7 +189,7 @@ def sii_write(slave: str, file: Path, bus: Place, output: Renderer) -> None:
 )
 @json_option("Print one object.")
 def voe(
-    slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, output: Renderer
+    slave: str, data: bytes, vendor: int, vendor_type: int, bus: BusAddress, output: Renderer
 ) -> None:
     """Send a vendor-specific message (VoE) and print the reply."""
     from eap.ops.bus_foe import exchange
@@ -231,7 +231,7 @@ def sdo_read(
     entry: ObjectId,
     kind: DataType | None,
     complete: bool,
-    bus: Place,
+    bus: BusAddress,
     output: Renderer,
 ) -> None:
     """Read an entry.
@@ -259,7 +259,7 @@ def sdo_write(
     value: str,
     kind: DataType | None,
     complete: bool,
-    bus: Place,
+    bus: BusAddress,
     output: Renderer,
 ) -> None:
     """Write an entry.
@@ -279,7 +279,7 @@ def sdo_write(
 @bus_options
 @slave_argument
 @json_option("Print one object a line.")
-def sdo_list(slave: str, bus: Place, output: Renderer) -> None:
+def sdo_list(slave: str, bus: BusAddress, output: Renderer) -> None:
     """List the objects that the slave describes."""
     from eap.cli.bus_view import object_table
     from eap.ops import bus_objects
@@ -292,7 +292,7 @@ def sdo_list(slave: str, bus: Place, output: Renderer) -> None:
 @bus_options
 @slave_argument
 @json_option("Print one object a line.")
-def sdo_dump(slave: str, bus: Place, output: Renderer) -> None:
+def sdo_dump(slave: str, bus: BusAddress, output: Renderer) -> None:
     """Read every entry of every object that the slave describes."""
     from eap.cli.bus_view import dump_table
     from eap.ops.bus_objects import dump_entries
@@ -335,7 +335,7 @@ def idn() -> None:
 @click.argument("number", type=parse_idn, metavar="IDN")
 @_drive_option
 @json_option("Print one object.")
-def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Renderer) -> None:
+def idn_read(slave: str, number: Idn, drive: int, bus: BusAddress, output: Renderer) -> None:
     """Read all elements of an IDN."""
     from eap.cli.bus_view import idn_lines
     from eap.ops.bus_objects import read_idn
@@ -353,7 +353,7 @@ def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Renderer) 
 @_drive_option
 @json_option("Print one object: what was written.")
 def idn_write(
-    slave: str, number: Idn, value: str, drive: int, bus: Place, output: Renderer
+    slave: str, number: Idn, value: str, drive: int, bus: BusAddress, output: Renderer
 ) -> None:
     """Write the value of an IDN.
 
@@ -371,7 +371,7 @@ def idn_write(
 @slave_argument
 @_drive_option
 @json_option("Print one object a line.")
-def idn_list(slave: str, drive: int, bus: Place, output: Renderer) -> None:
+def idn_list(slave: str, drive: int, bus: BusAddress, output: Renderer) -> None:
     """List all IDNs of a drive."""
     from eap.cli.bus_view import idn_table
     from eap.ops import bus_objects
@@ -407,7 +407,7 @@ def foe_get(
     name: str,
     file: Path | None,
     password: int,
-    bus: Place,
+    bus: BusAddress,
     output: Renderer,
 ) -> None:
     """Read the file NAME of a slave into FILE.
@@ -442,7 +442,7 @@ def foe_put(
     file: Path,
     name: str | None,
     password: int,
-    bus: Place,
+    bus: BusAddress,
     output: Renderer,
 ) -> None:
     """Write FILE to a slave as NAME; NAME defaults to the file's name.

@@ -88,7 +88,7 @@ def diagnosis_view(
     Args:
         found: The diagnosis.
         now_s: Unix time.
-        is_full: Slaves without errors are shown where there are many.
+        is_full: Show slaves without errors on long buses too.
     """
     shown = found.slaves
     if len(shown) > _MANY_SLAVES and not is_full:
@@ -160,7 +160,7 @@ def _port_table(slaves: Iterable[DiagnosedSlave]) -> TextTable:
 
 
 def eeprom_lines(content: EepromContent, *, has_octets: bool) -> Iterator[str]:
-    """Yield the identity in an EEPROM and its categories, then its octets if wanted."""
+    """Yield the identity in an EEPROM and its categories, then its bytes if *has_octets*."""
     yield f"slave {content.address}: {content.name or 'no name'}"
     identity = {
         "vendor": content.vendor,

@@ -15,14 +15,14 @@ import click
 from eap.cli.group import CommandGroup, LazyGroup
 from eap.cli.output import Column, Renderer, TextTable, count
 from eap.cli.params import (
+    BusAddress,
     BusCommand,
-    GatewayPlace,
-    Place,
+    GatewayTarget,
     bus_options,
+    bus_parameters,
     examples,
     json_option,
     open_session,
-    place_parameters,
     plant_option,
 )
 
@@ -64,12 +64,12 @@ def start(target: str, plant: str | None, output: Renderer) -> None:
     output.show_rows(_call("start", target, plant), _state_lines)
 
 
-@gateway.command(short_help="Stop a gateway; the bus goes on.")
+@gateway.command(short_help="Stop a gateway; the bus keeps running.")
 @_TARGET
 @plant_option
 @_JSON
 def stop(target: str, plant: str | None, output: Renderer) -> None:
-    """Stop a gateway until it is started again; the bus goes on."""
+    """Stop a gateway until it is started again; the bus keeps running."""
     output.show_rows(_call("stop", target, plant), _state_lines)
 
 
@@ -223,21 +223,21 @@ _FIRST_OF_COMMAND = 2
 """Words until the options of a command may come: HOST and its name."""
 
 
-def _parse_place(ctx: click.Context, param: click.Parameter, text: str) -> GatewayPlace:
+def _parse_address(ctx: click.Context, param: click.Parameter, text: str) -> GatewayTarget:
     del ctx, param
     host, colon, digits = text.partition(":")
     if not colon:
-        return GatewayPlace(host, _PORT)
+        return GatewayTarget(host, _PORT)
     if not host or not digits.isdecimal() or not 0 < int(digits) <= 0xFFFF:
         raise click.BadParameter(f"{text!r} is not HOST[:PORT], such as 10.0.0.5 or plc:34981")
-    return GatewayPlace(host, int(digits))
+    return GatewayTarget(host, int(digits))
 
 
 class GatewayGroup(LazyGroup):
-    """Commands of ``eapctl bus``, whose bus is the gateway."""
+    """Commands of ``eapctl bus`` through a mailbox gateway."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Take own options wherever they stand: behind HOST they would be taken for commands."""
+        """Parse the group's own options anywhere: after HOST click would parse them as commands."""
         rest = iter(args)
         first: list[str] = []
         others: list[str] = []
@@ -253,7 +253,7 @@ class GatewayGroup(LazyGroup):
         return super().parse_args(ctx, [*first, *others, *rest])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import one subcommand, and give it the gateway in the place of a bus."""
+        """Import one subcommand, and pass it the gateway as its bus."""
         command = super().get_command(ctx, cmd_name)
         return None if command is None else _behind_gateway(command)
 
@@ -262,7 +262,7 @@ def _behind_gateway(command: click.Command) -> click.Command:
     if isinstance(command, click.Group):
         found = {name: _behind_gateway(each) for name, each in command.commands.items()}
         return CommandGroup(command.name, found, help=command.help, epilog=None)
-    left_out = place_parameters()
+    left_out = bus_parameters()
     params = [each for each in command.params if each.name not in left_out]
     if len(params) == len(command.params):
         return command
@@ -278,7 +278,7 @@ def _behind_gateway(command: click.Command) -> click.Command:
 
 def _invoke(command: click.Command, **values: Any) -> Any:
     context = click.get_current_context()
-    place = context.find_object(GatewayPlace)
+    place = context.find_object(GatewayTarget)
     return context.invoke(command.callback, bus=place, **values) if command.callback else None
 
 
@@ -307,9 +307,9 @@ def _invoke(command: click.Command, **values: Any) -> Any:
     help="Mailbox size of the slave where the master does not describe it (virtual addresses);"
     " files need it. Anywhere on the command line.",
 )
-@click.argument("place", metavar="HOST[:PORT]", callback=_parse_place)
+@click.argument("place", metavar="HOST[:PORT]", callback=_parse_address)
 @click.pass_context
-def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) -> None:
+def gw(ctx: click.Context, place: GatewayTarget, tcp: bool, mailbox: int | None) -> None:
     """Access a master and its slaves through a mailbox gateway of any vendor (ETG.8200).
 
     SLAVE is a station address (1001 is the first slave) or the slave's name as the master knows it;
@@ -322,7 +322,7 @@ def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) 
 @bus_options
 @click.argument("slave", default="0", metavar="[SLAVE]")
 @json_option("Print one object per line.")
-def od(slave: str, bus: Place, output: Renderer) -> None:
+def od(slave: str, bus: BusAddress, output: Renderer) -> None:
     """Show every object with its entries and values; SLAVE defaults to the master."""
     from eap.ops.bus_objects import dump_entries
 

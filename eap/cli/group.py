@@ -54,7 +54,7 @@ class LazyGroup(CommandGroup):
         commands_at: ``module:attribute`` of each subcommand.
         summaries: Lines of the group's help page, so that it imports no subcommand.
         former_names: Hidden former names of subcommands, with the present ones.
-        **settings: As ``click.Group`` takes them.
+        **settings: Arguments of ``click.Group``.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class LazyGroup(CommandGroup):
             formatter.write_dl([(name, self._summaries[name]) for name in sorted(self._summaries)])
 
     def main(self, *args: Any, **extra: Any) -> NoReturn:
-        """Run one command line and end the process; takes what ``click.Command.main`` takes."""
+        """Run one command line and end the process; arguments as for ``click.Command.main``."""
         extra["standalone_mode"] = False
         try:
             code = super().main(*args, **extra)
@@ -107,7 +107,7 @@ class LazyGroup(CommandGroup):
 
 
 def exit_code_of(error: Exception) -> int:
-    """Return the exit code that an error stands for."""
+    """Return the exit code of an error."""
     if isinstance(error, click.ClickException):
         return error.exit_code
     if isinstance(error, (ConfigError, EnvironmentalError)):
@@ -135,7 +135,7 @@ def describe(error: Exception) -> str:
 
 
 def _has_reader_left() -> bool:
-    """Say whether it is stdout that broke, as of ``--help | head``, and no socket."""
+    """Return whether stdout broke, as in ``--help | head``, and not a socket."""
     import select
 
     poll = select.poll()
@@ -144,7 +144,7 @@ def _has_reader_left() -> bool:
 
 
 def _notes_of(error: BaseException) -> Sequence[str]:
-    """Return what was noted on an error; click hides a KeyboardInterrupt behind its own."""
+    """Return the notes of an error; click hides a KeyboardInterrupt behind its own exception."""
     cause = error.__cause__ if isinstance(error, click.Abort) else None
     notes: Sequence[str] = getattr(cause or error, "__notes__", ())
     return notes
@@ -181,7 +181,7 @@ _COMMANDS = {
     "status": ("status:status", "Show errors, stations, ports, process data and processes."),
     "trace": ("network:trace", "Show the path to a device, and the hop that failed."),
 }
-"""Place of each command below ``eap.cli``, and its line in the help."""
+"""BusAddress of each command below ``eap.cli``, and its line in the help."""
 
 
 @click.group(

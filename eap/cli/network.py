@@ -1,4 +1,4 @@
-"""``eapctl scan`` and ``trace``: stations of the plant, and the hops on the way to a device."""
+"""``eapctl scan`` and ``trace``: stations of the plant, and the hops on the path to a device."""
 
 from __future__ import annotations
 
@@ -94,10 +94,9 @@ class _Line(NamedTuple):
 
 
 def scan_table(answer: PlantScan) -> TextTable:
-    """Return the table of one plant: names as commands take them, AMS addresses, lines of pyads.
+    """Return the table of one plant: names for other commands, AMS addresses, lines of pyads.
 
-    On a terminal without room for the lines of pyads these are left out: a line that wraps could
-    not be pasted.
+    A narrow terminal omits the lines of pyads: a wrapped line could not be pasted.
     """
     table = TextTable(
         "Name", Column("Kind", rank=1), "State", "AMS address", Column("pyads", rank=2)
@@ -149,7 +148,7 @@ def _lines(station: StationEntry, via: ScanVia) -> Iterator[_Line]:
 
 
 def trace_view(found: TracedPath) -> Iterator[TextTable | Styled | str]:
-    """Yield the path, the answer of the target, and faults on the way."""
+    """Yield the path, the answer of the target, and faults on the path."""
     name = f" ({found.name})" if found.name not in {"", found.target} else ""
     yield f"{found.target}{name} is {found.address}"
     table = TextTable(

@@ -49,12 +49,12 @@ def value_line(entry: Entry) -> str:
 
 
 def octets_line(written: OdOctets) -> str:
-    """Return octets that were written as they are."""
+    """Return raw bytes that were written."""
     return f"{ObjectId(written.index, written.subindex)} = {RAW} {written.data}"
 
 
 def object_lines(found: OdWholeObject) -> Iterator[str]:
-    """Yield a whole object: its entries, or its octets if their types are not known."""
+    """Yield a whole object: its entries, or its raw bytes if their types are unknown."""
     yield _object_line(found.index, found.name, found.label)
     if not found.entries:
         octets = bytes.fromhex(found.data)
@@ -99,7 +99,7 @@ def read_file(path: Path) -> list[Download]:
     """Return the entries of a file, ``-`` for stdin.
 
     Raises:
-        ConfigError: a line cannot be read; the message says which one, and why.
+        ConfigError: a line cannot be read; the message names the line and the cause.
         OSError: the file cannot be read.
     """
     text = sys.stdin.read() if str(path) == "-" else path.read_text(encoding="utf-8")
@@ -147,7 +147,7 @@ def _quoted(text: str) -> str:
 
 
 def _literal(entry: Entry, data: str) -> str:
-    """Return type and value, in a form that reads as the very octets."""
+    """Return type and value, in a form that reads back as the same bytes."""
     octets = bytes.fromhex(data)
     kind = datatypes.parse(entry.type) if entry.type else None
     text = notation.show(kind, entry.name, octets) if kind else None

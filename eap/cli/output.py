@@ -6,7 +6,7 @@ reader of stdout may stop early (``| head``): that ends the command quietly and 
 
 A table leaves out columns before it breaks a word.  Each column has a rank.  Where the table is
 wider than the screen, the columns of the highest rank go first, and a line below the table names
-them.  Columns that wrap give way only at spaces.  Piped output has no width, so that nothing is
+them.  Columns that wrap break only at spaces.  Piped output has no width, so that nothing is
 left out there.
 
 Rich is imported when something is rendered: a command with ``--json`` never waits for it.
@@ -110,7 +110,7 @@ def write_view(view: View) -> None:
 
 
 def repaint(parts: Iterable[RenderableType]) -> None:
-    """Print rich renderables in place of what the screen shows; piped, as a block of lines.
+    """Print rich renderables over the content of the screen; piped, as a block of lines.
 
     Each line overwrites that of the time before, so that nothing flickers; what exceeds the screen
     is cut off, and a line says so.
@@ -121,9 +121,9 @@ def repaint(parts: Iterable[RenderableType]) -> None:
         write_text(text)
         return
     lines = text.rstrip("\n").split("\n")
-    room = console.height - 1  # the cursor rests below, where the shell will go on
-    if (hidden := len(lines) - room) > 0:
-        lines[room - 1 :] = [f"… {hidden + 1} more lines"]
+    max_lines = console.height - 1  # one line stays free for the prompt of the shell
+    if (hidden := len(lines) - max_lines) > 0:
+        lines[max_lines - 1 :] = [f"… {hidden + 1} more lines"]
     write_text(_HOME + "".join(f"{line}{_CLEAR_LINE}\n" for line in lines) + _CLEAR_BELOW, end="")
 
 
@@ -161,9 +161,9 @@ class Column:
 
     Attributes:
         heading: Its words above the rows.
-        rank: 0 is always shown; where there is no room, the highest rank is left out first.
-        is_number: Whether its cells are aligned to the right.
-        wraps: Whether its cells may take several lines, broken at spaces.
+        rank: 0 is always shown; a narrow screen omits the highest rank first.
+        is_number: Its cells are aligned to the right.
+        wraps: Its cells may take several lines, broken at spaces.
     """
 
     heading: str
@@ -239,21 +239,21 @@ class TextTable:
             names = ", ".join(" ".join(heading.split()) for heading in left_out)
             yield Styled(f"not shown for lack of width: {names}", style="dim")
 
-    def _fitting(self, room: int) -> list[int]:
-        """Return the numbers of the columns for which there is *room* without breaking words."""
+    def _fitting(self, max_width: int) -> list[int]:
+        """Return the numbers of the columns that fit in *max_width* without breaking words."""
         shown = list(range(len(self._columns)))
-        while _total(self._needs(at, "narrow") for at in shown) > room:
+        while _total(self._needs(at, "narrow") for at in shown) > max_width:
             worst = max(shown, key=lambda at: self._columns[at].rank)
             if not self._columns[worst].rank:
                 break
             shown.remove(worst)
         return shown
 
-    def _widths(self, shown: Sequence[int], room: int) -> list[int]:
-        """Return the width of each column; those that wrap share what the others leave."""
+    def _widths(self, shown: Sequence[int], max_width: int) -> list[int]:
+        """Return the width of each column; those that wrap share the rest."""
         least = [self._needs(at, "narrow") for at in shown]
         widths = [self._needs(at, "wide") for at in shown]
-        excess = _total(widths) - room
+        excess = _total(widths) - max_width
         while excess > 0:
             slack = [wide - narrow for wide, narrow in zip(widths, least, strict=True)]
             widest = max(range(len(shown)), key=lambda at: (slack[at] > 0, widths[at]))
@@ -324,7 +324,7 @@ def quality(units: int | None) -> str:
 
 
 def times(count: int) -> str:
-    """Return a number of times in words."""
+    """Return a number of times as text."""
     return "once" if count == 1 else f"{count} times"
 
 

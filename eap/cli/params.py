@@ -26,7 +26,7 @@ ANSWER_MARGIN_S = 5.0
 """Time that a command waits for its appliance beyond the time that the appliance itself waits."""
 
 PLANT_FILE = click.Path(path_type=Path)
-"""Path of a plant file; the loader says why it cannot be read."""
+"""Path of a plant file; the loader reports why it cannot be read."""
 
 
 class VariableName(NamedTuple):
@@ -71,7 +71,7 @@ def parse_names(words: tuple[str, ...]) -> dict[str, list[str]]:
     No variables means all of the station's.
 
     Raises:
-        click.UsageError: a name without a station stands before any station.
+        click.UsageError: a name has no station.
     """
     names: dict[str, list[str]] = {}
     current = ""
@@ -190,7 +190,7 @@ class StationBus(NamedTuple):
         return f"{self.station}/{self.port}"
 
 
-class GatewayPlace(NamedTuple):
+class GatewayTarget(NamedTuple):
     """A mailbox gateway (``eapctl gw``)."""
 
     host: str
@@ -200,13 +200,13 @@ class GatewayPlace(NamedTuple):
     """Octets of the slave's mailboxes, in place of the master's description."""
 
 
-Place: TypeAlias = StationBus | InterfaceUri | GatewayPlace
+BusAddress: TypeAlias = StationBus | InterfaceUri | GatewayTarget
 
 
 class BusCommand(click.Command):
-    """A command whose first argument is STATION/PORT, unless ``--interface`` says where the bus is.
+    """A command whose first argument is STATION/PORT, unless ``--interface`` gives the bus.
 
-    Its function gets the parameter *bus*, a Place.
+    Its function gets the parameter *bus*, a BusAddress.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -228,7 +228,7 @@ class BusCommand(click.Command):
         return rest
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """Return what is on the command line: no STATION/PORT behind ``--interface``."""
+        """Return the parameters: without STATION/PORT if ``--interface`` is given."""
         params = super().get_params(ctx)
         if ctx.meta.get(_INTERFACE):
             return [param for param in params if param.name != _PLACE]
@@ -278,8 +278,8 @@ def bus_options(command: CommandT) -> CommandT:
     return place(interface(plant(command)))
 
 
-def place_parameters() -> frozenset[str]:
-    """Return the names of the parameters that say which bus."""
+def bus_parameters() -> frozenset[str]:
+    """Return the names of the parameters that choose the bus."""
     return frozenset((_PLACE, _INTERFACE, _PLANT))
 
 
@@ -302,13 +302,13 @@ def parse_uri(text: str) -> InterfaceUri:
     return uri
 
 
-def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
+def open_session(bus: BusAddress) -> AbstractContextManager[SlaveBus]:
     """Open the bus; imported here, so that ``--help`` need not wait for a master."""
     if isinstance(bus, StationBus):
         from eap.ops.bus_running import open_running
 
         return open_running(*bus)
-    if isinstance(bus, GatewayPlace):
+    if isinstance(bus, GatewayTarget):
         from eap.ops.bus_gateway import open_gateway
 
         return open_gateway(bus.host, bus.port, tcp=bus.tcp, mailbox=bus.mailbox)

@@ -85,7 +85,7 @@ def watch(
             if output.is_json:
                 skipped = SkippedCycles(period_ms, partial(click.echo, err=True))
                 stack.callback(skipped.close)
-                stream = map(skipped.take_out, stream)
+                stream = map(skipped.count, stream)
             output.show_rows(stream, change_lines)
     except KeyboardInterrupt:
         return

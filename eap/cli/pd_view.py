@@ -157,7 +157,7 @@ class SkippedCycles:
     """Count of the cycles that were skipped, for stderr beside JSON lines.
 
     Args:
-        period_ms: Period of the looks at the values.
+        period_ms: Polling period of the values.
         write: Prints a line.
     """
 
@@ -167,7 +167,7 @@ class SkippedCycles:
         self._last: dict[str, int] = {}
         self._totals: dict[str, int] = {}
 
-    def take_out(self, change: ValueChange) -> ValueChange:
+    def count(self, change: ValueChange) -> ValueChange:
         """Return *change* without ``skipped``; write the first one of each station."""
         skipped, station, cycle = change.skipped or 0, change.station, change.cycle
         if skipped and self._last.get(station) != cycle:  # else another variable of that event

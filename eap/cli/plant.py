@@ -269,7 +269,7 @@ def _run_steps(
     refusing: Mapping[str, list[str]],
     output: Renderer,
 ) -> None:
-    """Take all steps, print the text of each when it is done, and then the whole result."""
+    """Run all steps, print each when it is done, and then the whole result."""
     from eap.ops.plant import ChangeReport
 
     taken: list[StepOutcome] = []

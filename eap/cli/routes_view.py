@@ -169,7 +169,7 @@ def short(number: int) -> str:
 
 
 def octets_of(row: EndpointRow) -> str:
-    """Return all octets, both ways."""
+    """Return all bytes, in both directions."""
     return short(row.octets_in + row.octets_out)
 
 
@@ -208,7 +208,7 @@ def route_kind(row: RouteRow) -> str:
 
 
 def route_state(row: RouteRow) -> str:
-    """Return the state of a route, and why, or how long its next hop takes."""
+    """Return the state of a route with its cause or the round-trip time of its next hop."""
     rest = row.why or (f"round trip {round_trip(row.rtt_us)}" if row.rtt_us is not None else "")
     if row.why and row.next_name not in {"", row.name}:
         rest = f"{row.next_name}: {row.why}"
@@ -240,7 +240,7 @@ def request_line(row: RequestRow) -> str:
 
 
 def belongs(request: RequestRow, row: RouteRow | ConnectionRow) -> bool:
-    """Return whether a request went by a route, or came by a connection."""
+    """Return whether a request used a route or a connection."""
     if isinstance(row, ConnectionRow):
         return request.came_by == path_of(row)
     prefix = row.pattern.partition("*")[0]

@@ -96,7 +96,7 @@ def parse_fault(words: tuple[str, ...]) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> bool | int | float | str:
-    """Read a truth value or a number, in hexadecimal too; what is neither stays text."""
+    """Read true, false or a number, decimal or hexadecimal; any other word stays text."""
     if text in {"true", "false"}:
         return text == "true"
     try:

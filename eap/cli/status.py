@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 _LEAST_INTERVAL_S = 0.1
 
 
-class Sample(NamedTuple):
+class StatusSample(NamedTuple):
     """Status of the appliances at one time.
 
     Attributes:
@@ -109,9 +109,11 @@ def status(
         return
 
 
-def _samples(plant: str | None, station: str | None, interval_s: float) -> Iterator[Sample | str]:
+def _samples(
+    plant: str | None, station: str | None, interval_s: float
+) -> Iterator[StatusSample | str]:
     """Yield a sample every *interval_s*, or the error of the request; never end."""
-    before: tuple[float, Sample] | None = None
+    before: tuple[float, StatusSample] | None = None
     while True:
         start = time.monotonic()
         try:
@@ -132,7 +134,7 @@ def _pause(seconds: float) -> None:
     Event().wait(seconds)
 
 
-def _take_sample(plant: str | None, station: str | None) -> Sample:
+def _take_sample(plant: str | None, station: str | None) -> StatusSample:
     """Return the merged answer of the chosen appliances, cut down to *station* if it is given."""
     from msgspec.structs import asdict, replace
 
@@ -147,32 +149,34 @@ def _take_sample(plant: str | None, station: str | None) -> Sample:
         )
     now_s = time.time()
     document = StatusReport(**asdict(status), findings=findings(status, now_s))
-    return Sample(now_s, document)
+    return StatusSample(now_s, document)
 
 
-def _write_object(found: Sample | str) -> None:
-    if isinstance(found, Sample):
+def _write_object(found: StatusSample | str) -> None:
+    if isinstance(found, StatusSample):
         write_json(found.document)
     else:
         click.echo(found, err=True)
 
 
 def _page(
-    found: Sample | str, view: Callable[[Sample], Iterable[RenderableType]], interval_s: float
+    found: StatusSample | str,
+    view: Callable[[StatusSample], Iterable[RenderableType]],
+    interval_s: float,
 ) -> Iterator[RenderableType]:
 
     yield Styled(f"{time.strftime('%H:%M:%S')}, every {interval_s:g} s", style="dim")
-    if isinstance(found, Sample):
+    if isinstance(found, StatusSample):
         yield from view(found)
     else:
         yield Styled(f"{found}; waiting for an appliance", style="bold red")
 
 
-def _screen(sample: Sample) -> Iterator[RenderableType]:
+def _screen(sample: StatusSample) -> Iterator[RenderableType]:
     yield StatusScreen(sample.document, sample.now_s, sample.earlier, sample.seconds)
 
 
-def _full(sample: Sample) -> Iterator[RenderableType]:
+def _full(sample: StatusSample) -> Iterator[RenderableType]:
     return full_view(sample.document, sample.now_s)
 
 
@@ -212,7 +216,7 @@ class StatusScreen:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         def excess(findings: int, stations: int) -> int:
-            """Return the number of lines for which the screen has no room."""
+            """Return the number of lines that exceed the screen."""
             lines = console.render_lines(self._layout(findings, stations), options, pad=False)
             return len(lines) + _SPARE_LINES - console.height
 

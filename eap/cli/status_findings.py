@@ -1,4 +1,4 @@
-"""Findings of a status document: each fault with its place, its beginning, and a remedy.
+"""Findings of a status document: each fault with its location, its begin, and a remedy.
 
 Pure: the document of ``eapctl status --json`` and the time in, a list of findings out, errors
 first.
@@ -6,8 +6,8 @@ A finding comes from a generator of this module, which reads it from the counter
 from the list ``findings`` that the services of an appliance report by themselves.  A new kind of
 finding is one more ``yield``.
 
-Counters that only say what happened since the start are of severity INFO: they are no fault of this
-moment, and the one-screen view leaves them out.
+Counters of past events are of severity INFO: they are no present fault, and the one-screen view
+omits them.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _OTHER_VERSION, _OTHER_LENGTH = 1, 2
 
 
 class Severity(StrEnum):
-    """How much a finding matters."""
+    """Severity of a finding."""
 
     ERROR = "error"  # a function fails now
     WARNING = "warning"  # it works, but not as configured
@@ -74,10 +74,10 @@ class StatusFinding:
     """One fault or remark.
 
     Attributes:
-        severity: How much it matters.
+        severity: Its severity.
         where: Name of the appliance's process, station, port, slave or PD.
-        what: The fault, in words.
-        advice: What to do about it; empty if there is nothing to do.
+        what: The fault.
+        advice: The remedy, or empty.
         since: Unix time at which it began, if that is known.
         plant: Plant of the appliance.
     """
@@ -135,7 +135,7 @@ def _stations_of(status: MergedStatus, appliance: ApplianceStatus) -> list[Row]:
 
 
 def is_special(frame: Row) -> bool:
-    """Tell whether a frame has more to show than its PDs: a monitored subscriber, or a NetID."""
+    """Return whether a frame has a monitored subscriber or a NetID as its destination."""
     return bool(frame["monitor_interval_ms"]) or frame["destination"].count(".") == _NET_ID_DOTS
 
 
@@ -375,7 +375,7 @@ def _counts(counts: Row) -> str:
 
 
 def _moment(at_s: float, now_s: float) -> str:
-    """Return a time of day, with the date if it is another day, and how long ago that is."""
+    """Return a time of day and its age, with the date if it is another day."""
     at, now = (datetime.fromtimestamp(each).astimezone() for each in (at_s, now_s))
     form = "%H:%M:%S" if at.date() == now.date() else "%Y-%m-%d %H:%M:%S"
     return f"{at.strftime(form)} ({duration(max(0, round((now_s - at_s) * 1e6)))})"

@@ -68,7 +68,7 @@ def get_file(
     """
     progress = Progress()
     start = time.monotonic()
-    with _writing(target) as file, _telling_how_far(progress, "read"):
+    with _writing(target) as file, _noting_progress(progress, "read"):
         digest = hashlib.sha256()
 
         def sink(data: bytes) -> None:
@@ -124,7 +124,7 @@ def put_file(
             return foe_client.write(name, take, sizes, password=password, progress=progress)
 
         transfer = _FileCopy(bus, slave, begin, f"FoE write of {name!r}", progress)
-        with _telling_how_far(progress, "written"):
+        with _noting_progress(progress, "written"):
             restarts = transfer.run(rewind if is_regular else None, report)
     report(progress.done, progress.done, restarts.count)
     seconds = time.monotonic() - start
@@ -132,7 +132,7 @@ def put_file(
 
 
 class _FileCopy:
-    """A file on its way to a slave or from it."""
+    """Transfer of one file to or from a slave."""
 
     def __init__(
         self, bus: SlaveBus, slave: str, begin: Begin[int], name: str, progress: Progress
@@ -197,7 +197,7 @@ def _note_restarts(exc: BusError, restarts: Restarts) -> None:
 
 @contextmanager
 def _writing(target: Path | None) -> Iterator[BinaryIO]:
-    """Open what is to be written; a regular file is replaced when the block is through."""
+    """Open the target; a regular file is replaced when the block ends."""
     if target is None:
         try:
             yield sys.stdout.buffer
@@ -224,8 +224,8 @@ def _reading(source: Path | None) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def _telling_how_far(progress: Progress, done: str) -> Iterator[None]:
-    """Note on whatever ends a transfer early how far it came."""
+def _noting_progress(progress: Progress, done: str) -> Iterator[None]:
+    """Add the progress to the exception that ends a transfer early."""
     try:
         yield
     except (EapError, KeyboardInterrupt) as exc:

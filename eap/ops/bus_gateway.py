@@ -2,7 +2,7 @@
 
 A gateway passes mailbox messages, and no registers.  Slaves are known by the master's dictionary.
 Not every gateway has one (KickCAT's is silent at address 0), so that it is read only for names, for
-the sizes of mailboxes that files need, and for hints about what was refused.
+the sizes of mailboxes that files need, and for hints about refused requests.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class GatewayBus:
 
     Args:
         client: Of the gateway.
-        mailbox: Octets of the slave's mailboxes, in place of what the master tells.
+        mailbox: Size of the slave's mailboxes, in place of the master's description.
     """
 
     def __init__(self, client: GatewayClient, mailbox: int | None = None) -> None:
@@ -51,7 +51,7 @@ class GatewayBus:
         """Slaves that have answered; a refusal needs no hint then."""
 
     def scan(self) -> Sequence[Slave]:
-        """Return the slaves that the master tells of.
+        """Return the slaves that the master describes.
 
         Raises:
             BusError: it does not answer, or has no dictionary.
@@ -67,8 +67,8 @@ class GatewayBus:
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name, the master for 0.
 
-        The master is asked for names only: addresses are for the gateway to know, which may have
-        virtual ones and no dictionary.
+        Only a name needs the master: the gateway decides about addresses, and may have virtual
+        ones and no dictionary.
         """
         if name in {"0", "master"}:
             return _slave(_unknown(MASTER_ADDRESS, "master"))
@@ -80,10 +80,10 @@ class GatewayBus:
         return _slave(_unknown(number, name))
 
     def require_mailbox(self, slave: Slave) -> None:
-        """Learn how long the mailbox of *slave* is.
+        """Read the mailbox size of *slave*.
 
         Raises:
-            BusError: the master does not tell.
+            BusError: the master does not describe it.
         """
         if slave.station == MASTER_ADDRESS or self._mailbox is not None:
             return
@@ -93,7 +93,7 @@ class GatewayBus:
                 self.scan()
         except BusError as exc:
             reason += f" ({exc.__cause__})"
-        if self._told_of(slave) is None:
+        if self._description_of(slave) is None:
             raise BusError(
                 f"slave {slave.name}: {reason}, and packets of another size would cut a file"
                 " off; use --mailbox BYTES"
@@ -124,7 +124,7 @@ class GatewayBus:
         return result
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
-        """Refuse: states are asked for by the master's dictionary, 0xAnnn:02."""
+        """Raise BusError: a gateway has no state requests."""
         del slaves
         _refuse(f"state {target.name}")
 
@@ -134,11 +134,11 @@ class GatewayBus:
         _refuse(name)
 
     def known(self) -> Sequence[Slave]:
-        """Return the slaves that the gateway tells of."""
+        """Return the slaves that the gateway describes."""
         return self.scan()
 
     def history(self) -> None:
-        """Return nothing: a gateway tells no times."""
+        """Return None: a gateway reports no times."""
         return
 
     def forget(self) -> None:
@@ -153,7 +153,7 @@ class GatewayBus:
             return MailboxSizes(_MASTER_SIZE, _MASTER_SIZE)
         if self._mailbox is not None:
             return self._mailbox
-        told = self._told_of(slave)
+        told = self._description_of(slave)
         if told is None:
             return MailboxSizes()
         if not told.to_slave:
@@ -161,22 +161,22 @@ class GatewayBus:
         return MailboxSizes(told.to_slave, told.to_master)
 
     def _can_learn_size(self, slave: Slave) -> bool:
-        """Ask the master how long the mailbox of *slave* is, if that was only assumed."""
+        """Read the mailbox size of *slave* from the master if it was only assumed."""
         if self._mailbox is not None or self._slaves is not None:
             return False
         with suppress(BusError), self._client.waiting_once(_HINT_S):
             self.scan()
-        return self._told_of(slave) is not None
+        return self._description_of(slave) is not None
 
     def _hint(self, slave: Slave) -> str:
-        """Return what the master knows that explains why a slave's mailbox is not reached."""
+        """Return the master's reason why a slave's mailbox is unreachable."""
         self._reached.add(slave.station)  # once is enough
         if self._slaves is None:
             with suppress(BusError), self._client.waiting_once(_HINT_S):
                 self.scan()
         if self._slaves is None:
             return ""
-        told = self._told_of(slave)
+        told = self._description_of(slave)
         if told is None:
             known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
             return f"unknown slave {slave.station}; slaves known to the master: {known or 'none'}"
@@ -184,8 +184,8 @@ class GatewayBus:
             return str(no_mailbox(_slave(told), state_name(_slave(told).status.state)))
         return ""
 
-    def _told_of(self, slave: Slave) -> MasterSlave | None:
-        """Return what the master tells of a slave, None if it has not told anything."""
+    def _description_of(self, slave: Slave) -> MasterSlave | None:
+        """Return the master's description of a slave, None without one."""
         station = slave.station & ~VIRTUAL_BIT
         return next((each for each in self._slaves or () if each.station == station), None)
 
@@ -236,7 +236,7 @@ def open_gateway(
     """Talk to a gateway for the length of a block; *mailbox* as GatewayBus has it.
 
     Raises:
-        EnvironmentalError: it has no address, or takes no connection.
+        EnvironmentalError: the host has no address, or accepts no connection.
     """
     with GatewayClient(host, port, tcp=tcp) as client:
         yield GatewayBus(client, mailbox)

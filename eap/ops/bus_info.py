@@ -72,7 +72,7 @@ class SlaveStates(msgspec.Struct, frozen=True):
 
 
 class ErrorOrigin(msgspec.Struct, frozen=True):
-    """Port at which errors start; None as neighbour stands for the master or nothing."""
+    """Port at which errors start; the neighbour is None for the master or an open port."""
 
     slave: int
     name: str
@@ -167,7 +167,7 @@ def slave_states(bus: SlaveBus, slave: str | None, target: str | None) -> SlaveS
 
 
 def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
-    """Return states and error counters of one slave or of all, and what is or was wrong.
+    """Return states, error counters, and present and past faults of one slave or of all.
 
     Args:
         bus: Reaches the slaves.
@@ -264,10 +264,10 @@ def read_eeprom(bus: SlaveBus, slave: str) -> EepromContent:
 
 
 def write_eeprom(bus: SlaveBus, slave: str, image: bytes) -> WrittenEeprom:
-    """Write a whole EEPROM, read it back, and let the slave load it.
+    """Write a whole EEPROM, read it back, and request the slave to load it.
 
     Raises:
-        SiiError: no slave would start with this image, or the EEPROM does not take it.
+        SiiError: no slave would start with this image, or the EEPROM rejects it.
     """
     if not sii.is_intact(image):
         raise SiiError("wrong checksum in the image: the slave would not load it")

@@ -44,7 +44,7 @@ _PLAIN_SIZES = (1, 2, 4, 8)
 
 
 class SdoValue(Struct, frozen=True, kw_only=True):
-    """``eapctl bus sdo read``: an entry or a whole object, octets in hexadecimal digits."""
+    """``eapctl bus sdo read``: an entry or a whole object, bytes in hexadecimal digits."""
 
     slave: int
     index: int
@@ -131,7 +131,7 @@ class NamedIdn(Struct, frozen=True):
 def read_entry(
     bus: SlaveBus, slave: str, index: int, subindex: int, *, kind: DataType | None, complete: bool
 ) -> SdoValue:
-    """Return an entry, or with *complete* the octets of an object.
+    """Return an entry, or with *complete* the bytes of an object.
 
     Raises:
         SdoAbortError: the slave refuses.
@@ -254,7 +254,7 @@ def _access(entry: EntryDescription) -> str:
 
 
 def _kind_of_entry(index: int, subindex: int) -> Conversation[DataType | None]:
-    """Ask the slave for an entry's type; None if it does not tell."""
+    """Read an entry's type from the slave; None without a description."""
     try:
         entry = yield from coe_client.entry_description(index, subindex)
     except (SdoAbortError, MailboxRefusedError, MailboxProtocolError):
@@ -278,7 +278,7 @@ def _numbers() -> dict[int, DataType]:
 
 
 def _value_of(kind: DataType | None, octets: bytes, *, complete: bool) -> Any:
-    """Return the value that *octets* stand for; None if that is not known."""
+    """Return the value of *octets*; None if the type is unknown."""
     if kind is None:
         is_number = not complete and len(octets) in _PLAIN_SIZES
         return int.from_bytes(octets, "little") if is_number else None

@@ -139,10 +139,10 @@ class RunningBus:
         return self._drive(slave, conversation, meanwhile)
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
-        """Bring slaves to a state, where the master keeps them then.
+        """Bring slaves to a state, which the master then keeps.
 
         Raises:
-            AlStatusError, StateTimeoutError: one refuses, or takes too long.
+            AlStatusError, StateTimeoutError: a slave refuses, or exceeds its time limit.
             BusError: several do.
         """
         everyone = {slave.station for slave in slaves} == set(self._reports)
@@ -150,7 +150,7 @@ class RunningBus:
             self._call(words.BUS_BRING, words.BRING_S, slave=station, state=target.name)
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
-        """Run a procedure to its end and return its result, or raise what went wrong."""
+        """Run a procedure to its end and return its result, or raise its error."""
         del name
         return drive(procedure, self._step)
 
@@ -225,7 +225,7 @@ def open_running(station: str, port: str, plant: str | None = None) -> Iterator[
 
 
 def _look(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:
-    """Read where slaves stand and what is wired to them; zeros for one that does not answer."""
+    """Read position and wiring of slaves; zeros for one that does not answer."""
     replies: list[DatagramReply] = []
     for start in range(0, len(stations), _PER_STEP):
         answers, _ = yield [

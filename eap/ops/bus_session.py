@@ -40,9 +40,9 @@ T = TypeVar("T")
 
 CYCLE_NS = 2_000_000
 SPIN_NS = 200_000
-"""How long the answer to a frame is looked for before sleeping."""
+"""Duration of the busy wait for the answer to a frame."""
 LOOK_NS = 100_000_000
-"""How often *meanwhile* is called while something runs."""
+"""Interval of calls of *meanwhile*."""
 
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 _WITH_MAILBOX = _WITH_PROCESS_DATA | {AlState.PREOP}
@@ -64,7 +64,7 @@ class BusSession:
         self._slaves: Sequence[Slave] = ()
 
     def scan(self) -> Sequence[Slave]:
-        """Find all slaves and give them their station addresses; raises as the scan does."""
+        """Find all slaves and assign their station addresses; raises as the scan does."""
         found = self.run(scan(), "scanning the bus")
         self._bus.slaves = {each.station: BusSlave(each, each.name) for each in found}
         for bus_slave in self._bus.slaves.values():
@@ -107,12 +107,12 @@ class BusSession:
         return self._finish(task, meanwhile)
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
-        """Bring slaves to a state together; cycles run until they are there.
+        """Bring slaves to a state together; cycles run until all have reached it.
 
         Process data of those that are to get some is laid out anew, so that they begin in PREOP.
 
         Raises:
-            AlStatusError, StateTimeoutError: one refuses, or takes too long.
+            AlStatusError, StateTimeoutError: a slave refuses, or exceeds its time limit.
             BusError: several do; the message has a line for each.
         """
         bus_slaves = [self._bus.slaves[slave.station] for slave in slaves]
@@ -132,7 +132,7 @@ class BusSession:
             self._bus.link.stop_cycles()
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
-        """Run a procedure to its end and return its result, or raise what went wrong."""
+        """Run a procedure to its end and return its result, or raise its error."""
         return self._finish(self._bus.runner.start(procedure, self._clock(), name))
 
     def frame_counts(self) -> FrameCounts:
@@ -180,7 +180,7 @@ class BusSession:
         return task.result()
 
     def _step(self) -> int:
-        """Send what is due, wait for what comes next, take it; return the time."""
+        """Send the due frames, wait for the next frame, process it; return the time."""
         bus, port = self._bus, self._port
         now_ns = self._clock()
         if bus.cycle is not None and now_ns >= self._cycle_ns:
@@ -206,7 +206,7 @@ class BusSession:
         return now_ns
 
     def _spin(self, now_ns: int) -> bytes | None:
-        """Return a frame if one comes soon: waking up would take longer than its whole way."""
+        """Return a frame if one arrives soon: waking up takes longer than its round trip."""
         end_ns = now_ns + SPIN_NS
         while (data := self._port.receive()) is None and self._clock() < end_ns:
             pass
@@ -266,11 +266,11 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     ports: tuple[int, ...]
     """Open ports."""
     fault: str = ""
-    """Why not all is known of it, or why it is not where it belongs."""
+    """Reason why its description is incomplete or its position is wrong."""
     target: int = 0
     """AL state where the master of a running station keeps it."""
     since_ns: int | None = None
-    """How many nanoseconds ago *fault* began, if that is known."""
+    """Age of *fault* in nanoseconds, if it is known."""
 
 
 class SlaveBus(Protocol):
@@ -283,7 +283,7 @@ class SlaveBus(Protocol):
         """Return the slave with a station address or a name; raise BusError if that is not one."""
 
     def require_mailbox(self, slave: Slave) -> None:
-        """Learn how long the mailbox of *slave* is, as files need; raise BusError otherwise."""
+        """Read the mailbox size of *slave*, which files need; raise BusError without one."""
 
     def converse(
         self,
@@ -298,7 +298,7 @@ class SlaveBus(Protocol):
         """Bring slaves to a state, or raise."""
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
-        """Run a procedure to its end and return its result, or raise what went wrong."""
+        """Run a procedure to its end and return its result, or raise its error."""
 
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the master's frames."""
@@ -307,7 +307,7 @@ class SlaveBus(Protocol):
         """Return all slaves in the order of the line, without asking those that are known."""
 
     def history(self) -> History | None:
-        """Return when faults were seen; None where there is no record."""
+        """Return the times of faults; None without a record."""
 
     def forget(self) -> None:
         """Forget faults that are over."""

@@ -61,7 +61,7 @@ class ControlClient(Closeable):
 
         Raises:
             ControlError: the appliance refused, or does not answer.
-            BusError: a bus or a slave did not do it; as its class says.
+            BusError: a bus or a slave refused or failed.
         """
         return method.decode(self.request_within(within_s, method.name, **params))
 
@@ -78,7 +78,7 @@ class ControlClient(Closeable):
 
         Raises:
             ControlError: the appliance refused, or does not answer.
-            BusError: a bus or a slave did not do it; as its class says.
+            BusError: a bus or a slave refused or failed.
         """
         self._last_id += 1
         self._socket.settimeout(within_s)
@@ -92,9 +92,9 @@ class ControlClient(Closeable):
                 return _checked(reply).result
 
     def events(self, **params: Any) -> Iterator[ValuesEvent]:
-        """Subscribe with *params* and yield each event until the appliance goes.
+        """Subscribe with *params* and yield each event until the appliance ends.
 
-        The connection takes no other requests meanwhile.
+        The connection accepts no other request meanwhile.
 
         Raises:
             ControlError: the appliance refused, went away, or cannot read the values now.
@@ -149,7 +149,7 @@ def connect(plant: str | None = None, station: str | None = None) -> list[Contro
     """Connect to all running appliances, or to those that run *plant* or *station*.
 
     Raises:
-        ControlError: there is none; the message says which others run, and where it looked.
+        ControlError: there is none; the message names the running ones and the searched folders.
     """
     clients = connect_those(
         lambda info: (
@@ -272,7 +272,7 @@ def _connect(connection: socket.socket, path: str) -> None:
 
 
 def _starting(folder: ApplianceFolder) -> Iterator[str]:
-    """Yield which processes of an appliance do not run yet, or not again, and how far they are."""
+    """Yield the processes of an appliance that are starting or restarting, with their steps."""
     with suppress(OSError, msgspec.MsgspecError):
         info = folder.read_info()
         processes = {"engine": info.engine, "services": info.services, **info.segments}

@@ -96,7 +96,7 @@ class DecodedFrame(Struct, kw_only=True):
     """``eapctl decode``: one frame, and for a capture the packet that it was in.
 
     Each type has fields of its own: ``publisher``, ``cycle`` and ``pds`` type 4, ``datagrams``
-    type 1, ``ams`` type 2, ``mailbox`` type 5, raw ``data`` all others.  Octets are strings of
+    type 1, ``ams`` type 2, ``mailbox`` type 5, raw ``data`` all others.  Bytes are strings of
     hexadecimal digits.  *error* is None if all is well.
     """
 
@@ -238,7 +238,7 @@ _MOST_WAITING = 64
 
 
 class TcpSegment(NamedTuple):
-    """Place of a packet's payload in its TCP stream."""
+    """Position of a packet's payload in its TCP stream."""
 
     sequence: int
     is_first: bool
@@ -256,7 +256,7 @@ class Packet(NamedTuple):
 
 
 def unwrap(octets: bytes) -> Packet | None:
-    """Return what an Ethernet frame carries under our EtherType or port, None if nothing."""
+    """Return the payload of an Ethernet frame under EtherType 0x88A4 or port 34980, or None."""
     if len(octets) < 14:
         return None
     ethertype = int.from_bytes(octets[12:14], "big")
@@ -296,7 +296,7 @@ def _unwrap_ipv4(octets: bytes, vlan_id: int | None) -> Packet | None:
 
 
 def cut_frames(stream: bytearray) -> Iterator[bytes]:
-    """Take every whole frame off the front of *stream*; the header's Length is what delimits."""
+    """Remove every whole frame from the front of *stream*; the header's Length delimits them."""
     while len(stream) >= EtherCatHeader.SIZE:
         size = EtherCatHeader.SIZE + EtherCatHeader.decode(stream).length
         if len(stream) < size:
@@ -329,14 +329,14 @@ class Stream:
             yield from self._skip_gap()
 
     def flush(self) -> Iterator[bytes]:
-        """Yield what is left, frames that were begun and never finished included."""
+        """Yield the remaining frames, incomplete ones included."""
         while self._waiting:
             yield from self._skip_gap()
         yield from self._give_up_begun()
 
     def _put_together(self) -> Iterator[bytes]:
-        for sequence in sorted(self._waiting, key=self._ahead):
-            ahead = self._ahead(sequence)
+        for sequence in sorted(self._waiting, key=self._distance):
+            ahead = self._distance(sequence)
             if ahead > 0:
                 break
             fresh = self._waiting.pop(sequence)[-ahead:]  # what a retransmission repeats is cut
@@ -346,7 +346,7 @@ class Stream:
 
     def _skip_gap(self) -> Iterator[bytes]:
         yield from self._give_up_begun()
-        self._next = min(self._waiting, key=self._ahead)
+        self._next = min(self._waiting, key=self._distance)
         yield from self._put_together()
 
     def _give_up_begun(self) -> Iterator[bytes]:
@@ -354,8 +354,8 @@ class Stream:
             yield bytes(self._begun)
             self._begun.clear()
 
-    def _ahead(self, sequence: int) -> int:
-        """Return how far *sequence* is ahead of what comes next; sequence numbers wrap."""
+    def _distance(self, sequence: int) -> int:
+        """Return the distance of *sequence* from the next expected one; sequence numbers wrap."""
         distance = (sequence - (self._next or 0)) % _SEQUENCES
         return distance - _SEQUENCES if distance >= _SEQUENCES // 2 else distance
 

@@ -71,7 +71,7 @@ class ObjectInfo(msgspec.Struct, frozen=True):
 
 
 class Content(msgspec.Struct, frozen=True):
-    """One entry with its octets, or with the reason why they cannot be read."""
+    """One entry with its bytes, or with the reason why they cannot be read."""
 
     object: ObjectInfo
     entry: EntryInfo
@@ -89,13 +89,13 @@ class OdDevice(Protocol):
         """Return one object with its entries; refuse as ``read`` does."""
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
-        """Return what is known of an entry, also of one that a download would make.
+        """Return the description of an entry, also of one that a download would create.
 
-        None if the device does not tell; raises if it does, and there can be no such entry.
+        None without a description; raises if the description excludes such an entry.
         """
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
-        """Return the octets of an entry or, with *complete*, of an object; raise if refused."""
+        """Return the bytes of an entry or, with *complete*, of an object; raise if refused."""
 
     def write(self, index: int, subindex: int, octets: bytes, *, complete: bool = False) -> None:
         """Write an entry or, with *complete*, an object; raise if refused."""
@@ -105,7 +105,7 @@ class OdDevice(Protocol):
 
 
 class OdValue(msgspec.Struct, frozen=True, kw_only=True):
-    """``eapctl od read`` and ``write``: an entry, its octets in hexadecimal digits."""
+    """``eapctl od read`` and ``write``: an entry, its bytes in hexadecimal digits."""
 
     index: int
     subindex: int
@@ -244,7 +244,7 @@ def write_entry(
 def write_octets(
     device: OdDevice, index: int, subindex: int, octets: bytes, *, complete: bool
 ) -> OdOctets:
-    """Write octets as they are; raises as write_entry does."""
+    """Write raw bytes; raises as write_entry does."""
     device.write(index, subindex, octets, complete=complete)
     return OdOctets(index, subindex, complete, octets.hex())
 
@@ -290,7 +290,7 @@ def _value(index: int, entry: EntryInfo, octets: bytes | None) -> OdValue:
 
 
 def _parts(found: ObjectInfo, first: int, octets: bytes) -> list[OdValue]:
-    """Return the entries that *octets* are made of, as far as the types are known."""
+    """Return the entries in *octets*, as far as the types are known."""
     rows = []
     chosen = [each for each in found.entries if 1 <= each.subindex <= found.max_subindex]
     if first == 0:

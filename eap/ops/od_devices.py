@@ -1,4 +1,4 @@
-"""Devices with an object dictionary, and the way to the one that a command names.
+"""Devices with an object dictionary, and the search for the one that a command names.
 
 An EAP port, a router or a slave of a station that runs here is reached by its appliance; everything
 else by ADS, through the routes of the first appliance that knows it (ETG.1020, AoE: CoE by index
@@ -48,12 +48,12 @@ from eap.ops.routing import AmsDevice, AmsRefusedError, open_ams
 from eap.runtime.folder import find_running
 
 _ROOM = 0x20002
-"""Octets of the longest description: a list of all indexes there can be."""
+"""Size of the longest description: a list of all possible indexes."""
 _COMPLETE = 0x100
 _LIST_TYPE = 2
-"""Octets in front of the indexes of a list."""
+"""Bytes before the indexes of a list."""
 _PADDED = 2
-"""Octets of subindex 0 in a whole object."""
+"""Size of subindex 0 in a whole object."""
 _UNTOLD = frozenset((AdsError.NOT_FOUND, AdsError.SERVICE, AdsError.INDEX_GROUP, AdsError.GENERAL))
 _OCTETS = 6
 _NOT_THERE = "is not STATION, STATION/PORT, STATION/PORT/SLAVE or NETID[:PORT]"
@@ -124,7 +124,7 @@ def open_device(target: Target) -> Iterator[OdDevice]:
 
 
 def is_bus(client: ControlClient, target: Target) -> bool:
-    """Say whether *target* is a bus port of a station that runs here: its master."""
+    """Return whether *target* is a bus port of a local station: its master."""
     if not target.port or target.slave:
         return False
     stations = client.request("status")["stations"]
@@ -143,14 +143,14 @@ def _open_far(target: Target) -> Iterator[OdDevice]:
 
 
 def object_info(index: int, found: ObjectDescription) -> ObjectInfo:
-    """Return what a description says of an object, without its entries."""
+    """Return the description of an object, without its entries."""
     known = found.code in ObjectCode._value2member_map_
     code = ObjectCode(found.code).name if known else str(found.code)
     return ObjectInfo(index, found.name, code, found.max_subindex)
 
 
 def entry_info(subindex: int, found: EntryDescription) -> EntryInfo:
-    """Return what a description says of an entry."""
+    """Return the description of an entry."""
     reads = "r" if found.access & Access.READ_ANY else ""
     writes = "w" if found.access & Access.WRITE_ANY else ""
     return EntryInfo(subindex, found.name, kind_of(found), reads + writes)
@@ -165,7 +165,7 @@ def with_entries(device: OdDevice, found: ObjectInfo) -> ObjectInfo:
 def read_all(device: OdDevice, *refusals: type[Exception]) -> Iterator[Content]:
     """Yield all entries of all objects of *device*, as they come in.
 
-    *refusals* are the errors that stand beside an entry; others are raised.
+    Errors of the types *refusals* are stored with the entry; others are raised.
     """
     for found in device.objects():
         for entry in device.describe(found.index).entries:
@@ -201,7 +201,7 @@ class SlaveOd:
         return with_entries(self, self._object(index))
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
-        """Return what the slave says of an entry; None if it says nothing."""
+        """Return the slave's description of an entry, or None."""
         name = str(ObjectId(index, subindex))
         try:
             found = self._bus.converse(
@@ -216,7 +216,7 @@ class SlaveOd:
         return entry_info(subindex, found)
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
-        """Return the octets of an entry or of an object."""
+        """Return the bytes of an entry or of an object."""
         return self._bus.converse(
             self._slave,
             lambda _: coe_client.upload(index, subindex, complete=complete),
@@ -265,7 +265,7 @@ class AdsOd:
         return with_entries(self, self._object(index))
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
-        """Return what the device says of an entry; None if it says nothing."""
+        """Return the device's description of an entry, or None."""
         offset = index << 16 | int(~ValueInfo(0)) << 8 | subindex
         name = str(ObjectId(index, subindex))
         try:
@@ -280,7 +280,7 @@ class AdsOd:
         return entry_info(subindex, found)
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
-        """Return the octets of an entry or of an object."""
+        """Return the bytes of an entry or of an object."""
         name = str(ObjectId(index, subindex))
         if not complete:
             return self._read(IndexGroup.SDO, index << 16 | subindex, name)
@@ -350,12 +350,12 @@ class StationOd:
         raise SdoAbortError(AbortCode.NO_SUBINDEX, index, subindex)
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
-        """Return the octets of an entry or of an object."""
+        """Return the bytes of an entry or of an object."""
         where = {"index": index, "subindex": subindex, "complete": complete}
         return bytes.fromhex(self._client.call(OD_READ, target=self._target, **where).data)
 
     def write(self, index: int, subindex: int, octets: bytes, *, complete: bool = False) -> None:
-        """Write an entry or an object; a refusal says what to do about it, if that is known."""
+        """Write an entry or an object; a refusal has a remedy, if one is known."""
         where = {"index": index, "subindex": subindex, "complete": complete}
         try:
             self._client.call(OD_WRITE, target=self._target, **where, data=octets.hex())

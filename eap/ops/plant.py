@@ -57,7 +57,7 @@ class StationPlan(msgspec.Struct, frozen=True):
         station: Its name.
         changes: Of the objects of its ports.
         notes: Differences beside the objects: sources, links, buses, routes, access rules.
-        refused: Why it cannot be as the file says.
+        refused: Reasons why the file cannot be applied.
     """
 
     station: str
@@ -80,7 +80,7 @@ class StepOutcome(msgspec.Struct, frozen=True):
 
 
 class PlannedStep(msgspec.Struct, frozen=True):
-    """Step that ``apply`` would take."""
+    """Step of a future ``apply``."""
 
     station: str
     why: str
@@ -119,7 +119,7 @@ class RefusingStation(msgspec.Struct, frozen=True):
 
 
 class ChangeReport(msgspec.Struct, frozen=True):
-    """``eapctl apply`` and ``rollback``; *error* says why it was broken off."""
+    """``eapctl apply`` and ``rollback``; *error* is the reason of an interruption."""
 
     ok: bool
     steps: list[TakenStep]
@@ -157,7 +157,7 @@ class PlantLink:
         file: The plant file.
         absent: Its stations that do not run here.
         routing: Configuration of their routers in it.
-        audit_required: Whether it wants changes refused that cannot be recorded.
+        audit_required: Changes that the audit cannot record are refused.
 
     Attributes:
         file: The plant file, as it was named.
@@ -202,12 +202,12 @@ class PlantLink:
         return StationPlan(spec.name, answer.changes, notes, refused)
 
     def apply(self, spec: StationSpec, cause: str) -> ApplyAnswer:
-        """Let the station of its name be as *spec* says, as a step of the change named *cause*."""
+        """Configure the station of its name by *spec*, as a step of the change named *cause*."""
         where = {"cause": cause, "file": self._file}
         return self._call(protocol.APPLY, spec.name, spec=msgspec.to_builtins(spec), **where)
 
     def rollback(self, spec: StationSpec) -> ApplyAnswer:
-        """Let the station of its name be *spec*: what it was before, or is, alternates aside."""
+        """Configure the station of its name by *spec*, which is without alternates."""
         return self._call(protocol.ROLLBACK, spec.name, spec=msgspec.to_builtins(spec))
 
     def export_routing(self, station: str) -> RunningRouting | None:
@@ -217,19 +217,19 @@ class PlantLink:
         return self._call(protocol.ROUTING_EXPORT, station)
 
     def plan_routing(self, station: str) -> RoutingDifference:
-        """Return the changes that the plant file would bring to a router."""
+        """Return the changes that the plant file makes at a router."""
         if station not in self._routing:
             return RoutingDifference(changes=[], refused=[])
         routing = msgspec.to_builtins(self._routing[station])
         return self._call(protocol.ROUTING_PLAN, station, routing=routing)
 
     def apply_routing(self, station: str, cause: str) -> RoutingDifference:
-        """Configure a router as the plant file says, as a step of the change named *cause*."""
+        """Configure a router by the plant file, as a step of the change named *cause*."""
         routing = msgspec.to_builtins(self._routing[station])
         return self._call(protocol.ROUTING_APPLY, station, routing=routing, cause=cause)
 
     def rollback_routing(self, station: str) -> RoutingDifference:
-        """Take the last change of a router back, or make it again."""
+        """Undo the last change of a router, or redo it."""
         return self._call(protocol.ROUTING_ROLLBACK, station)
 
     def _call(self, method: Method[ParametersT, AnswerT], station: str, **params: Any) -> AnswerT:
@@ -306,12 +306,12 @@ def start_command(file: Path, stations: Iterable[str]) -> str:
 
 
 def plan_all(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[StationPlan]:
-    """Return what differs at each of *wanted*; raises as PlantLink does."""
+    """Return the differences of each station of *wanted*; raises as PlantLink does."""
     return [link.plan(spec) for spec in wanted.values()]
 
 
 def steps_to(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[Step]:
-    """Return in which order the stations become what is *wanted*."""
+    """Return the order of steps to the specifications *wanted*."""
     running = {name: link.export(name).spec for name in link.stations}
     return steps(running, {**running, **wanted})
 
@@ -323,10 +323,10 @@ def apply_steps(
     keep_going: bool = False,
     routed: Iterable[str] = (),
 ) -> Iterator[StepOutcome]:
-    """Take *order* step by step, and yield what became of each; last the routers of *routed*.
+    """Run the steps of *order* and yield the outcome of each; last the routers of *routed*.
 
     A station that refused a step gets no other.  Steps that go on with a change that was broken off
-    belong to it, so that a rollback takes back both.
+    belong to it, so that a rollback undoes both.
     """
     running = [link.export(name) for name in link.stations]
     under_way = [each.cause for each in running if _is_under_way(each.spec)]
@@ -347,7 +347,7 @@ def apply_steps(
 def roll_back(
     link: PlantLink, stations: Iterable[str], *, keep_going: bool = False
 ) -> Iterator[StepOutcome]:
-    """Take the last change of *stations* back, and yield what became of each step.
+    """Undo the last change of *stations*, and yield the outcome of each step.
 
     Those that it did not change are left alone.  If it was taken back everywhere, and nothing is
     left to do, it is made again.

@@ -46,11 +46,11 @@ _PAUSE_S = 0.1
 
 
 def trace(target: str, plant: str | None = None, via: str | None = None) -> TracedPath:
-    """Return the way to *target*, hop by hop.
+    """Return the path to *target*, hop by hop.
 
     Args:
         target: ``STATION[/PORT[/SLAVE]]`` or ``NETID[:PORT]``.
-        plant: Of the appliance that asks; None for the first that knows the target.
+        plant: Of the appliance that sends; None for the first that knows the target.
         via: Station whose router sends the requests; None for the first of the appliance.
 
     Raises:
@@ -60,7 +60,7 @@ def trace(target: str, plant: str | None = None, via: str | None = None) -> Trac
     def ask(client: ControlClient) -> TracedPath:
         return client.call(TRACE, within_s=TRACE_S, via=via or "", target=target)
 
-    with first_that_knows(ask, plant, via) as (_, answer):
+    with first_answer(ask, plant, via) as (_, answer):
         return answer
 
 
@@ -79,18 +79,18 @@ def scan(plant: str | None = None, via: str | None = None) -> list[PlantScan]:
 
 
 @contextmanager
-def first_that_knows(
+def first_answer(
     ask: Callable[[ControlClient], T], plant: str | None, via: str | None = None
 ) -> Iterator[tuple[ControlClient, T]]:
-    """Ask one appliance after the other; give the first that knows the names, and its answer.
+    """Query the appliances in turn; return the first that knows the names, and its answer.
 
     Args:
-        ask: Raises ControlError where a name is not known.
+        ask: Query of one appliance; raises ControlError if a name is unknown.
         plant: Of the appliance; None for any.
         via: Station that has to run there; None for any.
 
     Raises:
-        ControlError: nothing runs, the names are not known, or *ask* failed in another way.
+        ControlError: nothing runs, the names are unknown, or *ask* failed in another way.
     """
     unknown: ControlError | None = None
     with ExitStack() as stack:
@@ -124,7 +124,7 @@ class AmsDevice:
         self._client = client
 
     def ask(self, operation: Operation) -> OperationOutcome:
-        """Return how one operation came out; raise ControlError if there is no such target."""
+        """Return the result of one operation; raise ControlError if there is no such target."""
         command, body = encode_query(operation)
         answer = self._client.call(
             AMS_ASK, target=self.target, command=command, data=body.hex(), device=True
@@ -158,7 +158,7 @@ class AmsDevice:
         return AmsRefusedError(f"{self.target}: {what}: {text}", result)
 
     def _find_fault(self) -> str:
-        """Return at which router the way to the device ends, and why; empty if that is unknown."""
+        """Return the router at which the path to the device ends and the cause, or ""."""
         try:
             return self._client.call(TRACE, target=self.target).why
         except ControlError:
@@ -172,7 +172,7 @@ def open_ams(target: str, plant: str | None) -> Iterator[AmsDevice]:
     Raises:
         ControlError: nothing runs, or the target is not known.
     """
-    with first_that_knows(lambda each: AmsDevice(each, target).ask(ReadState()), plant) as found:
+    with first_answer(lambda each: AmsDevice(each, target).ask(ReadState()), plant) as found:
         client, _ = found
         yield AmsDevice(client, target)
 
@@ -282,8 +282,8 @@ def list_routes(
     Args:
         plant: Of the appliance; None for all.
         station: Its name; None for all.
-        match: What name, NetID, transport, address, origin or state of a route have in them.
-        requests: How many of the latest ones to return of each station.
+        match: Substring of name, NetID, transport, address, origin or state of a route.
+        requests: Number of the latest requests to return of each station.
         most: Routes of one station; None for as many as there are.
 
     Raises:
@@ -319,7 +319,7 @@ def _ask(
 
 
 def text_of_xml(octets: bytes) -> str:
-    """Return what a file of XML holds, in the encoding that it begins with or declares.
+    """Return the text of an XML file, in the encoding of its byte order mark or declaration.
 
     Raises:
         ValueError: it is in another encoding, or in an unknown one.

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from eap.cli.routes_tui.app import RoutesApp
-from eap.cli.routes_tui.table import RouteLink
+from eap.cli.routes_tui.table import RouterClient
 from eap.ops.routing import list_routes
 from tests.support.appliance import wait_until
 from tests.support.pages import ROOT, Shell, commands, shell
@@ -47,7 +47,7 @@ def screen_after(keys: tuple[str, ...]) -> str:
     async def script(screen: Screen) -> None:
         shown.append(await screen.press(*keys))
 
-    play(RoutesApp(RouteLink(None), period_s=1000.0), script)
+    play(RoutesApp(RouterClient(None), period_s=1000.0), script)
     return "\n".join(line.rstrip() for line in shown[0].splitlines()) + "\n"
 
 

@@ -21,9 +21,9 @@ from eap.cli import routes_view
 from eap.cli.routes_tui.table import (
     STYLES,
     Grid,
-    Picture,
     PlantRouter,
-    RouteLink,
+    RouterClient,
+    Snapshot,
     View,
     detail,
     lines,
@@ -34,9 +34,9 @@ from eap.control.routes import (
 from eap.errors import EapError
 
 PERIOD_S = 1.0
-"""Between two looks."""
+"""Period of requests."""
 STALE_AFTER_S = 2.5
-"""For an answer, before it is said that there is none."""
+"""Time without an answer after which the view says so."""
 _ALL = "all stations"
 _SCROLLBAR = 1
 """Columns that one takes when there are more rows than lines."""
@@ -47,7 +47,7 @@ class RoutesApp(App[None]):
 
     Args:
         link: To the appliances.
-        period_s: Between two looks.
+        period_s: Period of requests.
     """
 
     CSS_PATH = "style.tcss"
@@ -67,15 +67,15 @@ class RoutesApp(App[None]):
         Binding("q,ctrl+c", "quit", "Quit", key_display="q"),
     ]
 
-    def __init__(self, link: RouteLink, *, period_s: float = PERIOD_S) -> None:
+    def __init__(self, link: RouterClient, *, period_s: float = PERIOD_S) -> None:
         super().__init__()
         self._link = link
         self._period_s = period_s
-        self._picture = Picture([], "asking…")
+        self._snapshot = Snapshot([], "sending…")
         self._view = View.ROUTES
         self._station = _ALL
         self._match = ""
-        self._looks_since: float | None = None
+        self._requested_at: float | None = None
 
     def compose(self) -> ComposeResult:
         """Yield the parts of the screen, top to bottom."""
@@ -88,24 +88,24 @@ class RoutesApp(App[None]):
         yield Footer(compact=True)
 
     def on_mount(self) -> None:
-        """Begin to look."""
+        """Start the periodic requests."""
         self.query_one("#filter").display = False
         self.query_one(Grid).focus()
         self.set_interval(self._period_s, self.look)
         self.look()
 
     def on_resize(self) -> None:
-        """Use the room that there is."""
+        """Fit the table to the new size."""
         self.call_after_refresh(self._show)
 
     def look(self) -> None:
         """Request the routes, unless a request is under way."""
-        if self._looks_since is None:
-            self._looks_since = monotonic()
+        if self._requested_at is None:
+            self._requested_at = monotonic()
             self._look(self._match if self._view is View.ROUTES else "")
-        elif (waited_s := monotonic() - self._looks_since) > STALE_AFTER_S:
+        elif (waited_s := monotonic() - self._requested_at) > STALE_AFTER_S:
             problem = f"no answer for {waited_s:.0f} s"
-            self._picture = self._picture._replace(problem=problem)
+            self._snapshot = self._snapshot._replace(problem=problem)
             self._show()
 
     @work(thread=True)
@@ -113,22 +113,22 @@ class RoutesApp(App[None]):
         picture = self._link.look(match)
         self.call_from_thread(self._take, picture)
 
-    def _take(self, picture: Picture) -> None:
-        self._looks_since = None
+    def _take(self, picture: Snapshot) -> None:
+        self._requested_at = None
         if picture.problem:
-            picture = Picture(self._picture.routers, picture.problem)
-        self._picture = picture
+            picture = Snapshot(self._snapshot.routers, picture.problem)
+        self._snapshot = picture
         self._show()
 
     def _routers(self) -> list[PlantRouter]:
-        routers = self._picture.routers
+        routers = self._snapshot.routers
         names = {each.routes.station for each in routers}
         if self._station in names:
             return [each for each in routers if each.routes.station == self._station]
         return routers
 
     def _show(self) -> None:
-        """Put on the screen what is known."""
+        """Refresh the screen."""
         routers = self._routers()
         found = lines(self._view, routers, self._match)
         self._show_head(routers)
@@ -140,14 +140,14 @@ class RoutesApp(App[None]):
 
     def _show_head(self, routers: list[PlantRouter]) -> None:
         stations = [each.routes for each in routers]
-        plants = ", ".join(dict.fromkeys(each.plant for each in self._picture.routers))
+        plants = ", ".join(dict.fromkeys(each.plant for each in self._snapshot.routers))
         where = self._station if self._station != _ALL else f"{len(stations)} stations"
         text = Text(f" {plants}, {where}: {routes_view.summary(stations)}" if stations else " ")
-        if self._picture.problem:
-            text = Text(f" {self._picture.problem}", style="bold red")
+        if self._snapshot.problem:
+            text = Text(f" {self._snapshot.problem}", style="bold red")
         text.truncate(self.size.width, overflow="ellipsis")
         self.query_one("#head", Static).update(text)
-        self.query_one("#table").set_class(bool(self._picture.problem), "stale")
+        self.query_one("#table").set_class(bool(self._snapshot.problem), "stale")
         counts = {
             View.ROUTES: sum(each.total for each in stations),
             View.CONNECTIONS: sum(len(each.connections) for each in stations),
@@ -173,7 +173,7 @@ class RoutesApp(App[None]):
 
     def action_help(self) -> None:
         """Show what each key does."""
-        self._tell("Keys", _HELP)
+        self._show_problem("Keys", _HELP)
 
     def action_view(self, view: str) -> None:
         """Show routes, connections or warnings."""
@@ -182,19 +182,19 @@ class RoutesApp(App[None]):
 
     def action_station(self) -> None:
         """Show the next station alone, and after the last one all."""
-        names = [_ALL, *dict.fromkeys(each.routes.station for each in self._picture.routers)]
+        names = [_ALL, *dict.fromkeys(each.routes.station for each in self._snapshot.routers)]
         at = names.index(self._station) if self._station in names else 0
         self._station = names[(at + 1) % len(names)]
         self._show()
 
     def action_filter(self) -> None:
-        """Ask what rows have to have in them."""
+        """Edit the filter of rows."""
         field = self.query_one("#filter", Input)
         field.display = True
         field.focus()
 
     @on(Input.Changed, "#filter")
-    def _take_filter(self, event: Input.Changed) -> None:
+    def _apply_filter(self, event: Input.Changed) -> None:
         self._match = event.value.strip()
         self._show()
         self.look()
@@ -211,26 +211,26 @@ class RoutesApp(App[None]):
         self._leave_filter()
 
     def action_add(self) -> None:
-        """Ask for a new route of the chosen station."""
+        """Open a form for a new route of the chosen station."""
         if (router := self._router()) is not None:
             self._ask_for(router, f"New route of {router.routes.station}", {"octets": "4"})
 
     def action_edit(self) -> None:
-        """Ask for a change of the chosen route."""
+        """Open a form for a change of the chosen route."""
         line = self.query_one(Grid).chosen
         if line is None or not isinstance(line.row, RouteRow):
-            self._tell("Edit", "Choose a route first.")
+            self._show_problem("Edit", "Choose a route first.")
         elif line.row.origin != "added":
-            self._tell("Edit", _KEPT_ELSEWHERE[line.row.origin].format(name=line.row.name))
+            self._show_problem("Edit", _KEPT_ELSEWHERE[line.row.origin].format(name=line.row.name))
         else:
             title = f"Route {line.row.name} of {line.router.routes.station}"
             self._ask_for(line.router, title, values_of(line.row))
 
     def action_remove(self) -> None:
-        """Remove the chosen route, when that is what is wanted."""
+        """Remove the chosen route after a confirmation."""
         line = self.query_one(Grid).chosen
         if line is None or not isinstance(line.row, RouteRow):
-            self._tell("Remove", "Choose a route first.")
+            self._show_problem("Remove", "Choose a route first.")
             return
         row, router = line.row, line.router
 
@@ -243,17 +243,17 @@ class RoutesApp(App[None]):
         self.push_screen(Question(text), answered)
 
     def action_test(self) -> None:
-        """Measure the way to the chosen route's station."""
+        """Measure the round trip to the chosen route's station."""
         line = self.query_one(Grid).chosen
         if line is None or not isinstance(line.row, RouteRow):
-            self._tell("Test", "Choose a route first.")
+            self._show_problem("Test", "Choose a route first.")
         elif not line.row.octets:
-            self._tell("Test", "A default route leads to no station of its own.")
+            self._show_problem("Test", "A default route leads to no station of its own.")
         else:
             self._test(line.router, line.row)
 
     def on_data_table_row_selected(self) -> None:
-        """Test what is chosen by Enter or by a second click."""
+        """Test the row that Enter or a second click chooses."""
         self.action_test()
 
     @work(thread=True)
@@ -261,7 +261,7 @@ class RoutesApp(App[None]):
         try:
             self._link.remove(router, row.net_id, row.transport, row.address)
         except EapError as exc:
-            self.call_from_thread(self._tell, "Remove", str(exc))
+            self.call_from_thread(self._show_problem, "Remove", str(exc))
         self.call_from_thread(self.look)
 
     @work(thread=True)
@@ -275,14 +275,14 @@ class RoutesApp(App[None]):
             said = f"{result.target}{trip}: {result.text}"
             text = "\n".join(filter(None, [said, result.hint]))
         title = f"{router.routes.station} to {row.name}"
-        self.call_from_thread(self._tell, title, text)
+        self.call_from_thread(self._show_problem, title, text)
         self.call_from_thread(self.look)
 
     def _ask_for(self, router: PlantRouter, title: str, values: dict[str, Any]) -> None:
         def ended(warnings: list[str] | None) -> None:
             self.look()
             if warnings:
-                self._tell("Added, but", "\n".join(warnings))
+                self._show_problem("Added, but", "\n".join(warnings))
 
         form = RouteForm(title, values, lambda params: self._link.add(router, params))
         self.push_screen(form, ended)
@@ -294,7 +294,7 @@ class RoutesApp(App[None]):
         routers = self._routers()
         return routers[0] if routers else None
 
-    def _tell(self, title: str, text: str) -> None:
+    def _show_problem(self, title: str, text: str) -> None:
         self.push_screen(Message(title, text))
 
 
@@ -319,7 +319,7 @@ _KEPT_ELSEWHERE = {
 
 def run_view(plant: str | None) -> None:
     """Show the live view until it is left."""
-    RoutesApp(RouteLink(plant)).run()
+    RoutesApp(RouterClient(plant)).run()
 
 
 _FIELDS = {
@@ -335,7 +335,7 @@ _KINDS_WITHOUT_PORT = {"ams-tcp", "mqtt"}
 
 
 class Tick(Checkbox):
-    """A checkbox that shows without colours, too, whether it is ticked."""
+    """A checkbox whose mark is visible without colours."""
 
     BUTTON_LEFT = "["
     BUTTON_INNER = " "
@@ -350,12 +350,12 @@ class Tick(Checkbox):
 class RouteForm(ModalScreen[list[str]]):
     """The fields of a route; it stays until the route is taken, or the form is left.
 
-    It ends with what there is to say against the route, or with None if it was left.
+    Its result is the warnings about the route, or None if it was cancelled.
 
     Args:
-        title: What it is about.
+        title: Its heading.
         values: Of the fields at first, and ``replaces`` for a route that is to go.
-        save: Takes the parameters of ``routes_add``, in a thread, and returns what there is to say
+        save: Sends the parameters of ``routes_add``, in a thread, and returns the warnings
             against them; raises EapError if refused.
     """
 
@@ -373,7 +373,7 @@ class RouteForm(ModalScreen[list[str]]):
         self._save = save
 
     def compose(self) -> ComposeResult:
-        """Yield a line for each field, and below them what to do."""
+        """Yield a line for each field, and the buttons below."""
         with Vertical(classes="box"):
             yield Static(self._title, classes="title", markup=False)
             for name, (label, hint) in _FIELDS.items():
@@ -385,7 +385,7 @@ class RouteForm(ModalScreen[list[str]]):
                     )
             with Horizontal(classes="field"):
                 is_probed = bool(self._values.get("probed", True))
-                yield Tick("ask whether it is alive", is_probed, id="probed", compact=True)
+                yield Tick("probe the next hop", is_probed, id="probed", compact=True)
                 is_one_way = bool(self._values.get("unidirectional", False))
                 yield Tick("one way only", is_one_way, id="unidirectional", compact=True)
             yield Static("", id="problem", markup=False)
@@ -395,22 +395,22 @@ class RouteForm(ModalScreen[list[str]]):
 
     @on(Button.Pressed, "#leave")
     def action_leave(self) -> None:
-        """Change nothing."""
+        """Close the form without a change."""
         self.dismiss(None)
 
     @on(Input.Submitted)
     @on(Button.Pressed, "#save")
     def action_save(self) -> None:
-        """Ask for the route."""
+        """Send the route."""
         texts = {name: self.query_one(f"#{name}", Input).value.strip() for name in _FIELDS}
         try:
             numbers = {name: int(texts[name] or 0) for name in ("timeout_ms",)}
             numbers["octets"] = int(texts["octets"] or 4)
         except ValueError as exc:
-            self._tell(f"a number is expected: {exc}")
+            self._show_problem(f"expected a number: {exc}")
             return
-        self._tell("asking…")
-        self._ask(
+        self._show_problem("sending…")
+        self._send(
             texts
             | numbers
             | {"replaces": self._values.get("replaces", "")}
@@ -421,15 +421,15 @@ class RouteForm(ModalScreen[list[str]]):
         )
 
     @work(thread=True, exclusive=True)
-    def _ask(self, params: dict[str, Any]) -> None:
+    def _send(self, params: dict[str, Any]) -> None:
         try:
             warnings = self._save(params)
         except EapError as exc:
-            self.app.call_from_thread(self._tell, str(exc))
+            self.app.call_from_thread(self._show_problem, str(exc))
         else:
             self.app.call_from_thread(self.dismiss, warnings)
 
-    def _tell(self, text: str) -> None:
+    def _show_problem(self, text: str) -> None:
         self.query_one("#problem", Static).update(text)
 
 
@@ -456,16 +456,16 @@ class Question(ModalScreen[bool]):
 
     @on(Button.Pressed)
     def answer_by_button(self, event: Button.Pressed) -> None:
-        """Take the button that was pressed for the answer."""
+        """Answer by a button."""
         self.dismiss(event.button.id == "yes")
 
     def action_answer(self, is_yes: bool) -> None:
-        """Take a key for the answer."""
+        """Answer by a key."""
         self.dismiss(is_yes)
 
 
 class Message(ModalScreen[None]):
-    """Something to be read, until a key is pressed."""
+    """A text with a button to close it."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,enter,space,q", "app.pop_screen", "Close"),
@@ -477,7 +477,7 @@ class Message(ModalScreen[None]):
         self._text = text
 
     def compose(self) -> ComposeResult:
-        """Yield what there is to read."""
+        """Yield the text."""
         with Vertical(classes="box"):
             yield Static(self._title, classes="title", markup=False)
             yield Static(self._text, markup=False)
@@ -491,7 +491,7 @@ class Message(ModalScreen[None]):
 
 
 def values_of(row: RouteRow) -> dict[str, Any]:
-    """Return what a form for a change of *row* begins with."""
+    """Return the initial values of a form for a change of *row*."""
     kind, _, port = row.transport.partition(":")
     address = port if kind == "mqtt" else row.address
     return {

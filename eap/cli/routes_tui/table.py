@@ -41,26 +41,26 @@ class PlantRouter(NamedTuple):
     routes: RouterRow
 
 
-class Picture(NamedTuple):
-    """Content of the view; *problem* says why there is nothing new."""
+class Snapshot(NamedTuple):
+    """Content of the view; *problem* is the error of the last request."""
 
     routers: list[PlantRouter]
     problem: str = ""
 
 
-class RouteLink:
+class RouterClient:
     """The running appliances, or the one that runs *plant*."""
 
     def __init__(self, plant: str | None) -> None:
         self._plant = plant
 
-    def look(self, match: str) -> Picture:
+    def look(self, match: str) -> Snapshot:
         """Return all routers, with those of their routes that *match*; never raises EapError."""
         try:
             found = list_routes(self._plant, None, match, requests=_REQUESTS, most=MOST)
         except EapError as exc:
-            return Picture([], str(exc))
-        return Picture([PlantRouter(each.plant, row) for each in found for row in each.stations])
+            return Snapshot([], str(exc))
+        return Snapshot([PlantRouter(each.plant, row) for each in found for row in each.stations])
 
     def add(self, router: PlantRouter, params: dict[str, Any]) -> list[str]:
         """Add a route, and return the warnings; raise EapError if refused."""
@@ -71,7 +71,7 @@ class RouteLink:
         self._call(router, ROUTES_REMOVE, route=route, transport=transport, address=address)
 
     def test(self, router: PlantRouter, target: str) -> TestResult:
-        """Test the way to *target*, which may take some seconds; raise EapError if refused."""
+        """Test the path to *target* within seconds; raise EapError if refused."""
         return self._call(router, ROUTES_TEST, target=target, timeout_ms=_TEST_MS)
 
     def _call(
@@ -90,7 +90,7 @@ _READABLE = 12
 
 
 class View(StrEnum):
-    """What the table is about."""
+    """Content of the table."""
 
     ROUTES = "routes"
     CONNECTIONS = "connections"
@@ -102,10 +102,10 @@ class GridColumn(NamedTuple):
 
     Attributes:
         heading: Above it.
-        least: Characters without which it is useless.
-        most: Characters that it never needs more of; 0 takes what is left.
-        is_number: Whether it stands on the right.
-        rank: 0 is always shown; where there is no room, the highest rank is left out first.
+        least: Minimum width.
+        most: Maximum width; 0 uses the rest.
+        is_number: It is aligned to the right.
+        rank: 0 is always shown; a narrow screen omits the highest rank first.
     """
 
     heading: str
@@ -124,7 +124,7 @@ class Line(NamedTuple):
     """None for a warning."""
     cells: tuple[str, ...]
     state: str
-    """``up``, ``down``, ``unknown``, or empty: how it is coloured."""
+    """``up``, ``down``, ``unknown``, or empty: its style."""
 
 
 _STATION = GridColumn("Station", 7, 14)
@@ -180,7 +180,7 @@ def lines(view: View, routers: Iterable[PlantRouter], match: str) -> list[Line]:
 def fit(
     view: View, found: Sequence[Line], width: int, *, has_station: bool
 ) -> list[tuple[int, GridColumn, int]]:
-    """Return number, column and width of what *width* characters have room for.
+    """Return number, column and width of the columns that fit in *width* characters.
 
     Columns are as wide as they need to be.  Where that is too wide, extra columns are left out, and
     then long texts give way, the longest first; but before they become unreadable, more columns are
@@ -256,7 +256,7 @@ def _connection_line(router: PlantRouter, row: ConnectionRow) -> Line:
 
 
 def detail(line: Line | None) -> list[tuple[str, str]]:
-    """Return what there is to say of a row: texts with how they are coloured."""
+    """Return the details of a row: texts with their styles."""
     if line is None:
         return []
     row = line.row
@@ -268,7 +268,7 @@ def detail(line: Line | None) -> list[tuple[str, str]]:
             (f"{routes_view.route_kind(row)}; {routes_view.route_state(row)}", row.state),
         ]
     else:
-        asked = f"asked by {', '.join(row.net_ids)}" if row.net_ids else "nothing asked yet"
+        asked = f"requests from {', '.join(row.net_ids)}" if row.net_ids else "no requests yet"
         texts = [(routes_view.path_of(row), "bold"), (asked, "")]
     texts.append((routes_view.figures(row), ""))
     if row.last_error:

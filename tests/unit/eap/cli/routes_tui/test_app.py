@@ -10,7 +10,7 @@ import pytest
 
 from eap.cli.routes_tui import app
 from eap.cli.routes_tui.app import RoutesApp
-from eap.cli.routes_tui.table import RouteLink
+from eap.cli.routes_tui.table import RouterClient
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
 from tests.support.screens import Screen, play
@@ -32,7 +32,7 @@ def stub(fake, runtime):
 
 
 def run(script, size=SIZE):
-    play(RoutesApp(RouteLink(None), period_s=NEVER_S), script, size)
+    play(RoutesApp(RouterClient(None), period_s=NEVER_S), script, size)
 
 
 async def look(screen: Screen) -> str:
@@ -119,7 +119,7 @@ def test_connections_and_warnings(stub):
     async def script(screen):
         shown = await screen.press("c")
         assert "127.0.0.1:40112#3 ams-tcp   127.0.0.1.1.1   75 s    15  47.3k      3" in shown
-        assert " asked by 127.0.0.1.1.1\n" in shown
+        assert " requests from 127.0.0.1.1.1\n" in shown
         shown = await screen.press("w")
         assert "island-01 route press (5.1.2.3.1.1) is not taken" in shown
         assert "RTT" in await screen.click("#views", offset=(3, 0))
@@ -300,7 +300,7 @@ def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
 
 
 def test_it_looks_by_itself(stub):
-    app = RoutesApp(RouteLink("line"), period_s=0.1)
+    app = RoutesApp(RouterClient("line"), period_s=0.1)
 
     async def script(screen):
         while len(stub.requests) < 4:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import msgspec
 
 from eap.cli.routes_tui.app import Message, Question, RouteForm, RoutesApp, values_of
-from eap.cli.routes_tui.table import RouteLink
+from eap.cli.routes_tui.table import RouterClient
 from eap.errors import ControlError
 from tests.support.fakeroutes import ISLAND, PRESS
 from tests.support.screens import play
 
 
 def run(script):
-    play(RoutesApp(RouteLink(None), period_s=1000.0), script)
+    play(RoutesApp(RouterClient(None), period_s=1000.0), script)
 
 
 def test_form_for_a_change_begins_with_the_route() -> None:
@@ -44,11 +44,11 @@ def test_form_asks_with_what_is_in_its_fields(runtime) -> None:
         await screen.write("press")
         await screen.press(*["tab"] * 6)
         await screen.write("soon")
-        assert "a number is expected: invalid literal" in await screen.press("ctrl+s")
+        assert "expected a number: invalid literal" in await screen.press("ctrl+s")
         await screen.press(*["backspace"] * 4)
         await screen.write("900")
         shown = await screen.press("tab", "space", "tab", "space")
-        assert "[ ] ask whether it is alive" in shown
+        assert "[ ] probe the next hop" in shown
         assert "[x] one way only" in shown
         assert "no such port" in await screen.press("ctrl+s")
         assert "A route" not in await screen.click("#save")

@@ -4,7 +4,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.cli.routes_tui.table import Picture, RouteLink
+from eap.cli.routes_tui.table import RouterClient, Snapshot
 from eap.errors import ControlError
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import FakeRoutes
@@ -14,7 +14,7 @@ def test_link_looks_and_works(runtime) -> None:
     fake = FakeRoutes()
     with ExitStack() as stack:
         ControlStub("line", list(fake.stations), fake.table(), stack)
-        link = RouteLink("line")
+        link = RouterClient("line")
         picture = link.look("press")
         assert [(each.plant, each.routes.station) for each in picture.routers] == [
             ("line", "island-01"), ("line", "island-02")
@@ -30,6 +30,6 @@ def test_link_looks_and_works(runtime) -> None:
 
 
 def test_what_does_not_answer_is_a_problem_and_no_error(runtime) -> None:
-    assert RouteLink("hall").look("") == Picture(
+    assert RouterClient("hall").look("") == Snapshot(
         [], f"no plant hall runs: start one with 'eapctl run PLANT' (looked in {runtime})"
     )

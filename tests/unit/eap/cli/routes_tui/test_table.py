@@ -77,11 +77,11 @@ def test_detail_of_a_route() -> None:
 def test_detail_of_others() -> None:
     (tool,) = lines(View.CONNECTIONS, [ROUTER], "")
     assert detail(tool)[:2] == [
-        ("127.0.0.1:40112#3 by ams-tcp", "bold"), ("asked by 127.0.0.1.1.1", "")
+        ("127.0.0.1:40112#3 by ams-tcp", "bold"), ("requests from 127.0.0.1.1.1", "")
     ]  # fmt: skip
     assert len(detail(tool)) == 6
     quiet = tool._replace(row=msgspec.structs.replace(tool.row, net_ids=[], last_error=""))
-    assert detail(quiet)[1] == ("nothing asked yet", "")
+    assert detail(quiet)[1] == ("no requests yet", "")
     (warning,) = lines(View.WARNINGS, [ROUTER], "")
     assert detail(warning) == [(ROUTER.routes.warnings[0], "down")]
     assert detail(None) == []
