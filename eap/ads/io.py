@@ -159,7 +159,7 @@ class MasterSpace(AdsSpace):
         return _pair(self._slave(offset))[:length]
 
     def write(self, group: int, offset: int, data: bytes) -> None:
-        """Ask for a state, of the master by the offset, of a slave by the two octets written."""
+        """Ask for a state, of the master by the offset, of a slave by the two bytes written."""
         if group == IndexGroup.MASTER_STATE:
             self._master.request_state(_al_state(offset))
         elif group == IndexGroup.SLAVE_STATES:

@@ -6,7 +6,7 @@ the answer that tells its handle, that of a value on change by ``first_change_ns
 Rule 2: a sample waits for others of its client at most as long as that client allows, and less if
 a packet is full: nothing is ever dropped here, and what waits is bounded.
 Rule 3: a source that fails for good ends its notification; the client is told by a sample without
-octets, as TwinCAT does, in a packet of its own, because AdsLib skips what follows such a sample.
+bytes, as TwinCAT does, in a packet of its own, because AdsLib skips what follows such a sample.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ MAX_HANDLES = 1024
 """Notifications of one client; TwinCAT's limit as well."""
 MAX_CLIENTS = 256
 MAX_WATCHED = 0xFFFF
-"""Octets of the largest value: that of a variable."""
+"""Bytes of the largest value: that of a variable."""
 FULL_PACKET = 32 * 1024
-"""Octets of samples of one client that are sent without waiting for more."""
+"""Bytes of samples of one client that are sent without waiting for more."""
 
 # TwinCAT's variants "in context" belong to the cycle of a task; here is only one cycle for all.
 _CYCLIC = frozenset((TransMode.SERVER_CYCLE, TransMode.SERVER_CYCLE_2))

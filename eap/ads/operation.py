@@ -22,7 +22,7 @@ class ReadState(NamedTuple):
 
 
 class Read(NamedTuple):
-    """*length*: octets that the client has room for."""
+    """*length*: bytes that the client has room for."""
 
     group: int
     offset: int
@@ -30,7 +30,7 @@ class Read(NamedTuple):
 
 
 class Write(NamedTuple):
-    """*data*: as many octets as the request says."""
+    """*data*: as many bytes as the request says."""
 
     group: int
     offset: int
@@ -38,7 +38,7 @@ class Write(NamedTuple):
 
 
 class ReadWrite(NamedTuple):
-    """*length*: octets that the client has room for."""
+    """*length*: bytes that the client has room for."""
 
     group: int
     offset: int

@@ -45,11 +45,11 @@ from eap.codec.ams import AmsCommand
 from eap.errors import TruncatedError
 
 MAX_ANSWER = 1 << 20
-"""Octets of the longest answer; a sum command that asks for more is refused as a whole."""
+"""Bytes of the longest answer; a sum command that asks for more is refused as a whole."""
 MAX_ITEMS = 10_000
 """Of a sum command; Beckhoff advises 500.  Others wait while a request is taken apart."""
 _HEAD_SIZE = 8
-"""Octets of a result and of what stands beside it in the answer of a sum command."""
+"""Bytes of a result and of what stands beside it in the answer of a sum command."""
 _REASONS = 3
 """That are told of one request, for a sum command may have thousands."""
 
@@ -62,7 +62,7 @@ class AdsRequest(NamedTuple):
     sum_group: int = 0
     """Of a sum command, else 0."""
     read_length: int = 0
-    """Octets that a client has room for in the answer of a sum command."""
+    """Bytes that a client has room for in the answer of a sum command."""
     index_offset: int = 0
     """Of a sum command: how many items it has, or 0."""
 
@@ -164,7 +164,7 @@ _BEHIND_RESULT: dict[int, int] = {
     AmsCommand.ADD_NOTIFICATION: 4,
     AmsCommand.READ_WRITE: 4,
 }
-"""Octets of an answer behind its result when there is no data."""
+"""Bytes of an answer behind its result when there is no data."""
 
 
 def _parse_write(body: bytes) -> Write:
@@ -262,7 +262,7 @@ def decode_outcome(command: int, error_code: int, body: bytes) -> OperationOutco
     if error_code:
         return OperationOutcome(error_code)
     if len(body) < _RESULT_SIZE:
-        return OperationOutcome(AdsError.SIZE, why=f"an answer of {len(body)} octets")
+        return OperationOutcome(AdsError.SIZE, why=f"an answer of {len(body)} bytes")
     result = int.from_bytes(body[:_RESULT_SIZE], "little")
     data = body[_RESULT_SIZE:]
     if result:
@@ -270,18 +270,18 @@ def decode_outcome(command: int, error_code: int, body: bytes) -> OperationOutco
     if command in _WITH_LENGTH:
         length, data = int.from_bytes(data[:_LENGTH_SIZE], "little"), data[_LENGTH_SIZE:]
         if len(data) < length:
-            return OperationOutcome(AdsError.SIZE, why=f"{len(data)} octets of {length}")
+            return OperationOutcome(AdsError.SIZE, why=f"{len(data)} bytes of {length}")
         data = data[:length]
     return OperationOutcome(data=data)
 
 
 _HEAD = 8
-"""Octets of result and length in front of all answers."""
+"""Bytes of result and length in front of all answers."""
 _RESULT = 4
 _SHORT_HEADS = frozenset(
     (IndexGroup.SUM_READ, IndexGroup.SUM_WRITE, IndexGroup.SUM_DELETE_NOTIFICATION)
 )
-"""Whose items are answered by a result; those of the others by a result and four octets more."""
+"""Whose items are answered by a result; those of the others by a result and four bytes more."""
 _PADDED = frozenset((IndexGroup.SUM_READ, IndexGroup.SUM_READ_EX))
 _RETURNED = frozenset((IndexGroup.SUM_READ_WRITE, IndexGroup.SUM_READ_EX_2))
 

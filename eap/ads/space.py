@@ -14,14 +14,14 @@ from eap.ads.operation import AdsRefusedError
 from eap.codec.ads import AdsError, AdsState, AdsStates, AdsSystemState, IndexGroup
 
 Source: TypeAlias = Callable[[], bytes]
-"""Gives the octets that a notification watches, whenever it is called.
+"""Gives the bytes that a notification watches, whenever it is called.
 
 It raises AdsRefusedError: BUSY and NOT_READY for now, anything else for good.
 """
 
 
 def fixed_size_source(read: Callable[[], bytes], length: int) -> Source:
-    """Return what gives *length* octets whenever it is called; what gets longer or shorter ends it.
+    """Return what gives *length* bytes whenever it is called; what gets longer or shorter ends it.
 
     Raises:
         AdsRefusedError: there are not as many even now, or what *read* raises.
@@ -47,7 +47,7 @@ class AdsSpace:
     groups: Collection[int] = ()
 
     def read(self, group: int, offset: int, length: int) -> bytes:
-        """Return at most *length* octets; raise AdsRefusedError."""
+        """Return at most *length* bytes; raise AdsRefusedError."""
         del group, offset, length
         _refuse()
 
@@ -57,12 +57,12 @@ class AdsSpace:
         _refuse()
 
     def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
-        """Write *data* and return at most *length* octets; raise AdsRefusedError."""
+        """Write *data* and return at most *length* bytes; raise AdsRefusedError."""
         del group, offset, length, data
         _refuse()
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives exactly *length* octets of this place; raise AdsRefusedError."""
+        """Return what gives exactly *length* bytes of this place; raise AdsRefusedError."""
         del group, offset, length
         _refuse()
 

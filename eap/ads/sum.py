@@ -28,7 +28,7 @@ class SumCommand(NamedTuple):
     """One of the sum commands."""
 
     item_size: int
-    """Octets that each item has at the front of the request."""
+    """Bytes that each item has at the front of the request."""
     split: Callable[[int, bytes], list[Operation]]
     join: Callable[[Sequence[Operation], Sequence[OperationOutcome]], bytes]
     is_padded: bool = False
@@ -47,14 +47,14 @@ def parse_delete(body: bytes) -> DeleteNotification:
 
 
 def read_exactly(data: bytes, start: int, length: int) -> bytes:
-    """Return *length* octets from *start*; refuse with SIZE if there are fewer."""
+    """Return *length* bytes from *start*; refuse with SIZE if there are fewer."""
     if len(data) - start < length:
         raise AdsRefusedError(AdsError.SIZE)
     return bytes(data[start : start + length])
 
 
 def requested_length(operation: Operation) -> int:
-    """Return how many octets a client has room for."""
+    """Return how many bytes a client has room for."""
     return operation.length if isinstance(operation, Read | ReadWrite) else 0
 
 

@@ -54,7 +54,7 @@ class SymbolType(NamedTuple):
     name: str
     """As IEC 61131-3 writes it."""
     size: int
-    """Octets for a client."""
+    """Bytes for a client."""
 
     def describe(self) -> list[DataTypeEntry]:
         """Return what clients may want to know of this type, and of its elements."""
@@ -75,7 +75,7 @@ class SymbolType(NamedTuple):
         return self._resized(octets, _element(self.kind).size, self.size // self.kind.count)
 
     def from_client(self, data: bytes) -> bytes:
-        """Return the octets of our type for what a client writes.
+        """Return the bytes of our type for what a client writes.
 
         Raises:
             AdsRefusedError: SIZE or VALUE.
@@ -148,7 +148,7 @@ _INDEX_BITS = 24
 _UTF_8 = (("TcEncoding", "UTF-8"),)
 """Attribute of texts; clients take those without for texts in the code page of TwinCAT."""
 _ALIGNMENT = 8
-"""Octets: no value of a client's lies across what its processor reads at once."""
+"""Bytes: no value of a client's lies across what its processor reads at once."""
 
 
 class SymbolVariable(NamedTuple):
@@ -275,10 +275,10 @@ class VariableStore(Protocol):
     """Where the values are; both methods raise AdsRefusedError, BUSY if it is only for now."""
 
     def read(self, name: str) -> bytes:
-        """Return the octets of a value, as its type has them."""
+        """Return the bytes of a value, as its type has them."""
 
     def write(self, name: str, octets: bytes) -> None:
-        """Store the octets of a value."""
+        """Store the bytes of a value."""
 
 
 class SymbolSpace(AdsSpace):
@@ -369,7 +369,7 @@ class SymbolSpace(AdsSpace):
         return _whole(symbol.describe(), length)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives a value, the first *length* octets of it, or the version."""
+        """Return what gives a value, the first *length* bytes of it, or the version."""
         if group == IndexGroup.SYMBOL_VERSION:
             if length != 1:
                 raise AdsRefusedError(AdsError.SIZE)

@@ -79,7 +79,7 @@ class Pending:
         header: As it came.
         endpoint: Where it came from and its answer goes; None when nobody waits any more.
         route: How it went on; None to a service of this station.
-        onward: Source and target of the packet that went on, 16 octets.
+        onward: Source and target of the packet that went on, 16 bytes.
         at_ns: When it came.
         deadline_ns: When its time is up.
         handles: How many notifications it asks for.

@@ -31,7 +31,7 @@ class OversizedPacket(NamedTuple):
 
     header: AmsHeader
     length: int
-    """Of the whole packet in octets, as its prefix says."""
+    """Of the whole packet in bytes, as its prefix says."""
 
 
 class RouterRequest(NamedTuple):
@@ -45,7 +45,7 @@ StreamItem: TypeAlias = bytes | OversizedPacket | RouterRequest
 
 _COMMANDS = frozenset(RouterCommand)
 _LONGEST_COMMAND = 16
-"""Octets behind the prefix of one."""
+"""Bytes behind the prefix of one."""
 
 
 class AmsStreamDecoder:
@@ -54,7 +54,7 @@ class AmsStreamDecoder:
     It never holds more than one packet of the limit, one prefix, and what came last.
 
     Args:
-        limit: Octets of the longest packet that is taken.
+        limit: Bytes of the longest packet that is taken.
     """
 
     def __init__(self, limit: int) -> None:
@@ -77,7 +77,7 @@ class AmsStreamDecoder:
         """Return the packet if *data* is exactly one, as it mostly is; else take what came."""
         start = AmsTcpHeader.SIZE
         end = len(data)
-        # The limit is below 4 GB and no packet is empty, so these octets are the whole prefix.
+        # The limit is below 4 GB and no packet is empty, so these bytes are the whole prefix.
         if (
             not self._buffer
             and not self._skip
@@ -139,21 +139,21 @@ FRAGMENT_TIMEOUT_NS = 2_000_000_000
 MAX_PACKETS = 8
 """Packets of which fragments are kept at a time; the oldest makes room."""
 MAX_LENGTH = 1 << 20
-"""Octets of the longest packet that is put together."""
+"""Bytes of the longest packet that is put together."""
 _ADDRESSES = 16
-"""Octets of a header that every fragment repeats."""
+"""Bytes of a header that every fragment repeats."""
 _REST = AmsHeader.SIZE - _ADDRESSES
 
 
 def iter_fragments(packet: bytes, number: int, max_size: int) -> Iterator[bytes]:
-    """Yield the packets that carry *packet*, each with at most *max_size* octets of it.
+    """Yield the packets that carry *packet*, each with at most *max_size* bytes of it.
 
     Nobody acknowledges them.
 
     Args:
         packet: A whole packet.
         number: Of the packet, another one for each; 16 bits count.
-        max_size: Octets behind the header of each.
+        max_size: Bytes behind the header of each.
     """
     header = AmsHeader.decode(packet)
     content = packet[_ADDRESSES:]
@@ -234,7 +234,7 @@ class FragmentAssembler:
         missing = _missing(partial.content)
         if missing < 0:
             self._drop(key)
-            raise MalformedError(f"packet {number} is {-missing} octets too long",
+            raise MalformedError(f"packet {number} is {-missing} bytes too long",
                                  layout="AmsHeader")  # fmt: skip
         if missing:
             return ReassemblyResult(None, _acknowledge(header))
@@ -264,7 +264,7 @@ class FragmentAssembler:
 
 
 def _missing(content: bytearray) -> int:
-    """Return how many octets are still to come; at least one while nobody can know."""
+    """Return how many bytes are still to come; at least one while nobody can know."""
     if len(content) < _REST:
         return _REST - len(content)
     length = int.from_bytes(content[4:8], "little")
@@ -290,7 +290,7 @@ def _acknowledge(header: AmsHeader) -> bytes | None:
 MAX_SENDERS = 64
 """Ways that fragments are kept of at a time; the one that began first makes room."""
 MAX_OCTETS = 16 << 20
-"""Octets kept in all; the sender whose fragment is too much loses what it has sent."""
+"""Bytes kept in all; the sender whose fragment is too much loses what it has sent."""
 
 
 class Reassembly:
@@ -310,7 +310,7 @@ class Reassembly:
 
     @property
     def octets(self) -> int:
-        """Octets that are kept."""
+        """Bytes that are kept."""
         return self._octets
 
     def receive(
@@ -331,7 +331,7 @@ class Reassembly:
         if self._octets > MAX_OCTETS:
             self._drop(endpoint)
             raise MalformedError(
-                f"{MAX_OCTETS} octets of fragments are kept already", layout="AmsHeader"
+                f"{MAX_OCTETS} bytes of fragments are kept already", layout="AmsHeader"
             )
         return taken
 

@@ -69,8 +69,8 @@ class Traffic(msgspec.Struct):
         requests: That went there, or came from there.
         answers: That came from there, or went there.
         errors: Requests that did not get to their targets.
-        request_bytes: Octets of the requests.
-        answer_bytes: Octets of the answers.
+        request_bytes: Bytes of the requests.
+        answer_bytes: Bytes of the answers.
         round_trip_ns: Of the latest answer.
         last_error: In words.
         sources: NetIDs that asked, the first of them.

@@ -194,7 +194,7 @@ def _advise_on_route(
 MAX_FURTHER = 16
 """Routers that a question is handed on to; more are no way that anybody means."""
 MAX_REPORT = 4096
-"""Octets."""
+"""Bytes."""
 
 
 class HopQuestion(WireStruct, frozen=True):

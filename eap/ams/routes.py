@@ -1,6 +1,6 @@
 """Routes: by which door and to which address a NetID is reached.
 
-The route with the longest match is taken: all six octets, five, four, then a default route.  Of two
+The route with the longest match is taken: all six bytes, five, four, then a default route.  Of two
 that match alike the one of the plant file comes first, then those that were added; among equals the
 older one.  A learned route is taken only where none of these matches, however well it does itself,
 but before a default route: whoever tells of a NetID must not draw packets away from where they
@@ -49,7 +49,7 @@ class Route(msgspec.Struct, frozen=True):
         name: As people call it.
         hop: Transport and address that packets go to.
         origin: Who says so.
-        octets: How many octets of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
+        octets: How many bytes of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
             default route.
         is_unidirectional: Whether nothing may be asked from there.
         expires_at_ns: When it is forgotten; None for never.
@@ -63,7 +63,7 @@ class Route(msgspec.Struct, frozen=True):
             connections of its own and does not listen.
 
     Raises:
-        ValueError: a number of octets that cannot be, or a virtual NetID of a default route.
+        ValueError: a number of bytes that cannot be, or a virtual NetID of a default route.
     """
 
     net_id: NetId
@@ -81,7 +81,7 @@ class Route(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         if self.octets not in _LEVELS:
-            raise ValueError(f"{self.name}: {self.octets} octets to match, expected 6, 5, 4 or 0")
+            raise ValueError(f"{self.name}: {self.octets} bytes to match, expected 6, 5, 4 or 0")
         if self.real is not None and not self.octets:
             raise ValueError(f"{self.name}: a default route has no virtual NetID")
 
@@ -197,7 +197,7 @@ class RouteTable:
         return True
 
     def find(self, target: NetId) -> tuple[Route, int] | None:
-        """Return the route to *target*, and how many octets of its NetID match."""
+        """Return the route to *target*, and how many bytes of its NetID match."""
         by_prefix = self._by_prefix
         learned = None
         for level in _LEVELS:

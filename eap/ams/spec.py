@@ -66,7 +66,7 @@ class RouteSpec(SpecStruct, frozen=True, kw_only=True):
         name: As people call it: a station, or what the plant file says.
         net_id: Of the station, as it really is there; 0.0.0.0.0.0 for a default route.
         hop: Where packets for it go.
-        octets: How many octets of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
+        octets: How many bytes of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
             default route.
         router: NetID of the router at the next hop, which is asked whether it is alive; empty if
             that is not known.
@@ -135,7 +135,7 @@ class ObjectRange(SpecStruct, frozen=True):
 
 
 class AccessTarget(SpecStruct, frozen=True):
-    """Whoever is behind a NetID, given by its first four, five or all six octets.
+    """Whoever is behind a NetID, given by its first four, five or all six bytes.
 
     *port* is None for all its AMS ports.
     """
@@ -154,7 +154,7 @@ class AccessRule(SpecStruct, frozen=True):
         allow: Whether it grants or refuses.
         networks: IPv4 networks that a connection comes from (``10.0.0.0/24``).
         macs: MAC addresses that frames come from on Ethernet; who is in one of the two fits.
-        net_ids: Source NetIDs, by their first four, five or all six octets; they prove nothing.
+        net_ids: Source NetIDs, by their first four, five or all six bytes; they prove nothing.
         transports: Names (``mqtt:line``) or kinds (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
             ``mqtt``, ``local``).
         targets: What is asked.

@@ -128,7 +128,7 @@ class IndexGroup(IntEnum):
     RAW_COMMAND = 0x002C
     """An EtherCAT command for the bus, there and back."""
     SYSTEM_STATE = 0x00F0
-    """Of the system service: states, version and platform in 16 octets."""
+    """Of the system service: states, version and platform in 16 bytes."""
     DATA = 0x4040
     """The memory of variables; where each lies is told by its symbol."""
     IO_DEVICES = 0x5000
@@ -164,7 +164,7 @@ class IndexGroup(IntEnum):
     ENTRY_DESCRIPTION = 0xF3FE
     """Offset: index in the high word, bits 8 to 15 value info, bits 0 to 7 subindex."""
     FOE_OPEN_READ = 0xF401
-    """ReadWrite, offset: a password; a file name is written, a handle of four octets read."""
+    """ReadWrite, offset: a password; a file name is written, a handle of four bytes read."""
     FOE_OPEN_WRITE = 0xF402
     """Likewise."""
     FOE_CLOSE = 0xF403
@@ -181,7 +181,7 @@ class IndexGroup(IntEnum):
 
 
 class AdsRange(WireStruct, frozen=True):
-    """Request of Read, and the head of a Write before its data; *length* is in octets."""
+    """Request of Read, and the head of a Write before its data; *length* is in bytes."""
 
     group: u32
     offset: u32
@@ -189,7 +189,7 @@ class AdsRange(WireStruct, frozen=True):
 
 
 class SdoOffset(WireStruct, frozen=True):
-    """The offset that names an entry at SDO; ``encode`` gives its four octets.
+    """The offset that names an entry at SDO; ``encode`` gives its four bytes.
 
     *is_slow* allows a slave ten times as long, which Ads.h calls an extended time-out.
     """
@@ -215,7 +215,7 @@ class SoeOffset(WireStruct, frozen=True):
 
 
 class AdsReadWrite(WireStruct, frozen=True):
-    """Head of a ReadWrite before the data that it writes; lengths are in octets."""
+    """Head of a ReadWrite before the data that it writes; lengths are in bytes."""
 
     group: u32
     offset: u32
@@ -240,7 +240,7 @@ class AdsStates(WireStruct, frozen=True):
 
 
 class AdsWriteControl(WireStruct, frozen=True):
-    """Head of a WriteControl before its data; *length* is in octets."""
+    """Head of a WriteControl before its data; *length* is in bytes."""
 
     ads_state: u16
     device_state: u16
@@ -269,5 +269,5 @@ def encode_result(result: int, data: bytes | None = None) -> bytes:
 
 
 def device_name(text: str) -> bytes:
-    """Return as much of *text* as ReadDeviceInfo has room for, 15 octets and a NUL at the end."""
+    """Return as much of *text* as ReadDeviceInfo has room for, 15 bytes and a NUL at the end."""
     return text.encode("latin-1", "replace")[:15].ljust(16, b"\0")

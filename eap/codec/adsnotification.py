@@ -35,7 +35,7 @@ class TransMode(IntEnum):
 
 
 class AddNotification(WireStruct, frozen=True):
-    """Request of AddDeviceNotification; *length* in octets, *max_delay* and *cycle* in 100 ns."""
+    """Request of AddDeviceNotification; *length* in bytes, *max_delay* and *cycle* in 100 ns."""
 
     group: u32
     offset: u32
@@ -47,7 +47,7 @@ class AddNotification(WireStruct, frozen=True):
 
 
 class _PacketHead(WireStruct, frozen=True):
-    """*length* counts the octets behind it."""
+    """*length* counts the bytes behind it."""
 
     length: u32
     stamps: u32
@@ -71,7 +71,7 @@ class Sample(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Octets in a packet."""
+        """Bytes in a packet."""
         return _SampleHead.SIZE + len(self.data)
 
 
@@ -121,7 +121,7 @@ def decode_notification(data: Buffer) -> list[Stamp]:
     # Its length is not looked at: servers disagree on whether it counts itself.
     if at != len(data):
         raise MalformedError(
-            f"{len(data)} octets, but the samples end at {at}", layout="DeviceNotification"
+            f"{len(data)} bytes, but the samples end at {at}", layout="DeviceNotification"
         )
     return stamps
 
@@ -132,7 +132,7 @@ def _decode_sample(data: Buffer, at: int) -> tuple[Sample, int]:
     octets = bytes(data[start : start + head.size])
     if len(octets) < head.size:
         raise TruncatedError(
-            f"sample of {head.size} octets, but {len(octets)} follow",
+            f"sample of {head.size} bytes, but {len(octets)} follow",
             layout="DeviceNotification",
             offset=at,
         )

@@ -17,11 +17,11 @@ CODE_PAGE = 1252
 _ENCODING = f"cp{CODE_PAGE}"
 """TwinCAT's, for names, types and comments."""
 MAX_TEXT = 255
-"""Octets of a name, type or comment: clients have room for 256 with the NUL."""
+"""Bytes of a name, type or comment: clients have room for 256 with the NUL."""
 
 
 class AdsType(IntEnum):
-    """ADSDATATYPEID: how the octets of a value are meant."""
+    """ADSDATATYPEID: how the bytes of a value are meant."""
 
     VOID = 0
     INT16 = 2
@@ -51,7 +51,7 @@ class SymbolFlag(IntFlag):
 
 
 class SymbolAddress(WireStruct, frozen=True):
-    """AdsSymbolInfoByName: where a value is; *size* in octets."""
+    """AdsSymbolInfoByName: where a value is; *size* in bytes."""
 
     group: u32
     offset: u32
@@ -59,9 +59,9 @@ class SymbolAddress(WireStruct, frozen=True):
 
 
 class UploadInfo(WireStruct, frozen=True):
-    """What SYM_UPLOADINFO2 tells; the first two fields are SYM_UPLOADINFO.  Sizes in octets.
+    """What SYM_UPLOADINFO2 tells; the first two fields are SYM_UPLOADINFO.  Sizes in bytes.
 
-    Clients that know of its third version ask for 64 octets: there *invalid_dynamic*,
+    Clients that know of its third version ask for 64 bytes: there *invalid_dynamic*,
     *code_page* of names and comments, *upload_flags* and seven reserved numbers follow, as the
     open client ads-client reads them.
     """
@@ -74,7 +74,7 @@ class UploadInfo(WireStruct, frozen=True):
     used_dynamic: u32 = 0
 
     def encode_for(self, length: int) -> bytes:
-        """Return the newest version that a client has room for in *length* octets."""
+        """Return the newest version that a client has room for in *length* bytes."""
         octets = self.encode()
         if length >= _INFO_3_SIZE:
             return (octets + _InfoTail(0, CODE_PAGE).encode()).ljust(_INFO_3_SIZE, b"\0")
@@ -131,7 +131,7 @@ class SymbolEntry(NamedTuple):
 
 
 def encode_entry(entry: SymbolEntry) -> bytes:
-    """Return an entry with its texts, each cut to MAX_TEXT octets and ended by a NUL."""
+    """Return an entry with its texts, each cut to MAX_TEXT bytes and ended by a NUL."""
     texts = [encode_text(text) for text in (entry.name, entry.type_name, entry.comment)]
     lengths = [len(text) for text in texts]
     address = entry.address
@@ -171,13 +171,13 @@ def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
     lengths = (head.name_length, head.type_length, head.comment_length)
     if head.entry_length < _SymbolHead.SIZE + sum(lengths) + len(lengths):
         raise MalformedError(
-            f"{head.entry_length} octets do not hold texts of {lengths}",
+            f"{head.entry_length} bytes do not hold texts of {lengths}",
             layout="AdsSymbolEntry",
             offset=offset,
         )
     if end > len(data):
         raise TruncatedError(
-            f"{head.entry_length} octets, but {len(data) - offset} follow",
+            f"{head.entry_length} bytes, but {len(data) - offset} follow",
             layout="AdsSymbolEntry",
             offset=offset,
         )
@@ -241,7 +241,7 @@ class DataTypeEntry(NamedTuple):
     type: int
     """Id of the type, or of the elements."""
     size: int
-    """Octets."""
+    """Bytes."""
     element: str = ""
     """Name of the elements' type; empty if it is no list."""
     elements: int = 0

@@ -63,7 +63,7 @@ class AmsHeader(WireStruct, frozen=True):
 
     *command* stays a number when :class:`AmsCommand` does not know it: a router passes such a
     packet on, and its target answers that it does not know the service.  *length* is the number of
-    octets behind the header, *invoke_id* pairs a response with its request.
+    bytes behind the header, *invoke_id* pairs a response with its request.
     """
 
     target: net_id
@@ -78,16 +78,16 @@ class AmsHeader(WireStruct, frozen=True):
 
 
 def decode_packet(data: Buffer, offset: int = 0) -> tuple[AmsHeader, memoryview]:
-    """Return header and data of the packet at *offset*; surplus octets behind it are ignored.
+    """Return header and data of the packet at *offset*; surplus bytes behind it are ignored.
 
-    Raises TruncatedError if fewer octets follow than the header says.
+    Raises TruncatedError if fewer bytes follow than the header says.
     """
     header = AmsHeader.decode(data, offset)
     start = offset + AmsHeader.SIZE
     body = memoryview(data)[start : start + header.length]
     if len(body) < header.length:
         raise TruncatedError(
-            f"length {header.length}, but {len(body)} octets follow",
+            f"length {header.length}, but {len(body)} bytes follow",
             layout="AmsHeader",
             offset=offset,
         )
@@ -129,7 +129,7 @@ class RouterCommand(IntEnum):
 
 
 class AmsTcpHeader(WireStruct, frozen=True):
-    """Beckhoff ADS specification, AMS/TCP header; *length* counts the octets of the packet.
+    """Beckhoff ADS specification, AMS/TCP header; *length* counts the bytes of the packet.
 
     *reserved* is 0 in front of a packet; behind a :class:`RouterCommand` there is no AMS header.
     """
@@ -139,7 +139,7 @@ class AmsTcpHeader(WireStruct, frozen=True):
 
 
 def decode_prefix(data: Buffer, offset: int = 0) -> int:
-    """Return how many octets the packet has whose prefix is at *offset*.
+    """Return how many bytes the packet has whose prefix is at *offset*.
 
     Raises:
         TruncatedError: the prefix is not whole.

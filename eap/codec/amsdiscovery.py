@@ -37,7 +37,7 @@ class Tag(IntEnum):
     """32 bits, as in ADS."""
     PASSWORD = 2
     VERSION = 3
-    """Of the router: two octets and 16 bits."""
+    """Of the router: two bytes and 16 bits."""
     HOST = 5
     NET_ID = 7
     OPTIONS = 9
@@ -62,7 +62,7 @@ class DiscoveryHeader(WireStruct, frozen=True):
 
 
 class TagHeader(WireStruct, frozen=True):
-    """What each tag begins with; *length* octets follow."""
+    """What each tag begins with; *length* bytes follow."""
 
     id: u16
     length: u16
@@ -80,7 +80,7 @@ class Discovery(NamedTuple):
 
 
 def decode_discovery(data: Buffer) -> Discovery:
-    """Read a datagram; surplus octets behind its tags are ignored.
+    """Read a datagram; surplus bytes behind its tags are ignored.
 
     Raises:
         TruncatedError: there are fewer tags than it says, or one is cut.
@@ -92,12 +92,12 @@ def decode_discovery(data: Buffer) -> Discovery:
             f"cookie is 0x{header.cookie:08x}, expected 0x{COOKIE:08x}", layout="DiscoveryHeader"
         )
     tags, at = [], DiscoveryHeader.SIZE
-    for _ in range(header.count):  # each takes octets, so there are never more than those allow
+    for _ in range(header.count):  # each takes bytes, so there are never more than those allow
         tag = TagHeader.decode(data, at)
         at += TagHeader.SIZE
         if len(data) - at < tag.length:
             raise TruncatedError(
-                f"length {tag.length}, but {len(data) - at} octets follow",
+                f"length {tag.length}, but {len(data) - at} bytes follow",
                 layout="TagHeader",
                 offset=at - TagHeader.SIZE,
             )
@@ -109,7 +109,7 @@ def decode_discovery(data: Buffer) -> Discovery:
 def encode_discovery(header: DiscoveryHeader, tags: Iterable[tuple[int, bytes]] = ()) -> bytes:
     """Return a datagram; cookie and count are set.
 
-    Raises CodecError if a tag is longer than 65535 octets.
+    Raises CodecError if a tag is longer than 65535 bytes.
     """
     parts = [TagHeader(tag, len(data)).encode() + data for tag, data in tags]
     whole = DiscoveryHeader(
@@ -119,7 +119,7 @@ def encode_discovery(header: DiscoveryHeader, tags: Iterable[tuple[int, bytes]] 
 
 
 def decode_text(data: bytes) -> str:
-    """Read the text of a tag: up to its NUL if it has one, undecodable octets replaced."""
+    """Read the text of a tag: up to its NUL if it has one, undecodable bytes replaced."""
     return data.partition(b"\0")[0].decode(errors="replace")
 
 
@@ -142,7 +142,7 @@ def encode_version(text: str) -> bytes:
 
 
 def decode_version(data: bytes) -> str:
-    """Read what :func:`encode_version` returns; empty if it is not four octets."""
+    """Read what :func:`encode_version` returns; empty if it is not four bytes."""
     if len(data) != 4:
         return ""
     return f"{data[0]}.{data[1]}.{int.from_bytes(data[2:], 'little')}"

@@ -19,7 +19,7 @@ NO_MAC = MacAddr(bytes(6))
 
 _LAYOUT = struct.Struct("!HHBBH6s4s6s4s")
 SIZE = _LAYOUT.size
-"""Octets of a message; padding of the frame may follow."""
+"""Bytes of a message; padding of the frame may follow."""
 
 _HARDWARE = (1, 6)  # some bridges write 6, IEEE 802, and mean the same addresses
 _IPV4 = 0x0800
@@ -54,7 +54,7 @@ class ArpMessage(NamedTuple):
         except struct.error:
             there = max(0, len(data) - offset)
             raise TruncatedError(
-                f"needs {SIZE} octets, but {there} follow", layout="ArpMessage", offset=offset
+                f"needs {SIZE} bytes, but {there} follow", layout="ArpMessage", offset=offset
             ) from None
         if hardware not in _HARDWARE or protocol != _IPV4 or sizes != [6, 4]:
             raise MalformedError(
@@ -72,7 +72,7 @@ class ArpMessage(NamedTuple):
         )
 
     def encode(self) -> bytes:
-        """Return the 28 octets behind the Ethernet header."""
+        """Return the 28 bytes behind the Ethernet header."""
         return _LAYOUT.pack(
             _HARDWARE[0],
             _IPV4,

@@ -1,6 +1,6 @@
 """CoE messages: the CoE header, SDO services and SDO information (ETG.1000.6).
 
-An SDO goes *expedited* (up to 4 octets, within the header), *normal* (all data in one message) or
+An SDO goes *expedited* (up to 4 bytes, within the header), *normal* (all data in one message) or
 *segmented* (the rest in messages with a toggle bit).  Nothing here knows more than one message.
 """
 
@@ -30,7 +30,7 @@ class CoeService(IntEnum):
 
 
 class CoeHeader(WireStruct, frozen=True):
-    """ETG.1000.6: the two octets behind the mailbox header; *number* is that of a PDO, else 0."""
+    """ETG.1000.6: the two bytes behind the mailbox header; *number* is that of a PDO, else 0."""
 
     number: Annotated[int, Bits(9)] = 0
     reserved: bits3 = 0
@@ -66,17 +66,17 @@ _PLAIN_HEADERS = [bytes((0, number << 4)) for number in range(16)]
 
 
 EXPEDITED_SIZE = 4
-"""Octets that fit into the header of an SDO."""
+"""Bytes that fit into the header of an SDO."""
 INITIATE_OVERHEAD = 16
-"""Octets of a mailbox that the first message of a normal SDO takes before its data."""
+"""Bytes of a mailbox that the first message of a normal SDO takes before its data."""
 SEGMENT_OVERHEAD = 9
-"""Octets of a mailbox that a segment takes before its data."""
+"""Bytes of a mailbox that a segment takes before its data."""
 SEGMENT_MINIMUM = 7
-"""Octets of a segment at least; in one with fewer the rest is padding."""
+"""Bytes of a segment at least; in one with fewer the rest is padding."""
 
 
 class SdoRequest(IntEnum):
-    """Client command specifier: bits 5 to 7 of the first octet of a request."""
+    """Client command specifier: bits 5 to 7 of the first byte of a request."""
 
     DOWNLOAD_SEGMENT = 0
     DOWNLOAD = 1
@@ -86,7 +86,7 @@ class SdoRequest(IntEnum):
 
 
 class SdoResponse(IntEnum):
-    """Server command specifier: bits 5 to 7 of the first octet of a response."""
+    """Server command specifier: bits 5 to 7 of the first byte of a response."""
 
     UPLOAD_SEGMENT = 0
     DOWNLOAD_SEGMENT = 1
@@ -99,7 +99,7 @@ class SdoHeader(WireStruct, frozen=True):
     """ETG.1000.6, initiate and abort SDO.
 
     *value* is the data of an expedited SDO, the size of a normal one or the code of an abort.  In
-    an expedited SDO *unused* of its octets do not count, unless *has_size* is 0: then nobody said.
+    an expedited SDO *unused* of its bytes do not count, unless *has_size* is 0: then nobody said.
     """
 
     has_size: bit
@@ -119,13 +119,13 @@ class SdoHeader(WireStruct, frozen=True):
 
 
 _HEAD = struct.Struct("<BHB")
-"""The octets of a header in front of its value, for what is sent most, in one step."""
+"""The bytes of a header in front of its value, for what is sent most, in one step."""
 _EXPEDITED = 0b11
 """With data in the header, of which the size is said."""
 
 
 class SdoSegmentHeader(WireStruct, frozen=True):
-    """ETG.1000.6, SDO segment: *unused* counts only where fewer than 7 octets of data follow."""
+    """ETG.1000.6, SDO segment: *unused* counts only where fewer than 7 bytes of data follow."""
 
     last: bit = 0
     unused: bits3 = 0
@@ -144,7 +144,7 @@ def encode_initiate(
 ) -> bytes:
     """Return the first message of a transfer that carries data, without CoE header.
 
-    One to four octets go expedited; else the size, and as many octets of *data* as *room* allows.
+    One to four bytes go expedited; else the size, and as many bytes of *data* as *room* allows.
     """
     size = len(data)
     if 0 < size <= EXPEDITED_SIZE:
@@ -207,7 +207,7 @@ class SdoInfoOpcode(IntEnum):
 
 
 class SdoInfoHeader(WireStruct, frozen=True):
-    """ETG.1000.6: the four octets behind the CoE header of every SDO information message."""
+    """ETG.1000.6: the four bytes behind the CoE header of every SDO information message."""
 
     opcode: Annotated[SdoInfoOpcode, Bits(7, SdoInfoOpcode)]
     incomplete: bit = 0
@@ -303,7 +303,7 @@ class EntryDescription(msgspec.Struct, frozen=True):
             offset += length
         if offset > len(body):
             raise TruncatedError(
-                f"value info 0x{head.value_info:02x} needs {offset} octets, these are {len(body)}",
+                f"value info 0x{head.value_info:02x} needs {offset} bytes, these are {len(body)}",
                 layout="EntryDescription",
             )
         unit = None if parts[0] is None else int.from_bytes(parts[0], "little")

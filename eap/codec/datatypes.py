@@ -16,7 +16,7 @@ from eap.suggest import suggest
 __all__ = ["MAX_SIZE", "DataType", "PdoLayout", "Plain", "Value", "layout", "parse"]
 
 MAX_SIZE = 0xFFFF
-"""Octets of the largest variable: a PD's length is 16 bits wide."""
+"""Bytes of the largest variable: a PD's length is 16 bits wide."""
 
 
 def _integer(name: str, code: int, bits: int, *, signed: bool = False) -> DataType:
@@ -121,7 +121,7 @@ def _scalar(text: str, name: str, length: str | None) -> DataType:
         )
         raise ValueError(f"{text!r} is not a data type{hint}")
     if length is None:
-        raise ValueError(f"{text!r} lacks its length in octets, such as {name}(16)")
+        raise ValueError(f"{text!r} lacks its length in bytes, such as {name}(16)")
     _check_size(text, int(length))
     return _SIZED[name](int(length))
 
@@ -144,7 +144,7 @@ def _array(text: str, element: DataType, count: int) -> DataType:
 
 def _check_size(text: str, size: int) -> None:
     if not 0 < size <= MAX_SIZE:
-        raise ValueError(f"{text!r} has {size} octets, expected 1 to {MAX_SIZE}")
+        raise ValueError(f"{text!r} has {size} bytes, expected 1 to {MAX_SIZE}")
 
 
 class PdoLayout(NamedTuple):

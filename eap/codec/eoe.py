@@ -13,9 +13,9 @@ from eap.errors import CodecError, TruncatedError
 from eap.ids import MacAddr
 
 DATA_OVERHEAD = 10
-"""Octets of a mailbox that a fragment takes before its data."""
+"""Bytes of a mailbox that a fragment takes before its data."""
 FRAGMENT_UNIT = 32
-"""Every fragment but the last is a multiple of so many octets."""
+"""Every fragment but the last is a multiple of so many bytes."""
 NAME_SIZE = 32
 
 
@@ -77,7 +77,7 @@ class EoeHeader(WireStruct, frozen=True):
 class FragmentWord(WireStruct, frozen=True):
     """ETG.1000.6: the second word of a fragment.
 
-    *offset* counts units of 32 octets; in fragment 0 it is the size of the whole frame in them,
+    *offset* counts units of 32 bytes; in fragment 0 it is the size of the whole frame in them,
     rounded up.  *frame* numbers the frames from 0 to 15.
     """
 
@@ -116,7 +116,7 @@ class IpSettings(msgspec.Struct, frozen=True):
     name: str | None = None
 
     def encode(self) -> bytes:
-        """Return the body of a message; raise CodecError if the name is longer than 32 octets.
+        """Return the body of a message; raise CodecError if the name is longer than 32 bytes.
 
         Addresses lie the other way round than IP has them: as 32-bit numbers.
         """
@@ -175,7 +175,7 @@ def _name(name: str | None) -> bytes | None:
     octets = name.encode()
     if len(octets) > NAME_SIZE:
         raise CodecError(
-            f"{name!r} has {len(octets)} octets, expected at most {NAME_SIZE}", layout="IpSettings"
+            f"{name!r} has {len(octets)} bytes, expected at most {NAME_SIZE}", layout="IpSettings"
         )
     return octets.ljust(NAME_SIZE, b"\0")
 

@@ -27,7 +27,7 @@ class FrameType(IntEnum):
 
 
 class EtherCatHeader(WireStruct, frozen=True):
-    """ETG.1000.4: the two octets behind EtherType 0x88A4, the UDP header or a TCP boundary."""
+    """ETG.1000.4: the two bytes behind EtherType 0x88A4, the UDP header or a TCP boundary."""
 
     length: bits11
     reserved: bit = 0

@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 from eap.codec.wire import Buffer, Scalar, WireStruct, u8, u32
 
 DATA_OVERHEAD = 12
-"""Octets of a mailbox that a DATA message takes before its data."""
+"""Bytes of a mailbox that a DATA message takes before its data."""
 PASSWORD_MAX = 0xFFFFFFFF
 
 
@@ -67,7 +67,7 @@ def name_of(code: int) -> str:
 
 
 class FoeHeader(WireStruct, frozen=True):
-    """ETG.1000.6: the six octets behind the mailbox header.
+    """ETG.1000.6: the six bytes behind the mailbox header.
 
     *number* is a password, a packet number, an error code, or how far a busy peer is.
     """

@@ -30,7 +30,7 @@ class MailboxType(IntEnum):
 
 
 class MailboxHeader(WireStruct, frozen=True):
-    """ETG.1000.4: the six octets in front of every mailbox message.
+    """ETG.1000.4: the six bytes in front of every mailbox message.
 
     *address* is a slave's station address, 0 the master or station itself.  *counter* runs from 1
     to 7 and detects repeats; 0 means no detection.
@@ -94,10 +94,10 @@ class MailboxErrorReply(WireStruct, frozen=True):
 
 
 def decode_message(data: Buffer, offset: int = 0) -> tuple[MailboxHeader, memoryview]:
-    """Return header and data of the message at *offset*; surplus octets behind it are ignored.
+    """Return header and data of the message at *offset*; surplus bytes behind it are ignored.
 
     Raises:
-        TruncatedError: fewer octets follow than the header says.
+        TruncatedError: fewer bytes follow than the header says.
         MalformedError: nobody knows the protocol.
     """
     header = MailboxHeader.decode(data, offset)
@@ -105,7 +105,7 @@ def decode_message(data: Buffer, offset: int = 0) -> tuple[MailboxHeader, memory
     body = memoryview(data)[start : start + header.length]
     if len(body) < header.length:
         raise TruncatedError(
-            f"length {header.length}, but {len(body)} octets follow",
+            f"length {header.length}, but {len(body)} bytes follow",
             layout="MailboxHeader",
             offset=offset,
         )
@@ -134,7 +134,7 @@ def decode_frame(data: Buffer) -> tuple[MailboxHeader, memoryview]:
     end = EtherCatHeader.SIZE + ethercat.length
     if end > len(data):
         raise TruncatedError(
-            f"length {ethercat.length}, but {len(data) - EtherCatHeader.SIZE} octets follow",
+            f"length {ethercat.length}, but {len(data) - EtherCatHeader.SIZE} bytes follow",
             layout="EtherCatHeader",
         )
     return decode_message(memoryview(data)[:end], EtherCatHeader.SIZE)
@@ -156,7 +156,7 @@ def encode_message(header: MailboxHeader, body: Buffer) -> bytes:
 def encode_frame(header: MailboxHeader, body: Buffer) -> bytes:
     """Return a whole frame of type 5; the lengths are set from *body*.
 
-    Raises CodecError if *body* is too long for the 11 bits of the frame's Length (2041 octets).
+    Raises CodecError if *body* is too long for the 11 bits of the frame's Length (2041 bytes).
     """
     message = encode_message(header, body)
     return EtherCatHeader(len(message), type=FrameType.MAILBOX).encode() + message

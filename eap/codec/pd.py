@@ -45,7 +45,7 @@ FIRST_PD = PD_FRAME_START + PdFrameHeader.SIZE
 CYCLE_OFFSET = PD_FRAME_START + 8
 """Offset of the cycle counter in a frame."""
 EAP_SM_OFFSET = PD_FRAME_START + 11
-"""Offset of the EAP SM octet in a frame."""
+"""Offset of the EAP SM byte in a frame."""
 
 
 def decode_frame_header(data: Buffer) -> PdFrameHeader:
@@ -60,14 +60,14 @@ def decode_frame_header(data: Buffer) -> PdFrameHeader:
         raise MalformedError(f"frame type {ethercat.type}, expected 4", layout="EtherCatHeader")
     if PD_FRAME_START + ethercat.length > len(data):
         raise TruncatedError(
-            f"length {ethercat.length}, but {len(data) - PD_FRAME_START} octets follow",
+            f"length {ethercat.length}, but {len(data) - PD_FRAME_START} bytes follow",
             layout="EtherCatHeader",
         )
     header = PdFrameHeader.decode(data, PD_FRAME_START)
     needed = PdFrameHeader.SIZE + header.count * PdHeader.SIZE
     if needed > ethercat.length:
         raise TruncatedError(
-            f"{header.count} PDs need at least {needed} octets, length is {ethercat.length}",
+            f"{header.count} PDs need at least {needed} bytes, length is {ethercat.length}",
             layout="PdFrameHeader",
             offset=PD_FRAME_START,
         )
@@ -77,7 +77,7 @@ def decode_frame_header(data: Buffer) -> PdFrameHeader:
 def iter_pds(data: Buffer) -> Iterator[tuple[PdHeader, memoryview]]:
     """Yield each PD of a whole frame with a view of its data; nothing is copied.
 
-    Surplus octets behind the last PD are ignored.
+    Surplus bytes behind the last PD are ignored.
 
     Raises:
         CodecError: as :func:`decode_frame_header`, or a PD reaches past the frame's Length.
@@ -92,7 +92,7 @@ def iter_pds(data: Buffer) -> Iterator[tuple[PdHeader, memoryview]]:
         payload = view[offset : offset + pd.length]
         if len(payload) < pd.length:
             raise TruncatedError(
-                f"PD {pd.pd_id} has {len(payload)} of {pd.length} octets",
+                f"PD {pd.pd_id} has {len(payload)} of {pd.length} bytes",
                 layout="PdHeader",
                 offset=offset,
             )

@@ -16,7 +16,7 @@ from eap.codec.wire import Bits, Buffer, WireStruct, bit, bits2, bits3, bits4, u
 from eap.errors import MalformedError, TruncatedError
 
 DATA_OVERHEAD = 10
-"""Octets of a mailbox that a message takes before its data."""
+"""Bytes of a mailbox that a message takes before its data."""
 MAX_DRIVE = 7
 
 
@@ -45,7 +45,7 @@ class Element(IntFlag):
 
 
 class SoeHeader(WireStruct, frozen=True):
-    """ETG.1000.6: the four octets behind the mailbox header.
+    """ETG.1000.6: the four bytes behind the mailbox header.
 
     *idn* is the number of fragments that follow this one while *incomplete* is set.
     """
@@ -61,7 +61,7 @@ class SoeHeader(WireStruct, frozen=True):
 class SoeAttribute(WireStruct, frozen=True):
     """IEC 61800-7-300, element 3 of an IDN: how its value is to be read and shown.
 
-    *length* is that of one value: 0 to 3 for 1, 2, 4 and 8 octets.
+    *length* is that of one value: 0 to 3 for 1, 2, 4 and 8 bytes.
     """
 
     factor: u16 = 1
@@ -78,7 +78,7 @@ class SoeAttribute(WireStruct, frozen=True):
 
     @property
     def size(self) -> int:
-        """Octets of one value."""
+        """Bytes of one value."""
         return 1 << self.length
 
 
@@ -113,7 +113,7 @@ COMMAND_CLEAR = 0
 
 
 class ListHead(WireStruct, frozen=True):
-    """IEC 61800-7-300: in front of a list and of every text, in octets."""
+    """IEC 61800-7-300: in front of a list and of every text, in bytes."""
 
     length: u16
     max_length: u16
@@ -175,16 +175,16 @@ def decode_message(data: Buffer) -> tuple[SoeHeader, memoryview]:
 
 
 def error_code_of(body: Buffer) -> int:
-    """Return the error code of a refusal: its last two octets; raise TruncatedError if missing."""
+    """Return the error code of a refusal: its last two bytes; raise TruncatedError if missing."""
     if len(body) < 2:
         raise TruncatedError(
-            f"an error of {len(body)} octets, expected at least 2", layout="SoeHeader"
+            f"an error of {len(body)} bytes, expected at least 2", layout="SoeHeader"
         )
     return int.from_bytes(body[-2:], "little")
 
 
 def encode_fragments(header: SoeHeader, body: Buffer, room: int) -> list[bytes]:
-    """Return the messages that carry *body*, with at most *room* octets of it in each."""
+    """Return the messages that carry *body*, with at most *room* bytes of it in each."""
     view = memoryview(body)
     pieces = [view[at : at + room] for at in range(0, len(view), room)] or [view]
     messages = []
@@ -208,7 +208,7 @@ def encode_list(octets: Buffer, max_length: int | None = None) -> bytes:
 
 
 def decode_list(body: Buffer) -> tuple[ListHead, bytes]:
-    """Return the head and the octets of a list or text.
+    """Return the head and the bytes of a list or text.
 
     Raises:
         TruncatedError: it is shorter than its head or than its head says.
@@ -218,7 +218,7 @@ def decode_list(body: Buffer) -> tuple[ListHead, bytes]:
     octets = bytes(body[ListHead.SIZE : ListHead.SIZE + head.length])
     if len(octets) < head.length:
         raise TruncatedError(
-            f"length {head.length}, but {len(octets)} octets follow", layout="ListHead"
+            f"length {head.length}, but {len(octets)} bytes follow", layout="ListHead"
         )
     if head.length > head.max_length:
         raise MalformedError(
@@ -340,10 +340,10 @@ _FLOAT = {2: "f", 3: "d"}
 
 
 def decode_value(attribute: SoeAttribute, body: Buffer) -> SoeValue:
-    """Return a value as element 7 carries it; octets behind it are ignored.
+    """Return a value as element 7 carries it; bytes behind it are ignored.
 
     Raises:
-        TruncatedError: the octets end before the value does.
+        TruncatedError: the bytes end before the value does.
         MalformedError: a list is no whole number of values, or longer than it may be.
     """
     if not attribute.is_list:
@@ -353,7 +353,7 @@ def decode_value(attribute: SoeAttribute, body: Buffer) -> SoeValue:
         return octets.rstrip(b"\0").decode(errors="replace")
     if len(octets) % attribute.size:
         raise MalformedError(
-            f"{len(octets)} octets for values of {attribute.size}", layout="SoeAttribute"
+            f"{len(octets)} bytes for values of {attribute.size}", layout="SoeAttribute"
         )
     steps = range(0, len(octets), attribute.size)
     values: list[int] | list[float] = [decode_scalar(attribute, octets[at:]) for at in steps]
@@ -364,7 +364,7 @@ def decode_scalar(attribute: SoeAttribute, body: Buffer) -> SoeScalar:
     """Return the one number that *body* begins with; raise TruncatedError if it is too short."""
     if len(body) < attribute.size:
         raise TruncatedError(
-            f"{len(body)} octets for a value of {attribute.size}", layout="SoeAttribute"
+            f"{len(body)} bytes for a value of {attribute.size}", layout="SoeAttribute"
         )
     number: SoeScalar = struct.unpack_from(_code(attribute), body)[0]
     return number
@@ -376,9 +376,9 @@ def encode_value(
     *,
     max_length: int | None = None,
 ) -> bytes:
-    """Return the octets of a value as element 7 carries it.
+    """Return the bytes of a value as element 7 carries it.
 
-    *max_length* is what the head of a list says it may grow to, in octets.  A single number is a
+    *max_length* is what the head of a list says it may grow to, in bytes.  A single number is a
     list of one where a list is due.
 
     Raises:
@@ -393,14 +393,14 @@ def encode_value(
 
 
 def encode_scalar(attribute: SoeAttribute, value: object) -> bytes:
-    """Return the octets of one number; raise ValueError if it is none that fits."""
+    """Return the bytes of one number; raise ValueError if it is none that fits."""
     code = _code(attribute)
     try:
         return struct.pack(code, value)
     except (struct.error, OverflowError):
         size = attribute.size
         raise ValueError(
-            f"{value!r} is no value of {size} octets: expected {_expected(code, 8 * size)}"
+            f"{value!r} is no value of {size} bytes: expected {_expected(code, 8 * size)}"
         ) from None
 
 

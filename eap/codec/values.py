@@ -35,15 +35,15 @@ class DataType(msgspec.Struct, frozen=True):
     """Index of the base type in the object dictionary (ETG.1020)."""
     bit_length: int
     size: int
-    """Octets in the process image."""
+    """Bytes in the process image."""
     is_bits: bool = False
-    """Whether it is packed bit by bit on the wire; in the image it has an octet of its own."""
+    """Whether it is packed bit by bit on the wire; in the image it has a byte of its own."""
     count: int = 1
     """Elements of an array, else 1."""
 
     @property
     def is_text(self) -> bool:
-        """Whether it is text, of which only as many octets count as are not NUL at the end."""
+        """Whether it is text, of which only as many bytes count as are not NUL at the end."""
         return self.code == 0x09
 
     def read(self, buffer: Buffer, offset: int) -> Value:
@@ -64,12 +64,12 @@ class DataType(msgspec.Struct, frozen=True):
         raise NotImplementedError
 
     def encode(self, value: Any) -> bytes:
-        """Return the octets of *value*; raise ValueError naming type and range if it is none."""
+        """Return the bytes of *value*; raise ValueError naming type and range if it is none."""
         raise NotImplementedError
 
     @property
     def zero(self) -> Value:
-        """The value of all octets zero."""
+        """The value of all bytes zero."""
         return self.decode(bytes(self.size), 0)
 
     @property
@@ -93,7 +93,7 @@ class DataType(msgspec.Struct, frozen=True):
 
     def _no_room(self, buffer: Buffer, offset: int) -> TruncatedError:
         return TruncatedError(
-            f"needs {self.size} octets of a buffer of {len(buffer)}",
+            f"needs {self.size} bytes of a buffer of {len(buffer)}",
             layout=self.text,
             offset=offset,
         )
@@ -106,7 +106,7 @@ class DataType(msgspec.Struct, frozen=True):
 
 
 class Integer(DataType, frozen=True):
-    """A whole number of 1 to 8 octets, or of 1 to 8 bits in an octet of its own."""
+    """A whole number of 1 to 8 bytes, or of 1 to 8 bits in a byte of its own."""
 
     signed: bool = False
 
@@ -119,7 +119,7 @@ class Integer(DataType, frozen=True):
         return 0, (1 << self.bit_length) - 1
 
     def encode(self, value: Any) -> bytes:
-        """Return the octets of any whole number in range."""
+        """Return the bytes of any whole number in range."""
         low, high = self.scalar_range
         try:
             number = index(value)
@@ -140,7 +140,7 @@ class Integer(DataType, frozen=True):
         return number
 
     def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read all octets as one number; a bit field ignores the bits beyond it."""
+        """Read all bytes as one number; a bit field ignores the bits beyond it."""
         number = int.from_bytes(buffer[offset : offset + self.size], "little", signed=self.signed)
         return number & (1 << self.bit_length) - 1 if self.is_bits else number
 
@@ -149,7 +149,7 @@ _TRUTH = {"true": True, "1": True, "on": True, "false": False, "0": False, "off"
 
 
 class Boolean(DataType, frozen=True):
-    """One bit; any octet but zero reads as true."""
+    """One bit; any byte but zero reads as true."""
 
     @property
     def scalar_range(self) -> tuple[int, int]:
@@ -157,7 +157,7 @@ class Boolean(DataType, frozen=True):
         return 0, 1
 
     def encode(self, value: Any) -> bytes:
-        """Return the octet of True, False, 1 or 0."""
+        """Return the byte of True, False, 1 or 0."""
         if not isinstance(value, int) or value not in (0, 1):
             raise self._refuse(value, "true or false")
         return bytes((value,))
@@ -170,7 +170,7 @@ class Boolean(DataType, frozen=True):
         return truth
 
     def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read any octet but zero as true."""
+        """Read any byte but zero as true."""
         return buffer[offset] != 0
 
 
@@ -182,7 +182,7 @@ _LARGEST = {
 
 
 class Real(DataType, frozen=True):
-    """An IEEE 754 number of 4 or 8 octets; infinities and NaN are values."""
+    """An IEEE 754 number of 4 or 8 bytes; infinities and NaN are values."""
 
     @property
     def scalar_range(self) -> tuple[float, float]:
@@ -190,7 +190,7 @@ class Real(DataType, frozen=True):
         return -_LARGEST[self.size], _LARGEST[self.size]
 
     def encode(self, value: Any) -> bytes:
-        """Return the octets of any number that is not too large."""
+        """Return the bytes of any number that is not too large."""
         try:
             return _FLOAT[self.size].pack(value)
         except (struct.error, OverflowError):
@@ -213,13 +213,13 @@ class Real(DataType, frozen=True):
 
 
 class String(DataType, frozen=True):
-    """Text in a fixed number of octets: UTF-8, padded with zeros, which end it on reading.
+    """Text in a fixed number of bytes: UTF-8, padded with zeros, which end it on reading.
 
-    Octets that are no UTF-8 read as U+FFFD: a peer's text never fails to be shown.
+    Bytes that are no UTF-8 read as U+FFFD: a peer's text never fails to be shown.
     """
 
     def encode(self, value: Any) -> bytes:
-        """Return the padded octets of a text that fits and has no NUL; take octets as they are."""
+        """Return the padded bytes of a text that fits and has no NUL; take bytes as they are."""
         if isinstance(value, bytes) and len(value) == self.size:
             return value
         if not isinstance(value, str):
@@ -231,7 +231,7 @@ class String(DataType, frozen=True):
         if 0 in octets:
             raise self._refuse(value, "a text without NUL, which would end it")
         if len(octets) > self.size:
-            raise self._refuse(value, f"at most {self.size} octets, this text has {len(octets)}")
+            raise self._refuse(value, f"at most {self.size} bytes, this text has {len(octets)}")
         return octets.ljust(self.size, b"\0")
 
     def parse_text(self, text: str) -> Value:
@@ -246,32 +246,32 @@ class String(DataType, frozen=True):
 
 
 class Block(DataType, frozen=True):
-    """Raw octets of a fixed number."""
+    """Raw bytes of a fixed number."""
 
     def encode(self, value: Any) -> bytes:
-        """Return the octets, which must be exactly as many as the block has."""
+        """Return the bytes, which must be exactly as many as the block has."""
         if not isinstance(value, bytes | bytearray | memoryview):
-            raise self._refuse(value, f"{self.size} octets")
+            raise self._refuse(value, f"{self.size} bytes")
         if len(value) != self.size:
-            raise self._refuse(bytes(value), f"{self.size} octets, these are {len(value)}")
+            raise self._refuse(bytes(value), f"{self.size} bytes, these are {len(value)}")
         return bytes(value)
 
     def parse_text(self, text: str) -> Value:
-        """Read hexadecimal digits, spaces between octets allowed."""
+        """Read hexadecimal digits, spaces between bytes allowed."""
         try:
             octets = bytes.fromhex(text)
         except ValueError:
-            raise self._refuse(text, f"{self.size} octets in hexadecimal") from None
+            raise self._refuse(text, f"{self.size} bytes in hexadecimal") from None
         return self.encode(octets)
 
     def from_plain(self, plain: object) -> Value:
         """Read hexadecimal digits."""
         if not isinstance(plain, str):
-            raise self._refuse(plain, f"{self.size} octets in hexadecimal")
+            raise self._refuse(plain, f"{self.size} bytes in hexadecimal")
         return self.parse_text(plain)
 
     def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Return a copy of the octets."""
+        """Return a copy of the bytes."""
         return bytes(buffer[offset : offset + self.size])
 
 
@@ -281,7 +281,7 @@ class Array(DataType, frozen=True, kw_only=True):
     element: DataType
 
     def encode(self, value: Any) -> bytes:
-        """Return the octets of a sequence of exactly as many numbers; errors name the element."""
+        """Return the bytes of a sequence of exactly as many numbers; errors name the element."""
         if not isinstance(value, Sequence) or isinstance(value, str | bytes | bytearray):
             raise self._refuse(value, f"{self.count} values")
         if len(value) != self.count:

@@ -156,7 +156,7 @@ def decode(cls, data, offset=0):
     except error:
         there = max(0, len(data) - offset)
         raise TruncatedError(
-            f"needs {{cls.SIZE}} octets, but {{there}} follow", layout=cls.__name__, offset=offset
+            f"needs {{cls.SIZE}} bytes, but {{there}} follow", layout=cls.__name__, offset=offset
         ) from None
     except ValueError as exc:
         raise MalformedError(str(exc), layout=cls.__name__, offset=offset) from None
@@ -164,7 +164,7 @@ def decode(cls, data, offset=0):
 def encode(self):
     try:
         if {unfit}:
-            raise error("a field is too large for its bits or octets")
+            raise error("a field is too large for its bits or bytes")
         return pack({", ".join(writes)})
     except (error, TypeError) as exc:
         raise CodecError(f"{{exc}} in {{self!r}}", layout=type(self).__name__) from None

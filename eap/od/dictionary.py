@@ -65,13 +65,13 @@ class ObjectDictionary:
             raise SdoAbortError(code, index, subindex) from None
 
     def upload(self, index: int, subindex: int, state: OdState) -> bytes:
-        """Return the octets of one entry as a client in *state* may read them."""
+        """Return the bytes of one entry as a client in *state* may read them."""
         entry = self.entry(index, subindex)
         _check_readable(entry, index, subindex, state)
         return entry.octets
 
     def download(self, index: int, subindex: int, data: bytes, state: OdState) -> None:
-        """Write the octets of one entry."""
+        """Write the bytes of one entry."""
         entry = self.entry(index, subindex)
         _check_writable(entry, index, subindex, state)
         check_value(entry, index, subindex, data)
@@ -89,7 +89,7 @@ class ObjectDictionary:
             limit = datatypes.layout([entry.kind for _, entry in chosen]).size + 2 * (subindex == 0)
             if size > limit:
                 raise SdoAbortError(
-                    AbortCode.TOO_LONG, index, subindex, f"{size} octets for entries of {limit}"
+                    AbortCode.TOO_LONG, index, subindex, f"{size} bytes for entries of {limit}"
                 )
             _check_any_writable([entry for _, entry in chosen], index, subindex, state)
         else:
@@ -129,9 +129,7 @@ class ObjectDictionary:
         if len(data) != plan.size:
             short = len(data) < plan.size
             code = AbortCode.TOO_SHORT if short else AbortCode.TOO_LONG
-            raise SdoAbortError(
-                code, index, first, f"{len(data)} octets for entries of {plan.size}"
-            )
+            raise SdoAbortError(code, index, first, f"{len(data)} bytes for entries of {plan.size}")
         accepted = []
         for (subindex, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
             if not entry.access & state.write_right:
@@ -152,7 +150,7 @@ class ObjectDictionary:
         if first or not item.complete_access or not item.entries[0].access & state.write_right:
             return None
         if len(data) < 2:
-            raise SdoAbortError(AbortCode.TOO_SHORT, index, 0, "subindex 0 takes two octets")
+            raise SdoAbortError(AbortCode.TOO_SHORT, index, 0, "subindex 0 takes two bytes")
         check_value(item.entries[0], index, 0, data[:1])
         if data[0] > max(item.entries):
             raise SdoAbortError(AbortCode.NO_SUBINDEX, index, data[0])
@@ -201,7 +199,7 @@ def _check_size(entry: Entry, index: int, subindex: int, given: int) -> None:
     if given == entry.kind.size or (given < entry.kind.size and entry.is_text):
         return
     code = AbortCode.TOO_LONG if given > entry.kind.size else AbortCode.TOO_SHORT
-    raise SdoAbortError(code, index, subindex, f"{given} octets for {entry.kind.text}")
+    raise SdoAbortError(code, index, subindex, f"{given} bytes for {entry.kind.text}")
 
 
 def check_value(entry: Entry, index: int, subindex: int, data: bytes) -> None:
@@ -244,7 +242,7 @@ def _put_bits(data: bytearray, bit_offset: int, entry: Entry) -> None:
 
 
 def extract_bits(data: bytes, bit_offset: int, kind: DataType) -> bytes:
-    """Return the octets of an entry of type *kind* out of the data of a complete access."""
+    """Return the bytes of an entry of type *kind* out of the data of a complete access."""
     offset, bit = divmod(bit_offset, 8)
     if not kind.is_bits:
         octets = data[offset : offset + kind.size]

@@ -1,6 +1,6 @@
 """Objects and entries of a dictionary.
 
-An entry either stores its octets or shows the octets of another source (*read*); a hook (*write*)
+An entry either stores its bytes or shows the bytes of another source (*read*); a hook (*write*)
 may check and act on a download before it is stored.
 """
 
@@ -15,7 +15,7 @@ from eap.codec.datatypes import DataType
 
 ReadHook: TypeAlias = Callable[[], bytes]
 WriteHook: TypeAlias = Callable[[bytes], None]
-"""Called with the octets before they are stored; raises SdoAbortError to refuse them."""
+"""Called with the bytes before they are stored; raises SdoAbortError to refuse them."""
 
 
 class ObjectCode(IntEnum):
@@ -73,7 +73,7 @@ class Entry:
         kind: Its data type.
         access: Rights per state and flags.
         value: What it starts with, and its default; None is all zero.
-        read: Where the octets come from instead of being stored.
+        read: Where the bytes come from instead of being stored.
         write: What a download must pass first.
         unit, minimum, maximum: For SDO information; the limits are checked too.
     """

@@ -70,7 +70,7 @@ def plain(kind: DataType, name: str, octets: bytes) -> Plain | None:
 
 
 def parse(kind: DataType, text: str) -> bytes:
-    """Return the octets of a value as typed; raise ValueError that says what was expected.
+    """Return the bytes of a value as typed; raise ValueError that says what was expected.
 
     A text of the dictionary is as long as it is: nothing is filled up.
     """

@@ -135,7 +135,7 @@ def decode_frame(data: Buffer) -> DecodedFrame:
     if end > len(data):
         there = len(data) - EtherCatHeader.SIZE
         found.error = (
-            f"EtherCatHeader at offset 0: length {header.length}, but {there} octets follow"
+            f"EtherCatHeader at offset 0: length {header.length}, but {there} bytes follow"
         )
     return found
 

@@ -190,7 +190,7 @@ CASES = {
         COE, upload, itertools.repeat(message(3, "0010 0010 01 0000000000")),
         MailboxTimeoutError, "no COE reply",
     ),
-    "cut SDO": Case(COE, upload, ["0030 43 18"], MailboxProtocolError, "needs 8 octets"),
+    "cut SDO": Case(COE, upload, ["0030 43 18"], MailboxProtocolError, "needs 8 bytes"),
     "object of 4 GiB": Case(
         COE, upload, ["0030 41 1810 01 ffffffff"], MailboxProtocolError, "4294967295 bytes"
     ),
@@ -246,7 +246,7 @@ CASES = {
         FOE, get, itertools.repeat("0300 01000000" + "61" * 244),
         MailboxTimeoutError, "no FOE reply within 3000 ms",
     ),
-    "cut FoE": Case(FOE, get, ["0300 0100"], MailboxProtocolError, "needs 6 octets"),
+    "cut FoE": Case(FOE, get, ["0300 0100"], MailboxProtocolError, "needs 6 bytes"),
     "unknown FoE error": Case(FOE, get, ["0500 77770000"], FoeError, "0x7777"),
     "unknown FoE opcode": Case(FOE, get, ["0900 01000000"], MailboxTimeoutError, "no FOE reply"),
     "endless busy": Case(
@@ -256,7 +256,7 @@ CASES = {
     "confirmation from the future": Case(
         FOE, put, ["0400 00000000", "0400 09000000"], MailboxProtocolError, "packet 9 acknowledged"
     ),
-    "cut SoE": Case(SOE, idn, ["0240 20"], MailboxProtocolError, "needs 4 octets"),
+    "cut SoE": Case(SOE, idn, ["0240 20"], MailboxProtocolError, "needs 4 bytes"),
     "fragments with a hole": Case(
         SOE, idn, [message(5, "0a40 0900 01"), message(5, "0a40 0300 01")],
         MailboxProtocolError, "9 fragments left, then 3",
@@ -280,11 +280,11 @@ CASES = {
     "no vendor": Case(VOE, other_vendor, ["01"], MailboxTimeoutError, "no VOE reply"),
     "cut AMS header": Case(AOE, ams, ["0102"], MailboxProtocolError, "AoE answer of"),
     "AMS length": Case(
-        AOE, ams, [packet(4, 5, b"ab", length=3)], MailboxProtocolError, "but 2 octets follow"
+        AOE, ams, [packet(4, 5, b"ab", length=3)], MailboxProtocolError, "but 2 bytes follow"
     ),
     "AMS packet of 4 GiB in fragments": Case(
         AOE, ams, [packet(0x0902, 6, b"\4\0\5\0\xff\xff\xff\xff\0\0\0\0\7\0\0\0", invoke_id=0)],
-        MailboxProtocolError, "octets too long",
+        MailboxProtocolError, "bytes too long",
     ),
     "AMS fragments with a hole": Case(
         AOE, ams, [message(1, packet(0x0902, 6, b"\4\0\5\0", invoke_id=0)),

@@ -102,7 +102,7 @@ def decode_payload(payload: bytes) -> Payload:
         if prefix.reserved == 0 and prefix.length == len(payload) - start:
             return Payload(payload[start:], is_prefixed=True)
     if len(payload) < AmsHeader.SIZE:
-        text = f"{len(payload)} octets, expected {AmsHeader.SIZE} or more"
+        text = f"{len(payload)} bytes, expected {AmsHeader.SIZE} or more"
         raise TruncatedError(text, layout="AmsHeader")
     return Payload(payload, is_prefixed=False)
 
@@ -113,7 +113,7 @@ def encode_payload(payload: Payload) -> bytes:
 
 
 MAX_INFO = 4096
-"""Octets; what is longer is not read."""
+"""Bytes; what is longer is not read."""
 MAX_NAME = 64
 _UNIX = 4
 """Number of the platform; 2, which routers on Windows have, is that of Windows NT."""
@@ -159,7 +159,7 @@ def _parse(payload: bytes) -> Element:
     from defusedxml import ElementTree  # the plant file's checks read topics only
 
     if len(payload) > MAX_INFO:
-        raise MalformedError(f"{len(payload)} octets, expected at most {MAX_INFO}", layout="info")
+        raise MalformedError(f"{len(payload)} bytes, expected at most {MAX_INFO}", layout="info")
     try:
         root: Element = ElementTree.fromstring(payload.rstrip(b"\0"), forbid_dtd=True)
     except (SyntaxError, ValueError, LookupError) as exc:

@@ -80,7 +80,7 @@ class Peers:
         self._learns = learns
         self._peers: dict[NetId, _Peer] = {}
         self._online: dict[bytes, list[NetId]] = {}
-        """By the octets that the NetIDs of a station have in common, the first one first."""
+        """By the bytes that the NetIDs of a station have in common, the first one first."""
 
     def __len__(self) -> int:
         return len(self._peers)
@@ -169,7 +169,7 @@ class Peers:
 
 
 MAX_PACKET = 256 << 10
-"""Octets of the longest AMS packet that is taken."""
+"""Bytes of the longest AMS packet that is taken."""
 MAX_SENDERS = 4096
 """Addresses whose form of packets is remembered; the one silent for longest makes room."""
 CONFIRM_NS = 30_000_000_000
@@ -400,7 +400,7 @@ class MqttNetwork:
         address = self._peers.address_of(header.source)
         actions = self._note_sender(address, payload, now_ns)
         if len(packet) > MAX_PACKET:
-            text = f"{header.source}: {len(packet)} octets"
+            text = f"{header.source}: {len(packet)} bytes"
             actions += self._drop(Drop.LENGTH, "too long a packet", text)
             return actions + self._refuse(header, address, AdsError.AMS_LENGTH)
         return [*actions, PacketReceived(self._ports.to_client(packet), address)]

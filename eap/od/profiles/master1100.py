@@ -87,8 +87,8 @@ CONFIGURED = ProfileObject(
         live(6, "Product code", "UDINT", MasterLive.PRODUCT, "Configured."),
         live(7, "Revision number", "UDINT", MasterLive.REVISION, "Configured."),
         live(8, "Serial number", "UDINT", MasterLive.SERIAL, "Configured."),
-        live(33, "Mailbox out size", "UINT", MasterLive.MAILBOX_OUT, "Octets, to the slave."),
-        live(34, "Mailbox in size", "UINT", MasterLive.MAILBOX_IN, "Octets, from the slave."),
+        live(33, "Mailbox out size", "UINT", MasterLive.MAILBOX_OUT, "Bytes, to the slave."),
+        live(34, "Mailbox in size", "UINT", MasterLive.MAILBOX_IN, "Bytes, from the slave."),
         live(35, "Link status", "USINT", MasterLive.LINK_STATUS, "Bit 0 no link, 1 link without "
              "communication, 2 link missing, 3 additional link, 4 to 7 the ports concerned."),
         live(36, "Link preset", "USINT", MasterLive.LINK_PRESET,

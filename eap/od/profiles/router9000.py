@@ -60,7 +60,7 @@ DEVICE = ProfileObject(
         live(4, "MAC address", "BLOCK(6)", RouterLive.DEVICE_MAC,
              "Of the Ethernet interface; all zero "
              "where the port is not bound to one.", form=Form.MAC),
-        fixed(5, "IP address", "BLOCK(4)", "First octet first; all zero where there is none.",
+        fixed(5, "IP address", "BLOCK(4)", "First byte first; all zero where there is none.",
               form=Form.IP),
         live(6, "State", "UINT", RouterLive.DEVICE_STATE,
              "1 Init, 2 PreOp, 4 SafeOp, 8 Op; of a bus "
@@ -76,7 +76,7 @@ ROUTE = ProfileObject(
              "Whoever has it, or one that begins alike, "
              "is reached by this route.", form=Form.NET_ID),
         live(2, "Octets", "USINT", RouterLive.ROUTE_OCTETS,
-             "How many octets of it have to match: 6, 5 "
+             "How many bytes of it have to match: 6, 5 "
              "or 4; 0 a default route."),
         live(3, "Name", NAME, RouterLive.ROUTE_NAME, "For people."),
         live(4, "Door", NAME, RouterLive.ROUTE_TRANSPORT, "By which packets leave."),

@@ -59,7 +59,7 @@ class Form(StrEnum):
 
     @property
     def is_address(self) -> bool:
-        """True if it is a block of octets that has a text of its own."""
+        """True if it is a block of bytes that has a text of its own."""
         return self in _BLOCKS
 
     def text_of(self, octets: bytes) -> str:
@@ -67,7 +67,7 @@ class Form(StrEnum):
         return _BLOCKS[self][0](octets)
 
     def octets_of(self, text: str) -> bytes:
-        """Return the octets of an address; raise ValueError if *text* is none."""
+        """Return the bytes of an address; raise ValueError if *text* is none."""
         return _BLOCKS[self][1](text)
 
 
@@ -88,7 +88,7 @@ def to_text(form: Form, kind: DataType, octets: bytes) -> str:
 
 
 def from_text(form: Form, kind: DataType, text: str) -> bytes:
-    """Return the octets that *text* stands for.
+    """Return the bytes that *text* stands for.
 
     Raises:
         ValueError: it is nothing of the form, or no value of the type.
@@ -321,7 +321,7 @@ DEFAULT_TYPE = datatypes.parse("UINT")
 Source: TypeAlias = Callable[[ProfileEntry, int, DataType], ReadHook | None]
 """Source of entries that store nothing: called with row, sub-index and type of each entry."""
 LiveRead: TypeAlias = Callable[[str], Any]
-"""Returns the value of a live key: a number, octets or a text, as the type of its entry says."""
+"""Returns the value of a live key: a number, bytes or a text, as the type of its entry says."""
 LiveWrite: TypeAlias = Callable[[str, bytes], None]
 """Carries out a download to a live key, or raises SdoAbortError."""
 

@@ -125,7 +125,7 @@ def test_mailbox_may_answer_whole_after_fragments_of_others() -> None:
     [
         ([part(0, ANSWER[:18]), part(2, ANSWER[18:])], "fragment 2 of packet 1 out of order"),
         ([part(0, ANSWER[:18]), part(1, ANSWER)], "too long"),
-        ([part(0, ANSWER[:18])[:-1]], "but 17 octets follow"),
+        ([part(0, ANSWER[:18])[:-1]], "but 17 bytes follow"),
         ([part(n, b"") for n in range(1, 40)], "16 fragments of other answers"),
     ],
 )

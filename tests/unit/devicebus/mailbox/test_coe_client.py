@@ -119,10 +119,10 @@ def test_abort_between_segments() -> None:
 @pytest.mark.parametrize(
     ("answers", "reason", "abort"),
     [
-        (["0030"], "needs 8 octets", None),
-        (["0030 43 1810 01 0000"], "needs 8 octets", None),
+        (["0030"], "needs 8 bytes", None),
+        (["0030 43 1810 01 0000"], "needs 8 bytes", None),
         (["0030 41 1810 01 ffffffff"], "4294967295 bytes, at most", AbortCode.OUT_OF_MEMORY),
-        ([FOUR, "0030"], "needs 1 octets", None),
+        ([FOUR, "0030"], "needs 1 bytes", None),
         ([FOUR, "0030 00"], "without data", AbortCode.GENERAL),
         ([FOUR, "0030 0e 01020304050607"], "without data", AbortCode.GENERAL),
         ([FOUR, "0030 00 01020304"], "more than the 4", AbortCode.TOO_LONG),
@@ -426,8 +426,8 @@ def test_incomplete_bit_alone_does_not_count() -> None:
     ("answers", "reason"),
     [
         (["0080 02 00 0000 0100 00"], "3 bytes, expected whole indexes"),
-        (["0080 02"], "needs 4 octets"),
-        (["0080 07 00 0000 0100"], "needs 4 octets"),
+        (["0080 02"], "needs 4 bytes"),
+        (["0080 07 00 0000 0100"], "needs 4 bytes"),
         (["0080 82 00 0500 0100 0010", "0080 82 00 0300 0110"], "5 fragments left, then 3"),
         (
             [

@@ -146,7 +146,7 @@ def test_refusal_is_raised_with_its_code_and_text() -> None:
 @pytest.mark.parametrize(
     ("answers", "reason"),
     [
-        (["03 00 0100"], "needs 6 octets"),
+        (["03 00 0100"], "needs 6 bytes"),
         (["03 00 00000000 61"], "packet 0, expected 1"),
         (["03 00 01000000 61626364", "03 00 03000000 61"], "packet 3, expected 2"),
         (["03 00 01000000 6162636465"], "5 bytes, at most"),
@@ -166,7 +166,7 @@ def test_endless_file_ends_with_the_limit() -> None:
 @pytest.mark.parametrize(
     ("answers", "reason"),
     [
-        (["04"], "needs 6 octets"),
+        (["04"], "needs 6 bytes"),
         (["04 00 00000000", "04 00 05000000"], "packet 5 acknowledged, expected 1"),
         (
             ["04 00 00000000", "04 00 01000000", "04 00 05000000"],

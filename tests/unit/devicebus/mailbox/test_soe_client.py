@@ -77,8 +77,8 @@ def test_refusal_is_raised_with_its_code() -> None:
 @pytest.mark.parametrize(
     ("answers", "reason"),
     [
-        (["02"], "needs 4 octets"),
-        (["12 40 2000 01"], "an error of 1 octets"),
+        (["02"], "needs 4 bytes"),
+        (["12 40 2000 01"], "an error of 1 bytes"),
         (["0a 40 0300 01", "0a 40 0100 02"], "3 fragments left, then 1"),
         (["0a 40 0300 01", "0a 40 0300 02"], "3 fragments left, then 3"),
         (["0a 40 0300 01", "02 40 2000 02"], "3 fragments left, then 0"),

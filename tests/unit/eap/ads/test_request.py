@@ -175,7 +175,7 @@ def test_what_is_no_answer() -> None:
     assert decode_outcome(AmsCommand.READ, 6, b"").result == AdsError.TARGET_PORT
     assert decode_outcome(AmsCommand.READ, 0, b"\0\0\0").result == AdsError.SIZE
     cut = encode_outcome(AmsCommand.READ, OperationOutcome(data=b"data"))[:-1]
-    assert decode_outcome(AmsCommand.READ, 0, cut) == (AdsError.SIZE, b"", "3 octets of 4")
+    assert decode_outcome(AmsCommand.READ, 0, cut) == (AdsError.SIZE, b"", "3 bytes of 4")
 
 
 READS = (Read(1, 2, 2), Read(3, 4, 1), Read(5, 6, 4))

@@ -192,7 +192,7 @@ def test_broken_packets_are_named_and_answered_by_nobody() -> None:
         assert station.router.receive_packet(broken, "tcp", "1", 0) == []
     events = station.events()
     assert [outcome for outcome, _ in events] == [Outcome.DROPPED] * 3
-    assert "length 3, but 2 octets follow" in events[2][1]
+    assert "length 3, but 2 bytes follow" in events[2][1]
 
 
 def test_surplus_octets_go_no_further() -> None:

@@ -105,7 +105,7 @@ def test_virtual_net_ids_stand_for_real_ones() -> None:
 
 
 def test_routes_that_cannot_be_are_refused() -> None:
-    with pytest.raises(ValueError, match="3 octets to match"):
+    with pytest.raises(ValueError, match="3 bytes to match"):
         route("5.1.1.1.1.1", octets=3)
     with pytest.raises(ValueError, match="default route"):
         route("5.1.1.1.1.1", octets=0, real=NetId(bytes(6)))

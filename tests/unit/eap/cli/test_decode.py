@@ -92,7 +92,7 @@ def test_hex_of_a_tcp_segment_may_hold_several_frames_and_a_begun_one() -> None:
     result = run(tcp_segment(FRAME + FRAME + FRAME[:3], 0).hex(), "--json")
     first, second, begun = lines(result)
     assert first["pds"] == second["pds"] == DECODED["pds"]
-    assert "length 21, but 1 octets follow" in begun["error"]
+    assert "length 21, but 1 bytes follow" in begun["error"]
     assert result.exit_code == 1
 
 
@@ -107,7 +107,7 @@ def test_frame_with_an_error_is_shown_and_fails() -> None:
     assert result.exit_code == 1
     (fields,) = lines(result)
     assert fields["publisher"] == "192.168.0.1.1.1"
-    assert "length 21, but 20 octets follow" in fields["error"]
+    assert "length 21, but 20 bytes follow" in fields["error"]
 
 
 @pytest.mark.parametrize(

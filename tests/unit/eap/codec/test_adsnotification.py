@@ -67,7 +67,7 @@ def test_packets_round_trip_and_truncate(stamps: list[Stamp], data: st.DataObjec
 
 def test_sample_that_is_cut_off() -> None:
     octets = encode_notification([Stamp(1, (Sample(1, b"abcd"),))])
-    with pytest.raises(TruncatedError, match="sample of 4 octets, but 3 follow"):
+    with pytest.raises(TruncatedError, match="sample of 4 bytes, but 3 follow"):
         decode_notification(octets[:-1])
 
 

@@ -84,7 +84,7 @@ def test_settings_that_lack_what_they_flag_are_truncated(
 
 def test_name_may_be_cut_and_may_not_be_too_long() -> None:
     assert IpSettings.decode(bytes.fromhex("20000000") + b"drive").name == "drive"
-    with pytest.raises(CodecError, match="33 octets, expected at most 32"):
+    with pytest.raises(CodecError, match="33 bytes, expected at most 32"):
         IpSettings(name="x" * 33).encode()
 
 

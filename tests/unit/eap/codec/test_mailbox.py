@@ -70,7 +70,7 @@ def test_garbage_decodes_or_raises_codec_error(noise: bytes, as_type_5: bool) ->
 
 def test_message_longer_than_its_frame_is_truncated() -> None:
     frame = EtherCatHeader(8, type=FrameType.MAILBOX).encode() + MailboxHeader(3).encode() + b"abc"
-    with pytest.raises(TruncatedError, match="length 3, but 2 octets follow"):
+    with pytest.raises(TruncatedError, match="length 3, but 2 bytes follow"):
         decode_frame(frame)
 
 

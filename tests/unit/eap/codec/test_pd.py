@@ -95,5 +95,5 @@ def test_pd_that_reaches_past_the_frame_is_truncated_after_the_good_ones() -> No
     frame[FIRST_PD + 10 + 4] = 3
     pds_read = iter_pds(frame)
     assert next(pds_read)[0].pd_id == 1
-    with pytest.raises(TruncatedError, match="PD 2 has 2 of 3 octets"):
+    with pytest.raises(TruncatedError, match="PD 2 has 2 of 3 bytes"):
         next(pds_read)

@@ -51,7 +51,7 @@ def test_refusal_lies_as_on_the_wire() -> None:
 
 def test_error_code_is_the_last_two_octets() -> None:
     assert error_code_of(b"\0\0\x09\x70") == 0x7009
-    with pytest.raises(TruncatedError, match="an error of 1 octets"):
+    with pytest.raises(TruncatedError, match="an error of 1 bytes"):
         error_code_of(b"\1")
 
 
@@ -104,7 +104,7 @@ def test_list_round_trip(octets: bytes, more: int) -> None:
 
 
 def test_list_that_contradicts_its_head_is_refused() -> None:
-    with pytest.raises(TruncatedError, match="length 4, but 3 octets follow"):
+    with pytest.raises(TruncatedError, match="length 4, but 3 bytes follow"):
         decode_list(bytes.fromhex("0400 0400 010203"))
     with pytest.raises(MalformedError, match="length 2 of at most 1"):
         decode_list(bytes.fromhex("0200 0100 0102"))
@@ -200,7 +200,7 @@ def test_list_and_text() -> None:
 
 @pytest.mark.parametrize("value", [-1, 1 << 32, "5", 1.5, None])
 def test_what_is_no_value_is_refused(value: object) -> None:
-    expected = "is no value of 4 octets: expected a whole number from 0 to 4294967295"
+    expected = "is no value of 4 bytes: expected a whole number from 0 to 4294967295"
     with pytest.raises(ValueError, match=expected):
         encode_scalar(UNSIGNED, value)
 
@@ -216,9 +216,9 @@ def test_what_is_expected_instead_is_said() -> None:
 
 
 def test_value_that_is_cut_is_truncated() -> None:
-    with pytest.raises(TruncatedError, match="3 octets for a value of 4"):
+    with pytest.raises(TruncatedError, match="3 bytes for a value of 4"):
         decode_scalar(UNSIGNED, bytes(3))
-    with pytest.raises(MalformedError, match="3 octets for values of 2"):
+    with pytest.raises(MalformedError, match="3 bytes for values of 2"):
         decode_value(IDNS, bytes.fromhex("0300 0400 200021"))
 
 

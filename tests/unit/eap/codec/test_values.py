@@ -125,12 +125,12 @@ def test_octets_of_a_text_are_taken_as_they_are() -> None:
         ("REAL", 1e39, "a number from -3.4"),
         ("LREAL", 10**400, "a number from -1.7"),
         ("REAL", "1", "a number"),
-        ("STRING(3)", "abcd", "at most 3 octets, this text has 4"),
+        ("STRING(3)", "abcd", "at most 3 bytes, this text has 4"),
         ("STRING(3)", "a\0b", "without NUL"),
         ("STRING(3)", "\ud800", "surrogates"),
         ("STRING(3)", b"ab", "a text"),
-        ("BLOCK(3)", b"ab", "3 octets, these are 2"),
-        ("BLOCK(3)", "abc", "3 octets"),
+        ("BLOCK(3)", b"ab", "3 bytes, these are 2"),
+        ("BLOCK(3)", "abc", "3 bytes"),
         ("UINT[2]", [1], "2 values, these are 1"),
         ("UINT[2]", [1, 70000], "element 1 of UINT"),
         ("UINT[2]", 7, "2 values"),
@@ -196,9 +196,9 @@ def test_typed_value(text: str, typed: str, value: Any) -> None:
         ("BOOL", "yes?", "true or false"),
         ("REAL", "1,5", "a number such as"),
         ("REAL", "1e99", "a number from"),
-        ("STRING(2)", "abc", "at most 2 octets"),
+        ("STRING(2)", "abc", "at most 2 bytes"),
         ("BLOCK(2)", "0g", "in hexadecimal"),
-        ("BLOCK(2)", "010203", "2 octets, these are 3"),
+        ("BLOCK(2)", "010203", "2 bytes, these are 3"),
         ("INT[2]", "1,2,3", "2 values between commas, these are 3"),
         ("INT[2]", "1,x", "'x' is not a value of INT"),
     ],
@@ -211,7 +211,7 @@ def test_typed_value_refused(text: str, typed: str, reason: str) -> None:
 def test_block_of_a_plant_file_is_hexadecimal_text() -> None:
     assert parse("BLOCK(2)").from_plain("01ff") == b"\x01\xff"
     for wrong in (511, "zz", b"\x01\xff"):
-        with pytest.raises(ValueError, match="2 octets"):
+        with pytest.raises(ValueError, match="2 bytes"):
             parse("BLOCK(2)").from_plain(wrong)
 
 

@@ -38,7 +38,7 @@ def source(name, text):
         ),
         (
             ("count: UDINT", "count: UDINT\n      raw: {type: BLOCK(2), default: 0011}"),
-            "10: default of raw: 11 is not a value of BLOCK(2); 2 octets in hexadecimal",
+            "10: default of raw: 11 is not a value of BLOCK(2); 2 bytes in hexadecimal",
         ),
         (
             source("cuont", "{kind: counter}"),

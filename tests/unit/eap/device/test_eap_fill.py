@@ -119,7 +119,7 @@ def test_a_default_is_kept_as_the_type_has_it():
 @pytest.mark.parametrize(
     ("variables", "sent", "index", "reason"),
     [
-        ([VariableSpec("n" * 256, "UINT")], [], 0x6000, "at most 255 octets"),
+        ([VariableSpec("n" * 256, "UINT")], [], 0x6000, "at most 255 bytes"),
         ([VariableSpec("own", "UINT")], ["own"] * 255, 0x1A00, "at most 254 entries"),
         ([VariableSpec(f"v{n}", "BIT1") for n in range(4097)], [], 0x6000, "at most 4096"),
     ],

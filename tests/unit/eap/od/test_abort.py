@@ -17,8 +17,8 @@ def test_unknown_codes_stay_numbers() -> None:
 def test_message_names_object_reason_and_detail() -> None:
     error = SdoAbortError(AbortCode.NO_OBJECT, 0x1018, 1)
     assert str(error) == "0x1018:01: object does not exist (0x06020000)"
-    assert str(SdoAbortError(0x06070012, 0x6000, 0, "5 octets for UDINT")).endswith(
-        "data is longer than the entry (0x06070012): 5 octets for UDINT"
+    assert str(SdoAbortError(0x06070012, 0x6000, 0, "5 bytes for UDINT")).endswith(
+        "data is longer than the entry (0x06070012): 5 bytes for UDINT"
     )
     assert (error.code, error.index, error.subindex) == (0x06020000, 0x1018, 1)
 

@@ -60,7 +60,7 @@ def test_value_that_is_none(bus, idn, text):
 
 
 def test_value_that_does_not_fit(bus):
-    with pytest.raises(ConfigError, match="4 octets"):
+    with pytest.raises(ConfigError, match="4 bytes"):
         write_idn(bus, "drive", Idn.parse("S-0-0032"), str(1 << 40), drive=0)
 
 

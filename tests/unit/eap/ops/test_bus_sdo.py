@@ -124,12 +124,12 @@ def test_dump(bus):
 def test_dump_goes_on_behind_a_description_that_makes_no_sense(bus, monkeypatch):
     def short_answer(index, subindex):
         if subindex == 1:
-            raise MailboxProtocolError("InfoError at offset 6: needs 4 octets, but 0 follow")
+            raise MailboxProtocolError("InfoError at offset 6: needs 4 bytes, but 0 follow")
         return (yield from entry_description(index, subindex))
 
     monkeypatch.setattr("devicebus.mailbox.coe_client.entry_description", short_answer)
     rows = {(row.index, row.subindex): row for row in dump_entries(bus, "sensor")}
-    assert "needs 4 octets" in rows[0x8000, 1].error
+    assert "needs 4 bytes" in rows[0x8000, 1].error
     assert rows[0x8000, 2].value == 1000
     assert read(bus, 0x1018, 1).value == 0xE5A
 

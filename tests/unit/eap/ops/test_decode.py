@@ -72,24 +72,24 @@ def test_error_reply_names_its_reason() -> None:
 @pytest.mark.parametrize(
     ("octets", "error", "rest"),
     [
-        ("", "EtherCatHeader at offset 0: needs 2 octets", {"type": None, "length": None}),
-        ("1540", "length 21, but 0 octets follow", {"publisher": None, "cycle": None, "pds": []}),
+        ("", "EtherCatHeader at offset 0: needs 2 bytes", {"type": None, "length": None}),
+        ("1540", "length 21, but 0 bytes follow", {"publisher": None, "cycle": None, "pds": []}),
         (
             "1540 c0a800010101 0100 0700 0000 e903",
-            "length 21, but 14 octets follow",
+            "length 21, but 14 bytes follow",
             {"publisher": "192.168.0.1.1.1", "cycle": 7, "pds": []},
         ),
         (
             "1540 c0a800010101 0100 0700 0000 e903 0000 0200 0000 01",
-            "PD 1001 has 1 of 2 octets",
+            "PD 1001 has 1 of 2 bytes",
             {"publisher": "192.168.0.1.1.1", "cycle": 7, "pds": []},
         ),
         ("0a40 c0a800010101 0100 0700 0000", "PdFrameHeader at offset 2", {"publisher": None}),
         ("0c10 0f 01 0000 0000 0000 0000 0000", "15 is not a valid Command", {"datagrams": []}),
         ("0650 0000 0000 00 06", "6 is not a valid MailboxType", {"mailbox": None}),
-        ("0450 0000 0000", "MailboxHeader at offset 2: needs 6 octets", {"mailbox": None}),
-        ("0220 0000", "AmsHeader at offset 0: needs 32 octets, but 2 follow", {"ams": None}),
-        ("0570 00", "length 5, but 1 octets follow", {"type": 7, "data": "00"}),
+        ("0450 0000 0000", "MailboxHeader at offset 2: needs 6 bytes", {"mailbox": None}),
+        ("0220 0000", "AmsHeader at offset 0: needs 32 bytes, but 2 follow", {"ams": None}),
+        ("0570 00", "length 5, but 1 bytes follow", {"type": 7, "data": "00"}),
     ],
 )
 def test_fault_is_named_beside_what_could_be_read(octets: str, error: str, rest: dict) -> None:
@@ -104,7 +104,7 @@ def test_good_pds_before_a_bad_one_are_shown() -> None:
     )
     fields = decode_frame(frame)
     assert [pd.data for pd in fields.pds] == ["aa"]
-    assert "PD 2 has 1 of 9 octets" in fields.error
+    assert "PD 2 has 1 of 9 bytes" in fields.error
 
 
 def test_bad_ams_leaves_the_mailbox_readable() -> None:
@@ -117,7 +117,7 @@ def test_bad_ams_leaves_the_mailbox_readable() -> None:
 def test_capture_cut_off_by_its_source() -> None:
     (vector,) = [v for v in load("type5_gateway") if v.name in BROKEN]
     fields = decode_frame(vector.frame)
-    assert "length 256, but 14 octets follow" in fields.error
+    assert "length 256, but 14 bytes follow" in fields.error
     assert fields.mailbox.length == 0xFA
 
 

@@ -42,7 +42,7 @@ def test_what_fits_is_no_warning(tmp_path: Path, count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "reason"), [({"count": 255}, "PD state"), ({"name": "n" * 256}, "255 octets")]
+    ("more", "reason"), [({"count": 255}, "PD state"), ({"name": "n" * 256}, "255 bytes")]
 )
 def test_what_does_not_fit_is_said_with_its_line(tmp_path: Path, more: dict, reason: str) -> None:
     path = write(tmp_path, **more)

@@ -101,7 +101,7 @@ def test_added_route_replaces_that_of_its_name_or_net_id(change, replaces):
         ({"net_id": "10.0.0.1.9.9"}, "NetID 10.0.0.1.x.x is one of this station itself"),
         ({"net_id": "10.0.0.2.9.9"}, "route 'mill' of the plant file covers the same NetIDs and"),
         ({"net_id": STATIC.net_id, "octets": 6}, "route 'mill' of the plant file covers the same"),
-        ({"octets": 3}, "3 octets to match, expected 6, 5, 4 or 0"),
+        ({"octets": 3}, "3 bytes to match, expected 6, 5, 4 or 0"),
         ({"hop": HopSpec(TransportKind.UDP, "gone", "1.1.1.1:1")}, "there is no door udp:gone"),
     ],
 )
