@@ -208,7 +208,9 @@ class RouteMethods:
             raise ControlError("a NUL in a text", code=ErrorCode.VALUE)
         route = RemoteRouteRequest(name, view.router.net_id, wanted.user, wanted.password)
         with unless_unavailable():
-            result = await add_remote_route(view.routes, route, address, wanted.wait_ms / 1000)
+            result = await add_remote_route(
+                view.routes.scanners, route, address, wanted.wait_ms / 1000
+            )
         if result is None:
             return records.RemoteRouteResult(ok=False, result=None, text="no answer by UDP 48899")
         text = "added" if result == AdsError.NONE else AdsError.words_of(result)
@@ -218,7 +220,10 @@ class RouteMethods:
         self, view: RouterView, wanted: records.RoutesScanParameters
     ) -> list[records.NeighbourRow]:
         with unless_unavailable():
-            found = await scan_routers(view.routes, wanted.address, wanted.wait_ms / 1000)
+            routes = view.routes
+            found = await scan_routers(
+                routes.scanners, routes.learn, wanted.address, wanted.wait_ms / 1000
+            )
         return [_neighbour_row(view, each) for each in found]
 
     async def _import(self, wanted: records.RoutesImportParameters) -> list[records.ImportRow]:

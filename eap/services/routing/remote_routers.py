@@ -12,7 +12,7 @@ import socket
 from collections.abc import Callable, Collection, Sequence
 from ipaddress import IPv4Address
 from time import monotonic_ns
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from eap.codec.ams import SYSTEM_PORT
 from eap.codec.amsdiscovery import (
@@ -54,33 +54,6 @@ class RemoteRouteRequest(NamedTuple):
     """Sent in clear text."""
 
 
-class NeighbourScanner(Protocol):
-    """Sender of requests to routers of other hosts."""
-
-    @property
-    def address(self) -> IPv4Address:
-        """IPv4 address that the requests are sent from."""
-
-    async def scan(self, address: str = "", *, wait_s: float) -> list[RemoteRouter]:
-        """Scan a host or a network at *address*; return the routers that answered in time."""
-
-    async def add_remote_route(
-        self, wanted: RemoteRouteRequest, address: str, *, wait_s: float
-    ) -> int | None:
-        """Request a route at the router of *address*; return the result, None if unanswered."""
-
-
-class LearningStation(Protocol):
-    """Routes of a station, which take up the routers that a scan found."""
-
-    @property
-    def scanners(self) -> Sequence[NeighbourScanner]:
-        """One for each address of the station."""
-
-    def learn(self, net_id: NetId, name: str, address: str, now_ns: int) -> bool:
-        """Learn a route; return whether the table accepted it."""
-
-
 class FoundRouter(NamedTuple):
     """Router that answered, and whether a route to it was learned."""
 
@@ -88,32 +61,41 @@ class FoundRouter(NamedTuple):
     is_learned: bool
 
 
-async def scan_routers(station: LearningStation, address: str, wait_s: float) -> list[FoundRouter]:
+async def scan_routers(
+    scanners: Sequence[RouterRequests],
+    learn: Callable[[NetId, str, str, int], bool],
+    address: str,
+    wait_s: float,
+) -> list[FoundRouter]:
     """Scan for routers of other hosts, and learn routes to them.
 
     Args:
-        station: Routes of the scanning station.
+        scanners: Those of the scanning station.
+        learn: Learns a route to a router; returns whether it was accepted.
         address: Host or network to scan; empty for the networks of the station.
         wait_s: Time limit for answers.
 
     Raises:
         EnvironmentalError: the station has no address to scan from, or sending failed.
     """
-    _check(station.scanners)
-    scans = [scanner.scan(address, wait_s=wait_s) for scanner in station.scanners]
+    _check(scanners)
+    scans = [scanner.scan(address, wait_s=wait_s) for scanner in scanners]
     found: dict[NetId, RemoteRouter] = {}
     for each in await asyncio.gather(*scans):
         for neighbour in each:
             found.setdefault(neighbour.net_id, neighbour)
     now_ns = monotonic_ns()
     return [
-        FoundRouter(each, station.learn(each.net_id, each.name, each.address, now_ns))
+        FoundRouter(each, learn(each.net_id, each.name, each.address, now_ns))
         for each in found.values()
     ]
 
 
 async def add_remote_route(
-    station: LearningStation, wanted: RemoteRouteRequest, address: IPv4Address, wait_s: float
+    scanners: Sequence[RouterRequests],
+    wanted: RemoteRouteRequest,
+    address: IPv4Address,
+    wait_s: float,
 ) -> int | None:
     """Request the route *wanted* at the router of *address*, from the station's nearest address.
 
@@ -123,13 +105,13 @@ async def add_remote_route(
     Raises:
         EnvironmentalError: the station has no address to send from, or sending failed.
     """
-    _check(station.scanners)
+    _check(scanners)
     # The longest common prefix, as in a routing table.
-    nearest = min(station.scanners, key=lambda each: int(each.address) ^ int(address))
+    nearest = min(scanners, key=lambda each: int(each.address) ^ int(address))
     return await nearest.add_remote_route(wanted, str(address), wait_s=wait_s)
 
 
-def _check(scanners: Sequence[NeighbourScanner]) -> None:
+def _check(scanners: Sequence[RouterRequests]) -> None:
     if not scanners:
         raise EnvironmentalError("the station has no IP address at which it serves AMS")
 
@@ -140,7 +122,7 @@ BROADCAST = "255.255.255.255"
 _MAX_NAME = 80
 
 
-class _PendingRequest:
+class _RouterRequest:
     """Pending request; *wanted* is the number of answers that completes it, 0 for none."""
 
     def __init__(
@@ -165,7 +147,7 @@ class RouterRequests:
         self._sock = sock
         self._own: Collection[NetId] = frozenset(own)
         self._net_id = own[0]
-        self._waiting: dict[int, _PendingRequest] = {}
+        self._waiting: dict[int, _RouterRequest] = {}
 
     async def scan(
         self, address: str = "", *, wait_s: float, port: int = AMS_UDP_PORT
@@ -189,7 +171,7 @@ class RouterRequests:
                 # The router itself answers first; later ones answer in its place.
                 found.setdefault(net_id, _router_of(answer, sender))
 
-        request = _PendingRequest(DiscoveryService.SERVER_INFO, receive, 0)
+        request = _RouterRequest(DiscoveryService.SERVER_INFO, receive, 0)
         target = address or network_of(str(self.address))
         await self._send(request, [], (target, port), wait_s)
         return list(found.values())
@@ -225,7 +207,7 @@ class RouterRequests:
             (Tag.PASSWORD, encode_text(wanted.password)),
             (Tag.HOST, encode_text(str(self._seen_from(address)))),
         ]
-        request = _PendingRequest(DiscoveryService.ADD_ROUTE, receive, 1)
+        request = _RouterRequest(DiscoveryService.ADD_ROUTE, receive, 1)
         await self._send(request, tags, (address, port), wait_s)
         return results[0] if results else None
 
@@ -254,7 +236,7 @@ class RouterRequests:
 
     async def _send(
         self,
-        request: _PendingRequest,
+        request: _RouterRequest,
         tags: Sequence[tuple[int, bytes]],
         target: tuple[str, int],
         wait_s: float,

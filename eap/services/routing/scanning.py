@@ -21,7 +21,8 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.control.routes import ScannedPort, SlaveEntry, StationEntry
 from eap.ids import STATION_OCTETS, NetId
-from eap.services.routing.tracing import TracedStation, find_fault, run_operation
+from eap.services.routing.station_router import StationRouter
+from eap.services.routing.tracing import find_fault, run_operation
 
 ANSWER_TIMEOUT_S = 3.0
 """Time limit for one answer."""
@@ -66,7 +67,7 @@ def scan_targets(directory: Directory, routes: Iterable[Route]) -> list[ScanTarg
     return [*found.values()]
 
 
-async def scan(station: TracedStation, known: Sequence[ScanTarget]) -> list[StationEntry]:
+async def scan(station: StationRouter, known: Sequence[ScanTarget]) -> list[StationEntry]:
     """Scan all stations; return an entry for each, in their order.
 
     Args:
@@ -88,7 +89,7 @@ async def scan(station: TracedStation, known: Sequence[ScanTarget]) -> list[Stat
 class _StationScan:
     """Scan of one station."""
 
-    def __init__(self, router: TracedStation, known: ScanTarget) -> None:
+    def __init__(self, router: StationRouter, known: ScanTarget) -> None:
         self._router = router
         self._known = known
         ports = known.planned.ports if known.planned else ()

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from ipaddress import IPv4Address
-from typing import Protocol
 
 from msgspec.structs import replace
 
 from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
-from eap.ams.access_filter import AuditEntry
-from eap.ams.routes import Origin, Route, RouteTable
+from eap.ams.routes import Origin, Route
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
@@ -29,7 +27,7 @@ from eap.ids import STATION_OCTETS, Destination, DestinationKind, InterfaceUri, 
 from eap.net.interface import own_addresses
 from eap.pd.spec import StationSpec
 from eap.runtime.store import StationFile
-from eap.services.routing.remote_routers import NeighbourScanner
+from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_router import StationRouter
 from eap.services.tasks import JobQueue
 
@@ -127,34 +125,6 @@ LEARNED_NS = 600_000_000_000
 logger = logging.getLogger(__name__)
 
 
-class RoutedStation(Protocol):
-    """Router of a station, as its routes use it."""
-
-    on_audit: list[Callable[[AuditEntry], None]]
-    """Called with each change, and each denied one."""
-
-    def why_not_recorded(self, entry: AuditEntry) -> str:
-        """Record a change before it is made, where that is required; return why it failed."""
-
-    @property
-    def table(self) -> RouteTable:
-        """Its routes, read-only."""
-
-    @property
-    def net_id(self) -> NetId:
-        """NetID of the router itself."""
-
-    @property
-    def net_ids(self) -> Collection[NetId]:
-        """All NetIDs of the station."""
-
-    def add_route(self, route: Route) -> bool:
-        """Add a route to the table; return whether it was accepted."""
-
-    def remove_route(self, net_id: NetId, hop: Endpoint) -> bool:
-        """Remove a route; return whether there was one."""
-
-
 class StationRoutes:
     """Routes of the router of a station.
 
@@ -171,14 +141,14 @@ class StationRoutes:
 
     def __init__(
         self,
-        router: RoutedStation,
+        router: StationRouter,
         spec: RoutingSpec,
         store: StationFile[tuple[RouteSpec, ...]],
         *,
         open_hop: Callable[[HopSpec], Endpoint] = to_endpoint,
     ) -> None:
         self.router = router
-        self.scanners: list[NeighbourScanner] = []
+        self.scanners: list[RouterRequests] = []
         self._spec = spec
         self._store = store
         self._open_hop = open_hop

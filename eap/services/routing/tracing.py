@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Container
 from time import monotonic_ns
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -24,7 +24,6 @@ from eap.ams.report import (
     Advice,
     HopQuestion,
     HopReport,
-    Location,
     RouteReport,
     RouteState,
     advise,
@@ -65,26 +64,6 @@ _NO_ANSWER = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsE
 """Errors that another router reports in place of the queried one."""
 
 
-class TracedStation(Protocol):
-    """Router of a station, as tracing and scanning use it."""
-
-    @property
-    def name(self) -> str:
-        """Name of the station."""
-
-    @property
-    def net_id(self) -> NetId:
-        """NetID of the router itself."""
-
-    def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
-        """Return the next hop of a request received from *endpoint*."""
-
-    async def request(
-        self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
-    ) -> AmsAnswer:
-        """Send a request to a local or remote *target*, and return its answer."""
-
-
 class Hop(NamedTuple):
     """One router on the path.
 
@@ -120,7 +99,7 @@ class TraceResult(NamedTuple):
 
 
 async def run_operation(
-    station: TracedStation,
+    station: StationRouter,
     target: NetId,
     port: int,
     operation: Operation,
@@ -133,7 +112,7 @@ async def run_operation(
 
 
 async def answer_hop_query(
-    station: TracedStation, question: HopQuestion, endpoint: Endpoint, source: NetId
+    station: StationRouter, question: HopQuestion, endpoint: Endpoint, source: NetId
 ) -> HopReport:
     """Return the report of a router about an address, or that of a router further on.
 
@@ -164,7 +143,7 @@ async def answer_hop_query(
 
 
 async def trace(
-    station: TracedStation, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
+    station: StationRouter, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
 ) -> TraceResult:
     """Follow the path from *station* to *target*, and read the state of the target."""
     hops, why = await _follow(station, target, port, clock)
@@ -186,7 +165,7 @@ async def trace(
     return TraceResult(tuple(hops), answer, took_ns, why)
 
 
-async def find_fault(station: TracedStation, target: NetId, port: int) -> str:
+async def find_fault(station: StationRouter, target: NetId, port: int) -> str:
     """Return the router at which the path to *target* ends, and the reason; empty if it has no end.
 
     This is for a request without an answer: the router that reported the error may not know which
@@ -197,7 +176,7 @@ async def find_fault(station: TracedStation, target: NetId, port: int) -> str:
 
 
 async def _follow(
-    station: TracedStation, target: NetId, port: int, clock: Callable[[], int]
+    station: StationRouter, target: NetId, port: int, clock: Callable[[], int]
 ) -> tuple[list[Hop], str]:
     """Return the routers on the path, and the reason why it ends at the last one."""
     hops: list[Hop] = []
@@ -254,7 +233,7 @@ class RouteQuery:
         rest: Service for all other requests.
     """
 
-    def __init__(self, station: TracedStation, rest: Service) -> None:
+    def __init__(self, station: StationRouter, rest: Service) -> None:
         self._station = station
         self._rest = rest
 

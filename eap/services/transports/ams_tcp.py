@@ -16,10 +16,9 @@ from ipaddress import IPv4Address
 from secrets import randbelow
 from threading import Thread
 from time import monotonic_ns
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from eap.ads.endpoint import Endpoint
-from eap.ams.routes import Route
 from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AMS_TCP_PORT
@@ -28,7 +27,7 @@ from eap.net.connections import OVERDUE_NS, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.drop_counters import DropReason
-from eap.services.routing.service import TransportSender
+from eap.services.routing.station_router import StationRouter
 from eap.services.transports.accepting import Listeners, ListeningSocket, connection_name
 from eap.services.transports.ams_connection import AmsConnection, ClientAddresses
 from eap.services.transports.demultiplexer import Demultiplexer
@@ -200,26 +199,6 @@ PEER_PREFIX = f"{TransportKind.AMS_TCP}:"
 """Prefix of the names of uplink transports; the address of the peer follows."""
 
 
-class PacketRouter(Protocol):
-    """Router of a station, as the connection to a peer uses it."""
-
-    @property
-    def name(self) -> str:
-        """Name of the station."""
-
-    def receive(self, data: bytes, transport: str, connection: str) -> None:
-        """Handle a packet; answers go to ``AmsUplink.send``."""
-
-    def connection_closed(self, transport: str, connection: str) -> None:
-        """Drop the pending requests of the peer."""
-
-    def hop_down(self, transport: str, address: str | None, text: str) -> None:
-        """Mark the peer as down."""
-
-    def hop_up(self, transport: str, address: str | None) -> None:
-        """Mark the peer as up."""
-
-
 class PeerAddress(NamedTuple):
     """Host and port of a peer's listener."""
 
@@ -251,7 +230,7 @@ class AmsUplink(ReconnectingLink):
         peer: PeerAddress,
         transport: str,
         address: str,
-        router: PacketRouter,
+        router: StationRouter,
         *,
         sources: Collection[str],
         claims: dict[tuple[str, int], AmsUplink],
@@ -407,26 +386,6 @@ def source_for(host: str, sources: Collection[str]) -> str | None:
     return None
 
 
-class UplinkRouter(PacketRouter, Protocol):
-    """Router of a station, as its uplinks use it.
-
-    Attributes:
-        on_routes: Called with the hop of each route that was added or removed.
-    """
-
-    on_routes: list[Callable[[Endpoint], None]]
-
-    @property
-    def table(self) -> Iterable[Route]:
-        """All routes."""
-
-    def add_transport(self, transport: Transport, sender: TransportSender) -> None:
-        """Add a transport with its sender."""
-
-    def remove_transport(self, name: str) -> None:
-        """Remove a transport."""
-
-
 class AmsUplinks:
     """Uplinks of one station: one for each peer that a route names.
 
@@ -438,7 +397,7 @@ class AmsUplinks:
 
     def __init__(
         self,
-        router: UplinkRouter,
+        router: StationRouter,
         sources: Collection[str],
         count_dropped: Callable[[DropReason], None],
     ) -> None:

@@ -17,7 +17,7 @@ import logging
 import socket
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from eap.codec.ams import StateFlags
 from eap.codec.ethercat import EtherCatHeader, FrameType
@@ -54,22 +54,6 @@ Serve: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter, str], A
 """Serves a connection to the named address until its end."""
 
 
-class HopRouter(Protocol):
-    """Routers, as the connections to other stations use them."""
-
-    def hop_down(self, address: str, text: str) -> None:
-        """Mark a hop as down."""
-
-    def hop_up(self, address: str) -> None:
-        """Mark a hop as up."""
-
-    def has_route_to(self, address: str) -> bool:
-        """Return whether a route leads there."""
-
-    def is_awaited(self, address: str) -> bool:
-        """Return whether an answer from there is pending."""
-
-
 class StreamUplinks:
     """Connections of one transport to other stations, by ``ADDRESS:PORT``.
 
@@ -79,7 +63,7 @@ class StreamUplinks:
         source: Own address to connect from; empty for any.
     """
 
-    def __init__(self, hops: HopRouter, serve: Serve, source: str = "") -> None:
+    def __init__(self, hops: Demultiplexer, serve: Serve, source: str = "") -> None:
         self._hops = hops
         self._serve = serve
         self._source = source
@@ -112,7 +96,7 @@ class StreamUplinks:
 class _StreamUplink(ReconnectingLink):
     """Connection to one other station, and the data that waits for it."""
 
-    def __init__(self, address: str, source: str, hops: HopRouter, serve: Serve) -> None:
+    def __init__(self, address: str, source: str, hops: Demultiplexer, serve: Serve) -> None:
         super().__init__(ReconnectPolicy(FIRST_PAUSE_S, LONGEST_PAUSE_S, _LASTING_S))
         self._address = address
         self._source = source or None

@@ -5,12 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Collection
 from pathlib import Path
 
-from eap.ads.endpoint import Endpoint
-from eap.ams.access_filter import AuditEntry
-from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AmsUser, RouteSpec, RoutingSpec
 from eap.codec.amsdiscovery import (
     decode_discovery,
@@ -24,6 +20,7 @@ from eap.ids import NetId
 from eap.runtime.drop_counters import DropReason
 from eap.runtime.store import StationFile
 from eap.services.routing.remote_routers import RouterRequests
+from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.ams_discovery import AmsDiscovery, RouteAdmin, RouterName
 
@@ -47,23 +44,6 @@ class _Store(StationFile[tuple[RouteSpec, ...]]):
         del value
 
 
-class _Router:
-    def __init__(self) -> None:
-        self.table = RouteTable()
-        self.net_id = OWN
-        self.net_ids: Collection[NetId] = (OWN,)
-        self.on_audit: list[Callable[[AuditEntry], None]] = []
-
-    def add_route(self, route: Route) -> bool:
-        return self.table.add(route)
-
-    def why_not_recorded(self, entry: AuditEntry) -> str:
-        return ""
-
-    def remove_route(self, net_id: NetId, hop: Endpoint) -> bool:
-        return self.table.remove(net_id, hop)
-
-
 def fuzz_one(data: bytes) -> None:
     """Read a datagram and write it again, then answer it; only CodecError may pass."""
     try:
@@ -84,7 +64,7 @@ def fuzz_one(data: bytes) -> None:
 
 async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     """Answer *data* from this host twice: the second time changes nothing."""
-    routes = StationRoutes(_Router(), RoutingSpec(users=users), _Store())
+    routes = StationRoutes(StationRouter("left", OWN), RoutingSpec(users=users), _Store())
     refused: list[DropReason] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         route_admin = RouteAdmin([routes])

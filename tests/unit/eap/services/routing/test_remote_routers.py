@@ -48,7 +48,7 @@ class Station:
 def test_scan_routers_asks_all_networks_and_lists_each_router_once():
     both = NeighbourScanner(MILL), NeighbourScanner(MILL._replace(address="10.1.0.2"), SAW)
     station = Station(*both)
-    found = asyncio.run(scan_routers(station, "10.0.0.255", 0.5))
+    found = asyncio.run(scan_routers(station.scanners, station.learn, "10.0.0.255", 0.5))
     assert found == [FoundRouter(MILL, False), FoundRouter(SAW, True)]
     assert station.learned[0] == ("10.0.0.2.1.1", "mill", "10.0.0.2")
     assert [each.asked for each in both] == [[("10.0.0.255", 0.5)]] * 2
@@ -56,14 +56,14 @@ def test_scan_routers_asks_all_networks_and_lists_each_router_once():
 
 def test_station_without_an_address_cannot_scan():
     with pytest.raises(EnvironmentalError, match="no IP address at which it serves AMS"):
-        asyncio.run(scan_routers(Station(), "", 0.5))
+        asyncio.run(scan_routers([], Station().learn, "", 0.5))
 
 
 def test_add_remote_route_uses_the_nearest_address():
     far, near = NeighbourScanner(address="192.168.7.1"), NeighbourScanner(address="10.0.0.1")
     wanted = RemoteRouteRequest("left", NetId.parse("10.0.0.1.1.1"), "me", "secret")
-    told = add_remote_route(Station(far, near), wanted, IPv4Address("10.0.0.9"), 2.0)
+    told = add_remote_route([far, near], wanted, IPv4Address("10.0.0.9"), 2.0)
     assert asyncio.run(told) == 0
     assert (far.asked, near.asked) == ([], [(wanted, "10.0.0.9", 2.0)])
     with pytest.raises(EnvironmentalError, match="no IP address at which it serves AMS"):
-        asyncio.run(add_remote_route(Station(), wanted, IPv4Address("10.0.0.9"), 2.0))
+        asyncio.run(add_remote_route([], wanted, IPv4Address("10.0.0.9"), 2.0))

@@ -102,7 +102,7 @@ def test_apply_of_the_same_routing_changes_nothing():
 def test_a_broker_does_not_change_while_it_runs():
     broker = replace(FILE, mqtt=(MqttSpec(network="n", host="broker"),))
     house = House()
-    with pytest.raises(ControlError, match="MQTT network n: added: this needs a new start"):
+    with pytest.raises(ControlError, match="MQTT network n: added: restart the appliance"):
         asyncio.run(house.routing.apply(broker, "1"))
     assert house.routing.plan(broker).refused
     assert house.routing.applied is None
