@@ -70,7 +70,7 @@ def median_ratio(pairs: Iterable[tuple[float, float]]) -> float:
 
 def text_table(figures: Sequence[Figure]) -> str:
     """Return *figures* in aligned columns."""
-    rows = [("figure", "target", "measured", "verdict")]
+    rows = [("figure", "target", "measured", "result")]
     rows += [(f.name, f.target, f.measured, f.decision.value) for f in figures]
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows]
@@ -80,7 +80,7 @@ def text_table(figures: Sequence[Figure]) -> str:
 
 def markdown_table(figures: Sequence[Figure]) -> str:
     """Return *figures* as a table of Markdown."""
-    rows = ["| figure | target | measured | verdict |", "|---|---|---|---|"]
+    rows = ["| figure | target | measured | result |", "|---|---|---|---|"]
     rows += [f"| {f.name} | {f.target} | {f.measured} | {f.decision.value} |" for f in figures]
     return "\n".join(rows)
 
