@@ -1,4 +1,4 @@
-"""Figures, their verdicts and their tables."""
+"""Figures, their results and their tables."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_median_ratio_compares_within_each_round() -> None:
 def test_text_table_aligns_columns() -> None:
     table = text_table([at_least("long name", 1.0, 0.5, "1 of 1"), skipped("b", "needs root")])
     assert table.splitlines() == [
-        "figure     target  measured       verdict",
+        "figure     target  measured       result",
         "---------  ------  -------------  -------",
         "long name  ≥ 0.5   1.00 (1 of 1)  ok",
         "b                  needs root     skipped",
