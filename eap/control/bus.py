@@ -43,9 +43,9 @@ Protocol = Literal["aoe", "eoe", "coe", "foe", "soe", "voe"]
 State = Literal["INIT", "PREOP", "BOOT", "SAFEOP", "OP"]
 Duration = Annotated[int, Meta(ge=0, le=_MAX_MS)]
 DatagramRow = tuple[int, int, int, str, int]
-"""Command, ADP, ADO, octets, tries (0: as the master's settings say)."""
+"""Command, ADP, ADO, bytes, tries (0: as the master's settings say)."""
 ReplyRow = tuple[int, str, int]
-"""Working counter, octets, tries."""
+"""Working counter, bytes, tries."""
 
 
 class BusParameters(Parameters, frozen=True, kw_only=True):

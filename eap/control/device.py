@@ -1,7 +1,7 @@
 """Control protocol: EAP devices and routers, their dictionaries, states and configurations.
 
 The records of requests and answers, which server and client share; docs/control.md describes them.
-Octets are hexadecimal digits, specifications are JSON as ``export`` gives them.
+Bytes are hexadecimal digits, specifications are JSON as ``export`` gives them.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class OdReadParameters(TargetParameters, frozen=True, kw_only=True):
 
 
 class OdWriteParameters(OdReadParameters, frozen=True, kw_only=True):
-    """``od_write``: likewise."""
+    """``od_write``: writes an entry, or with *complete* the object from there on."""
 
     data: str
 
@@ -102,7 +102,7 @@ class ApplyParameters(SpecParameters, frozen=True, kw_only=True):
 
 
 class RollbackParameters(StationParameters, frozen=True, kw_only=True):
-    """``rollback``: to what ran before the last change; *spec* is that, or what runs now.
+    """``rollback``: to the specification before the last change; *spec* is that or the running one.
 
     Either may have other alternates.
     """
@@ -148,7 +148,7 @@ class DescribedEntry(Document, frozen=True, kw_only=True):
 
 
 class EntryContent(DescribedEntry, frozen=True, kw_only=True):
-    """Entry with its octets, None if they cannot be read."""
+    """Entry with its bytes, None if they cannot be read."""
 
     data: str | None
 
@@ -331,7 +331,7 @@ def described_object(item: OdObject, label: str) -> DescribedObject:
 
 
 def dumped_object(item: OdObject, label: str, read_right: Access) -> DumpedObject:
-    """Return an object with its entries and the octets of those that *read_right* may read."""
+    """Return an object with its entries and the bytes of those that *read_right* may read."""
     return DumpedObject(
         index=item.index,
         name=item.name,

@@ -28,7 +28,7 @@ SLOW_READER_S = 10.0
 
 
 class ErrorCode(StrEnum):
-    """What a program does about a refusal; the message beside it is for people."""
+    """Reason of an error, for programs; the message is for people."""
 
     BAD_REQUEST = auto()
     """Not JSON, not this protocol, or parameters of the wrong form."""
@@ -180,7 +180,7 @@ class Values(Document, frozen=True):
 
 
 class ValuesEvent(Values, frozen=True):
-    """Event of a subscription; *skipped* cycles since the one before were not looked at."""
+    """Event of a subscription; *skipped* cycles since the one before were not sampled."""
 
     skipped: int = 0
 
@@ -263,7 +263,7 @@ def parameters(params: dict[str, Any], kind: type[ParametersT]) -> ParametersT:
 
 
 def of_station(name: str, known: Mapping[str, ItemT]) -> ItemT:
-    """Return what *known* has for a station; raise ControlError that says which comes near."""
+    """Return the item of *known* for a station; raise ControlError that suggests similar names."""
     try:
         return known[name]
     except KeyError:
@@ -273,7 +273,7 @@ def of_station(name: str, known: Mapping[str, ItemT]) -> ItemT:
 
 @contextmanager
 def unless_unavailable() -> Iterator[None]:
-    """Refuse what this machine cannot do: keep something over a restart, ask another host."""
+    """Convert EnvironmentalError to ControlError: this machine cannot store or reach something."""
     try:
         yield
     except EnvironmentalError as exc:
@@ -307,7 +307,7 @@ def encode_result(number: int | None, result: Any) -> bytes:
     line = _line({"v": VERSION, "id": number, "result": result})
     if len(line) <= MAX_LINE:
         return line
-    reason = f"the answer has {len(line)} octets, at most {MAX_LINE}: ask for fewer names"
+    reason = f"the answer has {len(line)} bytes, at most {MAX_LINE}: ask for fewer names"
     return encode_error(number, ControlError(reason, code=ErrorCode.BUSY))
 
 

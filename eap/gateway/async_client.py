@@ -113,11 +113,11 @@ class AsyncGatewayClient:
         return await self.converse(address, coe_client.object_list())
 
     async def od_object(self, address: int, index: int) -> ObjectDescription:
-        """Read what is said of an object."""
+        """Read the description of an object."""
         return await self.converse(address, coe_client.object_description(index))
 
     async def od_entry(self, address: int, index: int, subindex: int) -> EntryDescription:
-        """Read what is said of an entry."""
+        """Read the description of an entry."""
         return await self.converse(address, coe_client.entry_description(index, subindex))
 
     async def foe_read(
@@ -241,7 +241,7 @@ class _Datagrams(asyncio.DatagramProtocol):
             self._transport.close()
 
     def _go_on(self) -> None:
-        """Send, deliver and wait for what is due next."""
+        """Send pending frames, deliver results and set the timer."""
         core = self._conversations
         for frame in core.frames_to_send(monotonic_ns()):
             if self._transport is not None:

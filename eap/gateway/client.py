@@ -5,7 +5,7 @@
         gateway.foe_write(1001, "firmware.bin", Path("new.bin").read_bytes())
 
 Address 0 is the master itself, 1001 usually the first slave.  Where a message may not fit, the
-mailbox of a slave is looked up in the master's dictionary; for objects and IDNs 128 octets will do
+mailbox of a slave is looked up in the master's dictionary; for objects and IDNs 128 bytes will do
 if there is none.  A refusal raises SdoAbortError, SoeError, FoeError or MailboxRefusedError, and
 silence MailboxTimeoutError.
 """
@@ -138,11 +138,11 @@ class GatewayClient(Closeable):
         return self.converse(address, coe_client.object_list())
 
     def od_object(self, address: int, index: int) -> ObjectDescription:
-        """Read what is said of an object."""
+        """Read the description of an object."""
         return self.converse(address, coe_client.object_description(index))
 
     def od_entry(self, address: int, index: int, subindex: int) -> EntryDescription:
-        """Read what is said of an entry."""
+        """Read the description of an entry."""
         return self.converse(address, coe_client.entry_description(index, subindex))
 
     def idn_read(
@@ -290,7 +290,7 @@ class GatewayClient(Closeable):
 
 
 def cut_frame(octets: bytes) -> tuple[bytes | None, bytes]:
-    """Return the first whole frame of a stream, None if there is none yet, and what is left."""
+    """Return the first whole frame of a stream, None if there is none yet, and the rest."""
     if len(octets) < EtherCatHeader.SIZE:
         return None, octets
     end = EtherCatHeader.SIZE + EtherCatHeader.decode(octets).length

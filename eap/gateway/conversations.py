@@ -31,7 +31,7 @@ from eap.errors import CodecError
 _MAX_EARLY = 1024
 """Fragments of one reply that may come before the conversation listens for them."""
 _COUNTER_OCTET, _COUNTER_SHIFT = 7, 4
-"""Place of the counter in a frame: bits 4 to 6 of the mailbox header's last octet."""
+"""Place of the counter in a frame: bits 4 to 6 of the mailbox header's last byte."""
 
 
 class PendingRequest:
@@ -133,7 +133,7 @@ class _Queue:
         return max(request.deadline_ns, *held) if held else request.deadline_ns
 
     def _fits(self, late: _LateReplies, ask: MailboxRequest) -> bool:
-        """Say whether a late reply could be taken for the one to *ask*."""
+        """Return whether a late reply could be mistaken for the one to *ask*."""
         return late.reply is None or answers(self.kind, ask.request, late.reply)
 
     def count_off_late(self, data: bytes) -> None:
@@ -166,7 +166,7 @@ class _Address:
         return [(queue, found) for queue in queues if (found := queue.pending) is not None]
 
     def is_free_for(self, request: PendingRequest) -> bool:
-        """Say whether a request may be sent beside those that are in flight."""
+        """Return whether a request may be sent in parallel to those in flight."""
         if len(self.queues) == 1:
             return True
         others = [other for _, other in self.pending() if other is not request]
@@ -249,7 +249,7 @@ class GatewayConversations:
             del self._addresses[address.number]
 
     def receive_frame(self, octets: Buffer, now_ns: int) -> None:
-        """Take a frame; what answers nothing is dropped."""
+        """Handle a received frame; a frame that answers no request is dropped."""
         try:
             header, body = decode_frame(octets)
         except CodecError:
@@ -280,7 +280,7 @@ class GatewayConversations:
         return min((due for queue in queues if (due := queue.due_ns()) is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Send what is due, once more where no reply has come, or give up waiting for it."""
+        """Send or repeat the requests that are due; time out those without tries left."""
         for address in list(self._addresses.values()):
             self._advance(address, now_ns)
 

@@ -1,6 +1,6 @@
-"""The high-nibble dialect: what published clients of one vendor's ETG.8200 gateway send.
+"""Codec of the high-nibble dialect: messages of published clients of one vendor's ETG.8200 gateway.
 
-Its messages carry the type in the high nibble of the sixth octet, where the standard has the
+Its messages carry the type in the high nibble of the sixth byte, where the standard has the
 counter, and nothing in the low one, which in the standard would be a mailbox error; so no request
 of one can be taken for one of the other.  SoE is 4 and FoE is 5 there.  Requests name one thing to
 be done, in shorter layouts than the standard's, and files go in one packet.
@@ -106,7 +106,7 @@ Task: TypeAlias = ReadSdo | WriteSdo | ReadIdn | WriteIdn | ReadFile | ExchangeV
 
 
 class DialectFailure(IntEnum):
-    """Why something could not be done; each protocol has codes of its own for it."""
+    """Reason why a task was not carried out; each protocol has codes of its own for it."""
 
     GENERAL = 0
     MISSING = 1
@@ -169,7 +169,7 @@ def encode_header(kind: MailboxType, address: int) -> MailboxHeader:
 
 
 def decode(kind: MailboxType, body: bytes) -> Task:
-    """Return what a request asks for.
+    """Decode a request into its operation.
 
     Raises:
         MalformedError: it is none of the dialect; the text says what was expected.
@@ -239,7 +239,7 @@ _DECODERS = {
 
 
 def encode_done(request: bytes, task: Task, data: bytes) -> bytes:
-    """Return the message that says a task is done; *data* is what was read."""
+    """Return the reply to a task that was carried out; *data* is the data read."""
     match task:
         case ReadSdo(index, subindex, complete):
             body = encode_initiate(
@@ -266,11 +266,11 @@ def encode_failure(
     code: int | None = None,
     text: str = "",
 ) -> bytes:
-    """Return the message that says why something was not done.
+    """Return the error reply to a task that was not carried out.
 
     Args:
         kind: The protocol.
-        request: Its octets.
+        request: Its bytes.
         failure: Why.
         code: What the slave itself says, for protocols whose codes both sides share.
         text: For people, where the protocol has room for it.
@@ -296,5 +296,5 @@ def _soe_head(request: bytes, opcode: int) -> bytes:
 
 
 def _short(protocol: str, body: bytes, least: int) -> MalformedError:
-    text = f"{protocol} request of {len(body)} octets, expected at least {least}"
+    text = f"{protocol} request of {len(body)} bytes, expected at least {least}"
     return MalformedError(text, layout="dialect")

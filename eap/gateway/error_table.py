@@ -172,7 +172,7 @@ class Cause(Enum):
         is_from_slave=True,
     )  # fmt: skip
     LENGTH = ErrorCodes(
-        "the wrong number of octets",
+        "the wrong number of bytes",
         Box.SERVICE_NOT_SUPPORTED, Sdo.LENGTH, Soe.VALUE_TOO_LONG, Foe.NOT_DEFINED, Ads.SIZE,
         Fail.SIZE,
         (

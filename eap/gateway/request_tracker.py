@@ -1,7 +1,7 @@
 """Clients of a gateway: requests that wait, limits of their number and rate, memory of transfers.
 
-A client without an answer repeats its request with the same octets.  As long as its first request
-waits, the second is no other one, and both are answered once; afterwards the same octets are a new
+A client without an answer repeats its request with the same bytes.  As long as its first request
+waits, the second is no other one, and both are answered once; afterwards the same bytes are a new
 request, because real clients poll with a constant counter.
 """
 
@@ -29,14 +29,14 @@ class ClientLimits(NamedTuple):
 
 
 class MemoryBudget:
-    """Octets that transfers may hold while they are under way, by host: ports cost a host nothing.
+    """Bytes that active transfers may hold, limited by host: a host has any number of ports.
 
     Args:
-        in_all: Octets of all clients.
-        of_host: Octets of one host.
+        in_all: Bytes of all clients.
+        of_host: Bytes of one host.
 
     Attributes:
-        held: Octets that are held now.
+        held: Bytes that are held now.
     """
 
     def __init__(self, in_all: int = 64 << 20, of_host: int = 16 << 20) -> None:
@@ -46,7 +46,7 @@ class MemoryBudget:
         self._hosts: dict[str, int] = {}
 
     def grant(self, host: str, more: int) -> bool:
-        """Change what a host holds by *more* octets; return False if there is no room."""
+        """Change the bytes held by a host by *more*; return False if that exceeds a limit."""
         own = self._hosts.get(host, 0) + more
         if more > 0 and (own > self._of_host or self.held + more > self._in_all):
             return False
@@ -67,7 +67,7 @@ class MemoryShare:
         self._held = 0
 
     def hold(self, size: int) -> bool:
-        """Hold *size* octets instead of those before; return False, and hold those, if too many."""
+        """Hold *size* bytes instead of those before; return False, and hold those, if too many."""
         if not self._budget.grant(self._host, size - self._held):
             return False
         self._held = size
@@ -128,7 +128,7 @@ class RequestTracker:
 
         Args:
             endpoint: Connection, or address, of the client.
-            frame: All octets of the request.
+            frame: All bytes of the request.
             now_ns: The time on the monotonic clock.
         """
         client = self._client(endpoint, now_ns)
@@ -161,7 +161,7 @@ class RequestTracker:
         return len(client.waiting) if client else 0
 
     def counts_of(self, endpoint: Endpoint) -> Counts | None:
-        """Return what was done for a client that is known."""
+        """Return the counters of a known client."""
         client = self._clients.get(endpoint)
         return client.counts if client else None
 
@@ -206,12 +206,12 @@ class RequestTracker:
 class Ticket:
     """A request that was taken, until it is answered.
 
-    It is given back before the answer goes out: the client may then send the same octets anew.
+    It is given back before the answer goes out: the client may then send the same bytes anew.
 
     Args:
         tracker: That took it.
         endpoint: Connection, or address, of the client.
-        frame: All octets of the request.
+        frame: All bytes of the request.
     """
 
     __slots__ = ("_endpoint", "_frame", "_tracker")

@@ -79,7 +79,7 @@ Destination: TypeAlias = MasterAddress | SlaveAddress | RemoteAddress | GroupAdd
 
 
 class AddressMap:
-    """What the addresses of a gateway mean.
+    """Destinations of the addresses of a gateway.
 
     Args:
         virtual: Addresses of the plant file.  They go before station addresses, so that a slave
@@ -121,7 +121,7 @@ _EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
 
 @lru_cache(1024)  # clients ask for the same again and again
 def operation_of(kind: MailboxType, body: bytes) -> Operation | None:
-    """Return what a request does; None for a step of a transfer that was judged at its start."""
+    """Return the operation of a request; None for a step of a transfer, decided at its start."""
     find = _BY_KIND.get(kind)
     return find(body) if find is not None else _RAW
 
@@ -160,7 +160,7 @@ def _of_coe(body: bytes) -> Operation | None:
 
 
 def _written(body: bytes) -> bytes:
-    """Return what a download writes, as far as its first message has it."""
+    """Return the data of a download, as far as its first message has it."""
     start = CoeHeader.SIZE + SdoHeader.SIZE
     if len(body) < start:
         return b""
@@ -204,7 +204,7 @@ def _of_eoe(body: bytes) -> Operation:
 
 
 def _of_aoe(body: bytes) -> Operation:
-    """Return the only operation of a packet in one piece; others cannot be looked into."""
+    """Return the only operation of an unfragmented packet; other packets are opaque."""
     try:
         header, data = decode_packet(body)
         operations = parse_request(header.command, bytes(data)).operations
@@ -239,7 +239,7 @@ class GatewayError(EapError):
 
 
 class ErrorReply(NamedTuple):
-    """A message that goes back."""
+    """Error message in reply to a request."""
 
     type: MailboxType
     body: bytes

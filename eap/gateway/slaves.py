@@ -1,4 +1,4 @@
-"""The slaves behind a gateway, as the dictionary of its master tells of them (ETG.1510)."""
+"""Slaves behind a gateway, read from the dictionary of its master (ETG.1510)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NO_DICTIONARY = (SdoAbortError, MailboxRefusedError, MailboxTimeoutError)
 
 
 class MasterSlave(NamedTuple):
-    """A slave as the master's dictionary tells of it."""
+    """Slave as the master's dictionary describes it."""
 
     station: int
     name: str
@@ -87,7 +87,7 @@ def read_sizes(address: int) -> Conversation[MailboxSizes]:
 
 
 def sizes_of(slaves: Sequence[MasterSlave], address: int) -> MailboxSizes:
-    """Return the mailboxes of a slave; raise BusError if it has none, or nobody knows it."""
+    """Return the mailboxes of a slave; raise BusError if it has none or is unknown."""
     for slave in slaves:
         if slave.station in {address, address & ~VIRTUAL_BIT}:
             if not slave.to_slave:

@@ -33,7 +33,7 @@ Perform: TypeAlias = Callable[[Operation], OperationOutcome | Awaitable[Operatio
 
 
 def begin_answer(command: int, body: bytes, perform: Perform) -> AmsAnswer | Awaitable[AmsAnswer]:
-    """Have *perform* do what a request asks for; return the answer, or what is to be awaited.
+    """Execute the operations of a request by *perform*; return the answer, or an awaitable of it.
 
     Args:
         command: Of the AMS header.
@@ -77,7 +77,7 @@ async def _perform_all(
 
 
 async def control_state(device: StationDevice, request: WriteControl) -> OperationOutcome:
-    """Bring *device* to a state; the outcome says why it is not there."""
+    """Execute a WriteControl: bring *device* to a state; the outcome has the reason of an error."""
     try:
         fault = (await device.request_state(al_state_for(request.ads_state))).fault
     except AdsRefusedError as exc:
@@ -95,7 +95,7 @@ def first_handle() -> int:
 
 
 class AdsService:
-    """What clients reach at some AMS ports of one NetID (Service).
+    """ADS services at some AMS ports of one NetID (Service).
 
     Args:
         device: The EAP device of the station, whose state is that of the whole.
@@ -120,11 +120,11 @@ class AdsService:
 
     @property
     def notifications(self) -> Mapping[int, NotificationTable]:
-        """By AMS port: whom it tells of what."""
+        """Notifications of each AMS port."""
         return {port: device.notifications for port, device in self.devices.items()}
 
     def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
-        """Answer a request, at once where nobody has to be waited for."""
+        """Answer a request, without a task if no operation waits."""
         header = request.header
         client = AdsClient(request.endpoint, header.source, header.source_port)
         perform = partial(self.perform, header.target_port, client)
@@ -144,12 +144,12 @@ class AdsService:
         return self.devices[port].perform(operation, client, monotonic_ns())
 
     def states(self) -> AdsStates:
-        """Return what ReadState tells."""
+        """Return the answer to ReadState."""
         return states_of(self.device.status.state)
 
 
 def device_info(name: str, release: str) -> AdsDeviceInfo:
-    """Return what a device of this software tells of itself; *release* is such as ``0.1.0``."""
+    """Return name and version of a device; *release* is such as ``0.1.0``."""
     numbers = [int(part) if part.isdecimal() else 0 for part in release.split(".")]
     major, minor, build = (*numbers, 0, 0, 0)[:3]
     return AdsDeviceInfo(major & 0xFF, minor & 0xFF, build & 0xFFFF, device_name(name))

@@ -147,7 +147,7 @@ class SlaveAds:
                     return b""
                 found = await self._read(target, group, offset)
         if len(found) > length:
-            why = f"{len(found)} octets, the client has room for {length}"
+            why = f"{len(found)} bytes, the client has room for {length}"
             raise AdsRefusedError(AdsError.SIZE, why)
         return found
 
@@ -207,7 +207,7 @@ class ProcedureCommands:
         self._running = TaskSet("procedure commands")
 
     async def execute(self, access: LocalSlave, station: int, place: SoeOffset) -> None:
-        """Execute a command, or wait on for one that goes on."""
+        """Execute a command, or wait for one that is running."""
         key = station, place.drive, place.idn
         task = self._tasks.get(key)
         if task is None:
@@ -234,7 +234,7 @@ class ProcedureCommands:
 
 
 async def _execute(access: LocalSlave, place: SoeOffset) -> None:
-    """Execute a command; between two looks at its state the drive serves other clients."""
+    """Execute a command; between two polls of its state the drive serves other clients."""
     what = f"procedure command {Idn.of(place.idn)} at drive {place.drive}"
     loop = asyncio.get_running_loop()
     await access.write_elements(place.idn, Element.VALUE, _START, drive=place.drive)
@@ -280,7 +280,7 @@ class AoeForwarder:
         return outcome
 
     async def _set_address(self, target: SlaveTarget) -> None:
-        """Give a slave its address; its refusal changes nothing."""
+        """Assign a slave its address; an error of the slave is ignored."""
         write = Write(IndexGroup.ADDRESS, _NET_ID_OFFSET, bytes(self._net_id))
         await self._exchange(target, write, (self._net_id, target.slave.station))
 
@@ -346,7 +346,7 @@ def _soe_place(offset: int) -> SoeOffset:
 
 
 def _device_info(slave: SlaveDescription) -> AdsDeviceInfo:
-    """Name the slave as its bus does; the version is its revision, from the highest octet down."""
+    """Name the slave as its bus does; the version is its revision, from the highest byte down."""
     revision = slave.revision
     high, middle = revision >> 24 & _OCTET, revision >> 16 & _OCTET
     return AdsDeviceInfo(high, middle, revision & 0xFFFF, device_name(slave.name))
@@ -408,7 +408,7 @@ class BusService:
         return AmsAnswer(error_code=result, why=answer.why) if result in _IN_HEADER else answer
 
     def client_gone(self, endpoint: Endpoint) -> None:
-        """Forget what belongs to a connection that is closed; files stay open for another one."""
+        """Remove the notifications of a closed connection; files stay open for another one."""
         self._master.client_gone(endpoint)
 
     async def _performer(self, ams_port: int, client: AdsClient) -> Perform:

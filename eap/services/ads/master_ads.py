@@ -217,7 +217,7 @@ class MasterAds:
 
 
 class NotificationSender:
-    """Sends the notifications of one master, and looks at its bus while there are any.
+    """Sender of the notifications of one master; polls its bus while there are any.
 
     Args:
         table: The notifications.

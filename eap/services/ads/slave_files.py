@@ -94,11 +94,11 @@ class SlaveFiles:
             raise AdsRefusedError(AdsError.SERVICE, "a file is opened by ReadWrite")
         if group in _OPENED:
             if length < _HANDLE_SIZE:
-                raise AdsRefusedError(AdsError.SIZE, "a handle has four octets")
+                raise AdsRefusedError(AdsError.SIZE, "a handle has four bytes")
             is_write = group == IndexGroup.FOE_OPEN_WRITE
             return await self._begin(access, station, client, data, offset, is_write=is_write)
         if max(len(data), length) > MAX_BLOCK:
-            raise AdsRefusedError(AdsError.SIZE, f"a block has at most {MAX_BLOCK} octets")
+            raise AdsRefusedError(AdsError.SIZE, f"a block has at most {MAX_BLOCK} bytes")
         if data and group == IndexGroup.FOE_READ:
             raise AdsRefusedError(AdsError.SIZE, "nothing is written here")
         item = self._find(station, client, offset)
@@ -173,7 +173,7 @@ class SlaveFiles:
         self._drop(handle)
 
     def _drop_abandoned(self, owner: NetId, station: int) -> None:
-        """Give up files of *owner* at a slave that it has left open, now or when it is time."""
+        """Drop files of *owner* at a slave that it has abandoned, now or when the time is over."""
         loop = asyncio.get_running_loop()
         for handle, item in list(self._open.items()):
             if (item.owner, item.station) != (owner, station) or item.idle_since_s is None:
@@ -185,7 +185,7 @@ class SlaveFiles:
                 loop.call_at(left_at_s, self._drop_if_abandoned, handle, item.idle_since_s)
 
     def _drop_if_abandoned(self, handle: int, since_s: float) -> None:
-        """Give a file up if there was no request for it since then."""
+        """Drop a file if there was no request for it since then."""
         item = self._open.get(handle)
         if item is not None and item.idle_since_s == since_s:
             logger.info("%s given up: %s left it open and opens another one", item.name, item.owner)

@@ -104,20 +104,20 @@ _BUS_STATE = "state"
 
 
 class ReportingRouter(Protocol):
-    """What is needed of the router of a station."""
+    """Interface to the router of a station."""
 
     @property
     def table(self) -> RouteTable:
         """Its routes."""
 
     def report(self, route: Route) -> RouteReport:
-        """Return what is known of a route."""
+        """Return the report of a route."""
 
     def connections(self) -> list[ConnectionReport]:
-        """Return who asks."""
+        """Return the reports of all connections."""
 
     def stats(self) -> Stats:
-        """Return what is going on, and what was."""
+        """Return the counters of the router."""
 
 
 class LiveRouter:
@@ -145,7 +145,7 @@ class LiveRouter:
         self._version = -1
 
     def number(self, key: RouterLive) -> int:
-        """Return what *key* stands for, of the router as a whole."""
+        """Return the value of *key* for the router as a whole."""
         if key is RouterLive.STATE:
             return int(self._device.status.state)
         if key is RouterLive.CONNECTIONS:
@@ -181,7 +181,7 @@ class LiveRouter:
         return self._routes
 
     def of_route(self, key: RouterLive, route: object) -> Any:
-        """Return what *key* stands for, of one of the routes."""
+        """Return the value of *key* for one of the routes."""
         assert isinstance(route, Route)  # noqa: S101  they come from here
         reader = _OF_ROUTE.get(key)
         return _OF_REPORT[key](self._router.report(route)) if reader is None else reader(route)
@@ -227,7 +227,7 @@ _TYPES = {PortKind.EAP: IoDeviceType.EAP, PortKind.BUS: IoDeviceType.MASTER}
 
 
 class RouterAds(AdsService):
-    """What clients reach at the NetID of a station.
+    """ADS services at the NetID of a station: I/O server and dictionary of the router.
 
     Args:
         station: Whose router it is.
@@ -268,7 +268,7 @@ _BUSY_PAUSES = 20
 
 
 class EapAds(AdsService):
-    """What clients reach at the NetID of one EAP port.
+    """ADS services at the NetID of one EAP port.
 
     Args:
         device: Of the station.
@@ -302,7 +302,7 @@ class EapAds(AdsService):
     def perform(
         self, port: int, client: AdsClient, operation: Operation
     ) -> OperationOutcome | Awaitable[OperationOutcome]:
-        """Do one operation; what changes objects or the state, or finds a writer, takes time."""
+        """Execute one operation; changes, and retries while BUSY, are awaited."""
         if isinstance(operation, WriteControl):
             return super().perform(port, client, operation)
         perform = partial(self._ads.perform, operation, client, monotonic_ns())
@@ -323,7 +323,7 @@ class EapAds(AdsService):
 
 
 async def _retry_busy(perform: Callable[[], OperationOutcome]) -> OperationOutcome:
-    """Wait for a writer in the middle of writing; one that died there is told."""
+    """Repeat an operation while a writer holds the image; after the last try it is BUSY."""
     for _ in range(_BUSY_PAUSES):
         await asyncio.sleep(_BUSY_PAUSE_S)
         outcome = perform()
@@ -382,7 +382,7 @@ class StationAds:
                 self._drive(service, net_id)
 
     async def serve(self) -> None:
-        """Tell whom notifications are for, until cancelled."""
+        """Send notifications until cancelled."""
         await self.pump.serve()
 
     def _drive(self, service: AdsService, net_id: NetId) -> None:

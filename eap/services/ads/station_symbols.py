@@ -64,7 +64,7 @@ class ImageVariables:
             self._sample = None
 
     def read(self, name: str) -> bytes:
-        """Return the octets of a value; refuse with BUSY while its writer is in the middle."""
+        """Return the bytes of a value; refuse with BUSY while its writer is in the middle."""
         if self._sample is not None:
             return take(self._image.slots[name], self._sample, self._first_bit)
         try:
@@ -73,9 +73,9 @@ class ImageVariables:
             raise AdsRefusedError(AdsError.BUSY, str(exc)) from None
 
     def write(self, name: str, octets: bytes) -> None:
-        """Store a value; refuse with BUSY while another program writes, with VALUE what is none."""
+        """Store a value; raise BUSY while another program writes, VALUE if it is invalid."""
         kind = datatypes.parse(self._image.slots[name].type)
-        # A text of a client with another encoding than ours: its octets go on as they are.
+        # A text of a client with another encoding than ours: its bytes go on as they are.
         value = bytes(octets) if isinstance(kind, String) else kind.decode(octets, 0)
         try:
             self._station.write_once(Writer.APPLICATION, {name: value})
@@ -104,11 +104,11 @@ class StationSymbols(AdsSpace):
 
     @property
     def image(self) -> Image:
-        """The image that was the newest when somebody looked last."""
+        """The newest image at the last refresh."""
         return self._file.image
 
     def refresh(self) -> SymbolSpace:
-        """Go over to the newest image; return the symbols there, or refuse with NOT_READY."""
+        """Switch to the newest image; return its symbols, or raise NOT_READY."""
         try:
             file = self._station.file
         except ImageError as exc:
@@ -120,7 +120,7 @@ class StationSymbols(AdsSpace):
         return self._space
 
     def read(self, group: int, offset: int, length: int) -> bytes:
-        """Return what the newest symbols say."""
+        """Read from the newest symbols."""
         return self.refresh().read(group, offset, length)
 
     def write(self, group: int, offset: int, data: bytes) -> None:
@@ -128,11 +128,11 @@ class StationSymbols(AdsSpace):
         self.refresh().write(group, offset, data)
 
     def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
-        """Return what belongs to a name."""
+        """Return the answer to a lookup of a name."""
         return self.refresh().read_write(group, offset, length, data)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives a value."""
+        """Return the source of a value."""
         return self.refresh().watch(group, offset, length)
 
     def _table(self) -> SymbolTable:
@@ -197,7 +197,7 @@ class NotificationPump:
         table.on_add = self._wake.set
 
     async def serve(self) -> None:
-        """Tell whoever is to be told, until cancelled."""
+        """Send notifications until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             try:
@@ -214,7 +214,7 @@ class NotificationPump:
                 timer.cancel()
 
     def advance(self, now_ns: int, unix_ns: int) -> int | None:
-        """Tell what is due; return in how many nanoseconds to look again, None if not at all.
+        """Send due notifications; return the delay of the next call in nanoseconds, None for none.
 
         Args:
             now_ns: The time on the monotonic clock.
@@ -238,7 +238,7 @@ class NotificationPump:
         return self._delay_ns(now_ns) if is_done else _SHORT_PAUSE_NS
 
     def _send_due(self, samples: ImageSamples, unix_at_0_ns: int) -> bool:
-        """Go through the cycles since the last look; return whether that was all of them."""
+        """Send the notifications of cycles since the last call; return False if some are left."""
         budget = _MAX_VALUES
         for cycle in samples.since(self._last_cycle):
             if budget <= 0:
@@ -256,7 +256,7 @@ class NotificationPump:
         return True
 
     def _send_cycle(self, at_ns: int, time: int) -> int:
-        """Tell of one cycle; return how many values were looked at, at most."""
+        """Send the notifications of one cycle; return the number of values compared, at most."""
         looked_at = 0
         for table, net_id, port in self._devices:
             due_ns = table.next_timeout()
@@ -271,7 +271,7 @@ class NotificationPump:
         return min((each for each in times if each is not None), default=None)
 
     def _delay_ns(self, now_ns: int) -> int | None:
-        """Return how long it is until the cycle has ended that has to tell something."""
+        """Return the delay until the end of the next cycle with a due notification."""
         due_ns = self._due_ns()
         if due_ns is None:
             return 0  # the last one ended just now: look once more, to rest then

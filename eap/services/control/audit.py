@@ -49,7 +49,7 @@ was had again: another process may be stopped while it holds it.
 
 
 class AuditFile:
-    """The file; older ones lie beside it, with ``.1`` and so on behind their names.
+    """Audit file; older files have ``.1`` and so on appended to their names.
 
     Attributes:
         path: Of the file, in a folder that only its owner may enter.
@@ -205,7 +205,7 @@ class Audit:
         return self._file.path
 
     async def serve(self) -> None:
-        """Write what was left out and what was lost, until cancelled."""
+        """Write the numbers of skipped and lost lines, until cancelled."""
         try:
             while True:
                 await asyncio.sleep(_REPORT_S)
@@ -216,11 +216,11 @@ class Audit:
             self.write_lost()
 
     def report(self) -> dict[str, Any]:
-        """Return what ``status`` says."""
+        """Return the entry of ``status``."""
         return {"file": str(self.path), "required": self.is_required, **self.lost._asdict()}
 
     def begin(self, station: str, entry: AuditEntry) -> str:
-        """Write down what a station is going to change; return why that cannot be done."""
+        """Write the intended change of a station; return the reason if it cannot be recorded."""
         client = station, entry.endpoint.transport, host_of(entry.endpoint)
         if not all(self._allow(client) for _ in entry.operations):
             return TOO_MANY
@@ -229,7 +229,7 @@ class Audit:
         return "" if self._append(lines, are_counted=False) else self._refusal_text()
 
     def begin_request(self, who: str, station: str, fields: dict[str, Any]) -> str:
-        """Write down what a client of the control socket changes, or is refused, if required.
+        """Write the intended change of a client of the control socket, if the audit is required.
 
         Returns:
             Why it cannot be recorded, and hence not be done; empty if it can.
@@ -249,7 +249,7 @@ class Audit:
         return f"the audit is required and cannot be written: {self.lost.error}"
 
     def write(self, station: str, entry: AuditEntry) -> None:
-        """Write down what a station did, or refused."""
+        """Write a change that a station made or denied."""
         client = station, entry.endpoint.transport, host_of(entry.endpoint)
         head = self._head(station, entry)
         lines = []
@@ -263,7 +263,7 @@ class Audit:
             self._append(lines)
 
     def write_request(self, who: str, station: str, fields: dict[str, Any]) -> None:
-        """Write down what a client of the control socket did, or was refused.
+        """Write a change of a client of the control socket, made or denied.
 
         If that is required, :meth:`begin_request` has limited it already.
         """
@@ -404,7 +404,7 @@ def _result_fields(each: AuditedOperation) -> dict[str, Any]:
 
 
 def operation_fields(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]]:
-    """Yield what was to be done."""
+    """Yield the fields that describe an operation."""
     yield "operation", type(operation).__name__
     if isinstance(operation, AddRoute):
         yield "adds", operation._asdict()

@@ -136,7 +136,7 @@ class BusConnection:
         return held.opened if held is not None else None
 
     def close(self) -> None:
-        """End what is open."""
+        """End all open conversations."""
         for number in list(self._open_mailboxes):
             self._abandon(number)
 
@@ -242,7 +242,7 @@ _SHARED = {SocketKind.UDP: "udp", SocketKind.TCP: "tcp", SocketKind.PACKET: "eth
 
 
 class GatewayMethods:
-    """Starts and stops gateways, and tells what they do.
+    """Methods that start, stop and report gateways.
 
     Args:
         handover: Where they are served.

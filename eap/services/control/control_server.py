@@ -78,7 +78,7 @@ _MAX_TEXT = 200
 
 
 def peer_of(connection: socket.socket) -> str:
-    """Return whose process is at the other end of a Unix socket, and which."""
+    """Return user and process at the other end of a Unix socket."""
     pid, uid = process_of(connection)
     return f"uid {uid}, pid {pid}"
 
@@ -86,7 +86,7 @@ def peer_of(connection: socket.socket) -> str:
 def change_of(
     request: Request, opened: Callable[[int], BusOpenParameters | None]
 ) -> tuple[str, dict[str, Any]] | None:
-    """Return the station that a request changes, and what is told of it; None for one that reads.
+    """Return the station that a request changes, and fields for the audit; None if it only reads.
 
     Args:
         request: As it came, not checked yet.
@@ -204,7 +204,7 @@ class ControlServer:
         return ControlConnection(host)
 
     def refuse_connection(self, sock: socket.socket, why: str) -> None:
-        """Tell a client that there is no room for it (ConnectionServer)."""
+        """Send a client the reason why its connection is closed (ConnectionServer)."""
         with suppress(OSError):
             sock.send(encode_error(None, ControlError(why, code=ErrorCode.BUSY)))
 
@@ -291,7 +291,7 @@ class _Reader(asyncio.StreamReader):
             self._connection.note_partial()
 
     def feed_eof(self) -> None:
-        """Take the end of what the client sends; it may still wait for answers."""
+        """Handle the end of the client's input; it may still wait for answers."""
         super().feed_eof()
         poll = select.poll()
         poll.register(self._socket, 0)
@@ -348,7 +348,7 @@ class _Client:
         except asyncio.IncompleteReadError:
             return b""
         except asyncio.LimitOverrunError:
-            reason = f"a line has at most {MAX_LINE} octets"
+            reason = f"a line has at most {MAX_LINE} bytes"
             error = ControlError(reason, code=ErrorCode.BAD_REQUEST)
             await self.send(encode_error(None, error))
             return b""

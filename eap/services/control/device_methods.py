@@ -146,7 +146,7 @@ class DeviceMethods:
         return of_station(station, self._devices)
 
     def _find(self, target: str) -> _Target:
-        """Return who is meant by a target; raise ControlError that says which there are."""
+        """Return the device and dictionary of a target; raise ControlError with the known ones."""
         station, _, port = target.partition("/")
         device = self._device(station)
         ports = list(device.dictionaries)
@@ -163,7 +163,7 @@ class DeviceMethods:
 
 
 class _Target(NamedTuple):
-    """Whose dictionary is meant."""
+    """Dictionary that a target names, with its device."""
 
     device: StationDevice
     port: str

@@ -30,7 +30,7 @@ _OTHERS = (Writer.SERVICES, Writer.APPLICATION)
 
 
 class Methods:
-    """All methods but those that belong to a connection (subscriptions, and what is on buses).
+    """All methods but those with the state of a connection (subscriptions, buses).
 
     Args:
         identity: What ``hello`` says beside the protocol's version.
@@ -81,7 +81,7 @@ class Methods:
         return await result if isawaitable(result) else result
 
     def watch(self, params: dict[str, Any]) -> Watch:
-        """Check the parameters of ``subscribe`` and return what makes its events."""
+        """Check the parameters of ``subscribe`` and return the source of its events."""
         wanted = parameters(params, control.SubscribeParameters)
         if wanted.period_ms < MIN_PERIOD_MS:
             raise ControlError(
@@ -140,7 +140,7 @@ class Methods:
 
 
 class Watch:
-    """The events of one subscription; asked every *period_ms* by whoever sends them."""
+    """Events of one subscription, polled by its sender every *period_ms*."""
 
     def __init__(
         self,

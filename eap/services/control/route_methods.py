@@ -141,7 +141,7 @@ _USUAL_PORT = f":{AMS_TCP_PORT}"
 
 
 class RouteMethods:
-    """What can be asked about the routers of all stations here.
+    """Methods for the routes of all stations of the appliance.
 
     Args:
         views: The routers by the names of their stations.

@@ -71,7 +71,7 @@ class ProcessMeter:
 
 
 class SharedAnswer:
-    """An answer that is made once for all clients that ask while another one is being made.
+    """Answer that is made once for all clients that request it while another one is being made.
 
     It is made after they asked, so it is never older than a question; a crowd that asks for
     something costly does not multiply the cost.
@@ -84,7 +84,7 @@ class SharedAnswer:
         self._tasks = TaskSet("status")
 
     async def get(self) -> dict[str, Any]:
-        """Return the next answer; raises what making it does."""
+        """Return the next answer; errors of making it are raised."""
         if self._next is None:
             self._next = self._tasks.start_awaited(self._run())
         return await asyncio.shield(self._next)

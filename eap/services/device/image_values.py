@@ -49,7 +49,7 @@ _KINDS: dict[str, DataType] = {
 
 
 class ImageValues:
-    """What the dictionaries of one station show of what runs."""
+    """Live values for the dictionaries of one station."""
 
     def __init__(self, station: StationImage) -> None:
         self._station = station
@@ -57,7 +57,7 @@ class ImageValues:
         self._moment: Image | None = None
 
     def octets(self, key: str, name: str) -> bytes | None:
-        """Return what *key* shows of the object called *name*, None if that does not run."""
+        """Return the value of *key* of the object called *name*, None if that does not run."""
         try:
             image = self._station.image
             if key == EapLive.VALUE:

@@ -91,7 +91,7 @@ class UdpSubscriberProbe:
         return found & self._refused_at_ns.keys()
 
     def look(self, target: Destination, sent_at_ns: int) -> ProbeResult:
-        """Return what is known of *target*, to which a frame was sent last at *sent_at_ns*.
+        """Return the evidence about *target*, to which a frame was sent last at *sent_at_ns*.
 
         A refusal holds until frames have been sent for a while without another one.
         """
@@ -119,7 +119,7 @@ class SubscriberProbes(NamedTuple):
 
 
 def open_subscriber_probes(handover: Handover, resources: ExitStack) -> SubscriberProbes:
-    """Return the ways of all EAP ports; *resources* closes what they need."""
+    """Return the probes of all EAP ports; *resources* closes their sockets."""
     endpoints = SubscriberProbes({}, {})
     table = _open_table(resources)
     for shared in handover.sockets:
@@ -161,7 +161,7 @@ POLL_NS = 200_000_000
 
 
 class ImageHolder(Protocol):
-    """Whoever has the newest image of a station."""
+    """Holder of the newest image of a station."""
 
     @property
     def image(self) -> Image:
@@ -169,7 +169,7 @@ class ImageHolder(Protocol):
 
 
 class _Row:
-    """One monitored frame, and where it went when somebody looked last."""
+    """One monitored frame, and its destination at the last look."""
 
     def __init__(self, port: PortName, place: FrameSlot, image: Image) -> None:
         self.name = f"{port.station}/{place.name}"
@@ -183,7 +183,7 @@ class _Row:
         return int(self.words[self.place.words + word])
 
     def has_moved(self) -> bool:
-        """Look where the frame goes now; return whether that is somewhere else than before."""
+        """Read the present destination of the frame; return whether it has changed."""
         address = self.word(FrameWord.ADDRESS)
         if address == self.address:
             return False
@@ -236,7 +236,7 @@ class SubscriberWatch:
                 loop.remove_reader(errors.fileno())
 
     def step(self, now_ns: int) -> int:
-        """Do what there is to do; return when the next step is due."""
+        """Run one step; return when the next step is due."""
         self._follow_frames(now_ns)
         self._receive_replies(now_ns)
         for name in self._monitor.probes_to_send(now_ns):
@@ -248,7 +248,7 @@ class SubscriberWatch:
         return now_ns + POLL_NS if due_ns is None else min(due_ns, now_ns + POLL_NS)
 
     def _follow_frames(self, now_ns: int) -> None:
-        """Look which frames are monitored and where they go."""
+        """Read which frames are monitored and their destinations."""
         changed = False
         for station, holder in self._holders.items():
             try:
@@ -267,7 +267,7 @@ class SubscriberWatch:
             self._watch_targets()
 
     def _replace(self, station: str, image: Image) -> None:
-        """Follow the frames of *image*; what is known of those that stay as they were is kept."""
+        """Follow the frames of *image*; the evidence about unchanged frames is kept."""
         own = [name for name, row in self._rows.items() if row.port.station == station]
         before = {name: self._rows.pop(name) for name in own}
         for place in image.layout.frames:
@@ -281,7 +281,7 @@ class SubscriberWatch:
             self._monitor.remove(name)
 
     def _watch_targets(self) -> None:
-        """Have each way listen to what is said of its targets."""
+        """Set the filters of each probe to its targets."""
         self._pending = {}
         targets: dict[UdpSubscriberProbe, list[Destination]] = {}
         for row in self._rows.values():
@@ -319,7 +319,7 @@ class SubscriberWatch:
         return (row for row in self._rows.values() if row.port in self._endpoints.udp)
 
     def _probe(self, row: _Row) -> ProbeResult | None:
-        """Ask for the subscriber of *row*; return what is known at once, None if it may answer."""
+        """Probe the subscriber of *row*; return evidence known at once, None if it may answer."""
         if hop_prober := self._hop_prober(row):
             return (
                 None if hop_prober.probe(IPv4Address(row.place.monitor_ip)) else ProbeResult.BLIND
@@ -330,7 +330,7 @@ class SubscriberWatch:
         return endpoint.look(target, row.word(FrameWord.SENT_AT_NS))
 
     def _hop_prober(self, row: _Row) -> ArpProber | None:
-        """Return who asks by ARP for the subscriber of *row*, None where that is no way."""
+        """Return the ARP prober for the subscriber of *row*, None where ARP cannot reach it."""
         destination = row.destination
         if destination is None or destination.kind is not DestinationKind.MAC:
             return None
@@ -346,7 +346,7 @@ class SubscriberWatch:
 
 
 def _ip_of(row: _Row) -> Destination | None:
-    """Return where a unicast frame on UDP goes, None for all others."""
+    """Return the destination of a unicast frame on UDP, None for all others."""
     target = row.destination
     if target is None or target.kind is not DestinationKind.IP or target.is_group:
         return None

@@ -92,7 +92,7 @@ async def _play(
 
 
 def _sources(station: StationSpec) -> list[tuple[Source, str]]:
-    """Return what services plays, with the types that it is written as."""
+    """Return the sources that services plays, with the types of their variables."""
     types = {variable.name: variable.type for variable in station.variables}
     played = (each for each in station.sources if isinstance(each, (HostSource, CsvSource)))
     return [(each, types[each.variable]) for each in played]

@@ -86,16 +86,16 @@ class StationDevice:
 
     @property
     def spec(self) -> StationSpec:
-        """What runs."""
+        """The running specification."""
         return self._keeper.spec
 
     @property
     def last_change(self) -> tuple[Configuration | None, str, bool]:
-        """What ran before the last change, if anything, which change that was, and if undone."""
+        """Configuration before the last change, name of that change, and whether undone."""
         return self._keeper.previous, self._keeper.cause, self._keeper.undone
 
     def findings(self) -> list[dict[str, Any]]:
-        """Return as findings of ``status`` that what runs is not what a start would bring back."""
+        """Return a finding of ``status`` if the running configuration could not be stored."""
         unsaved = self._keeper.unsaved
         if unsaved is None:
             return []
@@ -121,7 +121,7 @@ class StationDevice:
         return self._machine.od_state or OdState.PREOP
 
     async def resend(self) -> None:
-        """Tell the engine what it is to run, which it may have missed."""
+        """Send the engine the configuration again, which it may have missed."""
         await self._jobs.run(self._keeper.resend)
 
     def upload(self, port: str, index: int, subindex: int, *, complete: bool = False) -> bytes:
@@ -145,7 +145,7 @@ class StationDevice:
         await self.change(port, write)
 
     async def change(self, port: str, write: Callable[[], ResultT]) -> ResultT:
-        """Have *write* change the dictionary of *port*, and do what follows; return its result.
+        """Change the dictionary of *port* by *write*, and apply the change; return its result.
 
         Raises:
             SdoAbortError: it, or the engine, refuses; nothing has changed.
@@ -158,13 +158,13 @@ class StationDevice:
         return await self._jobs.run(lambda: self._go_to(wanted))
 
     async def plan(self, spec: StationSpec) -> Plan:
-        """Return what it takes to run *spec*."""
+        """Return the plan of the change to *spec*."""
         return await self._jobs.run(lambda: asyncio.to_thread(self._plan, spec))
 
     async def apply(
         self, spec: StationSpec, cause: str = "", *, of_plant_file: bool = False
     ) -> tuple[Plan, DeviceFault | None]:
-        """Run *spec*, in the state that there is; return what that changes, or why it does not.
+        """Run *spec* in the present state; return the plan, and the fault if it does not run.
 
         A change of several stations in several steps has one *cause*; *of_plant_file* says that it
         is to what the plant file of the appliance says now.
@@ -173,7 +173,7 @@ class StationDevice:
         return await self._jobs.run(lambda: self._change(lambda: self._plan(spec), run))
 
     async def roll_back(self, spec: StationSpec | None = None) -> tuple[Plan, DeviceFault | None]:
-        """Run again what ran before the last change; returns as :meth:`apply` does.
+        """Run the configuration before the last change; returns as :meth:`apply` does.
 
         *spec* is that, or what runs now, with alternates where layouts change with other stations.
         """
@@ -201,7 +201,7 @@ class StationDevice:
         return plan, None
 
     async def _write(self, dictionary: EapDictionary, write: Callable[[], ResultT]) -> ResultT:
-        """Write to *dictionary*, and do what follows from it before anybody is answered.
+        """Write to *dictionary*, and apply the change before the client is answered.
 
         Raises:
             SdoAbortError: it is refused, by the dictionary or by the engine; nothing has changed.
@@ -224,7 +224,7 @@ class StationDevice:
         return result
 
     async def _go_to(self, wanted: int) -> StateResult:
-        """Have the engine go first; then the state machine does what the engine did."""
+        """Request the state from the engine first; then follow in the state machine."""
         state = self._machine.status.state
         try:
             if wanted in _STATES:
@@ -242,7 +242,7 @@ class StationDevice:
         await self._keeper.change_state(wanted)
 
     def _read_back(self) -> StationSpec:
-        """Return what the dictionaries say; raise DeviceFault if that cannot run."""
+        """Return the specification in the dictionaries; raise DeviceFault if it cannot run."""
         if self._incomplete is not None:
             raise self._incomplete
         spec = read_back(self.spec, self.dictionaries)
@@ -251,7 +251,7 @@ class StationDevice:
         return spec
 
     def _confirmed_spec(self) -> StationSpec:
-        """Return what the engine took, or raise why it did not."""
+        """Return the specification that the engine accepted, or raise its fault."""
         if isinstance(self._checked, DeviceFault):
             raise self._checked
         return self._checked
@@ -265,7 +265,7 @@ class StationDevice:
 
 
 class _ConfirmedActions:
-    """The actions of a state machine whose transitions the engine has made already."""
+    """Actions of a state machine whose transitions the engine has already made."""
 
     def __init__(self, recall: Callable[[], StationSpec]) -> None:
         self._confirmed_spec = recall
@@ -281,4 +281,4 @@ class _ConfirmedActions:
         """Nothing: the engine has stopped."""
 
     def stop_sending(self) -> None:
-        """Nothing: likewise."""
+        """Nothing: the engine has stopped."""

@@ -33,7 +33,7 @@ STATE_S = 5.0
 
 
 class EngineClient:
-    """Asks for changes of running stations.
+    """Client of the engine for changes of running stations.
 
     Args:
         link: Services' end of the pair with the engine.
@@ -85,7 +85,7 @@ class Unsaved(NamedTuple):
 
 
 class StationEngine(Protocol):
-    """Who runs stations.
+    """Interface to the engine that runs stations.
 
     Both methods raise EngineRefusedError, EngineGoneError or EnvironmentalError.
     """
@@ -98,7 +98,7 @@ class StationEngine(Protocol):
 
 
 class StationKeeper:
-    """What one station runs.
+    """Configuration and state that one station runs, and their stored copy.
 
     Args:
         spec: What the engine was started with.
@@ -149,7 +149,7 @@ class StationKeeper:
     async def change(
         self, spec: StationSpec, objects: dict[str, Any], *, cause: str = "", applied: bool = False
     ) -> None:
-        """Run *spec*, with what the dictionaries hold then.
+        """Run *spec*, with the content of the dictionaries then.
 
         Args:
             spec: What is to run.
@@ -174,7 +174,7 @@ class StationKeeper:
         await self._run(record)
 
     async def roll_back(self, spec: StationSpec, objects: dict[str, Any]) -> None:
-        """Run *spec*: what ran before the last change, or a step on the way there or from there.
+        """Run *spec*: the configuration before the last change, or a step to or from it.
 
         What ran until now is what another :meth:`roll_back` brings.  Raises as :meth:`change`.
         """
@@ -184,7 +184,7 @@ class StationKeeper:
         await self._run(record)
 
     def _running_configuration(self) -> Configuration:
-        """Return what runs, as something to go back to."""
+        """Return the running configuration, as the target of a later rollback."""
         spec = without_alternates(self.spec)
         return Configuration(base=self._base, spec=spec, objects=self.objects)
 
@@ -227,7 +227,7 @@ class StationKeeper:
         await self._save_back()
 
     async def resend(self) -> None:
-        """Tell the engine what it is to run, which it may have missed.
+        """Send the engine the configuration again, which it may have missed.
 
         It may have read what was kept just before that changed, and services may have been killed
         between the two.
@@ -259,7 +259,7 @@ class StationKeeper:
         self.unsaved = None
 
     async def _save_back(self) -> None:
-        """Keep what runs; if something else stays kept, log it once and show it until it is not."""
+        """Store the running configuration; log a failure once, and report it until it succeeds."""
         record = self._record()
         try:
             await self._save(record)

@@ -119,7 +119,7 @@ class GatewayAdmission:
         decision: Decision,
         result: int | None,
     ) -> None:
-        """Have the audit written of what was decided and how it came out.
+        """Write a decision and the result of the operation to the audit.
 
         Args:
             endpoint: Connection, or address, of the client.
@@ -147,7 +147,7 @@ def denial_cause(decision: Decision | None) -> Cause:
 
 
 def result_of(replies: Sequence[GatewayReply]) -> int | None:
-    """Return what an audit says of the answers to a request, as an error of ADS."""
+    """Return the result for the audit of a request, from its replies, as an error of ADS."""
     if not replies:
         return None
     reply = replies[-1]

@@ -72,7 +72,7 @@ class DialectHandler:
 
     Args:
         admission: Access rules and audit.
-        max_size: Octets of the longest answer.
+        max_size: Bytes of the longest answer.
         answer_s: Limit for an answer.
     """
 
@@ -129,7 +129,7 @@ class DialectHandler:
         return data
 
     async def _perform(self, task: Task, subject: DialectTarget) -> bytes:
-        """Carry out a task; return what was read, raise DialectError."""
+        """Carry out a task; return the data read, raise DialectError."""
         try:
             async with asyncio.timeout(self._answer_s):
                 if isinstance(subject, MasterSession):
@@ -206,12 +206,12 @@ def _dialect_error(error: EapError) -> DialectError:
 
 
 def _too_long(max_size: int) -> DialectError:
-    text = f"more than {max_size} octets do not fit one packet of this dialect"
+    text = f"more than {max_size} bytes do not fit one packet of this dialect"
     return DialectError(DialectFailure.GENERAL, text)
 
 
 def operation_of(task: Task) -> Operation:
-    """Return what a task does, in the terms of access rules."""
+    """Return the operation of a task for access rules."""
     match task:
         case ReadSdo(index, subindex, complete):
             return sdo(index, subindex, complete=complete)

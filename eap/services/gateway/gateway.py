@@ -119,8 +119,8 @@ class MailboxGateway:
     Attributes:
         statistics: Requests and answers by slave and protocol.
         tracker: Requests by client.
-        memory: Octets of objects and messages that are under way.
-        file_memory: Octets of files that are fetched ahead; without max_size fewer are.
+        memory: Bytes of objects and messages that are under way.
+        file_memory: Bytes of files that are fetched ahead; without max_size fewer are.
         admission: Access rules and audit.
         settings: As given.
         is_open: Whether it takes requests.
@@ -162,12 +162,12 @@ class MailboxGateway:
         self.is_open = True
 
     async def stop(self) -> None:
-        """Take no requests; what is under way is ended, at the slaves too."""
+        """Take no requests; active transfers are aborted, at the slaves too."""
         self.is_open = False
         await self.close()
 
     def transfers(self) -> list[SessionKey]:
-        """Return the transfers that are under way."""
+        """Return the active transfers."""
         return [*self._slaves.running()]
 
     def receive(self, frame: bytes, endpoint: Endpoint, send: Send) -> asyncio.Task[None] | None:
@@ -203,7 +203,7 @@ class MailboxGateway:
         return task
 
     def connection_closed(self, endpoint: Endpoint) -> None:
-        """Forget a client, and end what it had under way."""
+        """Remove a client, and abort its transfers."""
         self.tracker.forget(endpoint)
         self._listeners.forget(endpoint)
         self._slaves.close_of(endpoint)
@@ -215,7 +215,7 @@ class MailboxGateway:
             await self._tasks.wait_any()
 
     async def close(self) -> None:
-        """End everything that is under way."""
+        """Abort all requests and transfers."""
         await self._tasks.close()
         for endpoint in self.tracker.table():
             self.tracker.forget(endpoint)
@@ -332,7 +332,7 @@ class MailboxGateway:
         replies: Sequence[GatewayReply],
         start_ns: int,
     ) -> None:
-        """Tell the audit, count, and answer from *address*."""
+        """Write the audit, count, and answer from *address*."""
         operation, decision = authorized.operation, authorized.decision
         if operation is not None and decision is not None:
             self.admission.record(
@@ -408,7 +408,7 @@ class MailboxGateway:
         return ClientSession(key.kind, codec, answer_s=answer_s)
 
     def _end_stalls(self, key: SessionKey) -> None:
-        """Give up the files of other clients at a slave that waits for them."""
+        """Close files of other clients whose slave waits for them."""
         limit_s = asyncio.get_running_loop().time() - STALL_S
         for other, session in self._slaves.of_slave(key.address, key.kind):
             codec = session.codec

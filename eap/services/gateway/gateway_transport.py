@@ -1,4 +1,4 @@
-"""Way of frames of type 5 to a gateway, unless they are AoE to a station itself."""
+"""Binding of a socket to a gateway, for frames of type 5 that are no AoE to a station itself."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class GatewayTransport:
 
 
 def _reply_unknown_type(frame: bytes, answer: Callable[[bytes], None]) -> None:
-    """Say that nobody speaks the protocol of a frame."""
+    """Reply that the protocol of a frame is not supported."""
     kind, body = mailbox_error(MailboxError.UNSUPPORTED_PROTOCOL)
     address = int.from_bytes(frame[_ADDRESS], "little")
     answer(encode_plain_frame(kind, address, 0, body))

@@ -228,7 +228,7 @@ class ReplyEncoder:
     def _count_errors(
         self, request: GatewayRequest, kind: MailboxType, reasons: Iterable[Cause | None]
     ) -> None:
-        """Count what the gateway answers itself, and log it."""
+        """Count and log errors of the gateway itself."""
         for reason in reasons:
             if reason is not None:
                 break

@@ -41,7 +41,7 @@ _BUSY = bytes((FoeOpcode.BUSY,))
 
 
 class GatewayReply(msgspec.Struct, frozen=True):
-    """A message that goes back to the client."""
+    """Message in reply to a client."""
 
     type: MailboxType
     body: bytes
@@ -62,7 +62,7 @@ class SessionCodec(Protocol):
 
     @property
     def is_running(self) -> bool:
-        """Whether a transfer is under way, so that more requests belong to it."""
+        """Whether a transfer is active, so that more requests belong to it."""
 
     async def answer(self, body: bytes) -> list[bytes]:
         """Return the answers to a message.
@@ -74,13 +74,13 @@ class SessionCodec(Protocol):
         """
 
     def is_step(self, body: bytes) -> bool:
-        """Return whether a request goes on with a transfer, so that its repeat changes nothing."""
+        """Return whether a request continues a transfer, so that its repeat changes nothing."""
 
     def completes_write(self, body: bytes) -> bool:
         """Return whether a request is the last of many, for all of which the slave works now."""
 
     def reset(self) -> None:
-        """Give up what is under way, at the slave too."""
+        """Abort the active transfer, at the slave too."""
 
 
 class ClientSession:
@@ -107,7 +107,7 @@ class ClientSession:
 
     @property
     def is_running(self) -> bool:
-        """Whether a transfer is under way."""
+        """Whether a transfer is active."""
         return self.codec.is_running
 
     async def handle(self, body: bytes, *, is_step: bool) -> list[GatewayReply]:
@@ -133,7 +133,7 @@ class ClientSession:
             self._lock.release()
 
     def close(self) -> None:
-        """Give up what is under way."""
+        """Abort the active transfer."""
         self._stop_timer()
         self.codec.reset()
         self._replies = None
@@ -152,7 +152,7 @@ class ClientSession:
         return replies
 
     def _is_repeated(self, body: bytes) -> bool:
-        """Return whether a request is the last step again, whose reply was lost on its way.
+        """Return whether a request repeats the last step, whose reply was lost.
 
         After BUSY it is none: that is how a client asks whether the slave has time now.
         """
@@ -203,7 +203,7 @@ def error_replies(
 
 
 def cause_of(error: EapError) -> Cause:
-    """Return the cause of an error in the gateway, on the way to a slave, or at the slave."""
+    """Return the cause of an error of the gateway, of the routing to a slave, or of the slave."""
     match error:
         case GatewayError():
             return error.cause
@@ -215,7 +215,7 @@ def cause_of(error: EapError) -> Cause:
 
 
 def text_of(error: EapError) -> str:
-    """Return what an error says beyond its cause; the text of an ADS error adds nothing."""
+    """Return the text of an error beyond its cause; empty for an ADS error, which adds nothing."""
     return "" if isinstance(error, RemoteAccessError) else str(error)
 
 
@@ -233,10 +233,10 @@ class KeyedSession(Protocol):
 
     @property
     def is_running(self) -> bool:
-        """Whether a transfer is under way."""
+        """Whether a transfer is active."""
 
     def close(self) -> None:
-        """Give up what is under way."""
+        """Abort the active transfer."""
 
 
 S = TypeVar("S", bound=KeyedSession)
@@ -267,7 +267,7 @@ class SessionTable(Generic[S]):
         ]
 
     def running(self) -> Iterator[SessionKey]:
-        """Yield those that have a transfer under way."""
+        """Yield the keys of sessions with an active transfer."""
         return (key for key, session in self._open.items() if session.is_running)
 
     def drop(self, key: SessionKey) -> None:
@@ -296,7 +296,7 @@ class MasterSession:
 
     Args:
         dictionary: Of the master.
-        max_size: Octets of the longest answer behind its mailbox header.
+        max_size: Bytes of the longest answer behind its mailbox header.
         refresh: Sees to it that what an object shows is not old; it gets the object's index.
         is_fresh: Says whether that is so already.
     """
@@ -347,7 +347,7 @@ class MasterSession:
         self._dictionary.download(index, subindex, data, OdState.OP)
 
     def close(self) -> None:
-        """Forget what is under way."""
+        """Abort the active transfer."""
         self._server.reset()
 
 

@@ -85,7 +85,7 @@ class ObjectCodec:
 
     @property
     def is_running(self) -> bool:
-        """Whether an SDO in segments is under way."""
+        """Whether a segmented SDO is active."""
         return self._transfer is not None or self._stream is not None
 
     def is_step(self, body: bytes) -> bool:
@@ -98,7 +98,7 @@ class ObjectCodec:
         return is_segment and bool(body[CoeHeader.SIZE] & _LAST)
 
     def reset(self) -> None:
-        """End the SDO that is under way."""
+        """Abort the active SDO."""
         self._transfer = None
         stream, self._stream = self._stream, None
         if stream is not None:
@@ -216,7 +216,7 @@ class ObjectCodec:
 
     def _hold(self, head: SdoHeader, size: int) -> None:
         if not self._memory.hold(size):
-            detail = f"{size} octets are more than the gateway keeps"
+            detail = f"{size} bytes are more than the gateway keeps"
             raise SdoAbortError(AbortCode.OUT_OF_MEMORY, head.index, head.subindex, detail)
 
 
@@ -277,12 +277,12 @@ class FileCodec:
         return body[:1] in {bytes((opcode,)) for opcode in _STEPS}
 
     def completes_write(self, body: bytes) -> bool:
-        """Return that BUSY answers what takes long."""
+        """Return False: BUSY answers a step that takes long."""
         del body
         return False
 
     def reset(self) -> None:
-        """Give up the file if it is not complete."""
+        """Abort the file if it is not complete."""
         file, self._file = self._file, None
         if file is not None:
             file.close()
@@ -312,7 +312,7 @@ class FileCodec:
             return [encode_foe(FoeOpcode.ERROR, exc.code, text)]
 
     async def _step(self, head: FoeHeader, body: bytes) -> list[bytes]:
-        """Do one step; one that is cut short by BUSY goes on when it comes again."""
+        """Execute one step; one that was answered BUSY continues when it is repeated."""
         data = body[FoeHeader.SIZE :]
         if head.opcode in {FoeOpcode.READ, FoeOpcode.WRITE}:
             return await self._open(body, text_of(data), head)

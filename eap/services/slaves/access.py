@@ -33,12 +33,12 @@ class ObjectStream:
     """Octets of an object, from the moment when its size is known.
 
     Args:
-        size: Octets of all of it.
+        size: Bytes of all of it.
         data: The first ones; all of them unless :meth:`follow` brings the rest.
 
     Attributes:
         size: As given.
-        done: Octets that the reader has taken.
+        done: Bytes that the reader has taken.
     """
 
     def __init__(self, size: int, data: bytes) -> None:
@@ -55,12 +55,12 @@ class ObjectStream:
         return self._task
 
     def take(self, piece: bytes) -> None:
-        """Add the next octets."""
+        """Add the next bytes."""
         self._data += piece
         self._changed.set()
 
     async def read(self, size: int) -> bytes:
-        """Return the next *size* octets, fewer only at the end; cancelling it takes nothing.
+        """Return the next *size* bytes, fewer only at the end; cancelling it takes nothing.
 
         Raises:
             EapError: that has ended the upload, as SlaveAccess says.
@@ -128,7 +128,7 @@ class SlaveAccess(Protocol):
         """Write an entry, or with *complete* an object from subindex 0 or 1 on."""
 
     async def write_unsized(self, index: int, subindex: int, octets: bytes) -> None:
-        """Write an entry from four octets of which as many count as the entry has."""
+        """Write an entry from four bytes of which as many count as the entry has."""
 
     async def read_info(self, opcode: SdoInfoOpcode, request: bytes) -> bytes:
         """Return the body of an SDO information answer, its fragments joined."""
@@ -142,7 +142,7 @@ class SlaveAccess(Protocol):
     def open_file(
         self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
     ) -> FileStream:
-        """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
+        """Begin to move a file, *ahead* bytes before its reader; it is closed by the caller."""
 
     async def exchange_vendor(self, message: bytes) -> bytes:
         """Return the answer to a VoE message, both with their VoE headers."""
@@ -230,7 +230,7 @@ class LocalSlave:
         await self._converse(coe_client.download(index, subindex, data, sizes, complete=complete))
 
     async def write_unsized(self, index: int, subindex: int, octets: bytes) -> None:
-        """Write an entry from four octets of which as many count as the entry has."""
+        """Write an entry from four bytes of which as many count as the entry has."""
         await self._converse(coe_client.download_unsized(index, subindex, octets))
 
     async def read_info(self, opcode: SdoInfoOpcode, request: bytes) -> bytes:
@@ -251,7 +251,7 @@ class LocalSlave:
     def open_file(
         self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
     ) -> LocalFile:
-        """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
+        """Begin to move a file, *ahead* bytes before its reader; it is closed by the caller."""
         # By the file, not by the requester: two of its files take turns like those of two.
         lock_mailbox = partial(self.bus.lock_mailbox, self._slave.station, MailboxType.FOE)
         return LocalFile(

@@ -216,7 +216,7 @@ class MailboxLock:
         self.close()
 
     def close(self) -> None:
-        """Give the next client its turn; harmless when it is closed."""
+        """Release the mailbox to the next client; harmless when closed."""
         if self._is_open:
             self._is_open = False
             self._release()
@@ -362,7 +362,7 @@ class BusClient:
                 turn.close()
 
     async def run(self, procedure: Procedure[T]) -> T:
-        """Run a procedure to its end; return its result or raise what went wrong."""
+        """Run a procedure to its end; return its result or raise its error."""
         await self._wait_up()
 
         async def exchange(step: Step) -> StepReplies:
@@ -389,7 +389,7 @@ class BusClient:
         return list(reply.replies)
 
     async def bring(self, station: int, target: AlState) -> None:
-        """Bring a slave, or with station 0 all of them, to a state where they are kept then.
+        """Bring a slave, or with station 0 all of them, to a state, and keep them there.
 
         Raises:
             AlStatusError, StateTimeoutError: one refuses, or takes too long.

@@ -54,7 +54,7 @@ class FileStream(ABC):
     Attributes:
         is_write: As given.
         sizes: Of the slave's mailboxes, known when the file is open.
-        progress: Octets that the slave has, or has given.
+        progress: Bytes that the slave has, or has given.
         has_lock: Whether it is its turn at the slave; before, other files are moved.
         is_open: Whether the slave has opened it.
         is_finished: Whether nothing more will be written to it.
@@ -81,7 +81,7 @@ class FileStream(ABC):
 
     @property
     def has_ended(self) -> bool:
-        """Whether nothing more goes to the slave or comes from it."""
+        """Whether the transfer has completed or failed."""
         return self.is_complete or self._error is not None
 
     async def wait_open(self) -> None:
@@ -89,14 +89,14 @@ class FileStream(ABC):
         await self._wait_until(lambda: self.is_open)
 
     async def read(self, size: int) -> bytes:
-        """Return the next *size* octets, fewer only at the end."""
+        """Return the next *size* bytes, fewer only at the end."""
         self._wanted = size
         self.notify()
         await self._wait_until(lambda: len(self.buffer) >= size)
         return self.pop(size)
 
     async def write(self, data: bytes) -> None:
-        """Take *data* when most of what came before has gone on."""
+        """Accept *data* once most of the data before it has been sent."""
         await self._wait_until(lambda: len(self.buffer) < MAX_UNSENT)
         self.buffer += data
         self.notify()
@@ -108,7 +108,7 @@ class FileStream(ABC):
         await self._wait_until(lambda: self.is_complete)
 
     def close(self) -> None:
-        """Give the file up if it is not complete, at the slave too."""
+        """Abort the file if it is not complete, at the slave too."""
         if not self.has_ended:
             self._tasks.cancel()
 
@@ -117,14 +117,14 @@ class FileStream(ABC):
         """Move the whole file; raise EapError.  Cancelling it ends it at the slave too."""
 
     def notify(self, *, has_lock: bool = False, is_open: bool = False) -> None:
-        """Let everything that waits for a change look again."""
+        """Wake all waiters to check their conditions again."""
         self.has_lock |= has_lock
         self.is_open |= is_open
         self._changed.set()
         self._changed = asyncio.Event()
 
     def pop(self, size: int) -> bytes:
-        """Take octets out of the buffer."""
+        """Take bytes out of the buffer."""
         data = bytes(self.buffer[:size])
         del self.buffer[:size]
         self.notify()
@@ -136,7 +136,7 @@ class FileStream(ABC):
             await self._wait_stalled(lambda: len(self.buffer) < max(self._ahead // 2, self._wanted))
 
     async def wait_data(self, size: int) -> None:
-        """Wait for octets that go to the slave, fewer than *size* only at the end."""
+        """Wait for bytes that go to the slave, fewer than *size* only at the end."""
         await self._wait_stalled(lambda: self.is_finished or len(self.buffer) >= size)
 
     async def run(self) -> None:
@@ -161,7 +161,7 @@ class FileStream(ABC):
                 self.stalled_since_s = None
 
     async def _wait_until(self, is_so: Callable[[], bool]) -> None:
-        """Wait until it is so, or the transfer has ended; raise what has ended it."""
+        """Wait for a condition or the end of the transfer; raise the error that ended it."""
         await self._wait(lambda: is_so() or self.has_ended)
         if self._error is not None:
             raise self._error
@@ -172,7 +172,7 @@ class FileStream(ABC):
 
 
 class FileHistory:
-    """Beginning of a file that was moved already, for a transfer that begins anew.
+    """Part of a file that was transferred already, for a transfer that is restarted.
 
     The data of a written file is kept, up to MAX_KEPT, and sent to the slave again.  For a file
     that is read a hash is enough: what the reader has already is read again and compared.
@@ -189,7 +189,7 @@ class FileHistory:
         self._hash, self._hash_again = sha256(), sha256()
 
     def keep(self, data: bytes) -> None:
-        """Keep what the slave was given."""
+        """Keep data that was sent to the slave."""
         if self._is_kept and self.can_rewind:
             self._data += data
             FileHistory.all_kept += len(data)
@@ -198,12 +198,12 @@ class FileHistory:
                 self.forget()
 
     def forget(self) -> None:
-        """Free what is kept."""
+        """Free the data kept."""
         FileHistory.all_kept -= len(self._data)
         self._data.clear()
 
     def new_part(self, data: bytes) -> bytes:
-        """Return what is new of *data*; raise BusError if the rest is not as it was."""
+        """Return the new part of *data*; raise BusError if the repeated part has changed."""
         known = min(len(data), self._size - self._repeated)
         if known:
             self._hash_again.update(data[:known])
@@ -217,12 +217,12 @@ class FileHistory:
         return data
 
     def end(self) -> None:
-        """Raise BusError if the file ends before what the reader has already."""
+        """Raise BusError if the file ends before the data that the reader has already."""
         if self._repeated < self._size:
             raise BusError(_CHANGED)
 
     def rewind(self) -> bytes:
-        """Begin anew; return what the slave has to be given again."""
+        """Restart; return the data to be sent to the slave again."""
         self._repeated = 0
         self._hash_again = sha256()
         data = bytes(self._data)

@@ -157,7 +157,7 @@ class RemoteSlave:
             raise _sdo_error(exc, index, subindex) from None
 
     async def write_unsized(self, index: int, subindex: int, octets: bytes) -> None:
-        """Write an entry from four octets of which as many count as the entry has."""
+        """Write an entry from four bytes of which as many count as the entry has."""
         size = len(await self.read_object(index, subindex))
         await self.write_object(index, subindex, octets[:size])
 
@@ -199,7 +199,7 @@ class RemoteSlave:
     def open_file(
         self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
     ) -> RemoteFile:
-        """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
+        """Begin to move a file, *ahead* bytes before its reader; it is closed by the caller."""
         return RemoteFile(self, name, password, is_write=is_write, ahead=ahead)
 
     async def exchange_vendor(self, message: bytes) -> bytes:
@@ -231,7 +231,7 @@ class RemoteSlave:
     async def perform(
         self, operation: Operation, *, port: int | None = None, timeout_s: float | None = None
     ) -> bytes:
-        """Have an operation done; return what was read.
+        """Execute an operation; return the data read.
 
         Args:
             operation: To be done by the slave.
@@ -281,7 +281,7 @@ class RemoteFile(FileStream):
         name: Of the file, at the slave.
         password: Up to 32 bits.
         is_write: Whether it goes to the slave.
-        ahead: Octets that are read before the client wants them.
+        ahead: Bytes that are read before the client wants them.
     """
 
     def __init__(
@@ -294,7 +294,7 @@ class RemoteFile(FileStream):
         self._is_closed = False
 
     def close(self) -> None:
-        """Give the file up if it is not complete, at the slave too."""
+        """Abort the file if it is not complete, at the slave too."""
         self._is_closed = True
         if self.is_open:  # else the handle that closes it there is not known yet
             super().close()
@@ -350,7 +350,7 @@ class RemoteFile(FileStream):
         await self._request_block(IndexGroup.FOE_CLOSE, self._handle)
 
     async def _close_remote(self) -> None:
-        """Close the file there; what was written of it does not count unless it is complete."""
+        """Close the file at the slave; an incomplete write is discarded."""
         if not self.is_open or (self.is_write and self.is_complete):
             return
         last = ReadWrite(IndexGroup.FOE_CLOSE, self._handle, 0, b"")
@@ -398,7 +398,7 @@ def _soe_error(error: RemoteAccessError) -> RemoteAccessError | SoeError:
 
 
 def _foe_error(error: RemoteAccessError) -> RemoteAccessError | FoeError:
-    """Return the refusal with an FoE code; errors of the way to the slave stay as they are."""
+    """Return the error with an FoE code; routing errors stay as they are."""
     if error.is_routing_error:
         return error
     code = cause_of_result(error.result).foe

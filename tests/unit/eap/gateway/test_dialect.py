@@ -87,17 +87,17 @@ def test_what_else_is_understood(kind, octets, task) -> None:
 @pytest.mark.parametrize(
     ("kind", "octets", "why"),
     [
-        (COE, "0020 40 1810", "CoE request of 5 octets, expected at least 6"),
+        (COE, "0020 40 1810", "CoE request of 5 bytes, expected at least 6"),
         (COE, "0030 40 1810 00", "CoE service 3, expected 2"),
         (COE, "0020 60 1810 00", "SDO command 0x60"),
         (COE, "0020 20 1810 00", "a download without data"),
-        (SOE, "01 05 20", "SoE request of 3 octets"),
+        (SOE, "01 05 20", "SoE request of 3 bytes"),
         (SOE, "03 05 2000", "SoE command 3, expected 1 or 2"),
         (SOE, "01 45 2000", "drive 8, expected 0 to 7"),
-        (FOE, "01 0000", "FoE request of 3 octets"),
+        (FOE, "01 0000", "FoE request of 3 bytes"),
         (FOE, "02 00000000 66", "FoE opcode 2: only whole files are read"),
-        (VOE, "641100000100"[:-2], "VoE request of 5 octets"),
-        (COE, "0020 23 0020 00", "6 octets, expected at least 10"),
+        (VOE, "641100000100"[:-2], "VoE request of 5 bytes"),
+        (COE, "0020 23 0020 00", "6 bytes, expected at least 10"),
     ],
 )
 def test_what_is_not_understood_says_what_was_expected(kind, octets, why) -> None:

@@ -32,7 +32,7 @@ from eap.codec.mailbox import MailboxType
 from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.ads import bus_ads as service
 from eap.services.ads import slave_files
-from eap.services.device.master_values import MasterDictionaryProvider
+from eap.services.device.master_values import MasterView
 from tests.support.busads import DRIVE, MASTER, play, until
 
 VENDOR = Read(IndexGroup.SDO, 0x1018_0001, 4)
@@ -130,7 +130,7 @@ def test_master_dictionary_shows_states_and_scans_as_they_are():
 
 def test_notifications_refresh_only_objects_that_they_show(monkeypatch):
     looked_at = []
-    refresh = MasterDictionaryProvider.refresh
+    refresh = MasterView.refresh
 
     async def note(provider, index):
         looked_at.append(index)
@@ -151,7 +151,7 @@ def test_notifications_refresh_only_objects_that_they_show(monkeypatch):
         await until(is_looked_at)
         assert set(looked_at) == {0x8002}
 
-    monkeypatch.setattr(MasterDictionaryProvider, "refresh", note)
+    monkeypatch.setattr(MasterView, "refresh", note)
     play(scene, "coe")
 
 
@@ -270,7 +270,7 @@ def test_answer_longer_than_the_room_of_the_client_is_refused(length):
     async def scene(client, engine):
         outcome = await client.do(DRIVE, VENDOR._replace(length=length))
         assert outcome == OperationOutcome(AdsError.SIZE)
-        assert client.why == f"4 octets, the client has room for {length}"
+        assert client.why == f"4 bytes, the client has room for {length}"
 
     play(scene)
 

@@ -175,7 +175,7 @@ def test_dialect_station_that_does_not_answer() -> None:
 def test_dialect_answer_has_to_fit_one_packet() -> None:
     assert perform(UPLOAD, Station(bytes(80)).link(), 80) == bytes(80)
     error = failure(UPLOAD, Station(bytes(81)).link(), 80)
-    assert "more than 80 octets do not fit one packet" in str(error)
+    assert "more than 80 bytes do not fit one packet" in str(error)
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_dialect_file_of_a_slave_of_this_bus(size: int, room: int) -> None:
         assert perform(ReadFile("f"), slave(), room) == bytes(range(size))
     else:
         error = failure(ReadFile("f"), slave(), room)
-        assert f"more than {room} octets do not fit one packet" in str(error)
+        assert f"more than {room} bytes do not fit one packet" in str(error)
     assert failure(ReadFile("none"), slave(), room).failure is DialectFailure.MISSING
 
 
