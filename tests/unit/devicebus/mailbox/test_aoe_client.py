@@ -55,7 +55,7 @@ def serve(sizes: MailboxSizes, seed: int | None = None) -> Line:
 
 @examples(40)
 @given(st.binary(max_size=400), st.integers(39, 128), st.integers(39, 128), st.integers(0, 1 << 30))
-def test_exchange_with_our_slave_whatever_its_mailboxes_hold(
+def test_aoe_exchange_with_mailboxes_of_any_size(
     data: bytes, to_slave: int, to_master: int, seed: int
 ) -> None:
     line = serve(MailboxSizes(to_slave, to_master), seed)
@@ -94,7 +94,7 @@ def part(
 ANSWER = reply()[16:]
 
 
-def test_fragments_are_acknowledged_if_the_slave_wants_it() -> None:
+def test_aoe_fragments_are_acknowledged_on_request() -> None:
     answers = [part(0, ANSWER[:18], flags=4), part(1, ANSWER[18:20], flags=4), part(2, ANSWER[20:])]
     (_, data), asked = run_with(AOE, aoe_client.exchange(READ, b"", SIZES), answers)
     assert data == b"answer"
@@ -115,7 +115,7 @@ def test_fragments_of_others_are_not_taken() -> None:
     assert talk_to(AOE, aoe_client.exchange(READ, b"", SIZES), *answers)[1] == b"answer"
 
 
-def test_mailbox_may_answer_whole_after_fragments_of_others() -> None:
+def test_aoe_answer_without_fragments_after_fragments_of_others() -> None:
     answers = [part(1, b"late"), reply()]
     assert talk_to(AOE, aoe_client.exchange(READ, b"", SIZES), *answers)[1] == b"answer"
 

@@ -53,7 +53,7 @@ def test_address_is_that_of_the_first_request(server):
     assert call(server, AmsCommand.READ_STATE, target=other).error_code == 0
 
 
-def test_address_is_what_the_master_writes(server):
+def test_ads_server_address_is_written_by_the_master(server):
     call(server, AmsCommand.READ_STATE)
     given = b"\0\0\0\0\4\1"
     assert call(server, AmsCommand.WRITE, 1, 3, 6, data=given, port=1005)[:2] == (OK, 0)
@@ -136,7 +136,7 @@ def test_sums_are_done_item_by_item(server):
     assert got.data == OK + u32(13) + OK + u32(0x70C) + u32(7) + b"\0"
 
 
-def test_service_that_is_not_there(server):
+def test_ads_server_refuses_unknown_services(server):
     assert call(server, AmsCommand.ADD_NOTIFICATION)[:2] == (b"", 0x701)
 
 
@@ -152,14 +152,14 @@ def answer(header: AmsHeader, data: bytes) -> AmsAnswer:
     return AmsAnswer(bytes.fromhex("00000000 04000000 02000000"))
 
 
-def test_request_is_answered_as_the_vector_has_it() -> None:
+def test_aoe_server_answers_a_request_as_the_vector() -> None:
     server = AoeServer(answer, MailboxSizes())
     assert server.receive_message(REQUEST, 0) == [ANSWER]
     server.reset()
     assert server.messages_to_send(0) == []
 
 
-def test_request_that_wants_no_answer_gets_none() -> None:
+def test_aoe_server_request_without_return_has_no_answer() -> None:
     header, data = decode_packet(REQUEST)
     quiet = AmsHeader(*[getattr(header, name) for name in header.__struct_fields__[:5]],
                       StateFlags.ADS | StateFlags.NO_RETURN)  # fmt: skip
@@ -175,13 +175,15 @@ def test_request_that_wants_no_answer_gets_none() -> None:
         (ANSWER, MailboxError.SERVICE_NOT_SUPPORTED),
     ],
 )
-def test_what_is_no_request_gets_a_mailbox_error(packet: bytes, detail: MailboxError) -> None:
+def test_aoe_server_answers_other_messages_with_a_mailbox_error(
+    packet: bytes, detail: MailboxError
+) -> None:
     with pytest.raises(MailboxRefusedError) as caught:
         AoeServer(answer, MailboxSizes()).receive_message(packet, 0)
     assert caught.value.detail == detail
 
 
-def test_handler_may_say_that_nobody_was_reached() -> None:
+def test_aoe_server_handler_may_return_no_answer() -> None:
     server = AoeServer(lambda header, data: AmsAnswer(error_code=7), MailboxSizes())
     header, body = decode_packet(server.receive_message(REQUEST, 0)[0])
     assert (header.error_code, bytes(body)) == (7, b"")

@@ -60,7 +60,7 @@ FOUR = "0030 41 1810 01 04000000 01"
         ("0030 41 1810 01 00000000", b""),
     ],
 )
-def test_upload_in_one_message(answer: str, data: bytes) -> None:
+def test_upload_of_one_message(answer: str, data: bytes) -> None:
     read, asked = run_with(COE, coe_client.upload(0x1018, 1), [answer])
     assert read == data
     assert asked == [bytes.fromhex("0020 40 1810 01 00000000")]
@@ -162,7 +162,7 @@ def test_endless_short_segments_end_with_the_limit() -> None:
         )
 
 
-def test_slave_that_says_nothing_ends_in_a_timeout() -> None:
+def test_upload_without_answer_times_out() -> None:
     with pytest.raises(MailboxTimeoutError):
         talk_to(COE, coe_client.upload(0x1018, 1))
 
@@ -260,7 +260,7 @@ def faults(dice: Random | None) -> object:
     st.integers(16, 256),
     st.integers(0, 1 << 30),
 )
-def test_what_was_written_is_read_over_a_bad_line(
+def test_coe_client_reads_written_data_over_a_bad_line(
     data: bytes, to_slave: int, to_master: int, seed: int
 ) -> None:
     sizes = MailboxSizes(to_slave, to_master)
@@ -271,7 +271,7 @@ def test_what_was_written_is_read_over_a_bad_line(
 
 @examples(40)
 @given(st.lists(st.integers(0, 0xFFFF), max_size=8), st.integers(16, 64), st.integers(0, 1 << 30))
-def test_whole_objects_over_a_bad_line(numbers: list[int], size: int, seed: int) -> None:
+def test_coe_complete_access_over_a_bad_line(numbers: list[int], size: int, seed: int) -> None:
     sizes = MailboxSizes(size, size)
     line, dictionary = serve(sizes, Random(seed))
     octets = b"".join(number.to_bytes(2, "little") for number in numbers)
@@ -281,7 +281,7 @@ def test_whole_objects_over_a_bad_line(numbers: list[int], size: int, seed: int)
     assert dictionary[0x1C12].max_subindex == len(numbers)
 
 
-def test_line_is_as_bad_as_it_should_be() -> None:
+def test_bad_line_loses_and_repeats_messages() -> None:
     sizes = MailboxSizes(32, 32)
     line, _ = serve(sizes, Random(1))
     line.run(coe_client.download(0x2000, 0, b"x" * 1500, sizes))

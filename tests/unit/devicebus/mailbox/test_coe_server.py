@@ -153,7 +153,7 @@ def test_segmented_upload() -> None:
     assert slave.abort_code("60 00000000000000") is AbortCode.COMMAND
 
 
-def test_short_last_segment_says_how_much_of_it_counts() -> None:
+def test_sdo_server_short_last_segment_has_its_unused_count() -> None:
     slave = Slave(to_master=29)
     assert slave.ask("40 0220 00 00000000").endswith(octets(0, 13))
     assert slave.ask("60 00000000000000") == f"00 {octets(13, 33)}"
@@ -172,7 +172,7 @@ def test_segmented_download() -> None:
     assert slave.dictionary.entry(0x2002, 0).octets == bytes(range(50, 100))
 
 
-def test_segmented_download_of_a_whole_object() -> None:
+def test_sdo_server_segmented_complete_download() -> None:
     slave = Slave()
     assert slave.ask("31 121c 00 0a000000 0400 0016") == "70 12 1c 00 00 00 00 00"
     assert slave.ask("03 0116 0216 0316 00") == "20 00 00 00 00 00 00 00"
@@ -219,7 +219,7 @@ def test_abort_of_the_client_ends_its_transfer_without_an_answer() -> None:
     assert slave.abort_code("60 00000000000000") is AbortCode.COMMAND
 
 
-def test_new_transfer_and_reset_end_the_one_before() -> None:
+def test_sdo_server_new_transfer_and_reset_end_a_transfer() -> None:
     slave = Slave(to_master=32)
     slave.ask("40 0220 00 00000000")
     slave.ask("40 0010 00 00000000")
@@ -236,7 +236,7 @@ def test_request_that_is_too_short_gets_a_mailbox_error() -> None:
 
 
 @given(st.lists(st.binary(min_size=8, max_size=40), max_size=20))
-def test_any_request_gets_one_answer_or_ends_a_transfer(requests: list[bytes]) -> None:
+def test_sdo_server_any_request_has_one_answer_or_ends_a_transfer(requests: list[bytes]) -> None:
     slave = Slave(64, 32)
     for request in requests:
         answers = slave.server.receive_request(request)
@@ -367,7 +367,7 @@ def test_rx_pdo_is_taken_without_an_answer() -> None:
 
 
 @pytest.mark.parametrize("octets", ["0260", "0170", "0350 0102", "0140", "0030", "0010", "0090"])
-def test_what_is_no_service_of_a_slave_gets_a_mailbox_error(octets: str) -> None:
+def test_coe_server_answers_unknown_services_with_a_mailbox_error(octets: str) -> None:
     assert refusal(make()[0], octets) == "SERVICE_NOT_SUPPORTED"
 
 
@@ -392,7 +392,7 @@ def test_emergency_and_pdo_are_sent_once() -> None:
     assert server.messages_to_send(0) == []
 
 
-def test_emergencies_that_nobody_fetches_are_dropped_and_counted() -> None:
+def test_coe_server_drops_and_counts_emergencies_beyond_the_queue() -> None:
     server, _ = make()
     for code in range(MAX_PENDING + 2):
         server.send_emergency(code)
@@ -400,7 +400,7 @@ def test_emergencies_that_nobody_fetches_are_dropped_and_counted() -> None:
     assert [data[2] for data in server.messages_to_send(0)] == list(range(MAX_PENDING))
 
 
-def test_reset_forgets_what_waits() -> None:
+def test_coe_server_reset_discards_the_queue() -> None:
     server, _ = make()
     server.send_emergency(1)
     server.reset()

@@ -48,7 +48,7 @@ def test_rate_is_that_of_the_last_seconds() -> None:
     assert progress.rate(9 * second) == 0
 
 
-def test_what_a_decoder_says_becomes_a_protocol_error() -> None:
+def test_reading_converts_codec_errors() -> None:
     broken = pytest.raises(MailboxProtocolError, match="answer of S1: MailboxHeader at offset 0")
     with broken, reading("answer of S1"):
         MailboxHeader.decode(b"")

@@ -68,7 +68,7 @@ def test_frame_that_cannot_be_sent(frame: bytes, room: int, reason: str) -> None
         fragments(frame, data_size=room)
 
 
-def test_time_behind_a_frame_is_no_part_of_it() -> None:
+def test_eoe_appended_time_is_no_part_of_the_frame() -> None:
     header = EoeHeader(0, last=1, time_appended=1).encode() + FragmentWord(0, 1, 0).encode()
     assert receive(FrameAssembler(), header + b"frame" + b"time") == [b"frame"]
     with pytest.raises(CodecError, match="time stamp announced"):
@@ -98,7 +98,7 @@ def test_offset_that_does_not_fit_drops_the_frame() -> None:
     assert assembler.dropped == 1
 
 
-def test_reset_forgets_the_frame_under_way() -> None:
+def test_eoe_reset_discards_the_incomplete_frame() -> None:
     assembler = FrameAssembler()
     first, last = fragments(bytes(64), data_size=32)
     assembler.receive(first)
@@ -198,7 +198,7 @@ def test_settings_that_are_refused_or_cut_change_nothing() -> None:
 @pytest.mark.parametrize(
     ("asked", "answer"), [("0400 0000", "05 00 01 04"), ("0800 0000", "09 00 01 04")]
 )
-def test_filters_are_not_there(asked: str, answer: str) -> None:
+def test_eoe_server_has_no_filters(asked: str, answer: str) -> None:
     assert ask(EoeServer(MailboxSizes()), asked) == [answer]
 
 
@@ -211,7 +211,7 @@ def test_filters_are_not_there(asked: str, answer: str) -> None:
         ("0f00 0000", MailboxError.SERVICE_NOT_SUPPORTED),
     ],
 )
-def test_what_is_no_request_gets_a_mailbox_error(octets: str, detail: MailboxError) -> None:
+def test_eoe_answers_other_messages_with_a_mailbox_error(octets: str, detail: MailboxError) -> None:
     with pytest.raises(MailboxRefusedError) as caught:
         ask(EoeServer(MailboxSizes()), octets)
     assert caught.value.detail == detail
@@ -232,7 +232,7 @@ def test_frame_without_a_receiver_is_taken() -> None:
     assert drain(server) == []
 
 
-def test_frames_that_nobody_fetches_are_dropped_whole() -> None:
+def test_eoe_server_drops_whole_frames_beyond_the_queue() -> None:
     server = EoeServer(MailboxSizes(64, 42))
     for _ in range(3):
         server.send_frame(bytes(30 * 32))

@@ -80,7 +80,7 @@ def test_write(data: bytes, packets: list[str]) -> None:
     assert progress.done == len(data)
 
 
-def test_source_may_give_less_than_was_asked_for() -> None:
+def test_foe_write_source_may_return_less_than_requested() -> None:
     pieces = iter([b"a", b"bc", b"d", b"ef", b""])
     talk = foe_client.write(NAME, lambda size: next(pieces), SIZES)
     answers = ["04 00 00000000", "04 00 01000000", "04 00 02000000"]
@@ -89,7 +89,7 @@ def test_source_may_give_less_than_was_asked_for() -> None:
     assert [data[6:] for data in asked[1:]] == [b"abcd", b"ef"]
 
 
-def test_busy_slave_is_asked_again_after_a_while() -> None:
+def test_foe_busy_answer_repeats_the_request_after_a_pause() -> None:
     asked = write(b"ab", [BUSY, "04 00 00000000", BUSY, BUSY, "04 00 01000000"])
     assert asked == ["02 00 00 00 00 00 66"] * 2 + ["03 00 01 00 00 00 61 62"] * 3
     talk = foe_client.write(NAME, io.BytesIO(b"ab").read, SIZES)
@@ -188,7 +188,7 @@ def broken(_: object) -> bytes:
     raise OSError("disk on fire")
 
 
-def test_slave_is_told_when_our_side_fails() -> None:
+def test_foe_local_error_is_sent_to_the_slave() -> None:
     for talk, answers, code in (
         (foe_client.read(NAME, broken, SIZES), ["03 00 01000000 61"], "03800000"),
         (foe_client.write(NAME, broken, SIZES), ["04 00 00000000"], "00800000"),
@@ -241,7 +241,7 @@ def get(line: Line, name: str, password: int = 0) -> bytes:
     st.sampled_from([0, 25_000_000]),
     st.integers(0, 1 << 30),
 )
-def test_what_was_written_is_read_over_a_bad_line(
+def test_foe_client_reads_written_data_over_a_bad_line(
     data: bytes, to_slave: int, to_master: int, packet_time_ns: int, seed: int
 ) -> None:
     line = serve(MailboxSizes(to_slave, to_master), Random(seed), packet_time_ns)

@@ -51,7 +51,7 @@ def test_read_of_several_packets() -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"abcd"])
-def test_file_of_whole_packets_ends_with_an_empty_one(content: bytes) -> None:
+def test_foe_server_file_of_full_packets_ends_with_an_empty_one(content: bytes) -> None:
     slave = Slave(content)
     answer = slave.ask(READ)
     if content:
@@ -76,7 +76,7 @@ def test_write_of_several_packets() -> None:
     assert slave.error("03 00 03000000") is FoeErrorCode.ILLEGAL
 
 
-def test_write_of_whole_packets_ends_with_an_empty_one() -> None:
+def test_foe_server_write_of_full_packets_ends_with_an_empty_one() -> None:
     slave = Slave()
     slave.ask(WRITE)
     slave.ask("03 00 01000000 61626364")
@@ -84,7 +84,7 @@ def test_write_of_whole_packets_ends_with_an_empty_one() -> None:
     assert slave.file.content == b"abcd"
 
 
-def test_slow_slave_is_busy_until_it_is_done() -> None:
+def test_foe_server_is_busy_while_it_stores() -> None:
     slave = Slave(packet_time_ns=1000)
     slave.ask(WRITE, 0)
     assert slave.ask("03 00 01000000 61626364", 0) == "04 00 01 00 00 00"
@@ -182,7 +182,7 @@ def test_any_file_object_can_be_read() -> None:
 
 
 @given(st.lists(st.binary(min_size=6, max_size=12), max_size=20))
-def test_any_request_gets_one_answer_at_most(requests: list[bytes]) -> None:
+def test_foe_server_any_request_has_one_answer_at_most(requests: list[bytes]) -> None:
     slave = Slave(b"abcdefg")
     for request in requests:
         answers = slave.server.receive_message(request, 0)
@@ -239,7 +239,7 @@ def test_file_is_read_piece_by_piece() -> None:
     assert reader.read(4) == b""
 
 
-def test_reader_keeps_the_content_it_was_opened_with() -> None:
+def test_memory_reader_keeps_the_content_of_its_opening() -> None:
     store = make()
     reader = store.open_read("plain", 0)
     writer = store.open_write("plain", 0)
@@ -301,7 +301,7 @@ def test_content_that_fails_its_check_is_not_taken() -> None:
     assert store.files["checked"].content == b"\x01\xfe\x01"
 
 
-def test_new_file_appears_when_it_is_complete() -> None:
+def test_memory_store_new_file_appears_when_complete() -> None:
     store = make(creates=True)
     writer = store.open_write("new", 0)
     writer.write(b"abc")
@@ -315,6 +315,6 @@ def test_existing_file_may_be_kept() -> None:
     assert code_of(make(overwrites=False).open_write, "plain", 0) is FoeErrorCode.ALREADY_EXISTS
 
 
-def test_refusal_says_what_and_why() -> None:
+def test_store_error_has_file_and_reason() -> None:
     error = store_error(FoeErrorCode.DISK_FULL, "log.txt")
     assert (str(error), error.code, error.text) == (error.text, 0x8003, "log.txt: disk full")

@@ -100,7 +100,9 @@ READ, ACK, WRITE, DATA = "01 00 00000000 66", "04 00 03000000", "02 00 05000000 
         (MailboxType.ERR, "01000200", "01000200", False),
     ],
 )  # fmt: skip
-def test_what_answers_what(kind: MailboxType, request_: str, reply: str, *, expected: bool) -> None:
+def test_answers_by_protocol_and_content(
+    kind: MailboxType, request_: str, reply: str, *, expected: bool
+) -> None:
     assert answers(kind, bytes.fromhex(request_), bytes.fromhex(reply)) is expected
 
 
@@ -119,7 +121,7 @@ ASKED = encode_packet(AmsHeader(SLAVE, 1001, HERE, 300, 2, invoke_id=7), b"ask")
         (HERE, 1001, 2, 5, 7, False),
     ],
 )
-def test_aoe_answers_come_from_where_the_request_went(
+def test_aoe_answer_has_the_target_as_source(
     source: NetId, port: int, command: int, flags: int, invoke_id: int, *, expected: bool
 ) -> None:
     header = AmsHeader(HERE, 300, source, port, command, flags, invoke_id=invoke_id)
@@ -146,7 +148,7 @@ def test_aoe_answer_that_is_cut_is_left_to_the_conversation() -> None:
         (AOE, encode_packet(AmsHeader(SLAVE, 1, HERE, 1, 0x0902, 5), b"").hex(), False),
     ],
 )
-def test_which_messages_fragments_follow(kind: MailboxType, reply: str, *, expected: bool) -> None:
+def test_has_more_by_protocol(kind: MailboxType, reply: str, *, expected: bool) -> None:
     assert has_more(kind, bytes.fromhex(reply)) is expected
 
 

@@ -15,7 +15,7 @@ from devicebus.mailbox.protocol import (
 from eap.codec.mailbox import MailboxError
 
 
-def test_sizes_are_of_whole_mailboxes() -> None:
+def test_mailbox_sizes_include_the_header() -> None:
     sizes = MailboxSizes(256, 128)
     assert (sizes.to_slave, sizes.to_master, sizes.data_to_master) == (256, 128, 122)
     sizes.set(MINIMUM_SIZE, MINIMUM_SIZE)

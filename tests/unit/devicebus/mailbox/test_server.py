@@ -102,7 +102,7 @@ def test_reply_counter_never_is_0() -> None:
     assert box.server.stats().sent == 9
 
 
-def test_repeated_request_is_dropped_once_its_counter_says_so() -> None:
+def test_mailbox_server_drops_a_request_with_a_repeated_counter() -> None:
     box = Box()
     for counter in (1, 1, 2, 0, 0, 2):
         box.send(b"a", counter=counter)
@@ -130,7 +130,9 @@ def test_gap_in_the_requests_is_counted() -> None:
         ("0100 0000 00 06 61", "UNSUPPORTED_PROTOCOL"),
     ],
 )
-def test_what_no_protocol_takes_gets_a_mailbox_error(octets: str, detail: str) -> None:
+def test_mailbox_server_answers_unsupported_protocols_with_a_mailbox_error(
+    octets: str, detail: str
+) -> None:
     box = Box()
     box.server.receive_message(bytes.fromhex(octets).ljust(32, b"\0"), 0)
     assert box.refusal() == detail
@@ -177,14 +179,14 @@ def test_message_without_a_header_is_dropped() -> None:
     assert box.server.stats().dropped == 1
 
 
-def test_answers_come_before_what_nobody_asked_for() -> None:
+def test_mailbox_server_sends_answers_before_unsolicited_messages() -> None:
     box = Box()
     box.echo.unasked = [b"news"]
     box.send(b"a", address=7)
     assert [box.fetch()[1] for _ in range(2)] == [b"a", b"news"]
 
 
-def test_unasked_message_has_address_0() -> None:
+def test_mailbox_server_unsolicited_message_has_address_0() -> None:
     box = Box()
     box.send(b"a", address=7)
     box.fetch()
@@ -192,7 +194,7 @@ def test_unasked_message_has_address_0() -> None:
     assert box.fetch()[0].address == 0
 
 
-def test_repeat_sends_what_was_read_last_and_then_goes_on() -> None:
+def test_mailbox_server_repeats_the_last_read_message() -> None:
     box = Box()
     box.send(b"abc")
     first = box.server.next_message(0)

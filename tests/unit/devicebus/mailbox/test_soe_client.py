@@ -28,7 +28,7 @@ SIZES = MailboxSizes(16, 16)
 MODE, AT_LIST, TEXT, RESET = map(Idn.parse, ("S-0-0032", "S-0-0016", "P-0-0140", "S-0-0099"))
 
 
-def test_read_in_one_message() -> None:
+def test_soe_read_of_one_message() -> None:
     read, asked = run_with(SOE, soe_client.read(MODE, drive=1), ["22 40 2000 0b000000"])
     assert (read, asked) == (b"\x0b\0\0\0", [bytes.fromhex("21 40 2000")])
     elements = Element.NAME | Element.UNIT
@@ -224,7 +224,7 @@ def serve(sizes: MailboxSizes, dice: Random | None) -> Line:
     st.integers(16, 128),
     st.integers(0, 1 << 30),
 )
-def test_what_was_written_is_read_over_a_bad_line(
+def test_soe_client_reads_written_data_over_a_bad_line(
     data: bytes, to_slave: int, to_master: int, seed: int
 ) -> None:
     sizes = MailboxSizes(to_slave, to_master)
@@ -320,7 +320,7 @@ def test_idn_with_few_elements() -> None:
     assert described == IdnDescription(idn, AXES, [1, 2, 3], default=[1, 2, 3])
 
 
-def test_idn_that_is_not_there() -> None:
+def test_soe_describe_unknown_idn_is_refused() -> None:
     with pytest.raises(SoeError, match="S-0-0099 at drive 2: no such IDN"):
         serve_drive().run(soe_client.describe(Idn.parse("S-0-0099"), drive=2))
 

@@ -79,7 +79,7 @@ def test_start_may_be_refused() -> None:
 
 
 @pytest.mark.parametrize("is_interruptible", [True, False])
-def test_clearing_what_runs(is_interruptible: bool) -> None:
+def test_procedure_command_cleared_during_execution(is_interruptible: bool) -> None:
     procedure = ProcedureCommand(duration_ns=9, is_interruptible=is_interruptible)
     procedure.command(COMMAND_START, 0)
     if is_interruptible:
@@ -145,7 +145,7 @@ def test_elements(element: int, octets: str) -> None:
         (Element.VALUE | Element.MAXIMUM, "NO_MAXIMUM"),
     ],
 )
-def test_element_that_is_not_there(element: int, code: str) -> None:
+def test_soe_parameter_refuses_missing_elements(element: int, code: str) -> None:
     assert refusal_of(SoeParameter("P-0-0001", "", SIGNED).read, element, 0).name == code
 
 
@@ -364,14 +364,14 @@ def test_fragments_of_another_write_are_forgotten(before: str, now_ns: int) -> N
     assert drive.list.octets == b"\7\0"
 
 
-def test_short_message_does_not_end_a_write_of_which_more_is_missing() -> None:
+def test_soe_server_short_message_does_not_end_an_incomplete_write() -> None:
     drive = Drive()
     assert drive.ask("0b 40 0200 080008000100") == []
     assert drive.ask("03 40 2000 0c000000") == ["04 40 20 00"]
 
 
 @pytest.mark.parametrize("between", ["01 40 2000", "0b 40 0100 020002000700"])
-def test_write_that_starts_again_forgets_what_came_before(between: str) -> None:
+def test_soe_server_restarted_write_discards_fragments(between: str) -> None:
     drive = Drive()
     drive.ask("0b 40 0100 040004000100")
     drive.ask(between)
@@ -382,7 +382,7 @@ def test_write_that_starts_again_forgets_what_came_before(between: str) -> None:
     assert drive.list.octets == b"\7\0"
 
 
-def test_reset_forgets_fragments_and_what_waits() -> None:
+def test_soe_server_reset_discards_fragments_and_queue() -> None:
     drive = Drive()
     drive.ask("03 40 6300 0300")
     drive.server.send_emergency(1)
@@ -417,7 +417,7 @@ def test_emergency_lies_as_on_the_wire() -> None:
     assert drive.unasked() == ["26 00 00 00 10 23 03 07 00 00 00 00"]
 
 
-def test_messages_that_nobody_fetches_are_dropped_and_counted() -> None:
+def test_soe_server_drops_and_counts_messages_beyond_the_queue() -> None:
     drive = Drive()
     for code in range(MAX_PENDING + 2):
         drive.server.send_emergency(code)
@@ -434,7 +434,9 @@ def test_messages_that_nobody_fetches_are_dropped_and_counted() -> None:
         ("00 40 2000", MailboxError.SERVICE_NOT_SUPPORTED),
     ],
 )
-def test_what_is_no_request_gets_a_mailbox_error(octets: str, detail: MailboxError) -> None:
+def test_soe_server_answers_other_messages_with_a_mailbox_error(
+    octets: str, detail: MailboxError
+) -> None:
     with pytest.raises(MailboxRefusedError) as caught:
         Drive().ask(octets)
     assert caught.value.detail == detail

@@ -23,7 +23,7 @@ def test_exchange_with_our_echo() -> None:
     assert line.run(voe.exchange(0xFFFFFFFF, 0xFFFF, b"hello")) == b"hello"
 
 
-def test_nobody_answers() -> None:
+def test_voe_server_without_answer() -> None:
     with pytest.raises(MailboxTimeoutError):
         talk_to(VOE, voe.exchange(2, 1, b""), "02000000 02")
 

@@ -110,7 +110,7 @@ def test_a_choice_of_pdos_is_written_before_they_are_read():
     assert line.segment.slaves[0].state is AlState.OP
 
 
-def test_the_watchdog_is_set_when_asked_for():
+def test_bring_sets_the_watchdog_if_configured():
     line = Paced(Master(MasterSettings(watchdog_ms=20)), segment(slave("a")))
     line.wait(line.core.bring_up(line.now_ns))
     memory = line.segment.slaves[0].esc.memory
@@ -125,7 +125,7 @@ def test_slaves_without_boot_say_so():
             request(line, AlState.BOOT, station)
 
 
-def test_refusals_are_told():
+def test_bring_reports_a_refused_state():
     line = line_of(slave("a"))
     line.segment.slaves[0].refused_states[AlState.SAFEOP] = 0x1E
     with pytest.raises(AlStatusError, match="0x001E, invalid input configuration"):
@@ -133,7 +133,7 @@ def test_refusals_are_told():
     assert line.core.slaves[1001].state is AlState.PREOP
 
 
-def test_a_slave_nobody_knows_anything_of_is_not_touched():
+def test_bring_leaves_a_slave_without_eeprom_alone():
     line = line_of(slave("a"))
     unit = line.core.slaves[1001]
     unit.found = unit.found._replace(fault="its EEPROM is empty")

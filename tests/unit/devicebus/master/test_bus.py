@@ -44,7 +44,7 @@ def test_events_come_in_their_order_and_the_oldest_are_dropped():
     assert len(list(iter(bus.next_event, None))) == MAX_EVENTS - 1
 
 
-def test_a_mailbox_that_closes_tells_who_waits():
+def test_bus_closed_mailbox_fails_pending_requests():
     bus, unit = made()
     bus.open_mailbox(unit, AREA)
     first = unit.mailbox
@@ -62,7 +62,7 @@ def talk():
     yield MailboxRequest(MailboxType.COE, b"")
 
 
-def test_forgetting_ends_what_runs():
+def test_bus_reset_ends_running_tasks():
     bus, unit = made()
     bus.set_participation(unit, Participation.ACTIVE)
     set_up_cycle(bus)

@@ -37,7 +37,7 @@ def times(line):
     }
 
 
-def test_clocks_that_started_anyhow_show_the_same_time():
+def test_clocks_with_different_start_show_the_same_time():
     line, found = line_of(
         clocked("a", 5_000_000_000), clocked("b", 77), clocked("c", 123_456_789_012)
     )
@@ -88,7 +88,7 @@ def test_a_bus_without_clocks_has_nothing_to_do():
 
 
 @pytest.mark.parametrize("back", [0, 1])
-def test_one_that_came_back_is_set_and_the_others_left_alone(back):
+def test_clocks_only_the_returned_slave_is_set(back):
     line, found = line_of(clocked("a", 5), clocked("b", 77))
     run(line, synchronize(found, TIME))
     at = Register.DC_SYSTEM_TIME_OFFSET
@@ -101,7 +101,7 @@ def test_one_that_came_back_is_set_and_the_others_left_alone(back):
     assert abs(shown["a"] - shown["b"]) < 2 * HOP
 
 
-def test_a_slave_behind_one_that_is_not_known_begins_anew():
+def test_clocks_slave_behind_an_unknown_one_has_no_delay():
     nodes = {2: TopologyNode((0,), 1, 1, 0)}
     assert find_delays(nodes, {2: Latched((5, 0, 0, 0), 5)}) == {2: 0}
 
@@ -131,7 +131,7 @@ def test_differences_have_a_sign():
     assert run(line, read_difference(1001)) == 5
 
 
-def test_sync0_starts_at_a_whole_cycle_and_its_shift():
+def test_sync0_starts_at_a_whole_cycle_plus_shift():
     line, found = line_of(clocked("a"))
     run(line, synchronize(found, TIME))
     start = run(line, start_sync0(1001, Sync0(MS, 250_000)))

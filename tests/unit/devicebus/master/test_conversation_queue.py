@@ -29,7 +29,7 @@ def give(matcher, data=YES, *, address=0, kind=COE, ask=ASK):
     return matcher.answers(MailboxHeader(0, address, type=kind), data, ask)
 
 
-def test_replies_are_told_by_protocol_and_content(matcher):
+def test_reply_matcher_uses_protocol_and_content(matcher):
     assert matcher.next_address() == 0
     assert give(matcher)
     assert give(matcher, address=1001)
@@ -38,7 +38,7 @@ def test_replies_are_told_by_protocol_and_content(matcher):
     assert give(matcher, kind=ERR)
 
 
-def test_after_a_time_out_requests_are_tagged_and_replies_told_by_the_tag(matcher):
+def test_reply_matcher_tags_requests_after_a_time_out(matcher):
     matcher.next_address()
     matcher.expire(ASK)
     tag = matcher.next_address()
@@ -67,7 +67,7 @@ def test_without_echo_the_first_fitting_reply_is_the_late_one(matcher):
     assert give(matcher)
 
 
-def test_without_echo_a_lost_reply_costs_one_more_time_out_and_not_two(matcher):
+def test_reply_matcher_without_echo_loses_one_more_reply_at_most(matcher):
     matcher.expire(ASK)
     matcher.next_address()
     assert not give(matcher)
@@ -76,7 +76,7 @@ def test_without_echo_a_lost_reply_costs_one_more_time_out_and_not_two(matcher):
     assert give(matcher)
 
 
-def test_a_late_reply_that_nobody_could_confuse_is_settled(matcher):
+def test_reply_matcher_removes_the_expired_request_of_a_late_reply(matcher):
     matcher.expire(ASK)
     matcher.next_address()
     assert not give(matcher, ask=ASK_OTHER)
@@ -112,7 +112,7 @@ def test_without_echo_a_mailbox_error_may_be_late_too(matcher):
         (ERR, b"\1\0\2\0", False),
     ],
 )
-def test_what_slaves_send_unasked(kind, data, expected):
+def test_is_unsolicited_by_protocol_and_service(kind, data, expected):
     assert is_unsolicited(kind, data) is expected
 
 
@@ -123,7 +123,7 @@ EMERGENCY = encode_message(CoeService.EMERGENCY, bytes(8))
 REST = MailboxRequest(COE, LISTED.request[:6], listen=True)
 
 
-def test_fragments_that_come_before_somebody_listens_are_kept(matcher):
+def test_reply_matcher_stores_fragments_before_the_listener(matcher):
     matcher.next_address()
     assert not matcher.store(PARTS[1])
     assert give(matcher, PARTS[0], ask=LISTED)
@@ -135,7 +135,7 @@ def test_fragments_that_come_before_somebody_listens_are_kept(matcher):
     assert [matcher.take_stored(REST) for _ in range(3)] == [*PARTS[1:], None]
 
 
-def test_what_was_kept_is_forgotten_with_the_next_request(matcher):
+def test_reply_matcher_drops_stored_fragments_with_the_next_request(matcher):
     matcher.note_part(PARTS[0])
     assert matcher.store(PARTS[1])
     matcher.next_address()
@@ -174,7 +174,7 @@ def order(queue, *, count):
     return names
 
 
-def test_requesters_take_turns():
+def test_conversation_queue_alternates_requesters():
     queue = ConversationQueue()
     for number in range(3):
         queue.add(job(f"greedy{number}", "g"))
@@ -191,21 +191,21 @@ def test_a_conversation_of_a_protocol_ends_before_the_next_begins():
     assert [queue.next_job(0).task.name for _ in range(3)] == ["first"] * 3
 
 
-def test_protocols_take_turns_message_by_message():
+def test_conversation_queue_alternates_protocols_by_message():
     queue = ConversationQueue()
     queue.add(job("file", kind=FOE))
     queue.add(job("sdo"))
     assert [queue.next_job(0).task.name for _ in range(4)] == ["file", "sdo", "file", "sdo"]
 
 
-def test_who_only_listens_goes_first():
+def test_conversation_queue_prefers_listeners():
     queue = ConversationQueue()
     queue.add(job("file", kind=FOE))
     queue.add(job("fragments", listen=True))
     assert [queue.next_job(0).task.name for _ in range(3)] == ["fragments"] * 3
 
 
-def test_who_waits_holds_nobody_up():
+def test_conversation_queue_pause_of_one_does_not_delay_others():
     queue = ConversationQueue()
     queue.add(job("busy", kind=FOE, ready_ns=50))
     assert (queue.next_job(49), queue.next_ready()) == (None, 50)

@@ -29,7 +29,7 @@ class Fixture:
         return [access for frame in frames for access in accesses_of(frame)]
 
 
-def test_one_datagram_takes_outputs_and_brings_inputs():
+def test_cycle_exchanges_outputs_and_inputs_by_one_datagram():
     f = Fixture()
     f.image.outputs[:] = b"abc"
     (access,) = f.round(7, b"...WXYZ")
@@ -60,7 +60,7 @@ def test_a_wrong_working_counter_leaves_the_inputs_alone():
     assert f.troubles == [MS + 50]
 
 
-def test_inputs_of_those_who_are_there_go_on_while_one_is_away():
+def test_cycle_updates_inputs_of_the_others_while_one_is_absent():
     f = Fixture()
     f.round(7, b"...WXYZ")
     f.cycle.set_participation(1, Participation.ABSENT)
@@ -72,7 +72,7 @@ def test_inputs_of_those_who_are_there_go_on_while_one_is_away():
 
 
 @pytest.mark.parametrize(("wkc", "errors"), [(4, 0), (6, 1), (7, 0), (3, 1), (8, 1)])
-def test_a_slave_nobody_is_sure_of_counts_wholly_or_not_at_all(wkc, errors):
+def test_cycle_uncertain_slave_counts_fully_or_not_at_all(wkc, errors):
     f = Fixture()
     f.cycle.set_participation(1, Participation.UNCERTAIN)
     f.round(wkc, b"...WXYZ")
@@ -80,7 +80,7 @@ def test_a_slave_nobody_is_sure_of_counts_wholly_or_not_at_all(wkc, errors):
     assert f.image.inputs == (b"\0\0\0\0" if errors else b"\0\0YZ")
 
 
-def test_what_is_expected_holds_from_the_next_cycle_on():
+def test_cycle_changed_participation_applies_from_the_next_cycle():
     f = Fixture()
     f.cycle.start(0)
     (frame,) = f.link.frames_to_send(0)
@@ -116,7 +116,7 @@ def test_cycle_late_is_counted_and_its_inputs_are_taken():
     assert counts(f) == (1, 1, 0, 0)
 
 
-def test_cycle_overtaken_by_a_newer_one_changes_nothing():
+def test_cycle_overtaken_by_a_newer_one_is_ignored():
     f = Fixture()
     f.cycle.start(0)
     (older,) = f.link.frames_to_send(0)
@@ -167,7 +167,7 @@ def test_whether_the_last_cycle_came_back_well_is_known_at_any_time():
     assert not f.cycle.is_good
 
 
-def test_a_cycle_without_one_who_should_take_part_is_good_but_not_full():
+def test_cycle_without_an_uncertain_slave_is_good_but_not_full():
     f = Fixture()
     f.cycle.set_participation(3, Participation.UNCERTAIN)
     f.round(6)

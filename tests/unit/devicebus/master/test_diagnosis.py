@@ -52,7 +52,7 @@ def test_states_with_their_reasons(line):
         ("branch", Register.RX_ERROR, Fault(1002, 0, 1001)),
     ],
 )
-def test_errors_are_placed_where_they_start(line, name, register, fault):
+def test_diagnose_names_the_port_where_errors_start(line, name, register, fault):
     count(line, name, register, 3)
     count(line, "b", Register.FORWARDED_RX_ERROR, 9)
     found = run(line, diagnose(STATIONS))

@@ -63,7 +63,7 @@ def test_controllers_that_give_four_octets_are_read_as_well():
     assert len(chip.commands) == len(image) // 4 + 1
 
 
-def test_an_image_is_written_where_it_differs(line, monkeypatch):
+def test_write_image_writes_changed_words_only(line, monkeypatch):
     image = bytearray(run(line, eeprom.read_image(1001)))
     image[8:10] = b"\x34\x12"
     image[14] = sii.checksum(image[:14])

@@ -31,13 +31,13 @@ INIT, PREOP, BOOT, SAFEOP, OP = (
         (BOOT, BOOT, ()),
     ],
 )
-def test_the_way_from_state_to_state(current, target, expected):
+def test_esm_path_between_states(current, target, expected):
     assert path(current, target) == expected
 
 
 @pytest.mark.parametrize("current", list(AlState))
 @pytest.mark.parametrize("target", list(AlState))
-def test_every_step_of_every_way_is_allowed(current, target):
+def test_esm_every_path_has_allowed_steps(current, target):
     for step in path(current, target):
         assert step in ALLOWED[current]
         current = step
@@ -60,7 +60,7 @@ def test_a_state_is_reached(line):
     assert line.frames == before + 1
 
 
-def test_a_refusal_gives_code_text_and_where_the_slave_stands(line):
+def test_change_state_refused_reports_code_text_and_state(line):
     with pytest.raises(AlStatusError) as caught:
         run(line, change_state(1002, PREOP))
     assert str(caught.value) == (

@@ -68,7 +68,7 @@ def test_sound_bus_has_no_findings():
         ([*NAMES], "none of the 4 slaves answers, although frames come back"),
     ],
 )
-def test_silent_slaves_are_one_finding_that_names_what_answers(silent, expected):
+def test_findings_silent_slaves_are_one_with_the_answering_neighbours(silent, expected):
     assert whats(line(silent)) == [expected]
 
 
@@ -87,7 +87,7 @@ def test_lost_link_before_a_silent_slave_is_the_same_finding():
     assert (finding.port, finding.advice) == (1, "check the cable to c (1003) and its power")
 
 
-def test_slaves_with_the_same_trouble_are_one_finding():
+def test_findings_slaves_with_one_fault_are_one():
     trouble = "in SAFEOP+ERROR: watchdog"
     assert whats(line(b=trouble, c=trouble)) == [f"b (1002), c (1003): {trouble}"]
     assert whats(line(b="it refuses OP")) == ["b (1002) refuses OP"]
@@ -114,7 +114,7 @@ def test_errors_that_are_counted_no_longer_are_over():
     assert (finding.is_over, finding.until_ns) == (True, 12 * SECOND)
 
 
-def test_new_errors_are_found_behind_a_port_with_old_ones():
+def test_findings_new_errors_behind_a_port_with_old_ones():
     history = History(
         ports={(1001, 1): Times(20 * SECOND, 12 * SECOND), (1003, 0): Times(SECOND, SECOND)}
     )
@@ -122,7 +122,7 @@ def test_new_errors_are_found_behind_a_port_with_old_ones():
     assert [(each.slaves, each.is_over) for each in found] == [((1003,), False), ((1001,), True)]
 
 
-def test_both_ends_of_a_cable_are_one_finding_whenever_they_were_counted():
+def test_findings_both_ends_of_a_cable_are_one():
     history = History(
         ports={
             (1002, 1): Times(37 * SECOND, 37 * SECOND),
@@ -138,7 +138,7 @@ def test_errors_from_before_the_master_looked_are_over_at_an_unknown_time():
     assert (finding.is_over, finding.until_ns) == (True, None)
 
 
-def test_cut_that_was_mended_is_one_finding_for_slaves_and_both_ends_of_the_cable():
+def test_findings_mended_cut_is_one_for_slaves_and_cable():
     times = Times(30 * SECOND, 12 * SECOND)
     over = [(SlaveView(at, NAMES[at], trouble="it does not answer"), times) for at in (1003, 1004)]
     ports = {(1002, 1): Times(30 * SECOND, 30 * SECOND), (1003, 0): Times(12 * SECOND, 12 * SECOND)}
@@ -164,12 +164,12 @@ def test_slaves_that_were_missed_while_no_frame_came_back_are_no_finding_of_thei
     assert (finding.is_over, finding.until_ns) == (True, 12 * SECOND)
 
 
-def test_join_errors_one_error_stays_as_it_is():
+def test_join_errors_single_error_is_unchanged():
     error = AlStatusError("slave 1002: refuses OP", code=1, state=4)
     assert join_errors([("b (1002)", error)]) is error
 
 
-def test_join_errors_lost_frames_are_one_error_that_blames_no_cable_end():
+def test_join_errors_lost_frames_are_one_error():
     errors = [(f"s{n} ({n})", FrameLostError(f"FPRD 0x{n:04X}: no frame")) for n in range(1, 33)]
     error = join_errors(errors)
     assert isinstance(error, FrameLostError)

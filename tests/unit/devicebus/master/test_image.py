@@ -86,7 +86,7 @@ def test_a_bus_without_process_data_has_none():
     assert layout == ({}, (), ())
 
 
-def test_what_cannot_be_laid_out_is_refused():
+def test_plan_image_refuses_too_much_process_data():
     with pytest.raises(BusError, match="slave 5: 1500 bytes of process data, expected at most"):
         plan_image([shape(5, (8,) * 1500)])
     with pytest.raises(BusError, match="slave 5: 2 sync managers with process data, but 1 FMMUs"):
@@ -133,7 +133,7 @@ def test_values_lie_side_by_side(image):
     assert not any(image.outputs[len(image.outputs) // 2 :])
 
 
-def test_inputs_are_read_where_they_came(image):
+def test_image_reads_inputs_of_the_last_cycle(image):
     size = len(image.inputs) // 2
     image.inputs[size] = 200
     image.inputs[size + 1 : size + 11] = b"0123456789"
@@ -149,7 +149,7 @@ def test_octets_without_a_type(image):
         image.write(1001, "odd", 5)
 
 
-def test_what_is_not_there_names_what_is(image):
+def test_image_unknown_entry_names_the_known_ones(image):
     with pytest.raises(BusError, match="slave 1001 has no process data 'x', it has lamp, mode"):
         image.read(1001, "x")
     with pytest.raises(BusError, match="slave 1009 has no process data 'x', it has none"):

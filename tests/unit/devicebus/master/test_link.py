@@ -25,7 +25,7 @@ from devicebus.wire.datagram import Command, DatagramReply, brd, fprd, fpwr, log
 from tests.support.busline import MS, accesses_of, answer
 
 
-def test_round_trip_not_measured_yet_is_waited_for_patiently():
+def test_round_trip_not_measured_has_the_back_off_limit():
     trip = RoundTrip()
     assert (trip.timeout_ns, trip.smoothed_ns) == (BACKOFF_LIMIT_NS, 0)
     assert RoundTrip(ceiling_ns=3 * MS).timeout_ns == 3 * MS
@@ -49,7 +49,7 @@ def test_round_trip_has_a_floor_and_a_ceiling(trip_ns, timeout_ns):
     assert trip.timeout_ns == timeout_ns
 
 
-def test_round_trip_backs_off_up_to_its_patience():
+def test_round_trip_backs_off_up_to_the_limit():
     trip = RoundTrip()
     trip.measure(MS // 2)
     waits = [trip.timeout_of(number, 9) // MS for number in range(1, 10)]
@@ -58,7 +58,7 @@ def test_round_trip_backs_off_up_to_its_patience():
     assert trip.timeout_of(1, 1) == FLOOR_NS
 
 
-def test_round_trip_longer_than_patience_is_waited_for_each_time():
+def test_round_trip_longer_than_the_limit_is_the_time_out():
     trip = RoundTrip()
     trip.measure(100 * MS)
     assert [trip.timeout_of(number, 3) // MS for number in (1, 2, 3)] == [300] * 3
@@ -110,7 +110,7 @@ def test_accesses_of_several_share_a_frame_and_each_gets_its_own_answer(link):
     assert not link.is_waiting
 
 
-def test_an_exchange_larger_than_a_frame_is_answered_when_all_of_it_is(link):
+def test_link_exchange_of_several_frames_is_done_with_the_last(link):
     client = Client(link)
     client.ask(*[fprd(1001, 0x1000, 1000)] * 3)
     frames = link.frames_to_send(0)
@@ -132,7 +132,7 @@ def test_frames_hold_no_more_than_a_frame_holds(link):
 
 
 @pytest.mark.parametrize("accesses", [(), (fprd(1001, 0x1000, MAX_DATA + 1),)])
-def test_what_fits_no_frame_is_refused(link, accesses):
+def test_link_refuses_a_datagram_longer_than_a_frame(link, accesses):
     with pytest.raises(ValueError, match=str(MAX_DATA)):
         Client(link).ask(*accesses)
 
@@ -160,7 +160,7 @@ def test_link_sends_an_overdue_frame_again_less_often_each_time_and_gives_up(qui
     assert not quick.is_waiting
 
 
-def test_link_sends_as_often_as_it_is_told():
+def test_link_repeats_as_often_as_configured():
     link = Link(retries=1, ceiling_ns=5 * MS)
     client = Client(link)
     client.ask(READ)
@@ -172,7 +172,7 @@ def test_link_sends_as_often_as_it_is_told():
     assert [at for _, at in client.outcomes] == [5 * MS, 10 * MS]
 
 
-def test_an_answer_says_how_often_it_was_asked_for(quick):
+def test_link_reply_has_the_number_of_tries(quick):
     client = Client(quick)
     client.ask(READ)
     quick.frames_to_send(0)
@@ -198,7 +198,7 @@ def test_link_takes_the_answer_of_a_late_frame_and_drops_the_second_one(quick):
     assert not quick.is_waiting
 
 
-def test_link_does_not_send_again_what_a_late_frame_has_answered(quick):
+def test_link_does_not_repeat_a_datagram_answered_by_a_late_frame(quick):
     client = Client(quick)
     client.ask(READ)
     (late,) = quick.frames_to_send(0)
@@ -268,7 +268,7 @@ def test_a_frame_with_the_right_index_but_of_something_else_answers_nothing(link
     assert (client.outcomes, link.stats().malformed) == ([], 1)
 
 
-def test_positions_change_on_the_way_and_still_match(link):
+def test_link_matches_incremented_positions(link):
     client = Client(link)
     client.ask(replace(READ, command=Command.APRD, adp=0xFFFF))
     frame = bytearray(link.frames_to_send(0)[0])
@@ -290,7 +290,7 @@ def test_nothing_that_comes_back_does_harm(octets):
     assert len(client.outcomes) == 1
 
 
-def test_what_is_cancelled_is_not_sent_and_not_answered(link):
+def test_link_cancelled_exchange_is_neither_sent_nor_answered(link):
     client = Client(link)
     waiting = client.ask(READ)
     waiting.cancel()
@@ -306,7 +306,7 @@ def test_what_is_cancelled_is_not_sent_and_not_answered(link):
     assert (client.outcomes, link.frames_to_send(9 * MS)) == ([], [])
 
 
-def test_acyclic_frames_under_way_are_few(link):
+def test_link_limits_acyclic_frames_in_flight(link):
     client = Client(link)
     for _ in range(20):
         client.ask(fprd(1001, 0x1000, MAX_DATA))
@@ -342,7 +342,7 @@ def test_cyclic_frames_go_first_and_take_a_little_along():
     assert accesses_of(second) == [long, READ]
 
 
-def test_nobody_rides_along_without_budget_or_room():
+def test_link_adds_no_acyclic_datagram_without_budget_or_space():
     link = Link(acyclic_octets=64)
     client = Client(link)
     client.ask(READ, READ)
@@ -355,7 +355,7 @@ def test_nobody_rides_along_without_budget_or_room():
     assert len(accesses_of(third)) == 1
 
 
-def test_who_rode_along_with_an_overdue_frame_is_sent_again():
+def test_link_repeats_acyclic_datagrams_of_an_overdue_cyclic_frame():
     link = Link(acyclic_octets=3000)
     client = Client(link)
     client.ask(READ)
@@ -371,7 +371,7 @@ def test_who_rode_along_with_an_overdue_frame_is_sent_again():
     assert [type(outcome) for outcome, _ in client.outcomes] == [FrameLostError]
 
 
-def test_a_cycle_sends_no_more_acyclic_octets_than_its_budget_and_one_datagram():
+def test_link_cycle_sends_its_budget_and_one_datagram_at_most():
     link = Link(acyclic_octets=400)
     client = Client(link)
     for _ in range(10):

@@ -75,7 +75,7 @@ def test_a_request_takes_two_frames(line, box):
     assert (stats.sent, stats.received, stats.latency_ns) == (1, 1, 40_000)
 
 
-def test_refusals_reach_who_asked(line, box):
+def test_mailbox_error_reaches_the_requester(line, box):
     with pytest.raises(SdoAbortError, match="0x2000:00"):
         line.wait(start(line, box, coe_client.upload(0x2000, 0)))
 
@@ -87,7 +87,7 @@ def test_refusals_reach_who_asked(line, box):
     assert "UNSUPPORTED_PROTOCOL" in box.stats().last_error
 
 
-def test_a_message_that_does_not_fit_is_refused_before_it_is_sent(line, box):
+def test_mailbox_too_long_message_is_refused_before_sending(line, box):
     frames = line.frames
 
     def large():
@@ -194,7 +194,7 @@ def test_a_late_reply_is_not_taken_for_the_same_request_made_again(line, slow, e
     assert slow.stats().late == 2
 
 
-def test_a_slave_that_takes_nothing_is_told_apart(line, box):
+def test_mailbox_that_stays_full_has_its_own_error(line, box):
     line.segment.slaves[0].esc.channels[0].is_stuck = True
     with pytest.raises(MailboxTimeoutError, match="no COE reply"):
         line.wait(start(line, box, vendor()))
@@ -261,7 +261,7 @@ class Talker:
 EMERGENCY = encode_message(CoeService.EMERGENCY, bytes(range(8)))
 
 
-def test_what_comes_unasked_is_told_and_disturbs_no_request(line, box):
+def test_mailbox_unsolicited_message_is_reported_beside_a_request(line, box):
     protocols = server(line).protocols
     protocols[MailboxType.VOE] = talker = Talker()
     talker.unasked = [b"news"]
@@ -278,7 +278,7 @@ def test_what_comes_unasked_is_told_and_disturbs_no_request(line, box):
     assert box.stats().unsolicited == 4
 
 
-def test_requests_that_come_while_it_looks_are_served_too(line, box):
+def test_mailbox_request_during_a_poll_is_served(line, box):
     box.poll(line.now_ns)
     assert line.wait(start(line, box, vendor())) == VENDOR
 
@@ -309,7 +309,7 @@ def test_a_conversation_may_wait_send_without_reply_and_listen(line, box):
     assert line.now_ns - begun >= 50 * MS
 
 
-def test_fragments_wait_for_who_comes_back_for_them(line, box):
+def test_mailbox_fragments_are_stored_for_the_listener(line, box):
     """Who asks from another process listens a while after the slave has sent the rest."""
 
     def ask(request, **options):

@@ -80,7 +80,7 @@ def test_a_full_mailbox_takes_nothing():
     )
 
 
-def test_messages_are_fetched_whole_and_never_read_twice():
+def test_mailbox_port_reads_each_message_once():
     wire = Wire(reply=b"x" * 48)
     port = MailboxPort(7, AREA)
     assert drive(port.is_full(), wire)
@@ -98,7 +98,7 @@ def lose_read(port):
     assert end.value.value is None
 
 
-def test_a_lost_reply_is_asked_for_again():
+def test_mailbox_port_requests_a_lost_reply_again():
     port, wire = MailboxPort(7, AREA), Wire(reply=b"x")
     lose_read(port)
     assert drive(port.is_full(), wire)

@@ -111,7 +111,7 @@ def test_unsolicited_messages_are_events():
     assert (event.station, event.data) == (1001, b"\x00\x10" + bytes(8))
 
 
-def test_slaves_and_mailboxes_that_are_not_there_are_named():
+def test_master_names_unknown_slaves_and_closed_mailboxes():
     line = line_of(slave("plain", mailbox=None), slave("a"))
     master = line.core
     with pytest.raises(BusError, match="unknown slave 1009; known slaves: 1001, 1002"):
@@ -124,7 +124,7 @@ def test_slaves_and_mailboxes_that_are_not_there_are_named():
         master.converse(1002, coe_client.upload(0x1018, 1), line.now_ns)
 
 
-def test_a_slave_is_asked_for_one_state_at_a_time_and_kept_there():
+def test_master_requests_one_state_at_a_time_and_keeps_it():
     line = line_of(slave("a"), slave("b"))
     master = line.core
     going = master.request_state(1001, AlState.PREOP, line.now_ns)

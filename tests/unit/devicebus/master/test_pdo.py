@@ -48,14 +48,14 @@ SII = Sii(
 )
 
 
-def test_the_eeprom_tells_what_sync_managers_carry():
+def test_channels_from_sii_have_the_assigned_pdos():
     outputs, inputs = channels_from_sii(SII)
     entries = (PdoEntry(0x7000, 1, 1, "lamp", 1), PdoEntry(0, 0, 7))
     assert outputs == ProcessDataChannel(2, 0x1100, 0x64, True, (Pdo(0x1600, entries),))
     assert (outputs.size, inputs.size, inputs.pdos, inputs.is_output) == (1, 4, (), False)
 
 
-def test_sync_managers_without_a_type_are_told_by_their_control():
+def test_channels_from_sii_without_type_use_the_control_byte():
     managers = (
         SiiSyncManager(0x0F00, 1, 0x44),
         SiiSyncManager(0x1000, 2, 0x00),
@@ -69,7 +69,7 @@ def test_sync_managers_without_a_type_are_told_by_their_control():
     ]
 
 
-def test_a_slave_with_coe_is_asked_and_names_its_entries():
+def test_read_channels_reads_mapping_and_names_by_coe():
     line = Line(Bench(), segment(slave("a")))
     box = open_mailbox(line)
     sii = Sii(fixed=SiiFixed(), sync_managers=MANAGERS, general=SiiGeneral(coe_sdo=1, coe_info=1))
@@ -79,7 +79,7 @@ def test_a_slave_with_coe_is_asked_and_names_its_entries():
     assert (outputs.size, inputs.size) == (1, 1)
 
 
-def test_what_it_does_not_know_is_as_the_eeprom_says():
+def test_read_channels_falls_back_to_the_eeprom():
     line = Line(Bench(), segment(slave("a", inputs=())))
     dictionary = line.segment.slaves[0].device.dictionary
     for index in (0x1C12, 0x1C13):

@@ -21,7 +21,7 @@ def task(stopped):
     return Task("reading", lambda: stopped.append(True))
 
 
-def test_a_result_is_there_once_it_is_done(task):
+def test_task_has_its_result_at_the_end(task):
     seen = []
     task.watch(seen.append)
     with pytest.raises(BusError, match="reading is not done yet"):
@@ -33,14 +33,14 @@ def test_a_result_is_there_once_it_is_done(task):
     assert seen == [task, task]
 
 
-def test_what_went_wrong_is_raised(task):
+def test_task_raises_its_error(task):
     task.fail(BusError("no"))
     assert task.is_done
     with pytest.raises(BusError, match="no"):
         task.result()
 
 
-def test_cancelling_stops_what_is_behind_it_once(task, stopped):
+def test_task_cancel_stops_the_procedure_once(task, stopped):
     task.cancel()
     task.cancel()
     assert stopped == [True]
@@ -48,13 +48,13 @@ def test_cancelling_stops_what_is_behind_it_once(task, stopped):
         task.result()
 
 
-def test_cancelling_what_is_done_changes_nothing(task, stopped):
+def test_task_cancel_after_the_end_changes_nothing(task, stopped):
     task.finish(5)
     task.cancel()
     assert (task.result(), stopped) == (5, [])
 
 
-def test_nothing_is_kept_of_what_was_behind_a_task_that_is_done():
+def test_task_releases_its_procedure_at_the_end():
     class Behind:
         def stop(self):
             raise AssertionError
@@ -174,7 +174,7 @@ def test_errors_of_a_procedure_are_those_of_its_task(bench):
         task.result()
 
 
-def test_lost_frames_are_thrown_into_it(bench):
+def test_runner_throws_lost_frames_into_the_procedure(bench):
     task = bench.runner.start(read(1, 0, 1), 0)
     for count in range(1 + RETRIES):
         bench.frames_to_send(count * BACKOFF_LIMIT_NS)

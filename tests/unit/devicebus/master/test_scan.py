@@ -51,7 +51,7 @@ def test_branches_are_left_at_port_3_first_and_then_1_and_2():
     ]
 
 
-def test_ports_that_lead_nowhere_and_slaves_without_any_are_tolerated():
+def test_topology_tolerates_open_ends_and_slaves_without_ports():
     assert parents((0, 1), (0, 1)) == [(None, 0), (0, 1)]
     assert parents((0,), ()) == [(None, 0), (None, 0)]
     assert find_topology([status(1, 2)])[0].entry_port == 1
@@ -62,7 +62,7 @@ def bench_line(*slaves):
     return Line(Bench(), segment(*slaves))
 
 
-def test_a_scan_tells_who_is_there_and_how_they_are_wired():
+def test_scan_returns_identity_and_topology():
     line = bench_line(
         slave("a", vendor=2, product=3, revision=4, serial=5, alias=77),
         slave("b", clock=None),
@@ -169,7 +169,7 @@ def test_the_bus_as_expected():
     check_bus([COUPLER, exact, DRIVE], FOUND)
 
 
-def test_a_missing_slave_is_one_difference():
+def test_check_bus_missing_slave_is_one_difference():
     assert differences(COUPLER, VALVE, DRIVE, found=[FOUND[0], FOUND[2]]) == [
         "the valve is missing after coupler, expected vendor 0x00000E5A, product 0x00000002"
     ]
@@ -177,7 +177,7 @@ def test_a_missing_slave_is_one_difference():
     assert line.startswith("the coupler is missing at the start")
 
 
-def test_a_slave_too_many_is_one_difference():
+def test_check_bus_additional_slave_is_one_difference():
     (line,) = differences(COUPLER, DRIVE)
     assert line == (
         "position 1 (station 1002): vendor 0x00000E5A, product 0x00000002,"
@@ -207,13 +207,13 @@ def test_details_are_compared_when_they_are_named(options, text):
     assert text in line
 
 
-def test_an_unreadable_slave_says_why():
+def test_check_bus_unreadable_slave_has_its_reason():
     broken = FOUND[1]._replace(fault="slave 1002: broken", identity=Identity(0, 0, 0))
     (line,) = differences(COUPLER, VALVE, DRIVE, found=[FOUND[0], broken, FOUND[2]])
     assert line == "position 1 (station 1002): slave 1002: broken, expected the valve"
 
 
-def test_all_differences_are_told_at_once():
+def test_check_bus_reports_all_differences():
     with pytest.raises(IdentityError) as caught:
         check_bus([VALVE, DRIVE, COUPLER], FOUND)
     assert str(caught.value).startswith(
@@ -241,6 +241,6 @@ def test_whether_a_slave_fits():
         ((None, 6), (6, 3), (0, 1)),
     ],
 )
-def test_slaves_with_an_alias_are_found_wherever_they_are(expected, there, order):
+def test_match_aliases_finds_slaves_at_any_position(expected, there, order):
     slaves = [ExpectedSlave(name="s", vendor=1, product=1, alias=alias) for alias in expected]
     assert match_aliases(slaves, there) == order

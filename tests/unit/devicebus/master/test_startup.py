@@ -54,7 +54,7 @@ def test_sixteen_slaves_are_in_op_in_less_than_a_tenth_of_a_second():
     assert line.now_ns - begun < 100 * MS
 
 
-def test_slaves_with_an_alias_keep_name_and_station_wherever_they_are_wired():
+def test_startup_slaves_with_an_alias_keep_name_and_station():
     there = [slave("right", product=2, alias=6), slave("x"), slave("left", product=2, alias=5)]
     expected = [
         ExpectedSlave(name=name, vendor=0xE5A, product=product, alias=alias)
@@ -86,7 +86,7 @@ def test_a_bus_that_runs_is_taken_over():
 
 
 @pytest.mark.parametrize("seed", [3, 5])
-def test_lost_frames_delay_it_only(seed):
+def test_startup_lost_frames_delay_only(seed):
     line = line_of(*SLAVES)
     line.lose_out = lambda number: number % 11 == seed
     line.lose_back = lambda number: number % 13 == seed
@@ -109,7 +109,7 @@ def test_another_bus_is_left_in_init():
     assert states(line) == [AlState.INIT]
 
 
-def test_whoever_refuses_is_named():
+def test_startup_refusing_slave_is_named():
     line = line_of(slave("a"), slave("b"), slave("c"))
     line.segment.slaves[1].refused_states[AlState.OP] = 0x1A
     with pytest.raises(AlStatusError, match="slave 1002: refuses OP"):
@@ -135,7 +135,7 @@ def test_startup_slaves_that_fail_for_one_reason_are_one_line():
     )
 
 
-def test_one_that_refuses_does_not_keep_the_others_from_running():
+def test_startup_refusing_slave_does_not_stop_the_others():
     line = line_of(slave("a"), slave("b"), slave("c"))
     line.segment.slaves[1].refused_states[AlState.OP] = 0x1A
     with pytest.raises(AlStatusError):
@@ -147,7 +147,7 @@ def test_one_that_refuses_does_not_keep_the_others_from_running():
     assert set(states(line)) == {AlState.OP}
 
 
-def test_one_that_does_not_even_reach_preop_leaves_its_place_free():
+def test_startup_slave_below_preop_keeps_its_part_of_the_image():
     line = line_of(slave("a"), slave("b"), slave("c"))
     line.segment.slaves[1].refused_states[AlState.PREOP] = 0x16
     with pytest.raises(AlStatusError, match="slave 1002: refuses PREOP"):
@@ -163,7 +163,7 @@ def test_one_that_does_not_even_reach_preop_leaves_its_place_free():
     assert line.core.cycle.is_full
 
 
-def test_one_with_more_process_data_than_can_be_is_left_out():
+def test_startup_slave_with_too_much_process_data_is_left_out():
     line = line_of(slave("a"), slave("b", mailbox=None))
     image = line.segment.slaves[1].esc.eeprom.image
     content = sii.decode(image)
@@ -178,7 +178,7 @@ def test_one_with_more_process_data_than_can_be_is_left_out():
     assert line.core.cycle.is_full
 
 
-def test_nobody_left_is_no_bus():
+def test_startup_without_remaining_slaves_has_no_cycle():
     line = line_of(slave("a"))
     line.segment.slaves[0].refused_states[AlState.PREOP] = 0x16
     with pytest.raises(AlStatusError):
@@ -186,7 +186,7 @@ def test_nobody_left_is_no_bus():
     assert line.core.cycle is None
 
 
-def test_a_bus_that_is_not_there():
+def test_startup_without_frames_fails():
     line = line_of(slave("a"))
     line.segment.cut(0)
     with pytest.raises(FrameLostError, match="check the cable"):
@@ -244,7 +244,7 @@ def test_a_bus_that_is_shut_down_stays_in_init():
     assert set(states(line)) == {AlState.INIT}
 
 
-def test_a_bus_that_does_not_rest_is_told():
+def test_shut_down_reports_slaves_outside_of_init():
     line = line_of(slave("a"))
     line.wait(line.core.bring_up(line.now_ns))
     line.segment.slaves[0].refused_states[AlState.INIT] = 0x11

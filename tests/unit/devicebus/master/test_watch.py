@@ -88,7 +88,7 @@ def counters(**at):
     return bytes(octets)
 
 
-def test_port_error_log_first_look_says_nothing_about_times():
+def test_port_error_log_first_poll_has_no_times():
     log = PortErrorLog()
     log.take(1001, counters(crc0=7), 5)
     assert log.of(1001) == {}
@@ -197,7 +197,7 @@ def test_a_slave_that_was_switched_off_comes_back_with_its_address(line):
     assert line.core.slaves[1002].mailbox is not None
 
 
-def test_all_behind_a_cut_come_back_when_it_is_mended(line):
+def test_watch_slaves_behind_a_cut_come_back(line):
     line.segment.cut(2)
     line.elapse(500 * MS)
     assert set(kinds(line.events())) == {("SlaveLost", 1003), ("SlaveLost", 1004)}
@@ -285,7 +285,7 @@ def test_watch_with_a_short_silence_changes_nothing(line):
     assert {each.state for each in line.segment.slaves} == {AlState.OP}
 
 
-def test_slave_is_shown_lost_until_it_is_set_up_anew(line):
+def test_watch_slave_is_lost_until_it_is_configured_again(line):
     unit = line.core.slaves[1003]
     line.segment.switch(2, on=False)
     line.elapse(50 * MS)
@@ -301,7 +301,7 @@ def test_slave_is_shown_lost_until_it_is_set_up_anew(line):
 
 
 @pytest.mark.parametrize("silent_ms", [12, 400])
-def test_slave_whose_return_was_interrupted_by_a_silent_bus_gets_its_mailbox_back(line, silent_ms):
+def test_watch_return_interrupted_by_a_silent_bus_reopens_the_mailbox(line, silent_ms):
     line.period_ns = 4 * MS
     unit = line.core.slaves[1003]
     slave_b = by_name(line)["b"]

@@ -23,7 +23,7 @@ def get(memory, at, size):
     return int.from_bytes(memory[at : at + size], "little")
 
 
-def test_clock_starts_where_it_was_told_and_drifts(memory):
+def test_clock_starts_at_its_local_time_and_drifts(memory):
     clock = Clock(memory, drift_ppm=100, local_start_ns=5)
     assert clock.local_time(1_000) == 5
     assert clock.local_time(1_000_001_000) == 1_000_100_005
@@ -97,7 +97,7 @@ def activate(memory, clock, activation, *, start=1_000, sync0=500, sync1=0, now=
     clock.activate(now)
 
 
-def test_what_a_master_reads_is_the_time_at_the_reference(memory):
+def test_clock_register_is_the_time_at_the_reference(memory):
     clock = Clock(memory)
     put(memory, Register.DC_SYSTEM_TIME_DELAY, 100, 4)
     clock.local_time(0)

@@ -19,7 +19,7 @@ CALLS = [
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_every_access_is_refused_until_it_is_over(call):
+def test_sdo_fault_refuses_every_access_until_its_end(call):
     dictionary = FaultyDictionary([record(0x8000, "r", {1: Entry("e", "USINT", RW)})])
     dictionary.aborts[0x8000] = AbortCode.HARDWARE
     with pytest.raises(SdoAbortError) as caught:
@@ -66,7 +66,7 @@ class Counter:
         self._entry.value += 1
 
 
-def test_override_stays_until_it_is_released():
+def test_device_override_stays_until_release():
     dictionary = ObjectDictionary([variable(0x6000, "count", "UINT", RO, 5)])
     counter = Counter(dictionary)
     device = Device("d", dictionary, behaviour=counter)
@@ -83,7 +83,7 @@ def test_override_stays_until_it_is_released():
     assert not device.release(0x6000, 0)
 
 
-def test_override_with_what_is_no_value():
+def test_device_override_refuses_an_invalid_value():
     device = Device("d", ObjectDictionary([variable(0x6000, "count", "UINT", RO, 5)]))
     with pytest.raises(ValueError, match="70000 is not a value of UINT"):
         device.override(0x6000, 0, 70000)

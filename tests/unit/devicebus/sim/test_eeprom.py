@@ -78,7 +78,7 @@ def test_read_behind_the_end_is_erased(eeprom, memory):
     assert memory[0x0508:0x0510] == b"\xff" * 8
 
 
-def test_write_takes_one_word_and_permission(eeprom, memory):
+def test_eeprom_write_needs_write_enable(eeprom, memory):
     status = command(eeprom, memory, EepromCommand.WRITE, 4, data=b"\x78\x56")
     assert status.write_enable_error
     assert eeprom.image == IMAGE

@@ -37,7 +37,7 @@ def test_large_controller_with_clock(address, readable, writable):
 
 
 @pytest.mark.parametrize("small_or_large", [SMALL, LARGE])
-def test_what_can_be_written_can_be_read(small_or_large):
+def test_access_map_writable_registers_are_readable(small_or_large):
     assert len(small_or_large.readable) == len(small_or_large.writable) == REGISTERS
     assert all(r >= w for r, w in zip(*small_or_large, strict=True))
 
@@ -57,7 +57,7 @@ def test_describes_itself(esc):
     assert not esc.emulates_device
 
 
-def test_one_octet_is_enough_to_count(esc):
+def test_esc_one_accessible_byte_counts(esc):
     assert esc.read(0x0132, 2, 0) == bytes(2)
     assert esc.read(0x0136, 4, 0) is None
     assert esc.write(0x0610, bytes(64), 0)
@@ -121,7 +121,7 @@ def test_any_write_clears_a_counter(esc, group):
     assert esc.memory[0x0309] == (0 if group == 0x0300 else 7)
 
 
-def test_eeprom_through_one_write(esc):
+def test_esc_eeprom_command_by_one_write(esc):
     assert esc.write(0x0502, bytes.fromhex("000108000000"), 0)
     assert esc.read(0x0502, 2, READ_NS - 1) == b"\xc0\x81"
     assert not esc.write(0x0502, bytes.fromhex("000100000000"), READ_NS - 1)
@@ -173,7 +173,7 @@ def test_access_over_the_edge_of_the_registers(esc):
     assert esc.read(0x0FFE, 4, 0) == b"\0\0cd"
 
 
-def test_access_across_guards_touches_what_it_may(esc):
+def test_esc_access_across_sync_managers_is_partial(esc):
     esc.write(0x0800, SyncManager(0x1000, 32, 2, 1, enable=1).encode(), 0)
     esc.write(0x0808, SyncManager(0x1020, 32, 2, 0, enable=1).encode(), 0)
     assert esc.write(0x1000, b"m" * 48, 0)
@@ -235,7 +235,7 @@ def test_sixteen_sync_managers():
     assert esc.read(0x0880, 1, 0) is None
 
 
-def test_overlapping_sync_managers_are_asked_in_their_order():
+def test_esc_overlapping_sync_managers_apply_in_order():
     esc = Esc(IMAGE)
     for number, direction in enumerate((0, 1)):
         esc.write(0x0800 + 8 * number, SyncManager(0x1800, 4, 0, direction, enable=1).encode(), 0)

@@ -128,7 +128,7 @@ def test_drift(bench):
     assert clock.local_time(2 * 10**9) == 2 * 10**9 + 10**5
 
 
-def test_emergency_of_an_axis_is_a_fault_of_it():
+def test_emergency_fault_puts_the_axis_into_fault():
     bench = Bench(SlaveSpec(name="slave", kind=DeviceKind.DRIVE, axes=2))
     switch(bench, "emergency", code=0x7500, axis=1)
     dictionary = bench.slaves[0].device.dictionary
@@ -137,7 +137,7 @@ def test_emergency_of_an_axis_is_a_fault_of_it():
     assert dictionary.entry(0x6841, 0).value & 0x6F == 8
 
 
-def test_pdo_that_nobody_asked_for(bench):
+def test_tx_pdo_fault_sends_an_unsolicited_pdo(bench):
     bench.slaves[0].device.dictionary.entry(0x6000, 1).value = 0x1234
     switch(bench, "tx-pdo", object="0x1A00")
     bench.now_ns += 2_000_000
@@ -277,7 +277,7 @@ def test_wrong_working_counter_in_each_datagram():
     assert answers(faulty, 0) == [(2, b"\x11"), (0, b"")]
 
 
-def test_damaged_frames_are_counted_where_they_start():
+def test_damage_fault_is_counted_at_its_cable():
     faulty = make(fault("corrupt", slave="b", for_ms=1))
     assert wkcs(faulty) == []
     assert wkcs(faulty) == []
@@ -298,7 +298,7 @@ def test_damaged_frame_is_taken_in_front_of_the_damage_only():
     assert memory == [b"\x55", b"\0", b"\0"]
 
 
-def test_damage_where_no_frame_comes_hurts_nobody():
+def test_damage_fault_without_frames_has_no_effect():
     faulty = make(fault("corrupt", slave="c", for_ms=1), fault("cut", slave="b", for_ms=1))
     faulty.handle_timeout(0)
     assert wkcs(faulty) == []
@@ -372,7 +372,7 @@ def inputs(commanded):
     return commanded.cycle().data[1]
 
 
-def test_input_is_what_it_was_set_to_until_it_is_released(commanded):
+def test_command_set_holds_an_input_until_release(commanded):
     faulty = FaultySegment(commanded.segment)
     commanded.bring(AlState.OP)
     assert inputs(commanded) == 0
@@ -382,7 +382,7 @@ def test_input_is_what_it_was_set_to_until_it_is_released(commanded):
     assert inputs(commanded) == 0
 
 
-def test_slave_that_does_not_run_yet_has_the_value_when_it_does(commanded):
+def test_command_set_applies_to_a_slave_below_safeop(commanded):
     faulty = FaultySegment(commanded.segment)
     obey(faulty, SET, 0)
     commanded.bring(AlState.OP)

@@ -61,7 +61,7 @@ def test_only_active_units_with_a_length_count():
     assert windows(unit(0, 1, 0, bits=(5, 3, 0))) == ()
 
 
-def test_octets_are_read_where_both_overlap():
+def test_fmmu_reads_overlapping_bytes():
     memory = Memory(bytes(range(256)))
     parts = read(memory, windows(unit(100, 4, 10)), 98, 4)
     data = bytearray(b"\xee" * 4)
@@ -106,7 +106,7 @@ def mapped_bits(each: Fmmu):
 
 
 @given(one_unit(), st.binary(min_size=8, max_size=8), st.binary(min_size=32, max_size=32))
-def test_like_one_bit_at_a_time(each, sent, content):
+def test_fmmu_equals_a_bitwise_model(each, sent, content):
     address = 4
     expected_data = int.from_bytes(sent, "little")
     expected_memory = int.from_bytes(content, "little")

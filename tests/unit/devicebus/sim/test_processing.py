@@ -71,7 +71,7 @@ def test_new_station_address_counts_at_once():
     assert send(chain, Command.FPRD, 500, 0x1F00, bytes(2)).wkc == 1
 
 
-def test_alias_counts_while_dl_control_enables_it():
+def test_esc_alias_is_enabled_by_dl_control():
     chain, _ = line(1)
     assert send(chain, Command.FPRD, 0x77, 0, b"\0").wkc == 0
     send(chain, Command.BWR, 0, 0x0103, b"\1")
@@ -79,7 +79,7 @@ def test_alias_counts_while_dl_control_enables_it():
     assert send(chain, Command.FPRD, 1001, 0, b"\0").wkc == 1
 
 
-def test_broadcast_joins_what_it_reads():
+def test_chain_broadcast_read_is_ored():
     chain, escs = line()
     assert send(chain, Command.BRD, 0, 0x1F00, b"\x01\x00")[:3] == (b"\x71\x03", 3, 3)
     assert send(chain, Command.BWR, 0xFFFF, 0x1F00, b"\x04\x00")[:3] == (b"\x04\x00", 3, 2)
@@ -88,7 +88,7 @@ def test_broadcast_joins_what_it_reads():
 
 
 @pytest.mark.parametrize(("command", "adp"), [(Command.ARMW, 0xFFFF), (Command.FRMW, 1002)])
-def test_read_one_write_the_others(command, adp):
+def test_chain_read_multiple_write(command, adp):
     chain, escs = line()
     got = send(chain, command, adp, 0x1F00, b"pq")
     assert (got.data, got.wkc) == (b"\x20\x01", 3)
@@ -143,7 +143,7 @@ def test_new_units_count_at_once():
     assert send(chain, Command.LRD, 0, 1, b"\0")[:2] == (b"\x10", 1)
 
 
-def test_any_number_of_places_may_be_asked_for():
+def test_chain_any_number_of_logical_addresses():
     chain, _ = line(1)
     map_octets(chain, 1001, 0x10000, 0x10, 1)
     counts = [send(chain, Command.LRD, at, 1, b"\0").wkc for at in range(100)]
@@ -167,7 +167,7 @@ def test_events_are_joined_into_the_datagram():
     assert send(chain, Command.NOP, 0, 0, b"").header.irq == 0x000C
 
 
-def test_several_datagrams_and_what_lies_behind_them():
+def test_chain_several_datagrams_and_trailing_bytes():
     chain, _ = line()
     frame = bytearray(
         encode_frame(

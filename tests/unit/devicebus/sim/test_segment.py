@@ -53,7 +53,7 @@ def test_single_slave():
     assert (path.order, path.arrivals) == ((0,), {(0, 0): 0})
 
 
-def test_whole_ring_is_worked_off_from_one_side_only():
+def test_segment_closed_ring_is_processed_from_one_end():
     ring = links((1, 0, 1), (2, 1, 1), ring_end=(2, 1))
     assert trace_path(ring, (0, 0)).order == (0, 1, 2)
     assert trace_path(ring, (0, 0)).exit is SegmentEnd.SECONDARY
@@ -98,7 +98,7 @@ def test_segment_without_slaves_answers_nothing():
     assert SimulatedSegment([]).process_frame(frame, 0) is None
 
 
-def test_cut_cable_hides_what_is_behind_it():
+def test_segment_cut_cable_hides_the_slaves_behind():
     bench = line(4)
     bench.segment.cut(2)
     assert count(bench) == 2
@@ -165,7 +165,7 @@ def test_receive_times_follow_the_wiring():
     ]
 
 
-def test_ring_works_from_both_ends_when_it_is_broken():
+def test_segment_broken_ring_works_from_both_ends():
     slaves = [build_slave(generic(f"slave {n}")) for n in range(4)]
     segment = SimulatedSegment(slaves, ring_end=(3, 1))
 
@@ -228,7 +228,7 @@ def test_slave_without_power_waits_for_nothing():
     assert bench.segment.next_timeout() is None
 
 
-def test_clocks_show_one_time_once_they_follow_the_reference():
+def test_segment_clocks_follow_the_reference():
     slow = ClockSpec(drift_ppm=-80, start_ns=123_456_789)
     bench = Bench(generic("a"), generic("b", clock=slow), generic("c"), cable_ns=700)
     for number in (1, 2):
@@ -277,7 +277,7 @@ PLACES = st.one_of(
         max_size=30,
     )
 )
-def test_whatever_a_master_sends_the_slaves_stay_alive(steps):
+def test_segment_survives_any_frame(steps):
     bench = line(2)
     bench.bring(AlState.OP)
     for command, adp, ado, data, pause_ns in steps:
@@ -290,7 +290,7 @@ def test_whatever_a_master_sends_the_slaves_stay_alive(steps):
     assert count(bench) == 2
 
 
-def test_whole_assignment_in_one_transfer():
+def test_pdo_assignment_by_complete_access():
     bench = line(1)
     bench.bring(AlState.PREOP)
     dictionary = bench.slaves[0].device.dictionary

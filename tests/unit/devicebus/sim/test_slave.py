@@ -103,7 +103,7 @@ def bench():
 
 
 @pytest.mark.parametrize("state", [AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT])
-def test_way_up(bench, state):
+def test_slave_steps_up_to_op(bench, state):
     bench.bring(state)
     assert bench.slaves[0].state is state
     bench.ask(AlState.INIT)
@@ -140,7 +140,7 @@ def test_error_is_acknowledged_or_ended_by_init(bench):
 
 
 @pytest.mark.parametrize("state", [AlState.SAFEOP, AlState.PREOP])
-def test_way_down(bench, state):
+def test_slave_steps_down_to_init(bench, state):
     bench.bring(AlState.OP)
     bench.ask(state)
     assert bench.status() == (state, 0)
@@ -154,7 +154,7 @@ def test_preop_needs_its_mailboxes(bench):
     assert bench.status() == (AlState.INIT | ERROR, AlStatusCode.MAILBOX_BOOT)
 
 
-def test_boot_only_where_there_is_one():
+def test_slave_refuses_boot_without_support():
     bench = Bench(generic(boot=False))
     bench.set_channels(0, 0, 2)
     bench.ask(AlState.BOOT)
@@ -237,7 +237,7 @@ def test_channel_switched_off_under_data_is_an_error(bench):
     [(AlState.PREOP, AlStatusCode.MAILBOX_PREOP), (AlState.OP, AlStatusCode.MAILBOX_PREOP),
      (AlState.BOOT, AlStatusCode.MAILBOX_BOOT)],
 )  # fmt: skip
-def test_mailbox_switched_off_while_it_is_used_is_an_error(bench, state, code):
+def test_slave_mailbox_disabled_during_use_is_an_error(bench, state, code):
     bench.bring(state)
     bench.write(Register.SYNC_MANAGER + 6, b"\x00")
     assert bench.status() == (AlState.INIT | ERROR, code)
@@ -245,7 +245,7 @@ def test_mailbox_switched_off_while_it_is_used_is_an_error(bench, state, code):
     assert bench.status() == (AlState.INIT, 0)
 
 
-def test_sync0_where_it_is_needed():
+def test_slave_refuses_op_without_a_required_sync0():
     bench = Bench(generic(clock=ClockSpec(needs_sync0=True)))
     bench.bring(AlState.SAFEOP)
     bench.cycle()

@@ -66,7 +66,7 @@ def test_mailbox_to_the_master_is_empty_with_its_last_octet():
     assert channel.put(b"second")
 
 
-def test_discard_empties_whoever_filled_it():
+def test_sync_channel_discard_empties_the_mailbox():
     channel, _ = mailbox_out()
     channel.write_by_master(START, bytes(SIZE))
     channel.discard()
@@ -82,7 +82,7 @@ def test_repeat_request_is_acknowledged_and_no_new_setting():
     assert (channel.repeat_acknowledge, memory[0x080F]) == (1, 2)
 
 
-def test_outputs_are_taken_whole_and_once():
+def test_sync_channel_returns_complete_outputs_once():
     channel, memory = make(mode=0, direction=1, watchdog=1)
     assert (channel.watches, status(memory)) == (True, 0x30)
     assert channel.write_by_master(START, b"first half") == 0
@@ -133,7 +133,7 @@ def test_area_behind_the_memory_is_cut():
     assert SyncChannel(memory, 0).length == 0
 
 
-def test_new_setting_forgets_what_was_in_it():
+def test_sync_channel_new_setting_empties_it():
     channel, memory = mailbox_out()
     channel.write_by_master(START, bytes(SIZE))
     memory[0x0800:0x0808] = SyncManager(START, SIZE // 2, 2, 1, enable=1).encode()
@@ -199,7 +199,7 @@ def test_counter_stops_at_its_end(memory):
     assert memory[0x0442] == 255
 
 
-def test_zero_switches_it_off_and_stop_ends_it(memory):
+def test_watchdog_is_disabled_by_zero_and_stop(memory):
     watchdog = Watchdog(memory)
     watchdog.feed(0)
     watchdog.stop()

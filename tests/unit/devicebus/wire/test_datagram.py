@@ -102,7 +102,7 @@ def test_frame_that_cannot_be_is_refused(items: list[Datagram]) -> None:
         encode_frame(items)
 
 
-def test_positions_count_down_on_their_way():
+def test_datagram_positions_count_down():
     assert datagram.aprd(0, 0x10, 2) == DatagramRequest(Command.APRD, 0, 0x10, b"\0\0")
     assert datagram.apwr(2, 0x10, b"ab") == DatagramRequest(Command.APWR, 0xFFFE, 0x10, b"ab")
 
@@ -118,7 +118,7 @@ def test_stations_and_broadcasts():
     assert datagram.bwr(0x120, b"\1") == DatagramRequest(Command.BWR, 0, 0x120, b"\1")
 
 
-def test_what_ages_is_sent_once():
+def test_datagram_of_a_time_is_sent_once():
     assert datagram.frmw(1001, 0x910, 8) == DatagramRequest(Command.FRMW, 1001, 0x910, bytes(8), 1)
     assert datagram.logical(Command.LRW, 0x12345678, b"x") == DatagramRequest(
         Command.LRW, 0x5678, 0x1234, b"x", 1

@@ -97,7 +97,7 @@ def test_damage_shows_in_the_checksum():
     assert not sii.is_intact(image)
 
 
-def test_checksum_is_crc8_with_all_ones():
+def test_sii_checksum_is_crc8_from_0xff():
     # The empty message leaves the initial value; one zero byte gives 0xF3 by hand division.
     assert sii.checksum(b"") == 0xFF
     assert sii.checksum(b"\0") == 0xF3

@@ -105,7 +105,7 @@ def test_ports_follow_the_wiring():
     assert [slave.esc.peek(7, 1)[0] for slave in segment.slaves] == [0xCF, 0x0F, 0x0F]
 
 
-def test_axis_that_fails_reports_it():
+def test_drive_failed_axis_reports_an_emergency():
     slave = build_slave(SlaveSpec(name="d", kind=DeviceKind.DRIVE, axes=2,
                                   mailbox=MailboxSpec(soe=True)))  # fmt: skip
     slave.device.behaviour.drives[1].fail(0x7500)

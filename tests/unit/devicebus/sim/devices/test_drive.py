@@ -40,7 +40,7 @@ def test_control_word(word, command):
     assert command_of(word) is command
 
 
-def test_way_to_enabled_and_its_status_words():
+def test_drive_status_words_on_the_way_to_enabled():
     machine = DriveStateMachine()
     seen = [machine.status_word & 0x6F]
     for word in (0x06, 0x07, 0x0F):
@@ -106,7 +106,7 @@ def status(drive):
     return drive.entry(0x6041).value & 0x6F
 
 
-def test_process_data_unless_other_is_asked_for():
+def test_drive_has_default_process_data():
     spec = complete(SlaveSpec(name="d", kind=DeviceKind.DRIVE))
     assert [each.name for each in spec.inputs] == ["statusword", "position"]
     own = complete(SlaveSpec(name="d", kind=DeviceKind.DRIVE, inputs=(ChannelSpec(name="x"),)))

@@ -61,7 +61,7 @@ def found():
     return {each.index: each for each in objects(ElementTree.fromstring(DICTIONARY_XML))}
 
 
-def test_what_every_slave_makes_itself_and_unknown_types_are_left_out(found):
+def test_esi_skips_common_objects_and_unknown_types(found):
     assert sorted(found) == [0x8000, 0x8010, 0x8012, 0x8013, 0x8014]
 
 
@@ -144,7 +144,7 @@ XML = b"""<?xml version="1.0"?>
 SPEC = SlaveSpec(name="mixed", kind=DeviceKind.ESI, esi="mixed.xml", product=2)
 
 
-def test_device_is_what_its_file_says():
+def test_esi_device_equals_its_file():
     spec = complete(SPEC, XML)
     assert (spec.vendor, spec.product, spec.revision) == (0x123, 2, 0x20000)
     assert (spec.mailbox.size, spec.mailbox.foe, spec.mailbox.soe) == (160, True, False)
@@ -201,7 +201,7 @@ def test_first_device_without_a_product_code():
     assert (spec.product, spec.mailbox, spec.inputs) == (1, None, ())
 
 
-def test_slave_is_built_from_it():
+def test_esi_slave_is_built():
     slave = build_slave(SPEC, {"mixed.xml": XML})
     image = sii.decode(slave.esc.image)
     assert (image.fixed.vendor, image.fixed.receive_size) == (0x123, 160)

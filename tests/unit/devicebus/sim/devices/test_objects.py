@@ -28,7 +28,7 @@ def write(dictionary, sub, number, size=2, index=0x1C13):
     dictionary.download(index, sub, number.to_bytes(size, "little"), OdState.PREOP)
 
 
-def test_mapping_has_what_it_is_given_and_no_padding(dictionary):
+def test_pdo_mapping_has_the_given_entries_without_padding(dictionary):
     assert [e.value for e in dictionary[0x1A00].entries.values()][:3] == [1, 0x6000_0110, 0]
     assert [e.value for e in dictionary[0x1A01].entries.values()][:3] == [1, 0x6000_0201, 0]
 
@@ -61,7 +61,7 @@ def test_mapping_is_changed_from_empty(dictionary):
     assert whole == bytes.fromhex("08000000 10010060 01020060")
 
 
-def test_whole_mapping_in_one_transfer(dictionary):
+def test_pdo_mapping_by_complete_access(dictionary):
     octets = bytes.fromhex("0100 10010060")
     dictionary.download_complete(0x1A01, 0, octets, OdState.PREOP)
     assert dictionary.upload_complete(0x1A01, 0, OdState.PREOP) == octets

@@ -42,7 +42,7 @@ def question(ip=IP_ADDRESS, mac=MAC, size=32, **more):
     return bytes(Ether(src=PEER_MAC, dst=mac) / packet)
 
 
-def test_who_has(host):
+def test_ethernet_host_answers_arp(host):
     asked = Ether(src=PEER_MAC, dst=TO_ALL) / ARP(
         op=1, hwsrc=PEER_MAC, psrc=PEER_IP, pdst=IP_ADDRESS
     )
@@ -82,7 +82,7 @@ def test_ping(host, size):
         bytes(Ether(dst=MAC, type=0x88A4)),
     ],
 )
-def test_what_is_not_for_it_is_not_answered(host, frame):
+def test_ethernet_host_ignores_frames_for_others(host, frame):
     assert host.receive_frame(frame) == []
 
 
@@ -111,7 +111,7 @@ def ask(mailbox, kind, data):
 
 
 @pytest.mark.parametrize("kind", [MailboxType.COE, MailboxType.FOE])
-def test_protocol_that_is_not_there_is_refused(kind):
+def test_mailbox_without_a_protocol_refuses_it(kind):
     _, mailbox = make(MailboxSpec(coe=False))
     assert ask(mailbox, kind, bytes(10)) == (MailboxType.ERR, b"\1\0\2\0")
 
@@ -152,7 +152,7 @@ def test_rules_of_files(rules, read, write):
     assert foe(mailbox, b"\2\0\0\0\0\0f") == write
 
 
-def test_file_that_is_not_there_in_boot():
+def test_boot_only_file_is_missing_outside_of_boot():
     device, mailbox = make(MailboxSpec(foe=True), (FileSpec(name="f", not_in_boot=True),))
     device.al_state = AlState.BOOT
     assert foe(mailbox, b"\1\0\0\0\0\0f") == FoeErrorCode.NOT_IN_BOOTSTRAP

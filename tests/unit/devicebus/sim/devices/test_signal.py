@@ -70,7 +70,7 @@ def test_input_follows_an_output():
     assert values(signals, dictionary, (0,)) == [-3]
 
 
-def test_output_that_is_not_there():
+def test_signals_refuse_an_unknown_output():
     with pytest.raises(ValueError, match="a follows 'x', which is no output"):
         make(ChannelSpec(name="a", follows="x"))
 

@@ -60,7 +60,7 @@ def test_names_that_an_eeprom_cannot_hold():
     )
 
 
-def test_image_grows_with_what_it_holds():
+def test_sii_image_grows_with_its_content():
     inputs = tuple(ChannelSpec(name=f"input number {n}", type="USINT") for n in range(250))
     image = image_of(generic(inputs=inputs))
     assert len(image) == 8192
@@ -88,7 +88,7 @@ def test_ports():
     assert sii.decode(image).general.port_physics == 0x1011
 
 
-def test_image_tells_what_the_slave_is():
+def test_sii_image_describes_the_slave():
     mailbox = MailboxSpec(size=64, foe=True, soe=True, eoe=True, voe=True, aoe=True)
     spec = generic(
         "valve island", alias=9, vendor=1, product=2, revision=3, serial=4, mailbox=mailbox
