@@ -170,7 +170,7 @@ class StationDevices:
             name,
             StationRoutes(router, routing, store.routes),
             store.routing,
-            partial(_set_access, station, router),
+            lambda spec: router.set_access(access_of(station, spec)),
         )
         self.routing[name].start()
         self.ads[name] = StationAds(station, device, image, router, identity)
@@ -184,10 +184,6 @@ class StationDevices:
                     image.reopen_if_replaced()  # an engine that died may have retired no buffer
             for device in self.by_station.values():
                 await device.resend()
-
-
-def _set_access(station: StationSpec, router: StationRouter, spec: RoutingSpec) -> None:
-    router.set_access(access_of(station, spec))
 
 
 def _runs(image: StationImage) -> bool:
@@ -445,7 +441,7 @@ def main(handover_fd: int, startup: Startup) -> int:
     logging.basicConfig(format="services: %(message)s", level=logging.INFO, handlers=[log])
     try:
         with ExitStack() as resources:
-            asyncio.run(_serve(handover, startup, log, resources))
+            asyncio.run(Services(handover, startup, log, resources).run())
     except EapError as exc:
         sys.stderr.write(f"services: {exc}\n")
         return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
@@ -464,9 +460,3 @@ async def _keep_serving(serve: Callable[[], Awaitable[None]]) -> None:
         else:
             return
         await asyncio.sleep(_RETRY_S)
-
-
-async def _serve(
-    handover: Handover, startup: Startup, log: LimitedLogHandler, resources: ExitStack
-) -> None:
-    await Services(handover, startup, log, resources).run()

@@ -53,7 +53,7 @@ class RouterView:
         now_ns = monotonic_ns()
         found = list(self.router.table)
         if text := wanted.match.lower():
-            found = [route for route in found if text in self._words(route)]
+            found = [route for route in found if text in self._filter_text(route)]
         page = found[wanted.first : wanted.first + wanted.count]
         latest = list(self.router.record.latest)
         return RouterRow(
@@ -80,7 +80,7 @@ class RouterView:
             self._warnings = self.router.table.warnings(self.router.net_ids)[:MAX_WARNINGS]
         return self._warnings
 
-    def _words(self, route: Route) -> str:
+    def _filter_text(self, route: Route) -> str:
         """Return all texts that a filter matches."""
         report = self.router.report(route)
         origin = "derived" if self.routes.is_derived(route) else _ORIGINS[route.origin]

@@ -282,7 +282,7 @@ class StationRoutes:
         await asyncio.to_thread(self._store.save, kept)
         self._added = added
         for each in gone:
-            self._forget(each)
+            self._remove_from_table(each)
 
     def _apply_spec(self) -> None:
         """Apply the routes of the configuration; unchanged ones stay as they are.
@@ -316,7 +316,7 @@ class StationRoutes:
         except ValueError as exc:
             raise ControlError(f"route {spec.name!r}: {exc}") from None
 
-    def _forget(self, spec: RouteSpec) -> None:
+    def _remove_from_table(self, spec: RouteSpec) -> None:
         """Remove an added route from the table, unless a configured one has replaced it there."""
         for route in list(self.router.table):
             same = route.origin is Origin.ADDED and route.name == spec.name

@@ -112,24 +112,24 @@ async def run_operation(
 
 
 async def answer_hop_query(
-    station: StationRouter, question: HopQuestion, endpoint: Endpoint, source: NetId
+    station: StationRouter, query: HopQuestion, endpoint: Endpoint, source: NetId
 ) -> HopReport:
     """Return the report of a router about an address, or that of a router further on.
 
     Args:
         station: Router that answers.
-        question: The query.
+        query: The query.
         endpoint: Endpoint that the query came from.
         source: NetID of the sender.
     """
-    header = AmsHeader(question.target, question.port, source, 0, 0)
+    header = AmsHeader(query.target, query.port, source, 0, 0)
     location = station.locate(header, endpoint)
-    report = report_of(station.name, station.net_id, question.target, location, monotonic_ns())
-    if not question.further or report.is_here or report.why or not report.next_net_id:
+    report = report_of(station.name, station.net_id, query.target, location, monotonic_ns())
+    if not query.further or report.is_here or report.why or not report.next_net_id:
         return report
     # Bounded, because each router on a loop would forward the query once more.
-    further = min(question.further, MAX_FURTHER) - 1
-    onward = HopQuestion(NetId.parse(report.target), question.port, further)
+    further = min(query.further, MAX_FURTHER) - 1
+    onward = HopQuestion(NetId.parse(report.target), query.port, further)
     operation = ReadWrite(IndexGroup.ROUTE_QUERY, 0, MAX_REPORT, onward.encode())
     next_router = NetId.parse(report.next_net_id)
     timeout_s = _HOP_TIMEOUT_S + _TIMEOUT_PER_HOP_S * further
@@ -181,10 +181,10 @@ async def _follow(
     """Return the routers on the path, and the reason why it ends at the last one."""
     hops: list[Hop] = []
     why = ""
-    while not why and (not hops or _goes_on(hops[-1])):
+    while not why and (not hops or _has_next(hops[-1])):
         began_ns = clock()
-        question = HopQuestion(target, port, len(hops))
-        report = await answer_hop_query(station, question, HERE, station.net_id)
+        query = HopQuestion(target, port, len(hops))
+        report = await answer_hop_query(station, query, HERE, station.net_id)
         took_ns = clock() - began_ns
         if report.error:
             why = _explain(report)
@@ -204,7 +204,7 @@ async def _follow(
     return hops, why
 
 
-def _goes_on(hop: Hop) -> bool:
+def _has_next(hop: Hop) -> bool:
     """Return whether there is a router behind *hop* to query."""
     return not (hop.is_opaque or hop.report.is_here) and bool(hop.report.next_net_id)
 
@@ -255,12 +255,12 @@ class RouteQuery:
 
     async def _report(self, request: LocalRequest, operation: ReadWrite) -> AmsAnswer:
         try:
-            question = HopQuestion.decode(operation.data)
+            query = HopQuestion.decode(operation.data)
         except CodecError:
             outcome = OperationOutcome(AdsError.SIZE)
         else:
             source = request.header.source
-            report = await answer_hop_query(self._station, question, request.endpoint, source)
+            report = await answer_hop_query(self._station, query, request.endpoint, source)
             data = encode_report(report)
             fits = len(data) <= operation.length
             outcome = OperationOutcome(data=data) if fits else OperationOutcome(AdsError.SIZE)

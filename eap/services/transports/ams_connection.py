@@ -238,7 +238,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         name: Unique name.
         address: IP address of the peer.
         handler: Handles its packets.
-        is_ours: Whether this side opened it.
+        is_outgoing: Whether this side opened it.
         assign_address: Returns NetID and port for a client on a host that requests an AMS address;
             without it a request for one ends the connection.
         host: Host that the policy counts it for (:mod:`eap.net.connections`).
@@ -260,7 +260,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         address: str,
         handler: PacketHandler,
         *,
-        is_ours: bool = False,
+        is_outgoing: bool = False,
         assign_address: Callable[[str], tuple[NetId, int]] | None = None,
         host: str = "",
     ) -> None:
@@ -272,15 +272,15 @@ class AmsConnection(asyncio.BufferedProtocol):
         self._address = address
         self._is_used = False
         self._handler = handler
-        self._is_ours = is_ours
+        self._is_outgoing = is_outgoing
         self._window = AmsWindow()
-        self._cutter = AmsStreamDecoder(LONGEST_ANSWER if is_ours else LONGEST_PACKET)
+        self._cutter = AmsStreamDecoder(LONGEST_ANSWER if is_outgoing else LONGEST_PACKET)
         self._transport: asyncio.Transport
         self._is_open = False
-        self._is_held = False
+        self._is_paused = False
         self._is_scheduled = False
         self._is_blocked = False
-        self._has_ended = False
+        self._is_half_closed = False
         self._why = "closed by the peer"
         self._assign_address = assign_address
         self._net_id: NetId | None = None
@@ -302,20 +302,20 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     def buffer_updated(self, nbytes: int) -> None:
         """Handle received bytes (asyncio)."""
-        if self._is_ours and not self._is_blocked:
+        if self._is_outgoing and not self._is_blocked:
             # An answer of 4 MB takes longer than 10 s on a slow link: its latest byte counts.
             self.late_since_ns = None
         packet = self._cutter.receive_one(bytes(_RECEIVED[:nbytes]))
         if packet is None:
-            self._go_on()
+            self._handle_buffered()
         else:
-            self._take(packet)
-            if not self._is_ours and (self._is_blocked or self._window.is_full):
-                self._hold()
+            self._handle(packet)
+            if not self._is_outgoing and (self._is_blocked or self._window.is_full):
+                self._pause_reading()
 
     def eof_received(self) -> bool:
         """Note the end of the received data; the peer may still read answers (asyncio)."""
-        self._has_ended = True
+        self._is_half_closed = True
         self._close_when_done()
         return True
 
@@ -323,8 +323,8 @@ class AmsConnection(asyncio.BufferedProtocol):
         """Pause reading while the peer does not read (asyncio)."""
         self._is_blocked = True
         self.late_since_ns = monotonic_ns()
-        if not self._is_ours:
-            self._hold()
+        if not self._is_outgoing:
+            self._pause_reading()
 
     def resume_writing(self) -> None:
         """Resume reading (asyncio)."""
@@ -347,12 +347,12 @@ class AmsConnection(asyncio.BufferedProtocol):
             return "the connection was closed"
         # pause_writing() alone bounds nothing: notifications come without requests.
         if self._is_blocked and transport.get_write_buffer_size() > MAX_UNSENT:
-            if not self._is_ours:
+            if not self._is_outgoing:
                 self.close(CloseReason.OVERDUE)
             return "the peer does not read"
         for packet in packets:
             transport.write(encode_with_prefix(packet))
-            if self._window.note_outgoing(packet) and (self._is_held or self._has_ended):
+            if self._window.note_outgoing(packet) and (self._is_paused or self._is_half_closed):
                 self._schedule()
         return None
 
@@ -367,7 +367,7 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     def close(self, why: str) -> None:
         """Close it at once, even before it is open; the handler gets the reason *why*."""
-        if why is CloseReason.OVERDUE and not self._has_ended:
+        if why is CloseReason.OVERDUE and not self._is_half_closed:
             self._handler.count_dropped(DropReason.AMS_SLOW)
         self._why = why
         self._is_closed = True
@@ -378,16 +378,16 @@ class AmsConnection(asyncio.BufferedProtocol):
         if not self._is_scheduled:
             self._is_scheduled = True
             AmsConnection._busy_count += 1
-            asyncio.get_running_loop().call_soon(self._go_on)
+            asyncio.get_running_loop().call_soon(self._handle_buffered)
 
-    def _hold(self) -> None:
-        if not self._is_held:
-            self._is_held = True
+    def _pause_reading(self) -> None:
+        if not self._is_paused:
+            self._is_paused = True
             self._transport.pause_reading()
         if not self._is_blocked:
             self.late_since_ns = None  # an incomplete packet waits here, not at the peer
 
-    def _go_on(self) -> None:
+    def _handle_buffered(self) -> None:
         """Handle some of the buffered packets, and resume reading after the last one."""
         if self._is_scheduled:
             self._is_scheduled = False
@@ -395,48 +395,48 @@ class AmsConnection(asyncio.BufferedProtocol):
         for _ in range(_PER_TURN if AmsConnection._busy_count <= _FEW else 1):
             if self._transport.is_closing():
                 return
-            if not self._is_ours and (self._is_blocked or self._window.is_full):
-                self._hold()
+            if not self._is_outgoing and (self._is_blocked or self._window.is_full):
+                self._pause_reading()
                 return
             try:
                 piece = self._cutter.next_item()
             except MalformedError as exc:
-                self._break_off(str(exc))
+                self._reject_stream(str(exc))
                 return
             if piece is None:
-                self._read_on()
+                self._resume_reading()
                 return
-            self._take(piece)
-        self._hold()
+            self._handle(piece)
+        self._pause_reading()
         self._schedule()
 
-    def _read_on(self) -> None:
-        if self._has_ended:
+    def _resume_reading(self) -> None:
+        if self._is_half_closed:
             self._close_when_done()
             return
-        if self._is_held:
-            self._is_held = False
+        if self._is_paused:
+            self._is_paused = False
             self._transport.resume_reading()
         if self._cutter.has_begun and self.late_since_ns is None:
             self.late_since_ns = monotonic_ns()
 
-    def _break_off(self, why: str) -> None:
+    def _reject_stream(self, why: str) -> None:
         """Stop reading, because these are no AMS packets."""
         logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
         self._handler.count_dropped(DropReason.AMS_TYPE)
         self._why = f"no AMS packets: {why}"
         self._cutter = AmsStreamDecoder(0)
-        self._has_ended = True
-        self._hold()
+        self._is_half_closed = True
+        self._pause_reading()
         self._close_when_done()
 
     def _close_when_done(self) -> None:
-        if self._is_ours or not (self._window.requests or self._is_scheduled):
+        if self._is_outgoing or not (self._window.requests or self._is_scheduled):
             self._transport.close()
             if self.late_since_ns is None:
                 self.late_since_ns = monotonic_ns()  # the peer may not have read all answers
 
-    def _take(self, piece: StreamItem) -> None:
+    def _handle(self, piece: StreamItem) -> None:
         self.used_at_ns = monotonic_ns()
         self._is_used = True
         if not self._is_blocked:
@@ -455,7 +455,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _answer_client(self, request: RouterRequest) -> None:
         port = int.from_bytes(request.data, "little")
         if self._assign_address is None:
-            self._break_off("a router requests an address")
+            self._reject_stream("a router requests an address")
             return
         net_id, own_port = self._assign_address(self._address)
         self._net_id = net_id = self._net_id or net_id
@@ -463,11 +463,11 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._transport.write(encode_net_id(net_id))
         elif request.command is RouterCommand.CLOSE_PORT:
             self._why = "the client closed its port"
-            self._has_ended = True
+            self._is_half_closed = True
             self._close_when_done()
         # Port 0 requests any port; with another one the client would be a server.
         elif port:
-            self._break_off(f"programs cannot serve AMS port {port} of a router")
+            self._reject_stream(f"programs cannot serve AMS port {port} of a router")
         else:
             self._transport.write(encode_opened_port(net_id, own_port))
 

@@ -63,7 +63,7 @@ _SHOWN = 80
 logger = logging.getLogger(__name__)
 
 
-class _Request(NamedTuple):
+class _RouteRequest(NamedTuple):
     name: str
     net_id: NetId
     host: str
@@ -87,14 +87,14 @@ class RouteAdmin:
         self._limiter = SourceRateLimiter(RATES, MAX_SOURCES, clock())
 
     async def handle(
-        self, question: Discovery, sender: str, *, is_this_host: bool
+        self, request: Discovery, sender: str, *, is_this_host: bool
     ) -> AdsError | None:
         """Add the requested route, and return the result for its sender.
 
         None stands for no answer: the rate limit of the sender or of all senders is exceeded.
 
         Args:
-            question: The datagram.
+            request: The datagram.
             sender: Its source IPv4 address.
             is_this_host: Whether a program of this host sent it.
         """
@@ -104,19 +104,19 @@ class RouteAdmin:
         )
         if not is_allowed:
             return None
-        name = decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN]
+        name = _text(request, Tag.ROUTE_NAME)[:_SHOWN]
         results = []
         for station in self._stations:
-            wanted = _audited(station.router.net_id, question, sender, AdsError.NONE, "")
+            wanted = _audited(station.router.net_id, request, sender, AdsError.NONE, "")
             # Recorded before the change, because an audit that is required must not miss it.
             if why := station.router.why_not_recorded(wanted):
                 result = AdsError.ACCESS
             else:
-                result, why = await _decide(station, question, sender, is_this_host=is_this_host)
+                result, why = await _decide(station, request, sender, is_this_host=is_this_host)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
             cause = caused_by((station.router.net_id, name, sender, why), sender)
             logger.log(level, "route %r requested by %s: %s", name, sender, why, extra=cause)
-            entry = _audited(station.router.net_id, question, sender, result, why)
+            entry = _audited(station.router.net_id, request, sender, result, why)
             for write in station.router.on_audit:
                 write(entry)
             # All stations decide, although only one answer is sent: the first error of them.
@@ -125,33 +125,33 @@ class RouteAdmin:
 
 
 def _audited(
-    router: NetId, question: Discovery, sender: str, result: AdsError, why: str
+    router: NetId, request: Discovery, sender: str, result: AdsError, why: str
 ) -> AuditEntry:
     """Return the entry of the audit about a request."""
-    octets = (question.find(Tag.NET_ID) or b"")[:6].ljust(6, b"\0")
+    net_id = NetId((request.find(Tag.NET_ID) or b"")[:6].ljust(6, b"\0"))
     wanted = AddRoute(
-        decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN],
-        str(NetId(octets)),
-        decode_text(question.find(Tag.HOST) or b"")[:_SHOWN],
-        decode_text(question.find(Tag.USER) or b"")[:_SHOWN],
+        _text(request, Tag.ROUTE_NAME)[:_SHOWN],
+        str(net_id),
+        _text(request, Tag.HOST)[:_SHOWN],
+        _text(request, Tag.USER)[:_SHOWN],
     )
     decision = Decision(AccessService.CONTROL, result != AdsError.ACCESS, why)
-    header = AmsHeader(router, SYSTEM_PORT, NetId(octets), 0, 0)
+    header = AmsHeader(router, SYSTEM_PORT, net_id, 0, 0)
     done = AuditedOperation(wanted, decision, result)
     return AuditEntry(Endpoint("ams-udp", sender), header, "", (done,))
 
 
 async def _decide(
-    station: StationRoutes, question: Discovery, sender: str, *, is_this_host: bool
+    station: StationRoutes, request: Discovery, sender: str, *, is_this_host: bool
 ) -> tuple[AdsError, str]:
     """Return the result for the sender, and a text for the log."""
-    if refused := _why_not(station.spec.users, question, is_this_host=is_this_host):
+    if refused := _why_denied(station.spec.users, request, is_this_host=is_this_host):
         return AdsError.ACCESS, f"refused: {refused}"
     try:
-        wanted = _read(question, sender)
-        written = _written(station.router.table, wanted.net_id)
-        if written:
-            return AdsError.NONE, f"route {written!r} of the plant file leads there"
+        wanted = _read(request, sender)
+        configured = _configured(station.router.table, wanted.net_id)
+        if configured:
+            return AdsError.NONE, f"route {configured!r} of the plant file leads there"
         await _add(station, wanted)
     except (ValueError, ControlError) as exc:
         return AdsError.VALUE, f"refused: {exc}"
@@ -160,17 +160,21 @@ async def _decide(
     return AdsError.NONE, f"added, to {wanted.net_id} at {wanted.host}:{wanted.port}"
 
 
-def _why_not(users: Sequence[AmsUser], question: Discovery, *, is_this_host: bool) -> str:
+def _text(request: Discovery, tag: int) -> str:
+    return decode_text(request.find(tag) or b"")
+
+
+def _why_denied(users: Sequence[AmsUser], request: Discovery, *, is_this_host: bool) -> str:
     """Return why the sender may not add a route, empty if it may."""
     if users:
-        user = decode_text(question.find(Tag.USER) or b"")[:_SHOWN]
-        return "" if _is_known(users, question) else f"user {user!r} or the password is wrong"
+        user = _text(request, Tag.USER)[:_SHOWN]
+        return "" if _is_known(users, request) else f"user {user!r} or the password is wrong"
     return "" if is_this_host else "the station has no users, so only this host may add routes"
 
 
-def _is_known(users: Sequence[AmsUser], question: Discovery) -> bool:
-    name = decode_text(question.find(Tag.USER) or b"")
-    given = (question.find(Tag.PASSWORD) or b"").partition(b"\0")[0]
+def _is_known(users: Sequence[AmsUser], request: Discovery) -> bool:
+    name = _text(request, Tag.USER)
+    given = (request.find(Tag.PASSWORD) or b"").partition(b"\0")[0]
     is_known = False
     for user in users:  # all of them: the time must not reveal whether a user exists
         password = _password(user)
@@ -192,26 +196,28 @@ def _password(user: AmsUser) -> bytes | None:
     return password or None
 
 
-def _read(question: Discovery, sender: str) -> _Request:
+def _read(request: Discovery, sender: str) -> _RouteRequest:
     """Return the requested route; raise ValueError if its values are impossible."""
-    octets = question.find(Tag.NET_ID) or b""
+    octets = request.find(Tag.NET_ID) or b""
     if len(octets) != 6 or not any(octets):
-        raise ValueError("it has no NetID")
-    where = decode_text(question.find(Tag.HOST) or b"").strip() or sender
+        raise ValueError("the request has no NetID")
+    where = _text(request, Tag.HOST).strip() or sender
     host, port = parse_host(where, AMS_TCP_PORT)
-    name = decode_text(question.find(Tag.ROUTE_NAME) or b"").strip() or where
-    options = int.from_bytes((question.find(Tag.OPTIONS) or b"")[:4], "little")
-    return _Request(name, NetId(octets), host, port, not options & TEMPORARY)
+    name = _text(request, Tag.ROUTE_NAME).strip() or where
+    options = int.from_bytes((request.find(Tag.OPTIONS) or b"")[:4], "little")
+    return _RouteRequest(name, NetId(octets), host, port, not options & TEMPORARY)
 
 
-def _written(table: RouteTable, net_id: NetId) -> str:
+def _configured(table: RouteTable, net_id: NetId) -> str:
     """Return the name of the configured route to *net_id*, empty if there is none."""
     found = table.find(net_id)
-    is_written = found is not None and found[1] and found[0].origin is Origin.STATIC
-    return found[0].name if found is not None and is_written else ""
+    if found is None:
+        return ""
+    route, octets = found
+    return route.name if octets and route.origin is Origin.STATIC else ""
 
 
-async def _add(station: StationRoutes, wanted: _Request) -> None:
+async def _add(station: StationRoutes, wanted: _RouteRequest) -> None:
     """Add a route for all NetIDs of the requested station, or for the requested NetID alone."""
     hop = HopSpec(TransportKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
     is_here = station.has(wanted.net_id.station)
@@ -279,13 +285,13 @@ class AmsDiscovery:
     async def answers_to(self, data: bytes, sender: str) -> list[bytes]:
         """Return the answers to the datagram *data*: one for each router, or none."""
         try:
-            question = decode_discovery(data)
+            request = decode_discovery(data)
         except CodecError:
             return []
-        return [each async for each in self._answers(question, sender)]
+        return [each async for each in self._answers(request, sender)]
 
-    async def _answers(self, question: Discovery, sender: str) -> AsyncIterator[bytes]:
-        service, number = question.header.service, question.header.invoke_id
+    async def _answers(self, request: Discovery, sender: str) -> AsyncIterator[bytes]:
+        service, number = request.header.service, request.header.invoke_id
         if service == DiscoveryService.SERVER_INFO:
             for router in self._routers:
                 # The name first: some tools ignore the numbers of tags.
@@ -293,7 +299,7 @@ class AmsDiscovery:
                 yield _answer(router, service, number, [name, (Tag.VERSION, _VERSION)])
         elif service == DiscoveryService.ADD_ROUTE:
             is_this_host = sender == self._own or IPv4Address(sender).is_loopback
-            result = await self._route_admin.handle(question, sender, is_this_host=is_this_host)
+            result = await self._route_admin.handle(request, sender, is_this_host=is_this_host)
             if result is not None:
                 tag = Tag.RESULT, result.to_bytes(4, "little")
                 yield _answer(self._routers[0], service, number, [tag])

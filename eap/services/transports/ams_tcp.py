@@ -275,14 +275,11 @@ class AmsUplink(ReconnectingLink):
             connection.send(early)
 
     def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
-        """Forward a request of the peer (PacketHandler)."""
+        """Forward a request or an answer of the peer (PacketHandler)."""
         del connection
         self._router.receive(packet, *self._endpoint)
 
-    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Forward an answer of the peer (PacketHandler)."""
-        del connection
-        self._router.receive(packet, *self._endpoint)
+    handle_answer = handle_packet
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
         """Notify the router (PacketHandler)."""
@@ -353,7 +350,7 @@ class AmsUplink(ReconnectingLink):
         self._closed = loop.create_future()
         since = loop.time()
         _, connection = await loop.create_connection(
-            lambda: AmsConnection(str(self.peer), host, self, is_ours=True), sock=sock
+            lambda: AmsConnection(str(self.peer), host, self, is_outgoing=True), sock=sock
         )
         try:
             while not (await asyncio.wait([self._closed], timeout=self._overdue_ns / 4e9))[0]:

@@ -247,7 +247,7 @@ class MailboxStreams:
         self._streams[name] = writer, connection
         connection.waiting = lambda: self._demultiplexer.waiting(name) + self._gateway.waiting(name)
         try:
-            await self._take(reader, writer, name, connection)
+            await self._handle_frames(reader, writer, name, connection)
             async with asyncio.timeout(SLOW_READER_S):
                 # A client that closed its sending side may still read.
                 await self._demultiplexer.wait_below(name, 1)
@@ -293,11 +293,11 @@ class MailboxStreams:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str
     ) -> None:
         try:
-            await self._take(reader, writer, name, StreamConnection(OWN_HOST))
+            await self._handle_frames(reader, writer, name, StreamConnection(OWN_HOST))
         finally:
             self._demultiplexer.connection_closed(name)
 
-    async def _take(
+    async def _handle_frames(
         self,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,

@@ -95,7 +95,7 @@ def is_taken(net_id: NetId) -> bool:
     return net_id[4:] == b"\1\1" or net_id[5] % 2 == 0
 
 
-def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more: Any) -> Taker:
+def talk(script: Script, *, patience_s: float = 5, is_outgoing: bool = False, **more: Any) -> Taker:
     """Run ``script(reader, writer, taker)`` on a connection, and wait for its end."""
     made: list[Taker] = []
 
@@ -111,8 +111,8 @@ def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more
             f"{host}:{port}#1",
             host,
             taker,
-            is_ours=is_ours,
-            assign_address=None if is_ours else partial(ADDRESSES.next, taken=is_taken),
+            is_outgoing=is_outgoing,
+            assign_address=None if is_outgoing else partial(ADDRESSES.next, taken=is_taken),
         )
         await loop.connect_accepted_socket(lambda: connection, theirs)
         reader, writer = await asyncio.open_connection(sock=ours)
@@ -268,15 +268,15 @@ def test_client_gets_a_unique_ams_address() -> None:
 
 
 @pytest.mark.parametrize(
-    ("port", "is_ours", "why"),
+    ("port", "is_outgoing", "why"),
     [(30012, False, "programs cannot serve AMS port 30012"), (0, True, "a router requests")],
 )
-def test_request_to_serve_a_port_closes_the_connection(port, is_ours, why) -> None:
+def test_request_to_serve_a_port_closes_the_connection(port, is_outgoing, why) -> None:
     async def script(reader, writer, taker):
         writer.write(prefixed(port.to_bytes(2, "little"), reserved=0x1000))
         assert await reader.read() == b""
 
-    taker = talk(script, is_ours=is_ours)
+    taker = talk(script, is_outgoing=is_outgoing)
     assert taker.refused == [DropReason.AMS_TYPE]
     assert taker.why.startswith(f"no AMS packets: {why}")
 
@@ -331,7 +331,7 @@ def test_own_connection_is_not_late_while_bytes_of_a_long_answer_come() -> None:
         writer.write(answer[1000:2000])
         await eventually(lambda: connection.late_since_ns > before_ns)
 
-    assert talk(script, is_ours=True).refused == []
+    assert talk(script, is_outgoing=True).refused == []
 
 
 def test_packets_that_wait_for_their_turn_are_not_slow() -> None:
