@@ -54,4 +54,4 @@ def test_rules_of_the_page(
     access = AccessList(plant.routing["press"].access)
     address = Directory(plant.directory).find(target)
     source = NetId.parse("10.0.7.20.1.1")
-    assert rule in access.grants(endpoint, source, *address).admission(operation).why
+    assert rule in access.grants(endpoint, source, *address).decide(operation).why
