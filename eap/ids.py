@@ -40,20 +40,6 @@ class NetId(bytes):
         return f"NetId.parse({str(self)!r})"
 
 
-def encode_value(value: object) -> str:
-    """Return the text of an address in a record (msgspec's ``enc_hook``)."""
-    if isinstance(value, NetId):
-        return str(value)
-    raise NotImplementedError(f"{type(value).__name__} in a record")
-
-
-def decode_value(kind: type, text: object) -> NetId:
-    """Read an address of a record (msgspec's ``dec_hook``); raise ValueError if it is none."""
-    if kind is NetId and isinstance(text, str):
-        return NetId.parse(text)
-    raise NotImplementedError(f"{kind.__name__} in a record")
-
-
 def prefix_text(prefix: bytes) -> str:
     """Return what all NetIDs that begin with *prefix* look like: ``5.23.91.23.x.x``."""
     return ".".join([*map(str, prefix), *["x"] * (6 - len(prefix))])
@@ -122,16 +108,24 @@ EAP_MULTICAST_MAC = MacAddr.parse("01:01:05:04:00:00")
 INTERFACE_SCHEMES = ("udp", "ethernet", "tcp", "loop", "sim")
 
 
-class InterfaceUri(NamedTuple):
-    """What a port is attached to: ``udp://127.0.1.1``, ``ethernet://eth0``, ``loop://line``.
+class InterfaceUri:
+    """Interface of a port: ``udp://127.0.1.1``, ``ethernet://eth0``, ``loop://line``.
 
-    *host* is an address, an interface name or a loopback's name; *port* is 0 unless given.
+    *host* is an address, an interface name or the name of a loopback; *port* is 0 unless given.
+
+    Equal if all parts are.  In records and on the control socket it is its text.
     """
 
-    scheme: str
-    host: str
-    port: int = 0
-    options: tuple[tuple[str, str], ...] = ()
+    # Not a NamedTuple: msgspec would write that as an array, and stored plants hold a text.
+    __slots__ = ("host", "options", "port", "scheme")
+
+    def __init__(
+        self, scheme: str, host: str, port: int = 0, options: tuple[tuple[str, str], ...] = ()
+    ) -> None:
+        self.scheme = scheme
+        self.host = host
+        self.port = port
+        self.options = options
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -149,10 +143,36 @@ class InterfaceUri(NamedTuple):
             raise ValueError(f"{text!r} names no interface")
         return cls(scheme, rest, 0, options)
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, InterfaceUri) and str(self) == str(other)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+    def __repr__(self) -> str:
+        return f"InterfaceUri.parse({str(self)!r})"
+
     def __str__(self) -> str:
         port = f":{self.port}" if self.port else ""
         query = f"?{urlencode(self.options)}" if self.options else ""
         return f"{self.scheme}://{self.host}{port}{query}"
+
+
+def encode_value(value: object) -> str:
+    """Return the text of an address in a record (msgspec's ``enc_hook``)."""
+    if isinstance(value, NetId | InterfaceUri):
+        return str(value)
+    raise NotImplementedError(f"{type(value).__name__} in a record")
+
+
+def decode_value(kind: type, text: object) -> NetId | InterfaceUri:
+    """Read an address of a record (msgspec's ``dec_hook``); raise ValueError if it is invalid."""
+    if isinstance(text, str):
+        if kind is NetId:
+            return NetId.parse(text)
+        if kind is InterfaceUri:
+            return InterfaceUri.parse(text)
+    raise NotImplementedError(f"{kind.__name__} in a record")
 
 
 class DestinationKind(Enum):

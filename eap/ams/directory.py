@@ -180,7 +180,7 @@ def _ports(station: DirectoryStation, name: str) -> Sequence[DirectoryPort]:
 
 
 def _hop(mine: DirectoryPort, there: DirectoryPort) -> HopSpec | None:
-    here, target = InterfaceUri.parse(mine.interface), InterfaceUri.parse(there.interface)
+    here, target = mine.interface, there.interface
     if here.scheme in _IP and target.scheme in _IP:
         return ip_hop(mine.name, here, target)
     if here.scheme == target.scheme == "ethernet" and here.host == target.host:
@@ -259,7 +259,7 @@ _READERS: dict[str, Callable[[str, Sequence[DirectoryPort]], HopSpec]] = {
 
 def _first(ports: Sequence[DirectoryPort], schemes: tuple[str, ...]) -> str:
     for port in ports:
-        if InterfaceUri.parse(port.interface).scheme in schemes:
+        if port.interface.scheme in schemes:
             return port.name
     names = ", ".join(f"{port.name} ({port.interface})" for port in ports)
     raise ValueError(f"no EAP port here is on {' or '.join(schemes)}: {names}")

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 
 DEFAULT_TARGET = "default"
 """Name of a route that takes what no other one does."""
@@ -266,7 +266,7 @@ class DirectoryPort(SpecStruct, frozen=True):
     name: str
     is_bus: bool
     net_id: NetId
-    interface: str
+    interface: InterfaceUri
     slaves: dict[str, int] = {}
 
 

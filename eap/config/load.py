@@ -109,7 +109,7 @@ def _phase(index: Index, station: StationSection, position: int, count: int) -> 
 def _station(index: Index, station: StationSection, phase_us: int, folder: Path) -> StationSpec:
     return StationSpec(
         name=station.name,
-        net_id=str(station.net_id),
+        net_id=station.net_id,
         cycle_us=index.cycle_us(station),
         ports=tuple(
             _bus_port(index, station, port, folder)
@@ -283,8 +283,8 @@ def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
     return PortSpec(
         name=port.name,
         kind=port.kind,
-        interface=str(InterfaceUri.parse(port.interface)),
-        net_id=str(port.net_id),
+        interface=index.uris[station.name, port.name],
+        net_id=port.net_id,
         vlan_id=port.vlan.id if port.vlan else 0,
         vlan_priority=port.vlan.priority if port.vlan else 0,
         join=tuple(dict.fromkeys(groups)),
@@ -298,15 +298,15 @@ def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
 
 
 def _bus_port(index: Index, station: StationSection, port: PortSection, folder: Path) -> PortSpec:
-    uri = InterfaceUri.parse(port.interface)
+    uri = index.uris[station.name, port.name]
     file = bus_file(port, folder)[1]
     path = "" if file is None else str(file.resolve())
     slaves = index.buses[station.name, port.name].slaves
     return PortSpec(
         name=port.name,
         kind=port.kind,
-        interface=str(InterfaceUri("sim", path) if uri.scheme == "sim" else uri),
-        net_id=str(port.net_id),
+        interface=InterfaceUri("sim", path) if uri.scheme == "sim" else uri,
+        net_id=port.net_id,
         bus=BusPortSpec(
             path,
             slaves,
@@ -369,7 +369,7 @@ def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
                     name=port.name,
                     is_bus=port.kind is PortKind.BUS,
                     net_id=port.net_id,
-                    interface=str(InterfaceUri.parse(port.interface)),
+                    interface=index.uris[station.name, port.name],
                     slaves=_slaves(index, station, port.name),
                 )
                 for port in station.ports

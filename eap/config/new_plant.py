@@ -112,7 +112,7 @@ def _place(number: int, address: str, count: int) -> _StationAddress:
     try:
         uri = InterfaceUri.parse(text if "://" in text else f"udp://{text}")
         if uri.scheme == "udp" and NUMBER not in address:
-            uri = uri._replace(host=str(IPv4Address(uri.host) + (number - 1)))
+            uri = InterfaceUri(uri.scheme, str(IPv4Address(uri.host) + (number - 1)), uri.port)
     except ValueError as exc:
         raise ConfigError(f"address {address!r}: {exc}") from None
     if uri.scheme == "udp":

@@ -14,6 +14,7 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 import msgspec
 
 from eap.errors import ControlError, EnvironmentalError
+from eap.ids import decode_value, encode_value
 from eap.pd.report import PdRow
 from eap.suggest import suggest
 
@@ -224,7 +225,7 @@ class Method(Generic[ParametersT, AnswerT]):
     def decode(self, result: Any) -> AnswerT:
         """Return a result as a record; raise ControlError if it is none."""
         try:
-            return msgspec.convert(result, self.returns)
+            return msgspec.convert(result, self.returns, dec_hook=decode_value)
         except msgspec.ValidationError as exc:
             reason = f"the answer to {self.name}: {exc}"
             raise ControlError(reason, code=ErrorCode.BAD_REQUEST) from None
@@ -257,7 +258,7 @@ def decode_request(line: bytes) -> Request:
 def parameters(params: dict[str, Any], kind: type[ParametersT]) -> ParametersT:
     """Check *params*; raise ControlError that names the first wrong one."""
     try:
-        return msgspec.convert(params, kind)
+        return msgspec.convert(params, kind, dec_hook=decode_value)
     except msgspec.ValidationError as exc:
         raise ControlError(f"params: {exc}", code=ErrorCode.BAD_REQUEST) from None
 
@@ -327,4 +328,4 @@ def encode_event(subscription: int, event: ValuesEvent | dict[str, Any]) -> byte
 
 
 def _line(message: dict[str, Any]) -> bytes:
-    return msgspec.json.encode(message) + b"\n"
+    return msgspec.json.encode(message, enc_hook=encode_value) + b"\n"

@@ -20,7 +20,7 @@ from eap.codec.datatypes import DataType
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.device import eap_rules
 from eap.device.eap_rules import MappingEntry, check_mapped, lay_out_mapping, mapped_bits
-from eap.ids import InterfaceUri, NetId, ObjectId
+from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary, check_value, extract_bits
 from eap.od.model import WO, Access, Entry, OdObject, OdState, ReadHook
@@ -138,12 +138,12 @@ class EapDictionary(ObjectDictionary):
         super().__init__()
         self.station = station
         self.port: PortSpec = next(each for each in station.ports if each.name == port)
-        self.uri = InterfaceUri.parse(self.port.interface)
+        self.uri = self.port.interface
         self.live: LiveValues = live or NoLiveValues()
         self.identity = identity
         self.on_request: Callable[[int], object] | None = None
         self.on_change: Callable[[int, int], None] | None = None
-        self._net_id = NetId.parse(self.port.net_id)
+        self._net_id = self.port.net_id
         self._members: dict[int, dict[int, OdObject]] = {row.first: {} for row in profile.ALL}
         for row in profile.STATIC:
             self.add(self.make_object(row, row.first))
@@ -156,7 +156,7 @@ class EapDictionary(ObjectDictionary):
             **identity.entries(),
             (profile.PORT, PortSub.NAME): self.port.name,
             (profile.PORT, PortSub.TRANSPORT): TRANSPORTS.index(uri.scheme),
-            (profile.PORT, PortSub.INTERFACE): self.port.interface,
+            (profile.PORT, PortSub.INTERFACE): str(uri),
             (profile.PORT, PortSub.PORT_NUMBER): uri.port,
             (profile.NET_ID, 1): self._net_id,
         }

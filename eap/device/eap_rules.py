@@ -327,7 +327,7 @@ def check_station(
     _check_unique(frames, FrameSub.NAME, "frame")
     _check_unique(pds, Tx.NAME, "sent PD")
     _check_unique(subscriptions, Rx.NAME, "received PD")
-    uris = {port.name: InterfaceUri.parse(port.interface) for port in spec.ports}
+    uris = {port.name: port.interface for port in spec.ports}
     for found in frames:
         found.refuse(_breaches_of_frame(found.record, uris[found.port]))
     for found in pds:

@@ -31,7 +31,7 @@ from eap.device.eap_rules import (
     lay_out_mapping,
 )
 from eap.device.rollout import bus_variables, types_of
-from eap.ids import Destination, DestinationKind, MacAddr, NetId
+from eap.ids import Destination, DestinationKind, MacAddr, NetId, decode_value, encode_value
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import (
@@ -407,8 +407,9 @@ class PortReader:
         if value(PortSub.VLAN_PRIORITY) and not value(PortSub.VLAN_ID):
             detail = "a priority needs a VLAN"
             raise self.fault(FaultCode.PORT, detail, profile.PORT, PortSub.VLAN_PRIORITY)
-        fields = {**msgspec.to_builtins(self._dictionary.port), **self._fields(profile.PORT)}
-        return msgspec.convert({**fields, "join": list(self._groups())}, PortSpec)
+        own = msgspec.to_builtins(self._dictionary.port, enc_hook=encode_value)
+        fields = {**own, **self._fields(profile.PORT), "join": list(self._groups())}
+        return msgspec.convert(fields, PortSpec, dec_hook=decode_value)
 
     def _groups(self) -> Iterator[str]:
         for subindex, entry in self._dictionary[profile.GROUPS].entries.items():

@@ -13,7 +13,6 @@ from itertools import starmap
 from typing import Any, Protocol
 
 from eap.device.eap_dictionary import DeviceIdentity
-from eap.ids import InterfaceUri, NetId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject, OdState
@@ -112,16 +111,16 @@ class RouterDictionary(ObjectDictionary):
     def _set_fixed(self, station: StationSpec, identity: DeviceIdentity) -> None:
         fixed: dict[tuple[int, int], Any] = {
             **identity.entries(),
-            (0xF920, 1): NetId.parse(station.net_id),
+            (0xF920, 1): station.net_id,
         }
         for number, port in enumerate(station.ports):
             kind = _PROFILES[port.kind]
             fixed[router9000.MODULES.first, number + 1] = kind
             index = router9000.DEVICE.first + number
             fixed |= {
-                (index, 1): NetId.parse(port.net_id),
+                (index, 1): port.net_id,
                 (index, 2): kind,
-                (index, 3): port.interface,
+                (index, 3): str(port.interface),
                 (index, 5): _ip_of(port),
                 (index, 7): port.name,
             }
@@ -143,7 +142,7 @@ def _is_route(index: int) -> bool:
 
 
 def _ip_of(port: PortSpec) -> bytes:
-    uri = InterfaceUri.parse(port.interface)
+    uri = port.interface
     return IPv4Address(uri.host).packed if uri.scheme in _IP_SCHEMES else bytes(4)
 
 

@@ -70,7 +70,7 @@ def lay_out(version: int, variables: Iterable[tuple[str, str]]) -> PdLayout:
 
 def sent_pds(spec: StationSpec) -> Iterator[tuple[PdKey, TxPdSpec, PdLayout]]:
     """Yield every PD that *spec* sends."""
-    net_ids = {port.name: port.net_id for port in spec.ports}
+    net_ids = {port.name: str(port.net_id) for port in spec.ports}
     types = types_of(spec)
     for frame in spec.frames:
         for pd in frame.pds:

@@ -18,7 +18,6 @@ from devicebus.master.scan import ExpectedSlave
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.engine_bus import EngineBus
 from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
-from eap.ids import InterfaceUri
 from eap.net.busport import BusPort
 from eap.net.connections import CloseReason
 from eap.net.ethernet import EthernetInterface, packet_batch
@@ -274,7 +273,7 @@ class EnginePlant:
         """Connect the ports that need no shared socket."""
         lines = LoopbackLines()
         for name, port in self._ports():
-            uri = InterfaceUri.parse(port.interface)
+            uri = port.interface
             if port.kind is not PortKind.EAP:
                 continue
             if uri.scheme == "tcp":

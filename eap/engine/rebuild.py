@@ -19,7 +19,7 @@ from pathlib import Path
 from eap.engine.bus_mapping import BusMapping
 from eap.engine.engine_bus import EngineBus
 from eap.errors import EapError, EngineRefusedError
-from eap.ids import Destination, DestinationKind, InterfaceUri
+from eap.ids import Destination, DestinationKind
 from eap.net import realtime
 from eap.net.image_file import ImageFile, prepare_image
 from eap.net.tcpport import TcpPort
@@ -41,12 +41,12 @@ def sends_to(spec: StationSpec, port: str) -> set[str]:
 
 def has_tcp(spec: StationSpec, port: PortSpec) -> bool:
     """Return whether anything goes or comes by TCP at *port*."""
-    return port.tcp or port.interface.startswith("tcp:") or bool(sends_to(spec, port.name))
+    return port.tcp or port.interface.scheme == "tcp" or bool(sends_to(spec, port.name))
 
 
 def open_tcp_port(spec: PortSpec, datagrams: FrameChannel | None) -> TcpPort:
     """Return the channel of a port with TCP, beside its *datagrams* if it has any."""
-    return TcpPort(InterfaceUri.parse(spec.interface).host, datagrams)
+    return TcpPort(spec.interface.host, datagrams)
 
 
 def follow_station(port: TcpPort, station: Station, name: str) -> None:

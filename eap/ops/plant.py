@@ -36,7 +36,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill
 from eap.device.rollout import Step, steps, without_alternates
 from eap.errors import ConfigError, ControlError
-from eap.ids import InterfaceUri
+from eap.ids import encode_value
 from eap.ops.client import ControlClient, connect_those
 from eap.pd.device import DeviceFault
 from eap.pd.spec import BusSlaveSpec, PortKind, StationSpec
@@ -193,7 +193,9 @@ class PlantLink:
 
     def plan(self, spec: StationSpec) -> StationPlan:
         """Return the difference between *spec* and the station of its name."""
-        answer = self._call(protocol.PLAN, spec.name, spec=msgspec.to_builtins(spec))
+        answer = self._call(
+            protocol.PLAN, spec.name, spec=msgspec.to_builtins(spec, enc_hook=encode_value)
+        )
         router = self.plan_routing(spec.name)
         notes, refused = answer.station + router.changes, answer.refused + router.refused
         if self._clients[spec.name].info.audit_required != self._audit_required:
@@ -204,11 +206,18 @@ class PlantLink:
     def apply(self, spec: StationSpec, cause: str) -> ApplyAnswer:
         """Configure the station of its name by *spec*, as a step of the change named *cause*."""
         where = {"cause": cause, "file": self._file}
-        return self._call(protocol.APPLY, spec.name, spec=msgspec.to_builtins(spec), **where)
+        return self._call(
+            protocol.APPLY,
+            spec.name,
+            spec=msgspec.to_builtins(spec, enc_hook=encode_value),
+            **where,
+        )
 
     def rollback(self, spec: StationSpec) -> ApplyAnswer:
         """Configure the station of its name by *spec*, which is without alternates."""
-        return self._call(protocol.ROLLBACK, spec.name, spec=msgspec.to_builtins(spec))
+        return self._call(
+            protocol.ROLLBACK, spec.name, spec=msgspec.to_builtins(spec, enc_hook=encode_value)
+        )
 
     def export_routing(self, station: str) -> RunningRouting | None:
         """Return the configuration of a router; None if the plant file has none of it."""
@@ -432,7 +441,7 @@ def _small_dictionaries(station: StationSpec) -> Iterator[tuple[str, str]]:
 def _alike_slaves(station: StationSpec) -> Iterator[tuple[str, str]]:
     """Yield simulated slaves that have the identity of one before, but other process data."""
     for port in station.ports:
-        if port.bus is None or InterfaceUri.parse(port.interface).scheme != "sim":
+        if port.bus is None or port.interface.scheme != "sim":
             continue
         known: dict[tuple[int, int, int | None], BusSlaveSpec] = {}
         for slave in port.bus.slaves:

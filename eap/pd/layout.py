@@ -224,9 +224,9 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
 
     return ImageLayout(
         station=spec.name,
-        net_id=spec.net_id,
+        net_id=str(spec.net_id),
         cycle_us=spec.cycle_us,
-        ports=tuple(ImagePort(p.name, p.kind, p.net_id, p.interface) for p in spec.ports),
+        ports=tuple(ImagePort(p.name, p.kind, str(p.net_id), str(p.interface)) for p in spec.ports),
         variables=tuple(slots.values()),
         regions=regions,
         frames=frames,

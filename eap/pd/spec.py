@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import StrEnum
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import msgspec
+
+from eap.ids import InterfaceUri, NetId, decode_value, encode_value
 
 
 class Writer(StrEnum):
@@ -372,12 +374,12 @@ class GatewaySpec(SpecRecord, frozen=True):
 
 
 class PortSpec(SpecRecord, frozen=True):
-    """One port; *interface* is a URI such as ``udp://127.0.1.1`` or ``ethernet://eth0``."""
+    """One port of a station."""
 
     name: str
     kind: PortKind
-    interface: str
-    net_id: str
+    interface: InterfaceUri
+    net_id: NetId
     vlan_id: int = 0
     """Send tagged with this VID and take only its frames; 0 sends untagged."""
     vlan_priority: int = 0
@@ -403,7 +405,7 @@ class StationSpec(SpecRecord, frozen=True):
     """One station, complete."""
 
     name: str
-    net_id: str
+    net_id: NetId
     cycle_us: int
     ports: tuple[PortSpec, ...]
     phase_us: int = 0
@@ -420,6 +422,8 @@ class StationSpec(SpecRecord, frozen=True):
 RECORDS_PER_STEP = 64
 """Records in one step: about 50 us."""
 
+_encode = partial(msgspec.json.encode, enc_hook=encode_value)
+
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -429,11 +433,11 @@ def encode_in_steps(record: msgspec.Struct) -> bytes:
     for name in record.__struct_fields__:
         value = getattr(record, name)
         if isinstance(value, tuple):
-            pieces = (msgspec.json.encode(piece)[1:-1] for piece in _pieces(value))
+            pieces = (_encode(piece)[1:-1] for piece in _pieces(value))
             octets = b"[" + b",".join(pieces) + b"]"
         else:
-            octets = msgspec.json.encode(value)
-        fields.append(msgspec.json.encode(name) + b":" + octets)
+            octets = _encode(value)
+        fields.append(_encode(name) + b":" + octets)
     return b"{" + b",".join(fields) + b"}"
 
 
@@ -444,16 +448,16 @@ def record_to_lines(record: msgspec.Struct) -> bytes:
         for name in record.__struct_fields__
         if isinstance(value := getattr(record, name), tuple)
     }
-    lines = [msgspec.json.encode(msgspec.structs.replace(record, **dict.fromkeys(long, ())))]
+    lines = [_encode(msgspec.structs.replace(record, **dict.fromkeys(long, ())))]
     for name, value in long.items():
-        lines += [name.encode() + b" " + msgspec.json.encode(piece) for piece in _pieces(value)]
+        lines += [name.encode() + b" " + _encode(piece) for piece in _pieces(value)]
     return b"\n".join(lines)
 
 
 def record_from_lines(data: bytes, kind: type[T]) -> T:
     """Read what :func:`record_to_lines` made; raise MsgspecError or KeyError otherwise."""
     first, *rest = data.split(b"\n")
-    record = msgspec.json.decode(first, type=kind)
+    record = msgspec.json.decode(first, type=kind, dec_hook=decode_value)
     decoders = _decoders(kind)
     long: dict[str, list[Any]] = {}
     for line in rest:
@@ -468,4 +472,7 @@ def _pieces(value: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
 
 @lru_cache(maxsize=8)
 def _decoders(kind: type[msgspec.Struct]) -> dict[str, msgspec.json.Decoder[Any]]:
-    return {field.name: msgspec.json.Decoder(field.type) for field in msgspec.structs.fields(kind)}
+    return {
+        field.name: msgspec.json.Decoder(field.type, dec_hook=decode_value)
+        for field in msgspec.structs.fields(kind)
+    }

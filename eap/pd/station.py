@@ -16,7 +16,6 @@ from types import MappingProxyType
 
 import msgspec
 
-from eap.ids import InterfaceUri, NetId
 from eap.pd.address import NetIdLearner, forget
 from eap.pd.device import DeviceState, EapDevice
 from eap.pd.image import Image, Inputs, Sampler
@@ -127,7 +126,7 @@ class Station:
         else:
             self._rarely.append(channel.drain)
         own = next(p for p in self.spec.ports if p.name == port)
-        net_id = NetId.parse(own.net_id)
+        net_id = own.net_id
         out = StateChannel(channel, self._words) if own.eap_sm else channel
         publisher = None
         if pushed := _pds_of(frames, polled=False):
@@ -349,7 +348,7 @@ class Station:
 def _learning_ports(spec: StationSpec) -> Iterator[str]:
     """Yield the ports from which a frame may go to a NetID, now or after a reconfiguration."""
     for port in spec.ports:
-        is_ethernet = InterfaceUri.parse(port.interface).scheme == "ethernet"
+        is_ethernet = port.interface.scheme == "ethernet"
         if port.kind is PortKind.EAP and is_ethernet:
             yield port.name
 

@@ -9,7 +9,6 @@ from eap.config.finding import PlantFinding
 from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
 from eap.errors import ConfigError
-from eap.ids import InterfaceUri
 from eap.pd.spec import PortKind, StationSpec
 
 
@@ -30,7 +29,7 @@ def require_own_buses(stations: Sequence[StationSpec]) -> None:
     others: dict[str, str] = {}
     for station in stations:
         for port in station.ports:
-            uri = InterfaceUri.parse(port.interface)
+            uri = port.interface
             if uri.scheme != "ethernet":
                 continue
             label = f"{station.name}/{port.name}"

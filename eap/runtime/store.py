@@ -25,6 +25,7 @@ from eap.ams.spec import RouteSpec, RoutingSpec
 from eap.ams.spec import SpecStruct as AoeRecord
 from eap.device.rollout import without_alternates
 from eap.errors import ConfigError, EnvironmentalError
+from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
 from eap.pd.spec import SpecRecord, StationSpec
 from eap.runtime.durable import digest, put_aside, replace_file, seal, unseal
@@ -169,12 +170,14 @@ class StationFile(Generic[T]):
 
     def encode(self, value: T) -> bytes:
         """Return the bytes of the file."""
-        return seal(msgspec.json.encode(value), VERSION)
+        return seal(msgspec.json.encode(value, enc_hook=encode_value), VERSION)
 
     def decode(self, data: bytes) -> T:
         """Read the bytes of the file; raise ConfigError that says what is wrong with them."""
         try:
-            value: T = msgspec.json.decode(unseal(data, VERSION), type=self._kind)
+            value: T = msgspec.json.decode(
+                unseal(data, VERSION), type=self._kind, dec_hook=decode_value
+            )
         except msgspec.MsgspecError as exc:
             raise ConfigError(f"it holds no {self._what}: {exc}") from None
         return value
@@ -263,7 +266,7 @@ def digest_of(spec: StationSpec | RoutingSpec) -> str:
 
     Fields that hold their defaults do not count: a release that adds one does not change it.
     """
-    return digest(msgspec.json.encode(_lean(spec)))
+    return digest(msgspec.json.encode(_lean(spec), enc_hook=encode_value))
 
 
 def adopt_plant_file(

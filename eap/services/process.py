@@ -24,7 +24,6 @@ from eap.ams.directory import Directory
 from eap.ams.spec import RoutingSpec
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
-from eap.ids import NetId
 from eap.net import realtime
 from eap.net.image_file import StationImage
 from eap.pd.device import DeviceState
@@ -417,7 +416,7 @@ class Services:
         for bus in handover.buses:
             from eap.services.ads.bus_ads import BusService
 
-            net_id = NetId.parse(handover.port(bus.owner).net_id)
+            net_id = handover.port(bus.owner).net_id
             router = devices.routers[bus.owner.station]
             service = BusService(
                 clients[bus.owner],

@@ -19,7 +19,6 @@ from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.errors import EnvironmentalError
-from eap.ids import InterfaceUri, NetId
 from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
 from eap.net.interface import interface_of, link_is_up
 from eap.net.mmsg import ReceiveBatch
@@ -103,11 +102,7 @@ class Network(NamedTuple):
         """Return the gateway that has a port number to itself."""
         (owner,) = shared.owners
         spec = next(each for each in self.handover.stations if each.name == owner.station)
-        name = next(
-            port.name
-            for port in spec.ports
-            if InterfaceUri.parse(port.interface).host == shared.address
-        )
+        name = next(port.name for port in spec.ports if port.interface.host == shared.address)
         return GatewayTransport([(self.gateways[owner], f"{kind}:{name}")])
 
     def drop_counter(self, stations: Sequence[str]) -> Callable[[DropReason], None]:
@@ -352,7 +347,7 @@ class MailboxTransports:
 
     def _accepts_process_data(self, name: PortName) -> bool:
         port = self._network.handover.port(name)
-        return port.tcp or InterfaceUri.parse(port.interface).scheme == "tcp"
+        return port.tcp or port.interface.scheme == "tcp"
 
 
 class AmsTransports:
@@ -371,7 +366,7 @@ class AmsTransports:
         """Open the UDP 48899 socket of an address, and that for broadcasts to its network."""
         network, names = self._network, _stations_of(shared)
         routers = [
-            RouterName(station.name, NetId.parse(station.net_id))
+            RouterName(station.name, station.net_id)
             for station in network.handover.stations
             if station.name in names
         ]
@@ -414,9 +409,7 @@ class AmsTransports:
     def open_uplinks(self, station: StationSpec) -> AmsUplinks:
         """Return the AMS/TCP connections of *station* to other routers."""
         sources = [
-            uri.host
-            for port in station.ports
-            if (uri := InterfaceUri.parse(port.interface)).scheme in {"udp", "tcp"}
+            uri.host for port in station.ports if (uri := port.interface).scheme in {"udp", "tcp"}
         ]
         count_dropped = self._network.drop_counter([station.name])
         return AmsUplinks(self._network.routers[station.name], sources, count_dropped)

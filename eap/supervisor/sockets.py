@@ -20,7 +20,6 @@ import msgspec
 from eap.closeable import Closeable
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
-from eap.ids import InterfaceUri
 from eap.net.busport import open_bus_socket
 from eap.net.ipsocket import (
     open_ams_broadcast,
@@ -93,7 +92,7 @@ def segments(
 
 def _open_bus(name: PortName, port: PortSpec, opened: ExitStack) -> BusSocket:
     if not _is_simulated(port):
-        sock = opened.enter_context(open_bus_socket(InterfaceUri.parse(port.interface)))
+        sock = opened.enter_context(open_bus_socket(port.interface))
         return BusSocket(name, engine_fd=sock.fileno())
     engine_fd, segment_fd = open_message_pair(opened)
     command_fd, segment_command_fd = open_message_pair(opened)
@@ -101,7 +100,7 @@ def _open_bus(name: PortName, port: PortSpec, opened: ExitStack) -> BusSocket:
 
 
 def _is_simulated(port: PortSpec) -> bool:
-    return InterfaceUri.parse(port.interface).scheme == SIMULATED
+    return port.interface.scheme == SIMULATED
 
 
 BROADCAST = "255.255.255.255"
@@ -134,7 +133,7 @@ def plan_sockets(stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
 
 
 def _sockets_of(port: PortSpec) -> Iterator[SharedSocket]:
-    uri = InterfaceUri.parse(port.interface)
+    uri = port.interface
     number = uri.port or EAP_PORT
     if uri.scheme == "ethernet":
         yield SharedSocket(SocketKind.PACKET, uri.host)
@@ -159,7 +158,7 @@ def _ams_sockets(address: str) -> Iterator[SharedSocket]:
 
 def _gateway_sockets(station: StationSpec) -> Iterator[tuple[PortName, SharedSocket]]:
     """Yield what gateways have to themselves, at each address of their station."""
-    uris = [InterfaceUri.parse(port.interface) for port in station.ports if port.bus is None]
+    uris = [port.interface for port in station.ports if port.bus is None]
     hosts = dict.fromkeys(uri.host for uri in uris if uri.scheme in {"udp", "tcp"})
     for port in station.ports:
         if port.gateway is not None and port.gateway.port:
@@ -171,7 +170,7 @@ def _gateway_sockets(station: StationSpec) -> Iterator[tuple[PortName, SharedSoc
 
 def _ams_address(port: PortSpec) -> str:
     """Return where AMS routers listen for *port*, nothing if nowhere."""
-    uri = InterfaceUri.parse(port.interface)
+    uri = port.interface
     return uri.host if port.ams and uri.scheme in {"udp", "tcp"} else ""
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from eap.config.new_plant import Shape, plant_text
 from eap.device.rollout import without_alternates
+from eap.ids import decode_value
 from eap.ops.plant import load_or_raise
 from eap.pd.spec import StationSpec
 from tests.support.appliance import EAPCTL, Appliance, Plants, run_eapctl, troubles, wait_until
@@ -95,7 +96,9 @@ class Line:
         """Return what each station runs."""
         return {
             name: msgspec.convert(
-                self.appliance.request("export", station=name)["spec"], StationSpec
+                self.appliance.request("export", station=name)["spec"],
+                StationSpec,
+                dec_hook=decode_value,
             )
             for name in self.old
         }

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 import eap
 from eap.errors import ControlError, EapError
+from eap.ids import InterfaceUri, decode_value, encode_value
 from eap.pd.spec import StationSpec, TxFrameSpec, TxPdSpec, VariableSpec
 from eap.runtime.folder import VARIABLE
 from tests.support.addresses import own_address
@@ -73,11 +74,13 @@ def plant(farm: Plants) -> Iterator[Appliance]:
 
 
 def spec_of(plant: Appliance, station: str) -> StationSpec:
-    return msgspec.convert(plant.request("export", station=station)["spec"], StationSpec)
+    return msgspec.convert(
+        plant.request("export", station=station)["spec"], StationSpec, dec_hook=decode_value
+    )
 
 
 def apply(plant: Appliance, spec: StationSpec) -> dict[str, Any]:
-    document = msgspec.to_builtins(spec)
+    document = msgspec.to_builtins(spec, enc_hook=encode_value)
     answer: dict[str, Any] = plant.request("apply", station=spec.name, spec=document)
     return answer
 
@@ -169,7 +172,10 @@ def test_what_cannot_be_is_refused_and_the_old_keeps_running(plant: Appliance) -
     before = plant.rx("right", "state")
     eap0, bus0 = spec.ports
     for other in (
-        replace(spec, ports=(replace(eap0, interface=f"udp://{own_address(2)}"), bus0)),
+        replace(
+            spec,
+            ports=(replace(eap0, interface=InterfaceUri.parse(f"udp://{own_address(2)}")), bus0),
+        ),
         replace(spec, ports=(replace(eap0, tcp=True), bus0)),
         replace(spec, ports=(eap0,)),
         replace(spec, subscriptions=(replace(spec.subscriptions[0], variables=("nothing",)),)),

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 
 from eap.device.eap_spec import read_back
 from eap.errors import EngineGoneError, EngineRefusedError
+from eap.ids import InterfaceUri, NetId
 from eap.od.abort import SdoAbortError
 from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var
 from eap.pd.device import DeviceState
@@ -40,10 +41,12 @@ from eap.services.device.station_device import StationDevice
 from tests.support.examples import examples
 from tests.support.stationengine import StationEngine, make_device
 
-PORT = PortSpec("eap0", PortKind.EAP, "udp://127.9.2.1", "1.2.3.4.5.1")
+PORT = PortSpec(
+    "eap0", PortKind.EAP, InterfaceUri.parse("udp://127.9.2.1"), NetId.parse("1.2.3.4.5.1")
+)
 PLANT_FILE = StationSpec(
     "left",
-    "1.1.1.1.1.1",
+    NetId.parse("1.1.1.1.1.1"),
     10_000,
     (PORT,),
     variables=(

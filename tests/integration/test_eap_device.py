@@ -22,6 +22,7 @@ from scapy.layers.l2 import Ether
 
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
+from eap.ids import encode_value
 from eap.od.profiles.eap1000 import Tx, Var
 from eap.runtime.store import StationStore
 from tests.support import aoe
@@ -359,7 +360,11 @@ def _settled(appliance: Appliance) -> dict:
         except (ControlError, ValueError):
             return False
         stored = StationStore("devices", "left").configuration.read()
-        kept = exported if stored is None else json.loads(msgspec.json.encode(stored.spec))
+        kept = (
+            exported
+            if stored is None
+            else json.loads(msgspec.json.encode(stored.spec, enc_hook=encode_value))
+        )
         version = exported["frames"][0]["pds"][0]["version"]
         found.update(exported)
         return kept == exported and row["version"] == version == int(read[:2], 16)

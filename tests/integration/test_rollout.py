@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pytest
 
 from eap.device.rollout import steps
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, NetId
 from eap.net.loopback import LoopbackLines
 from eap.pd.engine import Engine
 from eap.pd.handover import ImageHandover
@@ -63,7 +63,7 @@ def _station(name: str, layouts: dict[str, tuple[dict[str, str], int]], heard: s
         )  # fmt: skip
     frame = TxFrameSpec("f", "eap0", "x", (TxPdSpec("p", 7, tuple(layout), version),))
     return StationSpec(
-        name, "5.9.9.9.1.1", 1000, (eap_port(net_id=net_id(name)),),
+        name, NetId.parse("5.9.9.9.1.1"), 1000, (eap_port(net_id=net_id(name)),),
         phase_us=200 * NAMES.index(name), variables=tuple(variables),
         sources=(CounterSource("n"),), frames=(frame,), subscriptions=tuple(subscriptions),
     )  # fmt: skip

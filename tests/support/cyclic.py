@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image, format_image
 from eap.pd.layout import RxSlot, VariableSlot, plan_layout
@@ -34,7 +34,7 @@ SECOND = 1_000_000_000
 
 
 def eap_port(name: str = "eap0", net_id: str = OWN) -> PortSpec:
-    return PortSpec(name, PortKind.EAP, "loop://line", net_id)
+    return PortSpec(name, PortKind.EAP, InterfaceUri.parse("loop://line"), NetId.parse(net_id))
 
 
 def received(*variables: str) -> tuple[VariableSpec, ...]:
@@ -50,7 +50,7 @@ def written(*variables: str) -> tuple[VariableSpec, ...]:
 def station(name: str = "a", *, cycle_us: int = 1000, **parts: object) -> StationSpec:
     """A station with one EAP port, unless *parts* name others."""
     parts.setdefault("ports", (eap_port(),))
-    return StationSpec(name, "5.23.91.99.1.1", cycle_us, **parts)
+    return StationSpec(name, NetId.parse("5.23.91.99.1.1"), cycle_us, **parts)
 
 
 def image_of(spec: StationSpec) -> Image:
@@ -183,7 +183,9 @@ def entries(*variables: str) -> tuple[BusEntrySpec, ...]:
 
 def bus_port(*slaves: BusSlaveSpec, name: str = "bus0") -> PortSpec:
     bus = BusPortSpec(slaves=slaves)
-    return PortSpec(name, PortKind.BUS, "sim://bus.yaml", OWN, bus=bus)
+    return PortSpec(
+        name, PortKind.BUS, InterfaceUri.parse("sim://bus.yaml"), NetId.parse(OWN), bus=bus
+    )
 
 
 def slave(

@@ -14,6 +14,7 @@ import msgspec
 
 from devicebus.wire.alstatus import AlState
 from eap.control.protocol import encode_request
+from eap.ids import InterfaceUri, NetId
 from eap.net.image_file import ImageFile, StationImage, create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
@@ -44,9 +45,16 @@ from tests.support.loopbus import LoopBus
 def station(name: str) -> StationSpec:
     return StationSpec(
         name=name,
-        net_id="1.1.1.1.1.1",
+        net_id=NetId.parse("1.1.1.1.1.1"),
         cycle_us=10_000,
-        ports=(PortSpec("eap0", PortKind.EAP, "udp://127.0.9.1", "1.1.1.1.2.1"),),
+        ports=(
+            PortSpec(
+                "eap0",
+                PortKind.EAP,
+                InterfaceUri.parse("udp://127.0.9.1"),
+                NetId.parse("1.1.1.1.2.1"),
+            ),
+        ),
         variables=(
             VariableSpec("ticks", "UDINT", Writer.ENGINE),
             VariableSpec("setpoint", "INT", default=7, unit="1/min"),
@@ -68,7 +76,10 @@ def station(name: str) -> StationSpec:
 
 def with_buses(spec: StationSpec, names: list[str]) -> StationSpec:
     """Return a station that has bus ports too."""
-    ports = [PortSpec(name, PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1") for name in names]
+    ports = [
+        PortSpec(name, PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.1.1.1.3.1"))
+        for name in names
+    ]
     return msgspec.structs.replace(spec, ports=(*spec.ports, *ports))
 
 

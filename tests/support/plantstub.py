@@ -10,6 +10,7 @@ import msgspec
 
 from eap.device.rollout import without_alternates
 from eap.errors import ControlError
+from eap.ids import decode_value
 from eap.pd.spec import StationSpec
 from tests.support.controlstub import ControlStub
 
@@ -112,7 +113,9 @@ class PlantStub:
         return {"changes": ["access rules: changed"], "refused": []}
 
     def _asked(self, params: dict[str, Any]) -> tuple[str, StationSpec]:
-        return params["station"], msgspec.convert(params["spec"], StationSpec)
+        return params["station"], msgspec.convert(
+            params["spec"], StationSpec, dec_hook=decode_value
+        )
 
     def _take(self, name: str, spec: StationSpec) -> Any:
         is_ok = not self.refuses(spec)

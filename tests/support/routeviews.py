@@ -14,7 +14,7 @@ from eap.ams.spec import (
 )
 from eap.ams.transport_table import Transport
 from eap.codec.ams import SYSTEM_PORT
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 from eap.runtime.store import StationStore
 from eap.services.routing.route_rows import RouterView
 from eap.services.routing.service import LocalRequest
@@ -25,7 +25,7 @@ from tests.support.routing import RecordingSender, StubService
 DIRECTORY = Directory([
     DirectoryStation(
         name, NetId.parse(f"127.0.9.{number}.1.1"),
-        (DirectoryPort("eap0", False, NetId.parse(f"127.0.9.{number}.2.1"), f"udp://127.0.9.{number}"),),
+        (DirectoryPort("eap0", False, NetId.parse(f"127.0.9.{number}.2.1"), InterfaceUri.parse(f"udp://127.0.9.{number}")),),
     )
     for number, name in ((1, "left"), (2, "right"), (3, "third"))
 ])  # fmt: skip

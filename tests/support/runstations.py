@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import msgspec
 
 from eap.codec.pd import iter_pds
+from eap.ids import InterfaceUri
 from eap.pd.handover import ImageHandover
 from eap.pd.image import Image
 from eap.pd.link import OutFrame
@@ -59,7 +60,7 @@ def assemble(spec: StationSpec, image: Image | None = None) -> tuple[Station, Wa
 
 def addressed() -> StationSpec:
     """Sends to a port whose address it learns, and to one address."""
-    port = msgspec.structs.replace(eap_port(), interface="ethernet://eth0")
+    port = msgspec.structs.replace(eap_port(), interface=InterfaceUri.parse("ethernet://eth0"))
     pds = (TxPdSpec("p", 1, ("x",)), TxPdSpec("q", 2, ("x",)))
     return station(
         ports=(port,),

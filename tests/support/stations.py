@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from eap.codec import datatypes
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import (
     REQUESTER,
     CounterSource,
@@ -34,10 +34,14 @@ TYPES = (
     "REAL[2]", "STRING(5)", "BLOCK(7)", "BLOCK(100)",
 )  # fmt: skip
 PORTS = (
-    PortSpec("eap0", PortKind.EAP, "udp://127.0.9.1", "127.0.9.1.2.1"),
-    PortSpec("eap1", PortKind.EAP, "ethernet://eth0", "127.0.9.1.3.1"),
+    PortSpec(
+        "eap0", PortKind.EAP, InterfaceUri.parse("udp://127.0.9.1"), NetId.parse("127.0.9.1.2.1")
+    ),
+    PortSpec(
+        "eap1", PortKind.EAP, InterfaceUri.parse("ethernet://eth0"), NetId.parse("127.0.9.1.3.1")
+    ),
 )
-BLANK = StationSpec("station", "127.0.9.1.1.1", CYCLE_US, PORTS)
+BLANK = StationSpec("station", NetId.parse("127.0.9.1.1.1"), CYCLE_US, PORTS)
 DESTINATIONS = {
     "udp": ("10.0.0.2", "10.0.0.2:4000", "239.1.2.3", "255.255.255.255", "tcp://10.0.0.3:5"),
     "ethernet": (
@@ -156,7 +160,7 @@ def stations(draw: st.DrawFn) -> StationSpec:
                 )
             )
             used += 1
-        scheme = InterfaceUri.parse(port.interface).scheme
+        scheme = port.interface.scheme
         target = REQUESTER if answers else draw(st.sampled_from(DESTINATIONS[scheme]))
         is_net_id = target.count(".") == 5
         is_monitored = target in UNICAST and draw(st.booleans())
@@ -177,7 +181,7 @@ def stations(draw: st.DrawFn) -> StationSpec:
         )
     return StationSpec(
         name="station",
-        net_id="127.0.9.1.1.1",
+        net_id=NetId.parse("127.0.9.1.1.1"),
         cycle_us=CYCLE_US,
         ports=ports,
         phase_us=draw(st.integers(0, CYCLE_US - 1)),
@@ -190,7 +194,7 @@ def stations(draw: st.DrawFn) -> StationSpec:
 
 
 def _port(draw: st.DrawFn, port: PortSpec) -> PortSpec:
-    is_udp = port.interface.startswith("udp")
+    is_udp = port.interface.scheme == "udp"
     vlan = 0 if is_udp else draw(st.sampled_from([0, 7, 4094]))
     groups = ("239.1.2.3", "224.0.0.9") if is_udp else ("01:00:5e:00:00:01",)
     return PortSpec(

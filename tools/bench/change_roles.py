@@ -12,6 +12,7 @@ from typing import Any
 from eap.engine.build import EnginePlant
 from eap.engine.process import StopFlag, run_cycles
 from eap.errors import EapError
+from eap.ids import InterfaceUri, NetId
 from eap.net import realtime
 from eap.pd.report import station_status
 from eap.pd.spec import (
@@ -61,9 +62,11 @@ def station(pds: int, more: int = 0, interface: str = f"udp://{_ADDRESS}") -> St
     ] + frames
     return StationSpec(
         name="station",
-        net_id="127.0.1.1.1.1",
+        net_id=NetId.parse("127.0.1.1.1.1"),
         cycle_us=CYCLE_US,
-        ports=(PortSpec("eap0", PortKind.EAP, interface, _NET_ID),),
+        ports=(
+            PortSpec("eap0", PortKind.EAP, InterfaceUri.parse(interface), NetId.parse(_NET_ID)),
+        ),
         variables=tuple(
             VariableSpec(variable, "REAL", writer)
             for writer, prefix in ((Writer.APPLICATION, ""), (Writer.ENGINE, "far-"))

@@ -14,6 +14,7 @@ import msgspec
 
 from eap.engine.build import EnginePlant
 from eap.engine.process import StopFlag, run_cycles
+from eap.ids import InterfaceUri, NetId
 from eap.net import realtime
 from eap.pd.engine import Engine
 from eap.pd.spec import (
@@ -89,10 +90,17 @@ def _station(number: int, cycle_us: int) -> StationSpec:
     other = 3 - number
     return StationSpec(
         name=f"station-{number}",
-        net_id=f"127.0.1.{number}.1.1",
+        net_id=NetId.parse(f"127.0.1.{number}.1.1"),
         cycle_us=cycle_us,
         phase_us=(number - 1) * cycle_us // 2,  # as the plant file staggers two stations
-        ports=(PortSpec("eap0", PortKind.EAP, f"udp://127.0.1.{number}", f"127.0.1.{number}.2.1"),),
+        ports=(
+            PortSpec(
+                "eap0",
+                PortKind.EAP,
+                InterfaceUri.parse(f"udp://127.0.1.{number}"),
+                NetId.parse(f"127.0.1.{number}.2.1"),
+            ),
+        ),
         variables=(
             VariableSpec("count", "UDINT", Writer.ENGINE),
             VariableSpec("block", f"BLOCK({_SIZE})"),

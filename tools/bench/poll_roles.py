@@ -8,6 +8,7 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
+from eap.ids import InterfaceUri, NetId
 from eap.net import realtime
 from eap.net.ticker import Ticker
 from eap.pd.engine import Engine
@@ -85,9 +86,16 @@ def _client(interface: str) -> StationSpec:
     trigger = TriggerSpec(cycle_us=EVERY * CYCLE_US)
     return StationSpec(
         name="client",
-        net_id="10.134.164.1.9.1",
+        net_id=NetId.parse("10.134.164.1.9.1"),
         cycle_us=CYCLE_US,
-        ports=(PortSpec("eap0", PortKind.EAP, f"ethernet://{interface}", _CLIENT),),
+        ports=(
+            PortSpec(
+                "eap0",
+                PortKind.EAP,
+                InterfaceUri.parse(f"ethernet://{interface}"),
+                NetId.parse(_CLIENT),
+            ),
+        ),
         variables=(
             VariableSpec("job", "UDINT"),
             *(VariableSpec(name, "UDINT", Writer.ENGINE) for name in ("first", "second")),
@@ -115,10 +123,17 @@ def _client(interface: str) -> StationSpec:
 def _server(interface: str, phase_us: int) -> StationSpec:
     return StationSpec(
         name="server",
-        net_id="10.134.164.2.9.1",
+        net_id=NetId.parse("10.134.164.2.9.1"),
         cycle_us=CYCLE_US,
         phase_us=phase_us,
-        ports=(PortSpec("eap0", PortKind.EAP, f"ethernet://{interface}", _SERVER),),
+        ports=(
+            PortSpec(
+                "eap0",
+                PortKind.EAP,
+                InterfaceUri.parse(f"ethernet://{interface}"),
+                NetId.parse(_SERVER),
+            ),
+        ),
         variables=(
             VariableSpec("job", "UDINT", Writer.ENGINE),
             VariableSpec("count", "UDINT", Writer.ENGINE),

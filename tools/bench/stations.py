@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 
+from eap.ids import InterfaceUri, NetId
 from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
 from eap.net.image_file import ImageFile, create_image
 from eap.net.packetsocket import open_packet_pair
@@ -64,9 +65,16 @@ def publishing(shape: Shape, interface: str) -> StationSpec:
     variables = shape.variables()
     return StationSpec(
         name="publisher",
-        net_id="10.134.164.1.1.1",
+        net_id=NetId.parse("10.134.164.1.1.1"),
         cycle_us=CYCLE_US,
-        ports=(PortSpec("eap0", PortKind.EAP, f"ethernet://{interface}", PUBLISHER),),
+        ports=(
+            PortSpec(
+                "eap0",
+                PortKind.EAP,
+                InterfaceUri.parse(f"ethernet://{interface}"),
+                NetId.parse(PUBLISHER),
+            ),
+        ),
         variables=tuple(variable for frame in variables for variable in frame),
         frames=tuple(
             TxFrameSpec(
@@ -86,10 +94,16 @@ def publishing(shape: Shape, interface: str) -> StationSpec:
 def subscribing(shape: Shape, interface: str) -> StationSpec:
     """Return the station that takes everything of :func:`publishing`."""
     variables = shape.variables()
-    port = PortSpec("eap0", PortKind.EAP, f"ethernet://{interface}", SUBSCRIBER, wake=Wake.ARRIVAL)
+    port = PortSpec(
+        "eap0",
+        PortKind.EAP,
+        InterfaceUri.parse(f"ethernet://{interface}"),
+        NetId.parse(SUBSCRIBER),
+        wake=Wake.ARRIVAL,
+    )
     return StationSpec(
         name="subscriber",
-        net_id="10.134.164.2.1.1",
+        net_id=NetId.parse("10.134.164.2.1.1"),
         cycle_us=CYCLE_US,
         phase_us=CYCLE_US // 2,
         ports=(port,),

@@ -49,7 +49,7 @@ from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
 from eap.errors import ControlError, ImageError
 from eap.gateway.error_table import ads_result
-from eap.ids import InterfaceUri, MacAddr, NetId
+from eap.ids import MacAddr, NetId
 from eap.net.image_file import StationImage
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
@@ -165,7 +165,7 @@ class LiveRouter:
 
     def mac_of(self, port: str) -> bytes:
         """Return the MAC address of the Ethernet interface that a port is bound to, if any."""
-        uri = InterfaceUri.parse(self._ports[port].interface)
+        uri = self._ports[port].interface
         if uri.scheme == "ethernet":
             with suppress(OSError, ValueError):
                 text = (_INTERFACES / uri.host / "address").read_text().strip()
@@ -258,7 +258,7 @@ class RouterAds(AdsService):
 
 def _io_devices(station: StationSpec) -> Iterator[IoDevice]:
     for number, port in enumerate(station.ports, start=1):
-        yield IoDevice(number, port.name, _TYPES[port.kind], NetId.parse(port.net_id))
+        yield IoDevice(number, port.name, _TYPES[port.kind], port.net_id)
 
 
 _READ, _DONE = AmsCommand.READ.value, AdsError.NONE.value  # members of enums are slow
@@ -373,7 +373,7 @@ class StationAds:
         system = SystemAds(device, info)
         router.add_service(router.net_id, RouteQuery(router, system))
         self._drive(system, router.net_id)
-        net_ids = {port.name: NetId.parse(port.net_id) for port in station.ports}
+        net_ids = {port.name: port.net_id for port in station.ports}
         for port in device.dictionaries:
             net_id, name = net_ids[port], f"{station.name}/{port}"
             of_port = EapAds(device, port, symbols, device_info(name, release))

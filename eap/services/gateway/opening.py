@@ -59,7 +59,7 @@ def open_gateways(
         spec, router = _gateway_of(handover, bus.owner), routers[bus.owner.station]
         provider = providers[bus.owner]
         settings = Settings(
-            NetId.parse(handover.port(bus.owner).net_id),
+            handover.port(bus.owner).net_id,
             answer_s=spec.answer_ms / _MS,
             is_silent=spec.silent,
             limits=ClientLimits(spec.in_flight, spec.rate, spec.clients),

@@ -121,7 +121,7 @@ class _StationScan:
         net_id = NetId(data[:6].ljust(6, b"\0"))
         planned = self._planned.get(net_id)
         name = _text(await self._read_io(number, "name"))
-        interface = planned.interface if planned else await self._interface(place)
+        interface = str(planned.interface) if planned else await self._interface(place)
         slaves: list[SlaveEntry] = []
         error = ""
         if kind == "bus":
@@ -182,7 +182,9 @@ class _StationScan:
 
 def _planned_port(port: DirectoryPort) -> ScannedPort:
     kind = "bus" if port.is_bus else "eap"
-    return ScannedPort(port.name, kind, str(port.net_id), port.interface, _planned_slaves(port), "")
+    return ScannedPort(
+        port.name, kind, str(port.net_id), str(port.interface), _planned_slaves(port), ""
+    )
 
 
 def _planned_slaves(port: DirectoryPort | None) -> list[SlaveEntry]:

@@ -23,7 +23,7 @@ from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, 
 from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
-from eap.ids import STATION_OCTETS, Destination, DestinationKind, InterfaceUri, NetId, prefix_text
+from eap.ids import STATION_OCTETS, Destination, DestinationKind, NetId, prefix_text
 from eap.net.interface import own_addresses
 from eap.pd.spec import StationSpec
 from eap.runtime.store import StationFile
@@ -41,8 +41,8 @@ _ADDRESSES = {
 
 def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
     """Return the router of a station, without services and routes."""
-    net_id = NetId.parse(station.net_id)
-    net_ids = [NetId.parse(port.net_id) for port in station.ports]
+    net_id = station.net_id
+    net_ids = [port.net_id for port in station.ports]
     return StationRouter(station.name, net_id, net_ids, access=access_of(station, routing))
 
 
@@ -106,7 +106,7 @@ def mqtt_transport_name(spec: MqttSpec) -> str:
 
 def _own_addresses(station: StationSpec) -> Iterator[IPv4Address]:
     for port in station.ports:
-        uri = InterfaceUri.parse(port.interface)
+        uri = port.interface
         if uri.scheme not in _IP_SCHEMES:
             continue
         address = IPv4Address(uri.host)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from eap.ids import InterfaceUri, NetId
 from eap.net.image_file import StationImage, create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
@@ -21,14 +22,20 @@ from eap.pd.spec import (
 
 def eap_port(number: int, interface: str = "", **more) -> PortSpec:
     interface = interface or f"udp://127.9.2.{number}"
-    return PortSpec("eap0", PortKind.EAP, interface, f"1.2.3.4.5.{number}", **more)
+    return PortSpec(
+        "eap0",
+        PortKind.EAP,
+        InterfaceUri.parse(interface),
+        NetId.parse(f"1.2.3.4.5.{number}"),
+        **more,
+    )
 
 
 def left(port: PortSpec | None = None, destination: str = "127.9.2.2") -> StationSpec:
     pd = TxPdSpec("state", 7, ("ticks", "running", "setpoint", "name"))
     return StationSpec(
         "left",
-        "1.1.1.1.1.1",
+        NetId.parse("1.1.1.1.1.1"),
         10_000,
         (port or eap_port(1),),
         variables=(
@@ -48,7 +55,7 @@ def right(port: PortSpec | None = None) -> StationSpec:
     types = ("UINT", "BOOL", "REAL[2]", "STRING(8)")
     return StationSpec(
         "right",
-        "1.1.1.1.1.2",
+        NetId.parse("1.1.1.1.1.2"),
         10_000,
         (port or eap_port(2),),
         variables=tuple(

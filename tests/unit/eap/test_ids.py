@@ -75,7 +75,10 @@ def test_interface_round_trip(text: str) -> None:
 
 
 def test_interface_parts() -> None:
-    assert InterfaceUri.parse("udp://127.0.1.1:40000") == ("udp", "127.0.1.1", 40000, ())
+    uri = InterfaceUri.parse("udp://127.0.1.1:40000")
+    assert (uri.scheme, uri.host, uri.port, uri.options) == ("udp", "127.0.1.1", 40000, ())
+    assert uri == InterfaceUri("udp", "127.0.1.1", 40000)
+    assert uri != InterfaceUri.parse("udp://127.0.1.1")
     assert InterfaceUri.parse("loop://a?loss=1").options == (("loss", "1"),)
 
 

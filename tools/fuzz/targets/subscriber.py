@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from eap.ids import InterfaceUri, NetId
 from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
 from eap.pd.poll import REQUESTERS_PER_CYCLE, PollRequests, outgoing_polls
@@ -55,9 +56,13 @@ _LIES_OTHERWISE = (
 )
 _SPEC = StationSpec(
     "fuzzed",
-    "5.1.1.1.1.1",
+    NetId.parse("5.1.1.1.1.1"),
     1000,
-    (PortSpec("eap0", PortKind.EAP, "loop://line", "5.1.1.1.2.1"),),
+    (
+        PortSpec(
+            "eap0", PortKind.EAP, InterfaceUri.parse("loop://line"), NetId.parse("5.1.1.1.2.1")
+        ),
+    ),
     variables=(
         *(VariableSpec(f"v{n}", f"BLOCK({size})", Writer.ENGINE) for n, size in _SIZES.items()),
         VariableSpec("on", "BOOL", Writer.ENGINE),

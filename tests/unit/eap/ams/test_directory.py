@@ -8,17 +8,20 @@ import pytest
 
 from eap.ams.directory import Directory, parse_via
 from eap.ams.spec import DirectoryPort, DirectoryStation, HopSpec, TransportKind
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 
 PORTS = (
     DirectoryPort(
-        "eap0", is_bus=False, net_id=NetId.parse("5.1.1.1.2.1"), interface="udp://127.0.1.1"
+        "eap0",
+        is_bus=False,
+        net_id=NetId.parse("5.1.1.1.2.1"),
+        interface=InterfaceUri.parse("udp://127.0.1.1"),
     ),
     DirectoryPort(
         "bus0",
         is_bus=True,
         net_id=NetId.parse("5.1.1.1.3.1"),
-        interface="sim://x.yaml",
+        interface=InterfaceUri.parse("sim://x.yaml"),
         slaves={"drive": 1001, "io": 1002},
     ),
 )
@@ -96,10 +99,17 @@ FAR = "9.1.1.1.1.1"
 
 def station(number: int, *interfaces: str) -> DirectoryStation:
     ports = [
-        DirectoryPort(f"eap{index}", False, NetId.parse(f"5.1.1.{number}.{index + 2}.1"), interface)
+        DirectoryPort(
+            f"eap{index}",
+            False,
+            NetId.parse(f"5.1.1.{number}.{index + 2}.1"),
+            InterfaceUri.parse(interface),
+        )
         for index, interface in enumerate(interfaces)
     ]
-    bus = DirectoryPort("bus0", True, NetId.parse(f"5.1.1.{number}.9.1"), "sim://x.yaml")
+    bus = DirectoryPort(
+        "bus0", True, NetId.parse(f"5.1.1.{number}.9.1"), InterfaceUri.parse("sim://x.yaml")
+    )
     return DirectoryStation(f"s{number}", NetId.parse(f"5.1.1.{number}.1.1"), (*ports, bus))
 
 

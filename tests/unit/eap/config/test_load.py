@@ -23,7 +23,7 @@ from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.amsdiscovery import AMS_UDP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.load import INTERFACE_PATH, NET_ID_PATHS, blank
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId, decode_value, encode_value
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
     LinkSpec,
@@ -55,13 +55,14 @@ def test_shipped_plants_have_no_findings_and_a_process_image(shipped):
 
 def test_a_station_travels_as_json(shipped):
     for station in shipped.stations:
-        assert msgspec.json.decode(msgspec.json.encode(station), type=StationSpec) == station
+        text = msgspec.json.encode(station, enc_hook=encode_value)
+        assert msgspec.json.decode(text, type=StationSpec, dec_hook=decode_value) == station
 
 
 def test_the_demo_is_the_ring_that_the_contract_describes():
     plant = load_shipped(PLANTS / "demo.yaml").plant
     assert [s.name for s in plant.stations] == ["island-01", "island-02", "island-03"]
-    assert [s.ports[0].interface for s in plant.stations] == [
+    assert [str(s.ports[0].interface) for s in plant.stations] == [
         f"udp://127.0.1.{n}" for n in (1, 2, 3)
     ]
     assert "setpoint" in {v.name for v in plant.stations[0].variables if v.writer == "application"}
@@ -69,7 +70,7 @@ def test_the_demo_is_the_ring_that_the_contract_describes():
     for station in plant.stations:
         eap0, bus0 = station.ports
         assert (eap0.name, eap0.kind, bus0.name, bus0.kind) == ("eap0", "eap", "bus0", "bus")
-        assert bus0.interface.startswith("sim:///")
+        assert str(bus0.interface).startswith("sim:///")
     drive = plant.stations[0].ports[1].bus.slaves[0]
     assert (drive.name, drive.station) == ("drive", 1001)
 
@@ -90,7 +91,7 @@ def test_the_solar_line_has_the_sizes_of_the_contract():
     assert [s.name for s in plant.stations] == [f"island-{n:02}" for n in range(1, 15)] + [
         "control"
     ]
-    hosts = [s.ports[0].interface.removeprefix("udp://127.0.1.") for s in plant.stations]
+    hosts = [s.ports[0].interface.host.removeprefix("127.0.1.") for s in plant.stations]
     assert hosts == [*map(str, range(1, 15)), "100"]
 
 
@@ -199,17 +200,21 @@ def test_security_page_lists_the_ports():
 
 def test_one_port_and_nothing_else():
     result = blank("mixer", "udp://10.0.0.4", "10.0.0.4.2.1", 5000)
-    port = PortSpec("eap0", PortKind.EAP, "udp://10.0.0.4", "10.0.0.4.2.1")
+    port = PortSpec(
+        "eap0", PortKind.EAP, InterfaceUri.parse("udp://10.0.0.4"), NetId.parse("10.0.0.4.2.1")
+    )
     assert result.findings == ()
     assert result.plant is not None
     assert result.plant.name == "mixer"
-    assert result.plant.stations == (StationSpec("mixer", "10.0.0.4.1.1", 5000, (port,)),)
+    assert result.plant.stations == (
+        StationSpec("mixer", NetId.parse("10.0.0.4.1.1"), 5000, (port,)),
+    )
 
 
 def test_the_router_has_a_net_id_of_its_own():
     result = blank("mixer", "udp://10.0.0.4", "1.2.3.4.0.9", 5000)
     assert result.plant is not None
-    assert result.plant.stations[0].net_id == "1.2.3.4.255.9"
+    assert result.plant.stations[0].net_id == NetId.parse("1.2.3.4.255.9")
 
 
 @pytest.mark.parametrize(
@@ -390,7 +395,11 @@ def test_a_bus_port_is_complete(stations, tmp_path):
     left, _ = stations(bus_port())
     port = left.ports[1]
     file = str((tmp_path / "line.yaml").resolve())
-    assert (port.kind, port.interface, port.net_id) == ("bus", f"sim://{file}", "127.0.9.1.3.1")
+    assert (port.kind, str(port.interface), str(port.net_id)) == (
+        "bus",
+        f"sim://{file}",
+        "127.0.9.1.3.1",
+    )
     assert (port.bus.file, port.bus.target, port.bus.clocks) == (file, "OP", False)
     [slave] = port.bus.slaves
     assert (slave.name, slave.station, slave.vendor, slave.product) == ("valves", 1001, 1, 2)
@@ -409,7 +418,7 @@ def test_a_real_bus_has_its_interface_and_may_be_described(stations, tmp_path):
         ", bus: line.yaml, target: SAFEOP, clocks: true, frame_timeout_us: 5000, frame_retries: 1"
     )
     left, _ = stations(bus_port(keys, uri))
-    assert left.ports[1].interface == uri
+    assert str(left.ports[1].interface) == uri
     assert left.ports[1].bus.file == str((tmp_path / "line.yaml").resolve())
     assert (left.ports[1].bus.target, left.ports[1].bus.clocks) == ("SAFEOP", True)
     assert (left.ports[1].bus.frame_timeout_us, left.ports[1].bus.frame_retries) == (5000, 1)
@@ -509,9 +518,15 @@ def test_the_directory_names_all_ports_and_slaves(plant):
         "left",
         NetId.parse("127.0.9.1.1.1"),
         (
-            DirectoryPort("eap0", False, NetId.parse("127.0.9.1.2.1"), "udp://127.0.9.1"),
             DirectoryPort(
-                "bus0", True, NetId.parse("127.0.9.1.3.1"), "sim://line.yaml", {"valves": 1001}
+                "eap0", False, NetId.parse("127.0.9.1.2.1"), InterfaceUri.parse("udp://127.0.9.1")
+            ),
+            DirectoryPort(
+                "bus0",
+                True,
+                NetId.parse("127.0.9.1.3.1"),
+                InterfaceUri.parse("sim://line.yaml"),
+                {"valves": 1001},
             ),
         ),
     )

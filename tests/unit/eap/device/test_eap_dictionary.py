@@ -11,6 +11,7 @@ from eap.codec import datatypes
 from eap.device.configuration import read_configuration
 from eap.device.eap_dictionary import DeviceIdentity, EapDictionary, NoLiveValues
 from eap.device.rollout import bus_variables
+from eap.ids import InterfaceUri, NetId
 from eap.od import info, model
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, ObjectCode, OdState
@@ -607,7 +608,9 @@ def test_names_are_those_of_what_an_object_is_about(udp):
 
 
 def test_variables_of_buses_belong_to_no_dictionary():
-    bus = PortSpec("bus0", PortKind.BUS, "sim:///x.yaml", "127.0.9.1.4.1")
+    bus = PortSpec(
+        "bus0", PortKind.BUS, InterfaceUri.parse("sim:///x.yaml"), NetId.parse("127.0.9.1.4.1")
+    )
     names = ("bus0.state", "bus0.drive.speed", "busy")
     station = replace(
         BLANK,

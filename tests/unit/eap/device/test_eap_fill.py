@@ -7,6 +7,7 @@ from msgspec.structs import replace
 from eap.device.configuration import read_configuration
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill
+from eap.ids import InterfaceUri, NetId
 from eap.od.profiles.eap1000 import RX_PD, RX_VARIABLE, TX_FRAME, TX_PD, TX_VARIABLE, Tx, Var
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import (
@@ -37,7 +38,15 @@ def forwarding() -> StationSpec:
             VariableSpec("got", "REAL", Writer.ENGINE),
             VariableSpec("bus0.state", "BYTE", Writer.ENGINE),
         ),
-        ports=(*BLANK.ports, PortSpec("bus0", PortKind.BUS, "sim:///b.yaml", "127.0.9.1.4.1")),
+        ports=(
+            *BLANK.ports,
+            PortSpec(
+                "bus0",
+                PortKind.BUS,
+                InterfaceUri.parse("sim:///b.yaml"),
+                NetId.parse("127.0.9.1.4.1"),
+            ),
+        ),
         subscriptions=(RxPdSpec("from", "eap0", 1, ("got",)),),
         frames=(
             TxFrameSpec(

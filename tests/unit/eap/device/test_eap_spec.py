@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import PortReader, read_back
+from eap.ids import InterfaceUri, NetId
 from eap.od.abort import SdoAbortError
 from eap.od.profiles.eap1000 import (
     AddressMode,
@@ -61,7 +62,9 @@ def _fault(dictionary: EapDictionary) -> tuple[FaultCode, int, int]:
 
 
 def _on(interface: str) -> EapDictionary:
-    ports = (PortSpec("eap0", PortKind.EAP, interface, "1.1.1.1.2.1"),)
+    ports = (
+        PortSpec("eap0", PortKind.EAP, InterfaceUri.parse(interface), NetId.parse("1.1.1.1.2.1")),
+    )
     return sender(EapDictionary(replace(BLANK, ports=ports), "eap0"))
 
 
@@ -340,7 +343,9 @@ def test_a_name_is_given_once_in_a_port():
 
 def test_variables_of_a_bus_stay_and_are_described_as_they_are():
     state = VariableSpec("bus0.state", "BYTE", Writer.ENGINE)
-    bus = PortSpec("bus0", PortKind.BUS, "sim:///b.yaml", "127.0.9.1.4.1")
+    bus = PortSpec(
+        "bus0", PortKind.BUS, InterfaceUri.parse("sim:///b.yaml"), NetId.parse("127.0.9.1.4.1")
+    )
     station = replace(BLANK, ports=(*BLANK.ports, bus), variables=(state,))
     ports = empty(station)
     assert read_back(station, ports).variables == (state,)

@@ -17,6 +17,7 @@ from eap.device.rollout import (
     steps,
     without_alternates,
 )
+from eap.ids import NetId
 from eap.pd.spec import (
     RxAlternateSpec,
     RxPdSpec,
@@ -59,7 +60,7 @@ def plant(
         sent = {pd_id: version for (who, pd_id), version in versions.items() if who == name}
         taken = [(who, pd_id, versions[who, pd_id]) for who, pd_id in received.get(name, ())]
         found[name] = StationSpec(
-            name, net_id(100 + number), 1000, (eap_port(net_id=net_id(number)),),
+            name, NetId.parse(net_id(100 + number)), 1000, (eap_port(net_id=net_id(number)),),
             variables=tuple(_variables(sent, taken)),
             frames=(
                 TxFrameSpec("f", "eap0", "somewhere", tuple(
@@ -100,7 +101,7 @@ def mismatches(running: Plant) -> list[str]:
         types = {each.name: each.type for each in spec.variables}
         for frame in spec.frames:
             for pd in frame.pds:
-                key = spec.ports[0].net_id, pd.pd_id
+                key = str(spec.ports[0].net_id), pd.pd_id
                 sent[key] = pd.version, size([types[name] for name in pd.variables])
     return [
         f"{spec.name} {pd.name}"
@@ -109,7 +110,7 @@ def mismatches(running: Plant) -> list[str]:
         for (publisher, pd_id), what in sent.items()
         if pd_id == pd.pd_id
         and pd.publisher in ("", publisher)
-        and publisher != spec.ports[0].net_id
+        and publisher != str(spec.ports[0].net_id)
         and not takes(pd, {each.name: each.type for each in spec.variables}, what)
     ]
 

@@ -6,7 +6,7 @@ import pytest
 
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
@@ -16,12 +16,18 @@ from tests.support.routervalues import MAC, Values
 
 STATION = StationSpec(
     "tower",
-    "1.2.3.4.1.1",
+    NetId.parse("1.2.3.4.1.1"),
     10_000,
     (
-        PortSpec("eap0", PortKind.EAP, "udp://10.0.0.7", "1.2.3.4.2.1"),
-        PortSpec("eap1", PortKind.EAP, "ethernet://eth1", "1.2.3.4.2.2"),
-        PortSpec("bus0", PortKind.BUS, "sim://bus.yaml", "1.2.3.4.3.1"),
+        PortSpec(
+            "eap0", PortKind.EAP, InterfaceUri.parse("udp://10.0.0.7"), NetId.parse("1.2.3.4.2.1")
+        ),
+        PortSpec(
+            "eap1", PortKind.EAP, InterfaceUri.parse("ethernet://eth1"), NetId.parse("1.2.3.4.2.2")
+        ),
+        PortSpec(
+            "bus0", PortKind.BUS, InterfaceUri.parse("sim://bus.yaml"), NetId.parse("1.2.3.4.3.1")
+        ),
     ),
 )
 

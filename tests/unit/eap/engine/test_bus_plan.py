@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from devicebus.master.image import ProcessDataLayout, ProcessVariable
 from eap.engine.bus_mapping import BusPlanner
+from eap.ids import InterfaceUri, NetId
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
     BusEntrySpec,
@@ -31,7 +32,13 @@ OUTPUTS = (
 SLAVE = BusSlaveSpec("io", 1001, 1, 2, inputs=INPUTS, outputs=OUTPUTS)
 STATION = station(
     ports=(
-        PortSpec("bus0", PortKind.BUS, "sim://x", "1.1.1.1.1.1", bus=BusPortSpec("", (SLAVE,))),
+        PortSpec(
+            "bus0",
+            PortKind.BUS,
+            InterfaceUri.parse("sim://x"),
+            NetId.parse("1.1.1.1.1.1"),
+            bus=BusPortSpec("", (SLAVE,)),
+        ),
     ),
     variables=(
         VariableSpec("other", "USINT", Writer.ENGINE),

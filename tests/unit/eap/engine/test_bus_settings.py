@@ -5,12 +5,19 @@ import pytest
 from devicebus.master.link import CEILING_NS, RETRIES
 from devicebus.master.scan import ExpectedSlave
 from eap.engine.build import master_settings
+from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, BusSlaveSpec, PortKind, PortSpec
 from tests.support.cyclic import MS
 
 
 def port(interface, **more):
-    return PortSpec("bus0", PortKind.BUS, interface, "1.1.1.1.1.1", bus=BusPortSpec(**more))
+    return PortSpec(
+        "bus0",
+        PortKind.BUS,
+        InterfaceUri.parse(interface),
+        NetId.parse("1.1.1.1.1.1"),
+        bus=BusPortSpec(**more),
+    )
 
 
 def test_described_slaves_are_expected():

@@ -69,7 +69,7 @@ def changed(plant: Plant, name: str) -> dict[str, StationSpec]:
 
 
 def _publisher(plant: Plant, name: str) -> str:
-    return next(s.ports[0].net_id for s in plant.stations if s.name == name)
+    return next(str(s.ports[0].net_id) for s in plant.stations if s.name == name)
 
 
 def test_findings_of_the_file(tmp_path):

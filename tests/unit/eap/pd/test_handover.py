@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from eap.ids import InterfaceUri, NetId
 from eap.pd.handover import ImageHandover, needs_new_start
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot, TxSlot
@@ -393,7 +394,13 @@ def test_what_was_replaced_can_be_taken_apart():
 
 
 END = ": restart the appliance"
-BUS = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1", bus=BusPortSpec("/x.yaml"))
+BUS = PortSpec(
+    "bus0",
+    PortKind.BUS,
+    InterfaceUri.parse("sim://x.yaml"),
+    NetId.parse("1.2.3.4.6.1"),
+    bus=BusPortSpec("/x.yaml"),
+)
 
 
 def test_all_but_ports_may_change():
@@ -402,12 +409,14 @@ def test_all_but_ports_may_change():
 
 
 def test_what_frames_say_of_a_port_may_change():
-    port = replace(eap_port(1), net_id="9.9.9.9.1.1", eap_sm=True)
+    port = replace(eap_port(1), net_id=NetId.parse("9.9.9.9.1.1"), eap_sm=True)
     assert needs_new_start(left(), left(port)) == []
 
 
 def test_what_was_opened_is_named():
-    port = replace(eap_port(1), interface="udp://127.9.2.9", join=("239.1.1.1",), tcp=True)
+    port = replace(
+        eap_port(1), interface=InterfaceUri.parse("udp://127.9.2.9"), join=("239.1.1.1",), tcp=True
+    )
     assert needs_new_start(left(), left(port)) == [
         f"port eap0: interface udp://127.9.2.1 -> udp://127.9.2.9{END}",
         f"port eap0: join () -> ('239.1.1.1',){END}",

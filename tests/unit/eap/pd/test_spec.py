@@ -3,6 +3,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from eap.ids import NetId, decode_value, encode_value
 from eap.pd.layout import ImageLayout, plan_layout
 from eap.pd.spec import (
     INTERFACE_MEASURES,
@@ -31,7 +32,7 @@ from tests.support.cyclic import PEER, eap_port, station
 
 STATION = StationSpec(
     "island-01",
-    "5.1.1.1.1.1",
+    NetId.parse("5.1.1.1.1.1"),
     10_000,
     (eap_port(),),
     variables=(
@@ -58,14 +59,14 @@ STATION = StationSpec(
 
 
 def test_a_station_crosses_to_the_engine_as_json_unchanged():
-    text = msgspec.json.encode(STATION)
-    assert msgspec.json.decode(text, type=StationSpec) == STATION
+    text = msgspec.json.encode(STATION, enc_hook=encode_value)
+    assert msgspec.json.decode(text, type=StationSpec, dec_hook=decode_value) == STATION
 
 
 def test_a_field_of_another_release_is_refused():
-    text = msgspec.json.encode(STATION).replace(b'"phase_us"', b'"phase_ms"')
+    text = msgspec.json.encode(STATION, enc_hook=encode_value).replace(b'"phase_us"', b'"phase_ms"')
     with pytest.raises(msgspec.ValidationError, match="phase_ms"):
-        msgspec.json.decode(text, type=StationSpec)
+        msgspec.json.decode(text, type=StationSpec, dec_hook=decode_value)
 
 
 def test_measures_of_interfaces_are_those_of_octets_and_packets():

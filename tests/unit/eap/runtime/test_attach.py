@@ -16,6 +16,7 @@ import pytest
 import eap
 from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
+from eap.ids import InterfaceUri, NetId
 from eap.net.image_file import ImageFile, create_image, prepare_image
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
@@ -47,7 +48,7 @@ CYCLE_US = 2000
 def spec(*more: VariableSpec) -> StationSpec:
     return StationSpec(
         name="mixer",
-        net_id="1.1.1.1.1.1",
+        net_id=NetId.parse("1.1.1.1.1.1"),
         cycle_us=CYCLE_US,
         ports=(),
         variables=(
@@ -144,7 +145,7 @@ def test_reads_defaults_and_what_the_engine_computes(path: Path) -> None:
 def test_status_during_cycles_is_of_one_moment(path: Path) -> None:
     pd = RxPdSpec("in", "eap0", 7, ("x",), PEER, step=1)
     out = TxFrameSpec("out", "eap0", "127.9.9.9", (TxPdSpec("p", 1, ("setpoint",)),))
-    port = PortSpec("eap0", PortKind.EAP, "loop://line", OWN)
+    port = PortSpec("eap0", PortKind.EAP, InterfaceUri.parse("loop://line"), NetId.parse(OWN))
     received = VariableSpec("x", "UINT", Writer.ENGINE)
     whole = msgspec.structs.replace(
         spec(received), ports=(port,), subscriptions=(pd,), frames=(out,)
@@ -228,7 +229,14 @@ def test_only_what_goes_by_event_can_be_fired(path: Path, monkeypatch: pytest.Mo
     )
     sender = msgspec.structs.replace(
         spec(),
-        ports=(PortSpec("eap0", PortKind.EAP, "udp://127.9.3.9", "1.1.1.1.2.1"),),
+        ports=(
+            PortSpec(
+                "eap0",
+                PortKind.EAP,
+                InterfaceUri.parse("udp://127.9.3.9"),
+                NetId.parse("1.1.1.1.2.1"),
+            ),
+        ),
         frames=(TxFrameSpec("out", "eap0", "127.9.3.8", pds),),
     )
     with create_image(path, plan_layout(sender)), eap.attach("mixer") as station:

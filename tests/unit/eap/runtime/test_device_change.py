@@ -7,6 +7,7 @@ from msgspec.structs import replace
 
 from eap.device.configuration import dump_configuration
 from eap.device.eap_dictionary import EapDictionary
+from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import (
     BusPortSpec,
     CounterSource,
@@ -32,7 +33,9 @@ from eap.runtime.store import Configuration
 
 @pytest.fixture
 def spec(stations):
-    bus = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.9.1")
+    bus = PortSpec(
+        "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.2.3.4.9.1")
+    )
     return replace(stations[0], ports=(*stations[0].ports, bus))
 
 
@@ -112,7 +115,13 @@ def test_rollback_with_alternates(stations):
     ]
 
 
-BUS = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.9.1", bus=BusPortSpec())
+BUS = PortSpec(
+    "bus0",
+    PortKind.BUS,
+    InterfaceUri.parse("sim://x.yaml"),
+    NetId.parse("1.2.3.4.9.1"),
+    bus=BusPortSpec(),
+)
 
 
 @pytest.fixture
@@ -149,7 +158,7 @@ def test_plan_reports_changed_layout_with_same_version(plain):
     [
         (lambda s: replace(s, name="middle"), "station left cannot become middle"),
         (
-            lambda s: replace(s, net_id="9.9.9.9.9.9"),
+            lambda s: replace(s, net_id=NetId.parse("9.9.9.9.9.9")),
             "the station's router: net_id 1.1.1.1.1.1 -> 9.9.9.9.9.9",
         ),
         (

@@ -7,6 +7,7 @@ import socket
 
 import pytest
 
+from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import CounterSource, PortKind, PortSpec, StationSpec, VariableSpec, Writer
 from eap.runtime.handover import (
     EngineOptions,
@@ -20,10 +21,12 @@ from eap.runtime.handover import (
     receive_connection,
 )
 
-PORT = PortSpec("eap0", PortKind.EAP, "udp://127.0.0.1", "1.2.3.4.5.6")
+PORT = PortSpec(
+    "eap0", PortKind.EAP, InterfaceUri.parse("udp://127.0.0.1"), NetId.parse("1.2.3.4.5.6")
+)
 STATION = StationSpec(
     "a",
-    "1.1.1.1.1.1",
+    NetId.parse("1.1.1.1.1.1"),
     1000,
     (PORT,),
     variables=(VariableSpec("x", "UINT", Writer.ENGINE, default=3),),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.errors import ConfigError
+from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec, StationSpec
 from eap.runtime.plantfile import load_plant, require_own_buses
 
@@ -64,7 +65,12 @@ def test_a_slave_whose_name_no_plant_can_use(tmp_path):
 
 def station(name, interface, kind=PortKind.BUS):
     bus = BusPortSpec() if kind is PortKind.BUS else None
-    return StationSpec(name, "1.1.1.1.1.1", 1000, (PortSpec("p", kind, interface, "", bus=bus),))
+    return StationSpec(
+        name,
+        NetId.parse("1.1.1.1.1.1"),
+        1000,
+        (PortSpec("p", kind, InterfaceUri.parse(interface), NetId.parse("1.1.1.1.2.1"), bus=bus),),
+    )
 
 
 @pytest.mark.parametrize(

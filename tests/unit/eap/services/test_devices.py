@@ -65,13 +65,13 @@ def test_port_answers_by_its_net_id_and_the_router_by_its_own(devices, stations)
         (stations[0].ports[0].net_id, 0xFFFF, AmsCommand.READ, aoe.read_body(0x1000 << 16)),
         (stations[0].net_id, 10_000, AmsCommand.READ_STATE, b""),
         (stations[0].net_id, 851, AmsCommand.READ_STATE, b""),
-        ("9.9.9.9.9.9", 0xFFFF, AmsCommand.READ_STATE, b""),
+        (NetId.parse("9.9.9.9.9.9"), 0xFFFF, AmsCommand.READ_STATE, b""),
     ]
     answers = []
 
     async def script():
         for net_id, *more in asked:
-            answers.append(await left.request(NetId.parse(net_id), *more, timeout_s=1))
+            answers.append(await left.request(net_id, *more, timeout_s=1))
 
     play(devices, script)
     assert [each.error_code for each in answers] == [0, 0, 6, 7]

@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from eap.codec.ethercat import EtherCatHeader
+from eap.ids import InterfaceUri, NetId
 from eap.net.image_file import create_image
 from eap.ops.client import ControlClient
 from eap.pd.layout import plan_layout
@@ -119,7 +120,9 @@ def say_ok(octets: bytes) -> bytes:
 
 
 def test_services_reads_engine_and_segment(tmp_path, stations):
-    port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
+    port = PortSpec(
+        "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.2.3.4.6.1")
+    )
     station = msgspec.structs.replace(stations[0], ports=(*stations[0].ports, port))
     where = {"station": "left", "port": "bus0"}
     with (

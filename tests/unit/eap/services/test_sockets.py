@@ -43,7 +43,8 @@ def script_on(tmp_path):
                 handover = Handover(1, "", "", "", stations, sockets.descriptions)
                 handover = _with_own_descriptors(handover)
                 routers = {
-                    each.name: station(each.ports[0].net_id, name=each.name) for each in stations
+                    each.name: station(str(each.ports[0].net_id), name=each.name)
+                    for each in stations
                 }
                 ours, theirs = socket.socketpair()
                 resources.enter_context(ours)

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from eap.config.load import Plant
 from eap.errors import ConfigError, EnvironmentalError
+from eap.ids import InterfaceUri, NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec, RxPdSpec, TxFrameSpec, TxPdSpec
 from eap.runtime.folder import ApplianceFolder, find_appliances
@@ -90,7 +91,11 @@ def test_a_segment_that_cannot_start_ends_all_with_its_exit_code(tmp_path, stati
     bus_file = tmp_path / "bus.yaml"
     bus_file.write_text("bus: b\nslaves: []\n")
     bus = PortSpec(
-        "bus0", PortKind.BUS, f"sim://{bus_file}", "1.1.1.1.1.9", bus=BusPortSpec(str(bus_file))
+        "bus0",
+        PortKind.BUS,
+        InterfaceUri.parse(f"sim://{bus_file}"),
+        NetId.parse("1.1.1.1.1.9"),
+        bus=BusPortSpec(str(bus_file)),
     )
     station = replace(stations[0], ports=(*stations[0].ports, bus))
     options = EngineOptions(realtime=False)
@@ -215,7 +220,7 @@ def test_what_no_engine_can_run_does_not_run(caplog):
     assert "station left: the plant file runs: it cannot be built: KeyError" in caplog.text
 
 
-BUS = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
+BUS = PortSpec("bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.2.3.4.6.1"))
 
 
 def test_whatever_a_plant_file_says_can_be_built():

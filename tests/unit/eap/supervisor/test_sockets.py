@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from eap.errors import EnvironmentalError
+from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec
 from eap.runtime.handover import NO_DESCRIPTOR, PortName, SocketKind
 from eap.supervisor.sockets import (
@@ -78,8 +79,8 @@ def test_no_ams_without_an_ip_address():
 def test_gateways_have_their_own_at_each_address():
     def bus(number: int, own: int) -> PortSpec:
         return PortSpec(
-            f"bus{number}", PortKind.BUS, "sim://bus.yaml", f"5.1.1.1.{number}.1",
-            bus=BusPortSpec(), gateway=GatewaySpec(port=own),
+            f"bus{number}", PortKind.BUS, InterfaceUri.parse("sim://bus.yaml"),
+            NetId.parse(f"5.1.1.1.{number}.1"), bus=BusPortSpec(), gateway=GatewaySpec(port=own),
         )  # fmt: skip
 
     station = msgspec.structs.replace(left(), ports=(eap_port(1), bus(0, 0), bus(1, 34981)))
@@ -149,7 +150,13 @@ def test_all_are_opened_and_described(tmp_path):
 @pytest.mark.net
 def test_buses_add_theirs(tmp_path):
     before = open_descriptors()
-    bus = PortSpec("bus0", PortKind.BUS, "sim:///x.yaml", "1.1.1.1.1.9", bus=BusPortSpec("/x.yaml"))
+    bus = PortSpec(
+        "bus0",
+        PortKind.BUS,
+        InterfaceUri.parse("sim:///x.yaml"),
+        NetId.parse("1.1.1.1.1.9"),
+        bus=BusPortSpec("/x.yaml"),
+    )
     station = left()
     station = msgspec.structs.replace(station, ports=(*station.ports, bus))
     with SharedSockets([station], tmp_path / "control") as shared:
@@ -182,12 +189,16 @@ SIM = BusPortSpec("/plants/io.yaml")
 
 
 def bus_port(name, interface, bus=SIM):
-    return PortSpec(name, PortKind.BUS, interface, "1.1.1.1.9.1", bus=bus)
+    return PortSpec(
+        name, PortKind.BUS, InterfaceUri.parse(interface), NetId.parse("1.1.1.1.9.1"), bus=bus
+    )
 
 
 def stations(*ports):
-    first = StationSpec("a", "1.1.1.1.1.1", 1000, (eap_port(1), *ports))
-    second = StationSpec("b", "1.1.1.1.1.2", 1000, (bus_port("bus0", "sim:///plants/io.yaml"),))
+    first = StationSpec("a", NetId.parse("1.1.1.1.1.1"), 1000, (eap_port(1), *ports))
+    second = StationSpec(
+        "b", NetId.parse("1.1.1.1.1.2"), 1000, (bus_port("bus0", "sim:///plants/io.yaml"),)
+    )
     return first, second
 
 

@@ -14,7 +14,7 @@ from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortKind, PortSpec
 from eap.services.ads.ads_service import device_info
@@ -34,10 +34,12 @@ class Bench:
     """A router of a station with an EAP port and a bus."""
 
     def __init__(self, spec, image) -> None:
-        bus = PortSpec("bus0", PortKind.BUS, "sim://bus.yaml", "1.2.3.4.7.1")
+        bus = PortSpec(
+            "bus0", PortKind.BUS, InterfaceUri.parse("sim://bus.yaml"), NetId.parse("1.2.3.4.7.1")
+        )
         self.device, self.engine = make_device(spec)
         spec = replace(spec, ports=(*spec.ports, bus))
-        router = StationRouter("left", NetId.parse(spec.net_id))
+        router = StationRouter("left", spec.net_id)
         values = LiveRouter(router, self.device, image, spec.ports)
         dictionary = RouterDictionary(spec, values, DeviceIdentity())
         self.ads = RouterAds(spec, self.device, dictionary, device_info("left", "1.2.3"))

@@ -12,7 +12,7 @@ from eap.ams.routes import Origin, Route
 from eap.ams.transport_table import Transport
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 from eap.net.image_file import create_image
 from eap.od.profiles.router9000 import RouterLive
 from eap.pd.layout import plan_layout
@@ -32,10 +32,18 @@ def station(stations):
     """A station with a bus, and with a port on an interface that every host has."""
     ports = (
         *stations[0].ports,
-        PortSpec("eap1", PortKind.EAP, "ethernet://lo", "1.2.3.4.6.1"),
-        PortSpec("bus0", PortKind.BUS, "sim://bus.yaml", "1.2.3.4.7.1"),
-        PortSpec("bus1", PortKind.BUS, "sim://bus.yaml", "1.2.3.4.7.2"),
-        PortSpec("eap2", PortKind.EAP, "ethernet://none0", "1.2.3.4.6.2"),
+        PortSpec(
+            "eap1", PortKind.EAP, InterfaceUri.parse("ethernet://lo"), NetId.parse("1.2.3.4.6.1")
+        ),
+        PortSpec(
+            "bus0", PortKind.BUS, InterfaceUri.parse("sim://bus.yaml"), NetId.parse("1.2.3.4.7.1")
+        ),
+        PortSpec(
+            "bus1", PortKind.BUS, InterfaceUri.parse("sim://bus.yaml"), NetId.parse("1.2.3.4.7.2")
+        ),
+        PortSpec(
+            "eap2", PortKind.EAP, InterfaceUri.parse("ethernet://none0"), NetId.parse("1.2.3.4.6.2")
+        ),
     )
     more = VariableSpec("bus0.state", "USINT", Writer.ENGINE)
     return replace(stations[0], ports=ports, variables=(*stations[0].variables, more))
@@ -43,7 +51,7 @@ def station(stations):
 
 @pytest.fixture
 def router(station):
-    router = StationRouter("left", NetId.parse(station.net_id))
+    router = StationRouter("left", station.net_id)
     router.add_transport(Transport("udp:eap0"), RecordingSender())
     router.add_route(ROUTE)
     return router

@@ -13,7 +13,6 @@ from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode, decode_notification
 from eap.codec.ams import AmsCommand
 from eap.device.eap_dictionary import DeviceIdentity
-from eap.ids import NetId
 from eap.pd.image import Inputs, Sampler
 from eap.pd.words import StationWord
 from eap.services.ads.station_ads import StationAds
@@ -34,8 +33,8 @@ def sender():
 @pytest.fixture
 def router(stations, sender):
     station = stations[0]
-    net_ids = [NetId.parse(port.net_id) for port in station.ports]
-    router = StationRouter(station.name, NetId.parse(station.net_id), net_ids)
+    net_ids = [port.net_id for port in station.ports]
+    router = StationRouter(station.name, station.net_id, net_ids)
     router.add_transport(Transport("ams-tcp", is_stream=True), sender)
     return router
 
@@ -65,12 +64,12 @@ def test_every_net_id_of_its_own_answers(router, sender, stations):
         (station.ports[0].net_id, 10_000, b"left"),
         (station.ports[0].net_id, 0xFFFF, b"left/eap0"),
     ):
-        info = ask(router, sender, net_id, AmsCommand.READ_DEVICE_INFO, port=port)
+        info = ask(router, sender, str(net_id), AmsCommand.READ_DEVICE_INFO, port=port)
         assert info[8:] == name.ljust(16, b"\0")
 
 
 def test_notifications_leave_by_the_router(ads, router, sender, stations, files):
-    target = stations[0].ports[0].net_id
+    target = str(stations[0].ports[0].net_id)
     image = files["left"].image
     sampler = Sampler(image, Inputs(image).memory)
 

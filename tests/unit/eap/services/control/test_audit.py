@@ -15,7 +15,7 @@ from eap.ams.directory import Directory
 from eap.ams.spec import AccessService, DirectoryPort, DirectoryStation
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 from eap.services.control import audit as module
 from eap.services.control.audit import BURST, KEPT, Audit, AuditFile
 
@@ -28,7 +28,15 @@ NAMES = Directory(
         DirectoryStation(
             "island-01",
             NetId.parse("5.1.1.1.1.1"),
-            (DirectoryPort("bus0", True, NetId.parse("5.1.1.1.3.1"), "sim://x", {"drive": 1001}),),
+            (
+                DirectoryPort(
+                    "bus0",
+                    True,
+                    NetId.parse("5.1.1.1.3.1"),
+                    InterfaceUri.parse("sim://x"),
+                    {"drive": 1001},
+                ),
+            ),
         )
     ]
 )

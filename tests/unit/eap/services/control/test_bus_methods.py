@@ -12,6 +12,7 @@ from eap.control import bus as control_bus
 from eap.control.bus import BUS_METHODS
 from eap.control.protocol import ErrorCode
 from eap.errors import ControlError, EngineGoneError
+from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.runtime.engine_messages import Cancel, ExchangeMailbox
 from eap.runtime.handover import PortName
@@ -27,15 +28,27 @@ VENDOR = "00204018100100000000"
 STATIONS = (
     StationSpec(
         "left",
-        "1.1.1.1.1.1",
+        NetId.parse("1.1.1.1.1.1"),
         10_000,
         (
-            PortSpec("eap0", PortKind.EAP, "udp://127.9.2.1", "1.1.1.1.2.1"),
-            PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1"),
-            PortSpec("bus1", PortKind.BUS, "udp://127.9.2.9", "1.1.1.1.4.1"),
+            PortSpec(
+                "eap0",
+                PortKind.EAP,
+                InterfaceUri.parse("udp://127.9.2.1"),
+                NetId.parse("1.1.1.1.2.1"),
+            ),
+            PortSpec(
+                "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.1.1.1.3.1")
+            ),
+            PortSpec(
+                "bus1",
+                PortKind.BUS,
+                InterfaceUri.parse("udp://127.9.2.9"),
+                NetId.parse("1.1.1.1.4.1"),
+            ),
         ),
     ),
-    StationSpec("right", "1.1.1.1.1.2", 10_000, ()),
+    StationSpec("right", NetId.parse("1.1.1.1.1.2"), 10_000, ()),
 )
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from eap.control.protocol import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.errors import ControlError, TornReadError
+from eap.ids import InterfaceUri, NetId
 from eap.net.connections import Activity, CloseReason, ListenerLimits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
@@ -395,8 +396,10 @@ def test_errors_of_a_bus_keep_kind_and_detail(methods):
     async def conversation():
         engine = FakeEngine(FakeBus(LoopBus("drive")))
         link = EngineLink(engine.services)
-        port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1")
-        station = StationSpec("left", "1.1.1.1.1.1", 10_000, (port,))
+        port = PortSpec(
+            "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.1.1.1.3.1")
+        )
+        station = StationSpec("left", NetId.parse("1.1.1.1.1.1"), 10_000, (port,))
         buses = Buses((station,), open_buses(link, [PORT]), {})
         where = {"station": "left", "port": "bus0"}
         async with Talk(ControlServer(methods, buses)) as client:

@@ -14,6 +14,7 @@ from eap.control.protocol import ErrorCode
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
 from eap.errors import ControlError, EngineRefusedError
+from eap.ids import InterfaceUri, NetId, decode_value, encode_value
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000 import FrameSub, Tx
 from eap.pd.spec import PortKind, PortSpec, StationSpec
@@ -23,7 +24,14 @@ from tests.support.routervalues import Values
 from tests.support.stationengine import make_device
 
 BUS_ONLY = StationSpec(
-    "io", "3.3.3.3.3.3", 10_000, (PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "3.3.3.3.4.1"),)
+    "io",
+    NetId.parse("3.3.3.3.3.3"),
+    10_000,
+    (
+        PortSpec(
+            "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("3.3.3.3.4.1")
+        ),
+    ),
 )
 
 
@@ -48,7 +56,7 @@ def call(methods):
             result = methods[method](params)
             return await result if isawaitable(result) else result
 
-        return msgspec.json.decode(msgspec.json.encode(asyncio.run(run())))
+        return msgspec.json.decode(msgspec.json.encode(asyncio.run(run()), enc_hook=encode_value))
 
     return call
 
@@ -166,7 +174,7 @@ def test_states(call, device):
 def test_export_plan_apply_and_rollback(call, stations, device):
     exported, *rest = call("export", station="left").values()
     assert rest == [None, "", False]
-    assert msgspec.convert(exported, StationSpec) == stations[0]
+    assert msgspec.convert(exported, StationSpec, dec_hook=decode_value) == stations[0]
     exported["frames"][0]["pds"][0]["version"] = 5
     changed = {
         "port": "eap0",
@@ -187,7 +195,7 @@ def test_export_plan_apply_and_rollback(call, stations, device):
         "refused": [],
     }
     before = call("export", station="left")["previous"]
-    assert msgspec.convert(before, StationSpec) == stations[0]
+    assert msgspec.convert(before, StationSpec, dec_hook=decode_value) == stations[0]
     assert call("export", station="left")["spec"] == exported
     assert call("plan", station="left", spec=exported)["changes"] == []
     back = call("rollback", station="left")
@@ -207,7 +215,9 @@ def test_export_plan_apply_and_rollback(call, stations, device):
 )
 def test_apply_of_the_own_plant_file_is_noted(call, stations, file, is_own):
     spec = replace(stations[0], cycle_us=20_000)
-    assert call("apply", station="left", spec=msgspec.to_builtins(spec), file=file)["ok"]
+    assert call(
+        "apply", station="left", spec=msgspec.to_builtins(spec, enc_hook=encode_value), file=file
+    )["ok"]
     stored = StationStore("demo", "left").configuration.read()
     assert stored is not None
     assert stored.applied == (digest_of(spec) if is_own else "")
@@ -219,7 +229,7 @@ def test_refused_apply(call, stations, device):
     refused = call("apply", station="left", spec=spec)
     assert (refused["ok"], refused["results"], len(refused["refused"])) == (False, [], 1)
     device[1].failure = EngineRefusedError("no memory")
-    spec = msgspec.to_builtins(replace(stations[0], cycle_us=20_000))
+    spec = msgspec.to_builtins(replace(stations[0], cycle_us=20_000), enc_hook=encode_value)
     refused = call("apply", station="left", spec=spec)
     assert refused["ok"] is False
     assert "no memory" in refused["refused"][0]

@@ -11,6 +11,7 @@ from time import CLOCK_BOOTTIME, clock_gettime_ns
 import msgspec
 import pytest
 
+from eap.ids import InterfaceUri, NetId
 from eap.net.connections import ListenerStats
 from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
@@ -136,7 +137,9 @@ def test_snapshot_of_an_engine_that_hangs_within_a_cycle_is_what_it_left(files, 
 
 
 def test_buses_and_segments(tmp_path):
-    bus = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
+    bus = PortSpec(
+        "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.2.3.4.6.1")
+    )
     station = msgspec.structs.replace(left(), ports=(*left().ports, bus))
     info = ApplianceInfo("demo", "demo.yaml", ["left"], "now", os.getpid())
     info.segments = {"left/bus0": ProcessInfo(os.getpid(), 3, step="building the slaves")}

@@ -16,7 +16,7 @@ from eap.ams.routes import Route
 from eap.ams.spec import DirectoryPort, DirectoryStation
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_name
 from eap.codec.ams import IO_PORT
-from eap.ids import NetId
+from eap.ids import InterfaceUri, NetId
 from eap.services.routing import scanning
 from eap.services.routing.scanning import scan, scan_targets
 from tests.support.eventually import elapse
@@ -82,10 +82,17 @@ def planned(number: int) -> DirectoryStation:
         NetId.parse(f"5.1.1.{number}.1.1"),
         (
             DirectoryPort(
-                "eap0", False, NetId.parse(f"5.1.1.{number}.2.1"), f"udp://127.0.1.{number}"
+                "eap0",
+                False,
+                NetId.parse(f"5.1.1.{number}.2.1"),
+                InterfaceUri.parse(f"udp://127.0.1.{number}"),
             ),
             DirectoryPort(
-                "bus0", True, NetId.parse(f"5.1.1.{number}.3.1"), "sim://io.yaml", {"drive": 1001}
+                "bus0",
+                True,
+                NetId.parse(f"5.1.1.{number}.3.1"),
+                InterfaceUri.parse("sim://io.yaml"),
+                {"drive": 1001},
             ),
         ),
     )
