@@ -67,6 +67,7 @@ def send(header: AmsHeader, data: bytes, sizes: MailboxSizes) -> Conversation[No
 
 
 def _send_fragments(packet: bytes, number: int, sizes: MailboxSizes) -> Conversation[None]:
+    # The smaller mailbox limits a fragment, as slave stacks expect it in both directions.
     fragment_size = min(sizes.to_slave, sizes.to_master) - MailboxHeader.SIZE - AmsHeader.SIZE
     if fragment_size < 1:
         raise MailboxSizeError(

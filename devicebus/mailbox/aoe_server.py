@@ -69,6 +69,7 @@ class AdsServer:
         """Answer one request."""
         if header.command == AmsCommand.WRITE and self._set_address(header, data):
             return AmsAnswer(encode_result(AdsError.NONE))
+        # A slave without a NetID adopts the target of the first request that reaches it.
         if self.address is None:
             self.address = header.target, header.target_port
         if header.target != self.address[0]:
@@ -87,6 +88,7 @@ class AdsServer:
         if (requested.group, requested.offset, requested.length) != location:
             return False
         octets = data[AdsRange.SIZE : AdsRange.SIZE + _NET_ID_SIZE]
+        # A NetID that begins with four zeros takes these four bytes from the target of the write.
         if not any(octets[:4]):
             octets = bytes(header.target)[:4] + octets[4:]
         self.address = NetId(octets), header.target_port

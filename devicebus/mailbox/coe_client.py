@@ -109,6 +109,8 @@ def continue_upload(
     progress = progress or Progress()
     progress.done, progress.total = len(content), size
     toggle = short = 0
+    # The end is decided by the size of the first answer, not by the last bit: a slave that sets it
+    # too early or too late breaks the protocol.
     while len(content) < size:
         asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
         body = yield from sdo.exchange_segment(asked)
@@ -167,6 +169,7 @@ def download(
 
 def download_unsized(index: int, subindex: int, octets: bytes) -> Conversation[None]:
     """Write an entry from four bytes, cut to the size of the entry.  Raises as download()."""
+    # Expedited without the size bit (command byte 0x22): the entry determines the size.
     value = int.from_bytes(octets, "little")
     head = SdoHeader(0, 1, 0, 0, SdoRequest.DOWNLOAD, index, subindex, value)
     yield from _Sdo(index, subindex).exchange(head.encode())
@@ -188,6 +191,7 @@ class _Sdo:
         data = (yield MailboxRequest(MailboxType.COE, request)).data
         with reading(f"answer to {self}"):
             head = SdoHeader.decode(data, CoeHeader.SIZE)
+        # Either side may abort; the abort of a slave comes as an SDO request (CoE service 2) too.
         if head.specifier == SdoResponse.ABORT:
             raise SdoAbortError(head.value, self.index, self.subindex)
         return head, data[CoeHeader.SIZE + SdoHeader.SIZE :]

@@ -78,6 +78,8 @@ class SegmentedTransfer:
         Raises:
             SdoAbortError: the total size is not that of the first message.
         """
+        # The size of the first message counts; the unused count of a segment is only valid below
+        # seven bytes, where the mailbox length is always 10.
         head, data = decode_segment(segment)
         self.data += data
         where = self.head.index, self.head.subindex
@@ -97,6 +99,7 @@ def transfer_of(segment: bytes, running: SegmentedTransfer | None) -> SegmentedT
     head = SdoSegmentHeader.decode(segment)
     if running is None or running.head.specifier != SEGMENTS.get(head.specifier):
         raise SdoAbortError(AbortCode.COMMAND, 0, 0, "no transfer of this kind is under way")
+    # The toggle bit starts at 0 and alternates; a repeated bit aborts with 0x05030000.
     if head.toggle != running.toggle:
         raise SdoAbortError(AbortCode.TOGGLE, running.head.index, running.head.subindex)
     return running
@@ -144,6 +147,7 @@ class SdoServer:
                 MailboxError.SIZE_TOO_SHORT, f"an SDO of {len(body)} bytes, expected 8"
             )
         specifier = body[0] >> 5
+        # An abort ends the transfer and has no answer of its own.
         if specifier == _ABORT:
             self._transfer = None
             return []

@@ -55,6 +55,7 @@ def iter_fragments(frame: bytes, number: int, data_size: int, *, port: int = 0) 
     for fragment, start in enumerate(range(0, len(frame), step)):
         piece = frame[start : start + step]
         last = start + step >= len(frame)
+        # Fragment 0 has the size of the whole frame in place of its offset, in units of 32 bytes.
         offset = start // FRAGMENT_UNIT if fragment else units
         word = FragmentWord(fragment, offset, number)
         yield EoeHeader(EoeType.FRAGMENT, port, last).encode() + word.encode() + piece
@@ -112,6 +113,7 @@ class FrameAssembler:
         content = self._content or b""
         if (word.frame, word.fragment) != (self._number, self._next):
             return False
+        # The size in fragment 0 is not compared: it is rounded up to 32 bytes.
         is_in_place = word.fragment == 0 or word.offset * FRAGMENT_UNIT == len(content)
         return is_in_place and len(content) + len(data) <= MAX_FRAME
 

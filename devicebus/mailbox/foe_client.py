@@ -78,6 +78,7 @@ def read(
             raise
         progress.done += len(data)
         sent = encode_message(FoeOpcode.ACK, expected)
+        # A packet that is not full ends the file; a file of full packets ends with an empty one.
         if len(data) < packet_size:
             yield MailboxRequest(MailboxType.FOE, sent, expects_reply=False)
             return progress.done

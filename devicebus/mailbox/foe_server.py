@@ -164,6 +164,7 @@ class FoeServer:
         if now_ns < self._busy_until_ns:
             entire = max(1, self._busy_until_ns - self._busy_from_ns)
             done = (now_ns - self._busy_from_ns) * 100 // entire
+            # BUSY carries progress; the master repeats the same packet later.
             return [encode_message(FoeOpcode.BUSY, Busy(done, 100).number)]
         writer.write(data)
         if len(data) < self._sizes.to_slave - DATA_OVERHEAD:

@@ -104,6 +104,7 @@ class CounterCheck:
     def is_new(self, counter: int) -> bool:
         """Count a message; return false for a repetition of the message before."""
         last, self._last = self._last, counter
+        # Counter 0 is always accepted: its sender does not count.
         if not counter or not last:
             return True
         if counter == last:

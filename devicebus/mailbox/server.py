@@ -89,6 +89,8 @@ class MailboxServer:
             self._dropped += 1
             return
         self._received += 1
+        # A repeated counter is a repetition by the data link layer: the request was handled
+        # already.
         if not self._watch.is_new(message[5] >> 4 & 7):
             return
         address = int.from_bytes(message[2:4], "little")
@@ -126,6 +128,7 @@ class MailboxServer:
         if self._offered is not None:
             self._queue.appendleft(self._offered)
             self._sent -= 1
+        # A newer message stays in front of the queue: it follows the repetition.
         self._offered = self._last_read
         self._repeated += 1
         return self._offered

@@ -88,6 +88,7 @@ def _read(
             message = yield MailboxRequest(MailboxType.SOE, listened, listen=True)
         with reading(what):
             header, body = decode_message(message.data)
+        # While fragments follow, the IDN field holds the number of fragments left.
         is_foreign = not header.incomplete and header.idn != number
         now_left = header.idn if header.incomplete else 0
         if is_foreign or (left is not None and now_left > left):
@@ -132,6 +133,7 @@ def write(
     fragment_size = sizes.to_slave - DATA_OVERHEAD
     header = SoeHeader(SoeOpcode.WRITE_REQUEST, 0, 0, drive, elements, idn.number)
     *fragments, last = encode_fragments(header, data, fragment_size)
+    # Only the last fragment of a write is answered; a full mailbox delays the next fragment.
     for fragment in fragments:
         yield MailboxRequest(MailboxType.SOE, fragment, expects_reply=False)
         progress.done += fragment_size

@@ -339,6 +339,7 @@ class SoeServer:
         try:
             answer = self._answer(header, body, now_ns)
         except SoeError as exc:
+            # An error code replaces the data: it is the last two bytes of the answer.
             error, answer = True, exc.code.to_bytes(2, "little")
         opcode = _RESPONSE[header.opcode]
         head = SoeHeader(opcode, 0, error, header.drive, header.elements, header.idn)

@@ -92,6 +92,7 @@ def synchronize(
         if only is None or slave.station in only:
             yield from _write_state(state)
     for _ in range(_DRIFT_FRAMES):
+        # The control loops of the slaves settle by many drift datagrams before SYNC0 may start.
         yield [drift_datagram(clocks[0].station)] * _DRIFT_PER_FRAME
     return tuple(states)
 
@@ -111,9 +112,11 @@ def find_delays(
             continue
         above, times = nodes[parent], latched[parent].ports
         before = _port_before(above, port)
+        # Receive times are 32 bits and wrap every 4.3 s: differences are taken modulo 2**32.
         round_trip = times[port] - times[before] & _U32
         inside = _inside(nodes[position], latched[position].ports)
         earlier = times[before] - times[above.entry_port] & _U32
+        # Half of the cable's round trip: both directions are taken as equally long.
         delays[position] = delays[parent] + earlier + max(0, round_trip - inside) // 2
     return delays
 
@@ -128,6 +131,7 @@ def start_sync0(station: int, sync0: Sync0) -> Procedure[int]:
 
     Raises WorkingCounterError if the slave does not answer.
     """
+    # The sync unit is stopped while its start time and cycle change.
     yield from write(station, Register.DC_ACTIVATION, b"\0", "DC activation")
     yield from write(station, Register.DC_CYCLIC_UNIT, b"\0", "DC cyclic unit")
     octets = yield from read(station, Register.DC_SYSTEM_TIME, 8, "DC system time")
@@ -144,6 +148,7 @@ def read_difference(station: int) -> Procedure[int]:
     """Return the difference of a slave's clock from the reference in ns, positive if ahead."""
     octets = yield from read(station, Register.DC_SYSTEM_TIME_DIFFERENCE, 4, "DC difference")
     value = int.from_bytes(octets, "little")
+    # 0x092C is sign and magnitude, not two's complement; bit 31 means behind the reference.
     magnitude = value & 0x7FFF_FFFF
     return -magnitude if value >> 31 else magnitude
 

@@ -98,6 +98,8 @@ class ReplyMatcher:
             self._echoes = True
             self._expired.clear()
             return False
+        # Some slave stacks write address 0 in replies: only a slave that has echoed a tag once is
+        # judged by it.
         if self._echoes or header.address & _TAG:
             return True
         self._suspected = self._drop_expired(header, data)
@@ -218,6 +220,7 @@ class ConversationQueue:
         if not ready:
             return None
         job = next((each for each in ready if each.step.listen), ready[0])
+        # Moved to the end: protocols alternate message by message.
         self._queues[job.step.type] = self._queues.pop(job.step.type)
         return job
 

@@ -201,6 +201,8 @@ class Cycle:
         group = self._image.layout.groups[datagram.group]
         begin = group.outputs_size if datagram.command is Command.LRW else 0
         inputs = self._image.inputs
+        # The common case is one slice; only a bus with a lost slave copies slave by slave, so that
+        # the lost slave keeps its last inputs.
         if self._all_active[datagram.group]:
             inputs[group.inputs : group.inputs + group.inputs_size] = data[begin:]
             return
@@ -219,6 +221,8 @@ class Cycle:
         for at, datagram in enumerate(self._datagrams):
             if datagram.group != number:
                 continue
+            # Bit n: working counter n is allowed.  An active slave shifts all, an uncertain one
+            # adds the shifted alternatives.
             counts = 1
             for slave, participation in zip(members, participations, strict=True):
                 if participation is Participation.ACTIVE:
@@ -250,5 +254,5 @@ def _count(command: Command, slave: SlaveLayout) -> int:
             return reads
         case Command.LWR:
             return writes
-        case _:
+        case _:  # LRW: a successful write counts 2
             return reads + 2 * writes

@@ -25,6 +25,7 @@ _END = b"\xff\xff"
 
 def take_over(station: int) -> Procedure[None]:
     """Take the EEPROM back from the slave's application."""
+    # Bit 1 forces the release by the PDI, which may have kept the EEPROM; 0 assigns it to EtherCAT.
     yield from write(station, Register.EEPROM_CONFIGURATION, b"\2", "EEPROM configuration")
     yield from write(station, Register.EEPROM_CONFIGURATION, b"\0", "EEPROM configuration")
 
@@ -38,6 +39,7 @@ def read_words(station: int, word: int) -> Procedure[bytes]:
     """
     request = EepromControl(command=EepromCommand.READ).encode() + word.to_bytes(4, "little")
     octets = yield from _command(station, request, f"reading word 0x{word:04X}")
+    # Status bit 6: the controller reads eight bytes per command instead of four.
     size = 8 if EepromControl.decode(octets).read_eight else 4
     return octets[6 : 6 + size]
 
@@ -98,6 +100,7 @@ def write_image(station: int, image: bytes) -> Procedure[None]:
     yield from _extend(station, there, len(image))
     for offset in range(0, len(image), 2):
         word = image[offset : offset + 2]
+        # Writing is slow (up to 10 ms a word) and wears the EEPROM.
         if there[offset : offset + 2] != word:
             yield from write_word(station, offset // 2, word)
 

@@ -27,11 +27,13 @@ def path(current: AlState, target: AlState) -> tuple[AlState, ...]:
     """Return the states to request in turn on the way from *current* to *target*."""
     if current is target:
         return ()
+    # BOOT is reached from INIT and left to INIT only (ETG.1000.6).
     if AlState.BOOT in {current, target}:
         through = (AlState.INIT,) if current is not AlState.INIT else ()
         start = AlState.INIT
         return through + ((target,) if target is AlState.BOOT else path(start, target))
     here, there = _LADDER.index(current), _LADDER.index(target)
+    # Up one state at a time; down in one request, which slaves in any state accept.
     return _LADDER[here + 1 : there + 1] if there > here else (target,)
 
 

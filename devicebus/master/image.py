@@ -103,6 +103,7 @@ def plan_image(slaves: Sequence[SlaveProcessData]) -> ProcessDataLayout:
     variables: list[ProcessVariable] = []
     outputs = inputs = 0
     for number, members in enumerate(_group(slaves)):
+        # Each group has an address range of its own, so that no FMMU serves two datagrams.
         address = BASE + number * _STRIDE
         group_outputs = sum(_size(slave, is_output=True) for slave in members)
         start = outputs, inputs

@@ -277,6 +277,7 @@ class Link:
         self._max_spent = max(self._max_spent, self._spent)
         self._spent = 0
         credit = self._credit or 0
+        # Unused budget expires: acyclic datagrams must not pile up into one cycle.
         self._credit = min(credit, 0) + self._budget
 
     def stop_cycles(self) -> None:
@@ -313,6 +314,7 @@ class Link:
             self._late += 1
         else:
             self._end_flight(index)
+        # Karn's rule is not needed: each transmission has its own index (see RoundTrip).
         self._round_trip.measure(now_ns - sent.sent_ns)
         for item, (reply, wkc) in zip(sent.items, results, strict=True):
             if item.is_over:
@@ -353,6 +355,7 @@ class Link:
                     again.append(item)
                 else:
                     item.exchange.fail(_lost(item), now_ns)
+        # In front of the queue and in their order: a repetition must not overtake a later write.
         self._acyclic.extendleft(reversed(again))
 
     def stats(self) -> LinkStats:
@@ -487,6 +490,7 @@ def _match(
         command, size = datagram.command, len(datagram.data)
         there = _LAYOUT.unpack_from(data, offset)
         same = (command, index, datagram.ado, size) == (*there[:2], there[3], there[4] & _LENGTH)
+        # ADP of position and broadcast commands is incremented by every slave on the way.
         if not same or (command in _FIXED_ADP and datagram.adp != there[2]):
             return None
         start = offset + DatagramHeader.SIZE

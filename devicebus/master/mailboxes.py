@@ -316,6 +316,8 @@ class Mailbox:
 
     def _send(self, step: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage | None]:
         """Write a request; return its reply if it came during a repetition of the write."""
+        # The counter stays the same for all attempts: the slave drops a repeated one, so that a
+        # request is executed once although its frame was lost.
         self._counter = next_counter(self._counter)
         address = self._queue.matcher(step.type).next_address()
         header = MailboxHeader(0, address, type=step.type, counter=self._counter)
@@ -327,6 +329,7 @@ class Mailbox:
                 self._counters.sent += 1
                 return None
             maybe_there = maybe_there or written.is_ambiguous
+            # A slave whose reply mailbox is full may not read requests: empty it first.
             if (yield from self._is_full(deadline_ns)):
                 reply = yield from self._receive(step if maybe_there else None)
                 if reply is not None:

@@ -86,6 +86,7 @@ class MailboxPort:
         Raises:
             FrameLostError: no frame comes back.
         """
+        # The mailbox becomes full when its last byte is written, so the whole area is sent.
         padded = message.ljust(self.area.to_slave_size, b"\0")
         (reply,), _ = yield [fpwr(self.station, self.area.to_slave, padded)]
         return WriteResult(reply.wkc == 1, reply.tries > 1)
@@ -109,6 +110,7 @@ class MailboxPort:
         """
         area = self.area
         try:
+            # Sent once: a lost read has emptied the mailbox, a second read would only fail.
             (reply,), _ = yield [fprd(self.station, area.to_master, area.to_master_size, tries=1)]
         except FrameLostError:
             self._needs_repeat = True
@@ -137,5 +139,6 @@ def configure(station: int, area: MailboxArea) -> Procedure[None]:
     Raises WorkingCounterError if the slave does not answer.
     """
     octets = b"".join(each.encode() for each in area.sync_managers())
+    # A sync manager is reconfigured while it is disabled.
     yield from write(station, Register.SYNC_MANAGER, bytes(len(octets)), "sync managers")
     yield from write(station, Register.SYNC_MANAGER, octets, "sync managers")

@@ -209,6 +209,8 @@ def _read_list(index: int, size: int) -> Conversation[list[int]]:
 def _write_list(
     index: int, numbers: Sequence[int], size: int, sizes: MailboxSizes
 ) -> Conversation[None]:
+    # Subindex 0 is cleared first: entries of a mapping or assignment are writable only then, and
+    # the new count makes them valid.
     yield from coe_client.download(index, 0, b"\0", sizes)
     for subindex, number in enumerate(numbers, 1):
         yield from coe_client.download(index, subindex, number.to_bytes(size, "little"), sizes)

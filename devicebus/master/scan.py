@@ -158,6 +158,7 @@ def scan(first_station: int = FIRST_STATION) -> Procedure[tuple[FoundSlave, ...]
     if count > MAX_SLAVES:
         raise BusError(f"{count} slaves answered, a bus has at most {MAX_SLAVES}")
     stations = range(first_station, first_station + count)
+    # Positions change when a slave is lost; from here on slaves are addressed by station.
     yield from assign_stations(list(enumerate(stations)))
     registers = yield from _read_registers(stations)
     nodes = find_topology([each.dl_status for each in registers])
@@ -241,6 +242,7 @@ def _found(
             raise image
         content = sii.decode(image)
     except EapError as exc:
+        # One unreadable EEPROM must not fail the scan of the others.
         fault = f"slave {station}: its EEPROM cannot be used: {exc}"
     fixed = content.fixed
     identity = Identity(fixed.vendor, fixed.product, fixed.revision, fixed.serial)

@@ -249,6 +249,7 @@ def _bring_back(bus: BusState, slave: BusSlave, *, stays: bool) -> Procedure[int
         found = slave.found.identity
         identity = yield from read_identity(slave.station)
         if identity != found:
+            # The other device must not answer under this station address.
             yield [fpwr(slave.station, Register.STATION_ADDRESS, bytes(2))]
             raise IdentityError(
                 f"in place of {slave.name} (station {slave.station}) there is {identity}, serial"

@@ -74,6 +74,7 @@ class Clock:
         """
         time_ns = self.system_time(now_ns)
         delay = self._get(Register.DC_SYSTEM_TIME_DELAY, 4)
+        # Without the delay a master would see a different time at every position.
         self._set(Register.DC_SYSTEM_TIME, (time_ns - delay) % _U64, 8)
         if self._start_ns is None:
             return
@@ -110,6 +111,7 @@ class Clock:
         if self._last_write_ns is not None and now_ns > self._last_write_ns:
             interval = now_ns - self._last_write_ns
             self._rebase(now_ns, -error // (1 << _PHASE_SHIFT))
+            # The rate is learnt from small errors only: a large one is an offset that was not set.
             if abs(error) < _LOCKED_NS:
                 rate = self._rate_ppb - (error * _PPB // interval >> _RATE_SHIFT)
                 self._rate_ppb = max(-_MAX_PPB, min(_MAX_PPB, rate))

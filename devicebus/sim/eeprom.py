@@ -107,6 +107,7 @@ class Eeprom:
         The alias is loaded at power-on only.
         """
         memory = self._memory
+        # A controller with a wrong check sum keeps running, with bit 11 of its status set.
         if not sii.is_intact(self.image):
             self._status(_CRC_ERROR)
             return
@@ -125,5 +126,6 @@ class Eeprom:
 
     def _status(self, bits: int) -> None:
         at = Register.EEPROM_CONTROL
+        # This EEPROM is larger than 16 Kbit (two address bytes) and is read eight bytes at a time.
         status = bits | _READ_EIGHT | _TWO_BYTES
         self._memory[at : at + 2] = status.to_bytes(2, "little")

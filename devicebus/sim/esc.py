@@ -166,6 +166,7 @@ class Esc:
         memory[4:8] = bytes(
             (given.fmmus, given.sync_managers, given.ram // 1024, given.port_descriptor)
         )
+        # Features: bit 2 distributed clocks, bit 3 with 64 bits.
         memory[Register.FEATURES] = 0x0C if given.has_dc else 0
         memory[Register.DL_CONTROL] = 1
 
@@ -228,12 +229,14 @@ class Esc:
                 (REGISTERS - address, self.read(address, REGISTERS - address, now_ns)),
                 (end - REGISTERS, self._read_memory(REGISTERS, end)),
             )
+        # An access to unimplemented registers only leaves the working counter unchanged.
         if _YES not in self._readable[address:end]:
             return None
         for page in range(address >> 8, (end - 1 >> 8) + 1):
             if page in _FRESH:
                 self._refresh(page, now_ns)
         data = bytes(self.memory[address:end])
+        # Reading the register acknowledges its ECAT event.
         if address <= Register.AL_STATUS < end:
             self.ecat_event &= ~_EVENT_AL
         if address <= Register.DL_STATUS < end:
@@ -326,6 +329,7 @@ class Esc:
         self._areas = _find_areas(self._guards)
 
     def _clear_counters(self, start: int, end: int) -> None:
+        # Any write clears the whole group of counters, whatever its data.
         groups = (
             (Register.RX_ERROR, Register.PROCESSING_UNIT_ERROR),
             (Register.PROCESSING_UNIT_ERROR, Register.PROCESSING_UNIT_ERROR + 1),
@@ -338,6 +342,7 @@ class Esc:
                 self.memory[first:last] = bytes(last - first)
 
     def _clock_written(self, start: int, end: int, now_ns: int) -> None:
+        # A write to the receive time of port 0 latches all ports.
         if start <= Register.DC_RECEIVE_TIME < end:
             self.clock.latch(now_ns, self.port_delays)
         if start <= Register.DC_SYSTEM_TIME < end:

@@ -85,6 +85,7 @@ class Chain:
             if offset + OVERHEAD + length > end:
                 break
             if self._closed_at is not None:
+                # A frame that passes this controller twice would circulate for ever.
                 if flags & _CIRCULATING:
                     return False
                 flags |= _CIRCULATING
@@ -145,8 +146,9 @@ class Chain:
         for esc in escs:
             sent = bytes(data)
             octets = esc.read(ado, len(sent), now_ns) if reads else None
+            # APRW, FPRW and BRW write the received data and return the old content.
             if writes and esc.write(ado, sent, now_ns):
-                count += 2 if reads else 1
+                count += 2 if reads else 1  # a write counts 2 in commands that also read
             if octets is not None:
                 count += 1
                 if command in _BROADCAST:

@@ -61,6 +61,7 @@ def trace_path(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> FrameP
     while True:
         if not is_loop:
             arrivals[slave, port] = time_ns
+        # The processing unit is behind port 0, on the way in.
         if port == 0:
             if is_loop and closed_at is None:
                 closed_at = len(order)

@@ -185,6 +185,7 @@ class SimulatedSlave:
         if self.esc.emulates_device:
             self._emulate(control)
             return
+        # With an error pending, only its acknowledgement or INIT is accepted (ETG.1000.6).
         if self._code and not control & ERROR and requested != AlState.INIT:
             return
         self._code = 0
@@ -239,11 +240,12 @@ class SimulatedSlave:
         receive, send = self.esc.channels[:2]
         receive.discard()
         send.discard()
+        # The present repeat bit is copied without a repetition: nothing was sent yet.
         send.acknowledge_repeat()
         mailbox.protocols = {
             kind: server
             for kind, server in self._protocols.items()
-            if kind is MailboxType.FOE or not boot
+            if kind is MailboxType.FOE or not boot  # in BOOT only FoE runs
         }
         mailbox.start(receive.length, send.length)
         return 0
@@ -263,6 +265,7 @@ class SimulatedSlave:
         self.esc.set_al_status(target, self._code)
 
     def _refuse(self, code: int) -> None:
+        # No error leaves a slave in OP: outputs go to their safe state first.
         if self.state is AlState.OP:
             self.device.al_state = AlState.SAFEOP
             self.esc.watchdog.stop()
@@ -325,6 +328,7 @@ class SimulatedSlave:
             data = self.esc.channels[self.device.output_channel].take()
             if data is not None:
                 self._has_outputs = True
+                # The first outputs complete the request of OP.
                 if self._deadline_ns is not None:
                     self._deadline_ns = None
                     self._enter(AlState.OP)

@@ -103,6 +103,7 @@ class SyncChannel:
         """
         if self.master_writes or self.is_locked or (self.is_mailbox and not self.is_full):
             return -1
+        # The first byte opens the buffer: until the last byte is read it must not change.
         if start == self.start:
             self._open = True
             if self._waiting is not None:

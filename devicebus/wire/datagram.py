@@ -141,6 +141,7 @@ def encode_frame(datagrams: Sequence[Datagram]) -> bytes:
     return EtherCatHeader(len(body), type=FrameType.DATAGRAM).encode() + body
 
 
+# The records are array-like structs: they cross the processes' sockets for every datagram.
 AS_SET = 0
 """Value of *tries* for the number of tries of the master's settings."""
 
