@@ -62,6 +62,8 @@ UNFINISHED = re.compile(r"\b(?:TO[D]O|FIX[M]E)\b(?!\W{0,3}#\d)")
 NAMED = re.compile(r"`((?:tests|config|eap|devicebus|docs|tools)/[\w./-]*\w)/?`")
 MODULE = re.compile(r"`((?:eap|devicebus)(?:\.[A-Za-z_]\w*)+)`")
 PROGRAM = re.compile(r"`(?!(?:tests|eap|devicebus|docs|tools)/)(?:\w+/)*(\w+\.py)`")
+LINK = re.compile(r"\]\(([^)\s:#]*)(?:#([\w-]+))?\)")
+HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 PAGES = ("CONTRIBUTING.md", "README.md")
 """Pages beside those in ``docs/``."""
 LOOSE_TASK = re.compile(r"(?<!group)\.create_task\(|\bensure_future\(")
@@ -130,6 +132,7 @@ def check(root: Path) -> list[Violation]:
             if name.suffix == ".md" and name.parts[0] in {"docs", *PAGES}:
                 found += check_named(root, name, text)
                 found += check_programs(files, name, text)
+                found += check_links(root, name, text)
     return sorted(found)
 
 
@@ -191,6 +194,25 @@ def check_programs(
         for match in PROGRAM.finditer(line):
             if match[1] not in names:
                 yield Violation(page, number, f"no file {match[1]}", "where it is now")
+
+
+def check_links(root: Path, page: PurePosixPath, text: str) -> Iterator[Violation]:
+    """Yield the links of a page to files and headings that do not exist."""
+    for number, line in enumerate(text.splitlines(), 1):
+        for match in LINK.finditer(line):
+            file, anchor = match.groups()
+            target = root / page.parent / file if file else root / page
+            is_found = target.exists() and (not anchor or anchor in _anchors(target))
+            if not is_found:
+                yield Violation(page, number, f"no target {match[0][2:-1]}", "where it is now")
+
+
+def _anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings."""
+    kept = (
+        re.sub(r"[^\w\- ]", "", found[1].lower()) for found in HEADING.finditer(page.read_text())
+    )
+    return {each.replace(" ", "-") for each in kept}
 
 
 def _is_module(root: Path, name: str) -> bool:

@@ -63,6 +63,16 @@ def test_pages_name_programs_that_exist_in_any_folder(tmp_path):
     assert found(tmp_path) == ["README.md:2: no file gone.py, expected where it is now"]
 
 
+def test_links_of_pages_lead_to_files_and_headings(tmp_path):
+    grow(tmp_path, "docs/ads.md", text="# `ADS`: states, objects\n")
+    links = "[a](docs/ads.md), [b](docs/ads.md#ads-states-objects), [c](https://example.org/#x)\n"
+    grow(tmp_path, "README.md", text=f"{links}[d](docs/gone.md), [e](docs/ads.md#gone), [f](#gone)")
+    assert found(tmp_path) == [
+        f"README.md:2: no target {name}, expected where it is now"
+        for name in ("#gone", "docs/ads.md#gone", "docs/gone.md")
+    ]
+
+
 def test_pages_name_modules_that_exist(tmp_path):
     grow(tmp_path, "eap/pd/image.py", text="LIMIT = 1\n\nclass Image: ...\n\ndef open_it(): ...\n")
     grow(tmp_path, "eap/__init__.py", text="def attach(): ...\n")
