@@ -1,4 +1,4 @@
-"""EtherCAT Automation Protocol (ETG.1005) appliance; docs/architecture.md draws its rooms.
+"""EtherCAT Automation Protocol (ETG.1005) appliance; docs/architecture.md draws its structure.
 
 User programs need one name: ``eap.attach("station")`` gives the variables of a running station.
 """

@@ -1,4 +1,4 @@
-"""What is closed at the end of a ``with`` block."""
+"""Base class of objects that a ``with`` block closes."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Self
 
 
 class Closeable(ABC):
-    """Something that holds files, sockets or memory until it is closed."""
+    """Object that holds files, sockets or memory until it is closed."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything."""
+        """Release all resources."""
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""Every exception the project raises on purpose.
+"""Exceptions of the project.
 
 EapError
 ├── CodecError              bytes do not match the layout
@@ -8,12 +8,12 @@ EapError
 │   └── LocalProtocolError
 ├── ConfigError             the plant file does not describe a plant
 ├── EnvironmentalError      this machine lacks something: a port, a capability, an interface
-├── ImageError              the process image cannot be used as asked
-│   ├── EngineGoneError     nobody runs the cycle any more
+├── ImageError              the process image cannot be used as requested
+│   ├── EngineGoneError     no engine runs the cycle any more
 │   ├── TornReadError       a writer stopped in the middle of writing
-│   └── WriterConflictError somebody else owns what was to be written
-├── EngineRefusedError      the engine continues with what it ran before
-└── ControlError            a running appliance refused a request
+│   └── WriterConflictError another writer owns the variables
+├── EngineRefusedError      the engine rejects a request and continues unchanged
+└── ControlError            a running appliance rejected a request
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class ProtocolError(EapError):
 
 
 class LocalProtocolError(ProtocolError):
-    """Our caller asked for something the current state forbids."""
+    """The caller requested something that the current state forbids."""
 
 
 class ConfigError(EapError):
@@ -57,7 +57,7 @@ class EnvironmentalError(EapError):
 
 
 class ImageError(EapError):
-    """The process image cannot be used as asked."""
+    """The process image cannot be used as requested."""
 
 
 class EngineGoneError(ImageError):
@@ -73,7 +73,7 @@ class TornReadError(ImageError):
 
 
 class WriterConflictError(ImageError):
-    """What was to be written belongs to *holder*."""
+    """The variables to be written belong to *holder*."""
 
     def __init__(self, message: str, *, holder: str) -> None:
         super().__init__(message)
@@ -81,11 +81,11 @@ class WriterConflictError(ImageError):
 
 
 class EngineRefusedError(EapError):
-    """The engine does not do what it was asked for, and continues as before; the text says why."""
+    """The engine rejects a request and continues unchanged; the text gives the reason."""
 
 
 class ControlError(EapError):
-    """A running appliance refused a request; *code* is for programs."""
+    """A running appliance rejected a request; *code* is for programs."""
 
     def __init__(self, message: str, *, code: str = "refused") -> None:
         super().__init__(message)

@@ -1,4 +1,4 @@
-"""Addresses as value types."""
+"""Addresses as value types: NetID, MAC address, object ID, interface URI, destination."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 from urllib.parse import parse_qsl, urlencode
 
 STATION_OCTETS = 4
-"""Bytes that all NetIDs of a station usually have in common."""
+"""Number of leading bytes that all NetIDs of a station usually have in common."""
 
 
 class NetId(bytes):
@@ -25,12 +25,12 @@ class NetId(bytes):
             raise ValueError(f"{text!r} is not an AMS NetID (six numbers such as 5.23.91.23.1.1)")
         numbers = [int(part) for part in octets]
         if max(numbers) > 255:
-            raise ValueError(f"{text!r} has an octet above 255")
+            raise ValueError(f"{text!r} has a number above 255")
         return cls(numbers)
 
     @property
     def station(self) -> bytes:
-        """The bytes that it has in common with all others of its station, usually."""
+        """The leading bytes that all NetIDs of its station usually have in common."""
         return self[:STATION_OCTETS]
 
     def __str__(self) -> str:
@@ -41,7 +41,7 @@ class NetId(bytes):
 
 
 def prefix_text(prefix: bytes) -> str:
-    """Return what all NetIDs that begin with *prefix* look like: ``5.23.91.23.x.x``."""
+    """Return the pattern of all NetIDs that begin with *prefix*: ``5.23.91.23.x.x``."""
     return ".".join([*map(str, prefix), *["x"] * (6 - len(prefix))])
 
 
@@ -57,9 +57,7 @@ class MacAddr(bytes):
     def parse(cls, text: str) -> Self:
         """Read the form with colons or dashes; raise ValueError if it is not six bytes."""
         if not _MAC.fullmatch(text):
-            raise ValueError(
-                f"{text!r} is not a MAC address (six octets such as 01:01:05:04:00:00)"
-            )
+            raise ValueError(f"{text!r} is not a MAC address (six bytes such as 01:01:05:04:00:00)")
         return cls.fromhex(text.replace("-", "").replace(":", ""))
 
     @property
@@ -80,7 +78,7 @@ _OBJECT_ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]+)(?::(?:0[xX])?([0-9A-Fa-f]+))?
 class ObjectId(NamedTuple):
     """Index and subindex of an entry of an object dictionary, written ``0x1018:01``.
 
-    Both are hexadecimal wherever people read or write them: the field knows no others, and
+    Both are hexadecimal in all texts: the field uses no other notation, and
     ``1000:0`` read as decimal would silently be another object.
     """
 
@@ -176,7 +174,7 @@ def decode_value(kind: type, text: object) -> NetId | InterfaceUri:
 
 
 class DestinationKind(Enum):
-    """Which kind of address a frame goes to."""
+    """Kind of the destination address of a frame."""
 
     MAC = auto()
     IP = auto()
@@ -185,7 +183,7 @@ class DestinationKind(Enum):
 
 
 class Destination(NamedTuple):
-    """Where a frame goes: a MAC address, an IPv4 address, ``tcp://`` and one, or a NetID.
+    """Destination of a frame: a MAC address, an IPv4 address, ``tcp://`` and one, or a NetID.
 
     A NetID stands for the MAC address of the port that has it.
     """

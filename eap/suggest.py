@@ -1,4 +1,4 @@
-"""What somebody may have meant who gave a name that nobody has."""
+"""Suggestion of the nearest known name for an unknown one."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class EngineBuses:
     Attributes:
         buses: By their numbers in requests.
         requests: Takes requests of services; None in a test without services.
-        arrivals: What to call when a descriptor is readable.
+        arrivals: Callbacks for readable descriptors.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class EngineBuses:
             bus.start(now_ns)
 
     def publish(self) -> None:
-        """Send services what has changed on the buses."""
+        """Send the changes on the buses to services."""
         if self.requests is not None:
             self.requests.publish()
 
@@ -178,14 +178,14 @@ class EnginePlant:
     """All stations of one engine process, with their images and channels.
 
     Args:
-        handover: What to build.
+        handover: Specifications and descriptors.
         step: Called with the name of each step before it.
 
     Attributes:
         engine: Runs them.
         rebuilder: Changes them while they run.
         buses: The slaves below them.
-        arrivals: Descriptors to wake up for besides the cycle, and what to call then.
+        arrivals: Callbacks for descriptors that are served between the cycles.
     """
 
     def __init__(self, handover: Handover, *, step: Step = no_step) -> None:
@@ -221,7 +221,7 @@ class EnginePlant:
         self.arrivals.update(self.buses.arrivals)
 
     def start(self, now_ns: int) -> None:
-        """Bring all stations to their states, and let programs that attach see who runs them."""
+        """Bring all stations to their states, and publish the pid of the engine in their images."""
         for entry in self._stations.values():
             entry.file.image.words[StationWord.ENGINE_PID] = os.getpid()
         self.engine.start(now_ns, self._handover.states)
@@ -248,14 +248,14 @@ class EnginePlant:
         return self._stations[station].file.image
 
     def publish_discards(self) -> None:
-        """Show what the interfaces dropped since the last time."""
+        """Add the frames that the interfaces dropped since the last call to the counters."""
         for tally in self._tallies:
             tally.publish()
 
     def stop(self) -> None:
-        """Bring all stations out of Op and wake who waits for a cycle that will not come.
+        """Bring all stations out of Op and wake programs that wait for a next cycle.
 
-        Slaves come to rest, for at most REST_NS.
+        Slaves are brought to INIT, for at most REST_NS.
         """
         self.engine.stop()
         self.buses.rest()
@@ -348,7 +348,7 @@ class EnginePlant:
 
 
 def _tcp_reason(closed: str) -> DropReason | None:
-    """Return what to count for a connection that ended; one that was just closed is no refusal."""
+    """Return the reason to count for a connection that ended, None for an orderly close."""
     if closed.startswith("frame of type"):
         return DropReason.TCP_TYPE
     return _REFUSALS.get(closed)

@@ -1,7 +1,7 @@
 """Mapping between the process data of a bus and the process image of its station.
 
-The plant file describes entries by slave, index and subindex; the slaves say themselves where these
-lie in their process data.
+The plant file describes entries by slave, index and subindex; the slaves define their offsets in
+the process data.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class BusMapping:
         return self._plan.missing if self._plan is not None else ()
 
     def lay_out(self, bus_image: BusImage | None) -> None:
-        """Plan what is copied between the station and *bus_image*."""
+        """Plan the copies between the station and *bus_image*."""
         self.bus_image = bus_image
         self._plan = None
         self._outputs = []
@@ -73,7 +73,7 @@ class BusMapping:
             self._plan.kept.run(self._memory, memoryview(self.bus_image.inputs))
 
     def take_inputs(self, master: Master) -> None:
-        """Copy what the last exchange brought into the image, and where the slaves are."""
+        """Copy the inputs of the last exchange and the states of the slaves into the image."""
         if self._plan is not None and self.bus_image is not None:
             self._plan.inputs.run(memoryview(self.bus_image.inputs), self._memory)
         self._states.show(master)
@@ -177,7 +177,7 @@ class BusStateVariables:
         self._seen: tuple[Master, int, bool] | None = None
 
     def show(self, master: Master) -> None:
-        """Store what has changed; the caller has begun the engine's write."""
+        """Store the values that have changed; the caller has begun the engine's write."""
         cycle = master.cycle
         seen = master, master.changes, cycle is not None and cycle.is_full
         if seen == self._seen:

@@ -21,7 +21,7 @@ from eap.runtime.engine_messages import (
 
 
 def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
-    """Return what *bus* knows now; before its slaves are known, those that are expected."""
+    """Return the report of *bus*, with the expected slaves until the real ones are known."""
     stats = bus.master.stats()
     bus_slaves = bus.master.slaves.values()
     presets = link_presets(bus_slaves)
@@ -59,7 +59,7 @@ def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
 
 
 def link_presets(slaves: Collection[BusSlave]) -> dict[int, int]:
-    """Return by position which ports led to other slaves when these were found (ETG.1510)."""
+    """Return by position the ports that led to other slaves when these were found (ETG.1510)."""
     presets: dict[int, int] = {}
     for slave in slaves:
         node = slave.found.node
@@ -167,11 +167,11 @@ class BusPublisher:
         self._changes = 0
 
     def reset(self) -> None:
-        """Send all slaves next: the receiver is another one."""
+        """Send all slaves next, because the receiver was replaced."""
         self._sent, self._bus_slaves = (), None
 
     def flush(self) -> None:
-        """Send what has changed, if anything has."""
+        """Send the changes, if there are any."""
         bus, master = self._bus, self._bus.master
         revision = bus.revision
         if revision == self._sent:

@@ -1,7 +1,7 @@
 """Requests of services to the engine, and their replies.
 
-Neither side waits for the other: a request that cannot be taken is refused at once, and a reply
-that services does not read is dropped.
+Neither side waits for the other: a request beyond the limits fails at once, and a reply that
+services does not read is dropped.
 """
 
 from __future__ import annotations
@@ -133,12 +133,12 @@ class BusRequestHandler:
         self._send(UnsolicitedMessage(bus, message))
 
     def publish(self) -> None:
-        """Send what has changed on the buses."""
+        """Send the changes on the buses."""
         for each in self._publishers:
             each.flush()
 
     def serve(self, now_ns: int) -> None:
-        """Take a few of the requests that wait."""
+        """Serve a few of the waiting requests."""
         for _ in range(PER_WAKE_UP):
             try:
                 message = self._sock.recv(_MAX_MESSAGE)
@@ -337,8 +337,8 @@ def _check_datagram(wanted: DatagramRequest) -> DatagramRequest:
         )
     if not (0 <= adp <= 0xFFFF and 0 <= ado <= 0xFFFF and 1 <= size <= MAX_DATA):
         raise BusError(
-            f"datagram to 0x{adp:X}:0x{ado:X} with {size} octets, expected addresses of 16"
-            f" bits and 1 to {MAX_DATA} octets"
+            f"datagram to 0x{adp:X}:0x{ado:X} with {size} bytes, expected addresses of 16"
+            f" bits and 1 to {MAX_DATA} bytes"
         )
     tries = min(max(wanted.tries, AS_SET), MAX_TRIES)
     return wanted if tries == wanted.tries else replace(wanted, tries=tries)
@@ -357,7 +357,7 @@ def bring_one(master: Master, station: int, target: AlState, now_ns: int) -> Tas
     """Bring one slave to *target*, where it is kept.
 
     Raises:
-        BusError: there is no such slave, it is on its way somewhere, or the bus has no process
+        BusError: there is no such slave, a transition of it is under way, or the bus has no process
             data yet.
     """
     if target in _WITH_PROCESS_DATA and master.cycle is None and station in master.slaves:

@@ -155,7 +155,7 @@ class EngineBus:
         port: The wire.
 
     Attributes:
-        is_up: Whether the bus has been brought up, wherever its slaves are now.
+        is_up: Whether the bus has been brought up, in any state of its slaves.
         tasks: Requests that are under way.
     """
 
@@ -217,7 +217,7 @@ class EngineBus:
         return task
 
     def keep(self, task: Task[Any], now_ns: int) -> None:
-        """Send what *task* wants, and hurry until it is done."""
+        """Send the frames of *task*, and run the bus between cycles until it is done."""
         if not task.is_done:
             self.tasks.add(task)
             task.watch(self.tasks.discard)
@@ -241,11 +241,11 @@ class EngineBus:
         self._mapping = mapping
 
     def take_inputs(self) -> None:
-        """Copy what the last exchange brought into the image, and where the slaves are."""
+        """Copy the inputs of the last exchange and the states of the slaves into the image."""
         self._mapping.take_inputs(self.master)
 
     def exchange(self, now_ns: int) -> None:
-        """Copy the outputs out of the image and send them; do what is due."""
+        """Run due timers, copy the outputs out of the image and send them."""
         self._guarded(self._exchange, now_ns)
 
     def next_timeout(self) -> int | None:
@@ -253,16 +253,16 @@ class EngineBus:
         return self._due_ns
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Time passed."""
+        """Run due timers."""
         self._guarded(self._handle_timeout, now_ns)
 
     def receive(self, now_ns: int) -> None:
-        """Take frames that came back, at most a batch, if any are under way."""
+        """Receive frames that came back, at most a batch, if any are under way."""
         if self.master.is_waiting:
             self._guarded(self._receive, now_ns)
 
     def drain(self, now_ns: int) -> None:
-        """Take frames that are there, at most a batch, also unexpected ones."""
+        """Receive waiting frames, at most a batch, also unexpected ones."""
         self._guarded(self._receive, now_ns)
 
     def _guarded(self, action: Callable[[int], None], now_ns: int) -> None:
@@ -280,7 +280,7 @@ class EngineBus:
         self._send(now_ns)
 
     def _end_start(self, task: Task[None], now_ns: int) -> None:
-        """The bus is up, maybe without some slaves that are seen to; or it is not."""
+        """Note the outcome of a start; the bus may be up without some of its slaves."""
         self._starting = None
         self.is_up = task.error is None or self.master.cycle is not None
         self._start_fault = "" if self.is_up else str(task.error)
@@ -289,7 +289,7 @@ class EngineBus:
             self._retry_ns = now_ns + (SILENT_RETRY_NS if is_silent else RETRY_NS)
 
     def _restart_master(self, exc: Exception, now_ns: int) -> None:
-        """The master cannot continue: replace it."""
+        """Replace a master that has failed."""
         self.faults.take_events(self.master)
         self.faults.end_all(now_ns)
         self.master = Master(self._settings)
@@ -323,7 +323,7 @@ class EngineBus:
         self._send(now_ns)
 
     def _take_frames(self, now_ns: int) -> None:
-        """Take a batch of what is there: a frame that waits to be taken is not overdue."""
+        """Receive a batch of frames first: a frame that waits in the socket is not overdue."""
         for _ in range(BATCH):
             frame = self._take_frame()
             if frame is None:

@@ -25,11 +25,15 @@ from eap.runtime.startup import Startup
 
 WINDOW_NS = 20_000_000
 SHARE_NS = 12_000_000
-"""Of each window; then descriptors wait for the next one.  Cycles take frames all the while."""
+"""Of each window; then descriptors wait for the next one, while cycles still drain channels."""
 
 
 class CycleWaiter:
-    """Waits for cycles and serves *handlers* meanwhile; *ticker* is closed by its owner."""
+    """Waits for the next cycle and serves *handlers* meanwhile, for a bounded share of the time.
+
+    Without the bound a sender without pause would starve the cycles.  A kernel that limits
+    real-time processes also stops a process that never sleeps.  The owner closes *ticker*.
+    """
 
     def __init__(self, ticker: Ticker, handlers: Mapping[int, Callable[[int], object]]) -> None:
         self._ticker = ticker
@@ -40,7 +44,7 @@ class CycleWaiter:
         self._open()
 
     def wait(self, deadline_ns: int) -> bool:
-        """Return True once *deadline_ns* has passed, False if something else was done first."""
+        """Return True once *deadline_ns* has passed, False if descriptors were served first."""
         if self._is_open:
             if self._ticker.wait(deadline_ns):
                 return True
@@ -75,14 +79,14 @@ class CycleWaiter:
 
 
 LOOK_PERIOD_NS = 20_000_000
-"""How often the engine looks beyond its cycles, and takes at most one connection from services."""
+"""Interval of work beside the cycles; each time at most one connection of services is taken."""
 
 GARBAGE = 5000
-"""Objects that may be made and not given back before the collector looks at them."""
+"""Objects allocated and not freed before the garbage collector runs."""
 
 
 class StopFlag:
-    """Set by SIGTERM; looked at once a cycle."""
+    """Set by SIGTERM; read once a cycle."""
 
     def __init__(self) -> None:
         self.is_set = False

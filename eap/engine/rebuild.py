@@ -40,7 +40,7 @@ def sends_to(spec: StationSpec, port: str) -> set[str]:
 
 
 def has_tcp(spec: StationSpec, port: PortSpec) -> bool:
-    """Return whether anything goes or comes by TCP at *port*."""
+    """Return whether *port* sends or receives by TCP."""
     return port.tcp or port.interface.scheme == "tcp" or bool(sends_to(spec, port.name))
 
 
@@ -50,7 +50,7 @@ def open_tcp_port(spec: PortSpec, datagrams: FrameChannel | None) -> TcpPort:
 
 
 def follow_station(port: TcpPort, station: Station, name: str) -> None:
-    """Have *port* do what *station* wants of it at its port *name*."""
+    """Configure *port* for the frames of *station* at its port *name*."""
     spec = station.spec
     asks = any(pd.poll_request and pd.port == name for pd in spec.subscriptions)
     port.follow(sends_to(spec, name), [station.handlers[name]] if asks else [])
@@ -67,7 +67,7 @@ class EngineStation:
         self.tcp_ports: dict[str, TcpPort] = {}
 
     def update_tcp(self) -> None:
-        """Have connections only to where the station sends now."""
+        """Keep connections only to the present destinations of the station."""
         for name, port in self.tcp_ports.items():
             follow_station(port, self.station, name)
 
@@ -79,7 +79,7 @@ class EngineStation:
 
 
 class StationReplacement:
-    """What is to take the place of a station; made in a thread, or in a test without one.
+    """Replacement of a station with another specification, built in a thread.
 
     Raises:
         EngineRefusedError: this cannot be done without a new start.
@@ -112,11 +112,11 @@ class StationReplacement:
 
     @property
     def is_current(self) -> bool:
-        """True if it still fits what it is to follow."""
+        """True if it still fits the station that it replaces."""
         return self._images.is_current
 
     def take_over(self, engine: Engine, now_ns: int) -> Station:
-        """Take the place, between two cycles; return who had it.
+        """Replace the station between two cycles; return the replaced one.
 
         Raises:
             EnvironmentalError: the image cannot be put in its place; nothing has changed.
@@ -142,7 +142,7 @@ class StationReplacement:
         return before
 
     def discard(self) -> None:
-        """Give it up."""
+        """Abandon the replacement and remove its image."""
         self._file.discard()
 
 
@@ -156,11 +156,11 @@ def _new_tcp_ports(entry: EngineStation, spec: StationSpec) -> dict[str, TcpPort
 
 
 SWITCH_S = 1e-4
-"""How long a cycle waits for the interpreter, as often as it lets go of it in a system call.
+"""Wait of a cycle for the interpreter, each time that it releases it in a system call.
 
 It wakes as often as that to ask again.  Where it shares a processor with the thread that builds, as
 with ``--cpu``, an interval as short as such a wake-up takes (5 us were tried) leaves that thread no
-time to let go of the interpreter, and both hang.
+time to release the interpreter, and both hang.
 """
 MAX_WAITING = 64
 _LOOK_S = 0.01
@@ -174,8 +174,8 @@ class _Job:
     """One request that is being served.
 
     Attributes:
-        successor: What was built, if anything.
-        error: Why nothing was, or why it did not take over.
+        successor: The replacement that was built, if any.
+        error: Reason that nothing was built, or that the swap failed.
         is_built: Whether the thread has made one of them.
         is_stale: Whether it has to be built again.
     """
@@ -206,7 +206,7 @@ class _Job:
         notify()
 
     def take(self, engine: Engine, now_ns: int) -> None:
-        """Put the successor in its place, if there is one; note that it has to be built again."""
+        """Swap in the replacement, if there is one; note whether it has to be built again."""
         self.is_built = False
         successor = self.successor
         if successor is not None:
@@ -219,7 +219,7 @@ class _Job:
         self._taken.release()
 
     def abandon(self) -> None:
-        """Do not put anything anywhere."""
+        """Abandon the job without a swap."""
         if self.is_built and self.successor is not None:
             self.successor.discard()
         if self._taken.locked():
@@ -246,7 +246,7 @@ class _Job:
 
 
 class StationRebuilder:
-    """Does what services asks for with the *stations* of *engine*, one change after the other."""
+    """Reconfigures the *stations* of *engine* as services requests, one change after the other."""
 
     def __init__(self, engine: Engine, stations: dict[str, EngineStation]) -> None:
         self._engine = engine
@@ -264,11 +264,11 @@ class StationRebuilder:
         return self._thread is not None
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when the thread has got somewhere."""
+        """Return the descriptor that becomes readable when the thread has made progress."""
         return self._done
 
     def close(self) -> None:
-        """Wait for the thread, and give up what it builds."""
+        """Wait for the thread, and abandon its result."""
         if self._job is not None and self._thread is not None:
             while not self._job.is_built and self._thread.is_alive():
                 self._thread.join(_LOOK_S)
@@ -291,7 +291,7 @@ class StationRebuilder:
                 self._begin(self._waiting.popleft())
 
     def collect(self, now_ns: int) -> None:
-        """The thread has got somewhere: swap now, or after the next cycle if that is near."""
+        """Handle progress of the thread: swap now, or after the next cycle if that is near."""
         os.eventfd_read(self._done)
         job, thread = self._job, self._thread
         if job is None or thread is None:
@@ -310,7 +310,7 @@ class StationRebuilder:
             self._begin(self._waiting.popleft())
 
     def swap(self, now_ns: int) -> None:
-        """Put what was built in its place."""
+        """Swap in the replacement that was built."""
         self.is_ready = False
         job = self._job
         assert job is not None  # noqa: S101  is_ready said so

@@ -27,7 +27,7 @@ Instruction: TypeAlias = tuple[int, int, int, int]
 
 
 class Role(IntEnum):
-    """Which process a socket belongs to: its index in a group of two."""
+    """Process that a socket belongs to: its index in a group of two."""
 
     ENGINE = 0
     SERVICES = 1
@@ -104,7 +104,7 @@ def packet_filter(role: Role) -> list[Instruction]:
 
 
 def type1_filter() -> list[Instruction]:
-    """Keep EtherCAT frames of type 1, whoever they are addressed to."""
+    """Keep EtherCAT frames of type 1 to any destination."""
     return [
         (_LOAD_HALF, 0, 0, 12),
         (_EQUAL, 1, 0, ETHERTYPE),
@@ -144,7 +144,7 @@ def arp_filter(addresses: Iterable[IPv4Address]) -> list[Instruction]:
 def attach(
     sock: socket.socket, program: Sequence[Instruction], option: int = SO_ATTACH_FILTER
 ) -> None:
-    """Give *program* to *sock*; raise OSError if the kernel refuses it."""
+    """Attach *program* to *sock*; raise OSError if the kernel rejects it."""
     code = b"".join(struct.pack("@HBBI", *instruction) for instruction in program)
     memory = ctypes.create_string_buffer(code, len(code))
     fprog = struct.pack("@HP", len(program), ctypes.addressof(memory))

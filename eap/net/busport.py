@@ -22,7 +22,7 @@ from eap.net.ipsocket import bind_failure
 from eap.net.packetsocket import join_type1, open_type1
 
 BUS_MULTICAST_MAC = MacAddr.parse("01:01:05:01:00:00")
-"""Where masters send frames of type 1; slaves take them whatever their destination is."""
+"""Destination of the frames of type 1 of masters; slaves process frames to any destination."""
 
 _HEADER = 14
 _PROCESSED = 0x02
@@ -100,7 +100,7 @@ def open_bus_port(interface: InterfaceUri) -> BusPort:
 
 
 def open_bus_socket(interface: InterfaceUri) -> socket.socket:
-    """Open ``ethernet://IFACE``, or ``udp://ADDRESS[:PORT]`` of whoever passes frames to a bus.
+    """Open ``ethernet://IFACE``, or ``udp://ADDRESS[:PORT]`` of a host that forwards to a bus.
 
     Raises:
         EnvironmentalError: it cannot be opened, and why; or it is neither of the two.

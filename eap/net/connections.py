@@ -62,7 +62,7 @@ class Connection(Protocol):
 
     @property
     def host(self) -> str:
-        """Address of the peer, or whatever else shares are counted by; OWN_HOST for this host."""
+        """Address of the peer, or another key for counting shares; OWN_HOST for this host."""
 
     @property
     def activity(self) -> Activity:
@@ -77,7 +77,7 @@ class Connection(Protocol):
         """Time since which a frame is unfinished or answers are not taken, None if neither."""
 
     def close(self, why: CloseReason) -> None:
-        """Close it at once, in whatever state; called by the driver, never by the policy."""
+        """Close it at once, in any state; called by the driver, never by the policy."""
 
 
 class ListenerLimits(NamedTuple):
@@ -102,7 +102,7 @@ class ListenerStats(NamedTuple):
     overdue: int
     """Connections closed because a frame stayed unfinished or answers were not taken."""
     crowded_at_ns: int | None = None
-    """Time of the last one that was refused or evicted."""
+    """Time of the last connection that was refused or evicted."""
 
 
 class AcceptDecision(NamedTuple):
@@ -174,7 +174,7 @@ class ConnectionTable:
     def admit(
         self, listener: Listener, connection: Connection, now_ns: int, *, spare_descriptors: int
     ) -> AcceptDecision:
-        """Give *connection* a place at *listener*, or say why it gets none.
+        """Admit *connection* to *listener*, or return the reason that it gets no place.
 
         Args:
             listener: Where it was accepted.

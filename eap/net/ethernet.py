@@ -75,7 +75,7 @@ class EthernetInterface:
     ) -> EthernetPort:
         """Return a new port that takes and sends frames of *vlan_id*; 0 is untagged.
 
-        It hears the interface's own address, broadcasts, the default multicast address of EAP and
+        It receives frames to the interface's address, broadcasts, the EAP multicast address and
         the multicast MAC addresses of *join*.
         """
         groups = {EAP_MULTICAST_MAC, *(MacAddr.parse(text) for text in join)}
@@ -137,7 +137,7 @@ class EthernetInterface:
         return source
 
     def is_group_frame(self, data: memoryview) -> bool:
-        """Return whether the frame in *data* was addressed to a group or to all."""
+        """Return whether the frame in *data* is a multicast or a broadcast."""
         position = self._batch.position(data)
         return position is not None and bool(self._batch.octets[position * BUFFER_SIZE] & 1)
 
@@ -181,7 +181,7 @@ class EthernetInterface:
         return taken
 
     def _handlers(self, head: int, tag: int) -> Sequence[FrameHandler]:
-        """Return who takes a frame of this first word and VLAN tag; count one of no port's VLAN."""
+        """Return the handlers of a frame with this first word and VLAN tag; count unknown VLANs."""
         by_address = self._routes.get(tag & _VID)
         if by_address is None:
             self.discarded["other_vlan"] += 1
@@ -197,7 +197,7 @@ class EthernetInterface:
 
 
 class EthernetPort:
-    """One station's port on a shared interface: a Channel of its own VLAN."""
+    """One station's port on a shared interface: a channel of its own VLAN."""
 
     minimum_size = MINIMUM_SIZE
 
@@ -217,7 +217,7 @@ class EthernetPort:
         return self.interface.drain()
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
-        """Send *frames* to the wire and to this host's other ports; return those refused."""
+        """Send *frames* to the wire and to this host's other ports; return those not sent."""
         failed = self._send(frames)
         if self.interface.has_neighbours:
             sent = [frame for frame in frames if frame not in failed] if failed else frames

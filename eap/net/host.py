@@ -133,7 +133,7 @@ class CsvReplay:
         self._period_ns = period_ns
 
     def value(self, elapsed_ns: int) -> str:
-        """Return the value of the row whose turn it is *elapsed_ns* after the start."""
+        """Return the value of the row at *elapsed_ns* after the start."""
         return self._values[elapsed_ns // self._period_ns % len(self._values)]
 
 
@@ -168,7 +168,7 @@ def read_password(file: Path) -> bytes:
         EnvironmentalError: it cannot be read, or is no regular file.
     """
     try:
-        # A pipe would keep whoever opens it waiting for somebody who writes.
+        # Opening a pipe would block until another process opens it for writing.
         with os.fdopen(os.open(file, os.O_RDONLY | os.O_NONBLOCK), "rb") as opened:
             if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
                 raise EnvironmentalError(f"{file}: a password is kept in a regular file")
@@ -178,7 +178,7 @@ def read_password(file: Path) -> bytes:
 
 
 def read_password_text(file: Path) -> str:
-    """Return the same as text; raises EnvironmentalError also if it is not UTF-8."""
+    """Return the first line of *file* as text; raise EnvironmentalError also if it is not UTF-8."""
     try:
         return read_password(file).decode()
     except UnicodeDecodeError:

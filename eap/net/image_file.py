@@ -83,10 +83,10 @@ class ImageFile(Closeable):
         return bool(self.image.words[StationWord.RETIRED])
 
     def move_to(self, path: Path) -> None:
-        """Be the file at *path*; who opens it waits until :meth:`release`.
+        """Rename the file to *path*; programs that open it wait until :meth:`release`.
 
         Raises:
-            EnvironmentalError: that is not possible; what was there still is.
+            EnvironmentalError: that is not possible; the old file is still there.
         """
         try:
             self.path = self.path.rename(path)
@@ -101,11 +101,11 @@ class ImageFile(Closeable):
         words[StationWord.FUTEX] = words[StationWord.FUTEX] + 1 & 0xFFFFFFFF
 
     def release(self) -> None:
-        """Let programs use a file that was made by :func:`prepare_image`."""
+        """Allow programs to use a file that was made by :func:`prepare_image`."""
         self.image.words[StationWord.RETIRED] = 0
 
     def discard(self) -> None:
-        """Remove a file that has taken nobody's place, and close it."""
+        """Remove a file that has replaced no other, and close it."""
         self.path.unlink(missing_ok=True)
         self.close()
 
@@ -118,10 +118,10 @@ class ImageFile(Closeable):
             return True
 
     def acquire_writer(self, writer: Writer) -> None:
-        """Become the one who writes the region of *writer*, until release or :meth:`close`.
+        """Acquire the right to write the region of *writer*, until release or :meth:`close`.
 
         Raises:
-            WriterConflictError: someone else is it already, in this process or another.
+            WriterConflictError: another attachment holds it, in this process or another.
         """
         # A lock of the open file, not of the process: it ends with this object or its process,
         # however that ends, and a second attachment of one program is a second writer too.
@@ -214,7 +214,7 @@ def _replace(existing: ImageFile | None, fresh: ImageFile, path: Path) -> ImageF
 
 
 def prepare_image(path: Path, layout: ImageLayout, generation: int) -> ImageFile:
-    """Make a fresh image beside the file at *path*, whose place it is to take; it is retired yet.
+    """Make a fresh image beside the file at *path*, which it will replace; it is retired at first.
 
     Raises:
         EnvironmentalError: the folder cannot be written.
@@ -272,7 +272,7 @@ def _format(view: memoryview, layout: ImageLayout, generation: int) -> None:
 
 
 def _pause() -> None:
-    """Let a writer that was interrupted in the middle continue."""
+    """Yield the processor to a writer that was interrupted in the middle."""
     _libc.usleep(100)
 
 
@@ -318,10 +318,10 @@ class StationImage:
         return self._file
 
     def acquire_writer(self, writer: Writer) -> None:
-        """Become the one who writes the region of *writer*, in newer images too.
+        """Acquire the right to write the region of *writer*, in newer images too.
 
         Raises:
-            WriterConflictError: someone else is it already.
+            WriterConflictError: another attachment holds it.
             ImageError: the image cannot be opened.
         """
         self.file.acquire_writer(writer)
@@ -351,10 +351,10 @@ class StationImage:
                 return
 
     def write_once(self, writer: Writer, values: Mapping[str, Any]) -> None:
-        """Write *values* at once, as the region's writer for just as long as that takes.
+        """Write *values* at once, holding the right to write only for that time.
 
         Raises:
-            WriterConflictError: someone else is it.
+            WriterConflictError: another attachment holds it.
             ValueError, ImageError: as :meth:`write` does.
         """
         self.acquire_writer(writer)
@@ -364,7 +364,7 @@ class StationImage:
             self.release_writer(writer)
 
     def reopen_if_replaced(self) -> bool:
-        """Look for a newer image where none was announced; return whether there is one."""
+        """Reopen the path if another file has replaced the image; return whether one has."""
         if not self._file.is_replaced:
             return False
         self._move()

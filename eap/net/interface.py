@@ -1,4 +1,4 @@
-"""What this machine's network interfaces are and do, asked of the kernel."""
+"""Network interfaces of this machine: addresses, flags and link state, from the kernel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NAME_LIMIT = 15
 
 @cache
 def _kernel() -> socket.socket:
-    """Return the socket for all questions; kept, so that none needs a free descriptor."""
+    """Return the socket for all queries; kept, so that no query needs a free descriptor."""
     return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
 
@@ -36,7 +36,7 @@ def interface_of(address: str) -> str:
 
 
 def _label_of(address: str) -> str:
-    """Return by what name the kernel lists *address*: ``eth0``, or perhaps ``eth0:1``."""
+    """Return the label under which the kernel lists *address*: ``eth0``, or perhaps ``eth0:1``."""
     for label, own in own_addresses():
         if own == address:
             return label
@@ -102,7 +102,7 @@ def link_is_up(name: str) -> bool:
     """Return whether interface *name* exists, is switched on and has a live cable.
 
     Raises:
-        OSError: the first question of this process, and there is no descriptor for it.
+        OSError: no descriptor is left for the first query of this process.
     """
     flags = _flags(name)
     return flags is not None and flags & (_IFF_UP | _IFF_RUNNING) == _IFF_UP | _IFF_RUNNING

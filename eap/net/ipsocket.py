@@ -39,7 +39,7 @@ def open_udp_pair(address: str, port: int = EAP_PORT) -> tuple[socket.socket, so
         The engine's socket, which also sends, and that of services.
 
     Raises:
-        EnvironmentalError: the port is taken, and by whom, or the address is not this machine's.
+        EnvironmentalError: another process holds the port, or the address is not this machine's.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
         # Without this a second appliance would join the group and take half of the frames.
@@ -69,7 +69,7 @@ def open_tcp_listener(address: str, port: int = EAP_PORT) -> socket.socket:
     """Return a socket that listens on *address*.
 
     Raises:
-        EnvironmentalError: the port is taken, and by whom, or the address is not this machine's.
+        EnvironmentalError: another process holds the port, or the address is not this machine's.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
@@ -86,7 +86,7 @@ def open_udp_receiver(address: str, port: int) -> socket.socket:
     """Return a socket that is bound to *address*, for one process alone.
 
     Raises:
-        EnvironmentalError: the port is taken, and by whom, or the address is not this machine's.
+        EnvironmentalError: another process holds the port, or the address is not this machine's.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -199,7 +199,7 @@ _OWN_COMMANDS = ("eapctl", "-m eap")
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """A socket that stands in the way, and its process where that is visible."""
+    """A socket that occupies a port, and its process where that is visible."""
 
     local: str
     remote: str
@@ -215,7 +215,7 @@ class Holder:
 
 
 def find_holders(protocol: str, address: str, port: int, *, proc: Path = _PROC) -> list[Holder]:
-    """Return the sockets of *protocol* (``UDP`` or ``TCP``) that keep *address* from being bound.
+    """Return the sockets of *protocol* (``UDP`` or ``TCP``) that prevent binding *address*.
 
     Raises nothing: what this user may not see is left out.
     """
@@ -239,7 +239,7 @@ def find_holders(protocol: str, address: str, port: int, *, proc: Path = _PROC) 
 
 
 def describe_holder(protocol: str, address: str, port: int, *, proc: Path = _PROC) -> str:
-    """Return one line for a person: who has the port, and what to do."""
+    """Return one line that names the holder of the port, and the remedy."""
     start = f"{protocol} {address}:{port} is in use"
     holders = find_holders(protocol, address, port, proc=proc)
     if not holders:
@@ -286,7 +286,7 @@ def _range(proc: Path) -> tuple[int, int]:
 
 
 def _is_ephemeral(port: int, proc: Path) -> bool:
-    """Return whether the kernel may give *port* to any client that asks for none in particular."""
+    """Return whether *port* is in the range of ephemeral ports of clients."""
     try:
         low, high = _range(proc)
         reserved = (proc / "sys/net/ipv4/ip_local_reserved_ports").read_text().strip()
@@ -307,7 +307,7 @@ def open_ams_listener(address: str) -> socket.socket:
     """Return a socket that listens on *address* for AMS/TCP.
 
     Raises:
-        EnvironmentalError: the port is taken, and by whom, or the address is not this machine's.
+        EnvironmentalError: another process holds the port, or the address is not this machine's.
     """
     try:
         return open_tcp_listener(address, AMS_TCP_PORT)

@@ -1,7 +1,7 @@
 """A line in memory that joins all ports of one name: ``loop://NAME``.
 
-It behaves like a hub with faults to order and knows no clock but the one it is told, so that a
-plant, or a test of one, runs the same way every time.
+It behaves like a hub with configurable faults, and takes the time as an argument, so that a plant,
+or a test of one, runs the same way every time.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ DRAIN_LIMIT = 256
 HOLD_NS = 100_000_000
 """Longest time that a frame to be reordered waits for the one that overtakes it."""
 _ADDRESS = "port "
-"""What the addresses of ports begin with; only answers have one of them as destination."""
+"""Prefix of the addresses of ports; only answers have such a destination."""
 _numbers = itertools.count(1)
 
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What happens to the frames that one port sends; shares are between 0 and 1."""
+    """Faults of the frames that one port sends; shares are between 0 and 1."""
 
     delay_ns: int = 0
     loss: float = 0.0
@@ -38,7 +38,7 @@ class Faults:
         """Read ``delay_us``, ``loss``, ``duplicate``, ``reorder`` and ``seed``.
 
         Raises:
-            ConfigError: an option is unknown or its value is not what it should be.
+            ConfigError: an option is unknown, or its value is invalid.
         """
         values: dict[str, float] = {}
         for name, text in uri.options:
@@ -78,7 +78,7 @@ class _FrameInFlight:
 class LoopbackChannel:
     """One port on a line; what it sends reaches every other port of the line.
 
-    Only an answer reaches no port but the one that asked.
+    An answer reaches only the port that sent the request.
     """
 
     minimum_size = 0
@@ -97,7 +97,7 @@ class LoopbackChannel:
         ports.append(self)
 
     def drain(self, now_ns: int) -> int:
-        """Hand over what has arrived by *now_ns*, in the order of arrival."""
+        """Hand over the frames that have arrived by *now_ns*, in the order of arrival."""
         if not self._queue:
             return 0
         due = [frame for frame in self._queue if frame.due_ns <= now_ns]
@@ -117,7 +117,7 @@ class LoopbackChannel:
         return self._sender
 
     def source_of(self, data: memoryview) -> bytes:
-        """Nothing: a line in memory has no addresses."""
+        """Return nothing: a line in memory has no addresses."""
         del data
         return b""
 
@@ -131,7 +131,7 @@ class LoopbackChannel:
         return ()
 
     def link_header(self, destination: str) -> bytes:
-        """Nothing: the line has no addresses, every port hears *destination*."""
+        """Return nothing: every port of the line receives frames to any *destination*."""
         del destination
         return b""
 
@@ -166,7 +166,7 @@ class LoopbackLines:
         self._lines: dict[str, list[LoopbackChannel]] = {}
 
     def open(self, uri: InterfaceUri) -> LoopbackChannel:
-        """Return a new port on the line that *uri* names; its options fault what it sends.
+        """Return a new port on the line that *uri* names; its options are the faults of its frames.
 
         Raises:
             ConfigError: the options of *uri* are wrong.

@@ -1,8 +1,8 @@
 """Many messages in one system call: ``recvmmsg`` and ``sendmmsg`` through ctypes.
 
-This is the hottest code of the drivers.  Whatever can be computed before the call is: the arrays
-the kernel reads are built once and their addresses are bound into the call, because ctypes takes
-longer to convert five arguments than the kernel takes to find an empty queue.
+This is the hottest code of the drivers, so everything possible is computed before the call.  The
+arrays that the kernel reads are built once and their addresses are bound into the call, because
+ctypes takes longer to convert five arguments than the kernel takes to find an empty queue.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ICMP_ERRNOS = frozenset(
         errno.EACCES,
     }
 )
-"""What a call fails with because of an earlier datagram (and some of them for its own sake)."""
+"""Errors of a call caused by an earlier datagram; some also have a cause of their own."""
 
 SO_TIMESTAMPNS = 35
 """Missing in the socket module; the same number on every Linux with 64-bit time."""
@@ -67,7 +67,7 @@ def count_error(errors: dict[str, int], number: int | None) -> None:
 def note_receive_error(errors: dict[str, int]) -> bool:
     """Count why the last receive call returned -1, unless there was just nothing to receive.
 
-    Return True if it was about something sent before: then what is to be received still waits.
+    Return True if the error belongs to an earlier datagram: then messages may still be waiting.
     """
     number = ctypes.get_errno()
     if number in ICMP_ERRNOS:
@@ -157,12 +157,12 @@ class ReceiveBatch:
         return self._positions.get(id(view))
 
     def sender(self, view: memoryview) -> tuple[int, bytes]:
-        """Return port and IPv4 address of who sent *view*, as long as the batch holds it."""
+        """Return port and IPv4 address of the sender of *view*, as long as the batch holds it."""
         port, address = _SENDER(self._senders, self._positions[id(view)] * _SOCKADDR_SIZE)
         return port, address
 
     def source_reader(self) -> Callable[[memoryview], bytes]:
-        """Return the function that tells which IPv4 address a view of the batch came from.
+        """Return the function that gives the source IPv4 address of a view of the batch.
 
         It is called for each frame; half its time would be attributes of this object.
         """
@@ -179,7 +179,7 @@ class ReceiveBatch:
         """Return the monotonic time and see how far the wall clock, which stamps, is from it.
 
         The distance changes only when the wall clock is set.  An interruption between the two
-        readings makes it look smaller: what is smaller is believed when it is measured again.
+        readings makes it look smaller: a smaller distance is accepted only if measured again.
         """
         now_ns = monotonic_ns()
         offset = now_ns - time_ns()
@@ -233,7 +233,7 @@ class SendBatch:
         self._batches: dict[tuple[OutFrame, ...], tuple[Callable[[], int], bytearray]] = {}
 
     def send(self, frames: Sequence[OutFrame]) -> Sequence[OutFrame]:
-        """Send *frames* and return those that the kernel refused; :attr:`errors` says why."""
+        """Send *frames*; return those that the kernel rejected, counted in :attr:`errors`."""
         if len(frames) == 1:
             # For one frame the socket's own method is faster than anything through ctypes.
             frame = frames[0]
@@ -263,7 +263,7 @@ class SendBatch:
     def _send_rest(
         self, frames: tuple[OutFrame, ...], headers: bytearray, sent: int
     ) -> list[OutFrame]:
-        """Continue behind what *sent* says went out; each frame that fails is left out."""
+        """Continue behind the first *sent* frames; each frame that fails is skipped."""
         failed: list[OutFrame] = []
         done = 0
         tried_again = -1
@@ -315,7 +315,7 @@ class SendBatch:
     def _resolve(self, destination: str) -> tuple[bytearray, tuple[str, int]]:
         assert self._address_of is not None  # noqa: S101  the callers asked
         if len(self._addresses) >= _CACHED_ADDRESSES:
-            self._addresses.clear()  # who asks for data can make up any number of them
+            self._addresses.clear()  # requesters may forge any number of them
         packed, address = self._address_of(destination)
         known = self._addresses[destination] = bytearray(packed), address
         return known

@@ -1,8 +1,8 @@
 """Connection to an MQTT broker, made again whenever it is lost (MQTT 5, else 3.1.1).
 
 aiomqtt is an extra of this project and imported only where a plant has a broker.  MQTT 5 comes
-first because only there the broker can be told how long a message may be; to a broker of before,
-every publisher sends as much as the broker itself allows.
+first because only there a client can limit the length of messages; with an older broker, only the
+limit of the broker itself applies.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from eap.net.mqttclient import MqttClient
 
 KEEPALIVE_S = 10
-"""After how much silence the broker is asked whether it is there; it waits half as long again."""
+"""Silence after which the client pings the broker; the broker waits half as long again."""
 MAX_WAITING = 1024
 """Messages that wait to be sent."""
 MAX_WAITING_OCTETS = 8 << 20
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 15.0
 """Between two attempts to connect: the longest that the first wait may be, and the limit."""
 _STABLE_S = 10.0
-"""How long a connection has to last to be a good one."""
+"""Duration from which a connection counts as stable."""
 _DISCONNECT_S = 0.3
 _PROBE_S = 3.0
 _UNCONFIRMED = 16
@@ -43,26 +43,26 @@ logger = logging.getLogger(__name__)
 
 
 class Handlers(NamedTuple):
-    """Who is told what; all of them return at once."""
+    """Callbacks of a link; all of them return at once."""
 
     connected: Callable[[], None]
     """Messages can be sent."""
     lost: Callable[[str], None]
-    """The connection is gone; why, for people."""
+    """The connection is lost; the argument is the reason as text."""
     message: Callable[[str, bytes, bool], None]
     """Topic, payload, and whether the broker had kept it."""
     overrun: Callable[[], None]
-    """A message found no room."""
+    """A message was dropped because the inbox is full."""
 
 
 class MqttLink(ReconnectingLink):
     """One broker.
 
     Args:
-        spec: Where it is and who we are.
+        spec: Its address, and the login of this client.
         client_id: At the broker.
-        will: What the broker publishes when this end is gone; at an orderly end it is published.
-        handlers: Who is told.
+        will: Published by the broker when this end is lost, and by this end when it closes.
+        handlers: Callbacks.
 
     Raises:
         EnvironmentalError: aiomqtt is not installed.
@@ -86,7 +86,7 @@ class MqttLink(ReconnectingLink):
         self._connections = self._connections_before = 0
 
     def send(self, message: Outgoing) -> str | None:
-        """Send *message* soon and in its turn; return why not, if not."""
+        """Queue *message*; return the reason if it cannot be sent, else None."""
         if not self._is_connected:
             return f"no connection to {self._name}: {self.reason or 'not yet'}"
         if self._outbox.qsize() >= MAX_WAITING or self._octets > MAX_WAITING_OCTETS:
@@ -139,8 +139,8 @@ class MqttLink(ReconnectingLink):
     async def _probe(self) -> None:
         """Raise OSError if nothing listens at the broker's address.
 
-        This can be cancelled; paho waits in a thread, which cannot, and holds the end of the
-        process up.
+        This can be cancelled.  paho connects in a thread, which cannot, and which would delay the
+        end of the process.
         """
         async with asyncio.timeout(_PROBE_S):
             _, writer = await asyncio.open_connection(self._spec.host, self._spec.port)

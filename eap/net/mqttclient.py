@@ -1,4 +1,4 @@
-"""What this project needs of aiomqtt, and paho underneath, besides what they have.
+"""MQTT client: aiomqtt and paho with bounded queues, bounded waits and readable errors.
 
 This is the only module that imports them, and it is imported late.
 """
@@ -23,11 +23,11 @@ from eap.ams.spec import TlsSpec
 __all__ = ["MqttClient", "MqttError", "describe", "is_too_new", "make_client", "tls_context"]
 
 MAX_MESSAGE = 1 << 20
-"""Bytes of a message; the broker is asked to keep longer ones."""
+"""Maximum size of a message in bytes; the broker is told not to send longer ones."""
 MAX_INBOX, MAX_INBOX_OCTETS = 1024, 8 << 20
 """Messages that were received and wait for their turn."""
 CONNECT_S, ANSWER_S = 3.0, 5.0
-"""How long a connection may take to be made, and the broker to answer."""
+"""Time-outs of a connection attempt, and of a reply of the broker."""
 _UNCONFIRMED = 64
 _REFUSED = 0x80
 """And above: results of subscriptions that are not granted."""
@@ -40,7 +40,7 @@ _UNSPECIFIED = 0x80
 
 
 class Inbox(asyncio.Queue[Message]):
-    """Messages that wait; what has no room is thrown away.
+    """Received messages that wait; a message that does not fit is dropped.
 
     Attributes:
         overrun: Called for each that is.
@@ -51,7 +51,7 @@ class Inbox(asyncio.Queue[Message]):
     octets = 0
 
     def full(self) -> bool:
-        """Return whether there is no room, by number or by bytes."""
+        """Return whether the inbox is full, by number or by bytes."""
         return super().full() or self.octets >= MAX_INBOX_OCTETS
 
     def put_nowait(self, item: Message) -> None:
@@ -72,7 +72,7 @@ class Inbox(asyncio.Queue[Message]):
 
 
 class ClientErrorLog(logging.Handler):
-    """Keeps the latest error of paho: often the only place that says why a connection broke."""
+    """Keeps the latest error of paho: often the only source of the reason a connection broke."""
 
     latest = ""
 
@@ -88,12 +88,12 @@ class MqttClient(aiomqtt.Client):
 
     @property
     def inbox(self) -> Inbox:
-        """What was received and waits."""
+        """Received messages that wait."""
         assert isinstance(self._queue, Inbox)  # noqa: S101  made below
         return self._queue
 
     async def subscribe_all(self, filters: Iterable[str]) -> list[str]:
-        """Subscribe with QoS 2; return what is refused."""
+        """Subscribe with QoS 2; return the filters that the broker rejects."""
         wanted = list(filters)
         codes: Iterable[int | ReasonCode] = await self.subscribe([(each, 2) for each in wanted])
         numbers = (each.value if isinstance(each, ReasonCode) else each for each in codes)
@@ -104,7 +104,7 @@ class MqttClient(aiomqtt.Client):
         self._client.connect_timeout = timeout_s
 
     def close(self) -> None:
-        """Close what is still open, also after a connection that was given up half-way."""
+        """Close the connection, also one that was abandoned during its set-up."""
         self._client.disconnect()
 
 
@@ -125,10 +125,10 @@ class _Socket(ssl.SSLSocket):
 
 
 def tls_context(spec: TlsSpec | None) -> ssl.SSLContext | None:
-    """Return how to connect; None for a connection that anybody can read.
+    """Return the TLS context of a connection, None for one without encryption.
 
     Raises:
-        OSError: a file is missing or is not what it should be.
+        OSError: a file is missing or invalid.
     """
     if spec is None:
         return None
@@ -153,7 +153,7 @@ def make_client(
         properties.MaximumPacketSize = MAX_MESSAGE
         properties.ReceiveMaximum = _UNCONFIRMED
     user, password = login or (None, None)
-    # Of this client alone, and heard by nobody else.
+    # Of this client alone, without other handlers.
     logger = logging.Logger(__name__, logging.ERROR)  # noqa: LOG001
     error_log = ClientErrorLog()
     logger.addHandler(error_log)
@@ -186,7 +186,7 @@ def is_too_new(error: MqttError) -> bool:
 
 
 def describe(error: MqttError, client: MqttClient, user: str) -> str:
-    """Return in words why there is no connection."""
+    """Return the reason that there is no connection, as text."""
     if isinstance(error, MqttConnectError) and _code(error) in _LOGIN:
         if not user:
             return "it wants to know who connects: give 'user' and 'password_file', or 'tls'"

@@ -42,7 +42,7 @@ _ANSWER_SIZE = 8192
 
 
 class NeighbourState(IntEnum):
-    """How the kernel stands with a neighbour (RFC 4861 7.3.2, for IPv4 too)."""
+    """State of an entry of the neighbour table (RFC 4861 7.3.2, for IPv4 too)."""
 
     NONE = 0x00
     INCOMPLETE = 0x01
@@ -56,7 +56,7 @@ class NeighbourState(IntEnum):
 
     @property
     def evidence(self) -> ProbeResult:
-        """What it says of who is there; an entry that nobody ever checks says nothing."""
+        """Presence that the state shows; an entry that the kernel never checks shows none."""
         return _EVIDENCE.get(self, ProbeResult.PENDING)
 
 
@@ -77,7 +77,7 @@ class NeighbourEntry(NamedTuple):
 
 
 class RouteKind(Enum):
-    """Where datagrams to an address go."""
+    """Kind of route of datagrams to an address."""
 
     LOCAL = auto()
     """To this machine itself."""
@@ -90,7 +90,7 @@ class RouteKind(Enum):
 
 
 class KernelRoute(NamedTuple):
-    """The way to an address; *neighbour* is the next on it."""
+    """Route to an address; *neighbour* is the next hop."""
 
     kind: RouteKind
     interface: int = 0
@@ -98,7 +98,7 @@ class KernelRoute(NamedTuple):
 
 
 class NeighbourTable:
-    """One rtnetlink socket; all calls are answered at once, without waiting for anybody.
+    """One rtnetlink socket; the kernel answers all queries at once.
 
     Raises:
         EnvironmentalError: the socket cannot be opened.
@@ -118,8 +118,8 @@ class NeighbourTable:
     def look(self, address: str, source: str = "") -> ProbeResult:
         """Return whether the kernel lately reached the host that has *address*.
 
-        That can be told of hosts on the same network.  Addresses of this machine itself have no
-        neighbour, and behind a gateway nothing can be told but that the gateway is gone.
+        That is known of hosts on the same network.  Addresses of this machine itself have no
+        neighbour, and of a host behind a gateway it is only known when the gateway is gone.
 
         Args:
             address: IPv4 address of one host.
@@ -135,7 +135,7 @@ class NeighbourTable:
         return evidence
 
     def route(self, address: str, source: str = "") -> KernelRoute:
-        """Return the way that a datagram from *source* to *address* takes."""
+        """Return the route that a datagram from *source* to *address* takes."""
         attributes = _attribute(_RTA_DST, socket.inet_aton(address))
         if source:
             attributes += _attribute(_RTA_SRC, socket.inet_aton(source))
@@ -178,7 +178,7 @@ class NeighbourTable:
         self._sock.close()
 
     def _ask(self, question: int, answer: int, body: bytes) -> bytes | None:
-        """Return the body of the kernel's answer, None if it refuses or has none."""
+        """Return the body of the kernel's reply, None for an error or an empty reply."""
         self._sequence = self._sequence + 1 & 0xFFFFFFFF
         size = _HEADER.size + len(body)
         head = _HEADER.pack(size, question, _NLM_F_REQUEST, self._sequence, 0)
@@ -221,13 +221,13 @@ class ArpSighting(NamedTuple):
 
     address: IPv4Address
     mac: MacAddr
-    """Who sent it."""
+    """Its sender."""
     is_claim: bool
     """False: it has the address.  True: it checks whether it may take it (RFC 5227 2.1.1)."""
 
 
 class ArpProber:
-    """Asks and listens in one VLAN of an interface; 0 is untagged.  It never waits.
+    """Sends and receives ARP in one VLAN of an interface; 0 is untagged.  It never waits.
 
     Attributes:
         errors: Failed system calls by errno name, and messages that made no sense.
@@ -246,7 +246,7 @@ class ArpProber:
         self._watched: frozenset[IPv4Address] = frozenset()
 
     def watch(self, addresses: Iterable[IPv4Address]) -> None:
-        """Hear of *addresses* from now on, and of no others.
+        """Receive ARP messages about *addresses* from now on, and about no others.
 
         Raises:
             EnvironmentalError: they are more than a filter or the kernel has room for.
@@ -262,10 +262,10 @@ class ArpProber:
         self._watched = wanted
 
     def probe(self, address: IPv4Address) -> bool:
-        """Ask who has *address*; return whether an answer can be expected at all.
+        """Send an ARP probe for *address*; return whether a reply can be expected.
 
-        It cannot for addresses of this machine, which hears no question of its own, on the loopback
-        interface, where nobody answers ARP, and where the kernel did not send.
+        It cannot for addresses of this machine, which does not receive its own probes, on the
+        loopback interface, where ARP is not answered, and where the kernel did not send.
         """
         if self._kind == ARPHRD_LOOPBACK or _is_own(address):
             return False
@@ -278,7 +278,7 @@ class ArpProber:
         return True
 
     def drain(self) -> list[ArpSighting]:
-        """Return what was heard of the watched addresses, from at most 256 frames."""
+        """Return the ARP messages about the watched addresses, from at most 256 frames."""
         found: list[ArpSighting] = []
         for _ in range(_FRAMES_PER_DRAIN):
             try:

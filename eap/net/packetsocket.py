@@ -32,8 +32,8 @@ _ARPHRD_ETHER = 1
 def open_packet_pair(interface: str) -> tuple[socket.socket, socket.socket]:
     """Open *interface* for EtherType 0x88A4 and let the kernel sort what arrives by frame type.
 
-    All protocols are asked for and filtered, because only then does the kernel say from which VLAN
-    a frame came.
+    The socket is bound to all protocols and filtered, because only then the kernel reports the VLAN
+    of a frame.
 
     Returns:
         The engine's socket and that of services.
@@ -55,7 +55,7 @@ def open_type1(interface: str, *, group: bytes = b"") -> socket.socket:
 
     Args:
         interface: Its name.
-        group: The multicast address to hear; without one whatever passes is heard.
+        group: The multicast address to join; without one the interface is promiscuous.
 
     Raises:
         EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
@@ -72,7 +72,7 @@ def open_type1(interface: str, *, group: bytes = b"") -> socket.socket:
 
 
 def join_type1(sock: socket.socket, interface: str, group: bytes) -> None:
-    """Bind a socket of :func:`open_type1`, also again to an interface that was made again.
+    """Bind a socket of :func:`open_type1`, also again to an interface that was recreated.
 
     Raises:
         OSError: the interface is not there.
@@ -86,7 +86,7 @@ def join_type1(sock: socket.socket, interface: str, group: bytes) -> None:
 
 
 def open_arp(interface: str) -> socket.socket:
-    """Open *interface* for ARP: nothing is heard until a prober watches addresses.
+    """Open *interface* for ARP: nothing is received until a prober watches addresses.
 
     Raises:
         EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.

@@ -36,7 +36,7 @@ def prepare(priority: int, cpus: Iterable[int] = ()) -> Report:
     0 leaves the scheduler as it is.
 
     Returns:
-        What was achieved, or in its place the reason why not.
+        What the kernel granted, or in its place the reason that it did not.
     """
     report: Report = {
         "scheduler": _set_scheduler(priority),
@@ -52,7 +52,7 @@ def prepare(priority: int, cpus: Iterable[int] = ()) -> Report:
 
 
 def raise_process_priority(nice: int = -10) -> None:
-    """Give this process the share of a busy machine that *nice* (-20 to 19) stands for.
+    """Set the priority of this process to *nice* (-20 to 19), its share of a busy machine.
 
     -10 is ten times the share of an ordinary process.  Less than 0 takes CAP_SYS_NICE; without it
     the process keeps the share that it has.
@@ -64,8 +64,8 @@ def raise_process_priority(nice: int = -10) -> None:
 def die_with_parent(parent_pid: int, number: signal.Signals = signal.SIGKILL) -> None:
     """Have the kernel send *number* to this process when its parent *parent_pid* ends.
 
-    *parent_pid* is what the parent knows as its own pid: if it has already gone, somebody else is
-    our parent now, and the signal is sent at once.
+    *parent_pid* is the pid that the parent gave: if the parent has already ended, this process has
+    another parent now, and the signal is sent at once.
     """
     _library["prctl"](_PR_SET_PDEATHSIG, int(number), 0, 0, 0)
     if os.getppid() != parent_pid:
@@ -73,7 +73,7 @@ def die_with_parent(parent_pid: int, number: signal.Signals = signal.SIGKILL) ->
 
 
 def lower_thread_priority() -> None:
-    """Let the calling thread give way to all others of its process, and to nobody else.
+    """Lower the priority of the calling thread below that of the other threads of its process.
 
     With SCHED_FIFO it goes one step down, for a thread of the same priority would not be
     interrupted; other processes stay behind it, so that it does not sleep with what others need.

@@ -1,4 +1,4 @@
-"""Reconnecting links: connections that are made again, after growing pauses, when they end."""
+"""Reconnecting links: connections that are re-established, after growing pauses, when they end."""
 
 from __future__ import annotations
 
@@ -84,10 +84,10 @@ class ReconnectingLink(ABC):
 
     @abstractmethod
     def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
-        """Tell the users of the link; return whether to connect again."""
+        """Notify the users of the link; return whether to connect again."""
 
     def _is_wanted(self) -> bool:
-        """Say after a pause whether to connect again."""
+        """Return whether to connect again after a pause."""
         return True
 
     def _is_new_reason(self, reason: str) -> bool:
@@ -106,11 +106,11 @@ async def connect_tcp(
         port: Its port.
         source: Own address to connect from, None for any.
         timeout_s: Time for the peer to accept.
-        unconfirmed_s: Time for the peer to confirm what was sent, before the connection is lost.
+        unconfirmed_s: Time for the peer to confirm sent data, before the connection is lost.
 
     Raises:
         TimeoutError: the peer does not answer in time.
-        OSError: it refuses, or is not reached.
+        OSError: the peer refuses the connection, or is not reached.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:

@@ -69,7 +69,7 @@ _CONNECTING = (errno.EINPROGRESS, errno.EALREADY)
 _CONNECTED = (0, errno.EISCONN)
 
 CONNECTION = "connection "
-"""What the destinations of answers on accepted connections begin with."""
+"""Prefix of the destinations of answers on accepted connections."""
 _numbers = itertools.count(1)
 
 
@@ -100,7 +100,7 @@ class TcpSender:
 
     A frame that has begun is always finished.  While that lasts, and while there is no connection,
     frames are lost as a whole and counted in *errors* as ``slow_peer`` and ``not_connected``.
-    What comes back goes to *handlers*, and is thrown away without any.
+    Received frames go to *handlers*; without any they are dropped.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class TcpSender:
             self._fail(error.errno, now_ns)
 
     def _receive(self, sock: socket.socket, now_ns: int) -> int:
-        """Take what the peer says; raise OSError if it is lost."""
+        """Receive from the peer; raise OSError if the connection is lost."""
         if self._receiver is None and self._handlers:  # it asks for something since
             self._listen(sock, now_ns)
         if self._receiver is not None:
@@ -236,17 +236,17 @@ class TcpReceiver:
 
     Args:
         sock: The connection.
-        handlers: Who takes its frames.
+        handlers: Handlers of its frames.
         name: The destination of answers to them, if it has been connected to; else it gets one.
-        writer: Who sends on it; else it is made.
+        writer: Its writer, if there is one already.
         host: Of the peer, as the policy counts it (connections.py).
 
     Attributes:
         name: The destination of answers.
         host: As above.
-        closed: Why the connection ended, empty while it lasts.
-        used_at_ns: When the last frame was complete; its owner sets the time of its acceptance.
-        late_since_ns: Since when a frame is unfinished.
+        closed: Reason of the end of the connection, empty while it lasts.
+        used_at_ns: Time of the last complete frame; its owner sets the time of its acceptance.
+        late_since_ns: Time since which a frame is unfinished.
     """
 
     def __init__(
@@ -275,7 +275,7 @@ class TcpReceiver:
         self._end = 0
 
     def drain(self, now_ns: int) -> int:
-        """Hand every complete frame to the takers, at most 256; return how many.
+        """Hand every complete frame to the handlers, at most 256; return how many.
 
         The stream has no time stamps that belong to frames: *now_ns* stands for the arrival.
         """
@@ -322,7 +322,7 @@ class TcpReceiver:
         self._sock.close()
 
     def _write(self, frame: OutFrame | None) -> bool:
-        """Send *frame*, or just continue with one that has begun."""
+        """Send *frame*, or only continue one that has begun."""
         try:
             return self._writer.flush() if frame is None else self._writer.send(frame)
         except OSError as error:

@@ -21,7 +21,7 @@ class TcpPort:
     Args:
         address: Where outgoing connections come from.
         datagrams: The port's UDP channel, if it has one.
-        answers: Who takes the answers that come back on outgoing connections.
+        answers: Handlers of the answers that are received on outgoing connections.
 
     Attributes:
         errors: Frames lost and failed calls of all outgoing connections, by name.
@@ -48,7 +48,7 @@ class TcpPort:
         self._look_ns = 0
 
     def link_header(self, destination: str) -> bytes:
-        """Nothing; but from now on there is a connection to a TCP *destination*."""
+        """Return nothing; from now on there is a connection to a TCP *destination*."""
         if destination.startswith(CONNECTION):
             return b""
         is_tcp = Destination.parse(destination).kind is DestinationKind.TCP
@@ -59,7 +59,7 @@ class TcpPort:
         return b""
 
     def follow(self, destinations: Collection[str], answers: Iterable[FrameHandler]) -> None:
-        """Keep connections to *destinations* only, and hand what comes back to *answers*."""
+        """Keep connections to *destinations* only, and hand received frames to *answers*."""
         self._answers[:] = answers
         for gone in self._senders.keys() - destinations:
             self._senders.pop(gone).close()
@@ -86,7 +86,7 @@ class TcpPort:
         return True
 
     def drain(self, now_ns: int) -> int:
-        """Hand over what has arrived, and keep the outgoing connections going."""
+        """Hand over received frames, and maintain the outgoing connections."""
         total = self._datagrams.drain(now_ns) if self._datagrams is not None else 0
         for sender in self._senders.values():
             total += sender.poll(now_ns)
@@ -104,7 +104,7 @@ class TcpPort:
         return total
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
-        """Send *frames* by the way their destinations ask for; return those that were not sent."""
+        """Send *frames* by the transport of their destinations; return those that were not sent."""
         failed: list[OutFrame] = []
         rest: list[OutFrame] = []
         for frame in frames:
@@ -132,7 +132,7 @@ class TcpPort:
         return False
 
     def close(self) -> None:
-        """Close all connections; the datagrams belong to somebody else."""
+        """Close all connections; the channel of the datagrams is left open."""
         for sender in self._senders.values():
             sender.close()
         for receiver in self._receivers:

@@ -47,7 +47,7 @@ class UdpChannel:
         self.errors = self._sender.errors
 
     def drain(self, now_ns: int) -> int:
-        """Hand every waiting frame to the takers, at most 256 in one call."""
+        """Hand every waiting frame to the handlers, at most 256 in one call."""
         del now_ns  # the kernel's stamps are nearer to the wire
         total = 0
         for _ in range(_BATCHES_PER_DRAIN):
@@ -71,16 +71,16 @@ class UdpChannel:
         return total
 
     def sender_of(self, data: memoryview) -> str:
-        """Return ``address:port`` of who sent *data*; nothing for who has no address yet."""
+        """Return ``address:port`` of the sender of *data*; empty if it has no address."""
         return _destination(self._batch.sender(data))
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
-        """Send *frames* to their destinations; return those that the kernel refused."""
+        """Send *frames* to their destinations; return those that the kernel rejected."""
         del now_ns
         return self._sender.send(frames)
 
     def link_header(self, destination: str) -> bytes:
-        """Nothing: the kernel writes the headers of a datagram to *destination*."""
+        """Return nothing: the kernel writes the headers of a datagram to *destination*."""
         del destination
         return b""
 
@@ -124,10 +124,10 @@ _TOO_LARGE = 4
 
 
 class UdpError(NamedTuple):
-    """One datagram about which somebody complained."""
+    """ICMP error about one datagram."""
 
     address: str
-    """Where it was sent, as is *port*."""
+    """Destination of the datagram, like *port*."""
     port: int
     unreachable: bool
     """True if it did not arrive, because nobody listens there or because of the way there."""
@@ -136,7 +136,7 @@ class UdpError(NamedTuple):
 
 
 def enable_errors(sock: socket.socket) -> None:
-    """Have the kernel queue what it learns about datagrams that *sock* sends from now on."""
+    """Have the kernel queue the ICMP errors of datagrams that *sock* sends from now on."""
     sock.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
 
 

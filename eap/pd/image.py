@@ -249,7 +249,7 @@ def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
             f"use the same release of eap-appliance on both sides"
         )
     if size > len(memory) or offset + length > size:
-        raise ImageError(f"process image is cut off: {len(memory)} octets of {size}")
+        raise ImageError(f"process image is cut off: {len(memory)} bytes of {size}")
     try:
         layout = msgspec.json.decode(memory[offset : offset + length], type=ImageLayout)
     except msgspec.MsgspecError as exc:

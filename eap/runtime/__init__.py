@@ -1,1 +1,5 @@
-"""Assembly: specifications become processes, sockets and the control protocol."""
+"""Shared state of an appliance: runtime folder, handover, engine messages, stored configuration.
+
+``folder`` finds running appliances, ``startup`` runs a child process, ``attach`` is the API of user
+programs, ``busfile`` and ``plantfile`` load files with the buses that they name.
+"""

@@ -44,7 +44,7 @@ class AttachedStation(Closeable):
         self._writes = False
 
     def close(self) -> None:
-        """Detach, and let others write."""
+        """Detach, and release the right to write."""
         self._station.close()
 
     @property
@@ -80,7 +80,7 @@ class AttachedStation(Closeable):
         Raises:
             WriterConflictError: one of them is not the application's, or another program writes.
             ValueError: a value does not fit its type; nothing was written.
-            EngineGoneError: nobody would read it.
+            EngineGoneError: no engine runs the station.
         """
         image = self._current()
         for name in values:

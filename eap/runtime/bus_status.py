@@ -69,7 +69,7 @@ def count_frames(source: BusReport | LinkStats) -> FrameCounts:
 
 
 def report_findings(report: BusReport) -> list[BusFinding]:
-    """Return the causes of what is wrong with a bus now."""
+    """Return the causes of the present faults of a bus."""
     views = [_view(slave) for slave in report.slaves]
     if is_silent(report):
         return [find_silence(views, report.silent_since_ns)]

@@ -1,7 +1,7 @@
 """Bus files: a simulated segment in YAML, checked as a whole like a plant file.
 
-The cores read no files, so what a bus file refers to (values in CSV, device descriptions in XML)
-is read here and handed over as bytes.
+The cores read no files, so this module reads the files that a bus file refers to (values in CSV,
+device descriptions in XML) and hands them over as bytes.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def load_or_raise(path: Path) -> BusFile:
 
 
 def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
-    """Return what a plant is to know of the bus file at *path*, or all that is wrong with it.
+    """Return the expected slaves of the bus file at *path*, or all findings about the file.
 
     That is what a master finds on such a bus.  What the file leaves open may be anything on a real
     one: revisions that it does not give, serial numbers and aliases that are 0.

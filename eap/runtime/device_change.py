@@ -1,4 +1,4 @@
-"""Another configuration for a running station: what it would change, tried before it is asked for.
+"""Plan of another configuration for a running station: its changes, checked before it is applied.
 
 Nothing here runs anything: a plan holds dictionaries as they would be, for which nothing runs yet.
 """
@@ -31,9 +31,9 @@ class Plan(NamedTuple):
     changes: list[tuple[str, EntryChange]]
     """Each with its port, in an order in which they could be written."""
     station: list[str]
-    """What changes beside the dictionaries."""
+    """Changes beside the dictionaries."""
     refused: list[str]
-    """Why it cannot be."""
+    """Reasons for which it cannot be applied."""
     dictionaries: Mapping[str, EapDictionary]
     """As they would be."""
 
@@ -43,7 +43,7 @@ class Plan(NamedTuple):
         return not (self.changes or self.station)
 
     def objects(self) -> dict[str, Any]:
-        """Return what the dictionaries would hold, for the store."""
+        """Return the planned objects of the dictionaries, for the store."""
         return dump_all(self.dictionaries)
 
 
@@ -53,7 +53,7 @@ def eap_ports(spec: StationSpec) -> list[str]:
 
 
 def dump_all(dictionaries: Mapping[str, EapDictionary]) -> dict[str, Any]:
-    """Return what *dictionaries* hold, for the store."""
+    """Return the objects of *dictionaries*, for the store."""
     return {name: dump_configuration(each) for name, each in dictionaries.items()}
 
 
@@ -62,12 +62,12 @@ def fill_all(
     objects: Mapping[str, Any],
     like: Mapping[str, EapDictionary] | None = None,
 ) -> None:
-    """Give *dictionaries* what was stored of them, else what their station says.
+    """Fill *dictionaries* with their stored objects, else from the specification of their station.
 
     Args:
         dictionaries: Empty ones, by port.
-        objects: What was stored, by port.
-        like: Others; what has the same name there gets the same index.
+        objects: Stored objects, by port.
+        like: Other dictionaries; an object with the same name there gets the same index.
 
     Raises:
         DeviceFault: there is no room for all of it.
@@ -87,7 +87,7 @@ def make_plan(
     now: StationSpec, dictionaries: Mapping[str, EapDictionary], wanted: StationSpec,
     objects: Mapping[str, Any],
 ) -> Plan:  # fmt: skip
-    """Return what it takes to run *wanted*, with *objects* where they are given."""
+    """Return the plan to run *wanted*, with *objects* where they are given."""
     refused = find_refusals(now, wanted)
     if refused:
         return Plan(wanted, [], [], refused, {})
@@ -110,7 +110,7 @@ def plan_rollback(
     now: StationSpec, dictionaries: Mapping[str, EapDictionary], previous: Configuration | None,
     wanted: StationSpec | None = None,
 ) -> Plan:  # fmt: skip
-    """Return what it takes to run again what ran before.
+    """Return the plan to run the previous configuration again.
 
     That is *wanted* if there are alternates to it, or else *wanted* is what runs now, with others.
     """
@@ -125,7 +125,7 @@ def plan_rollback(
 
 
 def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
-    """Return what cannot change while the station runs; nothing else may be done then."""
+    """Return the changes that a running station cannot make; any of them prevents all others."""
     before = {port.name: port.net_id for port in old.ports}
     net_ids = [("the station's router", old.net_id, new.net_id)]
     net_ids += [
@@ -141,7 +141,7 @@ def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
 
 
 def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
-    """Return what changes beside the objects of the dictionaries, a line for each thing."""
+    """Return the changes beside the objects of the dictionaries, one line each."""
     on_bus = bus_variables(old) | bus_variables(new)
     return [
         *kept_versions(old, new),

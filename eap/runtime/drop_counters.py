@@ -1,4 +1,4 @@
-"""What a process turned away before any subscription saw it, in a file that survives it."""
+"""Counters of frames and connections dropped before any subscription, in a file of the process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from eap.errors import EnvironmentalError
 
 
 class DropReason(StrEnum):
-    """Why a frame or a connection went no further."""
+    """Reason for which a frame or a connection was dropped."""
 
     MAILBOX = auto()
     """Type 5 that is no AoE request, to a station without a bus or to many."""
@@ -24,7 +24,7 @@ class DropReason(StrEnum):
     TRUNCATED = auto()
     """Shorter than its headers say."""
     TCP_OFF = auto()
-    """A type-4 connection to a station none of whose ports says ``tcp: true``."""
+    """A type-4 connection to a station without a port with ``tcp: true``."""
     TCP_SLOW = auto()
     """A connection left a frame unfinished, or took no answers, and was closed."""
     TCP_EVICTED = auto()
@@ -42,21 +42,21 @@ class DropReason(StrEnum):
     AMS_FULL = auto()
     """More AMS/TCP connections than there is room for."""
     AMS_TYPE = auto()
-    """An AMS/TCP connection continued with what is no AMS packet, and was closed."""
+    """An AMS/TCP connection carried data that is no AMS packet, and was closed."""
     AMS_LENGTH = auto()
     """An AMS packet too long, or of another length than its header says; it was answered so."""
     AMS_SLOW = auto()
     """An AMS/TCP connection left a packet unfinished, or took no answers, and was closed."""
     AMS_UNASKED = auto()
-    """An answer came by AMS/TCP, and nobody had asked."""
+    """An answer by AMS/TCP without a pending request."""
     AMS_DISCOVERY = auto()
-    """A datagram came to UDP 48899 that asks for nothing that there is."""
+    """A datagram to UDP 48899 with an unknown request."""
     GATEWAY_OFF = auto()
     """A mailbox message, while the gateway that it was for is stopped."""
     MQTT_TOPIC = auto()
-    """A message by MQTT on a topic that means nothing here, or that it has no business on."""
+    """A message by MQTT on an unknown topic, or on a topic that its sender must not use."""
     MQTT_BROKEN = auto()
-    """A message by MQTT that is neither a packet nor what a router tells of itself."""
+    """A message by MQTT that is neither a packet nor the description of a router."""
     MQTT_FULL = auto()
     """One router or one message by MQTT more than there is room for."""
 
@@ -109,9 +109,9 @@ class DropCounters(Closeable):
 
 
 class DropCounterFeed:
-    """Carries what a driver counts by name in a dict over to *counters* of all *stations*.
+    """Adds the counts of a driver, by name in a dict, to *counters* of all *stations*.
 
-    *reason_of* says which counter a name belongs to, None for none.
+    *reason_of* maps a name to its counter, None for none.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class DropCounterFeed:
         self._seen: dict[str, int] = {}
 
     def publish(self) -> None:
-        """Add what has come since the last call."""
+        """Add the counts since the last call."""
         for name, total in self._source.items():
             grown = total - self._seen.get(name, 0)
             if not grown:

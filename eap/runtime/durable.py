@@ -1,7 +1,7 @@
-"""Files that survive whatever happens: replaced in one step, and known to be whole when read.
+"""Durable files: replaced in one step, and checked for completeness when read.
 
-A file is JSON: a version, a digest, and under ``content`` what it is about.  The digest tells a
-file that was damaged, or edited by hand, from one that was written whole.
+A file is JSON: a version, a digest, and the content under ``content``.  The digest reveals a file
+that was damaged or edited by hand.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def seal(content: bytes, version: int) -> bytes:
 
 
 def unseal(data: bytes, version: int) -> bytes:
-    """Return the content of a file; raise ConfigError that says what is wrong with it."""
+    """Return the content of a file; raise ConfigError with the reason if it is invalid."""
     try:
         file = msgspec.json.decode(data, type=_File)
     except (msgspec.MsgspecError, UnicodeDecodeError) as exc:
@@ -51,15 +51,15 @@ def unseal(data: bytes, version: int) -> bytes:
 
 
 def digest(content: bytes) -> str:
-    """Return what tells *content* from any other."""
+    """Return the SHA-256 digest of *content*."""
     return hashlib.sha256(content).hexdigest()
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Put *data* in the place of what *path* holds; one of the two is there whatever happens.
+    """Replace the content of *path* by *data*; after any failure one of the two is there, whole.
 
     Raises:
-        OSError: it cannot be written; what there was is still there.
+        OSError: it cannot be written; the old content is still there.
     """
     temporary = path.with_suffix(".new")  # what a kill leaves behind is overwritten next time
     try:
@@ -85,7 +85,7 @@ def whole_file(target: Path) -> Iterator[BinaryIO]:
     Its rights stay as they are.  A pipe or a device is written as it is.
 
     Raises:
-        EnvironmentalError: it cannot be written; what there was is still there.
+        EnvironmentalError: it cannot be written; the old content is still there.
     """
     whole = target.resolve()
     partial = whole.with_name(f".{whole.name}.{os.getpid()}")

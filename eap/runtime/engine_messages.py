@@ -23,7 +23,7 @@ class StationMessage(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
     """Base of both; answered without anything, or with a failure."""
 
     id: int
-    """Chosen by who asks; the answer repeats it."""
+    """Chosen by the requester and repeated in the reply."""
     station: str
 
 
@@ -91,7 +91,7 @@ class Ping(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="ping"
 
 
 class Cancel(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="cancel"):
-    """Drop request *id*, whose requester has gone: not answered."""
+    """Cancel request *id*, whose requester is gone: not answered."""
 
     id: int
 
@@ -141,7 +141,7 @@ class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
     """Order code in its EEPROM."""
     usual_to_slave: int = 0
     usual_to_master: int = 0
-    """Bytes of the mailboxes in its EEPROM, whatever its state."""
+    """Bytes of the mailboxes in its EEPROM, in any state."""
     port_physics: int = 0
     """As in its EEPROM: four bits a port, 0 none, 1 MII, 3 E-bus."""
     link_preset: int = 0
@@ -173,14 +173,14 @@ class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
     until_ns: int | None = None
     """Nanoseconds since *past_fault* was over."""
     port_errors: tuple[PortErrorReport, ...] = ()
-    """Ports whose errors were counted while the master looked."""
+    """Ports whose errors were counted while the master read them."""
 
 
 class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Description of a bus; counters since the engine started, times in nanoseconds."""
 
     is_up: bool
-    """True after it has been brought up, whatever the states of its slaves are now."""
+    """True after it has been brought up, in any state of its slaves."""
     fault: str = ""
     """Why not."""
     slaves: tuple[SlaveReport, ...] = ()

@@ -1,7 +1,7 @@
-"""The runtime directory: one folder per running appliance, found by everyone who wants to talk.
+"""The runtime directory: one folder per running appliance, in which clients find it.
 
 A folder is alive exactly as long as its supervisor holds the lock in it.  The kernel drops that
-lock however the supervisor ends, so nothing here ever has to guess from a process id.
+lock however the supervisor ends, so no process id has to be interpreted.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ class ProcessInfo(msgspec.Struct):
     pid: int = 0
     restarts: int = 0
     report: dict[str, Any] = {}
-    """What the process said of itself when it became ready."""
+    """Report of the process when it became ready."""
     step: str = ""
     """Step of its start-up; empty when it runs."""
 
 
 class ApplianceInfo(msgspec.Struct):
-    """What a supervisor tells about its appliance (``appliance.json``)."""
+    """Description of an appliance by its supervisor (``appliance.json``)."""
 
     plant: str
     plant_file: str
@@ -62,7 +62,7 @@ class ApplianceInfo(msgspec.Struct):
     segments: dict[str, ProcessInfo] = {}
     """Simulated buses by ``STATION/PORT``."""
     audit_required: bool = False
-    """True if changes that cannot be recorded are refused."""
+    """True if changes that cannot be recorded fail."""
 
 
 def runtime_root() -> Path:
@@ -85,7 +85,7 @@ def runtime_roots() -> list[Path]:
 
 
 def describe_roots() -> str:
-    """Return where appliances are looked for, in words."""
+    """Return the directories that are searched for appliances, as text."""
     return ", ".join(map(str, runtime_roots()))
 
 
@@ -102,7 +102,7 @@ def _can_be_written(path: Path) -> bool:
 def _require_private(path: Path) -> None:
     """Make *path*, or check that it is a directory which no other user can have touched.
 
-    Everybody may make files in its parent, so another user can be there first.
+    Any user may make files in its parent, so another user can be first.
 
     Raises:
         EnvironmentalError: it is a symbolic link or no directory, or other users own or enter it.
@@ -148,7 +148,7 @@ def folder_name(plant: str, subset: Sequence[str] = ()) -> str:
 
 
 class ApplianceFolder(Closeable):
-    """The paths of one appliance's folder; whoever claims it holds its lock until ``close``."""
+    """The paths of one appliance's folder; its supervisor holds the lock until ``close``."""
 
     def __init__(self, path: Path, lock_fd: int = -1) -> None:
         self.path = path
@@ -160,7 +160,7 @@ class ApplianceFolder(Closeable):
         """Make the folder *name* ours and empty.
 
         Raises:
-            EnvironmentalError: another process holds it, it holds somebody else's files, or the
+            EnvironmentalError: another process holds it, it holds other files, or the
                 directory cannot be written.
         """
         root = runtime_root()
@@ -191,7 +191,7 @@ class ApplianceFolder(Closeable):
             folder.close()
             raise EnvironmentalError(
                 f"runtime directory {path} is too long for a socket's path (at most"
-                f" {MAX_SOCKET_PATH} octets): set {VARIABLE} to a shorter one"
+                f" {MAX_SOCKET_PATH} bytes): set {VARIABLE} to a shorter one"
             )
         folder._empty()
         folder._keep_from_ageing()
@@ -199,7 +199,7 @@ class ApplianceFolder(Closeable):
 
     @property
     def control_socket(self) -> Path:
-        """Where clients connect."""
+        """Path of the control socket."""
         return self.path / "control"
 
     @property
@@ -208,7 +208,7 @@ class ApplianceFolder(Closeable):
         return self.path / "bytecode"
 
     def discards(self, process: str) -> Path:
-        """Return the file of what *process* turned away before any subscription saw it."""
+        """Return the file of the drop counters of *process*."""
         return self.path / f"{process}.discards"
 
     def image(self, station: str) -> Path:
@@ -273,7 +273,7 @@ def find_appliances() -> list[ApplianceFolder]:
 
 
 def find_running() -> list[tuple[ApplianceFolder, ApplianceInfo]]:
-    """Return all running appliances that can be talked to, each with what it tells of itself."""
+    """Return all running appliances that can be reached, each with its description."""
     running = []
     for folder in find_appliances():
         try:

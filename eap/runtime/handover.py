@@ -27,7 +27,7 @@ NO_DESCRIPTOR = -1
 
 
 class SocketKind(StrEnum):
-    """How a shared socket is opened."""
+    """Kind of a shared socket."""
 
     UDP = "udp"
     """A pair bound to one unicast address, sorted by frame type."""
@@ -38,7 +38,7 @@ class SocketKind(StrEnum):
     TCP = "tcp"
     """One listener, for services."""
     ARP = "arp"
-    """One AF_PACKET socket for services, that asks for subscribers in one VLAN of an interface."""
+    """One AF_PACKET socket for services, which probes for subscribers in one VLAN."""
     AMS_TCP = "ams_tcp"
     """One listener, for services; the ports of an address share it."""
     AMS_UDP = "ams_udp"
@@ -72,30 +72,30 @@ class SharedSocket(SpecRecord, frozen=True):
     vlan_id: int = 0
     """ARP only; 0 is untagged."""
     owners: tuple[PortName, ...] = ()
-    """Whose frames arrive here; several share a group, a broadcast or an Ethernet interface."""
+    """Ports whose frames arrive here; several share a group, a broadcast or an interface."""
     engine_fd: int = NO_DESCRIPTOR
     services_fd: int = NO_DESCRIPTOR
 
 
 class BusSocket(SpecRecord, frozen=True):
-    """What belongs to one bus port, opened once like the shared sockets.
+    """Descriptors of one bus port, opened once like the shared sockets.
 
     The number of a bus in requests is its place in the handover.
     """
 
     owner: PortName
     engine_fd: int = NO_DESCRIPTOR
-    """Where the engine's frames go: a packet or UDP socket, or a pair with the segment process."""
+    """Socket of the engine's frames: packet, UDP, or a pair with the segment process."""
     segment_fd: int = NO_DESCRIPTOR
     """The other side of that pair, for the process of a simulated segment."""
     segment_command_fd: int = NO_DESCRIPTOR
-    """Where that process gets commands, one JSON object a message, and answers them."""
+    """Socket on which that process receives commands, one JSON object each, and answers them."""
     command_fd: int = NO_DESCRIPTOR
     """The other side of that pair, for services."""
 
 
 class InheritedRecord(SpecRecord, frozen=True):
-    """What crosses to a child in a descriptor."""
+    """Record that a child process inherits in a descriptor."""
 
     def to_descriptor(self) -> int:
         """Return the descriptor of a file that holds this; the caller closes it."""
@@ -128,10 +128,10 @@ class SegmentHandover(InheritedRecord, frozen=True):
 
 
 class EngineOptions(SpecRecord, frozen=True):
-    """How hard the engine tries to be on time."""
+    """Scheduling of the engine."""
 
     realtime: bool = True
-    """Ask for SCHED_FIFO, locked memory and PM QoS; what is not permitted is reported."""
+    """Request SCHED_FIFO, locked memory and PM QoS; the engine reports what is not permitted."""
     cpu: int = -1
     """Run on this processor only; -1 on any."""
     priority: int = 50
@@ -142,7 +142,7 @@ class Handover(InheritedRecord, frozen=True):
     """All that engine and services get; a descriptor that it does not need is NO_DESCRIPTOR."""
 
     supervisor: int
-    """Process id: a child whose parent is another one has been orphaned."""
+    """Process id: a child with another parent has been orphaned."""
     folder: str
     """The appliance's runtime folder."""
     plant: str
@@ -154,18 +154,18 @@ class Handover(InheritedRecord, frozen=True):
     control_fd: int = NO_DESCRIPTOR
     buses: tuple[BusSocket, ...] = ()
     bus_fd: int = NO_DESCRIPTOR
-    """This side of the pair on which services asks the engine for something on a bus."""
+    """This side of the pair for requests of services to the engine."""
     options: EngineOptions = EngineOptions()
     states: dict[str, DeviceState] = msgspec.field(default_factory=dict)
     """To which each station is brought, Op if it is not here."""
     first_state: DeviceState = DeviceState.OP
-    """Of stations that were never asked for another one."""
+    """Of stations for which no other state was requested."""
     routing: dict[str, RoutingSpec] = msgspec.field(default_factory=dict)
-    """What the router of each station is told; nothing for one that is not here."""
+    """Configuration of the router of each station; empty for one that is not here."""
     directory: tuple[DirectoryStation, ...] = ()
-    """The names of everything in the plant, of the stations that run elsewhere too."""
+    """Names of everything in the plant, also of stations on other hosts."""
     audit_required: bool = False
-    """True if changes that cannot be recorded are refused."""
+    """True if changes that cannot be recorded fail."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

@@ -1,4 +1,4 @@
-"""Plant files with the buses that they name: the one way in which programs load them."""
+"""Loading of plant files with the buses that they name, for all programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def load_plant(path: Path) -> PlantResult:
 
 
 def require_own_buses(stations: Sequence[StationSpec]) -> None:
-    """Refuse to run stations here together that need one Ethernet interface for their buses.
+    """Check that no two *stations* of this host need one Ethernet interface for a bus.
 
     A plant file may well name the same interface for stations that run on hosts of their own.
 

@@ -28,7 +28,7 @@ _NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def catch_end_signals() -> Iterator[int]:
-    """Give a descriptor that becomes readable when this process is asked to end.
+    """Give a descriptor that becomes readable on SIGINT or SIGTERM.
 
     The handlers from before are back when the block ends.
     """
@@ -49,7 +49,7 @@ Step: TypeAlias = Callable[[str], None]
 """Reports the beginning of a step."""
 
 _IMPORT_PERIOD_S = 0.5
-"""Period in which a process that imports reports that it continues."""
+"""Interval of progress reports while a process imports."""
 
 
 class Report(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -92,7 +92,7 @@ class Startup:
 
 
 def no_step(text: str) -> None:
-    """Report nothing: for those who build the objects of a process outside one."""
+    """Report nothing: for objects of a process that are built outside one."""
 
 
 class _Finder:
@@ -145,7 +145,7 @@ class _Loader(SourceFileLoader):
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Take SIGINT for SIGTERM: the process ends as it does when it is asked to."""
+    """Handle SIGINT like SIGTERM."""
     signal.raise_signal(signal.SIGTERM)
 
 

@@ -1,10 +1,10 @@
 """Store of a station that was changed while it ran: records, and one file for each.
 
 Rule 1: a station that was never changed while it ran has no files.
-Rule 2: a file is written beside the old one, synced and renamed, so that whatever happens one of
+Rule 2: a file is written beside the old one, synced and renamed, so that after any failure one of
 the two is there, and whole.
-Rule 3: who edits the plant file has the last word: what was stored before that does not run, and
-is kept for a rollback.  A file that was applied while the station ran is not edited since.
+Rule 3: an edit of the plant file overrides a stored configuration, which then does not run and is
+kept for a rollback.  A file that was applied while the station ran does not count as edited.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Configuration(SpecRecord, frozen=True, kw_only=True):
     base: str
     """``digest_of`` the station in the plant file that was in force then."""
     spec: StationSpec
-    """What the engine runs."""
+    """Specification that the engine runs."""
     objects: dict[str, Any] = msgspec.field(default_factory=dict)
     """Content of the dictionary of each EAP port, by its name; a port that is missing here has
     what follows from *spec*."""
@@ -55,14 +55,14 @@ class Stored(Configuration, frozen=True, kw_only=True):
     """The configuration in force and the one before it."""
 
     state: DeviceState = DeviceState.OP
-    """Asked for last."""
+    """State requested last."""
     applied: str = ""
     """``digest_of`` the station in the appliance's own plant file, if that was applied while it ran
     (and edited before); empty if it was not."""
     previous: Configuration | None = None
     """For a rollback."""
     cause: str = ""
-    """Which change brought it; the same at all stations that one ``apply`` changed."""
+    """Change that brought it; the same at all stations that one ``apply`` changed."""
     undone: bool = False
     """True if *cause* was rolled back: *previous* is what it had brought."""
 
@@ -72,9 +72,9 @@ class AppliedRouting(AoeRecord, frozen=True, kw_only=True):
 
     Attributes:
         base: Digest of what the plant file said that the appliance was started with.
-        spec: What is in force.
-        previous: What was before, for a rollback.
-        cause: Which change brought it, see ``Stored.cause``.
+        spec: The routing in force.
+        previous: The routing before, for a rollback.
+        cause: Change that brought it, see ``Stored.cause``.
         undone: Whether that change was rolled back: *previous* is what it had brought.
     """
 
@@ -93,7 +93,7 @@ class Effective(NamedTuple):
 
 
 def state_root() -> Path:
-    """Return where configurations are kept.
+    """Return the directory of stored configurations.
 
     EAP_STATE_DIR, else ``$XDG_STATE_HOME/eap``, else ``/var/lib/eap`` for root, else
     ``~/.local/state/eap``.
@@ -108,7 +108,7 @@ def state_root() -> Path:
 
 
 def plant_folder(plant: str) -> Path:
-    """Return the folder of everything that is kept of the stations of *plant*."""
+    """Return the folder of the stored files of the stations of *plant*."""
     return state_root() / folder_name(plant)
 
 
@@ -149,10 +149,10 @@ class StationFile(Generic[T]):
             return None
 
     def save(self, value: T) -> None:
-        """Keep *value*, in the place of what there was.
+        """Store *value*, replacing the old one.
 
         Raises:
-            EnvironmentalError: it cannot be written; what there was is still there.
+            EnvironmentalError: it cannot be written; the old value is still there.
         """
         try:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -173,7 +173,7 @@ class StationFile(Generic[T]):
         return seal(msgspec.json.encode(value, enc_hook=encode_value), VERSION)
 
     def decode(self, data: bytes) -> T:
-        """Read the bytes of the file; raise ConfigError that says what is wrong with them."""
+        """Decode the bytes of the file; raise ConfigError with the reason if they are invalid."""
         try:
             value: T = msgspec.json.decode(
                 unseal(data, VERSION), type=self._kind, dec_hook=decode_value
@@ -183,7 +183,7 @@ class StationFile(Generic[T]):
         return value
 
     def set_aside(self) -> bool:
-        """Let the station start as if nothing had been kept; return whether anything was.
+        """Hide the stored file, so that the station starts without it; return whether it existed.
 
         Raises:
             EnvironmentalError: the file cannot be renamed.
@@ -191,7 +191,7 @@ class StationFile(Generic[T]):
         return self._rename(self.path, self._aside)
 
     def bring_back(self) -> bool:
-        """Undo ``set_aside``, unless something was kept since; return whether that was done.
+        """Undo ``set_aside``, unless a new file was stored since; return whether it was undone.
 
         Raises:
             EnvironmentalError: the file cannot be renamed.
@@ -216,7 +216,7 @@ class StationFile(Generic[T]):
 
 
 class StationStore:
-    """Everything that is kept of one station.
+    """All stored files of one station.
 
     Attributes:
         configuration: Specification and objects of its devices.
@@ -237,7 +237,7 @@ class StationStore:
         )
 
     def set_aside(self) -> bool:
-        """Let the station start from the plant file alone; return whether it was configured.
+        """Hide all stored files, so that the plant file alone counts; return whether one existed.
 
         Raises:
             EnvironmentalError: a file cannot be renamed.
@@ -247,7 +247,7 @@ class StationStore:
         return self.configuration.set_aside()
 
     def bring_back(self) -> None:
-        """Undo ``set_aside`` for what was not kept again since.
+        """Undo ``set_aside`` for files that were not stored again since.
 
         Raises:
             EnvironmentalError: a file cannot be renamed.
@@ -262,7 +262,7 @@ def new_cause() -> str:
 
 
 def digest_of(spec: StationSpec | RoutingSpec) -> str:
-    """Return what tells *spec* from any other.
+    """Return a digest of *spec*.
 
     Fields that hold their defaults do not count: a release that adds one does not change it.
     """
@@ -272,10 +272,11 @@ def digest_of(spec: StationSpec | RoutingSpec) -> str:
 def adopt_plant_file(
     plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP
 ) -> None:
-    """Make up what is stored for a start of the appliance with *stations* of the plant file.
+    """Update the store for a start of the appliance with *stations* of the plant file.
 
-    While it runs, what counts is the file that it was started with, and what was applied on top;
-    now what was applied last is that file, or there is another one.  Arguments as for *effective*.
+    While the appliance runs, the base is the file that it was started with, plus applied changes.
+    At a start the file applied last becomes the base, unless the file was edited since.  Arguments
+    as for *effective*.
     """
     cause = new_cause()
     for spec in stations:
@@ -297,12 +298,12 @@ def adopt_plant_file(
 def effective(
     plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP
 ) -> tuple[Effective, ...]:
-    """Return what *stations* of the plant file are to run, each in the state asked for last.
+    """Return the specifications to run for *stations* of the plant file, with the last states.
 
     Args:
         plant: Its name.
         stations: As the plant file has them.
-        state: Of stations that were never asked for another.
+        state: Of stations for which no other state was requested.
     """
     cause = new_cause()
     return tuple(_effective(plant, spec, state, cause) for spec in stations)
@@ -329,7 +330,7 @@ def _keep(file: StationFile[Stored], stored: Stored) -> None:
 
 
 def _with_plant_file(stored: Stored, file: Stored) -> Stored:
-    """Return *stored* with what the plant file says in force."""
+    """Return *stored* with the specification of the plant file in force."""
     bare = without_alternates(stored.spec)
     if bare == file.spec:  # the file has caught up with what was configured
         return replace(stored, base=file.base, spec=bare, applied="")

@@ -1,4 +1,4 @@
-"""A simulated segment as a process: it answers a master until it is asked to end.
+"""A simulated segment as a process: it answers a master until it receives an end signal.
 
 ``eapctl sim run`` runs one in its own process; the supervisor starts one for each simulated bus
 with one argument, the descriptor of its handover.  Commands come as JSON (:mod:`command`), as lines
@@ -39,7 +39,7 @@ _MAX_COMMAND = 65536
 
 
 class Commands(Protocol):
-    """Where commands come from and answers go."""
+    """Source of commands and sink of their answers."""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when there is a command."""
@@ -72,7 +72,7 @@ class CommandLines:
 
 
 class CommandMessages:
-    """Commands as messages of *sock*; one that asks without reading gets no answers."""
+    """Commands as messages of *sock*; a client that does not read loses its answers."""
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock

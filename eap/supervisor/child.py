@@ -82,7 +82,7 @@ class StartWatch:
         self._waits_for = waits_for
 
     def release(self, other: str, now_ns: int) -> None:
-        """Take note that the process *other* runs: who waited for it continues."""
+        """Note that the process *other* runs, if this one waited for it."""
         if self._waits_for == other:
             self._waits_for = ""
             self._progress_ns = now_ns
@@ -109,7 +109,7 @@ class StartWatch:
         return self._note_ns if self._waits_for else min(self._note_ns, self._deadline_ns)
 
     def handle_timeout(self, now_ns: int) -> StartEvent | None:
-        """Return what has become of the start; early calls are harmless."""
+        """Return the event of the start that is due, None if none is; early calls are harmless."""
         due_ns = self.next_timeout()
         if due_ns is None or now_ns < due_ns:
             return None
@@ -126,11 +126,11 @@ class StartWatch:
 
 
 _PIECE = select.PIPE_BUF
-"""Bytes that whatever is ready to be written takes at once."""
+"""Bytes that a descriptor ready for writing takes at once."""
 
 
 class Output:
-    """Lines to a descriptor; those that it does not take now are left out, and counted.
+    """Lines to a descriptor; those that it does not take now are dropped and counted.
 
     Args:
         fd: Where lines go.
@@ -149,7 +149,7 @@ class Output:
     def write(self, line: str) -> None:
         """Write a line, behind a note on those that were left out before it."""
         if self.dropped:
-            line = f"({self.dropped} lines left out here, which nobody took)\n{line}"
+            line = f"({self.dropped} lines dropped here: the reader was too slow)\n{line}"
         if self._is_cut:  # a full pipe or disk took a part of the line before: it ends there
             line = f"\n{line}"
         octets = f"{line}\n".encode("utf-8", "replace")
@@ -165,7 +165,7 @@ class Output:
         self._is_cut = False
 
     def _take(self, octets: bytes) -> int:
-        """Write what is taken at once; return how much that was."""
+        """Write without waiting; return the number of bytes written."""
         if not self._poll.poll(0):
             return 0
         try:
@@ -196,7 +196,7 @@ _LAUNCHER = "eap.runtime.startup"
 
 
 class RestartPolicy:
-    """When to start a process again: at once after a long life, ever later after short ones."""
+    """Restart delay of a process: none after a long life, growing after short ones."""
 
     def __init__(self) -> None:
         self._backoff_ns = 0
@@ -334,7 +334,7 @@ class Child:
         return code, self._last_lines[-1] if self._last_lines else "it said nothing"
 
     def close(self) -> None:
-        """Close what is left of the descriptors."""
+        """Close the remaining descriptors."""
         for fd in (self.pid_fd, self.report_fd, self.error_fd):
             if fd >= 0:
                 os.close(fd)
@@ -342,7 +342,7 @@ class Child:
 
 
 def describe_end(code: int) -> str:
-    """Return how a process ended, in words."""
+    """Return the end of a process as text."""
     if code >= 0:
         return f"exit code {code}"
     try:

@@ -40,7 +40,7 @@ from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
 from eap.supervisor.sockets import SharedSockets, segments
 
 GRACE_NS = 1_000_000_000
-"""How long a process may take to end when asked; the whole appliance has two seconds."""
+"""Time for a process to end after SIGTERM; the whole appliance has two seconds."""
 SEGMENT_GRACE_NS = 500_000_000
 """The same for simulated segments, which end after the others."""
 
@@ -53,10 +53,10 @@ def run(
     *,
     options: EngineOptions = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
-    """Run the plant in *plant_file*, or only some of its *stations*, until told to stop.
+    """Run the plant in *plant_file*, or only some of its *stations*, until a stop signal.
 
     Returns:
-        The exit code: 0 when it was told to, 1 or 2 when it could not start.
+        The exit code: 0 after a stop signal, 1 or 2 when it could not start.
 
     Raises:
         ConfigError: the file is no plant; one line a finding.
@@ -72,10 +72,10 @@ def run(
 
 
 def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> int:
-    """Run *plant*, which no file describes, until told to stop.
+    """Run *plant*, which no file describes, until a stop signal.
 
     Its stations start in PreOp, as *plant* has them or, with *resume*, as they were configured
-    last, in the state that was asked for then.  Returns and raises as ``run`` does.
+    last, in the state that was requested then.  Returns and raises as ``run`` does.
     """
     info = make_info(plant.name, "", plant.stations)
     with _claim(folder_name(plant.name)) as folder:
@@ -152,7 +152,7 @@ def _choose(plant: Plant, wanted: Sequence[str]) -> tuple[StationSpec, ...]:
 
 
 class Supervisor:
-    """Runs engine, services and simulated buses of the stations of *plant* until told to stop.
+    """Runs engine, services and simulated buses of the stations of *plant* until a stop signal.
 
     Other stations are in its directory only.
     """
@@ -442,8 +442,8 @@ def with_stored_configuration(handover: Handover) -> Handover:
 def find_build_errors(spec: StationSpec) -> list[str]:
     """Return what keeps a station from being built, nothing if it can be.
 
-    A configuration may have been kept that no engine ever ran: whoever kept it was killed before
-    the engine refused it.  Started with it, the engine would fail again and again.
+    A stored configuration may be one that no engine ever ran: services was killed after storing it
+    and before the engine rejected it.  The engine would fail with it at every start.
     """
     try:
         layout = plan_layout(spec)

@@ -110,7 +110,7 @@ _ORDER = tuple(SocketKind)
 
 
 def plan_sockets(stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
-    """Return what has to be opened for *stations*, each socket once, in fixed order."""
+    """Return the sockets to open for *stations*, each once, in fixed order."""
     owners: dict[SharedSocket, list[PortName]] = {}
     ports = [(station.name, port) for station in stations for port in station.ports]
     ports = [(station, port) for station, port in ports if port.kind is PortKind.EAP]
@@ -175,7 +175,7 @@ def _ams_address(port: PortSpec) -> str:
 
 
 class SharedSockets(Closeable):
-    """All open descriptors of an appliance; whoever opened them closes them at its very end.
+    """All open descriptors of an appliance; the supervisor closes them at its very end.
 
     Attributes:
         descriptions: The plan, with the descriptors filled in.

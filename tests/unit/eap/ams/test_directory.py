@@ -56,7 +56,7 @@ def test_addresses_by_name(text: str, address: str) -> None:
         ("island-01/bus0/drv", "no slave 'drv' behind island-01/bus0, did you mean drive?"),
         ("island-01/bus0/", "no slave '' behind island-01/bus0; they are drive (1001), io (1002)"),
         ("9.8.7.6.1.1:70000", "'70000' in '9.8.7.6.1.1:70000' is no AMS port (0 to 65535)"),
-        ("9.8.7.6.1.300", "'9.8.7.6.1.300' has an octet above 255"),
+        ("9.8.7.6.1.300", "'9.8.7.6.1.300' has a number above 255"),
     ],
 )  # fmt: skip
 def test_what_is_no_name_here(text: str, reason: str) -> None:

@@ -231,7 +231,7 @@ def test_what_disturbs_others_is_refused(office, command):
         (read(1, Command.FPRD, ado=0x10000), "expected addresses of 16 bits"),
         (
             ExchangeDatagrams(id=1, bus=0, datagrams=(DatagramRequest(4, 1, 1, b"", 1),)),
-            "with 0 octets",
+            "with 0 bytes",
         ),
         (DescribeBus(id=1, bus=1), "no bus 1, there are 1"),
         (DescribeBus(id=1, bus=-1), "no bus -1"),
@@ -349,5 +349,5 @@ def test_tries_have_bounds(wanted, made):
 )
 def test_what_fits_no_frame_is_refused(datagram):
     assert len(check_datagrams((DatagramRequest(Command.FPRD, 0, 0, bytes(1486), 1),))) == 1
-    with pytest.raises(BusError, match="expected addresses of 16 bits and 1 to 1486 octets"):
+    with pytest.raises(BusError, match="expected addresses of 16 bits and 1 to 1486 bytes"):
         check_datagrams((datagram,))

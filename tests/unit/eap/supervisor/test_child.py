@@ -178,7 +178,7 @@ def test_what_nobody_takes_is_left_out_and_counted(pipe):
     output.write("nobody sees this")
     read(pipe[0])
     output.write("and this again")
-    assert read(pipe[0]) == "(2 lines left out here, which nobody took)\nand this again\n"
+    assert read(pipe[0]) == "(2 lines dropped here: the reader was too slow)\nand this again\n"
 
 
 def test_a_reader_that_has_gone_is_no_fault(pipe):
@@ -202,7 +202,7 @@ def test_line_after_one_that_a_full_disk_cut_begins_anew(tmp_path):
         output.write("fifth")
     lines = (tmp_path / "log").read_text().splitlines()
     assert lines == [
-        "first", "seco", "(2 lines left out here, which nobody took)", "fourth", "fifth",
+        "first", "seco", "(2 lines dropped here: the reader was too slow)", "fourth", "fifth",
     ]  # fmt: skip
 
 
@@ -212,7 +212,7 @@ def test_line_after_one_that_a_full_pipe_cut_begins_anew(pipe):
     found = read(pipe[0])
     assert set(found) == {"y"}
     output.write("next")
-    assert read(pipe[0]) == "\n(1 lines left out here, which nobody took)\nnext\n"
+    assert read(pipe[0]) == "\n(1 lines dropped here: the reader was too slow)\nnext\n"
 
 
 PROGRESS_SECOND_NS = 1_000_000_000

@@ -41,7 +41,7 @@ def test_targets(text: str, address: str) -> None:
     ("text", "reason"),
     [
         ("rihgt", "no station 'rihgt' in this plant, did you mean right.*nor is there a route"),
-        ("1.2.3.4.5.600", "has an octet above 255"),
+        ("1.2.3.4.5.600", "has a number above 255"),
     ],
 )
 def test_find_target_rejects_unknown_names(text: str, reason: str) -> None:
