@@ -151,6 +151,8 @@ QUALITY_MAX = 0xFFFF
 
 _GAP = 2
 """Spaces between two columns: what rich puts there for one space of padding and no border."""
+_SHOWN_CHARACTERS = 48
+"""Length at which the text of a value is cut."""
 _LEAST_WRAPPED = 16
 """A column that wraps is not made narrower than this while another one can be left out."""
 
@@ -331,3 +333,19 @@ def times(count: int) -> str:
 def count(number: int, thing: str) -> str:
     """Return *number* and *thing*, in singular or plural."""
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def value_text(value: Any) -> str:
+    """Return a value of a variable as text; a long one is cut."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.7g}"  # the precision of a REAL
+    if isinstance(value, list):
+        value = f"[{', '.join(map(value_text, value))}]"
+    text = str(value)
+    return (
+        text
+        if len(text) <= _SHOWN_CHARACTERS
+        else f"{text[:_SHOWN_CHARACTERS]}… ({len(text)} characters)"
+    )

@@ -5,13 +5,12 @@ from __future__ import annotations
 from contextlib import ExitStack
 from functools import partial
 from itertools import islice
-from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from eap.cli.group import CommandGroup
-from eap.cli.output import Renderer
+from eap.cli.output import Renderer, value_text
 from eap.cli.params import (
     json_option,
     parse_assignment,
@@ -19,11 +18,9 @@ from eap.cli.params import (
     plant_option,
     station_option,
 )
-from eap.errors import ControlError
 
 if TYPE_CHECKING:
     from eap.cli.pd_view import ListedPd
-    from eap.codec.values import DataType
 
 
 @click.group(cls=CommandGroup)
@@ -101,30 +98,8 @@ def set_value(words: tuple[str, ...], plant: str | None, output: Renderer) -> No
     VALUE is a literal of the variable's type: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
     hexadecimal digits for a raw block.
     """
-    from eap.cli.pd_view import WrittenVariable, value_text
-    from eap.codec import datatypes
-    from eap.control.protocol import VARIABLES, WRITE
-    from eap.ops.client import connect_station
+    from eap.ops.client import write_variable
 
     target, text = parse_assignment(words)
-    with connect_station(target.station, plant) as client:
-        variables = client.call(VARIABLES, station=target.station)
-        kinds = {each.name: datatypes.parse(each.type) for each in variables}
-        value: Any = text
-        if kind := kinds.get(target.name):
-            try:
-                value = _to_json(kind, text)
-            except ValueError as exc:
-                raise ControlError(f"variable {target}: {exc}", code="value") from None
-        client.call(WRITE, station=target.station, values={target.name: value})
-    done = WrittenVariable(target.station, target.name, value)
+    done = write_variable(target.station, target.name, text, plant)
     output.show(done, lambda each: f"{target} = {value_text(each.value)}")
-
-
-def _to_json(kind: DataType, text: str) -> Any:
-    """Read *text* as a value that the control protocol can carry; raise ValueError otherwise."""
-    value = kind.parse_text(text)
-    numbers = value if isinstance(value, tuple) else (value,)
-    if any(isinstance(number, float) and not isfinite(number) for number in numbers):
-        raise ValueError(f"{text!r} cannot be sent to the appliance: expected a finite number")
-    return kind.to_plain(value)

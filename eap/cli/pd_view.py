@@ -16,14 +16,11 @@ from typing import Any, TypeAlias
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from eap.cli.output import Column, Styled, TextTable, quality
+from eap.cli.output import Column, Styled, TextTable, quality, value_text
 from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
 from eap.ops.client import connect_station
 from eap.pd.report import PdRow, PdRowVariable
-
-_SHOWN = 48
-"""Characters of a value in a line for people."""
 
 
 class UncarriedVariables(Struct, frozen=True):
@@ -36,14 +33,6 @@ class UncarriedVariables(Struct, frozen=True):
 
 
 ListedPd: TypeAlias = PdRow | UncarriedVariables
-
-
-class WrittenVariable(Struct, frozen=True):
-    """``eapctl pd set``."""
-
-    station: str
-    variable: str
-    value: Any
 
 
 class ValueChange(Struct, frozen=True, kw_only=True):
@@ -214,15 +203,3 @@ def change_lines(stream: Iterable[ValueChange]) -> Iterator[str]:
         if change.quality is not UNSET:
             line = f"{line}  quality {quality(change.quality) or 'never received'}"
         yield f"{line}  ({change.skipped} skipped)" if change.skipped else line
-
-
-def value_text(value: Any) -> str:
-    """Return a value as a person reads it, long ones cut short."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return f"{value:.7g}"  # what a REAL is exact to
-    if isinstance(value, list):
-        value = f"[{', '.join(map(value_text, value))}]"
-    text = str(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}… ({len(text)} characters)"

@@ -7,15 +7,20 @@ import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
+from math import isfinite
 from time import monotonic
 from typing import Any, Self
 
 import msgspec
 
 from eap.closeable import Closeable
+from eap.codec import datatypes
+from eap.codec.values import DataType
 from eap.control.protocol import (
     MAX_LINE,
     SUBSCRIBE,
+    VARIABLES,
+    WRITE,
     AnswerT,
     ControlReply,
     ErrorCode,
@@ -192,6 +197,44 @@ def connect_station(station: str, plant: str | None) -> ControlClient:
         plants = ", ".join(client.info.plant for client in (first, *others))
         raise ControlError(f"station {station} runs in {plants}: choose one with --plant")
     return first
+
+
+class WrittenVariable(msgspec.Struct, frozen=True):
+    """``eapctl pd set``."""
+
+    station: str
+    variable: str
+    value: Any
+
+
+def write_variable(station: str, name: str, text: str, plant: str | None) -> WrittenVariable:
+    """Write *text*, a literal of the variable's type, to a variable of the application.
+
+    Raises:
+        ControlError: the value has another type, or the appliance refused.
+    """
+    with connect_station(station, plant) as client:
+        variables = client.call(VARIABLES, station=station)
+        kinds = {each.name: datatypes.parse(each.type) for each in variables}
+        value: Any = text
+        # The appliance reports an unknown name itself, with a suggestion.
+        if kind := kinds.get(name):
+            try:
+                value = _to_json(kind, text)
+            except ValueError as exc:
+                raise ControlError(f"variable {station}/{name}: {exc}", code="value") from None
+        client.call(WRITE, station=station, values={name: value})
+    return WrittenVariable(station, name, value)
+
+
+def _to_json(kind: DataType, text: str) -> Any:
+    """Read *text* as a value that the control protocol can carry; raise ValueError otherwise."""
+    value = kind.parse_text(text)
+    numbers = value if isinstance(value, tuple) else (value,)
+    # JSON has no NaN and no infinity.
+    if any(isinstance(number, float) and not isfinite(number) for number in numbers):
+        raise ValueError(f"{text!r} cannot be sent to the appliance: expected a finite number")
+    return kind.to_plain(value)
 
 
 class ApplianceStatus(msgspec.Struct, frozen=True):
