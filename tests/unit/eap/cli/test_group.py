@@ -104,7 +104,7 @@ def test_documentation_shows_every_command_with_all_its_options() -> None:
     text = Path("docs/commands.md").read_text()
     sections = dict(part.split("\n", 1) for part in text.split("\n## ")[1:])
     documented = {name for name, _ in commands(main, "")}
-    assert documented == set(sections) - {"What all commands share"}
+    assert documented == set(sections) - {"Common behaviour"}
     for name, command in commands(main, ""):
         for parameter in command.params:
             if isinstance(parameter, click.Option):
