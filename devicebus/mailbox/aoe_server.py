@@ -125,7 +125,7 @@ class AoeServer:
             raise_mailbox_error(MailboxError.SIZE_TOO_SHORT, str(exc))
         if header.state_flags & StateFlags.RESPONSE:
             raise_mailbox_error(
-                MailboxError.SERVICE_NOT_SUPPORTED, "a response, but nothing was asked"
+                MailboxError.SERVICE_NOT_SUPPORTED, "a response, expected a request"
             )
         if header.command != AmsCommand.FRAGMENT:
             return self._answer(header, bytes(body))

@@ -112,8 +112,8 @@ def continue_upload(
     # The end is decided by the size of the first answer, not by the last bit: a slave that sets it
     # too early or too late breaks the protocol.
     while len(content) < size:
-        asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
-        body = yield from sdo.exchange_segment(asked)
+        request = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
+        body = yield from sdo.exchange_segment(request)
         with reading(f"segment of {sdo}"):
             segment, data = decode_segment(body)
         content += data

@@ -1,6 +1,6 @@
 """CoE of a slave: SDO transfers and SDO information out of an object dictionary (ETG.1000.6).
 
-The SDO server has one transfer at a time: a new one ends the one before.  The client asks for each
+The SDO server has one transfer at a time: a new one ends the one before.  The client requests each
 segment, so the server never sends unasked.
 """
 
@@ -308,7 +308,7 @@ class CoeServer:
         dictionary: Objects of SDO and SDO information.
         state: Returns the present state of the slave.
         sizes: Sizes of the slave's mailboxes.
-        read_pdo: Returns the TxPDO or RxPDO of a number (told apart by the service TX_PDO or
+        read_pdo: Returns the TxPDO or RxPDO of a number (selected by the service TX_PDO or
             RX_PDO), None if there is none; without it the slave has no PDOs in its mailbox.
         write_pdo: Takes an RxPDO; returns whether there is one of this number.
     """

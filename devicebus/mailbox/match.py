@@ -56,16 +56,16 @@ def _service(data: bytes) -> int:
 
 
 def _answers_coe(request: bytes, reply: bytes) -> bool:
-    asked, found = _service(request), _service(reply)
-    if asked in {CoeService.SDO_REQUEST, CoeService.SDO_INFORMATION}:
+    requested, found = _service(request), _service(reply)
+    if requested in {CoeService.SDO_REQUEST, CoeService.SDO_INFORMATION}:
         if len(request) == CoeHeader.SIZE:
             return False
-        if asked == CoeService.SDO_REQUEST:
+        if requested == CoeService.SDO_REQUEST:
             return _answers_sdo(request, reply)
-        return found == asked and _answers_info(request, reply)
+        return found == requested and _answers_info(request, reply)
     number = int.from_bytes(request[:2], "little") & _PDO_NUMBER
     is_same = int.from_bytes(reply[:2], "little") & _PDO_NUMBER == number
-    return found == _REMOTE.get(asked) and is_same
+    return found == _REMOTE.get(requested) and is_same
 
 
 def _answers_sdo(request: bytes, reply: bytes) -> bool:
@@ -100,19 +100,19 @@ def _answers_info(request: bytes, reply: bytes) -> bool:
 def _answers_foe(request: bytes, reply: bytes) -> bool:
     if len(reply) < FoeHeader.SIZE or reply[0] in {FoeOpcode.ERROR, FoeOpcode.BUSY}:
         return True
-    asked, found = request[0], reply[0]
+    requested, found = request[0], reply[0]
     number = int.from_bytes(reply[2:6], "little")
     sent = int.from_bytes(request[2:6], "little")
-    if asked in {FoeOpcode.READ, FoeOpcode.ACK}:
+    if requested in {FoeOpcode.READ, FoeOpcode.ACK}:
         # Packets above 1 in answer to a read request belong to the transfer before: late, not
         # wrong. A repeated reply has the number of the packet before; any other number is an error.
-        is_late = number > 1 if asked == FoeOpcode.READ else number == sent
+        is_late = number > 1 if requested == FoeOpcode.READ else number == sent
         return found == FoeOpcode.DATA and not is_late
-    if asked == FoeOpcode.BUSY:  # BUSY asks for the same packet again
+    if requested == FoeOpcode.BUSY:  # BUSY requests the same packet again
         return found == FoeOpcode.DATA
-    if asked == FoeOpcode.WRITE:
+    if requested == FoeOpcode.WRITE:
         return found == FoeOpcode.ACK and number == 0
-    return asked == FoeOpcode.DATA and found == FoeOpcode.ACK and number != sent - 1
+    return requested == FoeOpcode.DATA and found == FoeOpcode.ACK and number != sent - 1
 
 
 def _answers_soe(request: bytes, reply: bytes) -> bool:
@@ -128,26 +128,29 @@ def _answers_soe(request: bytes, reply: bytes) -> bool:
 
 def _answers_aoe(request: bytes, reply: bytes) -> bool:
     try:
-        asked, found = AmsHeader.decode(request), AmsHeader.decode(reply)
+        requested, found = AmsHeader.decode(request), AmsHeader.decode(reply)
     except CodecError:
         return True
-    if (found.source, found.source_port) != (asked.target, asked.target_port):
+    if (found.source, found.source_port) != (requested.target, requested.target_port):
         return False
     if is_aoe_fragment(reply):
-        return _continues_aoe(asked, found, reply[AmsHeader.SIZE :])
+        return _continues_aoe(requested, found, reply[AmsHeader.SIZE :])
     is_response = bool(found.state_flags & StateFlags.RESPONSE)
-    return is_response and (found.invoke_id, found.command) == (asked.invoke_id, asked.command)
+    return is_response and (found.invoke_id, found.command) == (
+        requested.invoke_id,
+        requested.command,
+    )
 
 
-def _continues_aoe(asked: AmsHeader, found: AmsHeader, body: bytes) -> bool:
-    if asked.command == AmsCommand.FRAGMENT:  # the acknowledgement of the fragment before
-        return found.invoke_id == asked.invoke_id + 1
+def _continues_aoe(requested: AmsHeader, found: AmsHeader, body: bytes) -> bool:
+    if requested.command == AmsCommand.FRAGMENT:  # the acknowledgement of the fragment before
+        return found.invoke_id == requested.invoke_id + 1
     if found.invoke_id & 0xFFFF or len(body) < _AMS_REST:
         return True
     # The first fragment begins with the original AMS header from offset 16 (the command) on.
     is_response = body[2] & StateFlags.RESPONSE
     keys = int.from_bytes(body[:2], "little"), int.from_bytes(body[12:16], "little")
-    return bool(is_response) and keys == (asked.command, asked.invoke_id)
+    return bool(is_response) and keys == (requested.command, requested.invoke_id)
 
 
 def _answers_eoe(request: bytes, reply: bytes) -> bool:

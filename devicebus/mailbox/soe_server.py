@@ -170,10 +170,10 @@ class SoeParameter:
 
     def read(self, elements: int, now_ns: int) -> bytes:
         """Return the requested elements, concatenated; raise SoeError if one is missing."""
-        asked = [element for element in Element if elements & element]
-        if not asked:
+        requested = [element for element in Element if elements & element]
+        if not requested:
             raise self.error(SoeErrorCode.NO_ELEMENT)
-        return b"".join(self._read_element(element, now_ns) for element in asked)
+        return b"".join(self._read_element(element, now_ns) for element in requested)
 
     def write(self, elements: int, data: bytes, state: OdState, now_ns: int) -> None:
         """Write the value; raise SoeError if it is refused, or another element is requested."""
@@ -334,7 +334,7 @@ class SoeServer:
             body = joined
         else:
             self._partial = None
-        room = self._sizes.to_master - DATA_OVERHEAD
+        fragment_size = self._sizes.to_master - DATA_OVERHEAD
         error = False
         try:
             answer = self._answer(header, body, now_ns)
@@ -343,7 +343,7 @@ class SoeServer:
             error, answer = True, exc.code.to_bytes(2, "little")
         opcode = _RESPONSE[header.opcode]
         head = SoeHeader(opcode, 0, error, header.drive, header.elements, header.idn)
-        return encode_fragments(head, answer, room)
+        return encode_fragments(head, answer, fragment_size)
 
     def messages_to_send(self, now_ns: int) -> list[bytes]:
         """Return and remove queued emergencies and notifications of ended procedure commands."""

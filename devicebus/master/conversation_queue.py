@@ -98,8 +98,8 @@ class ReplyMatcher:
             self._echoes = True
             self._expired.clear()
             return False
-        # Some slave stacks write address 0 in replies: only a slave that has echoed a tag once is
-        # judged by it.
+        # Some slave stacks write address 0 in replies: the tag is only checked for a slave that
+        # has echoed one.
         if self._echoes or header.address & _TAG:
             return True
         self._suspected = self._drop_expired(header, data)

@@ -92,7 +92,7 @@ def change_state(
     )
     if status.error:
         raise AlStatusError(
-            f"slave {station}: refuses {target.name} and stands in {_name(status)}:"
+            f"slave {station}: refuses {target.name} and is in {_name(status)}:"
             f" AL status code 0x{status.code:04X}, {name_of(status.code)}",
             code=status.code,
             state=status.state,

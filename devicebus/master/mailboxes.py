@@ -223,15 +223,15 @@ class Mailbox:
             repeats=self._port.repeats, duplicates=self._watch.repeated, gaps=self._watch.gaps
         )
 
-    def _check_step(self, step: MailboxRequest, who: str) -> BusError | None:
+    def _check_step(self, step: MailboxRequest, name: str) -> BusError | None:
         """Return the error of a request that cannot be sent, or None."""
         if not self._is_open:
-            return MailboxClosedError(f"{who}: the slave's mailbox is closed")
+            return MailboxClosedError(f"{name}: the slave's mailbox is closed")
         size = MailboxHeader.SIZE + len(step.request)
         if step.listen or size <= self.sizes.to_slave:
             return None
         return MailboxSizeError(
-            f"{who}: a message of {size} bytes, the slave's mailbox holds {self.sizes.to_slave}"
+            f"{name}: a message of {size} bytes, the slave's mailbox holds {self.sizes.to_slave}"
         )
 
     def _begin(self, work: Procedure[None], now_ns: int) -> None:

@@ -228,16 +228,16 @@ class Master:
 
 def why_closed(slave: BusSlave) -> NoMailboxError | MailboxClosedError:
     """Return the error of a slave without an open mailbox: permanent, by its state, or for now."""
-    who = f"slave {slave.station} ({slave.name})"
+    name = f"slave {slave.station} ({slave.name})"
     if slave.is_lost:
-        return MailboxClosedError(f"{who} does not answer")
+        return MailboxClosedError(f"{name} does not answer")
     if slave.found.fault or not standard_mailbox(slave.found.sii.fixed).is_there:
-        return NoMailboxError(f"{who} has no mailbox: its EEPROM names none")
+        return NoMailboxError(f"{name} has no mailbox: its EEPROM names none")
     if slave.state is None:
-        return MailboxClosedError(f"{who} is being identified: its mailbox is not open yet")
+        return MailboxClosedError(f"{name} is being identified: its mailbox is not open yet")
     if slave.target in _WITH_MAILBOX:
         return MailboxClosedError(
-            f"{who} is in {slave.state.name} and being brought to {slave.target.name}: its mailbox"
+            f"{name} is in {slave.state.name} and being brought to {slave.target.name}: its mailbox"
             " is closed until PREOP"
         )
-    return NoMailboxError(f"{who} has no mailbox in {slave.state.name}")
+    return NoMailboxError(f"{name} has no mailbox in {slave.state.name}")

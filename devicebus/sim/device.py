@@ -44,7 +44,7 @@ class FaultyDictionary(ObjectDictionary):
 
     def _check(self, index: int, subindex: int) -> None:
         if index in self.aborts:
-            raise SdoAbortError(self.aborts[index], index, subindex, "a fault was asked for")
+            raise SdoAbortError(self.aborts[index], index, subindex, "injected fault")
 
 
 _ERROR_REGISTER = 0x1001

@@ -249,9 +249,9 @@ class Esc:
         if address >= REGISTERS:
             return self._write_memory(address, data, now_ns)
         if end > REGISTERS:
-            room = REGISTERS - address
-            done = self.write(address, data[:room], now_ns)
-            return self._write_memory(REGISTERS, data[room:], now_ns) or done
+            first_size = REGISTERS - address
+            done = self.write(address, data[:first_size], now_ns)
+            return self._write_memory(REGISTERS, data[first_size:], now_ns) or done
         marks = self._writable[address:end]
         if address < _EEPROM_END and end > _EEPROM and not self._takes_eeprom(now_ns):
             return False
@@ -392,17 +392,17 @@ class Esc:
         for channel in self._guards:
             if start < channel.end and end > channel.start:
                 if start < channel.start or end > channel.end:
-                    places = self._split(start, end)
+                    parts = self._split(start, end)
                     done = [
                         self._write_memory(at, data[at - start : last - start], now_ns)
-                        for at, last in places
+                        for at, last in parts
                     ]
                     return any(done)
                 return self._write_guarded(channel, start, data, now_ns)
         if start >= len(self.memory):
             return False
-        room = len(self.memory) - start
-        self.memory[start : start + min(room, len(data))] = data[:room]
+        first_size = len(self.memory) - start
+        self.memory[start : start + min(first_size, len(data))] = data[:first_size]
         return True
 
     def _write_guarded(self, channel: SyncChannel, start: int, data: bytes, now_ns: int) -> bool:

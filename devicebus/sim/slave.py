@@ -56,8 +56,8 @@ def check_process_data(esc: Esc, device: Device) -> AlStatusCode:
 
 def check_clock(esc: Esc, device: Device) -> AlStatusCode:
     """Return the AL status code for a clock without the required SYNC0, or NO_ERROR."""
-    asked = esc.memory[Register.DC_ACTIVATION] & 0x02
-    if (asked or device.needs_sync0) and not esc.clock.sync0_is_active:
+    is_requested = esc.memory[Register.DC_ACTIVATION] & 0x02
+    if (is_requested or device.needs_sync0) and not esc.clock.sync0_is_active:
         return AlStatusCode.DC_SYNC_CONFIGURATION
     return AlStatusCode.NO_ERROR
 

@@ -134,13 +134,13 @@ def _elements(
 
 
 def _entries(item: Element, parts: list[_SubItem]) -> Iterator[EntrySpec]:
-    told = {text_at(each, "Name", ""): each.find("Info") for each in item.iterfind("Info/SubItem")}
+    infos = {text_at(each, "Name", ""): each.find("Info") for each in item.iterfind("Info/SubItem")}
     for part in {each.subindex: each for each in parts}.values():
         yield EntrySpec(
             subindex=part.subindex,
             name=part.name,
             type=part.kind,
-            value=_value(told.get(part.name), part.kind),
+            value=_value(infos.get(part.name), part.kind),
             access=part.access,
         )
 
@@ -171,10 +171,10 @@ def _value(info: Element | None, kind_name: str) -> Value | None:
         if (data := text_at(info, "DefaultData", "")) != "":
             octets = bytes.fromhex(data).ljust(kind.size, b"\0")
             plain = kind.to_plain(kind.decode(octets, 0))
-        elif (told := text_at(info, "DefaultString", "")) != "":
-            plain = told
-        elif (told := text_at(info, "DefaultValue", "")) != "":
-            plain = number(told)
+        elif (text := text_at(info, "DefaultString", "")) != "":
+            plain = text
+        elif (text := text_at(info, "DefaultValue", "")) != "":
+            plain = number(text)
         else:
             return None
         kind.encode(plain)

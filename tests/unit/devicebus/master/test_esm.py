@@ -64,7 +64,7 @@ def test_change_state_refused_reports_code_text_and_state(line):
     with pytest.raises(AlStatusError) as caught:
         run(line, change_state(1002, PREOP))
     assert str(caught.value) == (
-        "slave 1002: refuses PREOP and stands in INIT+ERROR: AL status code 0x0016,"
+        "slave 1002: refuses PREOP and is in INIT+ERROR: AL status code 0x0016,"
         " invalid mailbox configuration for PreOp"
     )
     assert (caught.value.code, caught.value.state) == (0x16, INIT)

@@ -130,7 +130,7 @@ def test_startup_slaves_that_fail_for_one_reason_are_one_line():
     with pytest.raises(BusError) as caught:
         line.wait(line.core.bring_up(line.now_ns))
     assert str(caught.value) == (
-        "29 slaves from s3 (1004) to s31 (1032): refuses OP and stands in SAFEOP+ERROR:"
+        "29 slaves from s3 (1004) to s31 (1032): refuses OP and is in SAFEOP+ERROR:"
         " AL status code 0x0019, no valid outputs"
     )
 

@@ -63,7 +63,7 @@ def test_state_that_is_refused(line, command):
     code, _, err = command("state", "1003", "PREOP", *WHERE)
     assert code == 1
     assert err == (
-        "slave 1003: refuses PREOP and stands in INIT+ERROR: AL status code 0x0051, EEPROM error\n"
+        "slave 1003: refuses PREOP and is in INIT+ERROR: AL status code 0x0051, EEPROM error\n"
     )
 
 
