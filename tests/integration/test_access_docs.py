@@ -1,4 +1,4 @@
-"""docs/access.md tells the truth: its rules are those of a plant file, and judge as it says."""
+"""docs/access.md: its rules load from a plant file and decide as the page says."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SAFETY, FILE = Write(G.SDO, 0x9C01_0001, b"x"), ReadWrite(G.FOE_OPEN_WRITE, 0, 4
         (Endpoint("ams-tcp", "127.0.0.1:1"), FILE, "press/eap0", "no rule refuses it to this host"),
     ],
 )
-def test_rules_of_the_page(
+def test_access_page_rules_decide_as_described(
     tmp_path: Path, endpoint: Endpoint, operation: Operation, target: str, rule: str
 ) -> None:
     copy(ROOT / "config" / "buses" / "drive.yaml", tmp_path)

@@ -21,7 +21,7 @@ def reader() -> Iterator[Shell]:
         yield made
 
 
-def test_the_whole_page(reader: Shell) -> None:
+def test_configure_page_commands_print_the_shown_output(reader: Shell) -> None:
     for kind, text in BLOCK.findall(PAGE):
         if kind == "yaml":
             name = text.partition("\n")[0].removeprefix("# ")

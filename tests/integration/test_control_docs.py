@@ -1,4 +1,4 @@
-"""docs/control.md tells the truth: its plant runs and its exchanges happen as they are printed."""
+"""docs/control.md: its plant runs, and its exchanges give the printed answers."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def wait_for_data() -> None:
         wait_until(lambda: client.request("read", station="panel")["values"]["flame"] >= 10)
 
 
-def test_every_exchange_happens_as_printed(control):
+def test_control_page_exchanges_match(control):
     wait_for_data()
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(20)

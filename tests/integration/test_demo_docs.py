@@ -38,13 +38,13 @@ def is_up(demo: Appliance, station: str) -> bool:
 
 
 @pytest.mark.usefixtures("demo")
-def test_examples_of_ads() -> None:
+def test_ads_page_examples_run() -> None:
     pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
     run_examples(DOCS / "ads.md", at_least=25)
 
 
 @pytest.mark.usefixtures("demo")
-def test_examples_of_slaves_by_ads() -> None:
+def test_slaves_by_ads_page_examples_run() -> None:
     pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
     run_examples(DOCS / "slaves-by-ads.md", at_least=30)
 
@@ -56,7 +56,7 @@ def blocks(page: str) -> list[str]:
 
 
 @pytest.mark.usefixtures("demo")
-def test_gateway_client_prints_what_the_page_asks_for(capsys: pytest.CaptureFixture[str]) -> None:
+def test_gateway_client_page_prints_expected_values(capsys: pytest.CaptureFixture[str]) -> None:
     """Of one page: the other has the same program."""
     program = "\n".join(blocks(GATEWAY_PAGES[0]))
     exec(compile(program, GATEWAY_PAGES[0], "exec"), {"__name__": "client"})
@@ -87,7 +87,7 @@ def _code(block: str) -> str:
     return re.sub(r" *# .*", "", described)
 
 
-def test_traces_and_scans_print_what_the_pages_say(demo: Appliance) -> None:
+def test_trace_and_scan_print_the_shown_output(demo: Appliance) -> None:
     assert len(TRACES) == 2
     wait_until(lambda: "(up)" in demo.command("trace", "island-03/bus0/1001"))
     wait_until(lambda: demo.command("scan").count(" OP ") == 8)

@@ -1,4 +1,4 @@
-"""docs/mqtt.md tells the truth: its examples run, and its broker lets pass what it says."""
+"""docs/mqtt.md: its examples run, and its broker allows the listed topics only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PAGE = ROOT / "docs" / "mqtt.md"
 TIMEOUT = 0x719
 
 
-def test_rights_of_the_broker_are_as_the_page_says(farm, tmp_path):
+def test_mqtt_page_broker_rights_allow_listed_topics_only(farm, tmp_path):
     """North may ask south, and not the other way round."""
     users = {f"{NORTH}.1.1": "n", f"{SOUTH}.1.1": "s", "5.23.91.23.1.1": "e"}
     files = write_certificates(tmp_path, BROKER)
@@ -45,7 +45,7 @@ def test_rights_of_the_broker_are_as_the_page_says(farm, tmp_path):
         assert read(NORTH, SOUTH) == -TIMEOUT
 
 
-def test_examples_of_the_page(farm, tmp_path):
+def test_mqtt_page_examples_run(farm, tmp_path):
     settings = (ROOT / "config" / "mosquitto" / "open.conf").read_text().splitlines()
     settings.remove(f"listener 1883 {BROKER}")
     (start, commands) = re.findall(r"```sh\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -77,7 +77,7 @@ def without_times(text: str) -> str:
     return re.sub(r"\s+", " ", re.sub(r"[0-9.]+ (?:µs|ms|s)\b", "", text))
 
 
-def test_rights_on_the_page_are_those_of_the_example():
+def test_mqtt_page_rights_equal_the_example_file():
     rights = (ROOT / "config" / "mosquitto" / "plant.acl").read_text().splitlines()
     page = PAGE.read_text()
     for line in rights:

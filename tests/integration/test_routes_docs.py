@@ -1,4 +1,4 @@
-"""docs/routes.md: its commands run and print what the page says, its screens look so."""
+"""docs/routes.md: its commands print the shown output, its screens match."""
 
 from __future__ import annotations
 
@@ -74,6 +74,6 @@ def replay(reader: Shell) -> Iterator[tuple[str, str, str]]:
                     wait_until(routes_are_known)
 
 
-def test_the_whole_page(reader: Shell) -> None:
+def test_routes_page_commands_and_screens_match(reader: Shell) -> None:
     for command, expected, found in replay(reader):
         assert outline(found) == outline(expected), f"{command}\n{found}"

@@ -49,7 +49,7 @@ def test_a_foreign_directory_is_reported_once(tmp_path):
     assert found(tmp_path) == ["vendor/a.txt:1: 'vendor' at the top level, expected a known one"]
 
 
-def test_pages_name_files_that_exist(tmp_path):
+def test_missing_file_named_in_page_is_reported(tmp_path):
     grow(tmp_path, "tools/demo.py", "eap/pd/__init__.py")
     text = "`tools/demo.py`, `eap/pd/` show it\n`make demo` and `tests/unit/eap/test_gone.py`, too"
     grow(tmp_path, "docs/features.md", text=text)
@@ -58,12 +58,12 @@ def test_pages_name_files_that_exist(tmp_path):
     ]
 
 
-def test_pages_name_programs_that_exist_in_any_folder(tmp_path):
+def test_missing_program_named_in_page_is_reported(tmp_path):
     grow(tmp_path, "tools/demo.py", "README.md", text="`demo.py`, `python -m x`\nand `gone.py`")
     assert found(tmp_path) == ["README.md:2: no file gone.py, expected where it is now"]
 
 
-def test_links_of_pages_lead_to_files_and_headings(tmp_path):
+def test_broken_link_in_page_is_reported(tmp_path):
     grow(tmp_path, "docs/ads.md", text="# `ADS`: states, objects\n")
     links = "[a](docs/ads.md), [b](docs/ads.md#ads-states-objects), [c](https://example.org/#x)\n"
     grow(tmp_path, "README.md", text=f"{links}[d](docs/gone.md), [e](docs/ads.md#gone), [f](#gone)")
@@ -73,7 +73,7 @@ def test_links_of_pages_lead_to_files_and_headings(tmp_path):
     ]
 
 
-def test_pages_name_modules_that_exist(tmp_path):
+def test_missing_module_named_in_page_is_reported(tmp_path):
     grow(tmp_path, "eap/pd/image.py", text="LIMIT = 1\n\nclass Image: ...\n\ndef open_it(): ...\n")
     grow(tmp_path, "eap/__init__.py", text="def attach(): ...\n")
     text = "`eap.pd`, `eap.pd.image`, `eap.pd.image.Image`, `eap.pd.image.LIMIT`, `eap.attach`\n"
@@ -102,14 +102,14 @@ def test_test_of_tools_in_a_folder_of_no_tool_is_reported(tmp_path):
     ]
 
 
-def test_helper_in_the_mirror(tmp_path):
+def test_helper_among_unit_tests_is_reported(tmp_path):
     grow(tmp_path, "eap/ids.py", "tests/unit/eap/helper.py")
     assert found(tmp_path) == [
         "tests/unit/eap/helper.py:1: no test file, expected helpers of tests in tests/support"
     ]
 
 
-def test_tools_keep_the_length(tmp_path):
+def test_too_long_module_of_tools_is_reported(tmp_path):
     grow(tmp_path, "tools/short.py", text="x = 1\n" * MAX_LINES)
     grow(tmp_path, "tools/long.py", text="x = 1\n" * (MAX_LINES + 1))
     assert found(tmp_path) == [
@@ -134,7 +134,7 @@ def test_length_of_tests_and_texts_is_free(tmp_path):
         "registry.np" + "mjs.org",
     ],
 )
-def test_what_is_true_of_one_machine_only(line):
+def test_text_of_one_machine_is_reported(line):
     violations = list(check_text(PurePosixPath("docs/x.md"), f"\n{line}\n"))
     assert [violation.line for violation in violations] == [2]
 
@@ -143,7 +143,7 @@ def test_what_is_true_of_one_machine_only(line):
     "line",
     ["net/work/x", "./home/x", "https://example.org/a", f"{TWO_DOTS}/sharedness", "~/work/x"],
 )
-def test_what_only_looks_like_it(line):
+def test_similar_text_is_not_reported(line):
     assert list(check_text(PurePosixPath("docs/x.md"), line)) == []
 
 
