@@ -1,4 +1,4 @@
-"""One device that ADS clients talk to: whoever answers behind a NetID and a port."""
+"""ADS device: the services behind one NetID and port."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Control: TypeAlias = Callable[[WriteControl], None]
 
 
 def refuse_control(request: WriteControl) -> None:
-    """Take no other state, whatever is asked for."""
+    """Refuse any WriteControl."""
     del request
     raise AdsRefusedError(AdsError.SERVICE)
 
@@ -41,14 +41,14 @@ class AdsDevice:
     """The services of one device.
 
     Args:
-        info: What ReadDeviceInfo tells.
-        states: What ReadState tells.
+        info: Answer to ReadDeviceInfo.
+        states: Source of the answer to ReadState.
         spaces: That read and write; the first that has an index group answers for it.
         control: Acts on WriteControl.
         first_handle: Of its notifications.
 
     Attributes:
-        notifications: Whom it tells of what; the caller says when a cycle is over.
+        notifications: Of its clients; the caller reports the end of each cycle.
     """
 
     def __init__(
@@ -67,12 +67,12 @@ class AdsDevice:
         self._control = control
 
     def answer(self, command: int, body: bytes, client: AdsClient, now_ns: int) -> AmsAnswer:
-        """Do what a request asks for.
+        """Carry out a request.
 
         Args:
             command: Of the AMS header.
             body: What follows the header.
-            client: Whom notifications belong to.
+            client: Owner of the notifications.
             now_ns: The time on the monotonic clock.
         """
         request = accept_request(command, body)

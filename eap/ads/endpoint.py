@@ -8,7 +8,7 @@ from eap.codec.ams import AmsHeader, StateFlags
 
 
 class Endpoint(NamedTuple):
-    """A connection, or an address that packets go to without one, of a door.
+    """Connection of a transport, or an address on a transport without connections.
 
     Two connections never have the same name while a process runs, even from one address; where
     there are none, *connection* is the sender's address, which answers go back to.
@@ -19,11 +19,11 @@ class Endpoint(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Kind of the door, a :class:`~eap.ams.spec.TransportKind`."""
+        """Kind of the transport, a :class:`~eap.ams.spec.TransportKind`."""
         return self.transport.partition(":")[0]
 
     def __str__(self) -> str:
-        # A door to one address only is named after it, which need not be said twice.
+        # A transport to a single address is named after it: print the address once.
         return f"{self.connection} by {self.transport.removesuffix(f':{self.connection}')}"
 
 
@@ -31,17 +31,17 @@ _RESPONSE = StateFlags.RESPONSE.value  # a plain number: operators of flags are 
 
 
 class AmsAnswer(NamedTuple):
-    """What goes back to the sender of a request."""
+    """Answer of a service to a request."""
 
     data: bytes = b""
     error_code: int = 0
-    """Of the AMS header: why the request reached nobody."""
+    """Of the AMS header: the reason the request was not delivered."""
     why: str = ""
-    """For people, where results inside *data* refuse something: what, and why."""
+    """Reason for operators, where results inside *data* refuse something."""
 
 
 def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
-    """Return the packet that brings *answer* back to who sent the request with *header*."""
+    """Return the packet with *answer* to the request with *header*."""
     data = answer.data
     back = AmsHeader(
         header.source,

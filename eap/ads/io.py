@@ -47,7 +47,7 @@ class IoDevice(NamedTuple):
 
 
 class IoSpace(AdsSpace):
-    """The list of devices; *devices* come in the order in which they are told."""
+    """The list of devices; *devices* are listed in their order."""
 
     groups: Collection[int] = range(IndexGroup.IO_DEVICES, IndexGroup.IO_DEVICES + _MAX_ID + 1)
 
@@ -55,7 +55,7 @@ class IoSpace(AdsSpace):
         self._devices = {device.id: device for device in devices}
 
     def read(self, group: int, offset: int, length: int) -> bytes:
-        """Return what is asked of one device or of all, cut to *length*."""
+        """Return a property of one device or of all, cut to *length*."""
         number = group - IndexGroup.IO_DEVICES
         if not number:
             return self._read_all(offset)[:length]
@@ -112,7 +112,7 @@ class SlaveState(NamedTuple):
 
 
 class MasterBus(Protocol):
-    """The bus that is shown."""
+    """Bus behind a master."""
 
     def state(self) -> int:
         """Return the AL state of the master itself."""
@@ -159,7 +159,7 @@ class MasterSpace(AdsSpace):
         return _pair(self._slave(offset))[:length]
 
     def write(self, group: int, offset: int, data: bytes) -> None:
-        """Ask for a state, of the master by the offset, of a slave by the two bytes written."""
+        """Request a state, of the master by the offset, of a slave by the two bytes written."""
         if group == IndexGroup.MASTER_STATE:
             self._master.request_state(_al_state(offset))
         elif group == IndexGroup.SLAVE_STATES:

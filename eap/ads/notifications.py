@@ -1,11 +1,11 @@
-"""ADS notifications of one device: who is told of what, and when.
+"""ADS notifications of one device: sampling, collection and end.
 
 Rule 1: values are sampled when the caller says that a cycle is over (``handle_cycle``), never in
 between, and never in the cycle in which a notification was added: its first sample always follows
-the answer that tells its handle, that of a value on change by ``first_change_ns`` at least.
+the answer with its handle, that of a value on change by ``first_change_ns`` at least.
 Rule 2: a sample waits for others of its client at most as long as that client allows, and less if
 a packet is full: nothing is ever dropped here, and what waits is bounded.
-Rule 3: a source that fails for good ends its notification; the client is told by a sample without
+Rule 3: a source that fails for good ends its notification; the client gets a sample without
 bytes, as TwinCAT does, in a packet of its own, because AdsLib skips what follows such a sample.
 """
 
@@ -45,7 +45,7 @@ _FOR_NOW = frozenset((AdsError.BUSY, AdsError.NOT_READY))
 
 
 class AdsClient(NamedTuple):
-    """Whoever asked: an AMS address, which programs of one computer share, and its connection."""
+    """ADS client: an AMS address, which programs of one computer may share, and its connection."""
 
     endpoint: Endpoint
     net_id: NetId
@@ -108,7 +108,7 @@ class _Notification:
         self.next_ns = first_ns
 
     def advance(self, now_ns: int) -> None:
-        """Set the next time; the mean distance stays what was asked for, if cycles allow it."""
+        """Set the next time; the mean interval is the requested one, if cycles allow it."""
         self._due_ns += self.cycle_ns
         if self._due_ns <= now_ns:
             self._due_ns = now_ns + self.cycle_ns
@@ -117,7 +117,7 @@ class _Notification:
 
 
 class _Outbox:
-    """What a client is still to be told of."""
+    """Samples that wait to be sent to one client."""
 
     __slots__ = ("deadline_ns", "handles", "size", "stamps")
 
@@ -203,7 +203,7 @@ class NotificationTable:
         self._remove(notification)
 
     def forget(self, endpoint: Endpoint) -> None:
-        """End all notifications that were asked for by a connection that is gone."""
+        """End all notifications of a closed connection."""
         for client in [client for client in self._clients if client.endpoint == endpoint]:
             for handle in self._clients.pop(client).handles:
                 del self._notifications[handle]

@@ -24,7 +24,7 @@ _RESULTS: dict[int, AdsError] = {
 
 
 def slave_result(abort: SdoAbortError) -> AdsError:
-    """Return the result by which a slave tells of a refused SDO (as Beckhoff's stack code does)."""
+    """Return a slave's ADS result for a refused SDO (as Beckhoff's stack code does)."""
     return _RESULTS.get(abort.code, AdsError.GENERAL)
 
 
@@ -34,7 +34,7 @@ class ObjectSpace(AdsSpace):
     Args:
         dictionary: What is read and written.
         state: Says in which state the device is now.
-        result_of: The result that tells of a refused SDO.
+        result_of: Returns the ADS result for a refused SDO.
     """
 
     groups: Collection[int] = frozenset(

@@ -1,7 +1,7 @@
-"""What an ADS client wants done, one thing at a time, and how it came out.
+"""Operations of ADS requests, and their outcomes.
 
-Every request is a list of operations: one, or those of a sum command.  Whoever grants access looks
-at operations, whoever serves does them one after the other, and ``ads_request`` makes the answer of
+Every request is a list of operations: one, or those of a sum command.  Access rules are applied to
+operations, a server carries them out one after the other, and ``request`` encodes the answer from
 their outcomes.
 """
 
@@ -14,11 +14,11 @@ from eap.codec.adsnotification import AddNotification
 
 
 class ReadDeviceInfo(NamedTuple):
-    """Who are you?"""
+    """Request for name and version."""
 
 
 class ReadState(NamedTuple):
-    """Which states are you in?"""
+    """Request for ADS state and device state."""
 
 
 class Read(NamedTuple):
@@ -47,7 +47,7 @@ class ReadWrite(NamedTuple):
 
 
 class WriteControl(NamedTuple):
-    """Take these states."""
+    """Request to change the states."""
 
     ads_state: int
     device_state: int
@@ -55,7 +55,7 @@ class WriteControl(NamedTuple):
 
 
 class DeleteNotification(NamedTuple):
-    """Take a handle back."""
+    """Request to end a notification."""
 
     handle: int
 
@@ -73,17 +73,17 @@ Operation: TypeAlias = (
 
 
 class OperationOutcome(NamedTuple):
-    """How an operation came out."""
+    """Outcome of an operation."""
 
     result: int = AdsError.NONE
     data: bytes = b""
-    """What stands behind the result; of a Read or ReadWrite without its length."""
+    """Data behind the result; of a Read or ReadWrite without its length."""
     why: str = ""
-    """For people, where there is more to say than the result does."""
+    """Detail for operators beyond the result."""
 
 
 class AdsRefusedError(Exception):
-    """An operation that is answered with a result other than 0; *why* is for people."""
+    """An operation that is answered with a result other than 0; *why* is for operators."""
 
     def __init__(self, result: AdsError, why: str = "") -> None:
         super().__init__(f"{result.name}: {why}" if why else result.name)

@@ -45,17 +45,17 @@ from eap.codec.ams import AmsCommand
 from eap.errors import TruncatedError
 
 MAX_ANSWER = 1 << 20
-"""Bytes of the longest answer; a sum command that asks for more is refused as a whole."""
+"""Bytes of the longest answer; a sum command that requests more is refused as a whole."""
 MAX_ITEMS = 10_000
 """Of a sum command; Beckhoff advises 500.  Others wait while a request is taken apart."""
 _HEAD_SIZE = 8
 """Bytes of a result and of what stands beside it in the answer of a sum command."""
 _REASONS = 3
-"""That are told of one request, for a sum command may have thousands."""
+"""Reasons kept for one request: a sum command may have thousands."""
 
 
 class AdsRequest(NamedTuple):
-    """One request: what it asks for, and how its answer is made."""
+    """One request: its operations and the form of its answer."""
 
     command: int
     operations: tuple[Operation, ...]
@@ -84,9 +84,9 @@ class AdsRequest(NamedTuple):
 
 
 class Outcomes:
-    """How the operations of one request came out, one after the other.
+    """Outcomes of the operations of one request, one after the other.
 
-    What the answer has no room for is refused as it comes, so that it need not be kept.
+    Data that exceeds the answer is refused as it comes, so that it is not kept.
     """
 
     def __init__(self, request: AdsRequest) -> None:
@@ -113,7 +113,7 @@ class Outcomes:
 
 
 def accept_request(command: int, body: bytes) -> AdsRequest | AmsAnswer:
-    """Take a request apart; return the answer to one that is none."""
+    """Parse a request; return the answer to a malformed one."""
     try:
         return parse_request(command, body)
     except AdsRefusedError as exc:
@@ -123,10 +123,10 @@ def accept_request(command: int, body: bytes) -> AdsRequest | AmsAnswer:
 
 
 def parse_request(command: int, body: bytes) -> AdsRequest:
-    """Take a request apart.
+    """Parse a request.
 
     Raises:
-        AdsRefusedError: it is too short (SIZE), asks for too much at once (NO_MEMORY), or is of
+        AdsRefusedError: it is too short (SIZE), requests too much at once (NO_MEMORY), or is of
             a command that is none (COMMAND, which belongs into the AMS header).
     """
     parser = _PARSERS.get(command)
@@ -151,7 +151,7 @@ def encode_outcome(command: int, outcome: OperationOutcome) -> bytes:
 
 
 def encode_refusal(command: int, result: int) -> bytes:
-    """Return the body of an answer that says only why there is none."""
+    """Return the body of an answer with a result other than 0 and no data."""
     # Clients unpack what stands behind the result whatever the result is.
     return encode_result(result) + bytes(_BEHIND_RESULT.get(command, 0))
 
@@ -281,13 +281,13 @@ _RESULT = 4
 _SHORT_HEADS = frozenset(
     (IndexGroup.SUM_READ, IndexGroup.SUM_WRITE, IndexGroup.SUM_DELETE_NOTIFICATION)
 )
-"""Whose items are answered by a result; those of the others by a result and four bytes more."""
+"""Their items are answered by a result, those of the others by a result and four bytes."""
 _PADDED = frozenset((IndexGroup.SUM_READ, IndexGroup.SUM_READ_EX))
 _RETURNED = frozenset((IndexGroup.SUM_READ_WRITE, IndexGroup.SUM_READ_EX_2))
 
 
 def has_results(request: AdsRequest) -> bool:
-    """Say whether the answer to *request* has a result for each item."""
+    """Return whether the answer to *request* has a result for each item."""
     return bool(request.sum_group) and (
         request.sum_group != IndexGroup.SUM_READ or bool(request.index_offset)
     )

@@ -14,7 +14,7 @@ from eap.ads.operation import AdsRefusedError
 from eap.codec.ads import AdsError, AdsState, AdsStates, AdsSystemState, IndexGroup
 
 Source: TypeAlias = Callable[[], bytes]
-"""Gives the bytes that a notification watches, whenever it is called.
+"""Returns the bytes that a notification watches, whenever it is called.
 
 It raises AdsRefusedError: BUSY and NOT_READY for now, anything else for good.
 """
@@ -98,12 +98,12 @@ _REQUESTED: dict[int, int] = {
 
 
 def states_of(al_state: int) -> AdsStates:
-    """Return what ReadState tells of a device in *al_state*."""
+    """Return the ADS states of a device in *al_state*."""
     return AdsStates(_ADS_STATES.get(al_state, AdsState.INVALID), al_state)
 
 
 def al_state_for(ads_state: int) -> int:
-    """Return the AL state that a WriteControl to *ads_state* asks for; refuse with VALUE.
+    """Return the AL state that a WriteControl to *ads_state* requests; refuse with VALUE.
 
     The device state beside it says nothing: clients send back the one that they read before.
     """
@@ -136,7 +136,7 @@ class DeviceDataSpace(AdsSpace):
 
 
 class SystemSpace(AdsSpace):
-    """The state of the whole station; *state* is called whenever somebody asks."""
+    """State of the whole station; *state* is called for each read."""
 
     groups: Collection[int] = frozenset((IndexGroup.SYSTEM_STATE,))
 

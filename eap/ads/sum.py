@@ -1,7 +1,7 @@
 """Sum commands: many operations in one ReadWrite, and their outcomes in one answer.
 
 The layouts are those of the header AdsDef.h of Beckhoff's AdsLib.  SUM_READ_EX answers with the
-lengths that were asked for, padded with zeros, SUM_READ_EX_2 with those that were read.
+requested lengths, padded with zeros, SUM_READ_EX_2 with those that were read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class SumCommand(NamedTuple):
     split: Callable[[int, bytes], list[Operation]]
     join: Callable[[Sequence[Operation], Sequence[OperationOutcome]], bytes]
     is_padded: bool = False
-    """Whether the answer has the lengths that were asked for, whatever was read."""
+    """True if the answer has the requested lengths, whatever was read."""
 
 
 def parse_read(body: bytes) -> Read:
@@ -54,12 +54,12 @@ def read_exactly(data: bytes, start: int, length: int) -> bytes:
 
 
 def requested_length(operation: Operation) -> int:
-    """Return how many bytes a client has room for."""
+    """Return the number of bytes that a client accepts."""
     return operation.length if isinstance(operation, Read | ReadWrite) else 0
 
 
 def padded(operations: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
-    """Return what was read, each with the length that was asked for."""
+    """Return the data of all items, each with its requested length."""
     return b"".join(
         outcome.data.ljust(requested_length(operation), b"\0")
         for operation, outcome in zip(operations, outcomes, strict=True)

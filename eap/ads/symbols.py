@@ -47,7 +47,7 @@ _REALS = {4: (AdsType.REAL32, "REAL"), 8: (AdsType.REAL64, "LREAL")}
 
 
 class SymbolType(NamedTuple):
-    """How values of one of our types go to ADS clients and come from them."""
+    """ADS form of one of our types, with conversion of values both ways."""
 
     kind: DataType
     id: AdsType
@@ -152,7 +152,7 @@ _ALIGNMENT = 8
 
 
 class SymbolVariable(NamedTuple):
-    """What is known of one variable."""
+    """Description of one variable."""
 
     name: str
     type: DataType
@@ -193,8 +193,8 @@ class SymbolTable:
     """All symbols of one configuration.
 
     Args:
-        variables: In the order in which they are told.
-        version: Counts configurations; 8 bits of it are told.
+        variables: In the order of the upload.
+        version: Counts configurations; clients see 8 bits of it.
     """
 
     def __init__(self, variables: Iterable[SymbolVariable], version: int) -> None:
@@ -221,12 +221,12 @@ class SymbolTable:
 
     @cached_property
     def upload(self) -> bytes:
-        """All entries; made when the first client asks, for a large table takes its time."""
+        """All entries; encoded at the first upload, because a large table takes time."""
         return b"".join(symbol.describe() for symbol in self._symbols)
 
     @property
     def info(self) -> UploadInfo:
-        """How much there is to upload."""
+        """Numbers and sizes of entries to upload."""
         return UploadInfo(
             len(self._symbols), len(self.upload), len(self._types), len(self.type_upload)
         )
@@ -272,7 +272,7 @@ class SymbolTable:
 
 
 class VariableStore(Protocol):
-    """Where the values are; both methods raise AdsRefusedError, BUSY if it is only for now."""
+    """Store of the values; both methods raise AdsRefusedError, BUSY for a passing reason."""
 
     def read(self, name: str) -> bytes:
         """Return the bytes of a value, as its type has them."""
@@ -315,7 +315,7 @@ class SymbolSpace(AdsSpace):
     def replace(self, table: SymbolTable, store: VariableStore) -> None:
         """Go over to another configuration.
 
-        Who watches what is in both, with one type, goes on watching; what is gone ends.
+        Notifications of symbols that are in both, with one type, go on; the others end.
         """
         self._table = table
         self._store = store

@@ -1,7 +1,7 @@
-"""Access: which operations a station does, or passes on, for whom.
+"""Access rules: the operations that a client may have done or forwarded.
 
 Rules come from the plant file; the first one that fits says yes or no.  Where none fits, a program
-on this host may do everything and anybody else only reads.  What an operation is does not depend on
+on this host may do everything and other hosts only read.  What an operation is does not depend on
 its command alone: a ReadWrite that looks a name up reads, a file opened for write is written.
 
 A rule about objects grants what lies in its ranges as a whole, and refuses what touches them.
@@ -25,7 +25,7 @@ _MAX_KNOWN = 4096
 """Pairs of a client and a target whose rules are remembered."""
 
 _RAW = frozenset((IndexGroup.RAW_COMMAND, IndexGroup.VOE, *SUM_COMMANDS))
-"""Sum commands: one inside another, which nobody looks into."""
+"""Sum commands: one inside another, which is not parsed."""
 _FILES = frozenset((IndexGroup.FOE_OPEN_WRITE, IndexGroup.FOE_WRITE))
 _STATES = frozenset((IndexGroup.MASTER_STATE, IndexGroup.SLAVE_STATES))
 _OWN_HANDLES = frozenset((IndexGroup.RELEASE_HANDLE, IndexGroup.FOE_CLOSE))
@@ -43,11 +43,11 @@ LOOKUPS = frozenset(
         IndexGroup.ROUTE_QUERY,
     )
 )
-"""Groups whose ReadWrite changes nothing but what a client keeps of its own."""
+"""Groups whose ReadWrite changes only the client's own handles."""
 
 
 _ADDRESSED = (Read, Write, ReadWrite, AddNotification)
-"""Operations that say where.  A tuple: a union would be made anew at each question."""
+"""Operations with group and offset.  A tuple: a union would be built at each call."""
 
 
 def service_of(operation: Operation) -> AccessService:
@@ -67,7 +67,7 @@ def service_of(operation: Operation) -> AccessService:
 
 
 def group_and_offset(operation: Operation) -> tuple[int | None, int]:
-    """Return index group and offset, no group for what has none."""
+    """Return index group and offset; the group is None if the operation has none."""
     if isinstance(operation, _ADDRESSED):
         return operation.group, operation.offset
     return None, 0
@@ -92,20 +92,20 @@ _OF_OBJECTS = frozenset(
 
 
 class Decision(NamedTuple):
-    """What was decided on one operation."""
+    """Decision on one operation."""
 
     service: AccessService
     is_allowed: bool
     why: str
     """The rule, in words."""
     is_by_rule: bool = False
-    """Whether the plant file says so, and not only the default."""
+    """True if a rule of the plant file decides, False for the default."""
     is_recordable: bool = True
-    """Whether the audit can record it, where that is required."""
+    """True if the audit can record it, where that is required."""
 
 
 class Grants:
-    """What one client may do with one target."""
+    """Rights of one client at one target."""
 
     def __init__(self, rules: Sequence[AccessRule], *, is_this_host: bool) -> None:
         self._by_service = {
@@ -130,7 +130,7 @@ class Grants:
         return Decision(service, False, "no rule allows it, and other hosts only read")
 
     def may(self, service: AccessService) -> bool | None:
-        """Say whether *service* is allowed; None if that depends on the object."""
+        """Return whether *service* is allowed; None if that depends on the object."""
         rules = self._by_service[service]
         whole = next((rule for rule in rules if not rule.objects), None)
         if whole is None:
@@ -146,7 +146,7 @@ class AccessList:
 
     Args:
         rules: The first that fits counts.
-        own: Addresses of this station: who connects from there is this host.
+        own: Addresses of this station: a connection from one of them is from this host.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class AccessList:
         self._known: dict[tuple[Endpoint, NetId, NetId, int], Grants] = {}
 
     def grants(self, endpoint: Endpoint, source: NetId, target: NetId, port: int) -> Grants:
-        """Return what a client may do that came by *endpoint* and calls itself *source*."""
+        """Return the rights of the client at *endpoint* that uses the NetID *source*."""
         key = endpoint, source, target, port
         grants = self._known.get(key)
         if grants is None:
@@ -167,7 +167,7 @@ class AccessList:
         return grants
 
     def is_this_host(self, endpoint: Endpoint) -> bool:
-        """Say whether only a program of this host can have come by *endpoint*."""
+        """Return whether *endpoint* can only be a program of this host."""
         kind = endpoint.kind
         if kind not in IP_TRANSPORTS:
             return kind == TransportKind.LOCAL
@@ -185,7 +185,7 @@ class AccessList:
 
 
 def address_of(endpoint: Endpoint) -> IPv4Address | None:
-    """Return the IPv4 address that somebody came from, None where there is none."""
+    """Return the IPv4 address of an endpoint, None if it has none."""
     if endpoint.kind not in IP_TRANSPORTS:
         return None
     try:
@@ -195,7 +195,7 @@ def address_of(endpoint: Endpoint) -> IPv4Address | None:
 
 
 def host_of(endpoint: Endpoint) -> str:
-    """Return who came by *endpoint*, whichever of his connections it is."""
+    """Return the host of *endpoint*, the same for all its connections."""
     kind = endpoint.kind
     if kind in IP_TRANSPORTS:
         return endpoint.connection.partition(":")[0]
@@ -203,7 +203,7 @@ def host_of(endpoint: Endpoint) -> str:
 
 
 class _Matcher:
-    """A rule whose addresses need no reading any more."""
+    """Access rule with its addresses parsed."""
 
     def __init__(self, rule: AccessRule) -> None:
         self.rule = rule
@@ -235,7 +235,7 @@ def _prefix(text: str) -> bytes:
 
 
 def _is_about(rule: AccessRule, accessed: ObjectRange) -> bool:
-    """Say whether a rule grants all of *accessed*, or refuses any of it."""
+    """Return whether a rule grants all of *accessed*, or refuses any of it."""
     if rule.allow:
         return any(each.contains(accessed) for each in rule.objects)
     return any(each.overlaps(accessed) for each in rule.objects)

@@ -32,7 +32,7 @@ _RESULT = 4
 
 
 class AddRoute(NamedTuple):
-    """A route that somebody asked for by UDP 48899; *user* is who he says he is."""
+    """Request for a route by UDP 48899; *user* is the name in it, which proves nothing."""
 
     name: str
     net_id: str
@@ -46,28 +46,28 @@ class AuditedOperation(NamedTuple):
     operation: Operation | AddRoute
     decision: Decision
     result: int | None
-    """None if nobody knows: there was no answer, or none that can be read."""
+    """None if unknown: there was no answer, or it cannot be parsed."""
 
     @property
     def is_audited(self) -> bool:
-        """Whether an audit tells of it: it changed something, or was refused."""
+        """True if the audit has it: it changed something, or was refused."""
         if not self.decision.is_allowed:
             return True
         if self.decision.service is AccessService.READ:
             return False
-        # Of a file the opening is told; a megabyte of it is a thousand writes.
+        # Of a file only the opening is audited: a megabyte is a thousand writes.
         is_piece = getattr(self.operation, "group", None) == IndexGroup.FOE_WRITE
         return not is_piece or bool(self.result)
 
 
 class AuditEntry(NamedTuple):
-    """What somebody had changed, or wanted to."""
+    """Audit entry: a request with changes, made or refused."""
 
     endpoint: Endpoint
     header: AmsHeader
     """Of the request, as it came."""
     route: str
-    """Name of the route that it went on by; empty for what is of this station."""
+    """Name of the route that it was forwarded by; empty for a service of this station."""
     operations: tuple[AuditedOperation, ...]
 
 
@@ -113,7 +113,7 @@ class AuthorizedRequest(NamedTuple):
 
         Args:
             error_code: Of the AMS header of the answer.
-            body: Of the answer to what went on.
+            body: Of the answer to the forwarded part.
         """
         part = self._part()
         results: list[int | None] = [error_code or _first_result(body)] * len(part.operations)
@@ -159,7 +159,7 @@ def _first_result(body: bytes) -> int | None:
 
 
 MAX_ENTRIES = 4096
-"""Entries of the audit that wait for somebody who writes them down; the oldest makes room."""
+"""Audit entries that wait to be written; the oldest one is dropped for a new one."""
 _NOTIFICATION = AmsCommand.NOTIFICATION.value  # plain numbers: members of enums are slow
 _READ_WRITE = AmsCommand.READ_WRITE.value
 _READS = frozenset(
@@ -185,11 +185,11 @@ _READ_GROUPS = frozenset(
 """Groups of a ReadWrite that only reads, whatever else it holds."""
 _GROUP = slice(AmsHeader.SIZE, AmsHeader.SIZE + 4)
 _LENGTH = 20
-"""Where the header says how long the body is."""
+"""Offset of the length of the body in the header."""
 
 
 class AccessFilter:
-    """Judges requests.
+    """Applies the access rules to requests.
 
     Args:
         access: The rules.
@@ -209,7 +209,7 @@ class AccessFilter:
 
     @property
     def has_entries(self) -> bool:
-        """Whether :meth:`next_entry` has one."""
+        """True if :meth:`next_entry` has one."""
         return bool(self._entries)
 
     def next_entry(self) -> AuditEntry | None:
@@ -222,23 +222,23 @@ class AccessFilter:
         return {service: grants.may(service) for service in AccessService}
 
     def is_this_host(self, endpoint: Endpoint) -> bool:
-        """Say whether only a program of this host can have come by *endpoint*."""
+        """Return whether *endpoint* can only be a program of this host."""
         return self.access.is_this_host(endpoint)
 
     def filter_request(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, route: str = ""
     ) -> tuple[bytes, AuthorizedRequest | None] | RoutingError:
-        """Return a request as it goes in or on, and what to do with its answer, or refuse it.
+        """Return a request as it is delivered or forwarded, and its authorization, or an error.
 
         Args:
             header: As it came.
             data: All of the packet.
-            endpoint: That it came by.
+            endpoint: Of the client.
             now_ns: The time on the monotonic clock.
-            route: Name of the route that it would go on by.
+            route: Name of the route that it would be forwarded by.
         """
         if header.command == _NOTIFICATION:
-            return data, None  # nobody gets one who has not asked for it
+            return data, None  # samples reach only clients that subscribed
         grants = self.access.grants(endpoint, header.source, header.target, header.target_port)
         if grants.may_read and (
             header.command in _READS
@@ -264,13 +264,13 @@ class AccessFilter:
         return data, None if is_read else authorized
 
     def complete(self, authorized: AuthorizedRequest, error_code: int, body: bytes) -> bytes:
-        """Return the body of the answer that the client gets to all it asked for."""
+        """Return the body of the answer to the whole request, denied items included."""
         body, entry = authorized.complete(error_code, body)
         self._enter(entry)
         return body
 
     def abandon(self, authorized: AuthorizedRequest, error_code: int | None = None) -> None:
-        """Take note that nothing came back; *error_code* is what the client got, if anything."""
+        """Audit a request without an answer; *error_code* is the reply to the client, if any."""
         self._enter(authorized.abandon(error_code))
 
     def _record_changes(self, authorized: AuthorizedRequest) -> str:
@@ -307,9 +307,9 @@ def exchange_body(data: bytes, body: bytes) -> bytes:
 
 
 def _refuse_unreadable(header: AmsHeader, why: AdsRefusedError) -> RoutingError:
-    """Return the refusal of a request that nobody here understands.
+    """Return the error for a request that cannot be parsed.
 
-    Only clients that may send anything get it through, and nobody where changes are recorded.
+    Only clients with the right RAW may send one, and none if changes have to be recorded.
     """
     text = "the request cannot be read"
     if why.result is AdsError.COMMAND:

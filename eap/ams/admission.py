@@ -1,7 +1,7 @@
-"""Whether a request may go on: circles, links that are down, and how much is in flight.
+"""Admission of requests: loops, hops that are down, and limits of requests in flight.
 
-AoE has no count of hops.  What came in by a door does not go back to where it came from; a request
-that this router has passed on already, and whose answer it still waits for, has run in a circle.
+AoE has no hop count.  A packet is not sent back by the transport that it arrived by; a request that
+this router has forwarded already, and whose answer it still waits for, has run in a circle.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from eap.ids import STATION_OCTETS, NetId
 
 
 class RouterLimits(NamedTuple):
-    """How much a router takes on."""
+    """Limits of requests that a router accepts."""
 
     in_flight: int = 4096
     """Requests that wait, of all connections."""
     per_connection: int = 512
     """Requests of one connection that wait."""
     per_transport: int = 2048
-    """Requests of all connections of a door: a flood by one leaves room for the others.
+    """Requests of all connections of a transport: a flood by one leaves space for the others.
 
-    One connection may have as many as others leave, so however many flood, some room remains.
+    One connection may have as many as others leave, so however many flood, some space remains.
     """
     timeout_ns: int = 4_500_000_000
-    """How long an answer may take: an error comes back before clients lose patience at 5 s."""
+    """Limit for an answer: the error comes back before the usual client time-out of 5 s."""
 
 
 class Admission:
@@ -44,7 +44,7 @@ class Admission:
     Args:
         net_id: Of the router.
         table: The routes.
-        transports: All doors by name.
+        transports: All transports by name.
         in_flight: What waits.
         limits: How much may wait.
         hop_prober: Knows which hops do not answer.
@@ -68,7 +68,7 @@ class Admission:
         self._down: dict[Endpoint, str] = {}
         self._closed: dict[str, str] = {}
         self._opened: set[str] = set()
-        """Doors by which some hop was reached; a client behind one listens, or did."""
+        """Transports by which some hop was reached; a client behind one listens, or did."""
 
     def hop_down(self, transport: str, address: str | None, text: str) -> None:
         """Refuse what would go to *address* by *transport*, or to any address; *text* says why."""
@@ -78,7 +78,7 @@ class Admission:
             self._down[Endpoint(transport, address)] = text
 
     def hop_up(self, transport: str, address: str | None) -> None:
-        """Take back what :meth:`hop_down` was told with the same arguments."""
+        """Undo :meth:`hop_down` with the same arguments."""
         if transport in self._transports:
             self._opened.add(transport)
         if address is None:
@@ -87,14 +87,14 @@ class Admission:
             self._down.pop(Endpoint(transport, address), None)
 
     def transport_removed(self, name: str) -> None:
-        """Forget everything about a door."""
+        """Forget everything about a transport."""
         self._opened.discard(name)
         self._closed.pop(name, None)
         for endpoint in [each for each in self._down if each.transport == name]:
             del self._down[endpoint]
 
     def is_down(self, hop: Endpoint) -> bool:
-        """Say whether nothing can go to *hop* now."""
+        """Return whether *hop* is known to be down."""
         if hop in self._down or hop.transport in self._closed:
             return True
         return self._hop_prober is not None and self._hop_prober.is_dead(hop)
@@ -102,7 +102,7 @@ class Admission:
     def why_down(self, hop: Endpoint) -> str:
         """Return in words why nothing can go to *hop* now; empty if it can."""
         if hop.transport not in self._transports:
-            return f"this station has no door {hop.transport}"
+            return f"this station has no transport {hop.transport}"
         if why := self._down.get(hop) or self._closed.get(hop.transport):
             return why
         is_dead = self._hop_prober is not None and self._hop_prober.is_dead(hop)
@@ -119,35 +119,35 @@ class Admission:
         return Obstacle(RouteState.DOWN, why)
 
     def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | RoutingError:
-        """Return how a request goes on that is for nobody here."""
+        """Return the route of a request for another station, or an error."""
         found = self._table.find(header.target)
         if found is None:
             return RoutingError(AdsError.TARGET_MACHINE, f"no route to {header.target}")
         route, octets = found
         if octets < STATION_OCTETS and header.target.station == self._net_id.station:
-            # Whoever has a route for the station's NetIDs would send it back here.
+            # A router with a route for this station's NetIDs would send it back here.
             text = f"this station has no NetID {header.target}"
             return RoutingError(AdsError.TARGET_MACHINE, text)
         return self._find_obstacle(header, endpoint, route) or route
 
     def is_duplicate(self, header: AmsHeader, onward: bytes, endpoint: Endpoint) -> bool:
-        """Say whether it is a doubled packet, or asked again, while the first one waits."""
+        """Return whether the same request, repeated or doubled, waits already."""
         if self._transports[endpoint.transport].is_stream:
             return False
         return self._in_flight.has_request(endpoint, onward, header.invoke_id)
 
     def find_loop(self, header: AmsHeader, onward: bytes, route: Route) -> RoutingError | None:
-        """Say whether a request was passed on from here already."""
+        """Return an error if this router has forwarded the request already."""
         known = self._in_flight.get(header.invoke_id)
         if known is None or known.route is None:
             return None
         if known.onward != onward or known.header.command != header.command:
             return None
-        text = f"it was passed on from here already: routes to {header.target} run in a circle"
+        text = f"it was forwarded from here already: routes to {header.target} run in a circle"
         return RoutingError(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
 
     def check_limits(self, endpoint: Endpoint) -> RoutingError | None:
-        """Say whether too many requests wait for one more."""
+        """Return an error if too many requests wait already."""
         waiting = self._in_flight.count(endpoint)
         of_transport = self._in_flight.count_of_transport(endpoint.transport)
         if waiting >= self._limits.per_connection:

@@ -1,4 +1,4 @@
-"""Names and addresses of a plant: AMS addresses behind names, and hops as people write them.
+"""Names and addresses of a plant: AMS addresses behind names, and hops as operators write them.
 
 island-02/eap0        ams-tcp:192.168.1.5        udp:10.0.0.5        mqtt:line
 
@@ -26,7 +26,7 @@ _MAX_PORT = 0xFFFF
 
 
 class AmsAddress(NamedTuple):
-    """Whom an ADS request is for."""
+    """Target of an ADS request."""
 
     net_id: NetId
     port: int
@@ -86,7 +86,7 @@ class Directory:
         return self.find(text if first is None else f"{text}/{first.name}")
 
     def name_of(self, net_id: NetId, port: int) -> str:
-        """Return who has an address, as people call it; empty if nobody here knows."""
+        """Return the name of the owner of an address; empty if unknown."""
         known = self._names.get(AmsAddress(net_id, port))
         if known is not None:
             return known
@@ -94,7 +94,7 @@ class Directory:
         return "" if owner is None else f"{owner}:{port}"
 
     def station_of(self, net_id: NetId) -> str:
-        """Return the station that has a NetID, also one of its ports; empty if nobody here does."""
+        """Return the station that has a NetID, also one of its ports; empty if unknown."""
         return self._net_ids.get(net_id, "").partition("/")[0]
 
     def _enter(self, name: str, port: DirectoryPort) -> None:
@@ -139,7 +139,7 @@ def parse_via(
     """Return where packets go.
 
     Args:
-        text: As people write it.
+        text: As an operator writes it.
         net_id: Of the station that the route leads to; at a broker it is the address.
         own: The station that they leave.
         directory: All of its plant.
@@ -207,7 +207,7 @@ def read_address(host: str) -> IPv4Address:
 
 
 def _complete(text: str) -> str:
-    """Return *text* with the kind of its door in front."""
+    """Return *text* with the kind of its transport in front."""
     kind, colon, rest = text.partition("://")
     if colon:
         return f"{kind}:{rest}"

@@ -1,4 +1,4 @@
-"""Answers of a router itself: why a request went no further."""
+"""Error replies of a router to requests that it cannot forward or deliver."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ _NOTIFICATION = AmsCommand.NOTIFICATION.value
 
 
 class RoutingError(NamedTuple):
-    """Why a request goes no further."""
+    """Reason a request is not forwarded or delivered."""
 
     error: AdsError
     text: str
     route: Route | None = None
-    """Whose hop it stopped at, unless here."""
+    """Route whose hop failed; None for this router."""
     outcome: Outcome = Outcome.FAILED
     body: bytes = b""
-    """Of the answer, where that has the error and not the AMS header."""
+    """Body of the reply, where that carries the error and not the AMS header."""
 
 
 def wants_answer(header: AmsHeader) -> bool:
-    """Say whether the sender of a request waits for an answer."""
+    """Return whether the sender of a request waits for an answer."""
     return not (header.state_flags & _NO_RETURN or header.command == _NOTIFICATION)
 
 
 class ErrorReplier:
-    """Answers with errors, and remembers each."""
+    """Replies with errors, and records each."""
 
     def __init__(self, transports: TransportTable, record: Record) -> None:
         self._transports = transports
@@ -47,7 +47,7 @@ class ErrorReplier:
         at_ns: int,
         took_ns: int = 0,
     ) -> list[Action]:
-        """Answer the request with *header*, as it came by *endpoint*; None if nobody waits."""
+        """Reply to a request at *endpoint*, None if its client is gone; record it."""
         text = f"{describe(header, endpoint)}: {why.text}"
         hop = None
         if why.route is not None:
@@ -65,7 +65,7 @@ class ErrorReplier:
     def drop(
         self, endpoint: Endpoint, header: AmsHeader | None, outcome: Outcome, text: str, at_ns: int
     ) -> list[Action]:
-        """Say nothing to anybody, and remember it."""
+        """Record a packet that is dropped without a reply."""
         subject = str(endpoint) if header is None else describe(header, endpoint)
         text = f"{subject}: {text}"
         self._record.add(Trace(at_ns, outcome, endpoint, None, header, 0, 0, text))

@@ -1,8 +1,8 @@
-"""Requests that go on to the next hop, and their answers that come back.
+"""Forwarder: sends requests to the next hop and returns their answers.
 
-A request that goes on has an invoke id of the router's own, so that nothing a client chooses can be
-mixed up with what another one does, and an answer that comes too late is nobody's.  An id that a
-router before this one gave is kept: a packet that runs in a circle is known by it.
+A forwarded request has an invoke ID of the router's own, so that the IDs of two clients never
+collide and a late answer matches no request.  An ID that another router gave is kept: it identifies
+a packet that runs in a circle.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ _NOTIFICATION = AmsCommand.NOTIFICATION.value  # taken once: members of enums ar
 _ANSWERED = Outcome.ANSWERED
 _HALF = ADDRESSES.size // 2
 _INVOKE_ID = 28
-"""Where it stands in a packet; between the addresses and it nothing changes on the way."""
+"""Offset in a packet; the bytes between the addresses and it are forwarded unchanged."""
 
 
 class Forwarder:
-    """What a router passes on.
+    """Forwards requests, answers and notifications of a router.
 
     Attributes:
-        in_flight: What waits for an answer.
-        notification_forwarder: Notifications that pass.
+        in_flight: Requests that wait for an answer.
+        notification_forwarder: Notifications across this router.
         subscription_restorer: Subscriptions that are interrupted.
     """
 
@@ -85,15 +85,15 @@ class Forwarder:
     def forward_notification(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, *, is_own: bool
     ) -> list[Action]:
-        """Hand samples to the clients that subscribed, whatever NetID these have.
+        """Send samples to the clients that subscribed, whatever NetID these have.
 
-        Samples that no client here subscribed to go on by a route.  Where that leads nowhere, or to
-        a client that does not listen, the server is told to end them.
+        Samples that no client here subscribed to are forwarded by a route.  Without a route, or if
+        its client does not listen, the server is requested to end them.
 
         Args:
             header: Of the notification.
             data: All of the packet.
-            endpoint: That it came by.
+            endpoint: That it arrived by.
             now_ns: The time on the monotonic clock.
             is_own: Whether its target is of this station.
 
@@ -130,7 +130,7 @@ class Forwarder:
     def _end_unwanted(
         self, header: AmsHeader, samples: Samples, endpoint: Endpoint
     ) -> list[Action]:
-        """Have one notification ended that no client has; the others come again."""
+        """End one notification that no client has; the others follow with their next samples."""
         if not samples.unknown:
             return []
         return self._cleanup.end_unwanted(header, samples.unknown[0], endpoint)
@@ -138,7 +138,7 @@ class Forwarder:
     def forward_request(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
     ) -> list[Action]:
-        """Pass a request on that is for nobody here, or refuse it."""
+        """Forward a request to another station, or reply with an error."""
         is_tracked = header.command in TRACKED_COMMANDS
         own = (
             self.notification_forwarder.find_deleted(header, data, endpoint) if is_tracked else None
@@ -173,7 +173,7 @@ class Forwarder:
         authorized: AuthorizedRequest | None,
         now_ns: int,
     ) -> int | list[Action]:
-        """Remember a request that a service of this station gets; return its ticket, or refuse."""
+        """Add a request to a service of this station; return its ticket, or an error reply."""
         pending = self._admit(
             header, data, data[: ADDRESSES.size], endpoint, None, authorized, now_ns
         )
@@ -182,7 +182,7 @@ class Forwarder:
     def return_answer(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
     ) -> list[Action]:
-        """Send an answer back to who asked, unless it is late or comes from somewhere else."""
+        """Return an answer to its client, unless it is late or from another hop."""
         pending = self.in_flight.get(header.invoke_id)
         if pending is None or not self._is_answer(header, data, endpoint, pending):
             return self._error_replier.drop(
@@ -227,14 +227,14 @@ class Forwarder:
     def answer_now(
         self, header: AmsHeader, endpoint: Endpoint, answer: AmsAnswer, took_ns: int, now_ns: int
     ) -> list[Action]:
-        """Send back what a service had at hand for a request that never waited."""
+        """Return the immediate answer of a service."""
         packet = response_to(header, answer)
         self._record.connections.of(endpoint, now_ns).add_answer(len(packet), took_ns)
         self._record.add(Trace(now_ns, _ANSWERED, endpoint, None, header, 0, took_ns, ""))
         return [self._transports.reply(endpoint, packet)]
 
     def answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
-        """Send back what a service says to the request with *ticket*, if it still waits."""
+        """Return the answer of a service to the request with *ticket*, if it still waits."""
         pending = self.in_flight.get(ticket)
         if pending is None or pending.route is not None or pending.endpoint is None:
             return []
@@ -247,12 +247,12 @@ class Forwarder:
         return self._send_back(pending, pending.endpoint, packet, answer.error_code, now_ns, why)
 
     def send_failed(self, ticket: int, text: str, now_ns: int) -> list[Action]:
-        """Answer a request that its door could not send."""
+        """Reply to a request that its transport could not send."""
         pending = self.in_flight.pop(ticket)
         return [] if pending is None else self._fail(pending, text, now_ns)
 
     def endpoints_of(self, transport: str) -> set[Endpoint]:
-        """Return by which ways of a door somebody waits here for something."""
+        """Return the endpoints of a transport with pending requests or subscriptions."""
         endpoints = {
             *self.in_flight.endpoints(),
             *self.notification_forwarder.subscriptions.endpoints(),
@@ -260,7 +260,7 @@ class Forwarder:
         return {endpoint for endpoint in endpoints if endpoint.transport == transport}
 
     def connection_closed(self, endpoint: Endpoint, now_ns: int) -> list[Action]:
-        """Forget who waits at *endpoint*, and end their notifications."""
+        """Forget the requests of *endpoint*, and end its notifications."""
         for pending in self.in_flight.abandon(endpoint):
             self._give_up(pending)
             if pending.route is None:
@@ -268,12 +268,12 @@ class Forwarder:
         return self._cleanup.end(self.notification_forwarder.close(endpoint), now_ns)
 
     def hop_down(self, transport: str, address: str | None, text: str, now_ns: int) -> list[Action]:
-        """Answer what waits for a hop, and refuse what will be for it."""
+        """Fail the pending requests of a hop, and all later ones until it is up."""
         self._admission.hop_down(transport, address, text)
         return self.hop_lost(transport, address, text, now_ns)
 
     def hop_lost(self, transport: str, address: str | None, text: str, now_ns: int) -> list[Action]:
-        """Answer what waits for a hop: it will not."""
+        """Fail the pending requests of a hop."""
         actions = self.subscriptions_lost(transport, address, text, now_ns)
         for pending in self.in_flight.on(transport, address):
             self.in_flight.pop(pending.invoke_id)
@@ -283,28 +283,28 @@ class Forwarder:
     def subscriptions_lost(
         self, transport: str, address: str | None, text: str, now_ns: int
     ) -> list[Action]:
-        """Restore the subscriptions by a hop, or tell the router before this one."""
+        """Restore the subscriptions by a hop, or end them at the previous router."""
         lost = self.notification_forwarder.subscriptions.of_hop(transport, address)
         return self.subscription_restorer.interrupt(lost, text, now_ns)
 
     def hop_up(self, transport: str, address: str | None) -> None:
-        """Pass requests on to a hop again."""
+        """Forward requests to a hop again."""
         self._admission.hop_up(transport, address)
 
     def transport_removed(self, name: str) -> None:
-        """Forget everything about a door."""
+        """Forget everything about a transport."""
         self._admission.transport_removed(name)
 
     def find_obstacle(self, route: Route) -> Obstacle | None:
-        """Return why nothing can go by *route* now; None if something can."""
+        """Return the reason that *route* cannot be used now; None if it can."""
         return self._admission.find_obstacle(route)
 
     def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | RoutingError:
-        """Return how a request would go on that is for nobody here."""
+        """Return the route that a request would take, or an error."""
         return self._admission.find_route(header, endpoint)
 
     def is_down(self, hop: Endpoint) -> bool:
-        """Say whether nothing can go to a hop now."""
+        """Return whether a hop is known to be down."""
         return self._admission.is_down(hop)
 
     def next_timeout(self) -> int | None:
@@ -313,7 +313,7 @@ class Forwarder:
         return min((each for each in times if each is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> list[Action]:
-        """Answer the requests whose time is up."""
+        """Reply to requests whose time-out has passed."""
         actions: list[Action] = []
         for pending in self.in_flight.due(now_ns):
             self.in_flight.pop(pending.invoke_id)
@@ -324,7 +324,7 @@ class Forwarder:
     def _find_request_route(
         self, header: AmsHeader, packet: bytes, endpoint: Endpoint, now_ns: int
     ) -> tuple[Route, bytes] | RoutingError:
-        """Return by which route a request of a client goes on now, and with which addresses."""
+        """Return the route of a client's request now, and the addresses that it is sent with."""
         found = self._authorize(header, packet, endpoint, now_ns)
         if isinstance(found, RoutingError):
             return found
@@ -347,7 +347,7 @@ class Forwarder:
         endpoint: Endpoint,
         now_ns: int,
     ) -> list[Action]:
-        """End subscriptions that this router restores, whatever is wrong with the way."""
+        """End subscriptions that this router restores, even if their hop is down."""
         known = {each.handle for each in own}
         handles = deleted_handles(header, data)
         grants = self.notification_forwarder.forget(own)
@@ -377,7 +377,7 @@ class Forwarder:
     def _authorize(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
     ) -> tuple[Route, bytes, AuthorizedRequest | None] | RoutingError:
-        """Return by which route a request goes on, and as what."""
+        """Return the route of a request, its packet and its authorization, or an error."""
         route = self._admission.find_route(header, endpoint)
         if isinstance(route, RoutingError):
             return route
@@ -388,7 +388,7 @@ class Forwarder:
         self, header: AmsHeader, data: bytes, onward: bytes, endpoint: Endpoint,
         route: Route | None, authorized: AuthorizedRequest | None, now_ns: int,
     ) -> Pending | list[Action]:  # fmt: skip
-        """Remember a request that has an answer, unless something speaks against it."""
+        """Add a request that has an answer, unless a limit or a loop forbids it."""
         if self._admission.is_duplicate(header, onward, endpoint):
             if authorized is not None:
                 self._access_filter.abandon(authorized)
@@ -421,11 +421,11 @@ class Forwarder:
         route: Route,
         now_ns: int,
     ) -> list[Action]:
-        """Pass on what has no answer, unless it was passed on a short time ago."""
+        """Forward a packet without an answer, unless it was forwarded a short time ago."""
         invoke_id = header.invoke_id
         if is_marked(invoke_id):
             if (invoke_id, onward) in self._loop_detector:
-                text = f"passed on already: doubled, or routes to {header.target} run in a circle"
+                text = f"forwarded already: doubled, or routes to {header.target} run in a circle"
                 return self._error_replier.drop(endpoint, header, Outcome.LOOP, text, now_ns)
         else:
             invoke_id = self._ids.allocate(self.in_flight)
@@ -508,7 +508,7 @@ class Forwarder:
         return actions
 
     def _refuse(self, pending: Pending, why: RoutingError, now_ns: int) -> list[Action]:
-        """Answer a request that nothing came back for."""
+        """Reply with an error to a request without an answer."""
         self._give_up(pending, why.error)
         took_ns = now_ns - pending.at_ns
         return self._error_replier.reply_error(
@@ -530,5 +530,5 @@ def _with_result(answer: AmsAnswer) -> str:
 def _describe_late(answer: AmsHeader) -> str:
     return (
         f"an answer of {answer.source}:{answer.source_port} to {answer.target}:{answer.target_port}"
-        " that nobody waits for, or not any more"
+        " that no request waits for"
     )

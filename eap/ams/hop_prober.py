@@ -1,12 +1,12 @@
-"""Which next hops are alive: asked in the background, so that nobody waits for a dead one.
+"""Probes of the next hops in the background, so that no request waits for a dead hop.
 
-A hop is asked for the ADS state of its router; whatever it answers, an error too, it is alive, and
-so it is while it answers requests that pass.  What misses two questions in a row is down until it
-answers again.
+A probe reads the ADS state of the hop's router.  Any answer, an error too, shows that the hop is
+alive, and so does the answer to a forwarded request.  A hop that misses two probes in a row is down
+until it answers again.
 
-Where subscriptions come from a hop, its system service is also asked for its restart index: another
-one than before says that the router was started again and has forgotten what it passed on, although
-the hop may never have been silent for long.
+A hop with subscriptions is also probed for the restart index of its system service: a changed index
+shows that the router was restarted and has lost what it forwarded, although the hop may never have
+been silent for long.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId
 
 PROBE_PORT = 1
-"""AMS port of this router that answers to probes go to."""
+"""AMS port of this router for answers to probes."""
 MISSES = 2
-"""Questions without an answer that make a hop a dead one."""
+"""Probes without an answer after which a hop is dead."""
 GONE_NS = 60_000_000_000
 """Time after which a dead hop counts as gone: its notifications are ended.  A router that was cut
 off for as long subscribes again when it is back."""
 _BUSY = 5
-"""A hop that answers requests is asked only every so many turns: how long its router takes."""
+"""A hop that answers requests is probed only in every fifth interval, for its round trip."""
 _SPACING_NS = 10_000_000
-"""Between two probes at least, on the average: many hops are asked less often."""
+"""Smallest mean gap between two probes: many hops are probed less often."""
 
 
 _STATE = AdsRange(IndexGroup.SYSTEM_STATE, 0, AdsSystemState.SIZE).encode()
@@ -40,18 +40,18 @@ _HEAD = 8
 
 
 class Probe(NamedTuple):
-    """A question that is due."""
+    """Probe that is due."""
 
     hop: Endpoint
     packet: bytes
     is_found_dead: bool
-    """Whether the questions before it make the hop a dead one, which it was not yet."""
+    """True if the missed probes before it make the hop dead, which it was not yet."""
     is_gone: bool = False
     """True in one report, when the hop has been dead for GONE_NS."""
 
 
 class _Hop:
-    """What is known of one hop."""
+    """State of one hop."""
 
     __slots__ = (
         "answered_at_ns",
@@ -79,7 +79,7 @@ class _Hop:
         self.restart_index: int | None = None
 
     def is_due(self, now_ns: int, interval_ns: int) -> bool:
-        """Say whether to ask it, when its turn has come."""
+        """Return whether to probe it in this interval."""
         if self.is_down or self.answered_at_ns < 0 or self.probed_at_ns is None:
             return True
         is_busy = now_ns - self.answered_at_ns < interval_ns
@@ -87,15 +87,15 @@ class _Hop:
 
 
 class HopProber:
-    """Asks the hops of a table of routes.
+    """Probes the hops of a route table.
 
     Attributes:
         watched: Hops by which subscriptions come.
 
     Args:
-        net_id: Of the router that asks.
+        net_id: Of the router that probes.
         table: The routes; those with *is_probed* count.
-        interval_ns: Between two questions to a hop.
+        interval_ns: Between two probes of a hop.
     """
 
     def __init__(self, net_id: NetId, table: RouteTable, interval_ns: int = 1_000_000_000) -> None:
@@ -112,14 +112,14 @@ class HopProber:
         self.watched: Container[Endpoint] = ()
 
     def pause(self, transport: str, address: str | None) -> None:
-        """Ask no more: the door itself knows that there is no way."""
+        """Stop probing: the transport itself knows that the hop is unreachable."""
         if address is None:
             self._closed.add(transport)
         else:
             self._paused.add(Endpoint(transport, address))
 
     def resume(self, transport: str, address: str | None) -> None:
-        """Ask again, and take the hop for alive until it misses questions."""
+        """Probe again, and count the hop as alive until it misses probes."""
         if address is None:
             self._closed.discard(transport)
         else:
@@ -137,7 +137,7 @@ class HopProber:
             known.misses = 0
 
     def is_answer(self, header: AmsHeader) -> bool:
-        """Say whether a response is for the prober."""
+        """Return whether a response is for the prober."""
         return header.target_port == PROBE_PORT and header.target == self._net_id
 
     def receive_answer(
@@ -149,12 +149,12 @@ class HopProber:
         Args:
             header: Of the answer.
             body: What follows the header.
-            endpoint: That it came by.
+            endpoint: That it arrived by.
             now_ns: The time on the monotonic clock.
-            is_from: Says of a hop and a way whether it may come from there.
+            is_from: Returns whether a packet from an endpoint may come from a hop.
 
         Returns:
-            The hop, if its router was started again since the answer before.
+            The hop, if its router was restarted since the previous answer.
         """
         hop = self._by_number.get(header.invoke_id)
         if hop is None or not is_from(hop, endpoint):
@@ -169,17 +169,17 @@ class HopProber:
         return None
 
     def is_dead(self, hop: Endpoint) -> bool:
-        """Say whether a hop does not answer."""
+        """Return whether a hop does not answer."""
         known = self._hops.get(hop)
         return known is not None and known.is_down
 
     def has_answered(self, hop: Endpoint) -> bool:
-        """Say whether a hop is asked, and has ever answered anything."""
+        """Return whether a hop is probed, and has ever answered."""
         known = self._hops.get(hop)
         return known is not None and known.answered_at_ns >= 0
 
     def round_trip_ns(self, hop: Endpoint) -> int | None:
-        """Return how long a hop took to answer last; None if it is not asked or does not."""
+        """Return the last round trip of a hop; None if it is not probed or does not answer."""
         known = self._hops.get(hop)
         return None if known is None or known.is_down else known.round_trip_ns
 
@@ -190,7 +190,7 @@ class HopProber:
         return self._schedule[0][0] if self._schedule else None
 
     def probes_due(self, now_ns: int) -> Iterator[Probe]:
-        """Yield the questions to ask now."""
+        """Yield the probes that are due."""
         if self._version != self._table.version:
             self._follow_table(now_ns)
         interval_ns = max(self._interval_ns, len(self._hops) * _SPACING_NS)
@@ -213,7 +213,7 @@ class HopProber:
         is_found_dead = hop.misses >= MISSES and not hop.is_down
         hop.is_down = hop.is_down or is_found_dead
         if is_found_dead:
-            # What came from it is restored anyhow, and another router may answer next.
+            # Its subscriptions are restored anyhow, and another router may answer next.
             hop.restart_index, hop.has_restart_index = None, True
             hop.gone_at_ns = now_ns + GONE_NS
         is_gone = hop.is_down and hop.gone_at_ns is not None and now_ns >= hop.gone_at_ns
@@ -245,7 +245,7 @@ class HopProber:
 
 
 def _has_restarted(hop: _Hop, header: AmsHeader, body: bytes) -> bool:
-    """Note a restart index; say whether it is another one than before."""
+    """Note a restart index; return whether it has changed."""
     if header.error_code or any(body[:4]) or len(body) < _HEAD + AdsSystemState.SIZE:
         hop.has_restart_index = False
         return False

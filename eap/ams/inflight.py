@@ -23,11 +23,11 @@ _FACTOR = 2654435761
 
 
 class InvokeIds:
-    """Gives ids one after the other; one comes again after four millions.
+    """Allocates IDs one after the other; one repeats after four million.
 
     Args:
-        first: Where to begin; another number at each start keeps the answers to what an earlier
-            process asked from being taken for those of this one.
+        first: First serial; another number at each start keeps late answers to an earlier process
+            from matching requests of this one.
     """
 
     def __init__(self, first: int) -> None:
@@ -43,7 +43,7 @@ class InvokeIds:
 
 
 def is_marked(invoke_id: int) -> bool:
-    """Say whether a router gave this id."""
+    """Return whether a router gave this ID."""
     return invoke_id >> _SERIAL_BITS == _mark(invoke_id & _SERIALS - 1)
 
 
@@ -52,11 +52,11 @@ def _mark(serial: int) -> int:
 
 
 MAX_PASSED = 1024
-"""Packets that are remembered; one that runs in a circle comes again long before so many others."""
+"""Packets that are kept; one that runs in a circle returns long before so many others."""
 
 
 class LoopDetector:
-    """The latest packets, by invoke id and addresses."""
+    """The latest packets without an answer that were forwarded, by invoke ID and addresses."""
 
     def __init__(self) -> None:
         self._latest: OrderedDict[tuple[int, bytes], None] = OrderedDict()
@@ -72,20 +72,20 @@ class LoopDetector:
 
 
 class Pending:
-    """A request that was passed on.
+    """A request that was forwarded or delivered.
 
     Attributes:
         invoke_id: That it has now; unique here.
         header: As it came.
-        endpoint: Where it came from and its answer goes; None when nobody waits any more.
-        route: How it went on; None to a service of this station.
-        onward: Source and target of the packet that went on, 16 bytes.
+        endpoint: Of its client, where the answer goes; None when the client is gone.
+        route: That it was forwarded by; None for a service of this station.
+        onward: Target and source of the forwarded packet, 16 bytes.
         at_ns: When it came.
         deadline_ns: When its time is up.
-        handles: How many notifications it asks for.
-        request_body: What it asks for, if a subscription is restored by it here later: its body.
-        step: That of a restoration which the request is; None for a client's.
-        authorized: What access rules say of it, where its answer matters to them.
+        handles: Number of notifications that it requests.
+        request_body: Its body, if this router restores a subscription by it later.
+        step: Step of a restoration, for a request of this router; None for a client's.
+        authorized: Decisions on its operations, where its answer has to be completed or audited.
     """
 
     __slots__ = (
@@ -120,10 +120,9 @@ class Pending:
 
 
 class InFlight:
-    """All that waits.
+    """Requests in flight.
 
-    Each of its requests is found by invoke id, and by who asked what, in the same time however
-    many there are.
+    A request is found by invoke ID, and by client and request, in constant time.
     """
 
     def __init__(self) -> None:
@@ -148,15 +147,15 @@ class InFlight:
         return self._by_id.get(invoke_id)
 
     def endpoints(self) -> list[Endpoint]:
-        """Return by which ways there came requests that wait."""
+        """Return the endpoints with waiting requests."""
         return list(self._by_endpoint)
 
     def count(self, endpoint: Endpoint) -> int:
-        """Return how many came by *endpoint*."""
+        """Return the number of requests of *endpoint*."""
         return len(self._by_endpoint.get(endpoint, ()))
 
     def count_of_transport(self, transport: str) -> int:
-        """Return how many came by any connection of *transport*."""
+        """Return the number of requests of all endpoints of *transport*."""
         return self._by_transport.get(transport, 0)
 
     def add(self, pending: Pending) -> None:
@@ -177,7 +176,7 @@ class InFlight:
         self._by_time.setdefault(allowed, OrderedDict())[key] = pending
 
     def has_request(self, endpoint: Endpoint, onward: bytes, invoke_id: int) -> bool:
-        """Say whether a request with these addresses and this id of its client waits."""
+        """Return whether a request with these addresses and this ID of its client waits."""
         return (endpoint, onward, invoke_id) in self._asked
 
     def pop(self, invoke_id: int) -> Pending | None:
@@ -195,7 +194,7 @@ class InFlight:
         return pending
 
     def abandon(self, endpoint: Endpoint) -> list[Pending]:
-        """Return the requests that came by *endpoint*; nobody waits for their answers any more.
+        """Return the requests of *endpoint*, whose answers no client waits for any more.
 
         They stay until their time is up: a packet that runs in a circle is still known.
         """
@@ -207,14 +206,14 @@ class InFlight:
         return left
 
     def drop_abandoned(self) -> bool:
-        """Forget the oldest request that nobody waits for; return whether there was one."""
+        """Drop the oldest abandoned request; return whether there was one."""
         if not self._abandoned:
             return False
         self.pop(next(iter(self._abandoned)))
         return True
 
     def on(self, transport: str, address: str | None) -> list[Pending]:
-        """Return what went on by *transport*, to *address* or to any."""
+        """Return the requests forwarded by *transport*, to *address* or to any."""
         return [
             each
             for each in self
@@ -224,12 +223,12 @@ class InFlight:
         ]
 
     def next_timeout(self) -> int | None:
-        """Return when the time of the first one is up."""
+        """Return the earliest deadline."""
         heads = (next(iter(each.values())).deadline_ns for each in self._by_time.values())
         return min(heads, default=None)
 
     def due(self, now_ns: int) -> list[Pending]:
-        """Return those whose time is up, the first one first."""
+        """Return the requests whose deadline has passed, the earliest first."""
         found = []
         for waiting in self._by_time.values():
             for pending in waiting.values():

@@ -27,11 +27,14 @@ _WRITE = Struct("<III")  # group, offset, length
 
 
 class NotificationCleanup:
-    """Asks servers to end notifications.
+    """Ends notifications at their servers when no client here has them any more.
+
+    A client may be gone, may have got its answer too late, or may have asked a router that was
+    restarted since; without this the server would send samples for ever.
 
     Args:
-        transports: By which they are asked.
-        in_flight: What waits for an answer, these requests too.
+        transports: By which requests are sent.
+        in_flight: Requests that wait for an answer, these too.
         ids: Of requests of this router.
         limits: How much may wait, and for how long.
     """
@@ -45,7 +48,7 @@ class NotificationCleanup:
         self._limits = limits
 
     def end(self, grants: Iterable[Grant], now_ns: int) -> list[Action]:
-        """Have notifications ended, for nobody and as long as there is room to wait for it."""
+        """End notifications, as far as the limit of requests in flight allows."""
         actions: list[Action] = []
         for grant in grants:
             if grant.route.hop.transport not in self._transports.transports:
@@ -61,7 +64,7 @@ class NotificationCleanup:
         return actions
 
     def release(self, grant: Grant, now_ns: int) -> list[Action]:
-        """Give back the handle of a symbol that this router looked up."""
+        """Release the handle of a symbol that this router looked up."""
         if grant.symbol_handle is None:
             return []
         handle = grant.symbol_handle.to_bytes(4, "little")
@@ -71,7 +74,7 @@ class NotificationCleanup:
     def end_unwanted(self, header: AmsHeader, handle: int, endpoint: Endpoint) -> list[Action]:
         """Return what ends a notification that no client here has, at the server that sent it.
 
-        Not while the answer may still come that tells its handle: datagrams overtake each other.
+        Not while the answer with its handle may still arrive: datagrams overtake each other.
         """
         if any(pending.handles for pending in self._in_flight.on(endpoint.transport, None)):
             return []
@@ -117,13 +120,13 @@ _LOOKUPS = frozenset(
         IndexGroup.SYMBOL_ENTRY_BY_NAME.value,
     )
 )
-"""Groups whose ReadWrite tells by which group and offset a symbol is reached."""
+"""Groups whose ReadWrite returns group and offset of a symbol."""
 _SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value
 _SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value
 _SUM_HEAD = 8
 """Bytes of result and length before the answers to the items of a sum command."""
 _MAX_SYMBOLS = 1024
-"""Symbol handles that are remembered of one connection; the oldest makes room."""
+"""Symbol handles kept for one connection; the oldest one is dropped for a new one."""
 _LONGEST_LOOKUP = 272
 _PLACE = struct.Struct("<II")  # group, offset
 BY_HANDLE = frozenset((IndexGroup.VALUE_BY_HANDLE, IndexGroup.SYMBOL_NOTIFICATION))
@@ -140,7 +143,7 @@ class Granted(NamedTuple):
     """Notifications that no client waits for any more."""
     new: list[Subscription]
     displaced: list[Subscription]
-    """Subscriptions whose handle the server gave again, so that it does not know them any more."""
+    """Subscriptions whose handle the server gave again: it has forgotten them."""
 
 
 class Samples(NamedTuple):
@@ -156,10 +159,10 @@ class Samples(NamedTuple):
 
 
 class NotificationForwarder:
-    """Follows requests for notifications and their answers, and hands notifications on.
+    """Tracks requests for notifications and their answers, and forwards samples.
 
     Attributes:
-        subscriptions: What is known.
+        subscriptions: All that pass this router.
     """
 
     def __init__(self, transports: TransportTable) -> None:
@@ -183,14 +186,14 @@ class NotificationForwarder:
         return [each for each in found if each is not None] or None
 
     def is_within_limits(self, header: AmsHeader, data: bytes, endpoint: Endpoint) -> bool:
-        """Say whether a client may have the notifications that it asks for."""
+        """Return whether the limits allow the notifications that a client requests."""
         count = _count_of(header, data[AmsHeader.SIZE :])
         return not count or self.subscriptions.is_within_limits(
             endpoint, data[: ADDRESSES.size], count
         )
 
     def track_request(self, pending: Pending, body: bytes, endpoint: Endpoint) -> None:
-        """Note which notifications a client asks for, and which symbol it looks up."""
+        """Note the notifications that a client requests, and the symbol that it looks up."""
         header = pending.header
         pending.handles = _count_of(header, body)
         if pending.handles or _group_of(header, body) in _LOOKUPS:
@@ -204,7 +207,7 @@ class NotificationForwarder:
     def track_answer(
         self, pending: Pending, header: AmsHeader, body: bytes, now_ns: int
     ) -> Granted | None:
-        """Note the notifications that were granted, if any were asked for."""
+        """Note the notifications that were granted, if any were requested."""
         endpoint, route = pending.endpoint, pending.route
         if header.error_code or route is None:
             return None
@@ -240,12 +243,12 @@ class NotificationForwarder:
         return granted._replace(body=body)
 
     def forget(self, subscriptions: Iterable[Subscription]) -> list[Grant]:
-        """Forget what clients have deleted; return what servers gave for it."""
+        """Remove deleted subscriptions; return their grants."""
         grants = [self.subscriptions.remove(each) for each in subscriptions if not each.is_closed]
         return [grant for grant in grants if grant is not None]
 
     def knows(self, header: AmsHeader, body: bytes) -> bool:
-        """Say whether a client here subscribed to a sample of a notification.
+        """Return whether a client here subscribed to a sample of a notification.
 
         Raises:
             CodecError: it is shorter or longer than it says.
@@ -257,7 +260,7 @@ class NotificationForwarder:
     def distribute(
         self, header: AmsHeader, data: bytes, now_ns: int, is_from_hop: Callable[[Endpoint], bool]
     ) -> Samples:
-        """Return what the clients get of a notification.
+        """Return the part of a notification for each client.
 
         Raises:
             CodecError: it is shorter or longer than it says.
@@ -275,7 +278,7 @@ class NotificationForwarder:
         return Samples(replies, division.ended, division.unknown, division.hop)
 
     def close(self, endpoint: Endpoint) -> list[Grant]:
-        """Forget the clients of a connection; return what servers gave them."""
+        """Remove the clients of a connection; return their grants."""
         self._symbols.pop(endpoint, None)
         return self.subscriptions.close(endpoint)
 
@@ -347,7 +350,7 @@ def _group_of(header: AmsHeader, body: bytes) -> int:
 
 
 def _count_of(header: AmsHeader, body: bytes) -> int:
-    """Return how many notifications a request asks for."""
+    """Return the number of notifications in a request."""
     if header.command == _ADD:
         return 1
     if _group_of(header, body) == _SUM_ADD:
@@ -356,7 +359,7 @@ def _count_of(header: AmsHeader, body: bytes) -> int:
 
 
 def _requests_of(pending: Pending) -> list[AddNotification]:
-    """Return the parameters of the notifications that were asked for, if they are kept here."""
+    """Return the parameters of the requested notifications, if they are kept here."""
     octets = pending.request_body
     if not octets:
         return []

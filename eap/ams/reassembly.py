@@ -35,7 +35,7 @@ class OversizedPacket(NamedTuple):
 
 
 class RouterRequest(NamedTuple):
-    """What a local client asks the router itself."""
+    """Command of a local client to the router itself."""
 
     command: RouterCommand
     data: bytes
@@ -49,7 +49,7 @@ _LONGEST_COMMAND = 16
 
 
 class AmsStreamDecoder:
-    """What a connection brought and has not been taken yet.
+    """Decoder of the AMS packets in one TCP connection.
 
     It never holds more than one packet of the limit, one prefix, and what came last.
 
@@ -64,17 +64,17 @@ class AmsStreamDecoder:
 
     @property
     def has_begun(self) -> bool:
-        """Whether a packet has begun and is not whole."""
+        """True if a packet has begun and is not complete."""
         return bool(self._buffer) or self._skip > 0
 
     def receive(self, data: Buffer) -> None:
-        """Take what came."""
+        """Append received bytes."""
         skipped = min(self._skip, len(data))
         self._skip -= skipped
         self._buffer += memoryview(data)[skipped:]
 
     def receive_one(self, data: bytes) -> bytes | None:
-        """Return the packet if *data* is exactly one, as it mostly is; else take what came."""
+        """Return the packet if *data* is exactly one, as usual; else append *data*."""
         start = AmsTcpHeader.SIZE
         end = len(data)
         # The limit is below 4 GB and no packet is empty, so these bytes are the whole prefix.
@@ -89,7 +89,7 @@ class AmsStreamDecoder:
         return None
 
     def next_item(self) -> StreamItem | None:
-        """Return the next whole packet, None if there is none yet.
+        """Return the next complete packet, None if there is none yet.
 
         Raises:
             MalformedError: this is no stream of AMS packets; nothing can be cut from it any more.
@@ -135,9 +135,9 @@ class AmsStreamDecoder:
 
 
 FRAGMENT_TIMEOUT_NS = 2_000_000_000
-"""How long the next fragment may take; what came before is forgotten then."""
+"""Limit for the next fragment; the packet is dropped then."""
 MAX_PACKETS = 8
-"""Packets of which fragments are kept at a time; the oldest makes room."""
+"""Incomplete packets kept at a time; the oldest is dropped for a new one."""
 MAX_LENGTH = 1 << 20
 """Bytes of the longest packet that is put together."""
 _ADDRESSES = 16
@@ -148,7 +148,7 @@ _REST = AmsHeader.SIZE - _ADDRESSES
 def iter_fragments(packet: bytes, number: int, max_size: int) -> Iterator[bytes]:
     """Yield the packets that carry *packet*, each with at most *max_size* bytes of it.
 
-    Nobody acknowledges them.
+    They are not acknowledged.
 
     Args:
         packet: A whole packet.
@@ -171,7 +171,7 @@ def iter_fragments(packet: bytes, number: int, max_size: int) -> Iterator[bytes]
 
 
 class _PartialPacket:
-    """What came so far of one packet."""
+    """Incomplete packet."""
 
     __slots__ = ("content", "deadline_ns", "next")
 
@@ -182,12 +182,12 @@ class _PartialPacket:
 
 
 class ReassemblyResult(NamedTuple):
-    """What a fragment leads to."""
+    """Result of a fragment."""
 
     packet: bytes | None
     """The whole packet, if this was its last fragment."""
     acknowledgement: bytes | None
-    """What the sender waits for before it sends the next."""
+    """Acknowledgement that the sender waits for before its next fragment."""
 
 
 class FragmentAssembler:
@@ -212,7 +212,7 @@ class FragmentAssembler:
         return len(self._partial)
 
     def receive(self, header: AmsHeader, body: bytes, now_ns: int) -> ReassemblyResult:
-        """Take the fragment with *header* and *body*.
+        """Add the fragment with *header* and *body*.
 
         Raises:
             MalformedError: one before it is missing, or the whole is longer than it says.
@@ -264,7 +264,7 @@ class FragmentAssembler:
 
 
 def _missing(content: bytearray) -> int:
-    """Return how many bytes are still to come; at least one while nobody can know."""
+    """Return the number of missing bytes; at least one while the length is unknown."""
     if len(content) < _REST:
         return _REST - len(content)
     length = int.from_bytes(content[4:8], "little")
@@ -288,16 +288,16 @@ def _acknowledge(header: AmsHeader) -> bytes | None:
 
 
 MAX_SENDERS = 64
-"""Ways that fragments are kept of at a time; the one that began first makes room."""
+"""Endpoints with fragments at a time; the one that began first is dropped."""
 MAX_OCTETS = 16 << 20
-"""Bytes kept in all; the sender whose fragment is too much loses what it has sent."""
+"""Bytes kept in all; a sender whose fragment exceeds it loses all its fragments."""
 
 
 class Reassembly:
-    """An assembler for each way.
+    """Fragment assemblers, one for each endpoint.
 
-    Nobody's fragments fit to those of another, and nobody can push out more than their own as
-    long as fewer than 64 send.
+    Fragments of different endpoints never mix, and an endpoint can displace only its own as long as
+    fewer than 64 send.
 
     Attributes:
         dropped: Packets that were not put together.
@@ -316,7 +316,7 @@ class Reassembly:
     def receive(
         self, endpoint: Endpoint, header: AmsHeader, body: bytes, now_ns: int
     ) -> ReassemblyResult:
-        """Take a fragment that came by *endpoint*.
+        """Add a fragment from *endpoint*.
 
         Raises:
             MalformedError: it does not fit to the one before it, the whole is too long, or too
@@ -336,7 +336,7 @@ class Reassembly:
         return taken
 
     def forget(self, endpoint: Endpoint) -> None:
-        """Forget what came by *endpoint*."""
+        """Forget the fragments from *endpoint*."""
         assembler = self._senders.pop(endpoint, None)
         if assembler is not None:
             self._octets -= assembler.octets

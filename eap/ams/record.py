@@ -17,7 +17,7 @@ from eap.ids import NetId
 
 
 class Outcome(StrEnum):
-    """What became of a packet."""
+    """Outcome of a packet."""
 
     ANSWERED = "answered"
     FAILED = "failed"
@@ -27,7 +27,7 @@ class Outcome(StrEnum):
     LOOP = "loop"
     """It ran in a circle; if it was a request it was answered with an error."""
     LATE = "late"
-    """An answer or a notification that nobody waits for, or not any more."""
+    """An answer or a notification that no client waits for."""
     DROPPED = "dropped"
     """Nothing was answered: broken, doubled, or of the kind that has no answer."""
     INTERRUPTED = "interrupted"
@@ -37,7 +37,7 @@ class Outcome(StrEnum):
 
 
 class Trace(NamedTuple):
-    """What became of one packet; *text* is for people and names the hop where there is one."""
+    """Outcome of one packet; *text* is for operators and names the hop where there is one."""
 
     at_ns: int
     outcome: Outcome
@@ -54,26 +54,26 @@ class Trace(NamedTuple):
 
 
 MAX_ENDPOINTS = 4096
-"""Ways that are counted at a time; the one that was there first makes room."""
+"""Keys that are counted at a time; the oldest is dropped for a new one."""
 MAX_SOURCES = 8
-"""NetIDs that are remembered of those who ask by one way."""
+"""NetIDs of clients that are kept for one endpoint."""
 
 KeyT = TypeVar("KeyT", bound=Hashable)
 
 
 class Traffic(msgspec.Struct):
-    """Packets of one way, in one direction of asking.
+    """Traffic of one endpoint or route, in one direction of requests.
 
     Attributes:
         since_ns: When it was used first.
-        requests: That went there, or came from there.
-        answers: That came from there, or went there.
+        requests: Sent there, or received from there.
+        answers: Received from there, or sent there.
         errors: Requests that did not get to their targets.
         request_bytes: Bytes of the requests.
         answer_bytes: Bytes of the answers.
         round_trip_ns: Of the latest answer.
         last_error: In words.
-        sources: NetIDs that asked, the first of them.
+        sources: First NetIDs that sent requests.
         is_answered: Whether the latest of the requests that are over was answered.
     """
 
@@ -110,7 +110,7 @@ class Traffic(msgspec.Struct):
 
 
 class TrafficTable(Generic[KeyT]):
-    """The traffic of all ways, by what they are known by."""
+    """Traffic of all endpoints or routes, by key."""
 
     def __init__(self) -> None:
         self._endpoints: OrderedDict[KeyT, Traffic] = OrderedDict()
@@ -142,19 +142,19 @@ class TrafficTable(Generic[KeyT]):
 
 _ANSWERED = Outcome.ANSWERED  # looked up once: members of enums are slow
 MAX_EVENTS = 1024
-"""Traces that wait for somebody who reads them; the oldest makes room."""
+"""Traces that wait to be logged; the oldest is dropped for a new one."""
 MAX_LATEST = 256
-"""Traces that are kept for people who ask later."""
+"""Traces that are kept for later queries."""
 
 
 class Record:
-    """The memory of a router.
+    """Traces, counters and traffic of a router.
 
     Attributes:
         latest: The latest traces, the oldest first; without answers to probes.
-        counts: Packets by what became of them.
-        connections: What was asked from each, which have not been closed.
-        routes: What went by each.
+        counts: Packets by outcome.
+        connections: Requests from each open connection.
+        routes: Traffic by each route.
     """
 
     def __init__(self) -> None:
@@ -166,7 +166,7 @@ class Record:
 
     @property
     def has_events(self) -> bool:
-        """Whether :meth:`next_event` has one."""
+        """True if :meth:`next_event` has one."""
         return bool(self._events)
 
     def next_event(self) -> Trace | None:
@@ -174,7 +174,7 @@ class Record:
         return self._events.popleft() if self._events else None
 
     def add(self, trace: Trace) -> None:
-        """Remember what became of a packet."""
+        """Add the trace of a packet."""
         self.counts[trace.outcome] += 1
         if _is_probe(trace):
             return
@@ -185,14 +185,14 @@ class Record:
 
 
 class Stats(msgspec.Struct, frozen=True):
-    """What a router does and did.
+    """Statistics of a router.
 
     Attributes:
         in_flight: Requests that wait for their answers.
         subscriptions: Notifications that pass.
         fragment_octets: Kept of packets that are not complete.
         routes: That there are.
-        counts: Packets by what became of them.
+        counts: Packets by outcome.
     """
 
     in_flight: int
@@ -203,7 +203,7 @@ class Stats(msgspec.Struct, frozen=True):
 
 
 def _is_probe(trace: Trace) -> bool:
-    """Say whether a router was told that this one lives, as it is every second."""
+    """Return whether a trace is an answered probe of another router, one a second."""
     header = trace.header
     return (
         header is not None

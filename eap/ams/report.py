@@ -25,14 +25,14 @@ from eap.ids import NetId
 
 
 class RouteState(StrEnum):
-    """Whether a request would go on."""
+    """State of a route."""
 
     UP = "up"
     DOWN = "down"
     UNKNOWN = "unknown"
     """Nothing speaks against it, and nothing was answered yet."""
     CLIENT = "client"
-    """A client asked for it by "add route", and does not listen: it has its own connections."""
+    """A client requested it by "add route", and does not listen: it has its own connections."""
 
 
 class Obstacle(NamedTuple):
@@ -63,17 +63,17 @@ class RouteReport(NamedTuple):
 
 
 class ConnectionReport(NamedTuple):
-    """Who asks."""
+    """Traffic of one client connection."""
 
     endpoint: Endpoint
     traffic: Traffic
 
 
 class Location(NamedTuple):
-    """Where a request would go.
+    """Route of a request.
 
-    *route* is None if it is for this station, or if there is none; *why* says why it would go
-    nowhere.  *may* is what access rules let the asker do, None if that depends on the object.
+    *route* is None if it is for this station, or if there is none; *why* says why it would fail.
+    *may* is what access rules let the client do, None if that depends on the object.
     """
 
     is_here: bool
@@ -111,7 +111,7 @@ def report_route(
 
 
 _ALIVE = frozenset({AdsError.TARGET_PORT})
-"""Errors of the AMS header that only who has the NetID answers with."""
+"""Errors of the AMS header that only the owner of the NetID sends."""
 _UNREACHED: dict[str, str] = {
     TransportKind.AMS_TCP: (
         "see whether it is switched on, and listens on that TCP port (a firewall?)"
@@ -123,12 +123,12 @@ _UNREACHED: dict[str, str] = {
         "see whether both stations are connected to the broker, under the same network"
     ),
 }
-"""What to do about a hop that is down, by the kind of the door."""
+"""Advice on a hop that is down, by the kind of its transport."""
 _CLIENT = "nothing is wrong if it only asks; to be asked, it has to listen there"
 
 
 class Advice(NamedTuple):
-    """What to tell people."""
+    """Result of a request to another station, with a hint."""
 
     is_reached: bool
     text: str
@@ -142,9 +142,9 @@ def advise(
 
     Args:
         error: 0 for none.
-        target: Who was asked.
+        target: Of the request.
         route: That was taken; None for none.
-        own: NetID of the router that asked.
+        own: NetID of the router that sent the request.
         is_own: Whether *target* is of its station.
     """
     if not error:
@@ -192,13 +192,13 @@ def _advise_on_route(
 
 
 MAX_FURTHER = 16
-"""Routers that a question is handed on to; more are no way that anybody means."""
+"""Routers that a question is forwarded to; a longer path is an error."""
 MAX_REPORT = 4096
 """Bytes."""
 
 
 class HopQuestion(WireStruct, frozen=True):
-    """Where do requests for this address go?  *further*: how many routers further on that is."""
+    """Query for the route to an address, at the router that is *further* hops away."""
 
     target: net_id
     port: u16
@@ -207,7 +207,7 @@ class HopQuestion(WireStruct, frozen=True):
 
 
 class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What one router says.
+    """Answer of one router to a route query.
 
     Attributes:
         station: Its name.
@@ -221,11 +221,11 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         address: That they go to.
         target: NetID of the target over there.
         state: Of the route: ``up``, ``down`` or ``unknown``.
-        why: Why it passes nothing on; empty if it does.
-        may: What access rules let the asker do: true, false, or null if that depends on the object.
+        why: Reason it forwards nothing; empty if it does.
+        may: Rights of the client by access rules; null if they depend on the object.
         interrupted: How many subscriptions to the NetID it is restoring.
         interrupted_s: For how many seconds; None for none.
-        error: Of ADS, why the router that was asked next did not answer; 0 if there was none.
+        error: Of ADS, why the next router did not answer; 0 for none.
     """
 
     station: str

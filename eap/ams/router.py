@@ -1,6 +1,6 @@
 """The router of a station: AMS packets to its own services and to the next station (ETG.1020).
 
-Every request is answered exactly once, on the connection that it came by: by its target, or with
+Every request is answered exactly once, on the connection that it arrived by: by its target, or with
 an error of the AMS header that says why it did not get there.
 """
 
@@ -42,7 +42,7 @@ took; None to have the request delivered."""
 
 
 class Router:
-    """What becomes of every packet.
+    """Router of one station: handles every received packet.
 
     Args:
         net_id: Of the router itself.
@@ -50,14 +50,14 @@ class Router:
         transports: By which packets come and go.
         first_invoke_id: Another one at each start, see :class:`~eap.ams.inflight.InvokeIds`.
         limits: How much it takes on.
-        hop_prober: Finds dead hops; without one only doors tell of them.
-        access: Who may do what; without rules others than this host only read.
+        hop_prober: Finds dead hops; without one only transports report them.
+        access: Access rules; without any other hosts only read.
         answer_now: Answers what a service of this station has at hand: then there is no ``Deliver``
             and nothing waits.
 
     Attributes:
-        record: What it did.
-        gate: What it had changed, and what it refused.
+        record: Traces, counters and traffic.
+        access_filter: Applies the access rules, and collects audit entries.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Router:
         self._transports.add(transport)
 
     def remove_transport(self, name: str, now_ns: int) -> list[Action]:
-        """Forget a door, and whoever waits at it; answer what waits for those behind it."""
+        """Remove a transport with its clients; reply to the requests that wait for its hops."""
         actions: list[Action] = []
         for endpoint in self._forwarder.endpoints_of(name):
             actions += self.connection_closed(*endpoint, now_ns)
@@ -106,11 +106,11 @@ class Router:
         return actions
 
     def set_hop_connection(self, transport: str, address: str, connection: str) -> None:
-        """Take what comes by *connection* for what comes from the hop that is named *address*."""
+        """Treat packets from *connection* as packets of the hop *address*."""
         self._transports.set_connection(Endpoint(transport, address), connection)
 
     def is_waiting_for(self, header: AmsHeader, body: bytes, transport: str) -> bool:
-        """Say whether a client of this router waits for a packet: for the answer or the sample.
+        """Return whether a client of this router waits for a packet: the answer or the sample.
 
         This serves those that have several routers behind one socket.  The target does not say it:
         clients may have the NetID of any router.
@@ -138,10 +138,10 @@ class Router:
 
         Args:
             data: Header and what follows it.
-            transport: That it came by.
-            connection: That it came by, or its sender's address.
+            transport: That it arrived by.
+            connection: That it arrived by, or its sender's address.
             now_ns: The time on the monotonic clock.
-            is_broadcast: Whether others got it too: who is not meant says nothing.
+            is_broadcast: Whether other routers got it too: then only its target answers.
         """
         endpoint = Endpoint(transport, connection)
         try:
@@ -166,11 +166,11 @@ class Router:
         return self._forwarder.answer(ticket, answer, now_ns)
 
     def send_failed(self, ticket: int, text: str, now_ns: int) -> list[Action]:
-        """Answer the request with *ticket*, which its door could not send; *text* says why."""
+        """Reply to the request with *ticket*, which was not sent for the reason *text*."""
         return self._forwarder.send_failed(ticket, text, now_ns)
 
     def connection_closed(self, transport: str, connection: str, now_ns: int) -> list[Action]:
-        """Forget whom nobody can answer any more, and end the notifications that they had."""
+        """Forget the clients of a closed connection, and end their notifications."""
         endpoint = Endpoint(transport, connection)
         self._fragments.forget(endpoint)
         self.record.connections.forget(endpoint)
@@ -181,8 +181,8 @@ class Router:
 
         Args:
             transport: By which it is reached.
-            address: None for all that are reached by the door.
-            text: Why, for people.
+            address: None for all that are reached by the transport.
+            text: Reason, for operators.
             now_ns: The time on the monotonic clock.
         """
         if self._hop_prober is not None:
@@ -196,21 +196,21 @@ class Router:
         self._forwarder.hop_up(transport, address)
 
     def is_down(self, hop: Endpoint) -> bool:
-        """Say whether a hop is known not to answer now."""
+        """Return whether a hop is known not to answer now."""
         return self._forwarder.is_down(hop)
 
     def is_awaited(self, hop: Endpoint) -> bool:
-        """Say whether an answer from a hop is waited for, or subscriptions come from it."""
+        """Return whether an answer from a hop is waited for, or subscriptions come from it."""
         return hop in self._forwarder.notification_forwarder.subscriptions.hops or bool(
             self._forwarder.in_flight.on(*hop)
         )
 
     def waiting(self, endpoint: Endpoint) -> int:
-        """Return how many requests that came by *endpoint* wait for their answers."""
+        """Return the number of requests from *endpoint* that wait for answers."""
         return self._forwarder.in_flight.count(endpoint)
 
     def notify(self, endpoint: Endpoint, packet: bytes) -> list[Action]:
-        """Send what a service has for a client; nothing if its door is there no more."""
+        """Send a packet of a service to a client; nothing if its transport is gone."""
         return (
             [self._transports.reply(endpoint, packet)]
             if endpoint.transport in self._transports.transports
@@ -225,7 +225,7 @@ class Router:
         return min((each for each in times if each is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> list[Action]:
-        """Answer requests whose time is up, forget routes that expired, ask hops for life."""
+        """Reply to requests that timed out, forget expired routes, probe hops."""
         self._table.expire(now_ns)
         actions = self._forwarder.handle_timeout(now_ns)
         if self._hop_prober is not None:
@@ -246,7 +246,7 @@ class Router:
 
     @property
     def has_events(self) -> bool:
-        """Whether there are traces or entries of the audit to be taken."""
+        """True if there are traces or audit entries to be read."""
         return self.record.has_events or self.access_filter.has_entries
 
     def next_event(self) -> Trace | None:
@@ -261,7 +261,7 @@ class Router:
         return report_route(route, obstacle, traffic, self._hop_prober, next_name=name)
 
     def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
-        """Say where a request would go that came by *endpoint*."""
+        """Return the route that a request from *endpoint* would take."""
         may = self.access_filter.may(header, endpoint)
         ports = self._devices.get(header.target)
         if ports is not None:
@@ -276,7 +276,7 @@ class Router:
         return Location(False, found_route, why, may, number, since_ns)
 
     def connections(self) -> list[ConnectionReport]:
-        """Return who asks, or asked and is still connected."""
+        """Return the traffic of all open connections."""
         return [ConnectionReport(*each) for each in self.record.connections.snapshot().items()]
 
     def interruptions(self) -> list[Interruption]:
@@ -284,7 +284,7 @@ class Router:
         return self._forwarder.subscription_restorer.interruptions()
 
     def stats(self) -> Stats:
-        """Return what is going on, and what was."""
+        """Return the statistics."""
         return Stats(
             in_flight=len(self._forwarder.in_flight),
             subscriptions=len(self._forwarder.notification_forwarder.subscriptions),
@@ -342,7 +342,7 @@ class Router:
         hop = hop_prober.receive_answer(header, body, endpoint, now_ns, self._transports.is_from)
         if hop is None:
             return []
-        # Requests stay: those that were asked since then are answered.
+        # Requests stay: those sent after the restart are answered.
         return self._forwarder.subscriptions_lost(*hop, "its router was started again", now_ns)
 
     def _deliver(
@@ -371,6 +371,6 @@ class Router:
 def _no_port(header: AmsHeader) -> str:
     text = f"nothing has port {header.target_port} of {header.target}"
     if header.target_port in _PLC_PORTS:
-        # Where clients look that were told of no port.
+        # Default port of clients without a configured one.
         text += ": it is no PLC; the variables of a station are at port 65535 of its EAP ports"
     return text

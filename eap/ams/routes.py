@@ -1,10 +1,9 @@
-"""Routes: by which door and to which address a NetID is reached.
+"""Routes: transport and address of the next hop to a NetID.
 
 The route with the longest match is taken: all six bytes, five, four, then a default route.  Of two
 that match alike the one of the plant file comes first, then those that were added; among equals the
 older one.  A learned route is taken only where none of these matches, however well it does itself,
-but before a default route: whoever tells of a NetID must not draw packets away from where they
-were meant to go.
+but before a default route: a peer that announces a NetID must not divert packets.
 """
 
 from __future__ import annotations
@@ -20,21 +19,21 @@ from eap.ads.endpoint import Endpoint
 from eap.ids import NetId, prefix_text
 
 MAX_LEARNED = 10_000
-"""Routes that others may make known; who comes later is not taken."""
+"""Limit of learned routes; further ones are ignored."""
 _LEVELS = (6, 5, 4, 0)
 _Key = TypeVar("_Key")
 _Item = TypeVar("_Item")
 
 
 class Origin(IntEnum):
-    """Who says that there is a route; a smaller number goes before a larger one."""
+    """Origin of a route; a smaller number goes before a larger one."""
 
     STATIC = 0
     """The plant file."""
     ADDED = 1
-    """Somebody, at run time."""
+    """An operator or a peer, at run time."""
     LEARNED = 2
-    """The station itself told of it, or answered a scan; such a route expires."""
+    """An info by MQTT, or the answer to a scan; such a route expires."""
 
 
 RouteKey: TypeAlias = tuple[NetId, Endpoint]
@@ -46,20 +45,20 @@ class Route(msgspec.Struct, frozen=True):
 
     Attributes:
         net_id: Of the station, as it is addressed from here.
-        name: As people call it.
+        name: Of the station or peer.
         hop: Transport and address that packets go to.
-        origin: Who says so.
+        origin: Where it is from.
         octets: How many bytes of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
             default route.
-        is_unidirectional: Whether nothing may be asked from there.
+        is_unidirectional: Whether requests from there are refused.
         expires_at_ns: When it is forgotten; None for never.
         real: The NetID that the station itself has, where *net_id* is a virtual one.
         timeout_ns: How long an answer may take; 0 for as long as usual.
-        is_probed: Whether the station answers whoever asks for its ADS state; where it answers
-            only whom it has a route to, it would be taken for dead.
+        is_probed: Whether the next hop is probed; a router that answers only peers with a route
+            would seem dead.
         router: NetID of the router at the hop; None if that is not known, and the station itself
             is asked instead.
-        is_client: Whether its own end asked for it by "add route": it may be a client, which has
+        is_client: Whether its own end requested it by "add route": it may be a client, which has
             connections of its own and does not listen.
 
     Raises:
@@ -87,14 +86,14 @@ class Route(msgspec.Struct, frozen=True):
 
     @property
     def next_router(self) -> NetId | None:
-        """NetID of whoever is asked whether the hop is alive; None if nobody is known."""
+        """NetID of the router that is probed at the hop; None if unknown."""
         if self.router is not None or not self.octets:
             return self.router
         return self.to_real(self.net_id)
 
     @property
     def key(self) -> RouteKey:
-        """What tells it from all others of a table."""
+        """Key of the route in a table."""
         return self.net_id, self.hop
 
     def to_real(self, target: NetId) -> NetId:
@@ -130,7 +129,7 @@ class _Ranked(NamedTuple):
 
 
 class RouteTable:
-    """All routes; which one is taken does not take longer the more there are.
+    """Table of all routes; a lookup takes the same time however many there are.
 
     Attributes:
         version: Another one whenever there are other routes.
@@ -226,7 +225,7 @@ class RouteTable:
         return found[0].name
 
     def describe_hop(self, route: Route) -> str:
-        """Return the next hop of *route* in words: the router there, address and door."""
+        """Return the next hop of *route* in words: the router there, address and transport."""
         return f"{self.next_name(route)} ({route.hop})"
 
     def describe_beyond(self, route: Route) -> str:
@@ -247,7 +246,7 @@ class RouteTable:
         return self._next_expiry
 
     def expire(self, now_ns: int) -> list[Route]:
-        """Forget and return the routes whose time has come."""
+        """Remove and return the routes that have expired."""
         if self._next_expiry is None or now_ns < self._next_expiry:
             return []
         times = [(each.expires_at_ns, each) for each in self if each.expires_at_ns is not None]
@@ -258,7 +257,7 @@ class RouteTable:
         return over
 
     def warnings(self, own: Collection[NetId] = ()) -> list[str]:
-        """Say which routes are not taken for some NetIDs, because others are before them.
+        """Return warnings about routes that are shadowed by others.
 
         Args:
             own: NetIDs of this station, which no route leads to.

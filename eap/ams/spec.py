@@ -16,7 +16,7 @@ import msgspec
 from eap.ids import InterfaceUri, NetId
 
 DEFAULT_TARGET = "default"
-"""Name of a route that takes what no other one does."""
+"""Name of the default route."""
 
 
 class SpecStruct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -24,7 +24,7 @@ class SpecStruct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TransportKind(StrEnum):
-    """How packets come in and go out."""
+    """Kinds of transports for AMS packets."""
 
     UDP = "udp"
     """Type 5 by UDP."""
@@ -39,14 +39,14 @@ class TransportKind(StrEnum):
 
 
 IP_TRANSPORTS = frozenset((TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP))
-"""Kinds of doors whose connections begin with an IPv4 address."""
+"""Kinds of transports whose connections begin with an IPv4 address."""
 
 
 class HopSpec(SpecStruct, frozen=True):
-    """Where packets go from here.
+    """Next hop of packets.
 
     Attributes:
-        kind: Of the door.
+        kind: Of the transport.
         port: The station's own EAP port that they leave by (UDP, TCP, Ethernet), or the name of
             the network (MQTT); empty for AMS/TCP.
         address: ``ADDRESS:PORT`` (UDP, TCP), ``HOST:PORT`` (AMS/TCP, where a host may have a
@@ -63,19 +63,18 @@ class RouteSpec(SpecStruct, frozen=True, kw_only=True):
     """One route.
 
     Attributes:
-        name: As people call it: a station, or what the plant file says.
+        name: Of a station, or the name in the plant file.
         net_id: Of the station, as it really is there; 0.0.0.0.0.0 for a default route.
         hop: Where packets for it go.
         octets: How many bytes of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
             default route.
-        router: NetID of the router at the next hop, which is asked whether it is alive; empty if
-            that is not known.
+        router: NetID of the router at the next hop, which is probed; empty if unknown.
         virtual: NetID by which it is known here instead of *net_id*; empty for none.
-        is_unidirectional: Whether nothing may be asked from there.
+        is_unidirectional: Whether requests from there are refused.
         timeout_ms: How long an answer may take; 0 for as long as usual.
-        is_probed: Whether the next hop is asked from time to time whether it is alive.
-        is_derived: Whether it follows from the ports of the plant, and nobody wrote it.
-        is_client: Whether its own end asked for it by "add route" (UDP 48899): it may be a client,
+        is_probed: Whether the next hop is probed.
+        is_derived: Whether it follows from the ports of the plant and not from a route entry.
+        is_client: Whether its own end requested it by "add route" (UDP 48899): it may be a client,
             which has connections of its own and does not listen.
     """
 
@@ -96,7 +95,7 @@ class AccessService(StrEnum):
     """Kinds of operations that access is granted for."""
 
     READ = "read"
-    """Everything that changes nothing, also notifications and lookups by name."""
+    """Operations that change nothing, also notifications and lookups by name."""
     WRITE = "write"
     """Write and ReadWrite, of objects, variables and IDNs."""
     CONTROL = "control"
@@ -116,7 +115,7 @@ class ObjectRange(SpecStruct, frozen=True):
     high: int = 0xFF
 
     def contains(self, other: ObjectRange) -> bool:
-        """Say whether all of *other* is in it."""
+        """Return whether all of *other* is in it."""
         return (
             self.first <= other.first
             and other.last <= self.last
@@ -125,7 +124,7 @@ class ObjectRange(SpecStruct, frozen=True):
         )
 
     def overlaps(self, other: ObjectRange) -> bool:
-        """Say whether some of *other* is in it."""
+        """Return whether some of *other* is in it."""
         return (
             self.first <= other.last
             and other.first <= self.last
@@ -135,7 +134,7 @@ class ObjectRange(SpecStruct, frozen=True):
 
 
 class AccessTarget(SpecStruct, frozen=True):
-    """Whoever is behind a NetID, given by its first four, five or all six bytes.
+    """Target of requests: a NetID, given by its first four, five or all six bytes.
 
     *port* is None for all its AMS ports.
     """
@@ -145,20 +144,20 @@ class AccessTarget(SpecStruct, frozen=True):
 
 
 class AccessRule(SpecStruct, frozen=True):
-    """What some may do, or may not; of several rules the first that fits counts.
+    """Access rule that grants or refuses; of several rules the first that fits counts.
 
     An empty tuple stands for anything; otherwise one of its items has to fit.
 
     Attributes:
-        name: For logs and people.
+        name: For logs and commands.
         allow: Whether it grants or refuses.
         networks: IPv4 networks that a connection comes from (``10.0.0.0/24``).
-        macs: MAC addresses that frames come from on Ethernet; who is in one of the two fits.
+        macs: MAC addresses that frames come from on Ethernet; an address in one of the two fits.
         net_ids: Source NetIDs, by their first four, five or all six bytes; they prove nothing.
         transports: Names (``mqtt:line``) or kinds (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
             ``mqtt``, ``local``).
-        targets: What is asked.
-        services: What is to be done.
+        targets: Of the requests.
+        services: Kinds of operations.
         objects: Of a dictionary; a rule that has some is about nothing else.
     """
 
@@ -174,7 +173,7 @@ class AccessRule(SpecStruct, frozen=True):
 
 
 class AmsUser(SpecStruct, frozen=True):
-    """Who may add a route from elsewhere; the first line of *password_file* is the password."""
+    """User that may add routes remotely; the first line of *password_file* is the password."""
 
     name: str
     password_file: str
@@ -182,10 +181,10 @@ class AmsUser(SpecStruct, frozen=True):
 
 
 class TlsSpec(SpecStruct, frozen=True):
-    """How a connection is kept secret; paths are absolute, PEM.
+    """TLS settings of a connection; paths are absolute, files are PEM.
 
     Attributes:
-        ca: Certificates of those who may vouch for the other end; empty for those of the system.
+        ca: Certificates of trusted authorities; empty for those of the system.
         certificate: That this end shows; empty for none.
         key: Of that certificate.
         check_name: Whether the certificate of the other end has to name its host.
@@ -207,10 +206,10 @@ class MqttSpec(SpecStruct, frozen=True, kw_only=True):
         user: Empty for none.
         password_file: Absolute path; its first line is the password.
         tls: None for none.
-        client_id: Empty for one that is made up.
-        no_retain: Whether routers tell of themselves when somebody new does, and leave nothing
+        client_id: Empty for a generated one.
+        no_retain: Whether routers publish their infos again for each new router, and leave none
             retained at the broker.
-        is_unidirectional: Whether nothing may be asked from there.
+        is_unidirectional: Whether requests from there are refused.
         qos: Quality of service of what is sent, 0 to 2.
         is_prefixed: Whether packets are sent with the prefix of AMS/TCP in front.
     """
@@ -229,15 +228,15 @@ class MqttSpec(SpecStruct, frozen=True, kw_only=True):
 
 
 class RoutingSpec(SpecStruct, frozen=True, kw_only=True):
-    """All that the router of a station is told.
+    """Configuration of the router of a station.
 
     Attributes:
         routes: Those of the plant file in its order, then the derived ones.
         mqtt: Brokers.
         access: Rules; behind them stand the usual ones: this host may do anything, others read.
-        users: Who may add routes by UDP 48899; without any only who is on this host.
-        learn: From where routes are learned: ``mqtt:NETWORK``, from what routers tell there by
-            MQTT, and IPv4 networks, from answers to scans; true for all of these, false for none.
+        users: May add routes by UDP 48899; without any only programs of this host may.
+        learn: Sources of learned routes: ``mqtt:NETWORK``, from the infos of routers
+            there, and IPv4 networks, from answers to scans; true for all, false for none.
     """
 
     routes: tuple[RouteSpec, ...] = ()
@@ -247,13 +246,13 @@ class RoutingSpec(SpecStruct, frozen=True, kw_only=True):
     learn: bool | tuple[str, ...] = True
 
     def learns_by_mqtt(self, network: str) -> bool:
-        """Say whether routes are learned from what routers tell in an MQTT network."""
+        """Return whether routes are learned from the infos of an MQTT network."""
         if isinstance(self.learn, bool):
             return self.learn
         return f"{TransportKind.MQTT}:{network}" in self.learn
 
     def learns_from(self, address: str) -> bool:
-        """Say whether routes are learned from a router that answers a scan at an IPv4 address."""
+        """Return whether routes are learned from a router scanned at an IPv4 address."""
         if isinstance(self.learn, bool):
             return self.learn
         networks = (each for each in self.learn if not each.startswith(f"{TransportKind.MQTT}:"))

@@ -1,18 +1,18 @@
-"""Restoration of subscriptions whose way to the server was interrupted.
+"""Restoration of subscriptions whose path to the server was interrupted.
 
-The first router on the way restores: it keeps what its client asked for.  Others tell the router
-before them that a subscription has ended, by the sample without bytes that TwinCAT sends.
+The first router on the path restores: it keeps the parameters of its client.  The others signal the
+end of a subscription to the previous router, by the sample without bytes that TwinCAT sends.
 
 Rule 1: a subscription is interrupted when its hop is lost or was started again, when its server
 ends it, or when no sample comes for too long and the server does not know it any more.
-Rule 2: it is asked for again until the server grants it, whatever is wrong with the way; an error
+Rule 2: it is requested again until the server grants it, whatever fails on the path; an error
 that says that there is no such object, or that access is refused, ends it, and its client gets a
 sample without bytes.
 Rule 3: what was granted before is deleted at the server after the new one was granted, and never
 while requests for others with the same addresses are under way: a server that was started again may
 give a handle twice.
-Rule 4: after a failure one subscription for each pair of addresses tries the way, again and again;
-when it comes through, the others follow in groups.
+Rule 4: after a failure one subscription for each pair of addresses tries the path repeatedly; when
+it is granted, the others follow in groups.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ RETRY_NS = 500_000_000
 SPACING_NS = 10_000_000
 """Between two requests at all, on the average: many pairs are tried less often."""
 _LOOKUP_SPACING_NS = 1_000_000
-"""Likewise, between two looks for a way that find none, which cost no packet."""
+"""Likewise, between two route lookups that fail, which cost no packet."""
 GROUP = 32
-"""Subscriptions of one pair of addresses that are asked for at a time."""
+"""Subscriptions of one pair of addresses that are requested at a time."""
 MAX_REQUESTS = 128
 """Requests of restorations that wait for answers."""
 TIMEOUT_NS = 2_000_000_000
@@ -85,7 +85,7 @@ _STARTUP_ERRORS = frozenset(
 RouteFinder: TypeAlias = Callable[
     [AmsHeader, bytes, Endpoint, int], tuple[Route, bytes] | RoutingError
 ]
-"""Returns by which route and with which addresses a request goes on now, or why it does not."""
+"""Returns the route of a request now and its forwarded addresses, or an error."""
 
 
 class _Session:
@@ -125,7 +125,7 @@ class _Step(NamedTuple):
     """None for the end of an earlier grant."""
     stale: Grant | None = None
     is_check: bool = False
-    """Whether it shows that the server had forgotten what was not known to be interrupted."""
+    """True if it reveals that the server has lost a subscription that seemed alive."""
     symbol_handle: int | None = None
 
 
@@ -141,14 +141,14 @@ class Interruption(NamedTuple):
 
 
 class SubscriptionRestorer:
-    """Establishes subscriptions again.
+    """Restores interrupted subscriptions.
 
     Args:
         subscriptions: All that pass the router.
-        transports: By which servers are asked.
+        transports: By which requests are sent.
         in_flight: What waits for an answer, these requests too.
         ids: Of requests of this router.
-        cleanup: Ends what was granted in vain.
+        cleanup: Ends grants that are not needed.
         error_replier: Takes note of what is given up.
         limits: How much may wait.
         find_route: Finds the route of a client's request, by the access rules too.
@@ -184,7 +184,7 @@ class SubscriptionRestorer:
             heappush(self._checks, (at_ns, next(self._numbers), subscription))
 
     def granted(self, subscription: Subscription, now_ns: int) -> list[Action]:
-        """Take note of a new subscription that a client asked for."""
+        """Watch a new subscription of a client."""
         self.watch(subscription)
         return self._reject_deleted_handle(subscription, now_ns)
 
@@ -208,7 +208,7 @@ class SubscriptionRestorer:
         return actions
 
     def ended(self, subscriptions: Iterable[Subscription], now_ns: int) -> list[Action]:
-        """Act on samples without bytes: the server, or a router on the way, ended these."""
+        """Act on samples without bytes: the server, or a router on the path, ended these."""
         actions: list[Action] = []
         for each in subscriptions:
             if each.is_closed:
@@ -219,7 +219,7 @@ class SubscriptionRestorer:
                 actions += self._end(each, now_ns)
             else:
                 actions += self.interrupt(
-                    [each], "its server, or a router on the way, ended it", now_ns
+                    [each], "its server, or a router on the path, ended it", now_ns
                 )
         return actions
 
@@ -328,7 +328,7 @@ class SubscriptionRestorer:
         heappush(self._due, (at_ns, next(self._numbers), session))
 
     def _begin(self, session: _Session, now_ns: int) -> list[Action]:
-        """Ask for one subscription, or for a group when the way is known to be good."""
+        """Request one subscription, or a group once one has been granted."""
         actions: list[Action] = []
         limit = 1 if session.is_trying else GROUP
         while session.waiting and session.outstanding < limit and self._is_below_limits():
@@ -432,7 +432,7 @@ class SubscriptionRestorer:
         return actions + self._reject_deleted_handle(subscription, now_ns)
 
     def _reject_deleted_handle(self, subscription: Subscription, now_ns: int) -> list[Action]:
-        """Ask again for what has the handle of a notification that is being deleted."""
+        """Restore a subscription whose handle is that of a notification being deleted."""
         if subscription.grant is None or key_of(subscription.grant) not in self._deleting:
             return []
         self._subscriptions.detach(subscription)
@@ -472,7 +472,7 @@ class SubscriptionRestorer:
         return self._end(subscription, now_ns)
 
     def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
-        """Forget a subscription, and tell its client."""
+        """Remove a subscription, and send its end to the client."""
         self._subscriptions.remove(subscription)
         endpoint = subscription.endpoint
         if endpoint.transport not in self._transports.transports:

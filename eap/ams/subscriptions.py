@@ -1,7 +1,7 @@
 """Subscriptions of clients to notifications that pass this router.
 
 A notification is no answer: it names only the AMS address of its client, which several programs may
-share.  What tells them apart is the handle that the server gave.  So each subscription is kept with
+share.  The handle of the server tells them apart.  So each subscription is kept with
 the connection of its client; the handle that the client knows stays the same when the server gives
 another one, because the subscription was restored.
 """
@@ -47,7 +47,7 @@ class Grant(NamedTuple):
     handle: int
     route: Route
     symbol_handle: int | None = None
-    """Of the symbol that it watches, if this router looked it up; it is given back at the end."""
+    """Of the symbol that it watches, if this router looked it up; it is released at the end."""
 
 
 class Subscription:
@@ -124,7 +124,7 @@ class Subscription:
 
     @property
     def is_on_change(self) -> bool:
-        """Whether samples come only when the value changes."""
+        """True if samples come only when the value changes."""
         return self.request is not None and self.request.mode in _ON_CHANGE
 
     def quiet_limit_ns(self) -> int:
@@ -139,7 +139,7 @@ class Subscription:
         )  # fmt: skip
 
     def encode_end(self, now_ns: int) -> bytes:
-        """Return the packet that tells the client that the subscription has ended.
+        """Return the packet that signals the end of the subscription to the client.
 
         That is a sample without bytes, as TwinCAT sends it; it is alone in its packet, because
         AdsLib skips what follows such a sample.
@@ -176,7 +176,7 @@ class Subscriptions:
                 yield from handles.values()
 
     def is_within_limits(self, endpoint: Endpoint, addresses: bytes, count: int) -> bool:
-        """Say whether a client may have *count* more."""
+        """Return whether a client may have *count* more."""
         mine = self._by_client.get(endpoint, {}).get(addresses, ())
         return (
             len(mine) + count <= MAX_PER_CLIENT
@@ -243,7 +243,7 @@ class Subscriptions:
         subscription.grant = self.detach(subscription)
 
     def find(self, onward: bytes, handle: int) -> Subscription | None:
-        """Return whose a sample with *handle* is, from the first to the second address."""
+        """Return the subscription of a sample with *handle* between the addresses *onward*."""
         return self._by_grant.get((onward, handle))
 
     def find_of_client(
@@ -270,7 +270,7 @@ class Subscriptions:
         return self.detach(subscription)
 
     def endpoints(self) -> list[Endpoint]:
-        """Return the connections whose clients have any."""
+        """Return the connections with subscriptions."""
         return list(self._by_client)
 
     def close(self, endpoint: Endpoint) -> list[Grant]:
@@ -284,7 +284,7 @@ class Subscriptions:
         return [grant for grant in grants if grant is not None]
 
     def of_hop(self, transport: str, address: str | None) -> list[Subscription]:
-        """Return those whose samples come from a hop, or from any of a door."""
+        """Return the subscriptions by a hop, or by any hop of a transport."""
         found = []
         for each in self._by_grant.values():
             hop = each.grant.route.hop if each.grant is not None else None
@@ -297,7 +297,7 @@ class Division(NamedTuple):
     """Samples of one notification, divided by client."""
 
     parts: list[tuple[Endpoint, bytes, bytes]]
-    """Connection of a client, the addresses that it asked with, and the data that it gets."""
+    """Connection of a client, the addresses of its request, and the data that it gets."""
     ended: list[Subscription]
     """Subscriptions that their server has ended by a sample without bytes."""
     unknown: list[int]
@@ -310,7 +310,7 @@ def divide(
     body: bytes, onward: bytes, subscriptions: Subscriptions, now_ns: int,
     is_from_hop: Callable[[Endpoint], bool],
 ) -> Division:  # fmt: skip
-    """Return which connection gets what of a notification.
+    """Divide a notification by client connection.
 
     A handle counts as unknown that was given by another hop than *is_from_hop* says.
 

@@ -19,7 +19,7 @@ class Forward(NamedTuple):
     packets: tuple[bytes, ...]
     """One, or its fragments in their order."""
     ticket: int
-    """Names the request, for a door that cannot send it."""
+    """Names the request, for a transport that cannot send it."""
 
 
 class Reply(NamedTuple):
@@ -38,21 +38,21 @@ class Deliver(NamedTuple):
     header: AmsHeader
     body: bytes
     endpoint: Endpoint
-    """Where notifications go, if it is about any."""
+    """Endpoint of the client; its notifications go there too."""
 
 
 Action: TypeAlias = Forward | Reply | Deliver
 
 
 class Transport(msgspec.Struct, frozen=True):
-    """What a router has to know of one way to come in and go out.
+    """Transport as the router sees it.
 
     Attributes:
-        name: As people call it.
+        name: As in the plant file.
         max_size: Bytes of the longest packet in one piece, header included; 0 for any. A longer
             packet goes in fragments.
-        is_stream: Whether nothing comes twice; elsewhere what is asked again is not passed again.
-        is_shared: Whether all answers come by one connection, whoever gives them (a broker).
+        is_stream: Whether packets never arrive twice; on others a repeated request is dropped.
+        is_shared: Whether all answers arrive by one connection, from any peer (a broker).
         is_hub: Whether those behind it reach each other through a router only, so that packets
             may go back to where they came in, though not to the same address.
     """
@@ -65,7 +65,7 @@ class Transport(msgspec.Struct, frozen=True):
 
 
 class TransportTable:
-    """The doors of a router, seen from inside; raises as :meth:`add`."""
+    """Transports of a router; raises as :meth:`add`."""
 
     def __init__(self, transports: Iterable[Transport]) -> None:
         self._transports: dict[str, Transport] = {}
@@ -75,13 +75,13 @@ class TransportTable:
             self.add(transport)
 
     def add(self, transport: Transport) -> None:
-        """Take one more door.
+        """Add a transport.
 
         Raises:
-            ValueError: it has not even room for a fragment, or the name of another.
+            ValueError: it cannot carry a fragment, or has the name of another.
         """
         if transport.name in self._transports:
-            raise ValueError(f"two doors {transport.name!r}")
+            raise ValueError(f"transport {transport.name!r} exists already")
         if transport.max_size and transport.max_size <= AmsHeader.SIZE:
             raise ValueError(
                 f"transport {transport.name!r}: {transport.max_size} bytes,"
@@ -90,20 +90,20 @@ class TransportTable:
         self._transports[transport.name] = transport
 
     def remove(self, name: str) -> None:
-        """Forget a door; nothing goes back by it any more."""
+        """Remove a transport; nothing is sent by it any more."""
         del self._transports[name]
 
     @property
     def transports(self) -> Mapping[str, Transport]:
-        """All doors by name."""
+        """All transports by name."""
         return self._transports
 
     def set_connection(self, hop: Endpoint, connection: str) -> None:
-        """Know that what comes from *hop*, which has a name, comes by *connection*."""
+        """Note that packets of *hop*, which is a name, arrive by *connection*."""
         self._connections[hop] = connection
 
     def is_from(self, hop: Endpoint, endpoint: Endpoint) -> bool:
-        """Say whether what comes by *endpoint* may come from *hop*."""
+        """Return whether packets from *endpoint* may come from *hop*."""
         if hop == endpoint:
             return True
         if hop.transport != endpoint.transport:
@@ -114,11 +114,11 @@ class TransportTable:
         )
 
     def reply(self, endpoint: Endpoint, packet: bytes) -> Reply:
-        """Return how *packet* goes back by *endpoint*."""
+        """Return the action that sends *packet* back to *endpoint*."""
         return Reply(endpoint, self._split(endpoint.transport, packet))
 
     def forward(self, hop: Endpoint, packet: bytes, ticket: int) -> Forward:
-        """Return how *packet* goes on to *hop*."""
+        """Return the action that sends *packet* to *hop*."""
         return Forward(hop, self._split(hop.transport, packet), ticket)
 
     def _split(self, transport: str, packet: bytes) -> tuple[bytes, ...]:

@@ -12,7 +12,7 @@ from eap.codec.wire import WireStruct, bit, bits3, bits4, bits6, octets16, u8, u
 
 
 class AdsError(IntEnum):
-    """Results of a service, and the errors in an AMS header that mean the way to it."""
+    """Results of a service, and errors of the AMS header, which concern the route to it."""
 
     NONE = 0x000
     INTERNAL = 0x001
@@ -67,7 +67,7 @@ class AdsError(IntEnum):
 
     @classmethod
     def words_of(cls, code: int) -> str:
-        """Return a code with what it means, for people."""
+        """Return a code with its meaning, for operators."""
         text = _WORDS.get(code)
         return f"error 0x{code:x} ({text or cls.name_of(code)})" if code else "no error"
 
@@ -130,7 +130,7 @@ class IndexGroup(IntEnum):
     SYSTEM_STATE = 0x00F0
     """Of the system service: states, version and platform in 16 bytes."""
     DATA = 0x4040
-    """The memory of variables; where each lies is told by its symbol."""
+    """The memory of variables; a symbol gives the address of each."""
     IO_DEVICES = 0x5000
     """And those that follow: plus the id of a device."""
     SYMBOL_HANDLE = 0xF003
@@ -145,7 +145,7 @@ class IndexGroup(IntEnum):
     DATA_TYPE_UPLOAD = 0xF00E
     SYMBOL_UPLOAD_INFO_2 = 0xF00F
     SYMBOL_NOTIFICATION = 0xF010
-    """Offset: a handle, whose value a notification watches."""
+    """Offset: handle of the symbol that a notification watches."""
     DATA_TYPE_BY_NAME = 0xF011
     SUM_READ = 0xF080
     SUM_WRITE = 0xF081
@@ -177,7 +177,7 @@ class IndexGroup(IntEnum):
     VOE = 0xF430
     """Written: a message with its VoE header."""
     ROUTE_QUERY = 0x4541_5001
-    """Own format: of the system service, where it passes requests on to, see ``HopQuestion``."""
+    """Own format: of the system service, where it forwards requests to, see ``HopQuestion``."""
 
 
 class AdsRange(WireStruct, frozen=True):
@@ -248,7 +248,7 @@ class AdsWriteControl(WireStruct, frozen=True):
 
 
 class AdsSystemState(WireStruct, frozen=True):
-    """What the system service tells at SYSTEM_STATE, as the open client ads-client reads it."""
+    """Answer of the system service at SYSTEM_STATE, as the open client ads-client reads it."""
 
     ads_state: u16
     device_state: u16
@@ -269,5 +269,5 @@ def encode_result(result: int, data: bytes | None = None) -> bytes:
 
 
 def device_name(text: str) -> bytes:
-    """Return as much of *text* as ReadDeviceInfo has room for, 15 bytes and a NUL at the end."""
+    """Return *text* cut to the 15 bytes of ReadDeviceInfo, with a NUL at the end."""
     return text.encode("latin-1", "replace")[:15].ljust(16, b"\0")

@@ -1,4 +1,4 @@
-"""ADS notifications: what a client asks to be told of, and the packets that tell it.
+"""ADS notifications: requests of clients, and the packets with samples.
 
 Beckhoff ADS specification, AddDeviceNotification and DeviceNotification.  A packet holds stamps, a
 stamp the samples that were taken at one time.
@@ -76,7 +76,7 @@ class Sample(NamedTuple):
 
 
 class Stamp(NamedTuple):
-    """What was sampled at one time, in 100 ns since 1601 (FILETIME)."""
+    """Samples taken at one time, in 100 ns since 1601 (FILETIME)."""
 
     time: int
     samples: tuple[Sample, ...]

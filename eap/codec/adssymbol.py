@@ -17,7 +17,7 @@ CODE_PAGE = 1252
 _ENCODING = f"cp{CODE_PAGE}"
 """TwinCAT's, for names, types and comments."""
 MAX_TEXT = 255
-"""Bytes of a name, type or comment: clients have room for 256 with the NUL."""
+"""Bytes of a name, type or comment: clients accept 256 with the NUL."""
 
 
 class AdsType(IntEnum):
@@ -59,7 +59,7 @@ class SymbolAddress(WireStruct, frozen=True):
 
 
 class UploadInfo(WireStruct, frozen=True):
-    """What SYM_UPLOADINFO2 tells; the first two fields are SYM_UPLOADINFO.  Sizes in bytes.
+    """Answer to SYM_UPLOADINFO2; the first two fields are SYM_UPLOADINFO.  Sizes in bytes.
 
     Clients that know of its third version ask for 64 bytes: there *invalid_dynamic*,
     *code_page* of names and comments, *upload_flags* and seven reserved numbers follow, as the
@@ -74,7 +74,7 @@ class UploadInfo(WireStruct, frozen=True):
     used_dynamic: u32 = 0
 
     def encode_for(self, length: int) -> bytes:
-        """Return the newest version that a client has room for in *length* bytes."""
+        """Return the newest version that fits into *length* bytes."""
         octets = self.encode()
         if length >= _INFO_3_SIZE:
             return (octets + _InfoTail(0, CODE_PAGE).encode()).ljust(_INFO_3_SIZE, b"\0")
@@ -105,9 +105,9 @@ class _SymbolHead(WireStruct, frozen=True):
 
 
 class HandleInfo(WireStruct, frozen=True):
-    """What stands in front of the type's name where a client has room for more than a handle.
+    """Head in front of the type's name where a client accepts more than a handle.
 
-    As the open client ads-client reads it; nobody documents *decoration*.
+    As the open client ads-client reads it; *decoration* is not documented.
     """
 
     handle: u32
@@ -117,7 +117,7 @@ class HandleInfo(WireStruct, frozen=True):
 
 
 class SymbolEntry(NamedTuple):
-    """One variable as a server tells of it."""
+    """One variable as a server describes it."""
 
     address: SymbolAddress
     type: int
@@ -197,7 +197,7 @@ def encode_text(text: str) -> bytes:
 
 
 def decode_name(data: Buffer) -> str:
-    """Return the name that a client asks for: UTF-8 or TwinCAT's encoding, up to a NUL."""
+    """Return the name in a request: UTF-8 or TwinCAT's encoding, up to a NUL."""
     octets, _, _ = bytes(data).partition(b"\0")
     try:
         return octets.decode()

@@ -40,7 +40,7 @@ class AmsCommand(IntEnum):
 
     @classmethod
     def name_of(cls, command: int) -> str:
-        """Return the name of a command, or its number for one nobody documents."""
+        """Return the name of a command, or its number for an undocumented one."""
         return cls(command).name if command in cls._value2member_map_ else f"0x{command:04x}"
 
 
@@ -59,10 +59,10 @@ class StateFlags(IntFlag):
 
 
 class AmsHeader(WireStruct, frozen=True):
-    """Beckhoff ADS specification, AMS header: from whom, to whom, which service.
+    """Beckhoff ADS specification, AMS header: target, source and service.
 
-    *command* stays a number when :class:`AmsCommand` does not know it: a router passes such a
-    packet on, and its target answers that it does not know the service.  *length* is the number of
+    *command* stays a number when :class:`AmsCommand` does not know it: a router forwards such a
+    packet, and its target answers that it does not know the service.  *length* is the number of
     bytes behind the header, *invoke_id* pairs a response with its request.
     """
 
@@ -115,7 +115,7 @@ _LENGTH_AT = 16
 
 
 class RouterCommand(IntEnum):
-    """What a local client asks a router itself, in *reserved* of the prefix.
+    """Commands of a local client to a router, in *reserved* of the prefix.
 
     As the open client ads-client sends them; Beckhoff documents none.
     """
@@ -139,7 +139,7 @@ class AmsTcpHeader(WireStruct, frozen=True):
 
 
 def decode_prefix(data: Buffer, offset: int = 0) -> int:
-    """Return how many bytes the packet has whose prefix is at *offset*.
+    """Return the number of bytes of the packet whose prefix is at *offset*.
 
     Raises:
         TruncatedError: the prefix is not whole.
@@ -165,12 +165,12 @@ def encode_with_prefix(packet: bytes) -> bytes:
 
 
 def encode_opened_port(net_id: NetId, port: int) -> bytes:
-    """Return what tells a local client its AMS address."""
+    """Return the answer to OPEN_PORT."""
     return _encode_command(RouterCommand.OPEN_PORT, net_id + port.to_bytes(2, "little"))
 
 
 def encode_net_id(net_id: NetId) -> bytes:
-    """Return what tells a local client its NetID."""
+    """Return the answer to NET_ID."""
     return _encode_command(RouterCommand.NET_ID, net_id)
 
 

@@ -1,7 +1,7 @@
 """Datagrams of UDP port 48899, by which tools find AMS routers and add routes to them.
 
 Beckhoff documents none of it.  The layout is that of the requests of pyads 3.6, AdsLib and ads-rs
-(which has version and options), all open source; tags that nobody knows are kept as they come.
+(which has version and options), all open source; unknown tags are kept unchanged.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ TEMPORARY = 1
 
 
 class DiscoveryService(IntEnum):
-    """What is asked for."""
+    """Requested service."""
 
     SERVER_INFO = 1
     ADD_ROUTE = 6
 
 
 class Tag(IntEnum):
-    """What a tag holds."""
+    """Content of a tag."""
 
     RESULT = 1
     """32 bits, as in ADS."""
@@ -47,7 +47,7 @@ class Tag(IntEnum):
 
 
 class DiscoveryHeader(WireStruct, frozen=True):
-    """What each datagram begins with.
+    """Header of each datagram.
 
     *service* and *invoke_id* stay numbers; *net_id* and *port* are those of the sender's router.
     *count* is the number of tags that follow.
@@ -62,7 +62,7 @@ class DiscoveryHeader(WireStruct, frozen=True):
 
 
 class TagHeader(WireStruct, frozen=True):
-    """What each tag begins with; *length* bytes follow."""
+    """Header of each tag; *length* bytes follow."""
 
     id: u16
     length: u16

@@ -26,7 +26,7 @@ _IPV4 = 0x0800
 
 
 class ArpMessage(NamedTuple):
-    """RFC 826: who asks or tells, and about whom.  *operation* may be one that nobody knows."""
+    """RFC 826: ARP message; *operation* may be unknown."""
 
     operation: int
     sender_mac: MacAddr
@@ -36,7 +36,7 @@ class ArpMessage(NamedTuple):
 
     @classmethod
     def probe(cls, sender_mac: MacAddr, target: IPv4Address) -> Self:
-        """Return the question who has *target*, by somebody without an address (RFC 5227 2.1)."""
+        """Return a probe for *target* by a host without an address (RFC 5227 2.1)."""
         return cls(REQUEST, sender_mac, NO_ADDRESS, NO_MAC, target)
 
     @classmethod
@@ -87,14 +87,14 @@ class ArpMessage(NamedTuple):
 
     @property
     def is_probe(self) -> bool:
-        """Whether the sender asks if it may take the target address for itself (RFC 5227 2.1.1)."""
+        """True if the message is a probe for the target address (RFC 5227 2.1.1)."""
         return self.operation == REQUEST and self.sender == NO_ADDRESS
 
     @property
     def shows_sender(self) -> bool:
-        """Whether a host with the sender's two addresses sent it: a reply, request or announcement.
+        """True if a host with the sender's two addresses sent it: a reply, request or announcement.
 
-        A group address or none at all is nobody's.
+        A group address, or none at all, belongs to no host.
         """
         return (
             self.operation in {REQUEST, REPLY}

@@ -50,7 +50,7 @@ def decode_message(data: Buffer) -> tuple[CoeHeader, memoryview]:
 
     Raises:
         TruncatedError: it is shorter than the header.
-        MalformedError: nobody knows the service.
+        MalformedError: the service is unknown.
     """
     return CoeHeader.decode(data), memoryview(data)[CoeHeader.SIZE :]
 
@@ -99,7 +99,7 @@ class SdoHeader(WireStruct, frozen=True):
     """ETG.1000.6, initiate and abort SDO.
 
     *value* is the data of an expedited SDO, the size of a normal one or the code of an abort.  In
-    an expedited SDO *unused* of its bytes do not count, unless *has_size* is 0: then nobody said.
+    an expedited SDO *unused* of its bytes do not count, unless *has_size* is 0.
     """
 
     has_size: bit
@@ -175,7 +175,7 @@ def encode_segment(
 
 
 def encode_segment_answer(specifier: SdoRequest | SdoResponse, *, toggle: int) -> bytes:
-    """Return what asks for a segment, or confirms one."""
+    """Return the request for a segment, or its confirmation."""
     return SdoSegmentHeader(toggle=toggle, specifier=specifier).encode() + bytes(SEGMENT_MINIMUM)
 
 
@@ -195,7 +195,7 @@ def encode_abort(index: int, subindex: int, code: int) -> bytes:
 
 
 class SdoInfoOpcode(IntEnum):
-    """ETG.1000.6, SDO information header: what is asked or answered."""
+    """ETG.1000.6, SDO information header: kind of the message."""
 
     LIST_REQUEST = 1
     LIST_RESPONSE = 2

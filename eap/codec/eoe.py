@@ -185,7 +185,7 @@ def decode_message(data: Buffer) -> tuple[EoeHeader, int, memoryview]:
 
     Raises:
         TruncatedError: it is shorter than the two words.
-        MalformedError: nobody knows the type.
+        MalformedError: the type is unknown.
     """
     header = EoeHeader.decode(data)
     word = ResultWord.decode(data, EoeHeader.SIZE).result

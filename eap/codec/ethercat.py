@@ -17,7 +17,7 @@ MAX_UDP_FRAME = 1472
 
 
 class FrameType(IntEnum):
-    """What follows the header.  TwinCAT also sends type 7 while scanning; nobody documents it."""
+    """Type of the data behind the header.  TwinCAT also sends the undocumented type 7 in scans."""
 
     DATAGRAM = 1
     AMS = 2

@@ -78,7 +78,7 @@ class FoeHeader(WireStruct, frozen=True):
 
 
 class Busy(NamedTuple):
-    """How far a busy peer is: *done* of *entire*, both up to 65535, in a unit of its own."""
+    """Progress of a busy peer: *done* of *entire*, both up to 65535, in a unit of its own."""
 
     done: int
     entire: int
@@ -104,7 +104,7 @@ def decode_message(data: Buffer) -> tuple[FoeHeader, memoryview]:
 
     Raises:
         TruncatedError: it is shorter than the header.
-        MalformedError: nobody knows the opcode.
+        MalformedError: the opcode is unknown.
     """
     return FoeHeader.decode(data), memoryview(data)[FoeHeader.SIZE :]
 

@@ -16,7 +16,7 @@ from eap.errors import MalformedError, TruncatedError
 
 
 class MailboxType(IntEnum):
-    """Which protocol the data of a message belongs to (ETG.1000.4, mailbox header)."""
+    """Protocol of the data of a message (ETG.1000.4, mailbox header)."""
 
     ERR = 0
     AOE = 1
@@ -60,7 +60,7 @@ class MailboxError(IntEnum):
 
     @classmethod
     def name_of(cls, detail: int) -> str:
-        """Return the name of a detail code, or its number for one nobody documents."""
+        """Return the name of a detail code, or its number for an undocumented one."""
         return cls(detail).name if detail in cls._value2member_map_ else f"0x{detail:04x}"
 
     @classmethod
@@ -98,7 +98,7 @@ def decode_message(data: Buffer, offset: int = 0) -> tuple[MailboxHeader, memory
 
     Raises:
         TruncatedError: fewer bytes follow than the header says.
-        MalformedError: nobody knows the protocol.
+        MalformedError: the protocol is unknown.
     """
     header = MailboxHeader.decode(data, offset)
     start = offset + MailboxHeader.SIZE
@@ -117,7 +117,7 @@ def decode_frame(data: Buffer) -> tuple[MailboxHeader, memoryview]:
 
     Raises:
         TruncatedError: the frame is shorter than its Length, or its message than its length.
-        MalformedError: the frame is of another type, or nobody knows the protocol.
+        MalformedError: the frame is of another type, or its protocol is unknown.
     """
     if len(data) >= _HEADS.size:  # the usual frame in one step
         word, size, address, lane, kind = _HEADS.unpack_from(data)
@@ -206,7 +206,7 @@ _TYPES = {each.value: each for each in MailboxType}
 
 
 class VoeHeader(WireStruct, frozen=True):
-    """ETG.1000.6: whose protocol the data behind it is, and which of them."""
+    """ETG.1000.6, VoE header: vendor and protocol of the data behind it."""
 
     vendor_id: u32
     vendor_type: u16

@@ -13,7 +13,7 @@ from eap.errors import MalformedError, TruncatedError
 
 
 class PdFrameHeader(WireStruct, frozen=True):
-    """Who published the frame, how many PDs follow, and the sender's cycle counter.
+    """Publisher of the frame, number of PDs, and the sender's cycle counter.
 
     *eap_sm* carries the sender's state in newer devices; TwinCAT 2 and Wireshark read it and
     *reserved* as one reserved word.  It is never a reason to refuse a frame.

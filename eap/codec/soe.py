@@ -169,7 +169,7 @@ def decode_message(data: Buffer) -> tuple[SoeHeader, memoryview]:
 
     Raises:
         TruncatedError: it is shorter than the header.
-        MalformedError: nobody knows the opcode.
+        MalformedError: the opcode is unknown.
     """
     return SoeHeader.decode(data), memoryview(data)[SoeHeader.SIZE :]
 

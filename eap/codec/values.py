@@ -1,7 +1,7 @@
 """Kinds of values a process variable may have, and how each lies in memory (ETG.1020).
 
-Everything is little-endian.  A type knows nothing about where its variable is; whoever calls
-``read`` and ``write`` says the offset.  ``eap.codec.datatypes`` knows the types by name.
+Everything is little-endian.  A type does not know the offset of its variable; the caller of
+``read`` and ``write`` passes it.  ``eap.codec.datatypes`` knows the types by name.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from eap.codec.wire import Buffer
 from eap.errors import TruncatedError
 
 Value: TypeAlias = bool | int | float | str | bytes | tuple[int, ...] | tuple[float, ...]
-"""What ``read`` returns; ``write`` takes the same, and any sequence for an array."""
+"""Value that ``read`` returns; ``write`` takes the same, and any sequence for an array."""
 Plain: TypeAlias = bool | int | float | str | list[int] | list[float]
 """A value as YAML and JSON carry it: a raw block is a string of hexadecimal digits."""
 
@@ -37,13 +37,13 @@ class DataType(msgspec.Struct, frozen=True):
     size: int
     """Bytes in the process image."""
     is_bits: bool = False
-    """Whether it is packed bit by bit on the wire; in the image it has a byte of its own."""
+    """True if it is packed bit by bit on the wire; in the image it has a byte of its own."""
     count: int = 1
     """Elements of an array, else 1."""
 
     @property
     def is_text(self) -> bool:
-        """Whether it is text, of which only as many bytes count as are not NUL at the end."""
+        """True if it is text, of which only as many bytes count as are not NUL at the end."""
         return self.code == 0x09
 
     def read(self, buffer: Buffer, offset: int) -> Value:

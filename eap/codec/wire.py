@@ -94,7 +94,7 @@ def _reader(wrap: type | None) -> Callable[[Any], Any] | None:
 def _kinds_of(cls: type[WireStruct]) -> Iterator[tuple[str, Scalar | Bits]]:
     """Yield name and kind of each field.
 
-    ``typing.get_type_hints`` tells the same; for all records it took a tenth of a process's start.
+    ``typing.get_type_hints`` returns the same; it took a tenth of a process's start.
     """
     for base in reversed(cls.__mro__):
         scope = vars(sys.modules[base.__module__])

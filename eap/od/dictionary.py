@@ -1,4 +1,4 @@
-"""SDO semantics: entries that may be read and written, in which state, with which refusal.
+"""Object dictionary: SDO semantics, access rights by state, and abort codes.
 
 Every method raises :class:`eap.od.abort.SdoAbortError` and leaves the dictionary as it was, or
 succeeds.  Data is in the form in which CoE transfers it (ETG.1000.6).

@@ -74,7 +74,7 @@ def object_description(dictionary: ObjectDictionary, index: int) -> bytes:
 def entry_description(
     dictionary: ObjectDictionary, index: int, subindex: int, value_info: int
 ) -> bytes:
-    """Return type, length, rights, what *value_info* asks for and there is, and the name."""
+    """Return type, length, rights, the existing parts of *value_info*, and the name."""
     entry = dictionary.entry(index, subindex)
     parts = {
         ValueInfo.UNIT: None if entry.unit is None else struct.pack("<I", entry.unit),

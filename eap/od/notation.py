@@ -1,8 +1,8 @@
-"""Values of entries as people read and write them, and as JSON carries them.
+"""Notation of entry values: text for operators, and JSON.
 
-What is an address, a mapping or the index of another object is shown as that, told by the name of
-its entry, for that is all that a foreign device tells.  What is written in one of these forms is
-read as that, for whatever entry has its length.
+An address, a mapping or the index of another object is recognized by the name of its entry, because
+a foreign device gives nothing else.  A text in one of these forms is read as such for every entry
+of its length.
 """
 
 from __future__ import annotations

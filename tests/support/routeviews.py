@@ -68,7 +68,7 @@ class Left:
         if hop.kind is TransportKind.AMS_TCP and name not in self._transports():
             self.router.add_transport(Transport(name, is_stream=True), self.sender)
         if name not in self._transports():
-            raise ValueError(f"this station has no door {name}")
+            raise ValueError(f"this station has no transport {name}")
         return Endpoint(name, hop.address)
 
     def _transports(self) -> object:

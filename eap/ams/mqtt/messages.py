@@ -27,7 +27,7 @@ MAX_NETWORK = 128
 
 
 class TopicKind(Enum):
-    """What a topic is for; the value is what follows the NetID."""
+    """Purpose of a topic; the value is its part behind the NetID."""
 
     INFO = "info"
     REQUESTS = "ams"
@@ -41,8 +41,8 @@ class Topics:
         ValueError: no network can have that name.
 
     Attributes:
-        info: Where it tells of itself.
-        filters: What it subscribes to.
+        info: Topic of its own info.
+        filters: Topic filters that it subscribes to.
     """
 
     def __init__(self, network: str, net_id: NetId) -> None:
@@ -57,7 +57,7 @@ class Topics:
         return f"{self._start}{address}/{kind.value}"
 
     def parse(self, topic: str) -> tuple[NetId, TopicKind] | None:
-        """Return whose topic it is and what for; None for one that means nothing here."""
+        """Return router and purpose of a topic; None for an unknown one."""
         if not topic.startswith(self._start):
             return None
         address, _, rest = topic[len(self._start) :].partition("/")
@@ -66,7 +66,7 @@ class Topics:
             net_id = NetId.parse(address)
         except ValueError:
             return None
-        # Not 05.1.1.1.1.1: nobody has two topics for one thing.
+        # Not 05.1.1.1.1.1: each router has one topic for one purpose.
         return (net_id, kind) if kind is not None and str(net_id) == address else None
 
 
@@ -84,7 +84,7 @@ _KINDS = {kind.value: kind for kind in TopicKind}
 
 
 class Payload(NamedTuple):
-    """What a message brought."""
+    """Packet of a message, and its form."""
 
     packet: bytes
     is_prefixed: bool
@@ -113,7 +113,7 @@ def encode_payload(payload: Payload) -> bytes:
 
 
 MAX_INFO = 4096
-"""Bytes; what is longer is not read."""
+"""Bytes; a longer info is refused."""
 MAX_NAME = 64
 _UNIX = 4
 """Number of the platform; 2, which routers on Windows have, is that of Windows NT."""
@@ -121,17 +121,17 @@ _WORDS = {"true": True, "false": False}
 
 
 class Info(NamedTuple):
-    """What a router tells."""
+    """Info of a router."""
 
     name: str
-    """Of its host; empty if it does not say."""
+    """Of its host; empty if the info has none."""
     is_online: bool
     is_unidirectional: bool = False
-    """Whether it lets nobody ask it anything."""
+    """True if the router accepts no requests."""
 
 
 def encode_info(info: Info) -> bytes:
-    """Return the message that tells *info*."""
+    """Return the message that carries *info*."""
     more = ' unidirectional="true"' if info.is_unidirectional else ""
     word = "true" if info.is_online else "false"
     attributes = f'name={quoteattr(info.name)} osPlatform="{_UNIX}"{more}'
@@ -139,7 +139,7 @@ def encode_info(info: Info) -> bytes:
 
 
 def decode_info(payload: bytes) -> Info:
-    """Return what a message tells; nothing at all says that the router is gone.
+    """Return the info of a message; an empty message means that the router is offline.
 
     Raises:
         MalformedError: it is no such message, or longer than any.
@@ -177,7 +177,7 @@ _COMES_BACK = frozenset({AmsCommand.NOTIFICATION.value, AmsCommand.FRAGMENT.valu
 
 
 class ClientPorts:
-    """Which client has which port; the one silent for longest makes room.
+    """AMS ports of clients; the port of the client silent for longest is reused.
 
     Args:
         net_id: Of the router.
@@ -192,7 +192,7 @@ class ClientPorts:
         return len(self._ports)
 
     def to_network(self, packet: bytes) -> bytes:
-        """Return a packet of a client as it goes to others."""
+        """Return a packet of a client as it is sent to other routers."""
         if not is_request(packet):
             return packet
         client = packet[_SOURCE]
@@ -202,7 +202,7 @@ class ClientPorts:
         return packet[: _SOURCE.start] + source + packet[_SOURCE.stop :]
 
     def to_client(self, packet: bytes) -> bytes:
-        """Return a packet of others as the client gets it that it is for."""
+        """Return a packet of another router as its client gets it."""
         target = packet[_TARGET]
         client = self._clients.get(_port(target)) if target[:6] == self._net_id else None
         if client is None or not is_reply(packet):
@@ -225,13 +225,13 @@ class ClientPorts:
 
 
 def is_request(packet: bytes) -> bool:
-    """Say whether a packet asks something: neither an answer nor a notification."""
+    """Return whether a packet is a request: neither an answer nor a notification."""
     command, flags = _number(packet, _COMMAND), _number(packet, _FLAGS)
     return not flags & StateFlags.RESPONSE and command != AmsCommand.NOTIFICATION
 
 
 def is_reply(packet: bytes) -> bool:
-    """Say whether a packet is, or may be, for who asked before."""
+    """Return whether a packet is an answer, a notification or a fragment."""
     is_response = _number(packet, _FLAGS) & StateFlags.RESPONSE
     return bool(is_response) or _number(packet, _COMMAND) in _COMES_BACK
 

@@ -38,21 +38,21 @@ from eap.errors import CodecError
 from eap.ids import STATION_OCTETS, NetId
 
 MAX_PEERS = 2000
-"""Routers that are remembered; who comes later is not."""
+"""Routers that are kept; further ones are ignored."""
 EXPIRY_NS = 300_000_000_000
-"""How long what a router told counts."""
+"""Lifetime of an info."""
 REFRESH_NS = 120_000_000_000
-"""Between two times that all are asked for."""
+"""Interval in which all retained infos are requested again."""
 
 
 class Change(Enum):
-    """What is new of a router."""
+    """Change of a router's state by an info."""
 
     UP = auto()
     DOWN = auto()
     NOTHING = auto()
     IGNORED = auto()
-    """There is no room to remember it."""
+    """MAX_PEERS are known already."""
 
 
 class _Peer(NamedTuple):
@@ -62,7 +62,7 @@ class _Peer(NamedTuple):
 
 
 class Peers:
-    """The other routers.
+    """The other routers of a network.
 
     Args:
         net_id: Of this station's router.
@@ -86,7 +86,7 @@ class Peers:
         return len(self._peers)
 
     def update(self, net_id: NetId, info: Info, now_ns: int) -> Change:
-        """Note what *net_id* told; learn a route to it, if routes are learned."""
+        """Note the info of *net_id*; learn a route to it, if routes are learned."""
         before = self._peers.get(net_id)
         if before is None and len(self._peers) >= MAX_PEERS:
             return Change.IGNORED
@@ -95,13 +95,13 @@ class Peers:
             route = self._learn(net_id, info.name, route, now_ns)
         self._peers[net_id] = _Peer(info.is_online, now_ns, route)
         if info.is_online == (before is not None and before.is_online):
-            # Who was never there may all the same have a route in the plant file.
+            # A router that was never online may have a route in the plant file.
             return Change.DOWN if before is None else Change.NOTHING
         self._list(net_id, is_online=info.is_online)
         return Change.UP if info.is_online else Change.DOWN
 
     def missing(self) -> list[str]:
-        """Return the hops that some route needs, nothing asks for life, and have not told yet."""
+        """Return the hops of routes that are not probed and have sent no info yet."""
         online = {str(each) for each, peer in self._peers.items() if peer.is_online}
         needed = {
             each.hop.connection
@@ -112,7 +112,7 @@ class Peers:
         return sorted(needed - online)
 
     def forget(self, since_ns: int, now_ns: int) -> tuple[list[NetId], list[NetId]]:
-        """Forget who told nothing since then; return who of them was there, and who was not."""
+        """Forget routers without an info since then; return those online, and the others."""
         silent = [each for each, peer in self._peers.items() if peer.updated_at_ns < since_ns]
         were_there, were_not = [], []
         for net_id in silent:
@@ -154,7 +154,7 @@ class Peers:
             # Another router on this computer; this station's own NetIDs stay its own.
             octets=6 if net_id.station == self._net_id.station else STATION_OCTETS,
             expires_at_ns=expires_at_ns,
-            is_probed=False,  # the broker tells who is gone
+            is_probed=False,  # the broker publishes last wills
         )
         return route if self._table.add(route) else None
 
@@ -171,14 +171,14 @@ class Peers:
 MAX_PACKET = 256 << 10
 """Bytes of the longest AMS packet that is taken."""
 MAX_SENDERS = 4096
-"""Addresses whose form of packets is remembered; the one silent for longest makes room."""
+"""Senders whose packet form is kept; the one silent for longest is dropped."""
 CONFIRM_NS = 30_000_000_000
-"""How long after a connection routers may take to tell of themselves again."""
+"""Time after a connection in which routers have to publish their infos again."""
 _SILENCE_NS = 3_600_000_000_000
-"""After which a sender that nobody told of is forgotten."""
+"""After which a sender without an info is forgotten."""
 _ANNOUNCE_GAP_NS = 1_000_000_000
 _ANSWER_GAP_NS = 30_000_000_000
-"""Since a router told of itself last, in which a known one needs no answer."""
+"""Since the last own info: the info of a known router in this time needs no answer."""
 
 
 class Publish(NamedTuple):
@@ -201,11 +201,11 @@ class PacketReceived(NamedTuple):
 
     packet: bytes
     connection: str
-    """NetID whose topics answers go to."""
+    """NetID whose topics take the answers."""
 
 
 class HopDown(NamedTuple):
-    """A router is gone: whatever waits for it waits in vain."""
+    """A router is gone: its pending requests fail."""
 
     address: str
     text: str
@@ -218,33 +218,33 @@ class HopUp(NamedTuple):
 
 
 class PeerClosed(NamedTuple):
-    """Nobody can be answered there any more."""
+    """A sender is forgotten: no answer can reach it."""
 
     connection: str
 
 
 class Drop(StrEnum):
-    """Why a message came to nothing."""
+    """Reason a message is dropped."""
 
     TOPIC = auto()
     """Its topic means nothing here, or it has no business there: a request among answers, a packet
     that the broker had kept."""
     BROKEN = auto()
-    """Neither a packet, nor what a router tells of itself."""
+    """Neither a packet nor an info."""
     LENGTH = auto()
     """Longer than any packet may be; a request was answered so."""
     FULL = auto()
-    """It tells of one router too many."""
+    """Info of a router beyond MAX_PEERS."""
 
 
 class Dropped(NamedTuple):
-    """A message came to nothing."""
+    """A message was dropped."""
 
     reason: Drop
 
 
 class Warn(NamedTuple):
-    """Something for people, once for each kind of thing."""
+    """Warning for the log, once for each kind."""
 
     text: str
 
@@ -260,13 +260,13 @@ class _Sender(NamedTuple):
 
 
 class MqttNetwork:
-    """What becomes of messages, and which messages packets become.
+    """MQTT messages received and sent by the router of one station.
 
     Args:
         spec: The network and the broker.
         net_id: Of this station's router.
         name: Of the station.
-        transport: Name of the door by which the network is reached.
+        transport: Name of the transport by which the network is reached.
         table: Routes of the station.
         learns: Whether routes are added to them.
     """
@@ -289,7 +289,7 @@ class MqttNetwork:
         self._warned: set[str] = set()
 
     def will(self) -> Publish:
-        """Return the message by which the router is gone."""
+        """Return the last will of the router."""
         payload = encode_info(self._info._replace(is_online=False))
         return Publish(self._topics.info, payload, 2, not self._spec.no_retain)
 
@@ -310,7 +310,7 @@ class MqttNetwork:
     def receive_message(
         self, topic: str, payload: bytes, now_ns: int, *, is_retained: bool = False
     ) -> list[Action]:
-        """Act on a message; nothing that anybody sends raises.
+        """Act on a message; nothing that a peer sends raises.
 
         Args:
             topic: Where it was published.
@@ -320,13 +320,13 @@ class MqttNetwork:
         """
         parsed = self._topics.parse(topic)
         if parsed is None:
-            return self._drop(Drop.TOPIC, "topic nobody knows", topic[:80])
+            return self._drop(Drop.TOPIC, "unknown topic", topic[:80])
         net_id, kind = parsed
         try:
             if kind is TopicKind.INFO:
                 return self._receive_info(net_id, payload, now_ns, is_retained=is_retained)
             if net_id != self._net_id:
-                return self._drop(Drop.TOPIC, "topic nobody knows", topic[:80])
+                return self._drop(Drop.TOPIC, "unknown topic", topic[:80])
             if is_retained:  # it would be done again at each connection
                 return self._drop(Drop.TOPIC, "retained packet", topic)
             return self._receive_packet(kind, decode_payload(payload), now_ns)
@@ -351,7 +351,7 @@ class MqttNetwork:
         return min(self._publish_at_ns, self._refresh_at_ns)
 
     def handle_timeout(self, now_ns: int) -> list[Action]:
-        """Tell of this router, ask for the others, forget who is gone without a word."""
+        """Publish this router's info, request the others, forget routers that are gone."""
         actions: list[Action] = []
         if self._connected_at_ns is None:
             return actions
@@ -376,7 +376,7 @@ class MqttNetwork:
         if change is Change.IGNORED:
             return self._drop(Drop.FULL, "one router too many", address)
         if change is Change.DOWN:
-            return [HopDown(address, "it told that it is gone"), PeerClosed(address)]
+            return [HopDown(address, "its info says that it is offline"), PeerClosed(address)]
         actions: list[Action] = [HopUp(address)] if change is Change.UP else []
         is_due = change is Change.UP or now_ns - self._published_at_ns >= _ANSWER_GAP_NS
         if self._spec.no_retain and info.is_online and is_due:
@@ -395,7 +395,7 @@ class MqttNetwork:
         packet = payload.packet
         header = AmsHeader.decode(packet)
         if kind is TopicKind.ANSWERS and not is_reply(packet):
-            # Brokers let some write there who may not ask anything.
+            # Brokers may allow writes there to clients that may not send requests.
             return self._drop(Drop.TOPIC, "request on the topic for answers", str(header.source))
         address = self._peers.address_of(header.source)
         actions = self._note_sender(address, payload, now_ns)
@@ -424,7 +424,7 @@ class MqttNetwork:
         were_there, were_not = self._peers.forget(since_ns, now_ns)
         actions: list[Action] = []
         for net_id in were_there:
-            actions.append(HopDown(str(net_id), "it is gone without a word"))
+            actions.append(HopDown(str(net_id), "it has sent no info for too long"))
             actions.append(PeerClosed(str(net_id)))
         actions += [HopUp(str(net_id)) for net_id in (*were_there, *were_not)]
         actions += self._report_missing()
@@ -437,7 +437,7 @@ class MqttNetwork:
         return actions
 
     def _report_missing(self) -> list[Action]:
-        return [HopDown(each, "it has not told of itself yet") for each in self._peers.missing()]
+        return [HopDown(each, "it has sent no info yet") for each in self._peers.missing()]
 
     def _publish_info(self, now_ns: int) -> Publish:
         self._published_at_ns = now_ns

@@ -15,7 +15,7 @@ from eap.od.profiles.table import Form, ProfileObject, fixed, live, single
 
 MODULE_PROFILE = 9000
 ROUTER = "router"
-"""What people call the router of a station, beside its ports; a port of that name goes before."""
+"""Name of the router of a station, beside its ports; a port of that name goes before."""
 MASTER_PROFILE = 1100
 """Sub-profile of a bus port."""
 
@@ -73,12 +73,12 @@ ROUTE = ProfileObject(
     0x9000, 0x93FF, "Route {n}", _RECORD,
     (
         live(1, "NetID", "BLOCK(6)", RouterLive.ROUTE_NET_ID,
-             "Whoever has it, or one that begins alike, "
-             "is reached by this route.", form=Form.NET_ID),
+             "Stations with it, or with one that begins alike, "
+             "are reached by this route.", form=Form.NET_ID),
         live(2, "Octets", "USINT", RouterLive.ROUTE_OCTETS,
              "How many bytes of it have to match: 6, 5 "
              "or 4; 0 a default route."),
-        live(3, "Name", NAME, RouterLive.ROUTE_NAME, "For people."),
+        live(3, "Name", NAME, RouterLive.ROUTE_NAME, "For operators."),
         live(4, "Door", NAME, RouterLive.ROUTE_TRANSPORT, "By which packets leave."),
         live(5, "Address", NAME, RouterLive.ROUTE_ADDRESS, "Where they go from there."),
         live(6, "Origin", "USINT", RouterLive.ROUTE_ORIGIN,
@@ -114,7 +114,7 @@ DIAGNOSIS = single(
     live(8, "Routes", "UDINT", RouterLive.ROUTES, "That there are."),
     live(9, "Connections", "UDINT", RouterLive.CONNECTIONS, "Clients by connection or address."),
     live(10, "Notifications", "UDINT", RouterLive.SUBSCRIPTIONS,
-         "That pass on their way to clients."),
+         "Forwarded to clients."),
 )  # fmt: skip
 STATIC = (
     *identity(MODULE_PROFILE),

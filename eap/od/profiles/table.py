@@ -44,7 +44,7 @@ class Rule(StrEnum):
 
 
 class Form(StrEnum):
-    """Form in which people read and write an entry."""
+    """Form of an entry as text."""
 
     PLAIN = "plain"
     """As its type is written."""
@@ -63,7 +63,7 @@ class Form(StrEnum):
         return self in _BLOCKS
 
     def text_of(self, octets: bytes) -> str:
-        """Return an address as people write it."""
+        """Return an address as text."""
         return _BLOCKS[self][0](octets)
 
     def octets_of(self, text: str) -> bytes:
@@ -72,7 +72,7 @@ class Form(StrEnum):
 
 
 def to_text(form: Form, kind: DataType, octets: bytes) -> str:
-    """Return the *octets* of an entry as people write them; :func:`from_text` reads it again."""
+    """Return the *octets* of an entry as text; :func:`from_text` reads it again."""
     if form.is_address:
         return form.text_of(octets)
     value = kind.decode(octets.ljust(kind.size, b"\0"), 0)
@@ -141,13 +141,13 @@ class ProfileEntry(NamedTuple):
     last: int = 0
     """Last sub-index of a list; 0 for a single entry."""
     live: str = ""
-    """What the device is asked for, with the object's name."""
+    """Key of a live value, with the object's name."""
     derived: str = ""
-    """What the dictionary computes."""
+    """Key of a computed value."""
     form: Form = Form.PLAIN
-    """How people read and write it."""
+    """Its form as text."""
     changeable: bool = False
-    """Whether it can be written in SafeOp and Op too once its object says so."""
+    """True if it can be written in SafeOp and Op too once its object says so."""
     key: str = ""
     """Key of the plant file, below the section of the object."""
     field: str = ""
@@ -195,9 +195,9 @@ class ProfileObject(NamedTuple):
     entries: tuple[ProfileEntry, ...]
     description: str
     dynamic: bool = False
-    """Whether a download to a free index makes an object and 0 in sub-index 0 deletes it."""
+    """True if a download to a free index makes an object and 0 in sub-index 0 deletes it."""
     mapping: bool = False
-    """Whether it lists the variables of a PDO."""
+    """True if it lists the variables of a PDO."""
     companion: int = 0
     """First index of the range whose objects come and go with these."""
     section: str = ""
@@ -251,7 +251,7 @@ class FieldRow(NamedTuple):
     """Names of the records around the field, and its own."""
     row: ProfileEntry
     is_plain: bool
-    """Whether the specification has the value as it is in the entry."""
+    """True if the specification has the value as it is in the entry."""
 
 
 def field_rows(described: ProfileObject) -> tuple[FieldRow, ...]:

@@ -61,7 +61,7 @@ def test_hops_go_down_and_up() -> None:
     admission.hop_down("tcp", "3", "cut")
     assert not admission.is_down(TCP)
     assert admission.why_down(TCP) == ""
-    assert admission.why_down(Endpoint("gone", "1")) == "this station has no door gone"
+    assert admission.why_down(Endpoint("gone", "1")) == "this station has no transport gone"
 
 
 def test_circle_has_addresses_and_command_of_what_waits() -> None:

@@ -75,7 +75,7 @@ def test_answers_that_nobody_asked_for_are_dropped(change: dict, endpoint: Endpo
     assert station.give(answer._replace(**change), endpoint) == []
     (event,) = station.events()
     assert event[0] is Outcome.LATE
-    assert "nobody waits for" in event[1]
+    assert "no request waits for" in event[1]
     assert station.replied(answer, LINK)[0] == ONE
     assert station.give(answer, LINK) == []
 

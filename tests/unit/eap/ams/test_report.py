@@ -84,9 +84,9 @@ def test_door_tells_why_a_route_is_down() -> None:
 
 
 def test_route_by_a_door_that_is_not_there_is_down() -> None:
-    obstacle = Obstacle(RouteState.DOWN, "this station has no door link")
+    obstacle = Obstacle(RouteState.DOWN, "this station has no transport link")
     found = report_route(route(FAR, LINK), obstacle, None, None, next_name="far")
-    assert (found.state, found.why) == (RouteState.DOWN, "this station has no door link")
+    assert (found.state, found.why) == (RouteState.DOWN, "this station has no transport link")
 
 
 def test_route_of_a_client_that_does_not_listen_is_not_down() -> None:
@@ -112,7 +112,7 @@ def test_route_of_a_client_is_forgotten_with_its_door() -> None:
     station = Station([route(FAR, LINK, "tool", is_client=True)])
     station.router.hop_down("link", LINK.connection, "refused", 0)
     station.router.remove_transport("link", 0)
-    assert report(station)[1:3] == (RouteState.DOWN, "this station has no door link")
+    assert report(station)[1:3] == (RouteState.DOWN, "this station has no transport link")
     station.router.add_transport(Transport("link"))
     assert report(station).state is RouteState.UNKNOWN
 

@@ -124,7 +124,7 @@ def test_cancelled_request_is_cancelled_at_the_engine():
         await settle()
         assert [type(each) for each in engine.requests] == [DescribeBus, Cancel]
         assert engine.requests[0].id == engine.requests[1].id
-        engine.release()  # an answer that nobody waits for does no harm
+        engine.release()  # an answer that no request waits for does no harm
         await settle()
         assert (await link.request(describe(), 1)).report.is_up
 

@@ -213,7 +213,7 @@ def test_router_that_comes_is_a_hop_and_one_that_goes_is_none() -> None:
     assert place.hear_of(FAR_ID, HERE) == []
     assert [each.name for each in place.table] == ["far"]
     assert place.hear_of(FAR_ID, GONE) == [
-        HopDown(FAR_ID, "it told that it is gone"),
+        HopDown(FAR_ID, "its info says that it is offline"),
         PeerClosed(FAR_ID),
     ]
 
@@ -230,7 +230,7 @@ def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
     assert place.network.next_timeout() == place.now_ns + CONFIRM_NS
     assert place.wait(29) == []
     assert place.wait(1) == [
-        HopDown(FAR_ID, "it is gone without a word"), PeerClosed(FAR_ID), HopUp(FAR_ID),
+        HopDown(FAR_ID, "it has sent no info for too long"), PeerClosed(FAR_ID), HopUp(FAR_ID),
         HopUp("7.1.1.1.1.1"), Subscribe(("hall/+/info",)),
     ]  # fmt: skip
     place.table.expire(place.now_ns)
@@ -242,7 +242,7 @@ def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
     far = NetId.parse(FAR_ID)
     place.table.add(Route(far, "far", Endpoint("mqtt:hall", FAR_ID), is_probed=False))
     place.network.disconnected()
-    missing = HopDown(FAR_ID, "it has not told of itself yet")
+    missing = HopDown(FAR_ID, "it has sent no info yet")
     assert place.network.connected(place.now_ns) == [missing, *place.first]
     assert place.wait(30)[0] == missing
     assert place.hear_of(FAR_ID, HERE) == [HopUp(FAR_ID)]
@@ -250,7 +250,8 @@ def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
     place.wait(REFRESH_NS / SECOND)
     gone = place.wait(REFRESH_NS / SECOND)
     assert gone[:4] == [
-        HopDown(FAR_ID, "it is gone without a word"), PeerClosed(FAR_ID), HopUp(FAR_ID), missing,
+        HopDown(FAR_ID, "it has sent no info for too long"), PeerClosed(FAR_ID),
+        HopUp(FAR_ID), missing,
     ]  # fmt: skip
 
 
@@ -261,7 +262,7 @@ def test_all_are_asked_for_now_and_then() -> None:
     assert place.network.next_timeout() == place.now_ns + REFRESH_NS
     assert place.wait(120) == [Subscribe(("hall/+/info",))]
     place.wait(120)
-    assert place.wait(120)[0] == HopDown(FAR_ID, "it is gone without a word")
+    assert place.wait(120)[0] == HopDown(FAR_ID, "it has sent no info for too long")
 
 
 def test_without_retained_messages_who_is_new_is_told_of_this_router() -> None:
@@ -392,8 +393,8 @@ def test_too_long_a_request_is_answered_and_too_long_an_answer_is_not() -> None:
     [
         (f"{OWN_ID}/ams", b"short", {}, Drop.BROKEN, "broken packet"),
         (f"{FAR_ID}/info", b"<info>", {}, Drop.BROKEN, "broken info"),
-        (f"{FAR_ID}/ams", REQUEST, {}, Drop.TOPIC, "topic nobody knows"),
-        ("nonsense", b"", {}, Drop.TOPIC, "topic nobody knows"),
+        (f"{FAR_ID}/ams", REQUEST, {}, Drop.TOPIC, "unknown topic"),
+        ("nonsense", b"", {}, Drop.TOPIC, "unknown topic"),
         (f"{OWN_ID}/ams/res", REQUEST, {}, Drop.TOPIC, "request on the topic for answers"),
         (f"{OWN_ID}/ams", REQUEST, {"is_retained": True}, Drop.TOPIC, "retained packet"),
     ],

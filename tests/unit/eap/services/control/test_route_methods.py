@@ -107,7 +107,7 @@ def test_what_speaks_against_a_route_is_told(ask, left):
         ({"net_id": "127.0.9.1.1.1"}, "is one of this station itself"),
         ({"net_id": "127.0.9.2.1.1"}, "of the plant file covers the same NetIDs"),
         ({"virtual": "x"}, "is not an AMS NetID"),
-        ({"via": "mqtt:line"}, "has no door mqtt:line"),
+        ({"via": "mqtt:line"}, "has no transport mqtt:line"),
     ],
 )
 def test_routes_that_cannot_be_are_refused(ask, left, change, reason):
