@@ -52,7 +52,7 @@ def master_of(path: Path) -> Master:
 
 def sizes_of(path: Path) -> list[tuple[int, int]]:
     """Return the bytes of outputs and inputs of each slave, as our master exchanges them."""
-    places = master_of(path).image.layout.places.values()
+    places = master_of(path).image.layout.slaves.values()
     return [(place.outputs_size, place.inputs_size) for place in places]
 
 
