@@ -268,7 +268,7 @@ def of_station(name: str, known: Mapping[str, ItemT]) -> ItemT:
     try:
         return known[name]
     except KeyError:
-        reason = f"no station {name!r} here{suggest(name, known)}"
+        reason = f"unknown station {name!r}{suggest(name, known)}"
         raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
 
 

@@ -285,7 +285,7 @@ class GatewayClient(Closeable):
             self._rest += octets
 
     def _failure(self, error: OSError) -> BusError:
-        hint = ": nobody serves it there" if isinstance(error, ConnectionRefusedError) else ""
+        hint = ": no gateway listens there" if isinstance(error, ConnectionRefusedError) else ""
         return BusError(f"{self._place} does not answer: {error.strerror or error}{hint}")
 
 

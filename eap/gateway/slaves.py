@@ -94,4 +94,4 @@ def sizes_of(slaves: Sequence[MasterSlave], address: int) -> MailboxSizes:
                 raise BusError(f"slave {address} ({slave.name}) has no mailbox in its state")
             return MailboxSizes(slave.to_slave, slave.to_master)
     known = ", ".join(f"{slave.station} ({slave.name})" for slave in slaves) or "none"
-    raise BusError(f"the master knows no slave {address}; it knows {known}")
+    raise BusError(f"unknown slave {address}; known slaves: {known}")

@@ -158,5 +158,5 @@ def device_info(name: str, release: str) -> AdsDeviceInfo:
 def check_up(name: str, bus: BusDescription) -> None:
     """Raise AdsRefusedError if a bus is not up."""
     if not bus.is_up:
-        why = f"{name} is not up: {bus.fault or 'it begins'}"
+        why = f"{name} is not up: {bus.fault or 'starting'}"
         raise AdsRefusedError(AdsError.HOST_UNREACHABLE, why)

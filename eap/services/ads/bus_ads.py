@@ -122,7 +122,7 @@ class SlaveAds:
                     return await self._forwarder.perform(target, operation)
                 data = await self._exchange(protocol, target, operation)
             case _:
-                why = "slaves give no notifications here: read what they have, again and again"
+                why = "slaves have no notifications by ADS: poll their objects"
                 raise AdsRefusedError(AdsError.SERVICE, why)
         return OperationOutcome(data=data)
 
@@ -212,14 +212,16 @@ class ProcedureCommands:
         task = self._tasks.get(key)
         if task is None:
             if len(self._tasks) >= MAX_COMMANDS:
-                raise AdsRefusedError(AdsError.NO_MEMORY, f"{MAX_COMMANDS} commands go on already")
+                raise AdsRefusedError(
+                    AdsError.NO_MEMORY, f"{MAX_COMMANDS} procedure commands are running already"
+                )
             task = self._running.start_awaited(_execute(access, place))
             self._tasks[key] = task
             task.add_done_callback(lambda task: self._forget_later(key, task))
         await asyncio.wait({task}, timeout=COMMAND_ANSWER_S)
         if not task.done():
             idn = Idn.of(place.idn)
-            raise AdsRefusedError(AdsError.BUSY, f"{idn} is being executed: ask again")
+            raise AdsRefusedError(AdsError.BUSY, f"{idn} is being executed: repeat the request")
         self._forget(key, task)
         task.result()
 
@@ -426,7 +428,7 @@ class BusService:
         if slave is None:
             known = ", ".join(map(str, islice(bus.slaves, _MAX_NAMED))) or "none"
             why = f"{self._name} has no slave {ams_port}"
-            raise AdsRefusedError(AdsError.TARGET_PORT, f"{why}; known are {known}")
+            raise AdsRefusedError(AdsError.TARGET_PORT, f"{why}; known slaves: {known}")
         found = slave
 
         async def perform(operation: Operation) -> OperationOutcome:

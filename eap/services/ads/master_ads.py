@@ -251,7 +251,7 @@ class NotificationSender:
             try:
                 await self._refresh()
             except EapError as exc:
-                logger.debug("notifications of %s wait: %s", self._net_id, exc)
+                logger.debug("notifications of %s delayed: %s", self._net_id, exc)
                 continue
             for notice in self._table.handle_cycle(monotonic_ns(), to_filetime(time_ns())):
                 self._send(notice.client.endpoint, notice.encode(self._net_id, self._port))

@@ -100,7 +100,7 @@ class SlaveFiles:
         if max(len(data), length) > MAX_BLOCK:
             raise AdsRefusedError(AdsError.SIZE, f"a block has at most {MAX_BLOCK} bytes")
         if data and group == IndexGroup.FOE_READ:
-            raise AdsRefusedError(AdsError.SIZE, "nothing is written here")
+            raise AdsRefusedError(AdsError.SIZE, "a read of a file takes no data")
         item = self._find(station, client, offset)
         self._end_idle(item)
         try:
@@ -188,7 +188,7 @@ class SlaveFiles:
         """Drop a file if there was no request for it since then."""
         item = self._open.get(handle)
         if item is not None and item.idle_since_s == since_s:
-            logger.info("%s given up: %s left it open and opens another one", item.name, item.owner)
+            logger.info("%s closed: %s abandoned it and opened another one", item.name, item.owner)
             self._drop(handle)
 
     def _check_limits(self, owner: NetId) -> None:
@@ -240,14 +240,14 @@ async def _in_time(work: Awaitable[T], what: str) -> T:
         async with asyncio.timeout(ANSWER_S):
             return await work
     except TimeoutError:
-        raise AdsRefusedError(AdsError.BUSY, f"{what}: not yet, ask again") from None
+        raise AdsRefusedError(AdsError.BUSY, f"{what}: not ready: repeat the request") from None
 
 
 def _text(name: bytes) -> str:
     try:
         return name.rstrip(b"\0").decode()
     except UnicodeDecodeError:
-        raise AdsRefusedError(AdsError.VALUE, "a file name that is no UTF-8") from None
+        raise AdsRefusedError(AdsError.VALUE, "the file name is not UTF-8") from None
 
 
 def _progress(stream: FileStream) -> bytes:

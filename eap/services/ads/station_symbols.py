@@ -226,7 +226,7 @@ class NotificationPump:
         try:
             self._symbols.refresh()
         except AdsRefusedError as exc:
-            logger.debug("notifications wait: %s", exc)
+            logger.debug("notifications delayed: %s", exc)
             return _POLL_NS
         image = self._symbols.image
         if self._samples is None:

@@ -134,7 +134,7 @@ NEW_RATE = Rate(500, 50)
 """Likewise, of all its clients that were never seen: their addresses can be invented."""
 CONTROL = "control"
 """Stands for a transport in lines about clients of the control socket."""
-TOO_MANY = f"the audit is required, and records {PER_S} changes a second of a client for long"
+TOO_MANY = f"the audit is required, and records at most {PER_S} changes a second of one client"
 _MAX_CLIENTS = 1024
 """More than can be new at once: invented addresses do not make known clients forgotten."""
 _PLAIN = 8

@@ -154,7 +154,7 @@ class BusConnection:
             async with asyncio.timeout(records.TURN_S):
                 turn = await client.lock_mailbox(wanted.slave, kind, id(self))
         except TimeoutError:
-            reason = f"slave {wanted.slave}: others talk {kind.name} with it all the while"
+            reason = f"slave {wanted.slave}: its {kind.name} mailbox was busy with other clients"
             raise ControlError(reason, code=ErrorCode.BUSY) from None
         self._last += 1
         self._open_mailboxes[self._last] = _OpenMailbox(turn, kind, wanted)
@@ -203,8 +203,8 @@ class BusConnection:
             return self._open_mailboxes[number]
         except KeyError:
             raise _unknown(
-                f"no conversation {number} is open on this connection; one in which nothing is"
-                f" asked for {records.IDLE_S:.0f} s is ended"
+                f"no conversation {number} is open on this connection; one without"
+                f" requests for {records.IDLE_S:.0f} s is ended"
             ) from None
 
     def _begin_idle(self, number: int) -> None:
@@ -281,7 +281,7 @@ class GatewayMethods:
     def _find(self, wanted: GatewayParameters) -> list[PortName]:
         names = [station.name for station in self._handover.stations]
         if wanted.station not in names:
-            reason = f"no station {wanted.station!r} here{suggest(wanted.station, names)}"
+            reason = f"unknown station {wanted.station!r}{suggest(wanted.station, names)}"
             raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
         buses = [owner for owner in self._gateways if owner.station == wanted.station]
         found = [owner for owner in buses if wanted.port in {"", owner.port}]

@@ -226,7 +226,7 @@ class ControlServer:
             connection.subscriptions = client.subscriptions
             await client.run(reader)
         except* (OSError, TimeoutError) as group:
-            logger.debug("control client left: %s", group.exceptions[0])
+            logger.debug("control client disconnected: %s", group.exceptions[0])
         finally:
             bus.close()
             transport.abort()
@@ -379,7 +379,9 @@ class _Client:
             await self.send(encode_failure(number, failure))
         except Exception:
             logger.exception("control method failed")
-            error = ControlError("this request failed inside", code=ErrorCode.INTERNAL)
+            error = ControlError(
+                "internal error; the log of services has the cause", code=ErrorCode.INTERNAL
+            )
             await self.send(encode_error(number, error))
         else:
             await self.send(encode_result(number, result))

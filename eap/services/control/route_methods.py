@@ -205,7 +205,7 @@ class RouteMethods:
         view, address = self._view(wanted.station), _address(wanted.address)
         name = wanted.name or view.router.name
         if "\0" in name + wanted.user + wanted.password:
-            raise ControlError("a NUL in a text", code=ErrorCode.VALUE)
+            raise ControlError("NUL in name, user or password", code=ErrorCode.VALUE)
         route = RemoteRouteRequest(name, view.router.net_id, wanted.user, wanted.password)
         with unless_unavailable():
             result = await add_remote_route(

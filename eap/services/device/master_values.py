@@ -303,7 +303,7 @@ class MasterView:
         if key is MasterLive.AL_CONTROL:
             target = value & 0x0F
             if target not in _STATES or value >> _AL_CONTROL_BITS:
-                raise SdoAbortError(AbortCode.VALUE, 0xA000, 2, f"{value:#x} asks for no AL state")
+                raise SdoAbortError(AbortCode.VALUE, 0xA000, 2, f"{value:#x} is no AL state")
             self._requested[station] = value
             self._start(self._bring(station, AlState(target)))
         elif key is MasterLive.LINK_CONTROL:

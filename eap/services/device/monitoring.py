@@ -140,7 +140,7 @@ def _open_table(resources: ExitStack) -> NeighbourTable | None:
     try:
         table = NeighbourTable()
     except EnvironmentalError as exc:
-        logger.warning("%s; subscribers on UDP are known to be missing by ICMP alone", exc)
+        logger.warning("%s; missing subscribers on UDP are detected by ICMP only", exc)
         return None
     resources.callback(table.close)
     return table
@@ -363,6 +363,8 @@ def _log_change(event: PresenceChanged, row: _Row) -> None:
         "%s: subscriber at %s is %s%s",
         event.name,
         row.destination,
-        event.new.name.lower() if event.new is not SubscriberPresence.UNKNOWN else "out of sight",
+        event.new.name.lower()
+        if event.new is not SubscriberPresence.UNKNOWN
+        else "no longer observable",
         other,
     )

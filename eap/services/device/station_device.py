@@ -69,7 +69,7 @@ class StationDevice:
             fill_all(self.dictionaries, keeper.objects)
         except DeviceFault as exc:
             self._incomplete = exc
-            logger.warning("station %s: not all of it is in its dictionaries: %s", self.name, exc)
+            logger.warning("station %s: incomplete dictionaries: %s", self.name, exc)
         self._requested: int | None = None
         self._changed: StationSpec | None = None
         self._checked: StationSpec | DeviceFault = keeper.spec
@@ -105,7 +105,7 @@ class StationDevice:
             {
                 "severity": "error",
                 "where": self.name,
-                "what": f"{reason}; after a start it is as it was before",
+                "what": f"{reason}; a start restores the configuration before",
                 "advice": f"{remedy}, then 'eapctl state {self.name} {state}'",
                 "since": unsaved.since,
             }

@@ -222,7 +222,9 @@ class StationKeeper:
             if state > self.state:
                 raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
             self._is_engine_unknown = True
-            logger.warning("station %s, on the way to %s: %s", self.spec.name, state.name, exc)
+            logger.warning(
+                "station %s: %s not requested from the engine: %s", self.spec.name, state.name, exc
+            )
         self.state = state
         await self._save_back()
 
@@ -236,7 +238,9 @@ class StationKeeper:
             await self._engine.configure(self.spec.name, self.spec)
             await self._engine.set_state(self.spec.name, self.state)
         except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
-            logger.warning("station %s, after a start: %s", self.spec.name, exc)
+            logger.warning(
+                "station %s: configuration not sent again after a start: %s", self.spec.name, exc
+            )
         else:
             self._is_engine_unknown = False
 
@@ -265,5 +269,5 @@ class StationKeeper:
             await self._save(record)
         except EnvironmentalError as exc:
             if self.unsaved is None and record != self._kept:
-                logger.warning("%s; after a start it will be as it was before", exc)
+                logger.warning("%s; a start restores the configuration before", exc)
                 self.unsaved = Unsaved(str(exc), time())

@@ -414,7 +414,7 @@ class MailboxGateway:
             codec = session.codec
             if isinstance(codec, FileCodec) and codec.stalled_since_s < limit_s:
                 logger.info(
-                    "gateway %s: file of slave %d given up: %s has paused for %g s, and %s waits",
+                    "gateway %s: file of slave %d closed: %s paused for %g s while %s waits",
                     self.settings.name, key.address, other.endpoint.connection, STALL_S,
                     key.endpoint.connection,
                 )  # fmt: skip

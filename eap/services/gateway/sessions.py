@@ -142,7 +142,7 @@ class ClientSession:
         if self._is_repeated(body):
             return [replace(each, is_repeat=True) for each in self._replies or ()]
         if is_step and not self.is_running:
-            return self._error_replies(body, Cause.SERVICE, "no transfer is under way")
+            return self._error_replies(body, Cause.SERVICE, "no active transfer")
         self._stop_timer()
         self._request, self._replies = body, None
         replies = await self._answer(body, deadline_s)

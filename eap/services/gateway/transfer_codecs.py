@@ -216,7 +216,7 @@ class ObjectCodec:
 
     def _hold(self, head: SdoHeader, size: int) -> None:
         if not self._memory.hold(size):
-            detail = f"{size} bytes are more than the gateway keeps"
+            detail = f"{size} bytes exceed the memory of the gateway"
             raise SdoAbortError(AbortCode.OUT_OF_MEMORY, head.index, head.subindex, detail)
 
 

@@ -58,7 +58,7 @@ class BusDescription(NamedTuple):
 
     is_up: bool = False
     """Whether it has been brought up, wherever its slaves are now."""
-    fault: str = "nothing is known about it yet"
+    fault: str = "no report from the engine yet"
     slaves: Mapping[int, SlaveDescription] = MappingProxyType({})
     """By station address, in the order of the bus; while it is not up those that are expected."""
 
@@ -112,7 +112,7 @@ class BusView:
                 lambda number: Republish(id=number, bus=self._number), ANSWER_S
             )
         if not self._is_complete:
-            raise EngineGoneError("the engine says nothing about the bus")
+            raise EngineGoneError("no report from the engine about the bus")
         return self.latest
 
     def _take(self, change: BusChange) -> None:
@@ -269,7 +269,7 @@ class BusClient:
             lambda number: DescribeBus(id=number, bus=self._number), timeout_s
         )
         if reply.report is None:
-            raise BusError(f"{self.name}: the engine says nothing about it")
+            raise BusError(f"{self.name}: no report from the engine")
         return reply.report
 
     async def wait_up(self) -> BusReport:
@@ -297,7 +297,7 @@ class BusClient:
             else:
                 if bus.is_up:
                     return
-                error = BusError(f"{self.name} is not up: {bus.fault or 'it begins'}")
+                error = BusError(f"{self.name} is not up: {bus.fault or 'starting'}")
             if loop.time() >= end_s:
                 raise error
             await asyncio.sleep(_POLL_S)

@@ -148,7 +148,7 @@ class FileStream(ABC):
             self._error = exc
         finally:
             if not self.has_ended:
-                self._error = BusError(f"file {self.name!r}: the transfer was given up")
+                self._error = BusError(f"file {self.name!r}: the transfer was aborted")
             self.notify()
 
     async def _wait_stalled(self, is_so: Callable[[], bool]) -> None:

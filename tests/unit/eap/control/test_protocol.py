@@ -82,7 +82,7 @@ def test_unknown_parameters_are_refused():
 
 def test_a_station_that_is_not_here_is_refused_with_the_nearest_name():
     assert of_station("left", {"left": 1}) == 1
-    with pytest.raises(ControlError, match="no station 'lefd' here, did you mean left") as caught:
+    with pytest.raises(ControlError, match="unknown station 'lefd', did you mean left") as caught:
         of_station("lefd", {"left": 1})
     assert caught.value.code is ErrorCode.UNKNOWN_NAME
 

@@ -75,7 +75,7 @@ def test_slaves(client) -> None:
     (slave,) = client.slaves()
     assert (slave.station, slave.name, slave.vendor, slave.al_status) == (1001, "drive", 5, 8)
     assert client.sizes_of(0x8000 | 1001).to_slave == 140
-    with pytest.raises(BusError, match=r"knows no slave 7; it knows 1001 \(drive\)"):
+    with pytest.raises(BusError, match=r"unknown slave 7; known slaves: 1001 \(drive\)"):
         client.sizes_of(7)
     with pytest.raises(MailboxRefusedError):
         client.sdo_read(7, 0x1018)
@@ -114,7 +114,9 @@ def test_a_datagram_that_got_lost_is_sent_again(gateway) -> None:
 
 
 def test_nobody_there() -> None:
-    refused = r"gateway 127\.0\.0\.1:1 does not answer: Connection refused: nobody serves it there"
+    refused = (
+        r"gateway 127\.0\.0\.1:1 does not answer: Connection refused: no gateway listens there"
+    )
     with pytest.raises(BusError, match=refused):
         GatewayClient("127.0.0.1", 1, tcp=True)
     with (

@@ -191,7 +191,7 @@ def test_port_without_a_slave_is_refused_with_the_known_ones():
     async def scene(client, engine):
         answer = await client.answer(1009, AmsCommand.READ_STATE, b"")
         assert answer[:2] == (b"", AdsError.TARGET_PORT)
-        assert answer.why == "left/bus0 has no slave 1009; known are 1001"
+        assert answer.why == "left/bus0 has no slave 1009; known slaves: 1001"
         assert (await client.answer(DRIVE, 77, b"")).error_code == AdsError.COMMAND
         assert (await client.answer(DRIVE, AmsCommand.READ, b"")).data[:4] == b"\5\7\0\0"
 

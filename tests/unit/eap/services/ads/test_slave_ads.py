@@ -234,7 +234,7 @@ def test_procedure_command_that_takes_long_is_busy_until_it_is_done(monkeypatch)
     async def scene(client, engine):
         command = Write(IndexGroup.SOE, place(COMMAND, is_command=1), b"")
         assert (await client.do(DRIVE, command)).result == AdsError.BUSY
-        assert client.why == "S-0-0099 is being executed: ask again"
+        assert client.why == "S-0-0099 is being executed: repeat the request"
         value = await client.read(DRIVE, IndexGroup.SOE, place(MODE, Element.VALUE))
         assert value == b"\2\0\0\0"  # the drive can be talked to meanwhile
 

@@ -79,7 +79,7 @@ def test_file_progress_has_the_octets_so_far():
         (OPEN_READ, b"none.bin", AdsError.NOT_FOUND, "file not found (0x8001)"),
         (OPEN_WRITE, b"boot.bin", AdsError.STATE, "(0x8008)"),
         (OPEN_READ, b"locked.bin", AdsError.ACCESS, "(0x80"),
-        (OPEN_READ, b"\xff\xff", AdsError.VALUE, "no UTF-8"),
+        (OPEN_READ, b"\xff\xff", AdsError.VALUE, "is not UTF-8"),
         (OPEN_READ, bytes(300).replace(b"\0", b"n"), AdsError.SIZE, "300 bytes"),
     ],
 )
@@ -259,7 +259,7 @@ def test_file_of_a_slow_slave_is_busy_until_it_goes_on(monkeypatch):
         for group, data in ((WRITE, b"more"), (CLOSE, b"")):
             late = await client.do(DISK, ReadWrite(group, handle, 0, data))
             assert late.result == AdsError.BUSY
-            assert client.why == "file 'a.bin' of slave 1001: not yet, ask again"
+            assert client.why == "file 'a.bin' of slave 1001: not ready: repeat the request"
         more = await client.do(DISK, ReadWrite(WRITE, handle, 0, b"more"))
         assert more.result == AdsError.STATE  # it was said that there is no more
         engine.release()

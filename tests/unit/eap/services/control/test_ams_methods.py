@@ -72,8 +72,8 @@ def test_any_request() -> None:
     ("method", "params", "text"),
     [
         ("trace", {"target": "island-1"}, "no station 'island-1' in this plant, did you mean"),
-        ("trace", {"target": "island-01", "via": "x"}, "no station 'x' here"),
-        ("scan", {"via": "island"}, "no station 'island' here, did you mean island-01"),
+        ("trace", {"target": "island-01", "via": "x"}, "unknown station 'x'"),
+        ("scan", {"via": "island"}, "unknown station 'island', did you mean island-01"),
         ("ams_ask", {"target": "island-01", "command": 0}, ">= 1"),
         ("ams_ask", {"target": "island-01", "command": 2, "data": "x"}, "hexadecimal"),
     ],

@@ -186,7 +186,7 @@ def test_turn_that_does_not_come(monkeypatch):
         number = await open_coe(connection)
         params = WHERE | {"slave": 1001, "protocol": "coe"}
         error = await refusal(stage.connect(), "bus_open", **params)
-        assert (error.code, "talk COE" in str(error)) == (ErrorCode.BUSY, True)
+        assert (error.code, "COE mailbox was busy" in str(error)) == (ErrorCode.BUSY, True)
         await ask(connection, number)
 
     play(scene)
@@ -233,7 +233,7 @@ def test_faults():
 @pytest.mark.parametrize(
     ("station", "port", "reason"),
     [
-        ("lefd", "bus0", "no station 'lefd' here, did you mean left?"),
+        ("lefd", "bus0", "unknown station 'lefd', did you mean left?"),
         ("left", "eap0", "port eap0 of station left is no bus; its bus ports are bus0, bus1"),
         ("left", "bus2", "no port 'bus2'; its bus ports are bus0, bus1, did you mean bus"),
         ("right", "bus0", "station right has no port 'bus0'; it has no bus ports"),

@@ -262,11 +262,11 @@ def test_router_has_a_dictionary_beside_those_of_ports(call):
 @pytest.mark.parametrize(
     ("method", "params", "message"),
     [
-        ("od_list", {"target": "lft"}, "no station 'lft' here, did you mean left"),
+        ("od_list", {"target": "lft"}, "unknown station 'lft', did you mean left"),
         ("od_list", {"target": "left/eap1"}, "its EAP ports are eap0, did you mean eap0"),
         ("od_list", {"target": "io"}, "no EAP port; the dictionary of its router is at io/router"),
         ("od_list", {"target": "left/routr"}, "did you mean router"),
-        ("export", {"station": "x"}, "no station 'x' here"),
+        ("export", {"station": "x"}, "unknown station 'x'"),
     ],
 )
 def test_unknown_names(call, method, params, message):

@@ -106,7 +106,7 @@ def test_one_is_stopped_and_started(ask) -> None:
 @pytest.mark.parametrize(
     ("params", "reason"),
     [
-        ({"station": "lefd"}, "no station 'lefd' here, did you mean left"),
+        ({"station": "lefd"}, "unknown station 'lefd', did you mean left"),
         ({"station": "right"}, "station right has no gateway; it has no bus ports"),
         ({"station": "left", "port": "bus2"}, "no bus port 'bus2'; its bus ports are bus0, bus1"),
     ],

@@ -235,7 +235,7 @@ def test_read_while_a_cycle_runs_brings_values_of_the_cycle_that_is_named(method
 def test_a_watch_is_checked_when_it_begins(methods):
     with pytest.raises(ControlError, match="shortest is 10"):
         methods.watch({"station": "left", "period_ms": 1})
-    with pytest.raises(ControlError, match="no station"):
+    with pytest.raises(ControlError, match="unknown station"):
         methods.watch({"station": "middle"})
     with pytest.raises(ControlError, match="did you mean name"):
         methods.watch({"station": "left", "names": ["nam"]})

@@ -54,7 +54,7 @@ def test_list_of_all_and_of_one(ask):
     assert [each.name for each in row.routes] == ["right"]
     assert ask("list", station="left") == [row]
     assert refused(ask, "list", station="lefd") == (
-        "unknown_name", "no station 'lefd' here, did you mean left?"
+        "unknown_name", "unknown station 'lefd', did you mean left?"
     )  # fmt: skip
 
 
@@ -259,7 +259,7 @@ def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
     ("params", "text"),
     [
         ({"address": "plc"}, "address: Expected 4 octets in 'plc'"),
-        ({"address": "10.0.0.5", "user": "a\0"}, "a NUL in a text"),
+        ({"address": "10.0.0.5", "user": "a\0"}, "NUL in name, user or password"),
         ({"address": "10.0.0.5"}, "no IP address at which it serves AMS"),
     ],
 )

@@ -61,7 +61,7 @@ def test_what_is_no_routing_is_refused(ask, method):
 
 
 def test_a_station_that_is_not_here(ask):
-    with pytest.raises(ControlError, match="no station 'lefd' here, did you mean left") as caught:
+    with pytest.raises(ControlError, match="unknown station 'lefd', did you mean left") as caught:
         ask("export", station="lefd")
     assert caught.value.code == "unknown_name"
 

@@ -138,7 +138,7 @@ def test_view_requests_states_and_sets_loops() -> None:
         assert engine.of(BringSlaves)[0].target == 1
         assert view.of_diagnosis(1001, MasterLive.AL_CONTROL) == 1
         for value in (0, 5, 99):
-            with pytest.raises(SdoAbortError, match=f"{value:#x} asks for no AL state"):
+            with pytest.raises(SdoAbortError, match=f"{value:#x} is no AL state"):
                 view.write_slave(1001, MasterLive.AL_CONTROL, value)
         view.write_slave(1004, MasterLive.LINK_CONTROL, 0x0C)
         await settle()

@@ -139,4 +139,4 @@ def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog,
         endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
         endpoint = endpoints.udp[PortName("left", "eap0")]
         assert endpoint.look(closed, 0) is ProbeResult.BLIND
-    assert "forbidden; subscribers on UDP are known to be missing by ICMP alone" in caplog.text
+    assert "forbidden; missing subscribers on UDP are detected by ICMP only" in caplog.text

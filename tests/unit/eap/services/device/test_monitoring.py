@@ -127,7 +127,7 @@ def test_a_listener_on_this_machine_is_unknown_never_present(endpoint, closed, c
             found.add(holder.status())
     assert holder.status() == "unknown"
     assert found == {"missing", "unknown"}
-    assert "is out of sight" in caplog.text
+    assert "is no longer observable" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -287,7 +287,7 @@ def test_what_does_not_fit_into_dictionaries_runs_but_is_not_changed_by_download
     frame = TxFrameSpec("out", "eap0", "127.9.2.2", (TxPdSpec("all", 1, tuple(names)),))
     crowded = replace(spec, variables=variables, sources=(), frames=(frame,))
     device, engine = make_device(crowded)
-    assert "station left: not all of it is in its dictionaries" in caplog.text
+    assert "station left: incomplete dictionaries" in caplog.text
     assert device.status == (DeviceState.OP, None)
 
     async def script():
@@ -360,5 +360,7 @@ def test_device_that_cannot_be_kept_has_a_finding(spec, monkeypatch):
     asyncio.run(device.request_state(DeviceState.SAFEOP))
     (only,) = device.findings()
     assert (only["severity"], only["where"]) == ("error", "left")
-    assert only["what"].endswith(": No space left on device; after a start it is as it was before")
+    assert only["what"].endswith(
+        ": No space left on device; a start restores the configuration before"
+    )
     assert only["advice"] == "make room there, then 'eapctl state left SAFEOP'"

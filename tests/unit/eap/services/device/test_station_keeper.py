@@ -168,7 +168,7 @@ def test_states_are_kept(keeper, engine, spec):
 def test_way_up_can_fail_and_way_down_cannot(keeper, engine, caplog):
     engine.failure = EngineGoneError("it is gone")
     asyncio.run(keeper.change_state(DeviceState.PREOP))
-    assert "station left, on the way to PREOP: it is gone" in caplog.text
+    assert "station left: PREOP not requested from the engine: it is gone" in caplog.text
     assert keeper.state is kept().state is DeviceState.PREOP
     engine.failure = EngineGoneError("it is still gone")
     with pytest.raises(DeviceFault, match="still gone"):
@@ -185,7 +185,7 @@ def test_state_that_cannot_be_kept_is_told(keeper, engine, monkeypatch, caplog):
     monkeypatch.setattr(StationFile, "save", full)
     asyncio.run(keeper.change_state(DeviceState.SAFEOP))
     assert engine.state is keeper.state is DeviceState.SAFEOP
-    assert "disk full; after a start it will be as it was before" in caplog.text
+    assert "disk full; a start restores the configuration before" in caplog.text
     engine.failure = EngineRefusedError("no")
     with pytest.raises(DeviceFault, match="disk full"):
         asyncio.run(keeper.change(replace(keeper.spec, cycle_us=30_000), NEW))

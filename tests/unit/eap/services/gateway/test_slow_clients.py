@@ -109,7 +109,7 @@ def test_file_left_in_the_middle_gives_way_to_another_client(
         monkeypatch.setattr(gateway, "STALL_S", 0.0)
         assert (await desk.begin_file(begin, ALSO_HERE)).startswith("03 00 01 00 00 00")
         late = await desk.one(FOE, 1001, "03 00 01000000 61")
-        assert bytes.fromhex(late)[6:] == b"no transfer is under way\0"
+        assert bytes.fromhex(late)[6:] == b"no active transfer\0"
 
     play(scene, settings=SETTINGS)
 

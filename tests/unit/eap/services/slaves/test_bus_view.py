@@ -192,7 +192,7 @@ def test_view_does_not_trust_an_answer_without_a_description():
         await asyncio.sleep(0)
         request = msgspec.msgpack.decode(pair.engine.recv(100), type=Republish)
         await pair.send({"type": "answer", "id": request.id})
-        with pytest.raises(EngineGoneError, match="says nothing"):
+        with pytest.raises(EngineGoneError, match="no report from the engine"):
             await asking
 
     with_pair(scene)
