@@ -251,17 +251,16 @@ class Services:
         buses = self._buses(clients, devices, providers)
         methods = self._methods(images, buses, devices, gateways, audit)
         server = ControlServer(methods, buses, audit.write_request, announce=audit.begin_request)
+        watch = SubscriberWatch(images, open_subscriber_probes(self._handover, self._resources))
+        on_sockets: list[Callable[[], Awaitable[None]]] = [
+            partial(server.serve, self._listener, self._listeners),
+            self._listeners.serve,
+            *(each.serve for each in (*transports, *brokers)),
+            watch.run,
+        ]
         async with asyncio.TaskGroup() as group:
-            control = partial(server.serve, self._listener, self._listeners)
-            tasks = [group.create_task(_keep_serving(control))]
-            tasks.append(group.create_task(_keep_serving(self._listeners.serve)))
-            tasks += [group.create_task(_keep_serving(each.serve)) for each in transports]
-            tasks += [group.create_task(_keep_serving(each.serve)) for each in brokers]
-            tasks.append(group.create_task(devices.serve()))
-            tasks.append(group.create_task(audit.serve()))
-            tasks.append(group.create_task(self._log.serve()))
-            watch = SubscriberWatch(images, open_subscriber_probes(self._handover, self._resources))
-            tasks.append(group.create_task(_keep_serving(watch.run)))
+            tasks = [group.create_task(_keep_serving(serve)) for serve in on_sockets]
+            tasks += [group.create_task(each.serve()) for each in (devices, audit, self._log)]
             self._startup.finish({})
             await self._stopping.wait()
             # Cancel rather than raise: the TaskGroup then waits until all connections are closed.
@@ -317,9 +316,8 @@ class Services:
         routing = self._handover.routing
         if not any(spec.mqtt for spec in routing.values()):
             return ()
-        from eap.services.transports.mqtt_transport import (
-            open_mqtt_transports,  # few plants have a broker
-        )
+        # Imported here: few plants have a broker.
+        from eap.services.transports.mqtt_transport import open_mqtt_transports
 
         return open_mqtt_transports(routing, routers, self._counters)
 

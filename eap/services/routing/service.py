@@ -243,7 +243,7 @@ def _begin(waiting: _QueuedRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
     try:
         return waiting.service.answer(waiting.request)
     except Exception:
-        logger.exception("AoE request from %s failed", waiting.request.header.source)
+        logger.exception("AMS request from %s failed", waiting.request.header.source)
         return _FAILED
 
 
@@ -251,7 +251,7 @@ async def _end(waiting: _QueuedRequest, answer: Awaitable[AmsAnswer]) -> AmsAnsw
     try:
         return await answer
     except Exception:
-        logger.exception("AoE request from %s failed", waiting.request.header.source)
+        logger.exception("AMS request from %s failed", waiting.request.header.source)
         return _FAILED
 
 

@@ -77,7 +77,7 @@ def to_endpoint(hop: HopSpec) -> Endpoint:
     if hop.kind in _ADDRESSES:
         where = Destination.parse(address)
         if where.kind not in _ADDRESSES[hop.kind] or where.is_group:
-            raise ValueError(f"{address!r} is no address of a station by {hop.kind}")
+            raise ValueError(f"{address!r} is not an address of one station by {hop.kind}")
         address = where.host
         if where.kind is DestinationKind.IP:
             address += f":{where.port or EAP_PORT}"
@@ -294,7 +294,7 @@ class StationRoutes:
             try:
                 route = self._route(spec, Origin.STATIC)
             except ControlError as exc:
-                logger.warning("route %s of the plant file is left out: %s", spec.name, exc)
+                logger.warning("route %s of the plant file ignored: %s", spec.name, exc)
                 continue
             self._configured[route.key] = spec
             # Adding a route again would close the connection to its hop and drop pending requests.
@@ -308,7 +308,7 @@ class StationRoutes:
         try:
             self.router.add_route(self._route(spec, Origin.ADDED))
         except ControlError as exc:
-            logger.warning("added route %s is left out: %s", spec.name, exc)
+            logger.warning("added route %s ignored: %s", spec.name, exc)
 
     def _route(self, spec: RouteSpec, origin: Origin) -> Route:
         try:
@@ -336,7 +336,7 @@ class StationRoutes:
             raise ControlError(f"NetID {net_id} is the default route; it matches 0 octets")
         prefix = net_id[: spec.octets]
         if spec.octets and self.has(prefix):
-            raise ControlError(f"NetID {prefix_text(prefix)} is one of this station itself")
+            raise ControlError(f"NetID {prefix_text(prefix)} belongs to this station")
         for route in self.router.table:
             if route.origin is Origin.STATIC and _covers(route, net_id, spec.octets):
                 raise ControlError(_hidden_by(route.name))

@@ -130,7 +130,7 @@ class StationRouting:
         if kept.spec != self.routes.spec:
             logger.warning(
                 "station %s: the plant file was edited since routes or access rules were changed;"
-                " the file counts",
+                " the file is in force",
                 self._name,
             )
         try:

@@ -136,8 +136,8 @@ class Listeners:
             return
         self._reported[stats.name] = total
         logger.warning(
-            "%s: too many or too slow connections: %d of %d places taken; since the start %d"
-            " refused, %d closed to make room, %d closed as too slow",
+            "%s: too many or too slow connections: %d of %d open; since the start %d"
+            " refused, %d closed for new ones, %d closed as too slow",
             *(stats.name, stats.open, stats.limit, stats.refused, stats.evicted, stats.overdue),
             extra=caused_by(("connections", stats.name), stats.name),
         )

@@ -467,7 +467,7 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._close_when_done()
         # Port 0 requests any port; with another one the client would be a server.
         elif port:
-            self._reject_stream(f"programs cannot serve AMS port {port} of a router")
+            self._reject_stream(f"a client cannot serve AMS port {port}")
         else:
             self._transport.write(encode_opened_port(net_id, own_port))
 

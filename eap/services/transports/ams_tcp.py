@@ -430,7 +430,7 @@ class AmsUplinks:
         try:
             peer = PeerAddress(*parse_host(hop.connection, AMS_TCP_PORT))
         except ValueError as exc:
-            logger.warning("a route leads nowhere: %s", exc)
+            logger.warning("%s: route ignored: %s", self._router.name, exc)
             return
         self._uplinks[hop] = uplink = AmsUplink(
             peer,

@@ -316,7 +316,7 @@ class ChannelSender:
                 buffer += bytes(self._channel.minimum_size - len(buffer))
             sent.append(OutFrame(buffer, len(header), connection))
         failed = self._channel.send(sent, monotonic_ns())
-        return "the network took no frame" if failed else None
+        return "the network accepted no frame" if failed else None
 
 
 QUERY_NS = 1_000_000_000

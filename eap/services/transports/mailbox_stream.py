@@ -144,7 +144,7 @@ class _StreamUplink(ReconnectingLink):
             self._forget()
             await self._serve(reader, writer, self._address)
         except (OSError, TimeoutError) as exc:
-            return f"the connection broke: {exc.strerror or 'the peer does not read'}"
+            return f"connection lost: {exc.strerror or 'the peer does not read'}"
         finally:
             self._writer = None
             writer.transport.abort()

@@ -104,7 +104,7 @@ def test_what_speaks_against_a_route_is_told(ask, left):
         ({"net_id": "5.1.2"}, "is not an AMS NetID"),
         ({"via": "nowhere"}, "neither a station of the plant nor one of"),
         ({"via": "ethernet:02:00:00:00:00:09"}, "no EAP port here is on ethernet"),
-        ({"net_id": "127.0.9.1.1.1"}, "is one of this station itself"),
+        ({"net_id": "127.0.9.1.1.1"}, "belongs to this station"),
         ({"net_id": "127.0.9.2.1.1"}, "of the plant file covers the same NetIDs"),
         ({"virtual": "x"}, "is not an AMS NetID"),
         ({"via": "mqtt:line"}, "has no transport mqtt:line"),

@@ -82,7 +82,7 @@ def test_answers_fit_the_transport():
 def test_frame_that_the_network_does_not_take():
     wire = Wire()
     wire.is_broken = True
-    assert ChannelSender(wire).send("peer", (b"x" * 32,)) == "the network took no frame"
+    assert ChannelSender(wire).send("peer", (b"x" * 32,)) == "the network accepted no frame"
 
 
 @pytest.mark.parametrize(("for_many", "answers"), [(False, 1), (True, 0)])

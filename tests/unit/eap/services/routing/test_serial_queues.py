@@ -143,7 +143,7 @@ def test_service_that_fails_is_answered_for_and_the_next_request_served(caplog):
         (3, internal),
         (4, 0),
     ]
-    assert caplog.messages == [f"AoE request from {aoe.CLIENT} failed"] * 3
+    assert caplog.messages == [f"AMS request from {aoe.CLIENT} failed"] * 3
 
 
 def test_queue_close_cancels_running_requests():

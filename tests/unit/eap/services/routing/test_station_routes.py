@@ -98,7 +98,7 @@ def test_added_route_replaces_that_of_its_name_or_net_id(change, replaces):
         ({"name": " \n"}, "a route needs a name"),
         ({"net_id": "1.2.3"}, "'1.2.3' is not an AMS NetID"),
         ({"net_id": "0.0.0.0.0.0"}, "NetID 0.0.0.0.0.0 is the default route; it matches 0 octets"),
-        ({"net_id": "10.0.0.1.9.9"}, "NetID 10.0.0.1.x.x is one of this station itself"),
+        ({"net_id": "10.0.0.1.9.9"}, "NetID 10.0.0.1.x.x belongs to this station"),
         ({"net_id": "10.0.0.2.9.9"}, "route 'mill' of the plant file covers the same NetIDs and"),
         ({"net_id": STATIC.net_id, "octets": 6}, "route 'mill' of the plant file covers the same"),
         ({"octets": 3}, "3 bytes to match, expected 6, 5, 4 or 0"),
@@ -205,8 +205,8 @@ def test_impossible_stored_route_is_logged_and_kept(caplog):
         RoutingSpec(routes=(replace(STATIC, hop=HopSpec(TransportKind.UDP, "gone", "x")),))
     )
     assert house.names() == {}
-    assert "route mill of the plant file is left out: route 'mill': there is no door" in caplog.text
-    assert "added route plc is left out" in caplog.text
+    assert "route mill of the plant file ignored: route 'mill': there is no door" in caplog.text
+    assert "added route plc ignored" in caplog.text
     house.routes.replace_spec(RoutingSpec())
     assert len(house.routes.added) == 1
 

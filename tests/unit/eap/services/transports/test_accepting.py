@@ -134,8 +134,8 @@ def test_peer_that_leaves_a_frame_unfinished_is_closed(caplog):
 
     serve(script, overdue_ns=50_000_000)
     (message,) = caplog.messages
-    assert message.startswith("test: too many or too slow connections: 1 of 2 places taken;")
-    assert message.endswith("0 refused, 0 closed to make room, 1 closed as too slow")
+    assert message.startswith("test: too many or too slow connections: 1 of 2 open;")
+    assert message.endswith("0 refused, 0 closed for new ones, 1 closed as too slow")
 
 
 @pytest.mark.parametrize(("failure", "lines"), [(OSError(5, "x"), 0), (RuntimeError("a fault"), 1)])

@@ -269,7 +269,7 @@ def test_client_gets_a_unique_ams_address() -> None:
 
 @pytest.mark.parametrize(
     ("port", "is_outgoing", "why"),
-    [(30012, False, "programs cannot serve AMS port 30012"), (0, True, "a router requests")],
+    [(30012, False, "a client cannot serve AMS port 30012"), (0, True, "a router requests")],
 )
 def test_request_to_serve_a_port_closes_the_connection(port, is_outgoing, why) -> None:
     async def script(reader, writer, taker):

@@ -150,7 +150,7 @@ def test_missing_fields_have_defaults(tags, change):
         ({"net_id": bytes(6)}, "the request has no NetID"),
         ({"host": b"a b\0"}, "'a b' is no name of a host"),
         ({"host": b"239.1.1.1\0"}, "'239.1.1.1' is not the IPv4 address of a host"),
-        ({"net_id": bytes(NetId.parse(OWN))}, "NetID 10.0.0.1.2.1 is one of this station itself"),
+        ({"net_id": bytes(NetId.parse(OWN))}, "NetID 10.0.0.1.2.1 belongs to this station"),
     ],
 )
 def test_impossible_route_is_refused(caplog, tags, why):
