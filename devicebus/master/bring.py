@@ -15,7 +15,7 @@ from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea, configure
 from devicebus.master.pdo import channels_from_sii, read_channels, write_configuration
 from devicebus.master.procedure import Procedure, Sleep, Task, write
-from devicebus.wire.alstatus import AlState
+from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
 from devicebus.wire.register import Fmmu, Register, SyncManager
 from devicebus.wire.sii import SiiFixed, SiiProtocol
 
@@ -88,7 +88,6 @@ T = TypeVar("T")
 _FIRST_PAUSE_NS = 100_000
 _MAX_PAUSE_NS = 2_000_000
 """Pause between two checks of a task; it doubles from the first to this."""
-_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
 def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
@@ -110,10 +109,10 @@ def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
         before, slave.state, current = current, step, step
         if step is AlState.INIT:
             bus.close_mailbox(slave)  # only now: a slave that refused INIT keeps its mailbox
-        if before in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
+        if before in WITH_PROCESS_DATA and step not in WITH_PROCESS_DATA:
             yield from _end_process_data(bus, slave)
-        slave.is_set_up = step in _WITH_PROCESS_DATA
-        if step in _WITH_PROCESS_DATA:
+        slave.is_set_up = step in WITH_PROCESS_DATA
+        if step in WITH_PROCESS_DATA:
             bus.set_participation(slave, Participation.ACTIVE)
         elif step is AlState.BOOT:
             bus.open_mailbox(slave, boot_mailbox(slave.found.sii.fixed))
@@ -151,7 +150,7 @@ def wait_for(task: Task[T]) -> Procedure[T]:
 
 def _prepare(bus: BusState, slave: BusSlave, current: AlState, step: AlState) -> Procedure[None]:
     """Write the registers that the slave checks on its way to *step*."""
-    if current in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
+    if current in WITH_PROCESS_DATA and step not in WITH_PROCESS_DATA:
         bus.set_participation(slave, Participation.UNCERTAIN)
     if current is AlState.INIT:
         yield from _prepare_mailbox(bus, slave, step)

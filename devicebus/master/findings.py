@@ -44,7 +44,7 @@ class SlaveView(NamedTuple):
         return f"{self.name} ({self.station})"
 
 
-class Times(NamedTuple):
+class FaultPeriod(NamedTuple):
     """Ages of the start and the end of a fault in ns."""
 
     since_ns: int
@@ -70,13 +70,13 @@ class BusFinding(msgspec.Struct, frozen=True, kw_only=True):
 class History(NamedTuple):
     """Past faults of the slaves as a running master noted them."""
 
-    over: tuple[tuple[SlaveView, Times], ...] = ()
+    over: tuple[tuple[SlaveView, FaultPeriod], ...] = ()
     """Slaves with their past fault, in the order of the segment."""
-    silence: Times | None = None
+    silence: FaultPeriod | None = None
     """Last period without frames, if it has ended."""
     silent_since_ns: int | None = None
     """Age of the present period without frames in ns, if there is one."""
-    ports: Mapping[tuple[int, int], Times] = MappingProxyType({})
+    ports: Mapping[tuple[int, int], FaultPeriod] = MappingProxyType({})
     """Periods in which errors were counted, by station address and port."""
 
 
@@ -157,13 +157,13 @@ def _port_findings(
         )
 
 
-def _is_over(times: Times | None) -> bool:
+def _is_over(times: FaultPeriod | None) -> bool:
     return times is None or times.until_ns > RECENT_NS
 
 
 def _past(slaves: Sequence[SlaveView], history: History) -> list[BusFinding]:
     """Return past findings; faults that ended at one time are one finding."""
-    groups: list[list[tuple[SlaveView, Times]]] = []
+    groups: list[list[tuple[SlaveView, FaultPeriod]]] = []
     silence = history.silence
     for slave, times in history.over:
         if silence is not None and any(_same_time(times.since_ns, each) for each in silence):

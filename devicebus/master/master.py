@@ -25,12 +25,11 @@ from devicebus.master.watch import (
     poll_mailboxes,
     watch,
 )
-from devicebus.wire.alstatus import AlState
+from devicebus.wire.alstatus import WITH_MAILBOX, AlState
 from eap.codec.wire import Buffer
 
 T = TypeVar("T")
 
-_WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP))
 
 LOOK_NS = 10_000_000
 """Poll period of idle mailboxes for unsolicited messages."""
@@ -235,7 +234,7 @@ def why_closed(slave: BusSlave) -> NoMailboxError | MailboxClosedError:
         return NoMailboxError(f"{name} has no mailbox: its EEPROM names none")
     if slave.state is None:
         return MailboxClosedError(f"{name} is being identified: its mailbox is not open yet")
-    if slave.target in _WITH_MAILBOX:
+    if slave.target in WITH_MAILBOX:
         return MailboxClosedError(
             f"{name} is in {slave.state.name} and being brought to {slave.target.name}: its mailbox"
             " is closed until PREOP"

@@ -69,7 +69,7 @@ FIRST_STATION = 1001
 """Station address of the first slave, as TwinCAT counts."""
 MAX_SLAVES = 0xFFFF - FIRST_STATION
 _IDENTITY_WORD = 8
-_PER_STEP = 60
+_DATAGRAMS_PER_STEP = 60
 """Datagrams in flight at once while slaves are read one by one."""
 
 
@@ -174,7 +174,7 @@ def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
 
     Raises WorkingCounterError for a position without a slave.
     """
-    replies = yield from _in_frames(
+    replies = yield from in_frames(
         [apwr(at, Register.STATION_ADDRESS, to.to_bytes(2, "little")) for at, to in places]
     )
     for (position, _), reply in zip(places, replies, strict=True):
@@ -184,7 +184,7 @@ def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
 
 def read_stations(count: int) -> Procedure[list[int]]:
     """Return the station addresses at the first *count* positions; 0 for none."""
-    replies = yield from _in_frames([aprd(at, Register.STATION_ADDRESS, 2) for at in range(count)])
+    replies = yield from in_frames([aprd(at, Register.STATION_ADDRESS, 2) for at in range(count)])
     return [int.from_bytes(reply.data, "little") if reply.wkc else 0 for reply in replies]
 
 
@@ -203,7 +203,7 @@ def read_identity(station: int) -> Procedure[Identity]:
 
 
 def _read_registers(stations: Sequence[int]) -> Procedure[list[_Registers]]:
-    replies = yield from _in_frames(
+    replies = yield from in_frames(
         [
             datagram
             for station in stations
@@ -250,10 +250,11 @@ def _found(
     return FoundSlave(position, station, alias, esc, al_status, node, identity, content, fault)
 
 
-def _in_frames(datagrams: Sequence[DatagramRequest]) -> Procedure[list[DatagramReply]]:
+def in_frames(datagrams: Sequence[DatagramRequest]) -> Procedure[list[DatagramReply]]:
+    """Send any number of datagrams, a few frames at a time; return their replies."""
     replies: list[DatagramReply] = []
-    for start in range(0, len(datagrams), _PER_STEP):
-        answers, _ = yield datagrams[start : start + _PER_STEP]
+    for start in range(0, len(datagrams), _DATAGRAMS_PER_STEP):
+        answers, _ = yield datagrams[start : start + _DATAGRAMS_PER_STEP]
         replies += answers
     return replies
 

@@ -14,12 +14,10 @@ from devicebus.master.image import BusImage, SlaveProcessData, plan_image
 from devicebus.master.pdo import ProcessDataChannel, channels_from_sii
 from devicebus.master.procedure import Procedure, Sleep, together
 from devicebus.master.scan import FoundSlave, assign_stations, check_bus, match_aliases, scan
-from devicebus.wire.alstatus import AlState
+from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
 from devicebus.wire.datagram import brd, bwr
 from devicebus.wire.register import AlControl, AlStatus, Register
 from eap.errors import EapError
-
-_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
 def start_up(bus: BusState, target: AlState) -> Procedure[None]:
@@ -43,7 +41,7 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
     yield from starting.run_all(lambda slave: bring(bus, slave, AlState.INIT))
     if target is not AlState.INIT:
         yield from starting.run_all(lambda slave: bring(bus, slave, AlState.PREOP))
-    if target in _WITH_PROCESS_DATA:
+    if target in WITH_PROCESS_DATA:
         yield from starting.run_all(lambda slave: _read_process_data(bus, slave))
         if starting.remaining:
             yield from _run_process_data(bus, starting, target)

@@ -29,9 +29,15 @@ from devicebus.master.cycle import Participation
 from devicebus.master.diagnosis import COUNTERS, port_counters
 from devicebus.master.mailboxport import STATUS
 from devicebus.master.procedure import Procedure, Sleep, Task
-from devicebus.master.scan import assign_stations, count_slaves, read_identity, read_stations
-from devicebus.wire.alstatus import ERROR, AlState
-from devicebus.wire.datagram import DatagramReply, fprd, fpwr
+from devicebus.master.scan import (
+    assign_stations,
+    count_slaves,
+    in_frames,
+    read_identity,
+    read_stations,
+)
+from devicebus.wire.alstatus import ERROR, WITH_PROCESS_DATA, AlState
+from devicebus.wire.datagram import fprd, fpwr
 from devicebus.wire.register import AlStatus, Register, SmStatus
 from eap.errors import EapError
 
@@ -118,9 +124,6 @@ SLICE_NS = 5_000_000
 """Delay of the next poll after a faulty cycle."""
 RETRY_NS = 1_000_000_000
 """Pause before the next attempt for a slave that could not be brought back."""
-_STATES_PER_STEP = 60
-"""Slaves whose AL status is read together."""
-_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 _STATES = {int(state): state for state in AlState}
 
 
@@ -130,7 +133,9 @@ def watch(bus: BusState) -> Procedure[None]:
         now_ns = yield from _wait_for_period(bus)
         try:
             count = yield from count_slaves()
-            replies = yield from _read_states(list(bus.slaves))
+            replies = yield from in_frames(
+                [fprd(at, Register.AL_STATUS, AlStatus.SIZE) for at in bus.slaves]
+            )
         except FrameLostError:
             if not bus.is_lost:
                 bus.is_lost = True
@@ -161,15 +166,6 @@ def _wait_for_period(bus: BusState) -> Procedure[int]:
     return now_ns
 
 
-def _read_states(stations: Sequence[int]) -> Procedure[list[DatagramReply]]:
-    replies: list[DatagramReply] = []
-    for start in range(0, len(stations), _STATES_PER_STEP):
-        part = stations[start : start + _STATES_PER_STEP]
-        answers, _ = yield [fprd(at, Register.AL_STATUS, AlStatus.SIZE) for at in part]
-        replies += answers
-    return replies
-
-
 def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     """Leave out a slave that does not answer although the frame came back."""
     if slave.is_lost:
@@ -197,7 +193,7 @@ def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) 
         slave.state = _STATES.get(status.state)
     if now_ns < slave.retry_ns:
         return
-    is_set_up = slave.is_set_up or slave.target not in _WITH_PROCESS_DATA
+    is_set_up = slave.is_set_up or slave.target not in WITH_PROCESS_DATA
     if status.state == slave.target and not status.error and is_set_up and not slave.is_lost:
         _report_back(bus, slave, now_ns)
         return
@@ -218,8 +214,8 @@ def _report_back(bus: BusState, slave: BusSlave, now_ns: int) -> None:
 def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> None:
     stays = (
         not slave.is_lost
-        and status.state in _WITH_PROCESS_DATA
-        and slave.target in _WITH_PROCESS_DATA
+        and status.state in WITH_PROCESS_DATA
+        and slave.target in WITH_PROCESS_DATA
         and slave.is_set_up
     )
     bus.needs_check = True

@@ -9,7 +9,7 @@ from devicebus.mailbox.protocol import MINIMUM_SIZE
 from devicebus.sim.device import Device
 from devicebus.sim.esc import Esc
 from devicebus.sim.syncmanager import SyncChannel
-from devicebus.wire.alstatus import ERROR, AlState, AlStatusCode
+from devicebus.wire.alstatus import ERROR, WITH_MAILBOX, WITH_PROCESS_DATA, AlState, AlStatusCode
 from devicebus.wire.register import AlEvent, Register
 from eap.codec.mailbox import MailboxType
 
@@ -80,8 +80,7 @@ _IDENTIFY = 0x20
 _AL_CONTROL, _SM_ACTIVATION = int(AlEvent.AL_CONTROL), int(AlEvent.SM_ACTIVATION)
 _SM0 = int(AlEvent.SM0)
 _MAILBOX_EVENTS = _SM_ACTIVATION | _SM0 | _SM0 << 1
-_WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT))
-_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
+_WITH_MAILBOX = WITH_MAILBOX | {AlState.BOOT}
 
 
 class SimulatedSlave:
@@ -135,7 +134,7 @@ class SimulatedSlave:
         if event & _MAILBOX_EVENTS and self._has_mailbox():
             self._serve_mailbox(event)
             self._move_messages(now_ns)
-        if event >= _SM0 and self.device.al_state in _WITH_PROCESS_DATA:
+        if event >= _SM0 and self.device.al_state in WITH_PROCESS_DATA:
             self._exchange(now_ns)
 
     def handle_timeout(self, now_ns: int) -> None:
@@ -152,7 +151,7 @@ class SimulatedSlave:
         if (
             self.esc.clock.sync0_is_active
             and self._is_sync_pulse(now_ns)
-            and self.state in _WITH_PROCESS_DATA
+            and self.state in WITH_PROCESS_DATA
         ):
             self._offer_inputs(now_ns)
 
@@ -165,7 +164,7 @@ class SimulatedSlave:
 
     def offer_inputs(self, now_ns: int) -> None:
         """Update the input area after a change that no frame caused."""
-        if self.is_powered and self.state in _WITH_PROCESS_DATA:
+        if self.is_powered and self.state in WITH_PROCESS_DATA:
             self._offer_inputs(now_ns)
 
     def _is_sync_pulse(self, now_ns: int) -> bool:
@@ -282,7 +281,7 @@ class SimulatedSlave:
             self._fall_back(AlState.INIT, AlStatusCode.MAILBOX_BOOT if boot else
                        AlStatusCode.MAILBOX_PREOP)  # fmt: skip
             return
-        if self.state in _WITH_PROCESS_DATA:
+        if self.state in WITH_PROCESS_DATA:
             code = check_process_data(self.esc, self.device)
             if code:
                 self._fall_back(AlState.PREOP, code)

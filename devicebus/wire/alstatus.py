@@ -15,6 +15,9 @@ class AlState(IntEnum):
     OP = 8
 
 
+WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
+WITH_MAILBOX = WITH_PROCESS_DATA | {AlState.PREOP}
+"""States with process data, and with the standard mailbox; BOOT has a mailbox of its own."""
 ERROR = 0x10
 """Error bit: in AL status a refused request, in AL control its acknowledgement."""
 

@@ -24,7 +24,7 @@ from devicebus.master.link import MAX_DATA
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
 from devicebus.master.procedure import Procedure, Task
-from devicebus.wire.alstatus import AlState
+from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
 from devicebus.wire.datagram import AS_SET, Command, DatagramReply, DatagramRequest
 from eap.engine.bus_report import BusPublisher, report_bus
 from eap.engine.engine_bus import EngineBus
@@ -70,7 +70,6 @@ _ALLOWED = frozenset(
     )
 )
 """Commands that do not disturb the process data: none logical, no broadcast write."""
-_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
 class _Numbered(msgspec.Struct):
@@ -360,7 +359,7 @@ def bring_one(master: Master, station: int, target: AlState, now_ns: int) -> Tas
         BusError: there is no such slave, a transition of it is under way, or the bus has no process
             data yet.
     """
-    if target in _WITH_PROCESS_DATA and master.cycle is None and station in master.slaves:
+    if target in WITH_PROCESS_DATA and master.cycle is None and station in master.slaves:
         raise BusError(
             f"slave {station}: the process data of this bus is not laid out, for its slaves never"
             f" were beyond PREOP: bring all of them to {target.name} at once"
@@ -376,7 +375,7 @@ def bring_all(master: Master, target: AlState, now_ns: int) -> Task[None]:
     slaves = list(master.slaves.values())
     if not slaves:
         raise BusError("the bus is not up: no slave is known")
-    if target in _WITH_PROCESS_DATA and master.cycle is None:
+    if target in WITH_PROCESS_DATA and master.cycle is None:
         return master.bring_up(now_ns, target)
     return _AllSlaves(master, slaves, target, now_ns).task
 

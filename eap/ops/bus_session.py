@@ -29,7 +29,7 @@ from devicebus.master.findings import History, join_errors
 from devicebus.master.procedure import Procedure, Task, together
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import set_up_cycle
-from devicebus.wire.alstatus import AlState
+from devicebus.wire.alstatus import WITH_MAILBOX, WITH_PROCESS_DATA, AlState
 from devicebus.wire.register import AlStatus
 from eap.errors import EapError
 from eap.ids import InterfaceUri
@@ -43,9 +43,6 @@ SPIN_NS = 200_000
 """Duration of the busy wait for the answer to a frame."""
 LOOK_NS = 100_000_000
 """Interval of calls of *meanwhile*."""
-
-_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
-_WITH_MAILBOX = _WITH_PROCESS_DATA | {AlState.PREOP}
 
 
 class BusSession:
@@ -116,9 +113,9 @@ class BusSession:
             BusError: several do; the message has a line for each.
         """
         bus_slaves = [self._bus.slaves[slave.station] for slave in slaves]
-        if target in _WITH_PROCESS_DATA:
+        if target in WITH_PROCESS_DATA:
             for bus_slave in bus_slaves:
-                if bus_slave.state in _WITH_MAILBOX and bus_slave.found.sii.fixed.protocols:
+                if bus_slave.state in WITH_MAILBOX and bus_slave.found.sii.fixed.protocols:
                     self.run(attach(self._bus, bus_slave))
             self._bring_all(bus_slaves, AlState.PREOP)
             self._run_all(

@@ -10,9 +10,9 @@ import msgspec
 from devicebus.master.findings import (
     NO_ANSWER,
     BusFinding,
+    FaultPeriod,
     History,
     SlaveView,
-    Times,
     find_causes,
     find_silence,
 )
@@ -87,13 +87,13 @@ def history_of(report: BusReport) -> History:
     ports = {}
     silence = None
     if report.silent_since_ns is not None and report.silent_until_ns is not None:
-        silence = Times(report.silent_since_ns, report.silent_until_ns)
+        silence = FaultPeriod(report.silent_since_ns, report.silent_until_ns)
     for slave in report.slaves:
         if slave.since_ns is not None and slave.until_ns is not None:
             view = SlaveView(slave.station, slave.name, trouble=slave.past_fault)
-            over.append((view, Times(slave.since_ns, slave.until_ns)))
+            over.append((view, FaultPeriod(slave.since_ns, slave.until_ns)))
         for each in slave.port_errors:
-            ports[slave.station, each.port] = Times(each.since_ns, each.until_ns)
+            ports[slave.station, each.port] = FaultPeriod(each.since_ns, each.until_ns)
     since_ns = report.silent_since_ns if is_silent(report) else None
     return History(tuple(over), silence, since_ns, ports)
 

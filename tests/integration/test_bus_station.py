@@ -195,7 +195,7 @@ def test_a_file_and_objects_of_one_slave_at_once(works, content):
             reads += 1
     out, err = writing.communicate()
     assert (writing.returncode, err) == (0, "")
-    assert "200000 octets" in out
+    assert "200000 bytes" in out
     assert reads > 10
 
 

@@ -5,9 +5,9 @@ import pytest
 from devicebus.errors import AlStatusError, BusError, FrameLostError
 from devicebus.master.diagnosis import BusDiagnosis, Fault, PortErrors, SlaveDiagnosis
 from devicebus.master.findings import (
+    FaultPeriod,
     History,
     SlaveView,
-    Times,
     find_causes,
     find_silence,
     join_errors,
@@ -101,14 +101,14 @@ def test_errors_that_are_still_counted_are_present():
     (finding,) = find_causes(
         line(),
         diagnosis(Fault(1002, 0, 1001)),
-        History(ports={(1002, 0): Times(9 * SECOND, SECOND)}),
+        History(ports={(1002, 0): FaultPeriod(9 * SECOND, SECOND)}),
     )
     assert finding.what == "errors start at port 0 of b (1002): 1 lost link"
     assert (finding.is_over, finding.since_ns, finding.until_ns) == (False, 9 * SECOND, None)
 
 
 def test_errors_that_are_counted_no_longer_are_over():
-    history = History(ports={(1002, 0): Times(20 * SECOND, 12 * SECOND)})
+    history = History(ports={(1002, 0): FaultPeriod(20 * SECOND, 12 * SECOND)})
     (finding,) = find_causes(line(), diagnosis(Fault(1002, 0, 1001)), history)
     assert finding.what == "errors started at port 0 of b (1002): 1 lost link"
     assert (finding.is_over, finding.until_ns) == (True, 12 * SECOND)
@@ -116,7 +116,10 @@ def test_errors_that_are_counted_no_longer_are_over():
 
 def test_findings_new_errors_behind_a_port_with_old_ones():
     history = History(
-        ports={(1001, 1): Times(20 * SECOND, 12 * SECOND), (1003, 0): Times(SECOND, SECOND)}
+        ports={
+            (1001, 1): FaultPeriod(20 * SECOND, 12 * SECOND),
+            (1003, 0): FaultPeriod(SECOND, SECOND),
+        }
     )
     found = find_causes(line(), diagnosis(Fault(1001, 1, 1002), Fault(1003, 0, 1002)), history)
     assert [(each.slaves, each.is_over) for each in found] == [((1003,), False), ((1001,), True)]
@@ -125,8 +128,8 @@ def test_findings_new_errors_behind_a_port_with_old_ones():
 def test_findings_both_ends_of_a_cable_are_one():
     history = History(
         ports={
-            (1002, 1): Times(37 * SECOND, 37 * SECOND),
-            (1003, 0): Times(24 * SECOND, 24 * SECOND),
+            (1002, 1): FaultPeriod(37 * SECOND, 37 * SECOND),
+            (1003, 0): FaultPeriod(24 * SECOND, 24 * SECOND),
         }
     )
     (finding,) = find_causes(line(), diagnosis(Fault(1002, 1, 1003), Fault(1003, 0, 1002)), history)
@@ -139,9 +142,12 @@ def test_errors_from_before_the_master_looked_are_over_at_an_unknown_time():
 
 
 def test_findings_mended_cut_is_one_for_slaves_and_cable():
-    times = Times(30 * SECOND, 12 * SECOND)
+    times = FaultPeriod(30 * SECOND, 12 * SECOND)
     over = [(SlaveView(at, NAMES[at], trouble="it does not answer"), times) for at in (1003, 1004)]
-    ports = {(1002, 1): Times(30 * SECOND, 30 * SECOND), (1003, 0): Times(12 * SECOND, 12 * SECOND)}
+    ports = {
+        (1002, 1): FaultPeriod(30 * SECOND, 30 * SECOND),
+        (1003, 0): FaultPeriod(12 * SECOND, 12 * SECOND),
+    }
     (finding,) = find_causes(
         line(),
         diagnosis(Fault(1002, 1, 1003), Fault(1003, 0, 1002)),
@@ -154,10 +160,10 @@ def test_findings_mended_cut_is_one_for_slaves_and_cable():
 
 
 def test_slaves_that_were_missed_while_no_frame_came_back_are_no_finding_of_their_own():
-    silence = Times(30 * SECOND, 12 * SECOND)
+    silence = FaultPeriod(30 * SECOND, 12 * SECOND)
     over = (
-        (SlaveView(1001, "a", trouble="it does not answer"), Times(30 * SECOND, 12 * SECOND)),
-        (SlaveView(1002, "b", trouble="watchdog"), Times(12 * SECOND, 11 * SECOND)),
+        (SlaveView(1001, "a", trouble="it does not answer"), FaultPeriod(30 * SECOND, 12 * SECOND)),
+        (SlaveView(1002, "b", trouble="watchdog"), FaultPeriod(12 * SECOND, 11 * SECOND)),
     )
     (finding,) = find_causes(line(), diagnosis(), History(over, silence))
     assert finding.what == "no frame came back, so that 4 slaves could not be reached"
