@@ -154,6 +154,7 @@ def _targets(index: Index, text: str, shared: set[str]) -> list[AccessTarget]:
 def _slave(index: Index, station: StationSection, port: PortSection, slave: str) -> int:
     """Return the station address of a slave; without a bus file any number is valid."""
     bus = index.buses.get((station.name, port.name))
+    # Without a bus file any slave may be there, and any station address is accepted.
     known = {each.name: each.station for each in bus.slaves} if bus else {}
     if port.kind is not PortKind.BUS:
         raise SectionError("", f"{station.name}/{port.name} has no slaves", "a bus port")
@@ -270,6 +271,7 @@ def _check_order(
     for access, rule in zip(station.access, rules, strict=True):
         if reason := _reason_never_matching(rule):
             report.add(access.at, f"access rule never matches: {reason}", "a rule that can match")
+        # The first rule that matches decides, so a rule inside an earlier one has no effect.
         for earlier, other in before:
             if _covers(other, rule):
                 line = report.line_of(earlier.at)

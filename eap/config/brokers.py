@@ -182,6 +182,7 @@ HOST = "an IPv4 address or a host name, and :PORT if it is not the usual one"
 def unreadable_reason(file: Path) -> str:
     """Return the reason that *file* cannot be read as a whole; empty if it can."""
     try:
+        # A directory gets its usual error from open(); a pipe would block it.
         if file.exists() and not file.is_file() and not file.is_dir():
             return "no regular file"  # a pipe would keep us waiting
         with file.open("rb") as opened:

@@ -154,6 +154,7 @@ def gateway_port(station: StationSection, port: PortSection) -> int:
 
     The gateway to the first bus shares the port of the station, 34980.
     """
+    # A UDP and TCP port serves one master; each further bus of a station needs its own.
     buses = [each.name for each in station.ports if each.kind is PortKind.BUS]
     number = buses.index(port.name)
     return port.gateway.port or (EAP_PORT + number if number else 0)
@@ -290,6 +291,7 @@ def _check_addresses(
                 report.add(f"{path}.{text}", message, "each address once")
                 continue
             first[address] = text
+            # With bit 15 set, the station address is the same slave with its address in the answer.
             if address & _BIT_15 and address & ~_BIT_15 in stations:
                 slave = address & ~_BIT_15
                 message = f"gateway address {text} is that of slave {slave} with bit 15 set"

@@ -96,6 +96,7 @@ def _text(path: Path) -> str:
             raise _UnreadableError(0, "is a directory", "a YAML file")
         if not path.exists():
             raise _UnreadableError(0, "does not exist", "a YAML file")
+        # A pipe would block the reader, a device might never end.
         if not path.is_file():
             raise _UnreadableError(0, "is not a regular file", "a YAML file")
         with path.open("rb") as file:
@@ -106,6 +107,7 @@ def _text(path: Path) -> str:
     if len(octets) > MAX_FILE:
         raise _UnreadableError(0, "is too large", f"at most {MAX_FILE >> 20} MiB")
     try:
+        # Windows editors put a byte order mark in front; it is no part of the first key.
         return octets.decode("utf-8-sig")
     except UnicodeDecodeError as exc:
         line = octets.count(b"\n", 0, exc.start) + 1
@@ -156,6 +158,7 @@ class _Builder:
                 raise _UnreadableError(
                     line, "a second YAML document begins", "one document in a file"
                 )
+            # The alias shares the node: its findings are then known to have one cause.
             case yaml.AliasEvent(anchor=anchor):
                 if (node := self._anchors.get(anchor)) is None:
                     raise _UnreadableError(
@@ -189,6 +192,7 @@ class _Builder:
         else:
             value = done.items
             weight = 1 + sum(node.weight for node in value)
+        # Every use of an alias counts: nine levels of nine aliases are 387 million values.
         if weight > MAX_NODES:
             raise _UnreadableError(done.line, "aliases make the plant too large", _NODES)
         return Node(done.line, value, weight)
@@ -222,6 +226,7 @@ _TAB_INDENT = re.compile(r" *\t")
 _TAB_BEHIND_SIGN = re.compile(r"(^|\s)[-?:] *\t|: *\t")
 _NULL = {"", "~", "null", "Null", "NULL"}
 _BOOL = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
+# At most 100 digits: int() of a long text takes time that grows with its square.
 _INT = re.compile(r"[-+]?\d{1,100}|0x[0-9a-fA-F]{1,100}|0o[0-7]{1,100}", re.ASCII)
 _FLOAT = re.compile(
     r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", re.ASCII
@@ -241,6 +246,7 @@ def _resolve(text: str) -> Scalar:
         return None
     if text in _BOOL:
         return _BOOL[text]
+    # Base 10 unless 0x or 0o: with base 0 Python refuses 010, which YAML 1.2 reads as 10.
     if _INT.fullmatch(text):
         return int(text, 0 if text[1:2] in {"x", "o"} else 10)
     if _FLOAT.fullmatch(text):
@@ -423,6 +429,7 @@ class _Converter:
             self._report.add(where, message, one_of(shown), line=line)
             meant = nearest(name, missing)
             if meant is not None:
+                # Without it, one typing error would be reported again as a missing key.
                 given[meant] = node
                 self._report.enter(f"{path}.{meant}" if path else meant, line, node)
         return given

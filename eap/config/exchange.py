@@ -151,6 +151,7 @@ def _check_triggers(
 
 
 def _check_ids(index: Index, report: FindingReport) -> None:
+    # The pair of publisher and id is the key of a PD on the wire (ETG.1005).
     ids = (
         ((sent.port.net_id, sent.pd.id), sent) for sent in index.sent.values() if sent.port.net_id
     )

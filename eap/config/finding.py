@@ -99,6 +99,7 @@ class FindingReport:
             return 0, path, message
         words = (word for word in message.split() if word.strip(":,") not in self.stations)
         shape = _VARYING.sub("", " ".join(words))
+        # Uses of an anchor share a node, so its identity tells them from equal text without one.
         return id(self._nodes[known]), path.removeprefix(known), shape
 
     def findings(self) -> tuple[PlantFinding, ...]:

@@ -39,7 +39,7 @@ _STATES = "1 INIT, 2 PREOP, 4 SAFEOP, 8 OP, 0 without an answer"
 _OTHER = re.compile(r"[^\w-]")
 
 
-class DescribedEntry(msgspec.Struct, frozen=True):
+class DescribedPdoEntry(msgspec.Struct, frozen=True):
     """One entry of process data; *type* for ``datatypes.parse``, empty for padding."""
 
     name: str
@@ -58,9 +58,9 @@ class DescribedSlave(msgspec.Struct, frozen=True, kw_only=True):
     revision: int | None = None
     serial: int | None = None
     alias: int | None = None
-    outputs: tuple[DescribedEntry, ...] = ()
+    outputs: tuple[DescribedPdoEntry, ...] = ()
     """In the order of the PDOs."""
-    inputs: tuple[DescribedEntry, ...] = ()
+    inputs: tuple[DescribedPdoEntry, ...] = ()
 
 
 class ExpectedBus(msgspec.Struct, frozen=True):
@@ -118,13 +118,13 @@ def name_bus(port: str, description: ExpectedBus) -> NamedBus:
     return NamedBus(tuple(slaves), variables)
 
 
-def _name(entry: DescribedEntry, prefix: str, name: str) -> BusEntrySpec:
+def _name(entry: DescribedPdoEntry, prefix: str, name: str) -> BusEntrySpec:
     variable = f"{prefix}.{name}" if entry.type else ""
     return BusEntrySpec(variable, entry.index, entry.subindex, entry.bit_length)
 
 
 def _variables(
-    entries: Sequence[DescribedEntry], specs: Sequence[BusEntrySpec], *, is_output: bool
+    entries: Sequence[DescribedPdoEntry], specs: Sequence[BusEntrySpec], *, is_output: bool
 ) -> Iterator[tuple[str, BusVariable]]:
     for entry, spec in zip(entries, specs, strict=True):
         if spec.variable:
@@ -132,7 +132,7 @@ def _variables(
             yield spec.variable, BusVariable(entry.type, is_output, comment)
 
 
-def _unique_names(entries: Sequence[DescribedEntry]) -> list[str]:
+def _unique_names(entries: Sequence[DescribedPdoEntry]) -> list[str]:
     """Return the last part of the name of each entry; a duplicate gets its object index."""
     plain = [_plain(entry) for entry in entries]
     counts = Counter([STATE, *(name for name, e in zip(plain, entries, strict=True) if e.type)])
@@ -147,11 +147,11 @@ def _unique_names(entries: Sequence[DescribedEntry]) -> list[str]:
     return names
 
 
-def _plain(entry: DescribedEntry) -> str:
+def _plain(entry: DescribedPdoEntry) -> str:
     return _OTHER.sub("_", entry.name) or _object_suffix(entry)
 
 
-def _object_suffix(entry: DescribedEntry) -> str:
+def _object_suffix(entry: DescribedPdoEntry) -> str:
     return f"{entry.index:04X}_{entry.subindex:02X}"
 
 
@@ -291,6 +291,7 @@ class Index:
     def types(self, sent: SentPd) -> list[DataType] | None:
         """Return the types of the variables of a PD; None if one is missing or invalid."""
         texts = [self.type_text(sent.station, name) for name in sent.pd.variables]
+        # The caller reports nothing here: variables without a type are findings of their own.
         return parse_types(texts)
 
     def step(self, sent: SentPd) -> int:
@@ -300,6 +301,7 @@ class Index:
             return 0
         if pd.cycle_us:
             return max(pd.cycle_us // self.cycle_us(sent.station), 1)
+        # Both dividers count device cycles, and both must be due.
         return lcm(pd.divider or 1, sent.frame.divider or 1)
 
 

@@ -102,6 +102,7 @@ def _phase(index: Index, station: StationSection, position: int, count: int) -> 
     if station.phase_us is not None:
         return station.phase_us
     cycle = index.cycle_us(station)
+    # Short cycles have fewer groups, so that a group ends before the next one begins.
     groups = max(1, min(count, STAGGER_GROUPS, cycle // MIN_STAGGER_US))
     return position % groups * (cycle // groups)
 
@@ -258,6 +259,7 @@ def _sender_address(index: Index, subscription: SubscribeSection, publishers: li
     if subscription.sender:
         is_any = subscription.sender == ANY_SOURCE
         return "" if is_any else address_text(source_octets(subscription.sender))
+    # Several publishers with different addresses: any of them may send.
     known = {_own_address(index, sent) for sent in publishers}
     return known.pop() if len(known) == 1 else ""
 
@@ -534,5 +536,6 @@ def _router(net_id: NetId) -> NetId:
     if not net_id:
         return net_id
     octets = bytearray(net_id)
+    # The fifth octet numbers the devices of a host, as 1.1 and 2.1 in plant files do.
     octets[4] = (octets[4] - 1) & 0xFF
     return NetId(octets)

@@ -135,8 +135,8 @@ def _place(number: int, address: str, count: int) -> _StationAddress:
 
 def _head(name: str, shape: Shape, places: list[_StationAddress]) -> Iterator[str]:
     what = {
-        Shape.RING: "each tells the next one its state",
-        Shape.STAR: f"{places[0].name} tells all others what to do, and they tell it their states",
+        Shape.RING: "each sends its state to the next one",
+        Shape.STAR: f"{places[0].name} sends commands to all others, and they send it their states",
     }[shape]
     yield f"# {name}: {len(places)} stations in a {shape}, {what}."
     yield "#"
@@ -190,7 +190,7 @@ def _shared(shape: Shape, timeout_ms: int) -> Iterator[str]:
     yield "    temperature: {kind: sine, offset: 180, amplitude: 5, period_ms: 10000}"
     yield ""
     yield "# What is sent, in each device cycle as no other trigger is named.  Raise the version"
-    yield "# with each change of the variables, so that nobody reads new data in the old way."
+    yield "# with each change of the variables, so that no subscriber reads them by the old one."
     yield (
         f"x-state: &state {{name: state, frame: {frame}, version: 1,"
         " variables: [ticks, temperature, running, setpoint]}"

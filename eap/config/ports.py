@@ -73,8 +73,10 @@ def _net_id_address(destination: Destination, uri: InterfaceUri, index: Index) -
 
     On Ethernet it may be outside the plant: the engine learns its MAC address from its frames.
     """
+    # 0.0.0.0.0.0 stands for any publisher in a subscription and addresses no port.
     if not any(NetId.parse(destination.host)):
         raise ValueError(f"NetID {destination.host} stands for any")
+    # A port comes before a router of the same NetID; a router stands for its only EAP port.
     owners = find_net_id(destination.host, index)
     if len(owners) > 1:
         several = ", ".join(f"{station}/{name}" for station, name in owners)
@@ -101,6 +103,7 @@ def _port_address(text: str, uri: InterfaceUri, index: Index) -> Destination:
     if target is None:
         raise ValueError(f"no port {text} in this plant")
     port = index.ports[station, name]
+    # A loopback line has no addresses: each frame reaches all of its other ports.
     if target.scheme == "loop" == uri.scheme and target.host == uri.host:
         return Destination.parse(str(EAP_MULTICAST_MAC))
     address = f"{target.host}:{target.port}" if target.port else target.host
@@ -141,6 +144,7 @@ def reaches(
         return accepts_tcp(port, uri) and uri.host in {destination.host, "0.0.0.0"}  # noqa: S104
     if uri.scheme != "udp":
         return False
+    # The file has no netmask, so any host number of 255 may be the directed broadcast.
     directed = port.broadcast and destination.host.endswith(".255")
     return destination.is_group or directed or uri.host in {destination.host, "0.0.0.0"}  # noqa: S104
 
@@ -407,6 +411,7 @@ def _check_addresses(index: Index, report: FindingReport) -> None:
                 report.add(path, message, "an address of its own for each port")
                 break
             first[key] = path
+    # Slaves forward every frame, also those of other stations on the same interface.
     _check_segments(index, report)
 
 

@@ -225,6 +225,7 @@ def _closest_port(
 ) -> str:
     """Return the port whose IPv4 address shares most leading bits with *destination*."""
     if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
+        # XOR: the longest common prefix gives the smallest number, and the file has no netmasks.
         there = int(IPv4Address(destination.host))
         return min(ports, key=lambda name: int(IPv4Address(ports[name].host)) ^ there)
     if len(ports) > 1:
@@ -310,6 +311,7 @@ def find_hop(
         for mine in _eap_ports(index, station, own)
         for theirs in _eap_ports(index, target, other)
     )
+    # UDP first, then the nearest network, then the order of the ports in the file.
     ranked = [
         _Candidate(_PREFERENCE.index(hop.kind), bits, order, hop)
         for order, each in enumerate(found)
@@ -518,9 +520,11 @@ def _follow(plant: _PlantRouters, station: StationSection, to: str) -> str:
                 names.append(following)
                 found = plant.table(following).find(net_id)
                 if found is None:
+                    # Routes that are announced at run time are not known here.
                     if plant.discovers_routes(following):
                         break
                     return f"the route to {to!r} ends at {following}, which has no route to it"
+                # The next router knows the target by its real NetID, not by the virtual one.
                 net_id = found[0].to_real(net_id)
                 following = plant.next_station(str(found[0].router or ""))
     return ""

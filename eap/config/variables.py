@@ -166,6 +166,7 @@ def _check_csv(
                 message += suggest(source.column, columns)
                 report.add(f"{path}.column", message, one_of(columns))
                 return
+            # Every row is parsed: an error at run time could come hours after the start.
             count = 0
             for count, row in enumerate(rows, 1):  # noqa: B007  an empty file leaves 0
                 kind.parse_text(row[source.column] or "")
@@ -237,6 +238,7 @@ def execution_order(links: Sequence[Ends]) -> list[int]:
             after[other].append(position)
     missing = [len(others) for others in before]
     free = [position for position, number in enumerate(missing) if not number]
+    # A heap, not a queue: links that are free to run keep the order of the file.
     heapify(free)
     order = []
     while free:
@@ -423,6 +425,7 @@ def _fits_scaled(
 
 
 def _is_number(kind: DataType) -> bool:
+    # BOOL has a range from 0 to 1, but a scaled BOOL is an error of the file.
     return kind.scalar_range is not None and kind.text != "BOOL"
 
 

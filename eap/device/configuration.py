@@ -65,6 +65,7 @@ def restore_configuration(
     Raises:
         SdoAbortError: an entry does not exist or cannot hold its value; nothing has changed.
     """
+    # Built aside, so that an error leaves the dictionary unchanged.
     wanted = dictionary.blank()
     _put_all(wanted, kept)
     adopt_configuration(dictionary, wanted)
@@ -138,6 +139,7 @@ def _put_all(dictionary: EapDictionary, kept: Mapping[int, Mapping[int, bytes]])
             dictionary.make(row, index)
         if row.list_row is not None:
             dictionary.grow(index, min(max(entries, default=0), row.list_row.last))
+        # Sub-index 0 last: it is checked against the entries that exist.
         for subindex, octets in sorted(entries.items(), key=lambda pair: pair[0] or 0x100):
             _put(dictionary, row, index, subindex, octets)
 
@@ -210,6 +212,7 @@ class _Comparison:
     def run(self) -> Iterator[EntryChange]:
         """Yield all changes in their order."""
         yield from self._static()
+        # Frames first: as long as they list a PD, it cannot be deleted.
         yield from self._removed(profile.TX_FRAME)
         yield from self._cut_lists()
         rewritten = self._mappings_to_write()

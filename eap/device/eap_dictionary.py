@@ -380,6 +380,7 @@ class EapDictionary(ObjectDictionary):
         self._check_making(index, subindex, state)
         is_there = index in self and row in profile.VARIABLES
         kind = self[index].entries[Var.DEFAULT].kind if is_there else DEFAULT_TYPE
+        # At full length, because the data that sets the length has not arrived yet.
         largest = self.make_object(row, index, kind, row.last_subindex)
         for number, entry in self._objects.get(index, largest).entries.items():
             largest.entries[number].access = entry.access
@@ -387,6 +388,7 @@ class EapDictionary(ObjectDictionary):
 
     @contextmanager
     def _all_or_nothing(self, index: int) -> Iterator[None]:
+        # Only this object is saved: a download changes no other one before its checks pass.
         item = self._objects.get(index)
         saved = [
             (subindex, entry, b"" if entry.read else entry.octets, entry.access)
@@ -428,6 +430,7 @@ class EapDictionary(ObjectDictionary):
         count = item.max_subindex
         has_count = first == 0 and is_counted(item)
         if first == 0:
+            # In complete access sub-index 0 takes 16 bits; the upper byte is padding.
             if len(data) < 2:
                 raise SdoAbortError(AbortCode.TOO_SHORT, index, 0, "sub-index 0 has two bytes")
             count, data = data[0] if has_count else count, data[2:]
@@ -506,6 +509,7 @@ class EapDictionary(ObjectDictionary):
     def _check_mapping_entry(
         self, row: ProfileObject, item: OdObject, subindex: int, data: bytes
     ) -> None:
+        # A mapping in force is changed only after sub-index 0 was set to 0, as in slaves.
         if item.max_subindex:
             raise SdoAbortError(AbortCode.SUBINDEX_0_NOT_ZERO, item.index, subindex)
         word = int.from_bytes(data, "little")
@@ -535,6 +539,7 @@ class EapDictionary(ObjectDictionary):
         if index == profile.CONTROL:
             if self.on_request is not None:
                 self.on_request(self[index].entries[1].value)
+        # In PreOp nothing runs: the check of SafeOp reads all entries at once.
         elif state is not OdState.PREOP and self.on_change is not None:
             try:
                 self.on_change(index, written[0])

@@ -189,6 +189,7 @@ def encode_mapping(variables: Iterable[tuple[int, DataType]]) -> list[int]:
             gap = -end % 8
             words.append(MappingEntry(0, 0, gap).encode())
             end += gap
+        # The length field has 8 bits; WHOLE marks every longer variable.
         words.append(MappingEntry(index, 1, min(kind.bit_length, WHOLE)).encode())
         end += kind.bit_length
     if len(words) > MAX_ENTRIES:

@@ -102,6 +102,7 @@ class _DictionaryFiller:
         if first.name == self._dictionary.port.name:
             others = {name for pd in station.subscriptions for name in pd.variables}
             others |= bus_variables(station)
+            # Variables of the station alone need one place where clients find them.
             wanted |= {each.name for each in station.variables} - others
         wanted -= received
         return [each.name for each in station.variables if each.name in wanted]
@@ -133,6 +134,7 @@ class _DictionaryFiller:
 
     def _assign(self, rows: tuple[ProfileObject, ...], names: list[str]) -> dict[str, int]:
         """Return an index of *rows* for each name: that of *like*, or another."""
+        # The same index for the same name keeps the difference of two configurations small.
         like = self._like
         before = {like.name_of(i): i for i in like.members(*rows)} if like is not None else {}
         return self._choose(rows, names, before)

@@ -121,6 +121,7 @@ class EapStateMachine:
             else:
                 actions.start_receiving()
                 device.request(StateRequest.OP)
+        # Down: receiving stops before sending, in the reverse order of the way up.
         if device.state is DeviceState.OP and wanted < DeviceState.OP:
             actions.stop_receiving()
         if device.state.sends and not wanted.sends:

@@ -230,6 +230,7 @@ class _Rollout:
             ) & best_after.keys():
                 best_after[sender].add(name)
         while left:
+            # Prefer stations that wait for no other, then those that lose no PD, then any sender.
             best = (name for name in left if not best_after[name] & left.keys())
             free = (name for name in left if not old_senders[name] & left.keys())
             name = next(chain(best, free, (name for name in left if name in senders), left))
@@ -348,6 +349,7 @@ def _accepts(forms: list[PdLayout], layout: PdLayout) -> bool:
 
 def _names(form: PdLayout, layout: PdLayout) -> dict[tuple[str, str], str]:
     """Return the names in *form* of the variables of *layout* at equal offsets."""
+    # Equal offset and type is all that a receiver can know: names are not on the wire.
     places = {(each.bit_offset, each.type): each.name for each in form.variables}
     return {
         (each.name, each.type): places[each.bit_offset, each.type]

@@ -19,7 +19,7 @@ from devicebus.sim.spec import BusSpec, SlaveSpec
 from devicebus.wire import sii
 from eap.config.document import convert_to, read
 from eap.config.finding import FindingReport, PlantFinding, one_of
-from eap.config.index import DescribedEntry, DescribedSlave, ExpectedBus
+from eap.config.index import DescribedPdoEntry, DescribedSlave, ExpectedBus
 from eap.errors import ConfigError
 from eap.od.dictionary import ObjectDictionary
 from eap.suggest import suggest
@@ -132,12 +132,12 @@ def _describe(bus: BusFile, number: int) -> DescribedSlave:
     )
 
 
-def _describe_entry(entry: PdoEntry, dictionary: ObjectDictionary) -> DescribedEntry:
+def _describe_entry(entry: PdoEntry, dictionary: ObjectDictionary) -> DescribedPdoEntry:
     place = entry.index, entry.subindex, entry.bit_length
     if not entry.index:
-        return DescribedEntry("", "", *place)
+        return DescribedPdoEntry("", "", *place)
     known = dictionary.entry(entry.index, entry.subindex)
-    return DescribedEntry(known.name, known.kind.text, *place)
+    return DescribedPdoEntry(known.name, known.kind.text, *place)
 
 
 def _files(slave: SlaveSpec) -> Iterator[str]:

@@ -5,7 +5,7 @@ import pytest
 from eap.config.bus import describe_buses
 from eap.config.document import convert, read
 from eap.config.finding import FindingReport, PlantFinding
-from eap.config.index import DescribedEntry, DescribedSlave, ExpectedBus, Index
+from eap.config.index import DescribedPdoEntry, DescribedSlave, ExpectedBus, Index
 from eap.config.load import load
 
 PLANT = """\
@@ -39,15 +39,15 @@ BUS = ExpectedBus(
             vendor=1,
             product=2,
             outputs=(
-                DescribedEntry("valve", "BOOL", 0x7000, 1, 1),
-                DescribedEntry("lamp", "BOOL", 0x7000, 2, 1),
-                DescribedEntry("", "", 0, 0, 6),
-                DescribedEntry("speed", "INT", 0x7000, 3, 16),
+                DescribedPdoEntry("valve", "BOOL", 0x7000, 1, 1),
+                DescribedPdoEntry("lamp", "BOOL", 0x7000, 2, 1),
+                DescribedPdoEntry("", "", 0, 0, 6),
+                DescribedPdoEntry("speed", "INT", 0x7000, 3, 16),
             ),
             inputs=(
-                DescribedEntry("limit", "BOOL", 0x6000, 1, 1),
-                DescribedEntry("", "", 0, 0, 7),
-                DescribedEntry("status word", "UINT", 0x6000, 2, 16),
+                DescribedPdoEntry("limit", "BOOL", 0x6000, 1, 1),
+                DescribedPdoEntry("", "", 0, 0, 7),
+                DescribedPdoEntry("status word", "UINT", 0x6000, 2, 16),
             ),
         ),
     )

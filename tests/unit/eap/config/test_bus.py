@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.config.index import DescribedEntry, DescribedSlave, ExpectedBus, name_bus
+from eap.config.index import DescribedPdoEntry, DescribedSlave, ExpectedBus, name_bus
 
 
 def slave(*inputs, outputs=(), name="a", **identity):
@@ -14,7 +14,7 @@ def slave(*inputs, outputs=(), name="a", **identity):
 
 
 def entry(name, subindex=1, kind="BOOL", index=0x6000):
-    return DescribedEntry(name, kind, index, subindex, 1)
+    return DescribedPdoEntry(name, kind, index, subindex, 1)
 
 
 def names(*inputs, outputs=()):
@@ -33,7 +33,7 @@ def test_an_unknown_bus_has_its_own_state_only():
 
 
 def test_variables_come_with_type_and_direction():
-    outputs = [entry("valve", index=0x7000), DescribedEntry("", "", 0, 0, 7)]
+    outputs = [entry("valve", index=0x7000), DescribedPdoEntry("", "", 0, 0, 7)]
     bus = name_bus("b", ExpectedBus((slave(entry("level", 3, "INT"), outputs=outputs),)))
     assert {name: each[:2] for name, each in bus.variables.items()} == {
         "b.state": ("BYTE", False),
@@ -47,7 +47,7 @@ def test_variables_come_with_type_and_direction():
 
 
 def test_slaves_keep_identity_order_and_padding():
-    first = slave(DescribedEntry("", "", 0, 0, 5), entry("x"), serial=7)
+    first = slave(DescribedPdoEntry("", "", 0, 0, 5), entry("x"), serial=7)
     bus = name_bus("bus0", ExpectedBus((first, slave(name="b", revision=3, alias=9))))
     assert [each.station for each in bus.slaves] == [1001, 1002]
     assert [(each.revision, each.serial, each.alias) for each in bus.slaves] == [
@@ -87,7 +87,7 @@ def test_an_entry_that_is_mapped_twice_is_counted():
 
 ENTRIES = st.lists(
     st.builds(
-        DescribedEntry,
+        DescribedPdoEntry,
         st.one_of(st.sampled_from(["x", "x y", "state", "", "x_6000_01"]), st.text(max_size=4)),
         st.sampled_from(["BOOL", "BOOL", ""]),
         st.integers(0x6000, 0x6001),

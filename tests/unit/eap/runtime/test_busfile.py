@@ -8,7 +8,7 @@ import pytest
 
 from devicebus.master.pdo import channels_from_sii
 from devicebus.master.scan import scan
-from eap.config.index import DescribedEntry
+from eap.config.index import DescribedPdoEntry
 from eap.errors import ConfigError
 from eap.runtime import busfile
 from tests.support.busline import Bench, Line, run
@@ -103,7 +103,7 @@ def test_description_has_what_a_master_finds(tmp_path):
     assert (coupler.name, coupler.vendor, coupler.product) == ("a", 0x0E5A, 1)
     assert (coupler.inputs, coupler.outputs) == ((), ())
     assert analogue.product == 3
-    assert analogue.inputs == (DescribedEntry("level", "INT", 0x6000, 1, 16),)
+    assert analogue.inputs == (DescribedPdoEntry("level", "INT", 0x6000, 1, 16),)
 
 
 def test_description_of_bits_has_their_padding(tmp_path):
