@@ -43,11 +43,11 @@ def result_table(results: Iterable[TestedTarget]) -> Iterator[TextTable]:
         "Station", "Target", Column("Round trip", is_number=True), Column("Result", wraps=True)
     )
     for result in results:
-        said = Styled(result.text, style="" if result.ok else _STYLES["down"])
+        text = Styled(result.text, style="" if result.ok else _STYLES["down"])
         if result.hint:
-            said.append(f"\n{result.hint}", style="none")
+            text.append(f"\n{result.hint}", style="none")
         target = f"{result.name} {result.target}".strip()
-        table.add_row(result.station, target, round_trip(result.rtt_us), said)
+        table.add_row(result.station, target, round_trip(result.rtt_us), text)
     yield table
 
 

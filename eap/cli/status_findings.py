@@ -29,7 +29,7 @@ Row = Mapping[str, Any]
 _HUNG_AFTER_US = 2_000_000
 _HUNG_AFTER_CYCLES = 10
 _NET_ID_DOTS = 5
-_NOT_ASKED = "other: not asked for"
+_NOT_REQUESTED = "other: not asked for"
 _RECENT_US = 60_000_000
 """A sender that should not be there is a warning for so long, then a remark."""
 _LISTED = 3
@@ -173,7 +173,7 @@ def _of_appliance(appliance: ApplianceStatus) -> Iterator[StatusFinding]:
     refused = [
         f"{name.replace('_', ' ')} ({outcome.removeprefix('other: ')})"
         for name, outcome in engine.get("realtime", {}).items()
-        if isinstance(outcome, str) and not outcome.startswith("fifo") and outcome != _NOT_ASKED
+        if isinstance(outcome, str) and not outcome.startswith("fifo") and outcome != _NOT_REQUESTED
     ]
     if refused:
         advice = "cycles may be late: run as root, or use --no-realtime"

@@ -113,7 +113,7 @@ class GatewayBus:
         except MailboxTimeoutError:
             raise
         except EapError as exc:
-            # Its mailbox is smaller than was assumed, and nothing was done: say it in more pieces.
+            # The mailbox is smaller than assumed, and nothing was done: repeat in smaller parts.
             if _is_too_long(exc) and self._can_learn_size(slave):
                 return self.converse(slave, begin, name, meanwhile)
             # A gateway may refuse for a slave that is not there as slaves do for their objects.
@@ -153,12 +153,12 @@ class GatewayBus:
             return MailboxSizes(_MASTER_SIZE, _MASTER_SIZE)
         if self._mailbox is not None:
             return self._mailbox
-        told = self._description_of(slave)
-        if told is None:
+        described = self._description_of(slave)
+        if described is None:
             return MailboxSizes()
-        if not told.to_slave:
-            raise no_mailbox(_slave(told), state_name(_slave(told).status.state))
-        return MailboxSizes(told.to_slave, told.to_master)
+        if not described.to_slave:
+            raise no_mailbox(_slave(described), state_name(_slave(described).status.state))
+        return MailboxSizes(described.to_slave, described.to_master)
 
     def _can_learn_size(self, slave: Slave) -> bool:
         """Read the mailbox size of *slave* from the master if it was only assumed."""
@@ -176,12 +176,12 @@ class GatewayBus:
                 self.scan()
         if self._slaves is None:
             return ""
-        told = self._description_of(slave)
-        if told is None:
+        described = self._description_of(slave)
+        if described is None:
             known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
             return f"unknown slave {slave.station}; slaves known to the master: {known or 'none'}"
-        if not told.to_slave:
-            return str(no_mailbox(_slave(told), state_name(_slave(told).status.state)))
+        if not described.to_slave:
+            return str(no_mailbox(_slave(described), state_name(_slave(described).status.state)))
         return ""
 
     def _description_of(self, slave: Slave) -> MasterSlave | None:

@@ -57,10 +57,10 @@ def trace(target: str, plant: str | None = None, via: str | None = None) -> Trac
         ControlError: there is no such target or station, or no appliance answers.
     """
 
-    def ask(client: ControlClient) -> TracedPath:
+    def query(client: ControlClient) -> TracedPath:
         return client.call(TRACE, within_s=TRACE_S, via=via or "", target=target)
 
-    with first_answer(ask, plant, via) as (_, answer):
+    with first_answer(query, plant, via) as (_, answer):
         return answer
 
 
@@ -80,23 +80,23 @@ def scan(plant: str | None = None, via: str | None = None) -> list[PlantScan]:
 
 @contextmanager
 def first_answer(
-    ask: Callable[[ControlClient], T], plant: str | None, via: str | None = None
+    query: Callable[[ControlClient], T], plant: str | None, via: str | None = None
 ) -> Iterator[tuple[ControlClient, T]]:
     """Query the appliances in turn; return the first that knows the names, and its answer.
 
     Args:
-        ask: Query of one appliance; raises ControlError if a name is unknown.
+        query: Query of one appliance; raises ControlError if a name is unknown.
         plant: Of the appliance; None for any.
         via: Station that has to run there; None for any.
 
     Raises:
-        ControlError: nothing runs, the names are unknown, or *ask* failed in another way.
+        ControlError: nothing runs, the names are unknown, or *query* failed in another way.
     """
     unknown: ControlError | None = None
     with ExitStack() as stack:
         for client in [stack.enter_context(each) for each in connect(plant, via)]:
             try:
-                answer = ask(client)
+                answer = query(client)
             except ControlError as exc:
                 if exc.code != ErrorCode.UNKNOWN_NAME:
                     raise
@@ -123,7 +123,7 @@ class AmsDevice:
         self.target = target
         self._client = client
 
-    def ask(self, operation: Operation) -> OperationOutcome:
+    def send(self, operation: Operation) -> OperationOutcome:
         """Return the result of one operation; raise ControlError if there is no such target."""
         command, body = encode_query(operation)
         answer = self._client.call(
@@ -141,7 +141,7 @@ class AmsDevice:
         Raises:
             AmsRefusedError: the device refuses, or cannot be reached.
         """
-        outcome = self.ask(operation)
+        outcome = self.send(operation)
         if outcome.result:
             raise self.refusal(outcome.result, what)
         return outcome.data
@@ -172,7 +172,7 @@ def open_ams(target: str, plant: str | None) -> Iterator[AmsDevice]:
     Raises:
         ControlError: nothing runs, or the target is not known.
     """
-    with first_answer(lambda each: AmsDevice(each, target).ask(ReadState()), plant) as found:
+    with first_answer(lambda each: AmsDevice(each, target).send(ReadState()), plant) as found:
         client, _ = found
         yield AmsDevice(client, target)
 
@@ -202,7 +202,7 @@ def request_state(
     """
     number = _NUMBERS[wanted]
     pause = pause or Event().wait
-    outcome = device.ask(WriteControl(states_of(number).ads_state, number, b""))
+    outcome = device.send(WriteControl(states_of(number).ads_state, number, b""))
     if outcome.result == AdsError.ACCESS_DENIED:
         raise device.refusal(outcome.result, wanted)
     now = _now(device)
@@ -292,7 +292,7 @@ def list_routes(
     clients = connect(plant, station)
     try:
         return [
-            PlantRoutes(each.info.plant, _ask(each, station or "", match, requests, most))
+            PlantRoutes(each.info.plant, _fetch_routes(each, station or "", match, requests, most))
             for each in clients
         ]
     finally:
@@ -300,7 +300,7 @@ def list_routes(
             each.close()
 
 
-def _ask(
+def _fetch_routes(
     client: ControlClient, station: str, match: str, requests: int, most: int | None
 ) -> list[RouterRow]:
     """Return the routes of one appliance, page by page."""

@@ -46,7 +46,7 @@ class RoutesApp(App[None]):
     """Routes and connections of running stations.
 
     Args:
-        link: To the appliances.
+        client: Sends the requests.
         period_s: Period of requests.
     """
 
@@ -67,9 +67,9 @@ class RoutesApp(App[None]):
         Binding("q,ctrl+c", "quit", "Quit", key_display="q"),
     ]
 
-    def __init__(self, link: RouterClient, *, period_s: float = PERIOD_S) -> None:
+    def __init__(self, client: RouterClient, *, period_s: float = PERIOD_S) -> None:
         super().__init__()
-        self._link = link
+        self._client = client
         self._period_s = period_s
         self._snapshot = Snapshot([], "sending…")
         self._view = View.ROUTES
@@ -84,21 +84,21 @@ class RoutesApp(App[None]):
         yield Input(placeholder="show only what has this in it", id="filter", compact=True)
         yield Grid("table")
         with VerticalScroll(id="detail"):
-            yield Static(id="said")
+            yield Static(id="message")
         yield Footer(compact=True)
 
     def on_mount(self) -> None:
         """Start the periodic requests."""
         self.query_one("#filter").display = False
         self.query_one(Grid).focus()
-        self.set_interval(self._period_s, self.look)
-        self.look()
+        self.set_interval(self._period_s, self.fetch)
+        self.fetch()
 
     def on_resize(self) -> None:
         """Fit the table to the new size."""
         self.call_after_refresh(self._show)
 
-    def look(self) -> None:
+    def fetch(self) -> None:
         """Request the routes, unless a request is under way."""
         if self._requested_at is None:
             self._requested_at = monotonic()
@@ -110,14 +110,14 @@ class RoutesApp(App[None]):
 
     @work(thread=True)
     def _look(self, match: str) -> None:
-        picture = self._link.look(match)
-        self.call_from_thread(self._take, picture)
+        snapshot = self._client.fetch(match)
+        self.call_from_thread(self._take, snapshot)
 
-    def _take(self, picture: Snapshot) -> None:
+    def _take(self, snapshot: Snapshot) -> None:
         self._requested_at = None
-        if picture.problem:
-            picture = Snapshot(self._snapshot.routers, picture.problem)
-        self._snapshot = picture
+        if snapshot.problem:
+            snapshot = Snapshot(self._snapshot.routers, snapshot.problem)
+        self._snapshot = snapshot
         self._show()
 
     def _routers(self) -> list[PlantRouter]:
@@ -169,7 +169,7 @@ class RoutesApp(App[None]):
         text = Text("\n").join(
             Text(part, style=STYLES[style]) for part, style in detail(self.query_one(Grid).chosen)
         )
-        self.query_one("#said", Static).update(text)
+        self.query_one("#message", Static).update(text)
 
     def action_help(self) -> None:
         """Show what each key does."""
@@ -197,7 +197,7 @@ class RoutesApp(App[None]):
     def _apply_filter(self, event: Input.Changed) -> None:
         self._match = event.value.strip()
         self._show()
-        self.look()
+        self.fetch()
 
     @on(Input.Submitted, "#filter")
     def _leave_filter(self) -> None:
@@ -259,32 +259,32 @@ class RoutesApp(App[None]):
     @work(thread=True)
     def _remove(self, router: PlantRouter, row: RouteRow) -> None:
         try:
-            self._link.remove(router, row.net_id, row.transport, row.address)
+            self._client.remove(router, row.net_id, row.transport, row.address)
         except EapError as exc:
             self.call_from_thread(self._show_problem, "Remove", str(exc))
-        self.call_from_thread(self.look)
+        self.call_from_thread(self.fetch)
 
     @work(thread=True)
     def _test(self, router: PlantRouter, row: RouteRow) -> None:
         try:
-            result = self._link.test(router, row.net_id)
+            result = self._client.test(router, row.net_id)
         except EapError as exc:
             text = str(exc)
         else:
             trip = f" in {routes_view.round_trip(result.rtt_us)}" if result.ok else ""
-            said = f"{result.target}{trip}: {result.text}"
-            text = "\n".join(filter(None, [said, result.hint]))
+            line = f"{result.target}{trip}: {result.text}"
+            text = "\n".join(filter(None, [line, result.hint]))
         title = f"{router.routes.station} to {row.name}"
         self.call_from_thread(self._show_problem, title, text)
-        self.call_from_thread(self.look)
+        self.call_from_thread(self.fetch)
 
     def _ask_for(self, router: PlantRouter, title: str, values: dict[str, Any]) -> None:
         def ended(warnings: list[str] | None) -> None:
-            self.look()
+            self.fetch()
             if warnings:
                 self._show_problem("Added, but", "\n".join(warnings))
 
-        form = RouteForm(title, values, lambda params: self._link.add(router, params))
+        form = RouteForm(title, values, lambda params: self._client.add(router, params))
         self.push_screen(form, ended)
 
     def _router(self) -> PlantRouter | None:
@@ -300,7 +300,7 @@ class RoutesApp(App[None]):
 
 _HELP = """\
 ↑ ↓      choose a row
-t Enter  test the chosen route: ask its station for its state
+t Enter  test the chosen route: read the state of its station
 a        add a route
 e d      edit or remove a route that was added
 /        show only rows that have a text in them; Esc ends that

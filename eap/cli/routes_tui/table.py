@@ -54,7 +54,7 @@ class RouterClient:
     def __init__(self, plant: str | None) -> None:
         self._plant = plant
 
-    def look(self, match: str) -> Snapshot:
+    def fetch(self, match: str) -> Snapshot:
         """Return all routers, with those of their routes that *match*; never raises EapError."""
         try:
             found = list_routes(self._plant, None, match, requests=_REQUESTS, most=MOST)
@@ -268,8 +268,8 @@ def detail(line: Line | None) -> list[tuple[str, str]]:
             (f"{routes_view.route_kind(row)}; {routes_view.route_state(row)}", row.state),
         ]
     else:
-        asked = f"requests from {', '.join(row.net_ids)}" if row.net_ids else "no requests yet"
-        texts = [(routes_view.path_of(row), "bold"), (asked, "")]
+        clients = f"requests from {', '.join(row.net_ids)}" if row.net_ids else "no requests yet"
+        texts = [(routes_view.path_of(row), "bold"), (clients, "")]
     texts.append((routes_view.figures(row), ""))
     if row.last_error:
         texts.append((f"last error: {row.last_error}", "down"))

@@ -88,7 +88,7 @@ def test_refusal_in_the_middle(stub, file):
     assert stub.specs["station-03"].cycle_us == 10_000
 
 
-def test_what_cannot_be_leaves_all_as_it_is(stub, file):
+def test_impossible_change_changes_no_station(stub, file):
     stub.unable = {"station-02"}
     result = run("apply", file)
     assert result.exit_code == 1
@@ -109,7 +109,7 @@ def test_nothing_to_roll_back(stub, file):
     assert run("rollback", file).output == "no station changed\n"
 
 
-def test_appliance_that_goes_away(stub, file):
+def test_apply_reports_an_appliance_that_ends(stub, file):
     def refuse(spec):
         if spec.name == "station-02":
             raise ControlError("appliance ring does not answer")

@@ -52,7 +52,7 @@ def test_state(line, command):
     assert {row["state"] for row in document(command, "state", "OP")["slaves"]} == {"OP"}
 
 
-def test_state_that_there_is_not(line, command):
+def test_unknown_state_is_refused(line, command):
     code, _, err = command("state", "sensor", "RUN", *WHERE)
     assert code == 2
     assert "'RUN' is not a state; expected one of INIT, PREOP" in err
@@ -74,7 +74,7 @@ def test_diag(line, command):
     assert "0 lost" in out
 
 
-def test_eeprom_there_and_back(line, command, tmp_path):
+def test_eeprom_is_written_and_read_back(line, command, tmp_path):
     file = tmp_path / "image.bin"
     content = document(command, "sii", "dump", "sensor", str(file))
     assert file.read_bytes().hex() == content["data"]
@@ -146,7 +146,7 @@ def test_port_of_a_station_is_as_good_as_an_interface(
 
 
 @pytest.mark.net
-def test_what_the_running_master_makes_of_it(bus_appliance, command, tmp_path):
+def test_running_master_reports_findings(bus_appliance, command, tmp_path):
     assert "keeps it there" in command("state", "press/bus0", "sensor", "INIT")[1]
     assert "keeps them there" in command("state", "press/bus0", "PREOP")[1]
     file = tmp_path / "image.bin"

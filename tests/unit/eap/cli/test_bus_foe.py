@@ -58,7 +58,7 @@ def test_stdin_and_stdout(monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_stdin_has_no_name_and_stdout_takes_one_thing(command):
+def test_foe_refuses_stdin_without_a_name_and_json_with_stdout(command):
     nameless = command("put", "drive", "-")
     assert (nameless.exit_code, "has no name: give NAME" in nameless.stderr) == (2, True)
     both = command("get", "drive", "firmware.bin", "-", "--json")

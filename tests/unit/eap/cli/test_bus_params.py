@@ -8,7 +8,7 @@ import pytest
 from eap.cli.params import number_up_to, parse_entry, parse_octets, parse_type
 
 
-def test_what_is_read():
+def test_read_entries_have_type_and_value():
     assert parse_entry("0x1018:1") == (0x1018, 1)
     assert parse_entry("1000:0") == (0x1000, 0)
     assert number_up_to(255)("0xFF") == number_up_to(255)(255) == 255
@@ -28,6 +28,6 @@ def test_what_is_read():
         (parse_type, "UNIT", "did you mean UINT"),
     ],
 )
-def test_what_is_refused(parse, text, reason):
+def test_refused_requests_are_reported(parse, text, reason):
     with pytest.raises(click.BadParameter, match=reason):
         parse(text)

@@ -112,7 +112,7 @@ def test_diagnosis_shows_ports_frames_and_findings():
     assert any("no answer" in line for line in lines)
 
 
-def test_diagnosis_of_many_slaves_shows_those_with_errors_unless_all_are_wanted():
+def test_diagnosis_of_many_slaves_omits_those_without_errors():
     rows = [diagnosed(1001 + number) for number in range(100)]
     rows[49] = diagnosed(1050, ports=[port(0, lost_links=1)])
     found = diagnosis(rows, PRESENT)
@@ -123,7 +123,7 @@ def test_diagnosis_of_many_slaves_shows_those_with_errors_unless_all_are_wanted(
     assert "s1100" in shown(*diagnosis_view(found, NOW_S, is_full=True))
 
 
-def test_diagnosis_of_counters_of_an_unknown_time_says_so():
+def test_diagnosis_marks_counters_of_an_unknown_time():
     assert finding_line(msgspec.convert(OVER | {"until": None}, FindingRow), NOW_S) == (
         "was, before the master started: b (1002) did not answer; --reset clears this"
     )

@@ -147,7 +147,7 @@ def test_capture_with_one_bad_frame_fails_after_showing_all(tmp_path: Path) -> N
     assert [fields["error"] is None for fields in lines(result)] == [False, True]
 
 
-def test_capture_without_our_frames_says_so(tmp_path: Path) -> None:
+def test_decode_reports_a_capture_without_ethercat_frames(tmp_path: Path) -> None:
     path = write_pcap(tmp_path / "a.pcap", [udp(FRAME, source_port=1, port=2)])
     result = run(path, "--json")
     assert (result.exit_code, result.stdout) == (0, "")
@@ -163,7 +163,7 @@ def test_file_that_is_no_capture(tmp_path: Path) -> None:
     assert "no whole pcap or pcapng file" in result.stderr
 
 
-def test_tree_for_people() -> None:
+def test_gw_od_prints_a_tree() -> None:
     result = run(udp(FRAME).hex())
     assert result.exit_code == 0
     for part in ("127.0.1.2:34980 → 127.0.1.1:34980", "publisher 192.168.0.1.1.1", "PD 1001"):

@@ -56,7 +56,7 @@ def test_ams_in_a_mailbox() -> None:
     )
 
 
-def test_error_reply_says_why() -> None:
+def test_error_reply_has_its_reason() -> None:
     text = render(bytes.fromhex("0a50 0400 e903 00 10 0100 0200"))
     assert "refused: UNSUPPORTED_PROTOCOL (0x0002)" in text
 

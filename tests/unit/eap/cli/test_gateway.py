@@ -40,7 +40,7 @@ def gateway(*words):
     return CliRunner().invoke(main, ["gateway", *words])
 
 
-def test_it_is_stopped_and_started(asked):
+def test_gateway_is_stopped_and_started(asked):
     assert gateway("stop", "mixer/bus0").output == "mixer/bus0: stopped\n"
     assert gateway("start", "mixer").output == "mixer/bus0: running\n"
     assert asked == [{"station": "mixer", "port": "bus0"}, {"station": "mixer", "port": ""}]
@@ -56,7 +56,7 @@ def test_status_without_a_station_shows_all_gateways(asked):
     assert asked == [{"station": "mixer"}]
 
 
-def test_status_without_a_station_says_that_there_is_no_gateway(runtime):
+def test_gateway_status_without_gateways_fails(runtime):
     def refuse(params):
         raise ControlError("station mixer has no gateway", code=ErrorCode.UNKNOWN_NAME)
 
@@ -68,7 +68,7 @@ def test_status_without_a_station_says_that_there_is_no_gateway(runtime):
 
 
 @pytest.mark.parametrize("target", ["", "/bus0", "mixer/", "mixer/bus0/1001"])
-def test_what_is_no_target(asked, target):
+def test_invalid_target_is_refused(asked, target):
     found = gateway("stop", target)
     assert found.exit_code == 2
     assert "is neither STATION nor STATION/PORT" in found.output

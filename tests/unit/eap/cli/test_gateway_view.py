@@ -43,7 +43,7 @@ def shown(row):
     return captured.get()
 
 
-def test_what_a_gateway_does():
+def test_gateway_view_shows_clients_and_requests():
     text = shown(ROW)
     first, *lines = text.splitlines()
     assert first == (
@@ -56,7 +56,7 @@ def test_what_a_gateway_does():
     assert "there is no such slave" in text
 
 
-def test_of_many_clients_the_latest_are_shown_and_those_with_transfers():
+def test_gateway_view_of_many_clients_shows_the_latest_and_those_with_transfers():
     (busy,) = ROW["clients"]
     idle = [busy | {"address": f"10.0.0.9:{port}", "transfers": []} for port in range(6000, 6020)]
     text = shown(ROW | {"clients": [busy, *idle]})
@@ -65,7 +65,7 @@ def test_of_many_clients_the_latest_are_shown_and_those_with_transfers():
     assert "10 earlier clients not shown (--json shows them)" in text
 
 
-def test_one_that_is_stopped_and_silent():
+def test_gateway_view_of_a_stopped_silent_gateway():
     quiet = ROW | {"state": "stopped", "dropped": 3, "served": [], "clients": [], "slaves": []}
     quiet["settings"] = ROW["settings"] | {"silent": True}
     assert shown(quiet) == (

@@ -77,7 +77,7 @@ def test_usage_errors_name_the_command() -> None:
     )
 
 
-def test_unknown_command_names_all_when_none_is_near() -> None:
+def test_unknown_command_without_a_suggestion_names_all() -> None:
     result = CliRunner().invoke(main, ["xyzzy"], prog_name="eapctl")
     assert result.exit_code == 2
     assert "unknown command 'xyzzy'; known commands: " in result.stderr

@@ -46,7 +46,7 @@ def test_tcp_may_stand_behind_the_host(gateway, words, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("option", [("--mailbox", "140"), ("--mailbox=140",)])
-def test_the_mailbox_of_a_slave_may_be_told_behind_the_host(gateway, option, tmp_path) -> None:
+def test_mailbox_option_is_accepted_after_the_host(gateway, option, tmp_path) -> None:
     refused = run(gateway, "foe", "get", "7", "f", str(tmp_path / "f"))
     assert (refused.exit_code, "use --mailbox BYTES" in refused.output) == (1, True)
     asked = run(gateway, "foe", "get", "7", "f", str(tmp_path / "f"), *option)

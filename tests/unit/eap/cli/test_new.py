@@ -20,7 +20,7 @@ def check(path):
     return CliRunner().invoke(main, ["check", str(path)])
 
 
-def test_a_ring_unless_told_otherwise(run, tmp_path):
+def test_new_writes_a_ring_by_default(run, tmp_path):
     result = run("hall.yaml")
     assert result.output == "hall.yaml: plant hall, 3 stations in a ring; eapctl run hall.yaml\n"
     assert check(tmp_path / "hall.yaml").exit_code == 0
@@ -47,7 +47,7 @@ def test_stdout(run, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_is_there_stays(run, tmp_path):
+def test_new_keeps_an_existing_file_without_force(run, tmp_path):
     (tmp_path / "hall.yaml").write_text("mine")
     result = run("hall.yaml")
     assert (result.exit_code, result.stderr) == (
@@ -71,7 +71,7 @@ def test_a_file_that_is_there_stays(run, tmp_path):
         (("a b.yaml",), "plant name 'a b'"),
     ],
 )
-def test_what_cannot_be_is_said(run, tmp_path, words, reason):
+def test_impossible_change_has_its_reason(run, tmp_path, words, reason):
     result = run(*words)
     assert result.exit_code == 2
     assert reason in result.stderr

@@ -132,7 +132,7 @@ def test_write(command, device, entry, value, octets):
     assert device.written[-1][2].hex() == octets
 
 
-def test_what_was_written_is_said(command):
+def test_written_entry_is_printed(command):
     assert command("write", "mixer", "0xD000:7", "20000").output == (
         "0xD000:07 = UDINT 20000  # Cycle time, us, 0x4E20\n"
     )
@@ -205,7 +205,7 @@ def test_masters_and_what_is_behind_routes(command, stub, target):
     )
 
 
-def test_a_dump_is_for_people(command):
+def test_dump_prints_text_lines(command):
     lines = command("dump", "mixer").output.splitlines()
     assert lines[0] == (
         "# The objects of mixer.  'eapctl od write TARGET --from FILE' writes them to another"

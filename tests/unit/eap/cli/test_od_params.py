@@ -20,7 +20,7 @@ def test_target_comes_first():
     assert CliRunner().invoke(show, ["a", "x"]).output == "a None x\n"
 
 
-def test_what_is_no_target():
+def test_invalid_target_is_refused():
     result = CliRunner().invoke(show, ["a/", "x"])
     assert result.exit_code == 2
     assert "'a/' is not STATION" in result.output

@@ -35,6 +35,6 @@ def test_values_read_as_they_were(given, line):
     assert value_line(given) == line
 
 
-def test_whole_object_that_nobody_knows():
+def test_whole_object_without_a_description_is_bytes():
     given = record(OdWholeObject, index=0x8000, name="Settings", data="0102")
     assert list(object_lines(given)) == ["# 0x8000 Settings", "hex 01 02  # 2 bytes"]

@@ -17,7 +17,7 @@ def test_json_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr().out == '{"name":"µ","values":[1,null]}\n'
 
 
-def test_text_goes_out_at_once(capfd: pytest.CaptureFixture[str]) -> None:
+def test_text_is_flushed_at_once(capfd: pytest.CaptureFixture[str]) -> None:
     write_text("a", end="")
     assert capfd.readouterr() == ("a", "")
 
@@ -79,7 +79,7 @@ def test_repaint_overwrites_the_screen_without_scrolling(monkeypatch: pytest.Mon
     assert shown == "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J"
 
 
-def test_repaint_cuts_off_what_exceeds_the_screen_and_says_so(
+def test_repaint_cuts_lines_that_exceed_the_screen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown = repaint_on_terminal([Text("\n".join("abcdef"))], monkeypatch, 5)

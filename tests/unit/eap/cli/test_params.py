@@ -29,7 +29,7 @@ def test_names_of_variables(words: tuple[str, ...], names: dict[str, list[str]])
         (("mixer/a", "b"), "write STATION/b"),
     ],
 )
-def test_names_that_say_too_little(words: tuple[str, ...], reason: str) -> None:
+def test_incomplete_names_are_refused(words: tuple[str, ...], reason: str) -> None:
     with pytest.raises(click.UsageError, match=reason):
         parse_names(words)
 

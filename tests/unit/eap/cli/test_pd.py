@@ -66,7 +66,7 @@ def test_list_merges_all_appliances(other_appliance: Appliance) -> None:
     assert stations == {"oven", "mixer"}
 
 
-def test_list_for_people(appliance: Appliance) -> None:
+def test_list_prints_a_table(appliance: Appliance) -> None:
     result = invoke("list")
     rows = [" ".join(line.split()) for line in result.stdout.splitlines()]
     assert rows[2] == "mixer"
@@ -105,7 +105,7 @@ def test_watch_of_several_stations(appliance: Appliance) -> None:
     }
 
 
-def test_watch_for_people(appliance: Appliance) -> None:
+def test_watch_prints_text_lines(appliance: Appliance) -> None:
     result = invoke("watch", "mixer", "level", "silent", "setpoint", "--count", "3")
     texts = sorted(line[14:] for line in result.stdout.splitlines())
     assert texts == [
@@ -183,7 +183,7 @@ def test_set_reads_the_value_by_its_type(appliance: Appliance) -> None:
         (["mixr", "setpoint", "1"], "no station mixr runs"),
     ],
 )
-def test_refused_set_says_why_in_one_line(
+def test_refused_set_has_its_reason_in_one_line(
     appliance: Appliance, words: list[str], reason: str
 ) -> None:
     result = invoke("set", *words)

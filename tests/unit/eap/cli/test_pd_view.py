@@ -41,7 +41,7 @@ def test_quality_of_a_received_variable(quality: int | None, text: str) -> None:
     assert change_line(1, quality=quality).endswith(f"  cycle 12  quality {text}")
 
 
-def test_change_line_after_skipped_cycles_says_how_many() -> None:
+def test_change_line_has_the_number_of_skipped_cycles() -> None:
     assert change_line(1, skipped=3).endswith("  cycle 12  (3 skipped)")
     assert change_line(1, quality=0, skipped=9).endswith("  quality 0  (9 skipped)")
 

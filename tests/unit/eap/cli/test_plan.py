@@ -55,7 +55,7 @@ def test_differences(stub, file):
     assert stub.taken == []
 
 
-def test_what_cannot_be(stub, file):
+def test_impossible_change_is_refused(stub, file):
     stub.unable = {"station-03"}
     result = plan(file)
     assert result.exit_code == 1
@@ -72,7 +72,7 @@ def test_no_plant(stub, file):
     assert plan(file).exit_code == 2
 
 
-def test_stations_elsewhere(file, runtime):
+def test_plan_names_absent_stations(file, runtime):
     specs = load_or_raise(file).stations
     with ExitStack() as stack:
         PlantStub("ring", specs[1:], stack)

@@ -64,7 +64,7 @@ def test_list_without_such_a_station(command):
     assert "did you mean island-02" in result.stderr
 
 
-def test_plant_of_the_group_goes_behind_the_command(command):
+def test_plant_option_before_a_command_is_refused(command):
     assert command("--plant", "line", "list").exit_code == 2
     assert command("--plant", "line").exit_code == 0
 
@@ -86,7 +86,7 @@ def test_add(command, stub):
     )  # fmt: skip
 
 
-def test_add_tells_warnings_and_refusals(command):
+def test_add_prints_warnings_and_refusals(command):
     result = command("add", "island-01", "shadow", "6.1.2.3.1.1", "--via", "ams-tcp:10.0.0.6")
     assert result.stderr == "island-01: route shadow is never taken\n"
     answer = command("add", "island-01", "x", "6.1.2.3.1.2", "--via", "udp:1.2.3.4", "--json")
@@ -150,7 +150,7 @@ def test_terminal_gets_the_live_view(command, terminal, monkeypatch):
     assert shown == ["line"]
 
 
-def test_without_textual_the_way_to_it_is_told(command, terminal, monkeypatch):
+def test_routes_without_textual_names_the_extra(command, terminal, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("eap.cli.routes_tui")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "textual", None)

@@ -33,7 +33,7 @@ def run(runtime):
         yield run_command
 
 
-def test_a_password_is_asked_for(run):
+def test_add_remote_prompts_for_the_password(run):
     result, (asked,) = run("left", "10.0.0.5", "--user", "Administrator", typed="1\n")
     assert result.exit_code == 0
     assert result.output.endswith("10.0.0.5: added\n")

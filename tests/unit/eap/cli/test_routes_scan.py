@@ -32,7 +32,7 @@ def run(*words):
     return CliRunner().invoke(main, ["routes", "scan", *words])
 
 
-def test_who_answers_is_a_row(stub):
+def test_routes_scan_prints_a_row_per_router(stub):
     result = run()
     assert result.exit_code == 0
     assert "5.1.2.3.1.1" in result.output

@@ -28,7 +28,7 @@ def test_json_is_that_of_the_contract(stub):
     assert result.stderr.splitlines() == ["i2: 7", "i2/bus0: down"]
 
 
-def test_lines_for_people_and_the_station_that_asks(stub):
+def test_scan_prints_text_lines_and_the_sending_station(stub):
     result = CliRunner().invoke(main, ["scan", "--via", "island-01"])
     assert 'pyads.Connection("127.0.1.1.3.1", 1001, "127.0.1.1")' in result.stdout
     assert stub.requests == [("scan", {"via": "island-01"})]

@@ -55,7 +55,7 @@ def test_status_of_the_chosen(
     assert [s["name"] for s in status["stations"]] == stations
 
 
-def test_status_for_people(appliance: Appliance) -> None:
+def test_status_prints_tables(appliance: Appliance) -> None:
     result = CliRunner().invoke(main, ["status"])
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith("line: ")
@@ -99,7 +99,7 @@ def test_watch_prints_blocks_when_piped_until_it_is_interrupted(
     assert "\x1b" not in result.stdout
 
 
-def test_watch_goes_on_while_no_appliance_runs(
+def test_status_watch_continues_without_an_appliance(
     runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ExitStack() as stack:

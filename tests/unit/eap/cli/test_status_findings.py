@@ -283,7 +283,7 @@ def test_bus_that_is_down_is_one_finding() -> None:
     ]
 
 
-def test_what_happened_since_the_start_are_remarks() -> None:
+def test_past_events_are_remarks() -> None:
     left = rx(
         "left", timeouts=1, duplicated=2, reordered=3, late=4, discarded={"version": 5, "length": 6}
     )

@@ -177,5 +177,5 @@ def test_frames_to_a_net_id() -> None:
     assert row_of(text, "mixer/new") == "mixer/new 5.3.3.3.2.1 at an unknown address 0 7"
 
 
-def test_no_table_of_frames_that_have_nothing_more_to_say_than_their_pds() -> None:
+def test_frames_without_more_than_their_pds_have_no_table() -> None:
     assert "Subscriber" not in show(document(frames=[frame("to-panel")]))

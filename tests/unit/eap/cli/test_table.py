@@ -46,7 +46,7 @@ def test_table_wraps_at_spaces_before_it_leaves_out_a_column() -> None:
     ]
 
 
-def test_table_leaves_out_the_highest_rank_first_and_says_so() -> None:
+def test_table_omits_the_highest_rank_first_and_names_it() -> None:
     assert lines(sample(), 52)[0].split() == ["Station", "Says", "Serial", "Lost"]
     assert lines(sample(), 52)[-1] == "not shown for lack of width: Alias"
     assert lines(sample(), 45)[-1] == "not shown for lack of width: Serial, Alias"

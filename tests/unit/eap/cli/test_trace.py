@@ -35,13 +35,13 @@ def test_each_target_has_a_line_of_json(stub):
     assert CliRunner().invoke(main, ["trace", "near", "--json"]).exit_code == 0
 
 
-def test_a_table_for_people_and_the_station_that_asks(stub):
+def test_scan_prints_a_table_and_the_sending_station(stub):
     result = CliRunner().invoke(main, ["trace", "far", "--via", "island-01"])
     assert "not reached: x: down" in result.stdout
     assert stub.requests == [("trace", {"target": "far", "via": "island-01"})]
 
 
-def test_names_that_nobody_knows(stub):
+def test_unknown_names_are_refused(stub):
     result = CliRunner().invoke(main, ["trace", "nobody"])
     assert result.exit_code == 1
     assert "no station 'nobody' in this plant" in result.stderr

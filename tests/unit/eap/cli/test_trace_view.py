@@ -49,7 +49,7 @@ def lines(found: dict[str, Any]) -> list[list[str]]:
     return [line.split() for line in capture.get().splitlines() if line.strip()]
 
 
-def test_a_way_that_ends_well() -> None:
+def test_trace_prints_a_complete_path() -> None:
     head, _, _, first, last, target, rules = lines(FOUND)
     assert " ".join(head) == "island-03/bus0/1001 (island-03/bus0/drive) is 127.0.1.3.3.1:1001"
     assert " ".join(first) == (
@@ -60,7 +60,7 @@ def test_a_way_that_ends_well() -> None:
     assert " ".join(rules) == "island-03: its access rules refuse write, raw"
 
 
-def test_a_way_that_ends_before_its_target() -> None:
+def test_trace_of_a_path_that_ends_before_its_target_fails() -> None:
     hops = [FIRST | {"route": "", "why": "no route"}]
     found = FOUND | {"hops": hops, "answer": None, "why": "island-01: no route", "name": ""}
     *_, hop, why = lines(found)

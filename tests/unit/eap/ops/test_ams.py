@@ -41,7 +41,7 @@ def plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Pla
         yield [Plant(name, stack) for name in ("line", "press")]
 
 
-def test_the_appliance_that_knows_a_target_is_asked(plants: list[Plant]) -> None:
+def test_trace_uses_the_appliance_that_knows_the_target(plants: list[Plant]) -> None:
     assert routing.trace("press-2").target == "press-2"
     assert routing.trace("line-2", "line", "line-1").target == "line-2"
     with pytest.raises(ControlError, match="does not know it"):

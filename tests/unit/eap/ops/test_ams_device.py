@@ -18,7 +18,7 @@ def target(tmp_path, monkeypatch):
         yield AdsTarget(mixer(), stack)
 
 
-def test_a_device_is_asked_through_an_appliance(target):
+def test_ams_device_sends_requests_through_an_appliance(target):
     with open_ams(TARGET, None) as device:
         assert device.demand(ReadState(), "state")[2] == 2
     assert target.stub.requests[-1][1]["target"] == TARGET
@@ -32,14 +32,14 @@ def test_a_device_is_asked_through_an_appliance(target):
         (0x723, r"state: error 0x723 \(access rules forbid it\); 'eapctl trace"),
     ],
 )
-def test_refusals_say_what_to_do(target, error, text):
+def test_refusals_have_a_remedy(target, error, text):
     target.error = error
     with open_ams(TARGET, None) as device, pytest.raises(AmsRefusedError, match=text) as caught:
         device.demand(ReadState(), "state")
     assert caught.value.result == error
 
 
-def test_a_target_that_nobody_knows(target):
+def test_trace_of_an_unknown_target_fails(target):
     with (
         pytest.raises(ControlError, match="no such station in this plant"),
         open_ams("elsewhere", None),

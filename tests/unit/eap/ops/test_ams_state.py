@@ -50,7 +50,7 @@ def test_state_is_shown_and_requested(target):
     assert clock.now > 0.1
 
 
-def test_a_device_that_does_not_get_there(target):
+def test_request_state_of_a_device_that_keeps_its_state_fails(target):
     target.slow = 1000
     clock = Clock()
     found = bring("OP", clock)
@@ -59,7 +59,7 @@ def test_a_device_that_does_not_get_there(target):
 
 
 @pytest.mark.parametrize("error", [0x723, 0x1B])
-def test_a_device_that_cannot_be_asked(target, error):
+def test_ams_device_without_an_appliance_is_refused(target, error):
     with open_ams(TARGET, None) as device:
         target.error = error
         with pytest.raises(AmsRefusedError):

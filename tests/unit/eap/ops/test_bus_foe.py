@@ -111,7 +111,7 @@ def test_a_link_stays_one_and_what_is_read_only_stays(bus, tmp_path, reports, mo
     assert target.read_bytes() == content
 
 
-def test_who_breaks_off_is_told_how_far_it_came(tmp_path):
+def test_interrupted_transfer_reports_its_progress(tmp_path):
     source, target = tmp_path / "a.bin", tmp_path / "b.bin"
     source.write_bytes(FILE)
 
@@ -202,7 +202,7 @@ class BrokenBus:
         raise MailboxClosedError("the slave's mailbox was closed")
 
 
-def test_transfer_that_is_interrupted_again_and_again_is_given_up(tmp_path, monkeypatch):
+def test_transfer_that_is_interrupted_repeatedly_fails(tmp_path, monkeypatch):
     monkeypatch.setattr(bus_foe, "PAUSE_S", 0)
     source = tmp_path / "a.bin"
     source.write_bytes(CONTENT)

@@ -52,7 +52,7 @@ def test_slaves_and_the_master(bus) -> None:
         bus.find("65535")
 
 
-def test_a_dictionary_with_all_entries_tells_the_protocols() -> None:
+def test_gateway_scan_reads_protocols_from_a_full_dictionary() -> None:
     with (
         FakeGateway(full=True) as gateway,
         open_gateway("127.0.0.1", gateway.port, tcp=True) as bus,
@@ -60,7 +60,7 @@ def test_a_dictionary_with_all_entries_tells_the_protocols() -> None:
         assert scan_slaves(bus).slaves[0].mailbox == ["CoE", "FoE"]
 
 
-def test_virtual_addresses_are_the_gateways_business(bus) -> None:
+def test_virtual_addresses_are_passed_to_the_gateway(bus) -> None:
     slave = bus.find("0x9001")
     assert slave.station == 0x9001
     with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL") as caught:
@@ -154,7 +154,7 @@ def test_refusal_of_a_slave_that_the_master_does_not_know_has_a_hint(gateway, bu
     ]
 
 
-def test_slave_by_name_where_the_master_is_silent_says_to_give_the_address(silent_at_master):
+def test_slave_by_name_with_a_silent_master_has_a_remedy(silent_at_master):
     with pytest.raises(BusError, match=r"does not list its slaves: no answer .* such as 1001"):
         silent_at_master.find("drive")
 
@@ -173,7 +173,7 @@ def test_file_of_a_slave_where_the_master_is_silent_needs_the_mailbox(
     assert set(gateway.addresses) == {1001}
 
 
-def test_what_is_no_mailbox_message_is_not_passed(bus) -> None:
+def test_gateway_bus_refuses_requests_other_than_mailbox_messages(bus) -> None:
     for call in (
         lambda: bus.run(diagnose([1001]), "registers"),
         bus.frame_counts,

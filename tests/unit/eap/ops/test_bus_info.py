@@ -66,7 +66,7 @@ def test_states(line):
         assert (row.address, row.state, row.reason) == (1003, "SAFEOP", "")
 
 
-def test_slave_that_refused_says_why(line):
+def test_slave_state_has_the_reason_of_a_refusal(line):
     line.fault(kind="refuse", slave="sensor", state="PREOP", code=0x51)
     with line.session() as bus:
         with pytest.raises(BusError):
@@ -126,7 +126,7 @@ def test_reset_diagnosis_clears_the_counters(line):
         assert diagnosis(bus, None, 100.0).findings == []
 
 
-def test_eeprom_there_and_back(line):
+def test_eeprom_is_written_and_read_back(line):
     with line.session() as bus:
         content = read_eeprom(bus, "sensor")
         image = bytes.fromhex(content.data)

@@ -136,7 +136,7 @@ def test_frames_are_counted(bus):
     assert counts.timeout_us > counts.round_trip_us >= 0
 
 
-def test_who_leaves_gives_the_turn_back(bus, works):
+def test_closed_conversation_releases_the_slave(bus, works):
     bus.find("sensor")
 
     def stuck(sizes):

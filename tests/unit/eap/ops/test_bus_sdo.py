@@ -90,7 +90,7 @@ def test_value_that_is_none(bus, text, complete, reason):
         write(bus, 0x8000, 1, text, complete=complete)
 
 
-def test_type_that_nobody_knows(bus):
+def test_unknown_data_type_is_refused(bus):
     with pytest.raises(ConfigError, match="--type"):
         write(bus, 0x5555, 1, "1")
 
@@ -121,7 +121,7 @@ def test_dump(bus):
     }
 
 
-def test_dump_goes_on_behind_a_description_that_makes_no_sense(bus, monkeypatch):
+def test_dump_continues_after_an_invalid_description(bus, monkeypatch):
     def short_answer(index, subindex):
         if subindex == 1:
             raise MailboxProtocolError("InfoError at offset 6: needs 4 bytes, but 0 follow")
@@ -134,7 +134,7 @@ def test_dump_goes_on_behind_a_description_that_makes_no_sense(bus, monkeypatch)
     assert read(bus, 0x1018, 1).value == 0xE5A
 
 
-def test_dump_goes_on_behind_what_is_refused():
+def test_dump_continues_after_a_refused_entry():
     line = LoopBus("coe")
     line.fault(kind="sdo", slave="sensor", object="0x8000", code=AbortCode.HARDWARE)
     with line.session() as bus:

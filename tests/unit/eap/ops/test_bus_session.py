@@ -83,7 +83,7 @@ def test_one_refuses(line):
         bus.bring(bus.scan(), AlState.PREOP)
 
 
-def test_nobody_there(line):
+def test_request_without_an_appliance_fails(line):
     line.fault(kind="loss")
     with line.session() as bus, pytest.raises(FrameLostError):
         bus.scan()
@@ -107,6 +107,6 @@ def test_frames_are_counted(line):
 
 
 @pytest.mark.net
-def test_open_bus_where_nobody_answers():
+def test_open_bus_without_an_answer_fails():
     with open_bus(InterfaceUri.parse("udp://127.0.4.10")) as bus, pytest.raises(FrameLostError):
         bus.scan()

@@ -92,7 +92,7 @@ def test_events_follow_until_one_is_an_error():
         assert caught.value.code == "unavailable"
 
 
-def test_an_appliance_that_goes_is_named():
+def test_client_names_an_appliance_that_ends():
     with Script() as script, pytest.raises(ControlError, match=r"demo .* does not answer"):
         script.client.request("hello")
 

@@ -18,7 +18,7 @@ def device():
     return MemoryDevice(mixer())
 
 
-def test_entry_that_nobody_describes(device, monkeypatch):
+def test_entry_without_a_description_is_shown_as_bytes(device, monkeypatch):
     monkeypatch.setattr(device, "entry", lambda *_: None)
     row = od.read_entry(device, 0xD000, 7)
     assert (row.name, row.type, row.value, row.data) == ("", None, 10000, "10270000")
@@ -57,7 +57,7 @@ def test_texts_of_a_whole_object_end_where_they_end(device, monkeypatch):
     assert (row.value, row.data) == ("level", b"level".hex())
 
 
-def test_whole_object_of_unknown_parts(device, monkeypatch):
+def test_whole_object_of_unknown_types_is_bytes(device, monkeypatch):
     unknown = EntryInfo(7, "Cycle time", None, "rw")
     found = ObjectInfo(0xD000, "TxPD 0", "RECORD", 7, entries=(unknown,))
     monkeypatch.setattr(device, "describe", lambda _: found)

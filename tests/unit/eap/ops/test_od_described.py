@@ -47,7 +47,7 @@ def test_descriptions_are_read():
         assert entry_info(1, entry) == EntryInfo(1, "now", UINT, shown)
 
 
-def test_what_is_refused_is_told_beside_the_entry():
+def test_read_all_stores_refusals_with_the_entry():
     now, secret = read_all(Tank(), SdoAbortError)
     found = with_entries(Tank(), LEVEL)
     assert [each.subindex for each in found.entries] == [0, 2]
@@ -62,7 +62,7 @@ def test_other_errors_are_raised():
         list(read_all(tank, SdoAbortError))
 
 
-def test_what_cannot_be_read_is_not():
+def test_unreadable_entries_are_skipped():
     tank = Tank()
     tank.known = (EntryInfo(0, "command", UINT, "w"), None, None)
     (command,) = read_all(tank)

@@ -39,7 +39,7 @@ def test_order():
     assert [step[1] for step in device.written if step[0] == 0x8000] == [1, 0]
 
 
-def test_what_is_there_is_left_alone():
+def test_load_leaves_equal_entries_unchanged():
     device = MemoryDevice(mixer())
     entries = [(0x1A00, 0, b"\1"), (0x1A00, 1, (0x60000120).to_bytes(4, "little"))]
     entries += [(0xD000, 7, bytes(4)), (0xF200, 1, b"\x02\0")]
@@ -48,7 +48,7 @@ def test_what_is_there_is_left_alone():
 
 
 @pytest.mark.parametrize("name", ["demo", "solar-line", "triggers"])
-def test_what_a_station_is_goes_into_a_blank_one(name):
+def test_dump_of_a_station_loads_into_a_blank_one(name):
     plant = load_plant(CONFIG / f"{name}.yaml").plant
     assert plant is not None
     bare = blank("spare", "udp://127.9.9.9", "127.9.9.9.2.1", 10_000).plant
@@ -69,7 +69,7 @@ def test_what_a_station_is_goes_into_a_blank_one(name):
         assert (got.frames, got.subscriptions) == (spec.frames, spec.subscriptions)
 
 
-def test_refusal_says_how_far_it_went():
+def test_load_refusal_names_the_written_entries():
     device = MemoryDevice(mixer())
     entries = [(0x6000, 9, bytes(4)), (0xD000, 8, bytes(2))]
     with pytest.raises(ControlError, match=r"0xD000:08: .*; 1 entry was written before"):

@@ -15,7 +15,7 @@ def test_names(text):
 
 
 @pytest.mark.parametrize("text", ["", "/", "mixer/", "/eap0", "a/b/c/d", "a//c"])
-def test_what_is_no_device(text):
+def test_invalid_target_is_refused(text):
     with pytest.raises(ValueError, match="is not STATION, STATION/PORT, STATION/PORT/SLAVE"):
         Target.parse(text)
 

@@ -88,7 +88,7 @@ def changed(octets: bytes, position: int, value: int) -> bytes:
         "ICMP",
     ],
 )
-def test_what_is_not_ours_yields_nothing(octets: bytes) -> None:
+def test_unwrap_of_other_packets_yields_nothing(octets: bytes) -> None:
     assert unwrap(octets) is None
 
 

@@ -145,14 +145,14 @@ def test_refusal_ends_it(plant, link, stub):
     ]
 
 
-def test_who_refused_is_not_asked_again(plant, link, stub):
+def test_refused_request_is_not_repeated(plant, link, stub):
     stub.refuses = lambda spec: spec.name == "station-02"
     order = steps_to(link, changed(plant, "station-01"))
     done = list(apply_steps(link, order, keep_going=True))
     assert [each.station for each in done] == ["station-02", "station-01"]
 
 
-def test_what_is_half_done_is_finished(plant, link, stub):
+def test_interrupted_change_is_finished(plant, link, stub):
     wanted = changed(plant, "station-01")
     half = iter(apply_steps(link, steps_to(link, wanted)))
     next(half)
@@ -162,7 +162,7 @@ def test_what_is_half_done_is_finished(plant, link, stub):
 
 
 @pytest.mark.parametrize("steps_done", [1, 2, 3])
-def test_what_is_half_done_is_taken_back(plant, link, stub, steps_done):
+def test_interrupted_change_is_undone(plant, link, stub, steps_done):
     half = iter(apply_steps(link, steps_to(link, changed(plant, "station-01"))))
     for _ in range(steps_done):
         next(half)
@@ -172,7 +172,7 @@ def test_what_is_half_done_is_taken_back(plant, link, stub, steps_done):
 
 
 @pytest.mark.parametrize("steps_done", [1, 2, 3])
-def test_what_was_finished_later_is_taken_back_with_what_began_it(plant, link, stub, steps_done):
+def test_rollback_undoes_an_interrupted_change_and_its_completion(plant, link, stub, steps_done):
     wanted = changed(plant, "station-01")
     half = iter(apply_steps(link, steps_to(link, wanted)))
     for _ in range(steps_done):
@@ -196,7 +196,7 @@ def test_only_the_last_change_is_taken_back(plant, link, stub):
 
 
 @pytest.mark.parametrize("steps_done", [1, 2, 3])
-def test_a_rollback_that_was_broken_off_goes_on_or_is_turned_round(plant, link, stub, steps_done):
+def test_interrupted_rollback_is_continued_or_undone(plant, link, stub, steps_done):
     before = {spec.name: spec for spec in plant.stations}
     wanted = changed(plant, "station-01")
     list(apply_steps(link, steps_to(link, wanted)))
@@ -227,7 +227,7 @@ def ruled(plant):
     return replace(plant, routing={**plant.routing, first: told})
 
 
-def test_routers_are_told_last_and_taken_back(ruled, stub, file):
+def test_routers_are_configured_last_and_rolled_back(ruled, stub, file):
     with link_to(ruled, file) as link:
         wanted = changed(ruled, "station-01")
         notes = [each.notes for each in plan_all(link, wanted)]
@@ -257,7 +257,7 @@ def test_a_change_of_a_router_alone_is_taken_back_alone(ruled, stub, file):
         assert stub.specs == wanted
 
 
-def test_a_router_is_not_told_when_a_station_refused(ruled, stub, file):
+def test_router_is_not_configured_when_a_station_refused(ruled, stub, file):
     stub.refuses = lambda spec: spec.name == NAMES[1]
     with link_to(ruled, file) as link:
         order = steps_to(link, changed(ruled, "station-01"))

@@ -36,7 +36,7 @@ def write(folder: Path, name: str = "level", count: int = 1) -> Path:
 
 
 @pytest.mark.parametrize("count", [1, 248])
-def test_what_fits_is_no_warning(tmp_path: Path, count: int) -> None:
+def test_plant_within_the_dictionary_has_no_warning(tmp_path: Path, count: int) -> None:
     report, _ = check_plant(write(tmp_path, count=count))
     assert (report.findings, report.warnings) == ((), ())
 
@@ -44,7 +44,9 @@ def test_what_fits_is_no_warning(tmp_path: Path, count: int) -> None:
 @pytest.mark.parametrize(
     ("more", "reason"), [({"count": 255}, "PD state"), ({"name": "n" * 256}, "255 bytes")]
 )
-def test_what_does_not_fit_is_said_with_its_line(tmp_path: Path, more: dict, reason: str) -> None:
+def test_dictionary_overflow_is_a_warning_with_line(
+    tmp_path: Path, more: dict, reason: str
+) -> None:
     path = write(tmp_path, **more)
     report, plant = check_plant(path)
     (warning,) = report.warnings

@@ -36,7 +36,7 @@ def run(script, size=SIZE):
 
 
 async def look(screen: Screen) -> str:
-    screen.app.look()
+    screen.app.fetch()
     return await screen.settle()
 
 
@@ -88,7 +88,7 @@ def test_keys_are_explained(stub, key, size):
     run(script, size)
 
 
-def test_cursor_tells_of_its_row(stub):
+def test_cursor_shows_the_details_of_its_row(stub):
     async def script(screen):
         shown = await screen.press("down")
         assert " added; down: connection refused\n" in shown
@@ -156,7 +156,7 @@ def test_filter(stub):
     run(script)
 
 
-def test_test_says_what_is_wrong_and_what_to_do(stub):
+def test_routes_test_shows_fault_and_remedy(stub):
     async def script(screen):
         shown = await screen.press("t")
         assert "island-01 to island-02" in shown
@@ -204,7 +204,7 @@ def test_route_is_added(stub, fake):
     assert (added.name, added.address, added.octets) == ("plc", "10.0.0.6", 4)
 
 
-def test_what_speaks_against_a_route_is_told(stub):
+def test_form_shows_the_reason_of_a_refused_route(stub):
     async def script(screen):
         await screen.press("a")
         await screen.write("shadow")
@@ -232,7 +232,7 @@ def test_added_route_is_changed_and_others_are_not(stub, fake):
     assert [row.name for row in fake.stations["island-01"].routes] == ["island-02", "press2"]
 
 
-def test_route_is_removed_when_that_is_wanted(stub, fake):
+def test_route_is_removed_after_a_confirmation(stub, fake):
     async def script(screen):
         shown = await screen.press("down", "d")
         assert "Remove route press (5.1.2.3.1.1, 192.168.1.5:48898 by ams-tcp)" in shown
@@ -277,7 +277,7 @@ def test_nothing_to_work_with(runtime):
     run(script)
 
 
-def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
+def test_view_reports_an_appliance_that_hangs(stub, fake, monkeypatch):
     answer, goes_on = fake.table()["routes_list"], Event()
 
     def hang(params):
@@ -288,8 +288,8 @@ def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
 
     async def script(screen):
         stub._methods["routes_list"] = hang
-        screen.app.look()
-        screen.app.look()
+        screen.app.fetch()
+        screen.app.fetch()
         await screen.pilot.pause()
         assert screen.text().startswith(" no answer for 0 s")
         goes_on.set()
@@ -299,7 +299,7 @@ def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
     run(script)
 
 
-def test_it_looks_by_itself(stub):
+def test_view_refreshes_periodically(stub):
     app = RoutesApp(RouterClient("line"), period_s=0.1)
 
     async def script(screen):

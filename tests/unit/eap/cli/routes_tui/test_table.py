@@ -23,7 +23,7 @@ def test_columns_are_as_wide_as_they_need_to_be() -> None:
     assert sum(found.values()) + len(found) <= 80
 
 
-def test_what_is_left_out_on_narrow_screens_comes_on_wide_ones() -> None:
+def test_wide_screens_show_columns_that_narrow_ones_omit() -> None:
     found = widths(View.ROUTES, 150)
     assert [*found][-3:] == ["Address", "Origin", "Last error"]
     assert found["Address"] == len("192.168.1.5:48898")
@@ -33,7 +33,7 @@ def test_what_is_left_out_on_narrow_screens_comes_on_wide_ones() -> None:
 
 @pytest.mark.parametrize("view", View)
 @pytest.mark.parametrize("width", [40, 72, 80, 100, 200])
-def test_long_texts_give_way_to_their_least(view: View, width: int) -> None:
+def test_long_texts_are_cut_to_their_minimum(view: View, width: int) -> None:
     names = msgspec.structs.replace(
         ISLAND, name="a name that is much too long", transport="ethernet:an-interface"
     )

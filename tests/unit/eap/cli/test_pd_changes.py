@@ -60,7 +60,7 @@ def test_skipped_cycles_between_json_lines_are_reported_once_and_at_the_end() ->
     assert all(b"skipped" not in msgspec.json.encode(line) for line in lines)
 
 
-def test_change_after_cycles_that_were_not_looked_at_says_so(appliance: Appliance) -> None:
+def test_change_after_skipped_cycles_has_their_number(appliance: Appliance) -> None:
     with ExitStack() as stack:
         stream = changes(stack, {"mixer": ["ticks"]}, period_ms=10, plant=None)
         assert not next(stream).skipped

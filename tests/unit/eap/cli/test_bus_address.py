@@ -78,13 +78,13 @@ def test_both_forms(words, shown):
         (("1001", "--interface", "eth0"), "is not an interface"),
     ],
 )
-def test_neither_or_both(words, reason):
+def test_bus_command_without_one_bus_is_refused(words, reason):
     result = invoke(*words)
     assert result.exit_code == 2
     assert reason in " ".join(result.output.split())
 
 
-def test_plant_goes_with_the_port():
+def test_bus_command_passes_the_plant_with_the_port():
     @click.command(cls=BusCommand)
     @bus_options
     def plant(bus):
