@@ -1,4 +1,4 @@
-"""What holds for every test: the hypothesis profile, who is skipped and why, and who runs alone.
+"""Common test set-up: the hypothesis profile, skipped tests with their reasons, quiet tests.
 
 Tests marked ``net`` open sockets and start processes, on fixed addresses; they come after all
 others.  Under xdist, where each file has one worker (``--dist loadfile``), every worker has a
@@ -49,7 +49,7 @@ sys.dont_write_bytecode = False
 os.environ.pop("COLUMNS", None)
 
 _CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_SYS_ADMIN": 21}
-"""What a network namespace with a veth pair and a raw socket takes: name to bit."""
+"""Capabilities for a network namespace with a veth pair and a raw socket: name to bit."""
 
 _CLONE_NEWNET = 0x40000000
 

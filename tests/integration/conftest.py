@@ -1,4 +1,4 @@
-"""What the tests of running appliances share."""
+"""Fixtures of the tests of running appliances."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def test_routers_of_a_network_find_each_other(appliance):
             missing.discard(tool.recvfrom(400)[1])
 
 
-def test_a_scan_tells_who_is_there(appliance):
+def test_scan_lists_the_stations(appliance):
     lines = appliance.command("routes", "scan", "open", "--wait", "300", "--json").splitlines()
     rows = {row["name"]: row for row in map(json.loads, lines)}
     assert rows["closed"] == {

@@ -122,7 +122,7 @@ def test_variables_are_read_and_written_by_name(appliance, tower) -> None:
     assert tower.get_symbol("level").read() == 12
 
 
-def test_each_symbol_is_told_with_type_and_comment(tower) -> None:
+def test_each_symbol_has_type_and_comment(tower) -> None:
     symbols = {symbol.name: symbol for symbol in tower.get_all_symbols()}
     assert (symbols["level"].symbol_type, symbols["level"].comment) == ("UDINT", "of the tank [mm]")
     assert symbols["curve"].symbol_type == "ARRAY [0..3] OF INT"
@@ -133,7 +133,7 @@ def test_each_symbol_is_told_with_type_and_comment(tower) -> None:
     wait_until(lambda: symbols["bus0.state"].read() == 8)
 
 
-def test_only_what_is_the_applications_is_written(appliance, tower) -> None:
+def test_only_variables_of_the_application_are_written(appliance, tower) -> None:
     assert refusal(lambda: tower.write_by_name("ticks", 1)) == AdsError.ACCESS
     results = tower.write_list_by_name({"level": 5, "bus0.state": 1, "open": False})
     denied = pyads.errorcodes.ERROR_CODES[AdsError.ACCESS]
@@ -151,7 +151,7 @@ def test_only_what_is_the_applications_is_written(appliance, tower) -> None:
     tower.write_by_name("level", 1)
 
 
-def test_every_cycle_is_told_with_its_own_time(told) -> None:
+def test_every_cycle_is_notified_with_its_own_time(told) -> None:
     ticks = told.of("ticks", pyads.PLCTYPE_UDINT, cycle_time=0, **CYCLIC)
     wait_until(lambda: len(ticks) > 400)
     values = [value for _, value in ticks]
@@ -161,7 +161,7 @@ def test_every_cycle_is_told_with_its_own_time(told) -> None:
     assert time.time() - ticks[-1][0] < 5
 
 
-def test_changes_and_slower_rhythms_are_told(tower, told) -> None:
+def test_changes_and_longer_cycle_times_are_notified(tower, told) -> None:
     tower.write_by_name("level", 100)
     changes = told.of("level", pyads.PLCTYPE_UDINT)
     slow = told.of("ticks", pyads.PLCTYPE_UDINT, cycle_time=100, **CYCLIC)

@@ -1,4 +1,4 @@
-"""What strangers send to a running station: all of it counted, and nothing disturbed by it."""
+"""Bad input to a running station: every frame is counted, and nothing else is disturbed."""
 
 from __future__ import annotations
 

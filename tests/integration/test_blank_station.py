@@ -135,7 +135,7 @@ def test_configured_by_downloads_alone(hall: Hall, tmp_path: Path) -> None:
     assert hall.command("od", "dump", "mixer").count("\n0x") == file.read_text().count("\n0x")
 
 
-def test_what_cannot_run_is_said(hall: Hall) -> None:
+def test_plant_that_cannot_run_is_reported(hall: Hall) -> None:
     hall.command("od", "write", "mixer", "0xD000:5", "true")
     refused = hall.run("state", "mixer", "SAFEOP")
     assert refused.returncode == 1
@@ -146,7 +146,7 @@ def test_what_cannot_run_is_said(hall: Hall) -> None:
     assert "0x1A00:01: object does not exist (0x06020000)" in refused.stderr
 
 
-def test_blank_is_blank_unless_told_otherwise(farm: Plants) -> None:
+def test_blank_station_is_blank_by_default(farm: Plants) -> None:
     runtime = farm.folder / "run"
     first = farm.start(None, *BLANK, runtime=runtime)
     first.wait_ready()

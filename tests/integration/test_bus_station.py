@@ -108,7 +108,7 @@ def both(works, verbs, port, *words):
 
 
 def usable(works):
-    """Whether both protocols of the drive work as ever."""
+    """True if both protocols of the drive work."""
     (row,) = ask(works, "sdo", "read", "press/bus1", "drive", "0x1018:1")
     assert row["value"] == 0xE5A
     return True
@@ -277,7 +277,7 @@ def test_engine_that_hangs_is_said_to(works):
     wait_until(lambda: works.station("press")["ports"][1]["link"] == "up")
 
 
-def test_engine_that_starts_again_fails_what_was_under_way(works, tmp_path):
+def test_restarted_engine_fails_the_requests_in_flight(works, tmp_path):
     large = tmp_path / "large.bin"
     large.write_bytes(bytes(4_000_000))
     writing = begin_writing(works, large)

@@ -172,7 +172,7 @@ def test_one_variable_more_in_one_pd(line: Line) -> None:
     assert_nothing_lost(before, line)
 
 
-def test_what_was_applied_survives_a_restart(line: Line) -> None:
+def test_applied_configuration_survives_a_restart(line: Line) -> None:
     line.file.write_text(new_text())
     line.command("apply")
     line.command("rollback")

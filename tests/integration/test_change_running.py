@@ -167,7 +167,7 @@ def test_an_engine_that_dies_right_after_a_change_runs_what_was_applied(plant: A
     assert spec_of(plant, "left") == spec
 
 
-def test_what_cannot_be_is_refused_and_the_old_keeps_running(plant: Appliance) -> None:
+def test_impossible_plant_is_refused_and_the_old_keeps_running(plant: Appliance) -> None:
     spec = spec_of(plant, "left")
     before = plant.rx("right", "state")
     eap0, bus0 = spec.ports
@@ -192,7 +192,7 @@ def test_what_cannot_be_is_refused_and_the_old_keeps_running(plant: Appliance) -
     assert troubles(plant.rx("right", "state")) == troubles(before)
 
 
-def test_states_are_requested_while_it_runs(plant: Appliance) -> None:
+def test_states_are_requested_of_a_running_bus(plant: Appliance) -> None:
     def go(state: str) -> None:
         assert plant.request("request_state", target="right", state=state)["state"] == state
 

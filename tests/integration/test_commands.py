@@ -155,7 +155,7 @@ def test_status_for_people_fits(
     assert all(name in done.stdout for name in ISLANDS)
 
 
-def test_two_appliances_are_one_answer_and_end_when_told() -> None:
+def test_two_appliances_are_one_answer_and_end_on_request() -> None:
     """Two halves of a plant share a runtime directory, as two commands of one user do."""
     with plants() as folder:
         plant = folder.write(HALVES)

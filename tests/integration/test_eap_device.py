@@ -115,7 +115,7 @@ def with_version(spec: dict, version: int) -> dict:
     return spec
 
 
-def test_aoe_reads_what_runs(appliance: Appliance, left: UdpClient) -> None:
+def test_aoe_reads_the_running_configuration(appliance: Appliance, left: UdpClient) -> None:
     assert left.read(0x1000).data == struct.pack("<HH", 5001, 1000)
     assert left.read(0xF920, 1).data == aoe.net_id(f"{LEFT}.2.1")
     assert left.read(0xD000, Tx.NAME).data == b"state"
@@ -180,7 +180,7 @@ def test_configuration_by_aoe_comes_into_force(appliance: Appliance, left: UdpCl
 
 
 def test_both_ways_and_many_clients_at_a_time(appliance: Appliance) -> None:
-    """Whoever asks gets its own answers; downloads of one are seen by the others."""
+    """Each client gets its own answers; downloads of one are seen by the others."""
     wrong: list[object] = []
 
     def read(number: int) -> None:

@@ -86,7 +86,7 @@ def test_each_station_answers_for_itself(tool: Tool) -> None:
     assert tool.hears_nothing()
 
 
-def test_stranger_is_told_once_and_only_if_it_asked_one(tool: Tool) -> None:
+def test_stranger_gets_one_error_and_only_for_a_request(tool: Tool) -> None:
     question = aoe.read_body(0xF920 << 16 | 1)
     tool.ask(NOBODY, question)
     assert tool.hear().error == 7

@@ -95,7 +95,7 @@ def lines(disk: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (disk / "disk" / "audit.jsonl").read_text().splitlines()]
 
 
-def test_changes_on_a_full_disk_are_made_counted_and_told(farm: Plants, disk: Path) -> None:
+def test_changes_on_a_full_disk_are_made_counted_and_reported(farm: Plants, disk: Path) -> None:
     appliance = start(farm, "")
     with AmsClient(STATION, socket.socket()) as client:
         assert write(client, 1) == 0
@@ -161,7 +161,7 @@ create_image(pathlib.Path(sys.argv[1]), plan_layout(StationSpec("a", "1.1.1.1.1.
 """
 
 
-def test_process_image_on_a_full_disk_is_refused_and_kills_nobody(disk: Path) -> None:
+def test_process_image_on_a_full_disk_is_refused_without_a_crash(disk: Path) -> None:
     fill(disk)
     command = [sys.executable, "-c", MAKES_AN_IMAGE, str(disk / "a.image")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

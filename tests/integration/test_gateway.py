@@ -144,7 +144,7 @@ def test_writing_to_all_needs_a_rule(gateway: Wire) -> None:
     assert [gateway.receive()[8:] for _ in range(5)] == [denied] * 5
 
 
-def test_who_is_not_there_and_who_says_nothing(gateway: Wire) -> None:
+def test_missing_host_and_silent_host_differ(gateway: Wire) -> None:
     assert gateway.talk(COE, 1777, VENDOR) == abort(0x1018, 1, NO_OBJECT)
     assert gateway.talk(COE, COUPLER, VENDOR) == abort(0x1018, 1, LOCAL)
     for _ in range(2):
@@ -206,7 +206,7 @@ def test_a_stream_of_something_else_is_closed(plant: Appliance, octets: str) -> 
             tcp.receive()
 
 
-def test_a_reader_that_takes_nothing_hinders_nobody(plant: Appliance) -> None:
+def test_reader_that_takes_nothing_delays_no_other(plant: Appliance) -> None:
     names = bytes.fromhex("0080 01 00 0000 0100")
     requests = b"".join(frame(COE, 0, names, counter) for counter in range(8)) * 50
     with wire(HOST, tcp=True) as lazy, wire(HOST) as other:
@@ -292,5 +292,5 @@ def test_a_step_that_is_repeated_gets_the_same_reply(plant: Appliance) -> None:
         udp.send(frame(COE, SENSOR, bytes.fromhex("0020 80 0180 00 00000008")))
 
 
-def test_what_aoe_says_of_a_message_that_is_none(gateway: Wire) -> None:
+def test_aoe_message_that_is_none_gets_an_error(gateway: Wire) -> None:
     assert gateway.talk(AOE, DRIVE, b"short")[0] in {ERR, AOE}

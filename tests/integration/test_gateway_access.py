@@ -1,4 +1,4 @@
-"""Who is on a cable reads by the gateway, and changes nothing without a rule."""
+"""Hosts on the cable read through the gateway, and change nothing without a rule."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def refused(client: Wire, kind: int, address: int, body: str) -> str:
 
 
 @pytest.mark.parametrize("kind", [socket.SOCK_DGRAM, socket.SOCK_STREAM])
-def test_others_read_and_one_writes_what_a_rule_opens(there: Namespace, kind: int) -> None:
+def test_others_read_and_one_writes_as_a_rule_allows(there: Namespace, kind: int) -> None:
     clients = {}
     with there.socket(socket.AF_INET, kind) as first, there.socket(socket.AF_INET, kind) as second:
         for name, sock in ((TOOL, first), (OTHER, second)):

@@ -137,7 +137,7 @@ def test_two_clients_at_once(mill: Appliance, press: Appliance) -> None:
     assert found == [*contents.values(), *contents.values()]
 
 
-def test_what_the_slave_refuses_has_words(mill: Appliance, press: Appliance) -> None:
+def test_refusal_of_the_slave_has_a_text(mill: Appliance, press: Appliance) -> None:
     with client() as far:
         with pytest.raises(FoeError) as missing:
             far.foe_read(VIRTUAL, "none.bin")

@@ -118,7 +118,7 @@ def memory_kib(appliance: Appliance) -> int:
 
 
 @pytest.mark.timeout(REQUESTS // 200 + 120)
-def test_after_all_of_it_everything_works() -> None:
+def test_station_works_after_all_bad_input() -> None:
     with gateway_plant(HOST) as appliance:
         pids = [appliance.pid(name) for name in ("engine", "services", "supervisor")]
         before, crowd = 0, Crowd(random.Random(86))

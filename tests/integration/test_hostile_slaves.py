@@ -86,7 +86,7 @@ def line() -> Paced:
 
 
 class Case(NamedTuple):
-    """What is asked, what the slave says to it, and how that ends."""
+    """One case: the request, the slave's reply, and the expected result."""
 
     kind: MailboxType
     ask: Callable[[MailboxSizes], Conversation]
@@ -335,7 +335,7 @@ EEPROMS = {
     "PDO without its entries": ("3200 0400 001a ff 03 0000 0000 ffff", "SiiPdoEntry"),
     "cut general category": ("1e00 0100 0000 ffff", "SiiGeneral"),
 }
-"""What stands in the place of the categories, and what is said of it."""
+"""Content in place of the EEPROM categories, and the message about it."""
 
 
 def tamper(line: Paced, text: str) -> bytes:
@@ -368,7 +368,7 @@ def test_a_mailbox_that_lies_over_the_registers_is_no_mailbox(line: Paced) -> No
         line.wait(line.core.bring_up(line.now_ns))
 
 
-def test_a_slave_that_returns_with_an_eeprom_that_lies_disturbs_nobody(line: Paced) -> None:
+def test_slave_back_with_a_false_eeprom_disturbs_no_other(line: Paced) -> None:
     line.segment.switch(1, on=False)
     line.elapse(300 * MS)
     line.events()

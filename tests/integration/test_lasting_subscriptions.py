@@ -29,7 +29,7 @@ IS_LONG = bool(os.environ.get("EAP_LONG"))
 SUBSCRIPTIONS = 20
 RECOVERY_S = 5.0
 PATIENCE_S = 60.0
-"""How long a test waits for what the figures are about: a loaded machine is late, not wrong."""
+"""Time limit of a test for the measured event: a loaded machine is late, not wrong."""
 RUNS_US = 500_000
 """A station whose latest cycle is not older runs."""
 FIRST, MIDDLE, EAST, LAST = "10.77.1.1", "10.77.1.2", "10.77.2.1", "10.77.2.2"

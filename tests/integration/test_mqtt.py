@@ -182,7 +182,7 @@ def test_flood_leaves_memory_and_engine_alone(halls):
     until_read(SOUTH, by=NORTH)
 
 
-def test_one_way_hall_asks_and_is_not_asked(server, halls):
+def test_one_way_hall_sends_requests_and_gets_none(server, halls):
     with plants() as farm:
         line = f'mqtt: "mqtt://{BROKER}", unidirectional: true'
         farm.run(write_plant(farm.folder, "office", "127.0.5.3", line))

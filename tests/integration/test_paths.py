@@ -197,7 +197,7 @@ def test_an_untagged_port_takes_priority_tags_and_counts_vlans(farm: Plants) -> 
 
 
 def test_two_ports_of_one_station(farm: Plants) -> None:
-    """What arrives at one port goes out at the other; the same PD id at both is no conflict."""
+    """PDs that arrive at one port leave by the other; the same PD id at both is no conflict."""
     gateway = """\
   - name: gateway
     net_id: 10.9.7.5.1.1
@@ -272,7 +272,7 @@ def test_tcp_connects_in_either_order_and_again(farm: Plants, first: str) -> Non
     assert source.status()["processes"]["engine"]["restarts"] == 0
 
 
-def test_a_slow_tcp_peer_loses_whole_frames_and_delays_nobody(farm: Plants) -> None:
+def test_slow_tcp_peer_loses_whole_frames_and_delays_no_other(farm: Plants) -> None:
     both = sender("tcp://127.9.7.2").replace(
         "    publish:\n",
         "      - {name: fast, port: eap0, to: 127.9.7.3}\n"

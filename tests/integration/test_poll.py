@@ -47,7 +47,7 @@ def over(*, desk: str, mill: str, lathe: str, to: str) -> str:
 
 
 class Sample(NamedTuple):
-    """What the client says of a subscription, in the cycle that took an answer."""
+    """State of a subscription at the client, in the cycle that received an answer."""
 
     name: str
     cycle_index: int

@@ -244,7 +244,7 @@ def test_a_killed_supervisor_takes_all_along_and_the_next_start_succeeds(
     assert again.stop()[0] == 0
 
 
-def test_an_interrupt_ends_it_too(appliance: Appliance) -> None:
+def test_interrupt_ends_the_command(appliance: Appliance) -> None:
     appliance.process.send_signal(signal.SIGINT)
     assert appliance.finish(timeout_s=2 * slowness())[0] == 0
 
@@ -339,7 +339,7 @@ def test_a_wrong_plant_starts_nothing(alone: Plants) -> None:
     assert not refused.runtime.exists()
 
 
-def test_a_client_of_a_dead_appliance_is_told(appliance: Appliance) -> None:
+def test_client_of_a_dead_appliance_gets_an_error(appliance: Appliance) -> None:
     (client,) = connect()
     appliance.process.kill()
     appliance.process.wait()

@@ -1,4 +1,4 @@
-"""What a machine or a file lacks is said in one line, with exit code 2 and nothing half-started."""
+"""Missing rights, files or programs: one line, exit code 2, nothing half-started."""
 
 from __future__ import annotations
 

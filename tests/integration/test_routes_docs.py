@@ -19,7 +19,7 @@ pytestmark = pytest.mark.net
 PAGE = (ROOT / "docs" / "routes.md").read_text()
 BLOCK = re.compile(r"```(xml|console|text)\n(.*?)```", re.DOTALL)
 KEYS = [("down", "t", "escape"), ("down", "down", "t")]
-"""What is pressed before each screen of the page."""
+"""Keys pressed before each screen of the page."""
 
 
 def outline(text: str) -> str:

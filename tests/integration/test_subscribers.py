@@ -1,4 +1,4 @@
-"""Whether a subscriber is there, and frames to a NetID: on the loopback and between namespaces."""
+"""Presence of subscribers, and frames to a NetID: on the loopback and between namespaces."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_an_answer_from_another_interface_is_no_subscriber(farm: Plants) -> None
 
 
 @pytest.mark.root
-def test_a_killed_engine_sends_on_to_the_address_that_it_learned(farm: Plants) -> None:
+def test_killed_engine_sends_on_to_the_learned_address(farm: Plants) -> None:
     text = pair("to: right/eap0", "to: multicast", ("ethernet://line0", "ethernet://line0"))
     path = farm.write(text)
     with cable() as (here, there):

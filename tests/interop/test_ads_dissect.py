@@ -26,7 +26,7 @@ def frame(packet: bytes) -> bytes:
 
 
 def ams_fields(path, packets: list[bytes]) -> list[dict[str, str]]:
-    """What tshark calls the fields of each packet, flat."""
+    """Fields of each packet by tshark's names, flat."""
     return [
         dict(flat(seen["layers"]["ams"])) for seen in dissect(write_pcap(path, map(frame, packets)))
     ]

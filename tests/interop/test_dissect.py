@@ -122,7 +122,7 @@ def by_scapy(octets: bytes) -> dict[str, Any]:
 
 
 def common(fields: dict[str, Any]) -> dict[str, Any]:
-    """What all three know of a mailbox message by itself."""
+    """Fields of a mailbox message that all three decoders know."""
     names = ("length", "address", "channel", "priority", "type", "counter", "data")
     return {name: fields["mailbox"][name] for name in names}
 
@@ -140,7 +140,7 @@ def test_scapy_reads_mailboxes_like_us(wrap: Callable) -> None:
     assert read == [common(ours(frame)) for frame in frames]
 
 
-def test_scapy_builds_the_octets_it_read() -> None:
+def test_scapy_builds_the_bytes_it_read() -> None:
     for frame in pd_frames() + mailbox_frames():
         layers = EtherCatFrame(frame)
         for layer in (EtherCatFrame, Mailbox):
@@ -206,7 +206,7 @@ def test_tshark_reads_datagrams_like_us(tmp_path: Path) -> None:
 
 
 @needs_tshark
-def test_tshark_marks_what_we_refuse(tmp_path: Path) -> None:
+def test_tshark_marks_the_frames_that_we_refuse(tmp_path: Path) -> None:
     good = encode_frame(PdFrameHeader(NetId(bytes(6)), 0, 0), [(PdHeader(1, 0, 0), b"abcd")])
     too_many = bytearray(good)
     too_many[8] = 2

@@ -141,7 +141,7 @@ def farm() -> Iterator[Plants]:
 
 
 @pytest.mark.parametrize("name", WAYS)
-def test_tshark_sees_what_appliances_send(name: str, farm: Plants, tmp_path: Path) -> None:
+def test_tshark_decodes_the_frames_of_appliances(name: str, farm: Plants, tmp_path: Path) -> None:
     way, path = WAYS[name], tmp_path / "live.pcap"
     if way.needs_cable:
         with cable(addresses=True) as ends:

@@ -228,7 +228,7 @@ def test_clocks_and_sync0(master):
 
 
 def difference_ns(slave):
-    """How far a clock is from the reference, as the slave says."""
+    """Difference of a slave's clock from the reference clock, as the slave reports it."""
     value = int.from_bytes(slave._fprd(0x092C, 4), "little")
     return value & 0x7FFF_FFFF
 

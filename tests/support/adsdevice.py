@@ -65,7 +65,7 @@ def variables(store: DictStore) -> list[SymbolVariable]:
 
 
 class Station:
-    """What an AL state machine and a system service would stand for."""
+    """Stand-in for an AL state machine and a system service."""
 
     def __init__(self) -> None:
         self.al_state = OP

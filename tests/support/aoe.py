@@ -18,7 +18,7 @@ CLIENT = "192.168.9.9.1.1"
 
 
 class Answer(NamedTuple):
-    """What came back."""
+    """Reply to a request."""
 
     error: int
     """Of the AMS header."""

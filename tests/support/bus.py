@@ -16,7 +16,7 @@ STATION = 0x3E9
 
 
 class Answer(NamedTuple):
-    """What came back."""
+    """Reply to a request."""
 
     data: bytes
     wkc: int

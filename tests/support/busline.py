@@ -29,11 +29,11 @@ from devicebus.wire.datagram import (
 US = 1_000
 MS = 1_000_000
 TRIP_NS = 20 * US
-"""How long a frame is under way."""
+"""Travel time of a frame."""
 
 
 class Core(Protocol):
-    """What is driven: a master, or a link with a runner."""
+    """The driven object: a master, or a link with a runner."""
 
     def frames_to_send(self, now_ns: int) -> list[bytes]: ...
     def receive_frame(self, data: bytes, now_ns: int) -> None: ...
@@ -122,7 +122,7 @@ def run(line: Line, procedure: Procedure):
 
 
 def answer(frame: bytes, *, wkc: int = 1, data: bytes | None = None) -> bytes:
-    """What comes back of a frame from slaves that put *data* into each datagram."""
+    """Return a frame as slaves send it back that put *data* into each datagram."""
     return encode_frame(
         [
             Datagram(header, (data or bytes(there))[: len(there)].ljust(len(there), b"\0"), wkc)
@@ -132,7 +132,7 @@ def answer(frame: bytes, *, wkc: int = 1, data: bytes | None = None) -> bytes:
 
 
 def accesses_of(frame: bytes) -> list[DatagramRequest]:
-    """What a frame asks for."""
+    """Datagrams of a frame."""
     return [
         DatagramRequest(header.command, header.adp, header.ado, bytes(data))
         for header, data, _ in iter_datagrams(frame)

@@ -127,7 +127,7 @@ class Receiver:
         return self.image.words[first + word]
 
     def discarded(self, name: str | None = None) -> dict[str, int]:
-        """What the station, or one subscription, refused, by reason."""
+        """Counters of PDs that the station, or one subscription, refused, by reason."""
         first = StationWord.DISCARDED
         if name is not None:
             first = self.slot(name).words + RxWord.DISCARDED

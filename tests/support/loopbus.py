@@ -63,7 +63,7 @@ class LoopBus:
 
 
 class LoopPort:
-    """What a bus port is, without a network; it always looks readable, so that nobody waits."""
+    """Bus port without a network; it always looks readable, so that no reader waits."""
 
     def __init__(self, bus: LoopBus) -> None:
         self._bus = bus

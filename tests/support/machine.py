@@ -1,4 +1,4 @@
-"""How busy this machine is: limits on what starts a process are stretched by that, not by more."""
+"""Load of this machine: time limits of process starts are stretched by it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import time
 
 USUAL_START_S = 0.3
-"""What the start of an engine's interpreter takes on a machine that has nothing else to do."""
+"""Time to start an engine's interpreter on an idle machine."""
 
 
 def slowness() -> float:

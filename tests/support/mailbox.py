@@ -32,7 +32,7 @@ STEP_NS = 1_000_000
 
 
 class Fault(Enum):
-    """What happens to one message."""
+    """Fate of one message."""
 
     NONE = auto()
     LOST = auto()

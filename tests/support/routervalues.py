@@ -1,4 +1,4 @@
-"""What the dictionary of a router shows, without a router."""
+"""Values of a router's dictionary, without a router."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def load(stem: str) -> tuple[Vector, ...]:
 
 
 def read_yaml(stem: str) -> dict:
-    """What the file ``STEM.yaml`` holds; the loader in Python takes seconds for the longest."""
+    """Return the content of ``STEM.yaml``; the loader in Python takes seconds for the longest."""
     return yaml.load((FOLDER / f"{stem}.yaml").read_text(), Loader=yaml.CSafeLoader)
 
 

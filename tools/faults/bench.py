@@ -68,7 +68,7 @@ class Bench:
 
     @property
     def is_well(self) -> bool:
-        """Whether every slave is in OP, and the master knows it and exchanges its process data."""
+        """True if every slave is in OP, known to the master and exchanging process data."""
         return (
             all(slave.state is AlState.OP for slave in self.segment.segment.slaves)
             and all(unit.missing_since_ns is None for unit in self.master.slaves.values())

@@ -1,4 +1,4 @@
-"""What is said of ADS reads, hops and crowds."""
+"""Figures of ADS reads, hops and many clients."""
 
 from __future__ import annotations
 

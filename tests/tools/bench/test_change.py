@@ -1,4 +1,4 @@
-"""What the benchmark of changes makes of what it measured."""
+"""Figures of plant changes."""
 
 from __future__ import annotations
 

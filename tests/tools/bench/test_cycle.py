@@ -1,4 +1,4 @@
-"""What is said of a run of cycles, and what may not happen in one."""
+"""Figures of a run of cycles, and faults that end it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of files that go through stations."""
+"""Figures of files that pass stations."""
 
 from __future__ import annotations
 

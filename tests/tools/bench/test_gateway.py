@@ -1,4 +1,4 @@
-"""What is said of a gateway's reads, clients and files."""
+"""Figures of a gateway's reads, clients and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is read from cyclictest, and how windows are cut."""
+"""Results of cyclictest, and windows of lateness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of a bus in a running plant."""
+"""Figures of a bus in a running plant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of the cycles that answers took."""
+"""Figures of the cycles from poll request to answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/faults.md says is what happens."""
+"""Each fault of docs/faults.md against a running bus."""
 
 from __future__ import annotations
 

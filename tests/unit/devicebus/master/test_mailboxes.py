@@ -310,7 +310,7 @@ def test_a_conversation_may_wait_send_without_reply_and_listen(line, box):
 
 
 def test_mailbox_fragments_are_stored_for_the_listener(line, box):
-    """Who asks from another process listens a while after the slave has sent the rest."""
+    """A client in another process still listens after the slave has sent the rest."""
 
     def ask(request, **options):
         return (yield MailboxRequest(MailboxType.COE, request, **options)).data

@@ -1,4 +1,4 @@
-"""What a device shows to the state machine of its slave."""
+"""Interface of a device to the state machine of its slave."""
 
 from __future__ import annotations
 

@@ -259,7 +259,7 @@ def test_capture_replays_with_the_same_working_counters(name):
     ("ado", "size"), [(0x0120, 2), (0x0010, 2), (0x080D, 2), (0x0805, 1), (0x0300, 8), (0x0110, 2)]
 )
 def test_captured_data_of_a_lan9252(ado, size):
-    """What the capture's slave answered, its station address and wiring given."""
+    """Return the answer of the capture's slave, with its station address and wiring."""
     escs = [Esc(IMAGE, EscSettings(type=0xC0, revision=2, fmmus=3, sync_managers=4))]
     escs[0].set_dl_status(0x5617)
     chain = Chain(escs)

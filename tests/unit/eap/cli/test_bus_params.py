@@ -1,4 +1,4 @@
-"""How things on a bus are written on a command line."""
+"""Notation of bus parameters on the command line."""
 
 from __future__ import annotations
 

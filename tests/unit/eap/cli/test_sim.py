@@ -16,7 +16,7 @@ COE = Path(__file__).parents[4] / "config" / "buses" / "coe.yaml"
 
 @pytest.fixture
 def runs(monkeypatch):
-    """What would run, instead of running it."""
+    """Record the segment that would run, instead of running it."""
     found = []
 
     def pretend(bus, interface, say, *, second, command_fd):

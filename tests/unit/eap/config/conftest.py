@@ -52,7 +52,7 @@ BUS = ExpectedBus(
         ),
     )
 )
-"""What a file called line.yaml tells in the tests."""
+"""Content of line.yaml in the tests."""
 
 
 def describe(path):

@@ -271,7 +271,7 @@ class DeviceMachine(RuleBasedStateMachine):
 
     @rule()
     def write_it_all_again(self) -> None:
-        """What differs from nothing makes another dictionary that runs the same."""
+        """An empty difference makes another dictionary that runs the same."""
         others = empty()
         for name, each in others.items():
             for change in compare(each, self.ports[name]):

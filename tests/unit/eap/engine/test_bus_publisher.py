@@ -15,7 +15,7 @@ from tests.support.enginebus import BusRig
 
 
 class Receiver:
-    """What services has understood."""
+    """Reports that services has decoded."""
 
     def __init__(self) -> None:
         self.messages: list[BusChange] = []

@@ -127,7 +127,7 @@ def test_report_other_product_in_place_of_a_slave_has_no_state(tmp_path):
 
 
 def findings(rig):
-    """What `status` says of the bus, and what `bus diag` says is over."""
+    """Text of `status` on the bus, and the past findings of `bus diag`."""
     report = report_bus(rig.bus, rig.now_ns)
     return [each.what for each in report_findings(report)], history_of(report)
 

@@ -24,7 +24,7 @@ def rig(tmp_path):
 
 
 def entry(rig, position, index=0x7000, subindex=1):
-    """What a slave has of an output."""
+    """Return an output as the slave has it."""
     return rig.wire.segment.segment.slaves[position].device.dictionary.entry(index, subindex).value
 
 

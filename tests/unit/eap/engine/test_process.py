@@ -136,7 +136,7 @@ def test_an_orphan_does_not_start(tmp_path):
 
 
 class Circle:
-    """What only the garbage collector finds."""
+    """Reference cycle that only the garbage collector finds."""
 
     def __init__(self):
         self.me = self

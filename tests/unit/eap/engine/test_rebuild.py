@@ -302,7 +302,7 @@ def place(tmp_path):
 
 
 def test_nothing_that_is_written_at_the_moment_is_lost(place, tmp_path):
-    """Who writes while the image is replaced finds it retired, or is carried over."""
+    """A writer during the replacement finds the image retired, or is carried over."""
     engine = Engine([place.station])
     engine.start(0)
     engine.handle_timeout(10 * MS)

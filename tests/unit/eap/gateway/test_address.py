@@ -1,4 +1,4 @@
-"""Whom addresses mean."""
+"""Addresses of the gateway: master, slave, remote slave, group."""
 
 from __future__ import annotations
 

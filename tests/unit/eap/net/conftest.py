@@ -1,4 +1,4 @@
-"""What the tests of several drivers share."""
+"""Fixtures of the tests of several drivers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the kernel says about interfaces."""
+"""Interfaces as the kernel reports them."""
 
 from __future__ import annotations
 

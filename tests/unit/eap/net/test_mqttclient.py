@@ -1,4 +1,4 @@
-"""What is added to aiomqtt: bounded memory and time, and reasons in words."""
+"""MQTT client beyond aiomqtt: bounded memory and time, and reasons in words."""
 
 from __future__ import annotations
 

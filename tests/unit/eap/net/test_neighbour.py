@@ -103,7 +103,7 @@ OTHER = IPv4Address("10.77.0.3")
 
 
 class Host:
-    """Whoever is at the other end of the cable."""
+    """Host at the other end of the cable."""
 
     def __init__(self, interface):
         self.sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(0x0003))

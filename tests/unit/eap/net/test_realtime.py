@@ -1,4 +1,4 @@
-"""What a process may become, asked of real processes: the test's own must stay as it is."""
+"""Real-time settings of processes, tried on real ones: the test's own must stay as it is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a bus tells about its slaves."""
+"""Information of a bus about its slaves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole dictionaries written in the order that a device needs."""
+"""Dictionaries, written whole in the order that a device needs."""
 
 from __future__ import annotations
 

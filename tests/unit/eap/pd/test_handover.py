@@ -1,4 +1,4 @@
-"""What a station that is configured anew keeps: counters, trackers, values, addresses, triggers."""
+"""State kept by a reconfigured station: counters, trackers, values, addresses, triggers."""
 
 from __future__ import annotations
 

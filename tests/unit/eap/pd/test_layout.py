@@ -271,7 +271,7 @@ variables = st.lists(st.sampled_from(ALTERNATE_TYPES), min_size=1, max_size=8)
 
 @st.composite
 def layouts(draw: st.DrawFn) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
-    """What an RxPD has, and what an alternate of it brings, by name and type."""
+    """Variables of an RxPD, and of an alternate, by name and type."""
     own = [(f"v{number}", kind) for number, kind in enumerate(draw(variables))]
     kept = draw(st.sets(st.sampled_from(own)))
     others = [("", kind) for kind in draw(st.lists(st.sampled_from(ALTERNATE_TYPES), max_size=4))]

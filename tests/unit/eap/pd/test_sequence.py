@@ -1,4 +1,4 @@
-"""What the counters say about a sender, one frame at a time."""
+"""Sequence counters of a sender, one frame at a time."""
 
 from __future__ import annotations
 

@@ -351,7 +351,7 @@ def test_a_row_is_refused_at_load_or_sends_for_its_reasons(row, tmp_path):
 
 
 def predicted(given: dict[str, bool]) -> dict[int, str]:
-    """What the text above the table says of the script in the test: event before 15, changes
+    """The text above the table, applied to the script in the test: event before 15, changes
     before 1, 15 and 25."""
     sent: dict[int, str] = {}
     waiting_event = changed = False

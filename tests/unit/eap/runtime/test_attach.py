@@ -92,7 +92,7 @@ class Runner:
 
     @property
     def station(self) -> Station:
-        """What it runs."""
+        """Plant that it runs."""
         return self._place.station
 
     def pause(self) -> None:

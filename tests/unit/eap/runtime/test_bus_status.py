@@ -1,4 +1,4 @@
-"""What status says of bus ports."""
+"""Bus ports in ``status``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a child is handed crosses as it is."""
+"""Handover to a child process: everything arrives unchanged."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def changed(spec, comment: str = "changed"):
 
 
 def configured(spec, *, state: DeviceState = DeviceState.OP) -> Stored:
-    """What is stored of a station of the plant file after it was changed."""
+    """Return the stored configuration of a station after a change."""
     return Stored(base=digest_of(spec), spec=changed(spec), objects={"eap0": 1}, state=state)
 
 

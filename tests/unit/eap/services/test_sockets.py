@@ -1,4 +1,4 @@
-"""What services takes from the sockets of an appliance: UDP, multicast, TCP."""
+"""Packets from the sockets of an appliance: UDP, multicast, TCP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the ADS services of a station have in common."""
+"""Common behaviour of the ADS services of a station."""
 
 from __future__ import annotations
 

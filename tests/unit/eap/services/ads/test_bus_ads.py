@@ -1,4 +1,4 @@
-"""Who answers behind the NetID of a bus port: master and slaves, judged and in time."""
+"""ADS behind the NetID of a bus port: master and slaves, authorized and in time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ADS clients reach at the NetID of an EAP port."""
+"""ADS at the NetID of an EAP port."""
 
 from __future__ import annotations
 

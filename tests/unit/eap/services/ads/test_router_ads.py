@@ -1,4 +1,4 @@
-"""What ADS clients reach at the NetID of a station."""
+"""ADS at the NetID of a station."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the dictionary of a router shows."""
+"""Values of a router's dictionary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is told of requests by the control socket."""
+"""Audit of requests by the control socket."""
 
 from __future__ import annotations
 

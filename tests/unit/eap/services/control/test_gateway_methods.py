@@ -1,4 +1,4 @@
-"""What the control protocol can be asked of gateways."""
+"""Control methods of gateways."""
 
 from __future__ import annotations
 

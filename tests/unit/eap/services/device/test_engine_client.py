@@ -1,4 +1,4 @@
-"""What services asks of an engine, with an engine that the test answers for."""
+"""Requests of services to an engine, which the test answers."""
 
 from __future__ import annotations
 

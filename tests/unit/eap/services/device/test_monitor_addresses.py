@@ -1,4 +1,4 @@
-"""What UDP sockets of the test tell of their targets, and which ways a handover opens."""
+"""Reports of UDP sockets on their targets, and the addresses that a handover opens."""
 
 from __future__ import annotations
 

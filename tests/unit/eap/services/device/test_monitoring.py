@@ -207,7 +207,7 @@ def test_errors_are_taken_as_they_come(endpoint, closed):
 
 
 class Host:
-    """Whoever is at the other end of a cable, and answers for one address or not."""
+    """Host at the other end of a cable that answers for one address or not."""
 
     def __init__(self, interface: str) -> None:
         self.sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE_ARP))

@@ -1,4 +1,4 @@
-"""What runs and what is kept change together."""
+"""Running and stored configuration change together."""
 
 from __future__ import annotations
 

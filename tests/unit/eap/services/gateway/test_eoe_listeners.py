@@ -1,4 +1,4 @@
-"""Who hears a slave's Ethernet frames."""
+"""Listeners to a slave's Ethernet frames."""
 
 from __future__ import annotations
 

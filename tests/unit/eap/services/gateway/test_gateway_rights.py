@@ -1,4 +1,4 @@
-"""Who may do what through the gateway, and what the audit says of it."""
+"""Access rights through the gateway, and their audit."""
 
 from __future__ import annotations
 

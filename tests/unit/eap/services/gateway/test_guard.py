@@ -1,4 +1,4 @@
-"""Who may do what, and what the audit is told of it."""
+"""Access decisions, and their audit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a station asks itself, and others by its routes."""
+"""Requests of a station to itself, and to others by its routes."""
 
 from __future__ import annotations
 

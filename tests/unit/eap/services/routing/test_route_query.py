@@ -22,7 +22,7 @@ G = IndexGroup
 
 
 class Rest:
-    """What stands behind: it says that it was asked."""
+    """Service behind: it records that it was called."""
 
     ports = frozenset((10_000,))
 

@@ -1,4 +1,4 @@
-"""What goes to the other station for a file, and when; packets are in test_file_codec.py."""
+"""Requests to the other station for a file, in order; packets are in test_file_codec.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of a connection is under way."""
+"""Requests in flight of a connection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose a packet is that comes by a socket of several stations."""
+"""Station of a packet that arrives by a socket of several stations."""
 
 from __future__ import annotations
 
