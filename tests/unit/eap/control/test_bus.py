@@ -58,7 +58,7 @@ def test_datagrams_and_replies():
     assert to_replies([reply_row(each) for each in replies]) == replies
 
 
-def test_what_is_none():
+def test_kind_of_an_unknown_protocol_is_refused():
     with pytest.raises(ControlError, match="99 is no command"):
         to_datagram((99, 0, 0, "", 1))
     with pytest.raises(ControlError, match="'xy' is not pairs"):

@@ -39,7 +39,7 @@ def test_a_request_crosses():
         (b'{"v":2,"id":1,"method":"hello"}\n', ErrorCode.VERSION),
     ],
 )
-def test_what_is_no_request_is_refused_with_a_code(line, code):
+def test_decode_request_malformed_line_has_an_error_code(line, code):
     with pytest.raises(ControlError) as caught:
         control.decode_request(line)
     assert caught.value.code == code
@@ -87,7 +87,7 @@ def test_a_station_that_is_not_here_is_refused_with_the_nearest_name():
     assert caught.value.code is ErrorCode.UNKNOWN_NAME
 
 
-def test_what_this_machine_cannot_do_is_unavailable():
+def test_unless_unavailable_converts_environmental_errors():
     with pytest.raises(ControlError, match="disk full") as caught, unless_unavailable():
         raise EnvironmentalError("disk full")
     assert caught.value.code is ErrorCode.UNAVAILABLE

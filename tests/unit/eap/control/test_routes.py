@@ -13,7 +13,7 @@ from eap.errors import ControlError
 from tests.support.fakeroutes import FakeRoutes
 
 
-def test_what_is_told_is_read_again_and_new_fields_are_ignored() -> None:
+def test_routes_records_round_trip_and_ignore_new_fields() -> None:
     told = msgspec.to_builtins(FakeRoutes().stations["island-01"])
     told["routes"][0]["colour"] = "new"
     assert ROUTES_LIST.decode([told]) == [FakeRoutes().stations["island-01"]]

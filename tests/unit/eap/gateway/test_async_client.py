@@ -73,7 +73,7 @@ def test_requests_wait_side_by_side(gateway) -> None:
     asyncio.run(run())
 
 
-def test_what_got_lost_is_sent_again(gateway) -> None:
+def test_async_client_repeats_lost_datagrams(gateway) -> None:
     async def run() -> None:
         async with AsyncGatewayClient("127.0.0.1", gateway.port, timeout_s=0.05) as client:
             gateway.drop = 2

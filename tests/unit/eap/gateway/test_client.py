@@ -113,7 +113,7 @@ def test_a_datagram_that_got_lost_is_sent_again(gateway) -> None:
             client.sdo_read(0, 0x1008)
 
 
-def test_nobody_there() -> None:
+def test_client_without_a_gateway_raises() -> None:
     refused = (
         r"gateway 127\.0\.0\.1:1 does not answer: Connection refused: no gateway listens there"
     )

@@ -80,7 +80,7 @@ def test_answers_have_the_type_where_requests_have_it(kind) -> None:
         (FOE, "01 00000000", ReadFile("")),
     ],
 )
-def test_what_else_is_understood(kind, octets, task) -> None:
+def test_dialect_decodes_variants_of_requests(kind, octets, task) -> None:
     assert dialect.decode(kind, bytes.fromhex(octets)) == task
 
 
@@ -100,7 +100,7 @@ def test_what_else_is_understood(kind, octets, task) -> None:
         (COE, "0020 23 0020 00", "6 bytes, expected at least 10"),
     ],
 )
-def test_what_is_not_understood_says_what_was_expected(kind, octets, why) -> None:
+def test_dialect_malformed_request_error_names_the_expectation(kind, octets, why) -> None:
     with pytest.raises(MalformedError, match=why):
         dialect.decode(kind, bytes.fromhex(octets))
 
@@ -128,7 +128,7 @@ def test_what_is_not_understood_says_what_was_expected(kind, octets, why) -> Non
         ("64110000 0100 01", ExchangeVoe(b""), "64110000 0100 02", "64110000 0100 02"),
     ],
 )
-def test_what_is_done(request_, task, data, answer) -> None:
+def test_dialect_encodes_replies(request_, task, data, answer) -> None:
     body = dialect.encode_done(bytes.fromhex(request_), task, bytes.fromhex(data))
     assert body == bytes.fromhex(answer)
 
@@ -148,7 +148,7 @@ def test_what_is_done(request_, task, data, answer) -> None:
         (VOE, "64", DialectFailure.COMMAND, "640000000000 02000000"),
     ],
 )
-def test_what_is_not_done(kind, octets, failure, answer) -> None:
+def test_dialect_encodes_failures(kind, octets, failure, answer) -> None:
     body = dialect.encode_failure(kind, bytes.fromhex(octets), failure)
     assert body == bytes.fromhex(answer)
 

@@ -66,7 +66,7 @@ def test_a_file_transfer_ends_with_words() -> None:
 @pytest.mark.parametrize(
     ("reason", "words"), [(Cause.BUSY, "another client"), (Cause.TOO_FAST, "a second")]
 )
-def test_whose_file_has_to_wait_is_asked_for_patience(reason, words) -> None:
+def test_error_reply_of_a_busy_file_is_busy(reason, words) -> None:
     header, body = decode_message(error_reply(FOE, bytes.fromhex("01 00 00000000 66"), reason).body)
     assert header.opcode is FoeOpcode.BUSY
     assert Busy.of(header.number) == Busy(0, 100)
@@ -83,7 +83,7 @@ def test_an_ams_packet_comes_back() -> None:
 
 
 @pytest.mark.parametrize(("reason", "octets"), MAILBOX.items())
-def test_what_has_no_error_of_its_own_gets_that_of_the_mailbox(reason, octets) -> None:
+def test_error_reply_of_voe_and_eoe_is_a_mailbox_error(reason, octets) -> None:
     expected = MailboxType.ERR, bytes.fromhex(octets)
     assert error_reply(VOE, b"anything", reason) == expected
     assert error_reply(EOE, b"", reason) == expected

@@ -51,7 +51,7 @@ def test_requests_in_a_second() -> None:
     assert [ask(100), ask(100), ask(100)] == [True, True, False]
 
 
-def test_who_was_silent_longest_makes_room() -> None:
+def test_tracker_forgets_the_client_silent_longest() -> None:
     tracker = RequestTracker(ClientLimits(clients=2))
     tracker.admit(A, b"x", 0)
     tracker.admit(B, b"x", 1)

@@ -70,7 +70,7 @@ def test_services(kind, octets, service) -> None:
         (FOE, ""),
     ],
 )
-def test_steps_of_transfers_are_judged_at_their_start(kind, octets) -> None:
+def test_steps_of_transfers_have_no_operation(kind, octets) -> None:
     assert operation_of(kind, bytes.fromhex(octets)) is None
 
 

@@ -42,7 +42,7 @@ def test_items_of_a_sum_are_done_one_by_one():
     assert got == AmsAnswer(OK + struct.pack("<I", 17) + heads + b"\6", why="not 8")
 
 
-def test_what_is_at_hand_is_answered_without_waiting():
+def test_operation_without_waiting_is_answered_at_once():
     def at_once(operation):
         return OperationOutcome(data=b"\7")
 
@@ -54,7 +54,7 @@ def test_what_is_at_hand_is_answered_without_waiting():
     assert asyncio.run(later).data.endswith(b"\7\7")
 
 
-def test_what_is_no_request():
+def test_malformed_ads_request_is_answered_with_an_error():
     assert ask(99, b"") == AmsAnswer(error_code=AdsError.COMMAND)
 
 

@@ -73,7 +73,7 @@ def result(answer):
 @pytest.mark.parametrize(
     ("release", "numbers"), [("1.2.3", (1, 2, 3)), ("0.4", (0, 4, 0)), ("2.1rc1.7.9", (2, 0, 7))]
 )
-def test_device_says_who_it_is(release, numbers):
+def test_device_info_of_an_eap_port(release, numbers):
     name = b"island-01/eap0".ljust(16, b"\0")
     assert device_info("island-01/eap0", release) == AdsDeviceInfo(*numbers, name)
 
@@ -124,7 +124,7 @@ def test_missing_objects_are_refused_with_their_abort_code(bench):
     bench.run(script)
 
 
-def test_engine_that_refuses_a_state_is_told(bench):
+def test_write_control_reports_an_error_of_the_engine(bench):
     async def script():
         await bench.write(CONTROL << 16 | 1, b"\4\0")
         bench.engine.failure = EngineRefusedError("no memory")

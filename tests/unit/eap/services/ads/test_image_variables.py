@@ -83,7 +83,7 @@ def test_program_that_writes_keeps_others_out_for_now(symbols, files):
             symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "running"), b"\1")
 
 
-def test_writer_in_the_middle_is_told(symbols, files):
+def test_variable_with_an_active_writer_is_busy(symbols, files):
     files["left"].image.words[StationWord.APPLICATION_SEQUENCE] += 1
     with pytest.raises(AdsRefusedError, match="BUSY: station left: the application stopped"):
         symbols.read(G.VALUE_BY_HANDLE, handle(symbols, "running"), 1)

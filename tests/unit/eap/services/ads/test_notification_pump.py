@@ -104,13 +104,13 @@ def bench(engine, images):
     return Bench(engine, images["left"])
 
 
-def test_nobody_looks_while_nobody_listens(bench):
+def test_pump_without_notifications_does_not_poll(bench):
     bench.engine.run(3)
     assert bench.refresh() is None
     assert bench.engine.image.words[StationWord.SAMPLED_UNTIL] == 0
 
 
-def test_every_cycle_is_told_with_its_own_time(bench):
+def test_pump_sends_each_cycle_with_its_time(bench):
     bench.watch("ticks")
     bench.refresh()
     bench.engine.run(5)
@@ -121,7 +121,7 @@ def test_every_cycle_is_told_with_its_own_time(bench):
     assert bench.told() == [(6, 6)]
 
 
-def test_as_many_cycles_are_told_as_are_kept(bench):
+def test_pump_sends_as_many_cycles_as_are_kept(bench):
     bench.watch("ticks")
     bench.refresh()
     count = bench.engine.image.layout.samples.count
@@ -130,7 +130,7 @@ def test_as_many_cycles_are_told_as_are_kept(bench):
     assert bench.told() == [(n, n) for n in range(11, count + 11)]
 
 
-def test_others_have_a_turn_while_many_are_told(bench):
+def test_pump_yields_between_many_values(bench):
     for _ in range(300):
         bench.watch("ticks")
     bench.refresh()
@@ -142,7 +142,7 @@ def test_others_have_a_turn_while_many_are_told(bench):
     assert {cycle for cycle, _ in bench.told()} == {3, 4, 5}
 
 
-def test_only_what_is_due_is_told_and_looked_for(bench):
+def test_pump_sends_and_polls_only_due_notifications(bench):
     bench.engine.run()
     bench.watch("ticks", cycle_ns=5 * CYCLE)
     assert bench.refresh() == CYCLE + 200_000 - MS
@@ -155,7 +155,7 @@ def test_only_what_is_due_is_told_and_looked_for(bench):
     assert bench.told() == [(6, 6), (11, 11)]
 
 
-def test_changes_are_told(bench, images):
+def test_pump_sends_changes(bench, images):
     bench.watch("running", TransMode.SERVER_ON_CHANGE, size=1)
     bench.refresh()
     for _ in range(3):
@@ -164,14 +164,14 @@ def test_changes_are_told(bench, images):
     assert bench.told() == [(1, 0)]
 
 
-def test_the_end_of_the_last_one_is_the_end_of_looking(bench):
+def test_pump_stops_polling_after_the_last_notification(bench):
     handle = bench.watch("ticks")
     bench.refresh()
     bench.table.delete(CLIENT, handle)
     assert bench.refresh() is None
 
 
-def test_connection_that_is_gone_is_told_nothing(bench):
+def test_pump_sends_nothing_to_a_closed_connection(bench):
     bench.watch("ticks")
     bench.refresh()
     bench.table.forget(WAY)
@@ -180,7 +180,7 @@ def test_connection_that_is_gone_is_told_nothing(bench):
     assert bench.told() == []
 
 
-def test_engine_that_does_not_run_is_looked_at_less_often(bench):
+def test_pump_polls_a_stopped_engine_less_often(bench):
     bench.watch("ticks")
     bench.refresh()
     now_ns = bench.engine.now_ns
@@ -191,7 +191,7 @@ def test_engine_that_does_not_run_is_looked_at_less_often(bench):
     assert bench.told() == [(1, 1), (2, 2)]
 
 
-def test_samples_are_wanted_for_a_second_from_each_look(bench):
+def test_pump_requests_samples_for_a_second(bench):
     bench.watch("ticks", cycle_ns=10**12)
     bench.refresh()
     bench.engine.run(7)
@@ -213,7 +213,7 @@ def test_new_layout_is_followed(bench, stations, files):
         assert bench.told() == [(1, 1), (2, 2), (3, 3)]
 
 
-def test_the_last_one_whose_variable_is_gone_ends(bench, stations, files):
+def test_notification_of_a_removed_variable_ends(bench, stations, files):
     bench.watch("ticks")
     bench.refresh()
     spec = replace(stations[0], variables=stations[0].variables[1:], sources=(), frames=())
@@ -252,7 +252,7 @@ def test_image_that_is_gone_is_waited_for(bench, files, stations):
         assert bench.refresh() is not None
 
 
-def test_whoever_is_added_is_told_soon(bench):
+def test_pump_sends_soon_to_a_new_client(bench):
     async def run():
         serving = asyncio.ensure_future(bench.pump.serve())
         await asyncio.sleep(0)
@@ -266,7 +266,7 @@ def test_whoever_is_added_is_told_soon(bench):
     asyncio.run(run())
 
 
-def test_fault_is_logged_and_others_are_told_later(bench, caplog, monkeypatch):
+def test_pump_logs_a_fault_and_goes_on(bench, caplog, monkeypatch):
     caplog.set_level(logging.ERROR)
     bench.watch("ticks")
     monkeypatch.setattr(bench.symbols, "refresh", lambda: 1 // 0)

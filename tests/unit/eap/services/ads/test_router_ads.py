@@ -71,7 +71,7 @@ def test_it_has_the_ports_of_a_router(bench):
 
 
 @pytest.mark.parametrize("port", [IO, DEVICE])
-def test_each_says_who_and_how_it_is(bench, port):
+def test_router_services_report_info_and_state(bench, port):
     info = bench.ask(port, AmsCommand.READ_DEVICE_INFO).data
     assert info == OK + b"\1\2\3\0" + b"left".ljust(16, b"\0")
     assert bench.ask(port, AmsCommand.READ_STATE).data == OK + b"\5\0\x08\0"

@@ -76,7 +76,7 @@ def test_interfaces_have_addresses_or_none(values):
     assert [values.mac_of(port) for port in ("eap0", "eap1", "eap2", "bus0")] == [bytes(6)] * 4
 
 
-def test_interface_tells_its_address(values, tmp_path, monkeypatch):
+def test_live_router_reads_the_mac_address(values, tmp_path, monkeypatch):
     (tmp_path / "lo").mkdir()
     (tmp_path / "lo" / "address").write_text("02:00:00:00:00:05\n")
     monkeypatch.setattr("eap.services.ads.station_ads._INTERFACES", tmp_path)
@@ -91,7 +91,7 @@ def test_every_live_entry_has_a_value(station, values):
     assert dictionary[0xF110].entries[8].value == 1
 
 
-def test_routes_are_told_as_they_do(router, values):
+def test_live_router_reports_routes(router, values):
     (route,) = values.routes()
     shown = {
         key: values.of_route(key, route) for key in RouterLive if key.name.startswith("ROUTE_")

@@ -39,7 +39,7 @@ def test_slave_state_is_a_value_of_its_device_data():
 
 
 @pytest.mark.parametrize("group", [IndexGroup.SDO, IndexGroup.SOE, IndexGroup.VOE])
-def test_slave_refuses_groups_of_a_protocol_that_it_does_not_speak(group):
+def test_slave_without_the_protocol_of_a_group_is_an_error(group):
     async def scene(client, engine):
         assert (await client.do(MUTE, Read(group, 0, 4))).result == AdsError.SERVICE
         assert "slave 1002 does not speak" in client.why

@@ -46,7 +46,7 @@ def ask(system, device):
     return ask
 
 
-def test_it_says_who_and_how_the_station_is(system, ask):
+def test_system_service_reports_info_and_state(system, ask):
     assert system.ports == {10_000}
     assert ask(AmsCommand.READ_DEVICE_INFO) == OK + b"\1\2\3\0" + b"left".ljust(16, b"\0")
     assert ask(AmsCommand.READ_STATE) == OK + b"\5\0\x08\0"
@@ -64,7 +64,7 @@ def test_states_are_those_of_the_station(ask, device):
     assert ask(AmsCommand.READ_STATE) == OK + b"\x0f\0\2\0"
 
 
-def test_reset_is_how_clients_of_twincat_ask_for_run(ask, device):
+def test_system_service_reset_means_run(ask, device):
     assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.CONFIG, 0, 0)) == OK
     assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.RESET, 0, 0)) == OK
     assert device[1].state is DeviceState.OP

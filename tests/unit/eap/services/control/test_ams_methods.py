@@ -37,7 +37,7 @@ def call(method: str, **params: Any) -> Any:
     return asyncio.run(get())
 
 
-def test_trace_of_what_is_here() -> None:
+def test_trace_of_a_local_target() -> None:
     found = call("trace", target="island-01")
     assert (found["address"], found["name"]) == ("5.1.1.1.1.1:10000", "island-01")
     assert (found["ok"], found["why"]) == (True, "")
@@ -78,6 +78,6 @@ def test_any_request() -> None:
         ("ams_ask", {"target": "island-01", "command": 2, "data": "x"}, "hexadecimal"),
     ],
 )
-def test_what_cannot_be_asked(method: str, params: dict[str, Any], text: str) -> None:
+def test_ams_methods_refuse_unknown_names(method: str, params: dict[str, Any], text: str) -> None:
     with pytest.raises(ControlError, match=text):
         call(method, **params)

@@ -95,7 +95,7 @@ def test_clients_of_the_control_socket_have_lines_and_limits(audit: Audit, clock
     assert told[-1] == head | {"from": "uid 0, pid 7", "skipped": 2}
 
 
-def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
+def test_audit_line_has_client_operation_and_result(audit: Audit) -> None:
     audit.write("island-01", entry(result=0x706))
     assert lines(audit) == [
         {
@@ -145,7 +145,7 @@ def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
         (ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 4, b"a.bin\0"), {"file": "a.bin", "length": 6}),
     ],
 )
-def test_what_was_to_be_done(
+def test_operation_fields(
     audit: Audit, operation: Operation | AddRoute, said: dict[str, Any]
 ) -> None:
     audit.write("island-01", entry(operation))
@@ -161,7 +161,7 @@ def test_a_refusal(audit: Audit) -> None:
     assert line["error"] == "error 0x723 (access rules forbid it)"
 
 
-def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: Clock) -> None:
+def test_audit_counts_a_flood_and_writes_other_clients(audit: Audit, clock: Clock) -> None:
     audit.write("island-01", entry(count=BURST + 20))
     audit.write("island-01", entry(endpoint=Endpoint("ams-tcp", "10.0.0.6:1")))
     assert len(lines(audit)) == BURST + 1
@@ -181,7 +181,7 @@ def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: C
     assert len(lines(audit)) == BURST + 2 + BURST // 10
 
 
-def test_a_flood_from_many_addresses_is_bounded_by_its_door(audit: Audit) -> None:
+def test_audit_bounds_a_flood_by_transport(audit: Audit) -> None:
     for number in range(12):
         endpoint = Endpoint("udp:eap0", f"10.0.0.{number}:34980")
         audit.write("island-01", entry(endpoint=endpoint, count=BURST))
@@ -202,7 +202,7 @@ def test_flood_from_invented_addresses_leaves_known_clients_their_lines(audit: A
     assert len(found) == module.NEW_RATE.burst + 1, "one of the new ones is the known client"
 
 
-def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None:
+def test_audit_forgets_addresses_but_not_skipped_lines(audit: Audit) -> None:
     audit.write("island-01", entry(count=BURST + 1))
     for number in range(1100):
         endpoint = Endpoint("ams-tcp", f"10.1.{number // 250}.{number % 250}:1")
@@ -237,7 +237,7 @@ class FullDisk(AuditFile):
         super().append(lines)
 
 
-def test_audit_counts_what_cannot_be_written_and_says_so_when_it_can_again(
+def test_audit_counts_lost_lines_and_reports_them_later(
     tmp_path: Path, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = FullDisk(tmp_path / "plant" / "audit.jsonl")
@@ -298,7 +298,7 @@ def test_required_audit_says_why_a_change_cannot_be_recorded(tmp_path: Path, clo
     assert audit.lost.error == ""
 
 
-def test_required_audit_refuses_what_is_more_than_it_records(tmp_path: Path, clock: Clock) -> None:
+def test_required_audit_limits_changes_to_its_rate(tmp_path: Path, clock: Clock) -> None:
     audit = required(AuditFile(tmp_path / "audit.jsonl"), clock)
     assert audit.begin("island-01", entry(count=BURST)) == ""
     assert audit.begin("island-01", entry()) == module.TOO_MANY
@@ -318,7 +318,7 @@ def test_required_audit_limits_the_lines_of_a_control_client_that_it_refuses(
     assert lines(audit)[-1]["skipped"] == 3
 
 
-def test_audit_that_ends_writes_what_was_left_out(audit: Audit) -> None:
+def test_audit_writes_skipped_lines_at_its_end(audit: Audit) -> None:
     async def serve_and_end() -> None:
         serving = asyncio.create_task(audit.serve())
         await asyncio.sleep(0)

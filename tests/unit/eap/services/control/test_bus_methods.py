@@ -145,7 +145,7 @@ def test_one_after_the_other():
     play(scene)
 
 
-def test_who_leaves_lets_others_talk():
+def test_closed_connection_releases_its_mailbox():
     async def scene(stage, connection):
         number = await open_coe(connection)
         stage.engine.holds = True
@@ -165,7 +165,7 @@ def test_who_leaves_lets_others_talk():
     play(scene)
 
 
-def test_who_only_holds_a_turn_loses_it(monkeypatch):
+def test_idle_conversation_is_ended(monkeypatch):
     monkeypatch.setattr(control_bus, "IDLE_S", 0.05)
 
     async def scene(stage, connection):

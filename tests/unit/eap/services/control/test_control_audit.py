@@ -22,18 +22,18 @@ def told(method: str, protocol: str = "coe", **params: Any) -> tuple[str, dict[s
     return change_of(Request(v=1, id=1, method=method, params=params), lambda _: opened(protocol))
 
 
-def test_who_asks_is_told_by_the_kernel() -> None:
+def test_peer_of_a_unix_socket() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         assert peer_of(theirs) == f"uid {os.getuid()}, pid {os.getpid()}"
 
 
 @pytest.mark.parametrize("method", ["hello", "status", "od_read", "bus_describe", "plan"])
-def test_reading_is_not_told(method: str) -> None:
+def test_change_of_a_read_is_none(method: str) -> None:
     assert told(method, station="left") is None
 
 
-def test_a_change_is_told_without_secrets_and_at_no_length() -> None:
+def test_change_has_no_secrets_and_short_values() -> None:
     found = told("routes_add_remote", station="left", address="10.0.0.5", password="p")
     assert found == ("left", {"operation": "routes_add_remote", "asked": {"address": "10.0.0.5"}})
     found = told("od_write", target="left/eap0", index=0x8000, subindex=1, data="00" * 200)
@@ -44,7 +44,7 @@ def test_a_change_is_told_without_secrets_and_at_no_length() -> None:
     assert told("stop") == ("", {"operation": "stop", "asked": {}})
 
 
-def test_datagrams_are_told_when_one_of_them_writes() -> None:
+def test_change_of_datagrams_with_a_write() -> None:
     read, write = [4, 1001, 304, "0000", 1], [5, 1001, 288, "0800", 1]
     assert told("bus_transfer", station="left", port="bus0", datagrams=[read]) is None
     assert told("bus_transfer", station="left", port="bus0", datagrams="what") is None
@@ -64,7 +64,7 @@ def test_datagrams_are_told_when_one_of_them_writes() -> None:
         ("voe", "341200000100", {"operation": "ReadWrite"}),
     ],
 )
-def test_what_a_slave_is_told_to_change(protocol: str, request_: str, words: dict) -> None:
+def test_change_of_a_slave(protocol: str, request_: str, words: dict) -> None:
     found = told("bus_ask", protocol, conversation=1, request=request_)
     assert found is not None
     assert found[0] == "left"
@@ -84,7 +84,7 @@ def test_what_a_slave_is_told_to_change(protocol: str, request_: str, words: dic
     ],
     ids=["upload", "segment", "IDN", "open for read", "packet", "no digits"],
 )
-def test_reads_and_steps_of_a_conversation_are_not_told(protocol: str, request_: str) -> None:
+def test_change_of_reads_and_steps_of_a_conversation_is_none(protocol: str, request_: str) -> None:
     assert told("bus_ask", protocol, conversation=1, request=request_) is None
 
 
@@ -118,7 +118,7 @@ def test_refusals_that_are_results(result: Any, text: str) -> None:
         ("voe", "3412000001000102", False),
     ],
 )
-def test_what_a_slave_refuses(protocol: str, data: str, is_error: bool) -> None:
+def test_error_in_the_answer_of_a_slave(protocol: str, data: str, is_error: bool) -> None:
     text = error_in_result(MailboxData(data), opened(protocol))
     assert bool(text) == is_error
     assert protocol != "coe" or not is_error or "read-only entry (0x06010002)" in text

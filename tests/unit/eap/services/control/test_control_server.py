@@ -98,7 +98,7 @@ def test_refusals_keep_the_connection(methods):
     asyncio.run(conversation())
 
 
-def test_changes_are_told_before_they_are_answered(images):
+def test_changes_are_audited_before_the_answer(images):
     def refuse(params):
         raise SdoAbortError(AbortCode.NO_OBJECT, 0x2000, 1)
 
@@ -146,7 +146,7 @@ def test_change_that_cannot_be_recorded_is_refused(images):
     assert not told  # what refuses it writes that down
 
 
-def test_refusals_of_dictionaries_carry_their_abort_code(images):
+def test_errors_of_dictionaries_have_their_abort_code(images):
     def refuse(params):
         raise SdoAbortError(AbortCode.NO_OBJECT, 0x2000, 1)
 
@@ -202,7 +202,7 @@ def test_subscriptions_run_beside_requests_until_unsubscribed(methods):
         (ControlError("gone", code="unknown_name"), "unknown_name"),
     ],
 )
-def test_a_subscription_outlives_what_cannot_be_read(methods, monkeypatch, exc, code):
+def test_subscription_survives_unreadable_values(methods, monkeypatch, exc, code):
     def fail(self):
         raise exc
 
@@ -290,7 +290,7 @@ def test_line_that_stays_unfinished_makes_its_client_late(methods):
     asyncio.run(conversation())
 
 
-def test_who_does_not_read_is_disconnected(methods):
+def test_client_that_does_not_read_is_disconnected(methods):
     async def conversation():
         server = ControlServer(methods, NO_BUSES, slow_reader_s=0.05)
         ours, theirs = socket.socketpair()
@@ -344,7 +344,7 @@ STATUS = b'{"v":1,"id":1,"method":"status"}\n'
 
 
 @pytest.mark.parametrize("rest", [b"", STATUS * 3, b'{"v":1'])
-def test_who_leaves_is_not_waited_for(files, rest):
+def test_request_of_a_disconnected_client_is_cancelled(files, rest):
     async def conversation():
         slow = Slow()
         methods = Methods({}, files, status=slow.wait, stop=lambda: None)
@@ -360,7 +360,7 @@ def test_who_leaves_is_not_waited_for(files, rest):
     asyncio.run(conversation())
 
 
-def test_who_only_stops_sending_gets_answers(files):
+def test_half_closed_client_gets_answers(files):
     async def conversation():
         slow = Slow()
         methods = Methods({}, files, status=slow.wait, stop=lambda: None)
@@ -379,7 +379,7 @@ def test_who_only_stops_sending_gets_answers(files):
     asyncio.run(conversation())
 
 
-def test_what_was_sent_before_leaving_is_done(files):
+def test_requests_before_a_disconnect_are_executed(files):
     async def conversation():
         stopped = []
         methods = Methods({}, files, status=torn, stop=lambda: stopped.append(True))

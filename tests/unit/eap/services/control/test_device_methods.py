@@ -112,7 +112,7 @@ def test_describe(call):
     assert caught.value.code == AbortCode.NO_OBJECT
 
 
-def test_describe_what_a_download_would_make(call):
+def test_describe_object_that_a_download_would_create(call):
     def entries(index, subindex=None):
         row = call("od_describe", target="left", index=index, subindex=subindex)
         return {each["subindex"]: each["type"] for each in row["entries"]}

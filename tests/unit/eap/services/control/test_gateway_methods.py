@@ -75,7 +75,7 @@ def ask(gateways):
     return call
 
 
-def test_what_is_told_of_a_gateway(ask, gateways) -> None:
+def test_gateway_row(ask, gateways) -> None:
     gateways[FIRST].tracker.admit(HERE, b"request", 0)
     gateways[FIRST].statistics.count(1001, MailboxType.COE, [None], 2000)
     first, second = ask("status", station="left")
@@ -111,6 +111,6 @@ def test_one_is_stopped_and_started(ask) -> None:
         ({"station": "left", "port": "bus2"}, "no bus port 'bus2'; its bus ports are bus0, bus1"),
     ],
 )
-def test_who_is_not_there(ask, params, reason) -> None:
+def test_unknown_gateway_is_an_error(ask, params, reason) -> None:
     with pytest.raises(ControlError, match=reason):
         ask("stop", **params)

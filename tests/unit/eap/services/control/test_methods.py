@@ -82,7 +82,7 @@ def test_variables_with_type_and_writer(methods):
     assert rows["ticks"]["writer"] == "engine"
 
 
-def test_what_is_written_is_read(methods):
+def test_written_values_are_read(methods):
     values = {"setpoint": [1, 2.5], "running": True, "name": "xyz"}
     assert call(methods, "write", {"station": "left", "values": values}) == {"written": 3}
     answer = call(methods, "read", {"station": "left", "names": ["setpoint", "running", "name"]})
@@ -163,7 +163,7 @@ def test_a_user_program_that_writes_is_named(methods, files):
     assert call(methods, "write", {"station": "left", "values": {"running": True}})["written"] == 1
 
 
-def test_a_watch_by_period_tells_all_and_by_change_what_changed(methods, files):
+def test_watch_by_period_has_all_values_and_by_change_the_changed(methods, files):
     image = files["left"].image
     params = {"station": "left", "names": ["running", "name"]}
     always = methods.watch(params)
@@ -179,9 +179,7 @@ def test_a_watch_by_period_tells_all_and_by_change_what_changed(methods, files):
     assert changes.next_event().values == {"running": True}
 
 
-def test_watch_event_counts_the_cycles_since_the_event_before_that_were_not_looked_at(
-    methods, files
-):
+def test_watch_event_counts_skipped_cycles(methods, files):
     image = files["left"].image
     params = {"station": "left", "names": ["running"]}
     always = methods.watch(params)
@@ -241,7 +239,7 @@ def test_a_watch_is_checked_when_it_begins(methods):
         methods.watch({"station": "left", "names": ["nam"]})
 
 
-def test_a_watch_goes_on_when_the_station_is_configured_anew(methods, files, stations):
+def test_watch_survives_a_new_configuration(methods, files, stations):
     some = methods.watch({"station": "left", "names": ["running", "name"]})
     all_of_them = methods.watch({"station": "left"})
     more = (*stations[0].variables, VariableSpec("more", "UINT"))

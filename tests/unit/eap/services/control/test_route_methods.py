@@ -90,7 +90,7 @@ def test_replaced_route_goes(ask, left):
     assert names(left) == ["right", "press"]
 
 
-def test_what_speaks_against_a_route_is_told(ask, left):
+def test_add_invalid_route_is_an_error(ask, left):
     net_id = NetId.parse(PLC["net_id"])
     left.router.add_route(Route(net_id, "first", Endpoint("udp:eap0", "127.0.9.9:34980"), octets=6))
     (warning,) = ask("add", **PLC).warnings
@@ -115,12 +115,12 @@ def test_routes_that_cannot_be_are_refused(ask, left, change, reason):
     assert names(left) == ["right"]
 
 
-def test_remove_of_what_was_not_added(ask):
+def test_remove_of_an_unknown_route(ask):
     assert refused(ask, "remove", station="left", route="right")[0] == "refused"
     assert "no route 'x' was added" in refused(ask, "remove", station="left", route="x")[1]
 
 
-def test_what_cannot_be_kept_is_refused(ask, left, monkeypatch):
+def test_route_that_cannot_be_stored_is_refused(ask, left, monkeypatch):
     def fail(_):
         raise EnvironmentalError("disk full")
 
@@ -128,19 +128,19 @@ def test_what_cannot_be_kept_is_refused(ask, left, monkeypatch):
     assert refused(ask, "add", **PLC) == ("unavailable", "disk full")
 
 
-def test_virtual_routes_are_told_by_their_net_ids_here(ask):
+def test_virtual_routes_have_their_local_net_ids(ask):
     ask("add", **PLC, virtual="9.9.9.9.1.1")
     removed = ask("remove", station="left", route="9.9.9.9.1.1").route
     assert (removed.net_id, removed.real) == ("9.9.9.9.1.1", "5.1.2.3.1.1")
 
 
-def test_test_asks(methods, left):
+def test_routes_test_sends_a_request(methods, left):
     testing = methods["routes_test"]({"station": "left", "target": "left", "timeout_ms": 200})
     found = asyncio.run(while_serving(testing, left.router))
     assert (found.ok, found.state) == (True, "RUN")
 
 
-def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
+def test_import_adds_valid_routes_and_reports_the_rest(ask, left):
     file = [
         StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
         StaticRoute("old", "5.1.2.4.1.1", "3", "PROFIBUS"),
@@ -192,7 +192,7 @@ class NeighbourScanner:
         ]
 
 
-def test_scan_tells_who_is_there_and_learns(ask, left):
+def test_scan_lists_routers_and_learns_routes(ask, left):
     left.routes.scanners.append(scanner := NeighbourScanner())
     known, new = ask("scan", station="left", address="10.0.0.255", wait_ms=20)
     assert scanner.asked == [("10.0.0.255", 0.02)]
@@ -246,7 +246,7 @@ class Introducer:
         (None, False, "no answer by UDP 48899"),
     ],
 )
-def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
+def test_add_remote_requests_a_route_from_another_router(ask, left, result, ok, text):
     left.routes.scanners.append(other := Introducer(result))
     login = {"user": "Administrator", "password": "1"}
     row = ask("add_remote", station="left", address="10.0.0.5", **login, wait_ms=20)

@@ -46,7 +46,7 @@ def test_apply_and_rollback(ask):
     assert ask("export") == RunningRouting(routing=OLD, previous=NEW, cause="1", undone=True)
 
 
-def test_what_needs_a_new_start_is_refused(ask):
+def test_routing_change_that_needs_a_restart_is_refused(ask):
     broker = RoutingSpec(mqtt=(MqttSpec(network="n", host="broker"),))
     refused = ["MQTT network n: added: restart the appliance"]
     for answer in (ask("plan", routing=broker), ask("apply", routing=broker)):
@@ -55,7 +55,7 @@ def test_what_needs_a_new_start_is_refused(ask):
 
 
 @pytest.mark.parametrize("method", ["plan", "apply"])
-def test_what_is_no_routing_is_refused(ask, method):
+def test_malformed_routing_is_refused(ask, method):
     with pytest.raises(ControlError, match="unknown field `rout`"):
         ask(method, routing={"rout": []})
 
@@ -66,7 +66,7 @@ def test_a_station_that_is_not_here(ask):
     assert caught.value.code == "unknown_name"
 
 
-def test_what_cannot_be_kept_is_told(ask, tmp_path):
+def test_routing_that_cannot_be_stored_is_an_error(ask, tmp_path):
     (tmp_path / "p").write_text("")
     with pytest.raises(ControlError, match="cannot be kept") as caught:
         ask("apply", routing=NEW)

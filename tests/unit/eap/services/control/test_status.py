@@ -129,7 +129,7 @@ def test_snapshot_within_a_cycle_is_taken_after_it_while_others_go_on(files):
     assert asyncio.run(scene()).words[StationWord.OVERRUNS] == 5
 
 
-def test_snapshot_of_an_engine_that_hangs_within_a_cycle_is_what_it_left(files, monkeypatch):
+def test_snapshot_of_an_engine_that_hangs_within_a_cycle(files, monkeypatch):
     monkeypatch.setattr(status, "SNAPSHOT_PAUSES", 2)
     image = files["left"].image
     image.words[StationWord.CYCLE] = 1
@@ -163,7 +163,7 @@ def test_buses_and_segments(tmp_path):
     assert "step" not in engines[0]
 
 
-def test_shared_answer_is_made_once_for_all_that_ask_while_another_is_made():
+def test_shared_answer_is_made_once_for_concurrent_requests():
     made = []
 
     async def run():

@@ -93,13 +93,13 @@ def test_states_cross_as_numbers(tmp_path):
         lambda client: client.set_state("left", DeviceState.OP),
     ],
 )
-def test_refusals_are_told(ask, tmp_path):
+def test_engine_client_raises_errors_of_the_engine(ask, tmp_path):
     with pytest.raises(EngineRefusedError, match=r"^port eap0 is gone$"):
         run(refused, ask, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_engine_that_was_started_again_is_told_apart(tmp_path):
+def test_engine_client_detects_a_restarted_engine(tmp_path):
     with pytest.raises(EngineGoneError, match="started again"):
         run(lambda _: EngineStarted(1), lambda client: client.configure("left", left()), tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -133,7 +133,7 @@ def test_pds_that_are_received(values, files):
     assert number(right, EapLive.RX_DISCARDED_VERSION, "left-state") == 2
 
 
-def test_frame_state_tells_that_the_subscriber_is_missing(values, files):
+def test_frame_state_of_a_missing_subscriber(values, files):
     image = files["left"].image
     first = image.layout.frames[0].words
     image.words[first + FrameWord.UNSENT] = 1
@@ -141,7 +141,7 @@ def test_frame_state_tells_that_the_subscriber_is_missing(values, files):
     assert number(values["left"], EapLive.FRAME_STATE, "out") == 5
 
 
-def test_what_does_not_run_shows_nothing(values):
+def test_values_of_objects_that_do_not_run_are_none(values):
     for key in (EapLive.FRAME_STATE, EapLive.TX_SKIPPED, EapLive.RX_LOST):
         assert values["left"].octets(key, "nobody") is None
 

@@ -305,14 +305,14 @@ def test_slave_objects_are_read_again_after_the_slave_was_gone() -> None:
     assert client.asked == 2
 
 
-def test_slave_without_an_answer_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slave_that_did_not_answer_is_not_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(master_values, "FACTS_ANSWER_S", 0.01)
     for client in (ScriptedClient(), ScriptedClient(TYPE)):
         assert facts_of(client, times=2) == (0, False)
         assert client.asked == 1
 
 
-def test_slave_without_coe_is_not_asked() -> None:
+def test_slave_without_coe_is_not_read() -> None:
     client = ScriptedClient(slave=msgspec.structs.replace(SLAVE, protocols=0))
     assert facts_of(client) == (0, False)
     client.show(SLAVE)

@@ -51,7 +51,7 @@ def send(endpoint, target):
     endpoint.sockets[0].sendto(b"frame", (target.host, target.port))
 
 
-def test_nobody_listens(endpoint, closed):
+def test_closed_port_of_a_subscriber_is_evidence(endpoint, closed):
     endpoint.watch([closed])
     send(endpoint, closed)
     assert endpoint.hear(5 * SECOND) == {key_of(closed)}
@@ -68,7 +68,7 @@ def test_refusal_holds_until_frames_went_on_without_another(endpoint, closed):
     assert endpoint.look(closed, 5 * SECOND) is ProbeResult.BLIND
 
 
-def test_targets_that_nobody_watches_are_not_told(endpoint, closed):
+def test_unwatched_targets_are_ignored(endpoint, closed):
     endpoint.watch([closed])
     send(endpoint, closed)
     endpoint.watch([Destination.parse("127.9.2.9:9")])
@@ -83,7 +83,7 @@ def test_a_target_that_stays_keeps_its_refusal(endpoint, closed):
     assert endpoint.look(closed, 5 * SECOND) is ProbeResult.ABSENT
 
 
-def test_nothing_is_asked_of_the_kernel_before_there_is_a_target(endpoint, closed):
+def test_probe_without_targets_does_not_query_the_kernel(endpoint, closed):
     send(endpoint, closed)
     assert endpoint.hear(SECOND) == set()
     endpoint.watch([])

@@ -133,7 +133,7 @@ def test_a_listener_on_this_machine_is_unknown_never_present(endpoint, closed, c
 @pytest.mark.parametrize(
     "destination", ["239.1.1.1", "tcp://10.0.0.1", "5.5.5.5.1.1", NOBODY, "01:01:05:04:00:00"]
 )
-def test_where_nothing_can_be_told_it_is_unknown(endpoint, destination):
+def test_subscriber_without_evidence_is_unknown(endpoint, destination):
     holder = Holder(frame(destination))
     watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     for second in range(1, 10):
@@ -141,7 +141,7 @@ def test_where_nothing_can_be_told_it_is_unknown(endpoint, destination):
     assert holder.status() == "unknown"
 
 
-def test_frame_that_is_sent_elsewhere_is_judged_anew(endpoint, closed):
+def test_frame_with_a_new_destination_is_monitored_again(endpoint, closed):
     holder = Holder(frame(closed))
     watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
@@ -153,7 +153,7 @@ def test_frame_that_is_sent_elsewhere_is_judged_anew(endpoint, closed):
     assert holder.status() == "unknown"
 
 
-def test_a_station_may_be_configured_anew(endpoint, closed):
+def test_watch_follows_a_new_configuration(endpoint, closed):
     holder = Holder(frame(closed), frame("127.9.2.7", "g"))
     watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
@@ -166,7 +166,7 @@ def test_a_station_may_be_configured_anew(endpoint, closed):
     assert (holder.status(0), holder.status(1)) == ("unknown", "unknown")
 
 
-def test_what_is_known_of_a_frame_that_stays_is_kept(endpoint, closed):
+def test_evidence_of_an_unchanged_frame_is_kept(endpoint, closed):
     holder = Holder(frame(closed))
     watch = SubscriberWatch({"a": holder}, SubscriberProbes({}, {PORT: endpoint}))
     watch.step(SECOND)
@@ -177,7 +177,7 @@ def test_what_is_known_of_a_frame_that_stays_is_kept(endpoint, closed):
     assert (holder.status(0), holder.status(1)) == ("unknown", "missing")
 
 
-def test_nothing_to_monitor_is_looked_for_now_and_then(endpoint):
+def test_watch_without_frames_polls_the_images(endpoint):
     watch = SubscriberWatch({"a": Holder()}, SubscriberProbes({}, {PORT: endpoint}))
     assert watch.step(SECOND) == SECOND + POLL_NS
 
@@ -232,7 +232,7 @@ def ends(cable):
 
 
 @pytest.mark.root
-def test_arp_tells_who_is_there_and_who_is_gone(ends):
+def test_arp_detects_present_and_missing_subscribers(ends):
     hop_prober, host = ends
     holder = Holder(frame(str(host.mac), monitor_ip="10.77.0.2"))
     watch = SubscriberWatch({"a": holder}, SubscriberProbes({PORT: hop_prober}, {}))
@@ -259,7 +259,7 @@ def test_another_host_with_the_address_is_not_the_subscriber(ends, caplog):
 
 
 @pytest.mark.root
-def test_more_addresses_than_one_socket_takes_are_told(ends, caplog):
+def test_too_many_addresses_for_a_socket_are_logged(ends, caplog):
     hop_prober, _ = ends
     frames = [
         frame(NOBODY, f"f{n}", monitor_ip=str(IPv4Address(0x0A4D0000 + n))) for n in range(1001)

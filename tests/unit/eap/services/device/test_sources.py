@@ -61,7 +61,7 @@ def test_a_column_is_replayed_from_the_start_again(images, tmp_path):
     asyncio.run(run())
 
 
-def test_what_cannot_be_read_keeps_its_value_and_is_said_once(images, tmp_path, caplog):
+def test_unreadable_source_keeps_its_value_and_is_logged_once(images, tmp_path, caplog):
     (tmp_path / "data.csv").write_text("load\nmany\n")
     play(
         images["left"],

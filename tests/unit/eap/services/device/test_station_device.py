@@ -201,7 +201,7 @@ def test_apply_changes_a_running_station(spec, state):
     assert effective("demo", (spec,)) == ((wanted, DeviceState.OP if state == 8 else state),)
 
 
-def test_apply_keeps_the_indexes_of_what_stays(spec):
+def test_apply_keeps_the_indexes_of_unchanged_objects(spec):
     device, engine = make_device(spec)
     (frame,) = spec.frames
     first = TxPdSpec("first", 6, ("ticks",), trigger=TriggerSpec(divider=2))
@@ -222,7 +222,7 @@ def test_plan_changes_nothing(spec):
     assert asyncio.run(device.plan(spec)).is_empty
 
 
-def test_apply_of_what_cannot_be_is_refused_whole(spec):
+def test_apply_of_an_invalid_change_changes_nothing(spec):
     device, engine = make_device(spec)
     other_port = replace(spec, ports=(replace(spec.ports[0], tcp=True),))
     (frame,) = spec.frames
@@ -281,7 +281,7 @@ def test_rollback_goes_back_and_forth(spec):
     assert engine.spec == spec
 
 
-def test_what_does_not_fit_into_dictionaries_runs_but_is_not_changed_by_downloads(spec, caplog):
+def test_spec_too_large_for_dictionaries_runs_without_downloads(spec, caplog):
     names = [f"v{number}" for number in range(255)]
     variables = tuple(VariableSpec(name, "USINT") for name in names)
     frame = TxFrameSpec("out", "eap0", "127.9.2.2", (TxPdSpec("all", 1, tuple(names)),))

@@ -57,7 +57,7 @@ def kept():
     return StationStore("demo", "left").configuration.read()
 
 
-def test_nothing_is_kept_of_what_never_changed(keeper, spec):
+def test_unchanged_station_is_not_stored(keeper, spec):
     assert (keeper.spec, keeper.state, keeper.objects, keeper.previous) == (
         spec,
         DeviceState.OP,
@@ -90,7 +90,7 @@ def test_next_keeper_goes_on_from_there(keeper, engine, spec, changed):
     assert kept().previous.spec == changed
 
 
-def test_what_was_kept_of_something_else_is_not_taken(keeper, engine, spec, changed):
+def test_stored_objects_of_another_spec_are_ignored(keeper, engine, spec, changed):
     asyncio.run(keeper.change(changed, NEW))
     assert (
         StationKeeper(
@@ -100,7 +100,7 @@ def test_what_was_kept_of_something_else_is_not_taken(keeper, engine, spec, chan
     )
 
 
-def test_it_is_kept_before_the_engine_is_asked(keeper, engine, changed):
+def test_change_is_stored_before_the_engine_request(keeper, engine, changed):
     async def script():
         engine.gate = asyncio.Event()
         changing = asyncio.ensure_future(keeper.change(changed, NEW))
@@ -113,7 +113,7 @@ def test_it_is_kept_before_the_engine_is_asked(keeper, engine, changed):
 
 
 @pytest.mark.parametrize("error", [EngineRefusedError("no room"), EngineGoneError("it is gone")])
-def test_what_the_engine_does_not_take_is_not_kept(keeper, engine, spec, changed, error):
+def test_spec_that_the_engine_refuses_is_not_stored(keeper, engine, spec, changed, error):
     engine.failure = error
     with pytest.raises(DeviceFault, match=str(error)) as caught:
         asyncio.run(keeper.change(changed, NEW))
@@ -123,7 +123,7 @@ def test_what_the_engine_does_not_take_is_not_kept(keeper, engine, spec, changed
     assert effective("demo", (spec,))[0].spec == spec
 
 
-def test_what_cannot_be_kept_does_not_run(keeper, engine, changed, monkeypatch):
+def test_spec_that_cannot_be_stored_does_not_run(keeper, engine, changed, monkeypatch):
     def full(self, stored):
         raise EnvironmentalError("disk full")
 
@@ -134,7 +134,7 @@ def test_what_cannot_be_kept_does_not_run(keeper, engine, changed, monkeypatch):
     assert keeper.unsaved is None  # what runs is still what was kept
 
 
-def test_engine_that_went_away_is_told_again(keeper, engine, spec, changed):
+def test_restarted_engine_gets_the_configuration_again(keeper, engine, spec, changed):
     engine.failure = EngineGoneError("it is gone")
     with pytest.raises(DeviceFault):
         asyncio.run(keeper.change(changed, NEW))
@@ -178,7 +178,7 @@ def test_way_up_can_fail_and_way_down_cannot(keeper, engine, caplog):
     assert engine.state is DeviceState.PREOP
 
 
-def test_state_that_cannot_be_kept_is_told(keeper, engine, monkeypatch, caplog):
+def test_state_that_cannot_be_stored_is_reported(keeper, engine, monkeypatch, caplog):
     def full(self, stored):
         raise EnvironmentalError("disk full")
 

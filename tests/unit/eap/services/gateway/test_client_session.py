@@ -116,7 +116,7 @@ def test_session_transfer_without_next_step_is_given_up() -> None:
     play(COE, Station(bytes(200)), scene, idle_s=0.02)
 
 
-def test_session_begins_anew_with_a_request_that_begins() -> None:
+def test_session_restarts_with_an_initiate_request() -> None:
     station = Station(bytes(200))
 
     async def scene(handle: Ask, session: ClientSession) -> None:
@@ -142,7 +142,7 @@ def test_session_begins_anew_with_a_request_that_begins() -> None:
         (AOE, "00" * 16 + "0600 0400" + "00" * 12, 0, Cause.SERVICE),
     ],
 )
-def test_session_refuses_in_the_name_of_the_gateway(
+def test_session_answers_errors_of_the_gateway(
     kind: MailboxType, body: str, result: int, cause: Cause
 ) -> None:
     async def scene(handle: Ask, session: ClientSession) -> None:
@@ -152,7 +152,7 @@ def test_session_refuses_in_the_name_of_the_gateway(
     play(kind, Station(result=result), scene)
 
 
-def test_session_general_refusal_of_a_remote_element_keeps_its_bytes() -> None:
+def test_session_general_error_of_a_remote_element_keeps_its_bytes() -> None:
     async def scene(handle: Ask, session: ClientSession) -> None:
         assert await handle("03 40 2000 01") == ["14402000" + "0b80"]
 

@@ -24,7 +24,7 @@ def test_clients_hear_a_slave_for_a_while_after_they_talked_to_it() -> None:
     assert listeners.of_slave(1001, 11) == []
 
 
-def test_the_least_lately_heard_makes_room() -> None:
+def test_listeners_drop_the_least_recent() -> None:
     listeners = EoeListeners()
     for number in range(MAX_LISTENERS + 1):
         listeners.add(1001, Endpoint("udp:e", str(number)), number, send, 0)

@@ -94,7 +94,9 @@ def test_files_of_any_size(size: int) -> None:
         (READ, bytes(300).replace(b"\0", b"n"), FoeErrorCode.NOT_DEFINED),
     ],
 )
-def test_what_the_slave_refuses(opcode: FoeOpcode, name: bytes, code: FoeErrorCode) -> None:
+def test_file_error_of_the_slave_reaches_the_client(
+    opcode: FoeOpcode, name: bytes, code: FoeErrorCode
+) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
         for _ in range(2):  # asking again is another try
@@ -179,7 +181,7 @@ def test_a_packet_longer_than_the_mailbox() -> None:
 
 
 @pytest.mark.parametrize("goes_on", [True, False])
-def test_who_has_to_wait_is_told_busy(goes_on: bool) -> None:
+def test_file_client_that_has_to_wait_gets_busy(goes_on: bool) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         engine.held_kind = ExchangeMailbox
         engine.holds = True
@@ -222,7 +224,7 @@ def test_a_station_that_vanishes(opcode: FoeOpcode) -> None:
     play(scene)
 
 
-def test_what_was_begun_and_left_does_not_count() -> None:
+def test_abandoned_write_leaves_no_file() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
         await desk.handle(WRITE, 0, b"a.bin")

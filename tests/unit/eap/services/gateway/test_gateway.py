@@ -205,9 +205,7 @@ def test_any_upload_command_and_surplus_octets_are_taken() -> None:
         (COE, 1001, "0020 40 9999 00 00000000", (COE, "0020 80 9999 00 00000206")),
     ],
 )
-def test_what_cannot_be_done_is_answered_in_the_protocol_of_the_request(
-    kind, address, octets, answer
-) -> None:
+def test_gateway_errors_are_in_the_protocol_of_the_request(kind, address, octets, answer) -> None:
     async def scene(desk: Desk) -> None:
         ((header, body),) = await desk.handle(kind, address, octets)
         assert (header.type, body) == (answer[0], bytes.fromhex(answer[1]))
@@ -289,7 +287,7 @@ def test_all_slaves_of_a_bus_that_is_down_are_answered_for() -> None:
     play(scene, bus="coe")
 
 
-def test_session_begins_anew_when_a_slave_has_another_mailbox() -> None:
+def test_session_restarts_when_the_mailbox_of_a_slave_changes() -> None:
     upload = "0020 40 0180 00 00000000"
 
     async def scene(desk: Desk) -> None:
@@ -305,7 +303,7 @@ def test_session_begins_anew_when_a_slave_has_another_mailbox() -> None:
     play(scene, bus="coe")
 
 
-def test_virtual_addresses_stand_for_slaves_here_and_elsewhere() -> None:
+def test_virtual_addresses_of_local_and_remote_slaves() -> None:
     async def scene(desk: Desk) -> None:
         assert await desk.one(COE, 0x9000, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
         assert await desk.one(COE, 0x9001, VENDOR) == "00 30 43 18 10 01 07 00 00 00"
@@ -342,7 +340,7 @@ def test_a_mailbox_error_is_no_request() -> None:
     play(scene)
 
 
-def test_ethernet_frames_of_a_slave_go_to_who_talks_to_it() -> None:
+def test_ethernet_frames_of_a_slave_go_to_its_clients() -> None:
     async def scene(desk: Desk) -> None:
         heard: list[bytes] = []
         frame = encode_frame(
@@ -388,7 +386,7 @@ def test_requests_of_the_dialect(name) -> None:
     play(scene)
 
 
-def test_the_dialect_of_who_may_only_read() -> None:
+def test_dialect_of_a_read_only_client() -> None:
     write = next(each for each in load("high_nibble_dialect") if "coe_write" in each.name)
 
     async def scene(desk: Desk) -> None:

@@ -87,7 +87,7 @@ def test_changes_and_refusals_are_audited() -> None:
     play(scene)
 
 
-def test_a_file_elsewhere_is_judged_when_it_is_opened() -> None:
+def test_access_to_a_remote_file_is_decided_at_its_opening() -> None:
     async def scene(desk: Desk) -> None:
         refused = await desk.one(FOE, 0x9001, "02 00 00000000" + FILE, ELSEWHERE)
         assert refused.startswith("05 00 0a 80 00 00")
@@ -100,7 +100,7 @@ def test_a_file_elsewhere_is_judged_when_it_is_opened() -> None:
     play(scene)
 
 
-def test_the_audit_tells_how_a_change_came_out() -> None:
+def test_audit_has_the_result_of_a_change() -> None:
     async def scene(desk: Desk) -> None:
         entries: list[AuditEntry] = []
         desk.gateway.admission.on_audit.append(entries.append)

@@ -50,14 +50,14 @@ def test_the_first_station_with_a_bus_has_the_gateway() -> None:
     ]
 
 
-def test_without_a_bus_nobody_answers() -> None:
+def test_transport_without_a_gateway_drops_frames() -> None:
     transport = GatewayTransport([])
     assert transport.receive(UPLOAD, "me", lambda *each: None) is DropReason.MAILBOX
     transport.connection_closed("me")
     asyncio.run(transport.wait_below("me", 1))
 
 
-def test_a_protocol_that_nobody_knows_is_refused_by_a_mailbox_error() -> None:
+def test_unknown_protocol_is_answered_with_a_mailbox_error() -> None:
     transport = GatewayTransport([(Gateway(), "udp:a")])
     sent = []
     frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]

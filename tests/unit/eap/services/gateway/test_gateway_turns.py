@@ -28,7 +28,7 @@ from tests.unit.eap.services.gateway.test_gateway import (
 )
 
 
-def test_what_is_asked_twice_at_once_is_answered_twice_on_a_connection() -> None:
+def test_repeated_request_on_a_connection_is_answered_twice() -> None:
     request = encode_frame(
         MailboxHeader(0, 1001, type=COE, counter=3), bytes.fromhex("0020 40 1810 01 00000000")
     )
@@ -58,7 +58,7 @@ def test_a_repeated_step_of_a_transfer_is_answered_and_counted() -> None:
     play(scene)
 
 
-def test_who_is_too_fast_is_told_so() -> None:
+def test_client_over_its_rate_gets_an_error() -> None:
     async def scene(desk: Desk) -> None:
         await desk.one(COE, 1001, VENDOR)
         assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
@@ -102,7 +102,7 @@ def test_two_clients_transfers_do_not_mix() -> None:
     play(scene, settings=Settings(NET_ID, answer_s=0.2))
 
 
-def test_who_has_to_wait_too_long_is_told_that_the_slave_is_busy() -> None:
+def test_client_that_waits_too_long_gets_busy() -> None:
     async def scene(desk: Desk) -> None:
         await desk.one(FOE, 1001, "02 00 00000000" + FILE)
         answer = await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
@@ -143,7 +143,7 @@ def test_a_client_that_leaves_leaves_no_transfer_behind() -> None:
     play(scene)
 
 
-def test_who_is_stopped_lets_go_of_everything() -> None:
+def test_stopped_gateway_aborts_all_transfers() -> None:
     async def scene(desk: Desk) -> None:
         await desk.one(FOE, 1001, "01 00 00000000" + FILE)
         (running,) = desk.gateway.transfers()
@@ -172,7 +172,7 @@ def test_the_same_request_is_answered_once_until_then() -> None:
     play(scene)
 
 
-def test_who_asks_too_much_at_once_is_told() -> None:
+def test_client_over_its_pending_limit_gets_an_error() -> None:
     async def scene(desk: Desk) -> None:
         answers: list[bytes] = []
         for index in range(4):

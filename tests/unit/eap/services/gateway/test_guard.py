@@ -34,7 +34,7 @@ def test_rules_that_change_count_at_once() -> None:
     assert admission.decide(ELSEWHERE, TARGET, WRITE).is_allowed
 
 
-def test_the_audit_is_told_of_changes_and_refusals() -> None:
+def test_admission_records_changes_and_denials() -> None:
     admission = GatewayAdmission(AccessList)
     told: list[AuditEntry] = []
     admission.on_audit.append(told.append)
@@ -77,11 +77,11 @@ def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
         (MailboxType.ERR, "0100 0200", AdsError.SERVICE),
     ],
 )
-def test_how_a_request_came_out(kind: MailboxType, body: str, result: int) -> None:
+def test_result_of_replies_of_a_slave(kind: MailboxType, body: str, result: int) -> None:
     assert result_of([GatewayReply(kind, bytes.fromhex(body))]) == result
 
 
-def test_how_a_request_came_out_that_the_gateway_answers() -> None:
+def test_result_of_replies_of_the_gateway() -> None:
     refusal = error_reply(MailboxType.COE, bytes(10), Cause.TIMEOUT)
     assert result_of([GatewayReply(*refusal, reason=Cause.TIMEOUT)]) == AdsError.TIMEOUT
     assert result_of([]) is None

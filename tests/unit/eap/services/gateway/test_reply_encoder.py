@@ -104,7 +104,7 @@ def test_refusal_log_names_client_address_and_cause(caplog):
     )
 
 
-def test_refusal_log_client_that_asks_again_is_the_same_cause_and_another_is_not(caplog):
+def test_error_log_repeats_of_one_client_have_the_same_cause(caplog):
     log = ErrorLog("mill/bus0")
     again = NEAR._replace(connection="10.0.0.8:2")
     for endpoint in (NEAR, again, THERE):

@@ -91,7 +91,7 @@ def test_whole_object_in_segments():
     play(scene)
 
 
-def test_errors_reach_the_conversation_as_what_they_are():
+def test_errors_keep_their_class_in_a_conversation():
     async def scene(client, engine):
         engine.buses[0].line.fault(kind="mailbox", slave="sensor")
         seen = []
@@ -149,7 +149,7 @@ def _sizes(report):
     return report.slaves[0].to_slave, report.slaves[0].to_master
 
 
-def test_who_leaves_in_the_middle_of_a_file_leaves_the_slave_usable():
+def test_client_that_leaves_in_a_file_frees_the_slave():
     async def scene(client, engine):
         sizes = MailboxSizes(*_sizes(await client.describe()))
         write = foe_client.write("firmware.bin", bytes, sizes)  # a file without an end
@@ -249,7 +249,7 @@ def test_engine_that_is_gone(monkeypatch):
     play(scene)
 
 
-def test_bus_clients_ask_for_their_buses_by_number():
+def test_bus_clients_request_their_buses_by_number():
     async def run():
         engine = FakeEngine(FakeBus(LoopBus("drive")), FakeBus(LoopBus("coe")))
         link = EngineLink(engine.services)

@@ -54,7 +54,7 @@ def change(*slaves: SlaveDescription, stations: tuple[int, ...] = (1001, 1002), 
     return BusChange(bus=bus, is_up=True, fault="", stations=stations, slaves=slaves)
 
 
-def test_view_asks_the_engine_once():
+def test_view_requests_the_engine_once():
     async def scene(view, engine, link):
         assert not view.latest.slaves
         for _ in range(3):
@@ -78,7 +78,7 @@ def test_view_has_the_state_that_was_requested_when_the_answer_comes():
     play(scene)
 
 
-def test_view_confirmed_has_changes_that_nobody_requested():
+def test_view_confirmed_has_unrequested_changes():
     async def scene(view, engine, link):
         await view.current()
         engine.buses[0].is_up = False
@@ -105,7 +105,7 @@ def test_view_of_a_silent_engine_is_confirmed_before_it_is_used():
     play(scene)
 
 
-def test_view_is_empty_after_a_restart_of_the_engine_and_asks_again():
+def test_view_is_empty_after_a_restart_of_the_engine_and_requests_again():
     async def scene(view, engine, link):
         await view.current()
         notified = []

@@ -80,7 +80,7 @@ def test_a_file_that_is_written_is_closed_once() -> None:
     play(scene)
 
 
-def test_who_gives_up_before_the_file_is_opened() -> None:
+def test_remote_file_closed_before_it_is_opened() -> None:
     async def scene(bus: Bus) -> None:
         file = opened(bus, is_write=True)
         file.close()
@@ -90,7 +90,7 @@ def test_who_gives_up_before_the_file_is_opened() -> None:
     play(scene)
 
 
-def test_who_gives_up_while_the_file_is_opened() -> None:
+def test_remote_file_closed_while_it_is_opened() -> None:
     async def scene(bus: Bus) -> None:
         file = opened(bus, is_write=True)
         await busads.until(asked(bus, IndexGroup.FOE_OPEN_WRITE))
@@ -100,7 +100,7 @@ def test_who_gives_up_while_the_file_is_opened() -> None:
     play(scene)
 
 
-def test_who_gives_up_a_file_closes_it_there() -> None:
+def test_remote_file_closed_is_closed_at_the_slave() -> None:
     async def scene(bus: Bus) -> None:
         await write(bus, CONTENT)
         file = opened(bus, is_write=False)

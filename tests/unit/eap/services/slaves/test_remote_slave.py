@@ -71,7 +71,7 @@ def test_a_slave_behind_the_first_list() -> None:
         (AdsError.HOST_UNREACHABLE, AdsError.HOST_UNREACHABLE),
     ],
 )
-def test_a_master_that_does_not_tell(result: AdsError, told: AdsError) -> None:
+def test_remote_master_without_a_dictionary(result: AdsError, told: AdsError) -> None:
     with pytest.raises(RemoteAccessError) as caught:
         asyncio.run(Station(result=result).link().sizes())
     assert caught.value.result == told
@@ -134,7 +134,7 @@ def test_remote_slave_reads_and_writes_whole_objects() -> None:
         (AdsError.HOST_UNREACHABLE, RemoteAccessError, None),
     ],
 )
-def test_remote_slave_tells_its_refusals_from_errors_of_the_way(
+def test_remote_slave_separates_errors_from_routing_errors(
     result: int, error: type[Exception], code: AbortCode | None
 ) -> None:
     slave = Station(result=result).link()
