@@ -58,7 +58,7 @@ def test_info_and_states(bench) -> None:
     assert bench.ask(AmsCommand.READ, "3I", G.DEVICE_DATA, 0, 4).data[8:] == b"\5\0\x08\0"
 
 
-def test_states_are_taken_where_somebody_takes_them(bench) -> None:
+def test_device_write_control_reaches_its_handler(bench) -> None:
     assert bench.result(AmsCommand.WRITE_CONTROL, "2HI", AdsState.CONFIG, 8, 0) == 0
     assert bench.station.al_state == 2
     assert bench.result(AmsCommand.WRITE_CONTROL, "2HI", AdsState.IDLE, 8, 0) == AdsError.VALUE
@@ -97,7 +97,7 @@ def test_unknown_commands_are_an_error_of_the_header(bench, command: int) -> Non
     assert bench.ask(command) == AmsAnswer(error_code=AdsError.COMMAND)
 
 
-def test_notifications_are_added_told_and_deleted(bench) -> None:
+def test_device_adds_samples_and_deletes_notifications(bench) -> None:
     added = bench.ask(
         AmsCommand.ADD_NOTIFICATION,
         "6I16x",
@@ -143,7 +143,7 @@ class Talkative(AdsSpace):
         return bytes(length + 1)
 
 
-def test_nothing_longer_than_asked_for_is_sent(bench) -> None:
+def test_device_refuses_data_longer_than_requested(bench) -> None:
     device = AdsDevice(info("talkative"), bench.station.states, [Talkative()])
     for command, body in ((AmsCommand.READ, bytes(12)), (AmsCommand.READ_WRITE, bytes(16))):
         answer = device.answer(command, b"\1\0\0\0" + body[4:], CLIENT, 0)

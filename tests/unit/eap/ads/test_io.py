@@ -30,7 +30,7 @@ SPACE = IoSpace(
         (0x5007, 7, "6f00"),
     ],
 )
-def test_what_adstool_reads(group: int, offset: int, octets: str) -> None:
+def test_io_space_answers_reads_of_adstool(group: int, offset: int, octets: str) -> None:
     assert group in SPACE.groups
     assert SPACE.read(group, offset, 254) == bytes.fromhex(octets)
     assert SPACE.read(group, offset, 2) == bytes.fromhex(octets)[:2]
@@ -40,12 +40,12 @@ def test_what_adstool_reads(group: int, offset: int, octets: str) -> None:
     ("group", "offset", "result"),
     [(0x5000, 5, "INDEX_OFFSET"), (0x5001, 2, "INDEX_OFFSET"), (0x5002, 1, "NOT_FOUND")],
 )
-def test_what_is_not_there(group: int, offset: int, result: str) -> None:
+def test_io_space_refuses_unknown_devices_and_offsets(group: int, offset: int, result: str) -> None:
     with pytest.raises(AdsRefusedError, match=result):
         SPACE.read(group, offset, 4)
 
 
-def test_device_without_segment_answers_as_an_empty_one() -> None:
+def test_device_without_segment_answers_as_empty_master() -> None:
     space = NoSegmentSpace()
     assert IndexGroup.RAW_COMMAND in space.groups
     with pytest.raises(AdsRefusedError, match="TIMEOUT: no segment"):
@@ -76,7 +76,9 @@ def space(master: FakeMaster) -> MasterSpace:
         (9, 1003, 1, "08"),
     ],
 )
-def test_what_is_read(space, group: int, offset: int, length: int, octets: str) -> None:
+def test_master_space_reads_states_and_addresses(
+    space, group: int, offset: int, length: int, octets: str
+) -> None:
     assert space.read(group, offset, length) == bytes.fromhex(octets)
 
 

@@ -72,7 +72,7 @@ def test_cyclic_ones_are_sampled_in_their_cycle(table, mode: int) -> None:
     assert value.reads == 4
 
 
-def test_first_sample_never_comes_in_the_moment_of_the_request(table) -> None:
+def test_first_sample_follows_the_answer_to_the_request(table) -> None:
     table.add(ME, asked(CYCLE), Value(), 5 * MS)
     assert cycle(table, 5) == []
     assert len(cycle(table, 5.1)) == 1
@@ -98,7 +98,7 @@ def test_a_cycle_of_zero_is_every_cycle(table) -> None:
 
 
 @pytest.mark.parametrize("mode", [TransMode.SERVER_ON_CHANGE, TransMode.SERVER_ON_CHANGE_2])
-def test_changes_are_told_with_the_first_value(table, mode: int) -> None:
+def test_changes_are_sampled_from_the_first_value(table, mode: int) -> None:
     value = Value(b"a")
     handle = table.add(ME, asked(mode), value, 0)
     assert cycle(table, 1) == [(ME, [stamp(1, (handle, b"a"))])]
@@ -156,7 +156,7 @@ def test_samples_of_one_cycle_share_a_stamp_and_wait_for_others(table) -> None:
     assert cycle(table, 50) == []
 
 
-def test_the_most_impatient_sample_takes_the_others_along(table) -> None:
+def test_sample_with_shortest_delay_sends_waiting_samples(table) -> None:
     patient = table.add(ME, asked(CHANGE, delay_ms=1000), Value(b"p"), 0)
     assert cycle(table, 10) == []
     hasty = table.add(ME, asked(CHANGE), Value(b"h"), 10 * MS)
@@ -189,7 +189,7 @@ def test_handles_belong_to_their_client(table) -> None:
     assert tuple(table._clients) == (YOU,)
 
 
-def test_connections_that_are_gone_are_forgotten(table) -> None:
+def test_notifications_of_closed_connection_are_removed(table) -> None:
     for client in (ME, ME, OTHER, YOU):
         table.add(client, asked(CYCLE, delay_ms=100), Value(), 0)
     assert cycle(table, 1) == []
@@ -209,7 +209,7 @@ def test_packet_of_a_notice() -> None:
     assert body == b"data"
 
 
-def test_what_waits_for_a_client_goes_with_its_last_notification(table) -> None:
+def test_waiting_samples_are_dropped_with_the_last_notification(table) -> None:
     handle = table.add(ME, asked(CYCLE, delay_ms=100), Value(), 0)
     assert cycle(table, 1) == []
     table.delete(ME, handle)
@@ -217,7 +217,7 @@ def test_what_waits_for_a_client_goes_with_its_last_notification(table) -> None:
     assert tuple(table._clients) == ()
 
 
-def test_a_source_that_fails_for_now_is_asked_again(table) -> None:
+def test_source_that_is_busy_is_read_again(table) -> None:
     value = Value(b"a")
     handle = table.add(ME, asked(CHANGE), value, 0)
     value.octets = None
@@ -249,7 +249,7 @@ def test_a_last_source_that_fails_ends_its_client(table) -> None:
     assert tuple(table._clients) == ()
 
 
-def test_who_drives_the_table_hears_of_new_ones(table) -> None:
+def test_table_reports_new_notifications(table) -> None:
     heard: list[int] = []
     table.on_add = lambda: heard.append(table.stats().notifications)
     table.add(ME, asked(CYCLE), Value(), 0)
@@ -300,7 +300,7 @@ def test_clients_and_their_handles_are_bounded(table, monkeypatch) -> None:
     assert table.add(ME, asked(CYCLE), Value(), 0) not in handles
 
 
-def test_handles_come_round_after_all_others(table, monkeypatch) -> None:
+def test_handles_wrap_around(table, monkeypatch) -> None:
     kept = table.add(ME, asked(CYCLE), Value(), 0)
     monkeypatch.setattr(table, "_next_handle", 0xFFFF_FFFF)
     assert table.add(ME, asked(CYCLE), Value(), 0) == 0xFFFF_FFFF

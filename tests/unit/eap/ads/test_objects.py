@@ -77,7 +77,7 @@ def test_refusals(space, attempt, result: str) -> None:
         attempt(space)
 
 
-def test_results_may_be_told_in_other_words(dictionary) -> None:
+def test_object_space_maps_aborts_to_given_results(dictionary) -> None:
     space = ObjectSpace(dictionary, lambda: OdState.OP, lambda _: AdsError.ACCESS)
     with pytest.raises(AdsRefusedError, match="ACCESS"):
         space.read(SDO, 0x3000_0000, 4)

@@ -127,18 +127,18 @@ def test_requests_that_are_too_short(command: int, body: bytes) -> None:
 
 
 @pytest.mark.parametrize("command", [0, AmsCommand.NOTIFICATION, AmsCommand.FRAGMENT, 0xFFFF])
-def test_commands_that_ask_for_nothing(command: int) -> None:
+def test_commands_without_body_are_parsed(command: int) -> None:
     with pytest.raises(AdsRefusedError, match="COMMAND"):
         parse_request(command, bytes(64))
 
 
-def test_what_is_no_request_is_answered_at_once() -> None:
+def test_malformed_request_is_answered_at_once() -> None:
     assert accept_request(AmsCommand.READ, bytes(11)) == AmsAnswer(b"\5\7\0\0" + bytes(4))
     assert accept_request(0, b"") == AmsAnswer(error_code=AdsError.COMMAND)
     assert accept_request(AmsCommand.READ_STATE, b"") == parse_request(AmsCommand.READ_STATE, b"")
 
 
-def test_the_first_reasons_are_told() -> None:
+def test_answer_names_the_first_reasons() -> None:
     items = struct.pack("<4I", G.SUM_READ, 5, 100, 60) + bytes(60)
     outcomes = Outcomes(parse_request(AmsCommand.READ_WRITE, items))
     outcomes.add(OperationOutcome())
@@ -171,7 +171,7 @@ def test_an_outcome_is_the_answer_that_is_encoded(command: AmsCommand) -> None:
         assert decode_outcome(command, 0, encode_outcome(command, outcome)) == outcome
 
 
-def test_what_is_no_answer() -> None:
+def test_short_answer_is_decoded_as_size_error() -> None:
     assert decode_outcome(AmsCommand.READ, 6, b"").result == AdsError.TARGET_PORT
     assert decode_outcome(AmsCommand.READ, 0, b"\0\0\0").result == AdsError.SIZE
     cut = encode_outcome(AmsCommand.READ, OperationOutcome(data=b"data"))[:-1]
@@ -199,7 +199,9 @@ def sum_of(group: int, operations: tuple[Operation, ...]) -> AdsRequest:
 
 
 @pytest.mark.parametrize(("group", "operations"), SUMS.items())
-def test_a_part_asks_for_the_chosen_items(group: int, operations: tuple[Operation, ...]) -> None:
+def test_part_of_sum_requests_the_chosen_items(
+    group: int, operations: tuple[Operation, ...]
+) -> None:
     whole = sum_of(group, operations)
     assert parse_request(AmsCommand.READ_WRITE, encode_sum(whole)) == whole
     part = part_of(whole, operations[::2])
@@ -235,7 +237,7 @@ def test_an_answer_is_split_as_it_is_made(group: int, datas: tuple[bytes, ...]) 
         struct.pack("<II6I", 0, 24, 0, 1, 0, 0, 0, 0),
     ],
 )
-def test_what_is_no_answer_to_all_items_is_not_split(body: bytes) -> None:
+def test_short_answer_to_sum_is_not_split(body: bytes) -> None:
     assert split_answer(sum_of(G.SUM_READ_EX_2, READS), body) is None
 
 

@@ -27,12 +27,12 @@ from eap.codec.ads import AdsState, AdsStates, AdsSystemState, IndexGroup
         lambda space: space.watch(1, 2, 3),
     ],
 )
-def test_what_is_not_overridden_is_refused(attempt: Callable[[AdsSpace], object]) -> None:
+def test_space_refuses_operations_without_override(attempt: Callable[[AdsSpace], object]) -> None:
     with pytest.raises(AdsRefusedError, match="ACCESS"):
         attempt(AdsSpace())
 
 
-def test_what_gets_longer_or_shorter_ends() -> None:
+def test_fixed_size_source_ends_when_length_changes() -> None:
     octets = [b"four", b"more", b"five!", b"two", b"two"]
     source = fixed_size_source(lambda: octets.pop(0), 4)
     assert source() == b"more"
@@ -57,11 +57,11 @@ DATA = IndexGroup.DEVICE_DATA
         (0, AdsState.INVALID),
     ],
 )
-def test_states_that_are_told(al_state: int, ads_state: AdsState) -> None:
+def test_al_states_map_to_ads_states(al_state: int, ads_state: AdsState) -> None:
     assert states_of(al_state) == AdsStates(ads_state, al_state)
 
 
-def test_states_that_are_asked_for() -> None:
+def test_ads_states_map_to_al_states() -> None:
     for al_state in (1, 2, 4, 8):
         assert al_state_for(states_of(al_state).ads_state) == al_state
     assert al_state_for(AdsState.RESET) == 1
@@ -82,7 +82,7 @@ def test_device_data_is_read_and_watched() -> None:
     assert source() == b"\6\0\4\0"
 
 
-def test_device_data_that_is_not_there() -> None:
+def test_device_data_refuses_unknown_offsets() -> None:
     space = DeviceDataSpace(lambda: AdsStates(AdsState.RUN, 8))
     with pytest.raises(AdsRefusedError, match="INDEX_OFFSET"):
         space.read(DATA, 1, 2)
@@ -90,7 +90,7 @@ def test_device_data_that_is_not_there() -> None:
         space.watch(DATA, 2, 4)
 
 
-def test_state_is_asked_for_each_time() -> None:
+def test_system_state_is_read_each_time() -> None:
     starts = iter((1, 2))
     space = SystemSpace(lambda: AdsSystemState(AdsState.RUN, 8, restart_index=next(starts)))
     assert space.read(IndexGroup.SYSTEM_STATE, 0, 16) == b"\5\0\x08\0\1\0" + bytes(10)

@@ -119,21 +119,21 @@ def test_sum_commands_do_not_nest() -> None:
     assert request.operations == (ReadWrite(G.SUM_READ, 1, 100, reads(4)[0]),)
 
 
-def test_answer_must_fit_where_the_client_has_room() -> None:
+def test_sum_answer_longer_than_read_length_is_refused() -> None:
     request = parse_sum(G.SUM_READ, reads(4), room=7)
     answer = request.encode_answer([OperationOutcome(data=b"abcd")])
     assert answer == struct.pack("<II", AdsError.SIZE, 0)
 
 
 @pytest.mark.parametrize("group", [G.SUM_READ, G.SUM_WRITE, G.SUM_READ_EX_2])
-def test_nobody_has_others_wait_for_too_many_items(group: int) -> None:
+def test_sum_with_too_many_items_is_refused(group: int) -> None:
     with pytest.raises(AdsRefusedError, match="NO_MEMORY"):
         parse_sum(group, reads(*[0] * (MAX_ITEMS + 1)))
     assert len(parse_sum(group, reads(*[0] * MAX_ITEMS)).operations) == MAX_ITEMS
 
 
 @pytest.mark.parametrize("group", [G.SUM_READ, G.SUM_READ_EX])
-def test_nobody_is_promised_more_than_fits_in_an_answer(group: int) -> None:
+def test_sum_that_exceeds_the_answer_is_refused(group: int) -> None:
     with pytest.raises(AdsRefusedError, match="NO_MEMORY"):
         parse_sum(group, reads(MAX_ANSWER - 8, 1))
     assert parse_sum(group, reads(MAX_ANSWER - 8)).operations

@@ -125,7 +125,7 @@ def test_texts_may_be_shorter_and_truth_any_octet() -> None:
         ),
     ],
 )
-def test_what_types_are_made_of(text: str, entries: list) -> None:
+def test_type_describes_its_elements(text: str, entries: list) -> None:
     assert symbol_type(datatypes.parse(text)).describe() == entries
 
 
@@ -133,7 +133,7 @@ TEXTS = ["INT24", "UINT56[3]", "BIT5", "REAL", "LINT[2]", "STRING(9)", "BLOCK(5)
 
 
 @given(st.sampled_from(TEXTS), st.data())
-def test_whatever_a_client_writes_is_a_value_it_reads_again(text: str, data: st.DataObject) -> None:
+def test_written_value_is_read_back_by_client(text: str, data: st.DataObject) -> None:
     kind = symbol_type(datatypes.parse(text))
     written = data.draw(st.binary(min_size=kind.size, max_size=kind.size))
     try:
@@ -199,7 +199,7 @@ def handle(space: SymbolSpace, name: str) -> int:
     return int.from_bytes(space.read_write(G.SYMBOL_HANDLE, 0, 4, name.encode() + b"\0"), "little")
 
 
-def test_a_value_is_the_same_whichever_way_it_is_reached(space, store) -> None:
+def test_value_by_name_handle_and_offset_is_equal(space, store) -> None:
     for name, kind in store.types.items():
         place = SymbolAddress.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, name.encode()))
         by_name = space.read_write(G.VALUE_BY_NAME, 0, BIG, name.encode())
@@ -240,7 +240,7 @@ def test_table_is_uploaded(space) -> None:
         space.read(G.SYMBOL_UPLOAD, 0, size - 1)
 
 
-def test_types_of_symbols_are_told_and_uploaded(space) -> None:
+def test_types_of_symbols_are_uploaded(space) -> None:
     info = UploadInfo.decode(space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 24))
     octets = space.read(G.DATA_TYPE_UPLOAD, 0, BIG)
     assert len(octets) == info.type_size
@@ -260,7 +260,7 @@ def test_types_of_symbols_are_told_and_uploaded(space) -> None:
         space.read_write(G.DATA_TYPE_BY_NAME, 0, 40, b"INT")
 
 
-def test_a_handle_comes_with_its_type_where_there_is_room(space) -> None:
+def test_handle_answer_includes_type_if_it_fits(space) -> None:
     octets = space.read_write(G.SYMBOL_HANDLE, 0, BIG, b"count")
     assert octets == bytes.fromhex("03000001 04000000 00000000 0500") + b"UDINT\0"
     assert space.read_write(G.SYMBOL_HANDLE, 0, len(octets), b"count") == octets
@@ -303,7 +303,7 @@ def test_handles_of_an_older_table_are_refused_as_such(space, store) -> None:
         handle(space, "count")
 
 
-def test_watching_goes_on_with_what_is_in_the_next_table_too(space, store) -> None:
+def test_watch_continues_for_symbol_of_the_next_table(space, store) -> None:
     value = space.watch(G.VALUE_BY_HANDLE, handle(space, "count"), 4)
     space.replace(SymbolTable(reversed(variables(store)), 2), store)
     store.set("count", 5)
@@ -321,7 +321,7 @@ def test_handles_that_never_were_any(space, number: int) -> None:
         space.read(G.VALUE_BY_HANDLE, number, 4)
 
 
-def test_watching_gives_exactly_what_was_asked_for(space, store) -> None:
+def test_watch_returns_the_requested_length(space, store) -> None:
     place = SymbolAddress.decode(space.read_write(G.SYMBOL_BY_NAME, 0, 12, b"curve"))
     second = space.watch(G.DATA, place.offset + 2, 2)
     store.set("curve", (1, 2, 3, 4))
@@ -355,7 +355,7 @@ def test_refusals(space, attempt, result: str) -> None:
         attempt(space)
 
 
-def test_what_the_store_refuses_is_passed_on(space, store) -> None:
+def test_symbol_space_returns_refusal_of_the_store(space, store) -> None:
     store.broken["motor.speed"] = AdsError.BUSY
     number = handle(space, "motor.speed")
     with pytest.raises(AdsRefusedError, match="BUSY"):

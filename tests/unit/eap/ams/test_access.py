@@ -84,7 +84,7 @@ def test_objects_of_operations() -> None:
     assert objects_of(CONTROL) is None
 
 
-def test_host_of_a_way() -> None:
+def test_host_of_endpoint() -> None:
     assert host_of(Endpoint("ams-tcp", "10.0.0.2:40000#7")) == "10.0.0.2"
     assert host_of(Endpoint("ethernet:eap0", "02:00:00:00:00:01")) == "02:00:00:00:00:01"
     assert host_of(Endpoint("mqtt:line", "5.1.1.1.1.1")) == "5.1.1.1.1.1"
@@ -118,12 +118,12 @@ def test_without_rules_this_host_does_everything_and_others_read() -> None:
         (Endpoint("mqtt:line", "127.0.1.1.1.1"), False),
     ],
 )
-def test_who_is_this_host(endpoint: Endpoint, *, here: bool) -> None:
+def test_access_list_recognizes_this_host(endpoint: Endpoint, *, here: bool) -> None:
     access = AccessList(own=[IPv4Address("10.0.0.1")])
     assert access.is_this_host(endpoint) is here
 
 
-def test_address_of_a_way() -> None:
+def test_address_of_endpoint() -> None:
     assert address_of(Endpoint("udp:eap0", "10.0.0.2:34980")) == IPv4Address("10.0.0.2")
     assert address_of(Endpoint("tcp:eap0", "nobody")) is None
     assert address_of(Endpoint("mqtt:line", "10.0.0.2")) is None
@@ -192,7 +192,7 @@ def test_every_condition_of_a_rule_has_to_fit(rule: AccessRule, *, fits: bool) -
     assert grants(rule).decide(WRITE).is_allowed is fits
 
 
-def test_a_network_is_no_matter_of_doors_without_addresses() -> None:
+def test_rule_with_network_does_not_fit_transports_without_addresses() -> None:
     rule = AccessRule("all", networks=("0.0.0.0/0",))
     assert (
         not grants(rule, endpoint=Endpoint("ethernet:eap0", "02:00:00:00:00:01"))
@@ -201,7 +201,7 @@ def test_a_network_is_no_matter_of_doors_without_addresses() -> None:
     )
 
 
-def test_what_is_remembered_of_clients_is_bounded() -> None:
+def test_access_list_cache_is_bounded() -> None:
     access = AccessList()
     first = access.grants(LAPTOP, ENGINEER, *SLAVE)
     assert access.grants(LAPTOP, ENGINEER, *SLAVE) is first

@@ -51,7 +51,7 @@ def test_an_answer_that_cannot_be_read_is_left_as_it_is() -> None:
         assert [each.result for each in entry.operations] == [result, 0x723, result]
 
 
-def test_what_is_told() -> None:
+def test_audited_operations() -> None:
     read, piece = Read(1, 2, 3), Write(IndexGroup.FOE_WRITE, 7, b"a")
     files = Decision(AccessService.FILES, True, "")
     assert not AuditedOperation(read, READ_DECISION, 0).is_audited
@@ -97,14 +97,14 @@ def results(entry: AuditEntry) -> list[int | None]:
 
 
 class TestWhole:
-    def test_reading_goes_in_and_on_and_is_not_told(self) -> None:
+    def test_filter_delivers_and_forwards_reads_without_audit(self) -> None:
         here = station()
         read = ask(READ, struct.pack("<3I", G.SDO, 0x1018_0001, 4))
         assert isinstance(here.give(read, LAPTOP)[0], Deliver)
         assert isinstance(here.give(read._replace(target=FAR_DEVICE), LAPTOP)[0], Forward)
         assert not list(entries(here))
 
-    def test_a_write_of_another_host_is_refused_and_told(self) -> None:
+    def test_filter_denies_and_audits_write_of_another_host(self) -> None:
         here = station()
         for target in (DEVICE, FAR_DEVICE):
             write = ask(WRITE, SDO_WRITE, target)
@@ -119,7 +119,7 @@ class TestWhole:
             " write refused: no rule allows it, and other hosts only read"
         )
 
-    def test_a_write_that_a_rule_allows_is_done_and_told_with_its_result(self) -> None:
+    def test_filter_audits_allowed_write_with_result(self) -> None:
         here = station(DRIVES)
         delivered = here.delivered(ask(WRITE, SDO_WRITE), LAPTOP)
         here.router.receive_answer(delivered.ticket, AmsAnswer(b"\x06\x07\0\0"), 1)
@@ -131,7 +131,7 @@ class TestWhole:
         assert done.operations[0].decision.why == "rule drives allows it"
         assert here.replied(ask(WRITE, OTHER_WRITE), LAPTOP)[1].error == 0x723
 
-    def test_what_cannot_be_read_is_answered_so(self) -> None:
+    def test_filter_answers_request_that_cannot_be_parsed(self) -> None:
         here = station()
         assert here.replied(ask(WRITE, b"\1\2"), LAPTOP)[1].body == b"\x05\x07\0\0"
         assert here.replied(ask(77, b""), LAPTOP)[1].error == 8
@@ -152,7 +152,7 @@ class TestWhole:
 
 
 class TestNoAnswer:
-    def test_a_hop_that_goes_or_is_silent(self) -> None:
+    def test_filter_audits_write_to_lost_or_silent_hop(self) -> None:
         here = station(DRIVES)
         here.forwarded(ask(WRITE, SDO_WRITE, FAR_DEVICE), LAPTOP)
         here.router.hop_down(*LINK, "cable pulled", 5)
@@ -169,7 +169,7 @@ class TestNoAnswer:
         here.give(onward.answer(), LINK)
         assert [results(each) for each in entries(here)] == [[None], [None]]
 
-    def test_a_change_for_which_there_is_no_room_is_told(self) -> None:
+    def test_filter_audits_write_beyond_limits(self) -> None:
         here = Station(
             [route(FAR, LINK, "far")], rules=[DRIVES], limits=RouterLimits(per_connection=1)
         )
@@ -181,7 +181,7 @@ class TestNoAnswer:
 
 
 class TestSums:
-    def test_items_are_judged_one_by_one_here_and_at_hops(self) -> None:
+    def test_filter_decides_on_sum_items_at_every_hop(self) -> None:
         here = station(DRIVES)
         body = sum_body(G.SUM_WRITE, SOME)
         kept = sum_body(G.SUM_WRITE, SOME[::2])
@@ -225,7 +225,7 @@ class TestSums:
         delivered = here.delivered(ask(READ_WRITE, sum_body(G.SUM_READ, reads)), LAPTOP)
         assert delivered.body == sum_body(G.SUM_READ, reads[:1])
 
-    def test_sums_of_reads_are_not_told(self) -> None:
+    def test_filter_does_not_audit_sums_of_reads(self) -> None:
         here = station()
         body = sum_body(G.SUM_READ, (Read(G.SDO, 0x1018_0001, 4),) * 3)
         here.delivered(ask(READ_WRITE, body), LAPTOP)
@@ -235,7 +235,7 @@ class TestSums:
 class TestRequiredRecord:
     """Changes that have to be recorded before they are done."""
 
-    def test_change_goes_in_when_it_was_recorded(self) -> None:
+    def test_filter_delivers_change_after_recording(self) -> None:
         here, recorded = station(DRIVES), []
         here.router.access_filter.before_change = lambda entry: recorded.append(entry) or ""
         assert isinstance(here.give(ask(WRITE, SDO_WRITE), LAPTOP)[0], Deliver)
@@ -266,7 +266,7 @@ class TestRequiredRecord:
 
 
 class TestFiles:
-    def test_pieces_of_a_file_are_told_only_when_they_fail(self) -> None:
+    def test_filter_audits_file_blocks_only_on_failure(self) -> None:
         here = station(AccessRule("anything"))
         for body, result in (
             (struct.pack("<4I", G.FOE_OPEN_WRITE, 0, 4, 1) + b"a", 0),
@@ -279,7 +279,7 @@ class TestFiles:
         assert told == [(G.FOE_OPEN_WRITE, 0), (G.FOE_WRITE, 0x700)]
 
 
-def test_the_audit_that_nobody_takes_is_bounded() -> None:
+def test_filter_audit_queue_is_bounded() -> None:
     here = station()
     for _ in range(MAX_ENTRIES + 3):
         here.give(ask(WRITE, SDO_WRITE), LAPTOP)

@@ -35,7 +35,9 @@ def make(hop: Endpoint = TCP, **more: object) -> tuple[Admission, InFlight, Rout
         (Endpoint("door that is gone", "1"), TCP, AdsError.HOST_UNREACHABLE),
     ],
 )
-def test_way_back_is_no_way(hop: Endpoint, endpoint: Endpoint, error: AdsError | None) -> None:
+def test_admission_refuses_route_back_to_source(
+    hop: Endpoint, endpoint: Endpoint, error: AdsError | None
+) -> None:
     admission, _, route = make(hop)
     found = admission.find_route(ASKED, endpoint)
     assert (
@@ -64,7 +66,7 @@ def test_hops_go_down_and_up() -> None:
     assert admission.why_down(Endpoint("gone", "1")) == "this station has no transport gone"
 
 
-def test_circle_has_addresses_and_command_of_what_waits() -> None:
+def test_admission_finds_loop_by_addresses_and_command() -> None:
     admission, waiting, route = make()
     assert admission.find_loop(ASKED, b"addresses", route) is None
     waiting.add(Pending(9, ASKED, TCP, route, b"addresses", 0, 1))
@@ -79,7 +81,7 @@ def test_circle_has_addresses_and_command_of_what_waits() -> None:
     assert admission.find_loop(ASKED, b"addresses", route) is None
 
 
-def test_only_doors_that_may_double_packets_look_for_doubles() -> None:
+def test_admission_checks_duplicates_on_datagram_transports_only() -> None:
     admission, waiting, route = make()
     for number, endpoint in enumerate((TCP, SEGMENT)):
         waiting.add(Pending(number, ASKED, endpoint, route, b"addresses", 0, 1))
@@ -87,7 +89,7 @@ def test_only_doors_that_may_double_packets_look_for_doubles() -> None:
     assert not admission.is_duplicate(ASKED, b"addresses", TCP)
 
 
-def test_room_is_limited_by_connection_and_in_all() -> None:
+def test_admission_limits_requests_by_connection_and_total() -> None:
     admission, waiting, route = make()
     assert admission.check_limits(TCP) is None
     waiting.add(Pending(1, ASKED, TCP, route, b"", 0, 1))

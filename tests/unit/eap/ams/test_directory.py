@@ -59,7 +59,7 @@ def test_addresses_by_name(text: str, address: str) -> None:
         ("9.8.7.6.1.300", "'9.8.7.6.1.300' has a number above 255"),
     ],
 )  # fmt: skip
-def test_what_is_no_name_here(text: str, reason: str) -> None:
+def test_directory_refuses_unknown_names(text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=f"^{re.escape(reason)}$"):
         HERE.find(text)
 
@@ -187,6 +187,6 @@ def test_port_is_chosen() -> None:
         ("mqtt:line/x", "is not an AMS NetID"),
     ],
 )
-def test_what_is_no_place_is_refused(text: str, reason: str) -> None:
+def test_via_refuses_unknown_targets(text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         parse_via(text, FAR, OWN, PLANT)

@@ -36,7 +36,7 @@ def test_refusal_is_answered_counted_and_traced() -> None:
     assert record.routes.of(ROUTE.key, 9).errors == 1
 
 
-def test_nobody_is_answered_when_nobody_waits() -> None:
+def test_error_replier_sends_nothing_without_waiting_client() -> None:
     error_replier = ErrorReplier(TransportTable([Transport("tcp")]), Record())
     assert error_replier.reply_error(HEADER, None, WHY, 9) == []
 

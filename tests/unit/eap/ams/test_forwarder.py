@@ -30,7 +30,7 @@ ONE, TWO = (Endpoint("tcp", f"10.0.0.9:{port}") for port in (4711, 4712))
 ASKED = Ams(FAR_DEVICE, CLIENT, invoke_id=1, body=b"which")
 
 
-def test_request_goes_on_with_another_id_and_its_answer_comes_back_with_the_first() -> None:
+def test_forwarder_replaces_invoke_id_and_restores_it() -> None:
     station = Station([route(FAR, LINK)])
     onward = station.forwarded(ASKED, ONE)
     assert onward == ASKED._replace(invoke_id=onward.invoke_id)
@@ -69,7 +69,7 @@ def test_error_from_behind_the_hop_is_passed_back_and_named() -> None:
         ({}, ONE),
     ],
 )
-def test_answers_that_nobody_asked_for_are_dropped(change: dict, endpoint: Endpoint) -> None:
+def test_forwarder_drops_unexpected_answers(change: dict, endpoint: Endpoint) -> None:
     station = Station([route(FAR, LINK)])
     answer = station.forwarded(ASKED, ONE).answer()
     assert station.give(answer._replace(**change), endpoint) == []
@@ -88,7 +88,7 @@ def test_answer_for_a_service_by_a_packet_is_nobodys() -> None:
     assert station.router.receive_answer(ticket, AmsAnswer(), 0)
 
 
-def test_all_answers_of_a_broker_come_by_one_connection() -> None:
+def test_forwarder_accepts_answers_by_shared_connection() -> None:
     station = Station([route(FAR, Endpoint("broker", FAR))])
     onward = station.forwarded(ASKED, ONE)
     assert station.replied(onward.answer(), Endpoint("broker", "it")) == (ONE, ASKED.answer())
@@ -150,7 +150,7 @@ def test_hop_that_is_down_is_answered_at_once() -> None:
     assert station.forwarded(ASKED, ONE)
 
 
-def test_door_may_be_down_as_a_whole() -> None:
+def test_forwarder_transport_down_fails_all_its_hops() -> None:
     station = Station([route(FAR, LINK), route("7.1.1.1.1.1", SECOND_LINK)])
     station.forwarded(ASKED, ONE)
     station.forwarded(ASKED._replace(target="7.1.1.1.1.1:1"), ONE)
@@ -160,7 +160,7 @@ def test_door_may_be_down_as_a_whole() -> None:
     assert station.forwarded(ASKED, ONE)
 
 
-def test_what_a_door_cannot_send_is_answered() -> None:
+def test_forwarder_replies_to_request_that_was_not_sent() -> None:
     station = Station([route(FAR, LINK)])
     (action,) = station.give(ASKED, ONE)
     assert isinstance(action, Forward)
@@ -170,7 +170,7 @@ def test_what_a_door_cannot_send_is_answered() -> None:
     assert station.router.send_failed(action.ticket, "again", 1) == []
 
 
-def test_closed_connection_gets_nothing_and_leaves_others_alone() -> None:
+def test_forwarder_closed_connection_gets_no_answer() -> None:
     station = Station([route(FAR, LINK)])
     gone, stays = (station.forwarded(ASKED, endpoint) for endpoint in (ONE, TWO))
     ticket = station.delivered(ASKED._replace(target=DEVICE), ONE).ticket
@@ -182,7 +182,7 @@ def test_closed_connection_gets_nothing_and_leaves_others_alone() -> None:
     assert station.router.stats().in_flight == 0
 
 
-def test_closed_connection_is_forgotten_when_the_time_is_up_or_the_hop_is_down() -> None:
+def test_forwarder_closed_connection_is_forgotten_after_timeout_or_hop_loss() -> None:
     station = Station([route(FAR, LINK)])
     for _ in range(2):
         station.forwarded(ASKED, ONE)
@@ -207,7 +207,7 @@ def test_virtual_net_id_is_translated_there_and_back() -> None:
     assert station.forwarded(back, LINK).source == "10.0.0.6.1.1:851"
 
 
-def test_unidirectional_route_lets_nobody_ask_from_there() -> None:
+def test_forwarder_refuses_requests_from_unidirectional_route() -> None:
     station = Station([route(FAR, LINK, "island", is_unidirectional=True),
                        route("7.1.1.1.1.1", SECOND_LINK)])  # fmt: skip
     assert station.forwarded(ASKED, ONE)
@@ -216,7 +216,7 @@ def test_unidirectional_route_lets_nobody_ask_from_there() -> None:
     assert "route island is unidirectional" in station.events()[0][1]
 
 
-def test_nothing_goes_back_to_where_it_came_from() -> None:
+def test_forwarder_refuses_route_back_to_source() -> None:
     segment = Endpoint("segment", "02:00:00:00:00:06")
     station = Station([route(FAR, segment), route("7.1.1.1.1.1", LINK)])
     for asked, endpoint in ((ASKED, Endpoint("segment", "02:00:00:00:00:07")),
@@ -243,7 +243,7 @@ def test_circle_of_stations_is_found_in_one_round() -> None:
     assert first.replied(unwound, LINK) == (ONE, ASKED.answer(b"", 7))
 
 
-def test_circle_is_found_though_who_asked_is_gone() -> None:
+def test_forwarder_finds_loop_after_client_is_gone() -> None:
     station = Station([route(FAR, LINK)])
     once = station.forwarded(ASKED, ONE)
     station.router.connection_closed(*ONE, 1)
@@ -272,7 +272,7 @@ def test_packet_without_answer_is_passed_once() -> None:
     assert station.router.stats().in_flight == 0
 
 
-def test_request_asked_again_is_passed_once_where_packets_may_be_doubled() -> None:
+def test_forwarder_drops_repeated_request_on_datagram_transport() -> None:
     station = Station([route(FAR, LINK)])
     there = Endpoint("segment", "02:00:00:00:00:09")
     onward = station.forwarded(ASKED, there)
@@ -304,7 +304,7 @@ def test_requests_that_wait_are_limited() -> None:
     assert station.router.stats().in_flight == 3
 
 
-def test_flood_by_one_door_leaves_room_for_the_others() -> None:
+def test_forwarder_flood_by_one_transport_leaves_space_for_others() -> None:
     station = Station([route(FAR, LINK)], limits=RouterLimits(per_transport=2))
     for number in range(2):
         station.forwarded(ASKED, Endpoint("segment", str(number)))
@@ -314,7 +314,7 @@ def test_flood_by_one_door_leaves_room_for_the_others() -> None:
     assert station.forwarded(ASKED, ONE)
 
 
-def test_flood_by_some_connections_of_a_door_leaves_room_for_another_one() -> None:
+def test_forwarder_flood_by_connections_leaves_space_for_another() -> None:
     station = Station([route(FAR, LINK)], limits=RouterLimits(per_transport=16))
     for port in range(4):
         endpoint = Endpoint("tcp", f"10.0.0.5:{port}")
@@ -323,13 +323,13 @@ def test_flood_by_some_connections_of_a_door_leaves_room_for_another_one() -> No
     assert station.forwarded(ASKED, ONE)
 
 
-def test_route_by_a_door_that_is_not_there_is_answered() -> None:
+def test_forwarder_replies_to_route_by_missing_transport() -> None:
     station = Station([route(FAR, Endpoint("nowhere", "1"), "island")])
     assert station.replied(ASKED, ONE) == (ONE, ASKED.answer(b"", 0x1B))
     assert "route island is by nowhere" in station.events()[0][1]
 
 
-def test_long_request_goes_on_in_fragments() -> None:
+def test_forwarder_sends_long_request_in_fragments() -> None:
     station = Station([route(FAR, Endpoint("narrow", "1"))])
     (action,) = station.give(ASKED._replace(body=bytes(100)), ONE)
     assert isinstance(action, Forward)

@@ -42,7 +42,7 @@ def tick(station: Station, now_ns: int) -> tuple[list[Ams], list[tuple[Endpoint,
     return probes, replies
 
 
-def test_router_of_each_hop_is_asked_for_its_state() -> None:
+def test_prober_reads_state_of_each_hop() -> None:
     station = probing(route(FAR, LINK), route("6.1.1.1.7.1", LINK),
                       route("7.1.1.1.1.1", SECOND_LINK), route("8.1.1.1.1.1", TCP, is_probed=False),
                       route("0.0.0.0.0.0", Endpoint("tcp", "9"), octets=0))  # fmt: skip
@@ -57,7 +57,7 @@ def test_router_of_each_hop_is_asked_for_its_state() -> None:
     assert station.router.next_timeout() == 5 + SECOND
 
 
-def test_hop_that_misses_two_questions_is_dead_and_lives_when_it_answers() -> None:
+def test_prober_hop_is_dead_after_two_misses_until_it_answers() -> None:
     station = probing()
     ((probe,), _) = tick(station, 0)
     station.forwarded(ASKED, TCP)
@@ -72,7 +72,7 @@ def test_hop_that_misses_two_questions_is_dead_and_lives_when_it_answers() -> No
     assert tick(station, 5 * SECOND) == ([probe], [])
 
 
-def test_hop_that_stays_dead_for_a_minute_is_gone_once() -> None:
+def test_prober_hop_dead_for_a_minute_is_gone_once() -> None:
     station = probing()
     gone = {}
     for second in range(200):
@@ -94,7 +94,7 @@ def test_answers_to_requests_are_signs_of_life() -> None:
         assert tick(station, number * SECOND) == ([], [])
 
 
-def test_busy_hop_is_asked_now_and_then_for_its_time() -> None:
+def test_prober_busy_hop_is_probed_less_often() -> None:
     station = probing()
     tick(station, 0)
     asked = 0
@@ -106,7 +106,7 @@ def test_busy_hop_is_asked_now_and_then_for_its_time() -> None:
     assert asked == 2
 
 
-def test_answer_from_elsewhere_is_no_sign_of_life() -> None:
+def test_prober_ignores_answer_from_another_hop() -> None:
     station = probing()
     ((probe,), _) = tick(station, 0)
     for now_ns in (SECOND, 2 * SECOND):
@@ -127,7 +127,7 @@ def test_answer_by_a_broker_names_no_hop_but_the_question_does() -> None:
     assert station.forwarded(ASKED, TCP)
 
 
-def test_nothing_is_asked_where_the_door_says_that_there_is_no_way() -> None:
+def test_prober_pauses_for_hop_reported_down() -> None:
     for address in (LINK.connection, None):
         station = probing()
         tick(station, 0)
@@ -156,12 +156,12 @@ def test_hops_come_and_go_with_the_routes() -> None:
     assert [each.target for each in probes] == [f"7.1.1.1.1.1:{SYSTEM_PORT}"]
 
 
-def test_hop_by_a_door_that_is_not_there_is_not_asked() -> None:
+def test_prober_skips_hop_by_missing_transport() -> None:
     station = probing(route(FAR, Endpoint("nowhere", "1")))
     assert tick(station, 0) == ([], [])
 
 
-def test_hops_that_are_not_asked_are_alive() -> None:
+def test_prober_hops_without_probes_are_alive() -> None:
     station = probing(route(FAR, LINK, is_probed=False), route("7.1.1.1.1.1", SECOND_LINK))
     tick(station, 0)
     onward = station.forwarded(ASKED, TCP)
@@ -173,12 +173,12 @@ def test_hops_that_are_not_asked_are_alive() -> None:
     assert station.replied(ASKED._replace(target="7.1.1.1.1.1:1"), TCP)[1].error == 0x1B
 
 
-def test_real_net_id_is_asked() -> None:
+def test_prober_uses_real_net_id() -> None:
     station = probing(route("10.0.0.6.1.1", LINK, real=NetId.parse(FAR)))
     assert tick(station, 0)[0][0].target == f"{FAR}:{SYSTEM_PORT}"
 
 
-def test_the_router_at_the_hop_is_asked_and_not_who_is_behind_it() -> None:
+def test_prober_probes_router_at_the_hop() -> None:
     near = NetId.parse("6.2.2.2.1.1")
     station = probing(route(FAR, LINK, router=near))
     assert tick(station, 0)[0][0].target == f"{near}:{SYSTEM_PORT}"
@@ -186,13 +186,13 @@ def test_the_router_at_the_hop_is_asked_and_not_who_is_behind_it() -> None:
     assert tick(station, 0)[0][0].target == f"{FAR}:{SYSTEM_PORT}"
 
 
-def test_a_default_route_is_asked_only_if_its_router_is_known() -> None:
+def test_prober_probes_default_route_only_with_known_router() -> None:
     assert not tick(probing(route("0.0.0.0.0.0", LINK, octets=0)), 0)[0]
     known = probing(route("0.0.0.0.0.0", LINK, octets=0, router=NetId.parse(FAR)))
     assert tick(known, 0)[0][0].target == f"{FAR}:{SYSTEM_PORT}"
 
 
-def test_many_hops_are_asked_less_often() -> None:
+def test_prober_many_hops_are_probed_less_often() -> None:
     table = RouteTable(route(f"6.1.{n // 200}.{n % 200}.1.1", Endpoint("link", str(n)))
                        for n in range(500))  # fmt: skip
     hop_prober = HopProber(NetId.parse(ROUTER), table)

@@ -17,7 +17,7 @@ def test_ids_are_marked_and_differ() -> None:
     assert all(0 < each < 1 << 32 for each in given)
 
 
-def test_ids_of_clients_who_count_are_not_marked() -> None:
+def test_counted_client_ids_are_not_marked() -> None:
     assert not any(map(is_marked, range(100_000)))
     high = [each for each in range(1 << 31, (1 << 31) + 100_000) if is_marked(each)]
     assert len(high) < 1000
@@ -76,7 +76,7 @@ def test_request_is_found_until_it_is_taken_out() -> None:
     assert waiting.has_request(TWO, b"addresses", 7)
 
 
-def test_asked_again_is_known_until_the_latest_is_taken_out() -> None:
+def test_repeated_request_is_known_until_latest_is_removed() -> None:
     waiting = filled(pending(1), pending(2))
     waiting.pop(1)
     assert waiting.has_request(ONE, b"addresses", 7)
@@ -96,7 +96,7 @@ def test_deadlines_come_in_order_whatever_is_allowed() -> None:
     assert waiting.next_timeout() is None
 
 
-def test_abandoned_requests_stay_for_nobody_and_make_room_first() -> None:
+def test_abandoned_requests_are_dropped_first() -> None:
     waiting = filled(pending(1), pending(2), pending(3, TWO))
     assert not waiting.drop_abandoned()
     assert [each.invoke_id for each in waiting.abandon(ONE)] == [1, 2]
@@ -109,7 +109,7 @@ def test_abandoned_requests_stay_for_nobody_and_make_room_first() -> None:
     assert not waiting.drop_abandoned()
 
 
-def test_request_of_nobody_makes_room_too() -> None:
+def test_own_request_without_client_can_be_dropped() -> None:
     waiting = filled(pending(1, None))
     assert waiting.drop_abandoned()
     assert len(waiting) == 0

@@ -36,7 +36,7 @@ from tests.unit.eap.ams.test_subscriptions import stream
 SECOND = 1_000_000_000
 
 
-def test_notification_that_nobody_asked_for_is_ended_where_it_comes_from() -> None:
+def test_unexpected_notification_is_ended_at_its_server() -> None:
     station = subscribed(ONE)
     end = Ams(NOTICE.source, NOTICE.target, DELETE_NOTIFICATION, flags=6, invoke_id=0)
     unknown = NOTICE._replace(body=stream((5, {9: b"", 10: b""})))
@@ -51,7 +51,7 @@ def test_notification_that_nobody_asked_for_is_ended_where_it_comes_from() -> No
     ]  # fmt: skip
 
 
-def test_notification_that_comes_before_its_answer_is_not_ended() -> None:
+def test_notification_before_its_answer_is_not_ended() -> None:
     station = Station([route(FAR, LINK)])
     onward = station.forwarded(ADD, ONE)
     notice = NOTICE._replace(body=stream((5, {1: b"data"})))
@@ -60,7 +60,7 @@ def test_notification_that_comes_before_its_answer_is_not_ended() -> None:
     assert station.replied(notice, LINK) == (ONE, notice)
 
 
-def test_nothing_is_ended_when_there_is_no_room_to_wait_for_it() -> None:
+def test_nothing_is_ended_beyond_limit_in_flight() -> None:
     station = Station([route(FAR, LINK)], limits=RouterLimits(in_flight=1))
     station.replied(station.forwarded(ADD, ONE).answer(granted(1)), LINK)
     station.forwarded(ADD, TWO)
@@ -122,7 +122,7 @@ def subscribed(*endpoints: Endpoint, routes: tuple[Route, ...] = (route(FAR, LIN
     return station
 
 
-def test_notification_goes_to_who_asked_for_it_with_one_address_for_both() -> None:
+def test_notification_reaches_its_client_among_equal_addresses() -> None:
     station = subscribed(ONE, TWO)
     for handle, endpoint in ((1, ONE), (2, TWO)):
         notice = NOTICE._replace(body=stream((5, {handle: b"data"})))
@@ -164,7 +164,7 @@ def test_notification_for_a_router_that_is_down_for_now_is_not_ended() -> None:
     assert station.give(NOTICE._replace(body=stream((5, {9: b"data"}))), LINK) == []
 
 
-def test_notification_comes_from_the_address_that_was_asked() -> None:
+def test_notification_has_address_of_the_request() -> None:
     virtual = route("10.0.0.6.1.1", LINK, real=NetId.parse(FAR))
     station = subscribed(ONE, routes=(virtual,))
     notice = NOTICE._replace(body=stream((5, {1: b"data"})))
@@ -245,7 +245,7 @@ def test_client_that_has_too_many_subscriptions_is_refused() -> None:
     station.forwarded(more, TWO)
 
 
-def test_handle_that_a_client_has_already_is_given_as_another_one() -> None:
+def test_duplicate_handle_of_client_is_replaced() -> None:
     station = subscribed(ONE)
     again = ADD._replace(invoke_id=2)
     interrupted, _ = station.give(station.forwarded(again, ONE).answer(granted(1)), LINK), None

@@ -114,7 +114,7 @@ def test_packet_of_the_limit_is_taken() -> None:
     assert take(cutter) == [packet(LIMIT - 32)]
 
 
-def test_what_is_no_such_stream_cannot_be_cut() -> None:
+def test_decoder_refuses_stream_without_ams_packets() -> None:
     cutter = AmsStreamDecoder(LIMIT)
     cutter.receive(encode_with_prefix(packet(1)) + b"GET / HTTP/1.1")
     assert cutter.next_item() == packet(1)
@@ -149,7 +149,7 @@ def give(assembler, fragment, now_ns=0):
 
 
 @given(st.binary(max_size=500), st.integers(1, 200), st.integers(0, 0xFFFF))
-def test_packet_comes_out_as_it_went_in(body, room, number):
+def test_fragments_are_reassembled_to_the_packet(body, room, number):
     packet = encode_packet(HEADER_FRAGMENT, body)
     assembler = FragmentAssembler()
     fragments = list(iter_fragments(packet, number, room))
@@ -256,7 +256,7 @@ def test_fragments_of_two_senders_do_not_fit_together() -> None:
     assert (parts.octets, parts.dropped) == (0, 1)
 
 
-def test_closed_ways_leave_nothing() -> None:
+def test_closed_endpoints_leave_no_fragments() -> None:
     parts = Reassembly()
     give_reassembly(parts, endpoint(1), 0)
     parts.forget(endpoint(1))

@@ -19,7 +19,7 @@ from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 
 
-def test_traffic_is_counted_by_way() -> None:
+def test_traffic_is_counted_by_endpoint() -> None:
     table: TrafficTable[Endpoint] = TrafficTable()
     endpoint = Endpoint("tcp", "1")
     table.of(endpoint, 7).add_request(44)
@@ -40,7 +40,7 @@ def test_snapshot_does_not_change() -> None:
     assert before[endpoint].requests == 1
 
 
-def test_ways_are_limited() -> None:
+def test_endpoints_are_limited() -> None:
     table: TrafficTable[Endpoint] = TrafficTable()
     for number in range(MAX_ENDPOINTS + 1):
         table.of(Endpoint("tcp", str(number)), 0)
@@ -48,7 +48,7 @@ def test_ways_are_limited() -> None:
     assert Endpoint("tcp", "0") not in table.snapshot()
 
 
-def test_figures_of_one_way() -> None:
+def test_traffic_of_one_endpoint() -> None:
     table: TrafficTable[Endpoint] = TrafficTable()
     endpoint = Endpoint("tcp", "1")
     assert table.get(endpoint) is None
@@ -75,7 +75,7 @@ def trace(at_ns: int, outcome: Outcome = Outcome.FAILED, error: int = 7, text: s
     return Trace(at_ns, outcome, None, None, None, error, 0, text)
 
 
-def test_what_was_simply_answered_is_no_event() -> None:
+def test_record_answered_request_is_no_event() -> None:
     record = Record()
     record.add(trace(1, Outcome.ANSWERED, 0))
     record.add(trace(2, Outcome.ANSWERED, 6))

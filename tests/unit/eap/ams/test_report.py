@@ -75,7 +75,7 @@ def test_probes_measure_the_next_hop() -> None:
     assert report(station)[1:4] == (RouteState.DOWN, "it does not answer", None)
 
 
-def test_door_tells_why_a_route_is_down() -> None:
+def test_report_has_reason_of_transport_for_route_down() -> None:
     station = Station([route(FAR, LINK)])
     station.router.hop_down("link", None, "no carrier", 0)
     assert report(station)[1:4] == (RouteState.DOWN, "no carrier", None)
@@ -83,7 +83,7 @@ def test_door_tells_why_a_route_is_down() -> None:
     assert report(station).state is RouteState.UNKNOWN
 
 
-def test_route_by_a_door_that_is_not_there_is_down() -> None:
+def test_report_route_by_missing_transport_is_down() -> None:
     obstacle = Obstacle(RouteState.DOWN, "this station has no transport link")
     found = report_route(route(FAR, LINK), obstacle, None, None, next_name="far")
     assert (found.state, found.why) == (RouteState.DOWN, "this station has no transport link")
@@ -108,7 +108,7 @@ def test_route_of_a_client_that_listens_is_up_and_then_down() -> None:
     assert report(station)[1:3] == (RouteState.DOWN, "refused")
 
 
-def test_route_of_a_client_is_forgotten_with_its_door() -> None:
+def test_report_forgets_client_route_with_its_transport() -> None:
     station = Station([route(FAR, LINK, "tool", is_client=True)])
     station.router.hop_down("link", LINK.connection, "refused", 0)
     station.router.remove_transport("link", 0)
@@ -151,7 +151,7 @@ BEYOND = DOWN._replace(next_name="near")
         (0x723, UP, "access rules forbid to ask for its state", "under access in the plant"),
     ],
 )
-def test_what_is_wrong_is_told_with_what_to_do(
+def test_advice_has_error_and_hint(
     error: int, report: RouteReport | None, text: str, hint: str
 ) -> None:
     found = advise(error, TARGET, report, OWN, is_own=False)
@@ -159,7 +159,7 @@ def test_what_is_wrong_is_told_with_what_to_do(
     assert hint in found.hint
 
 
-def test_other_errors_are_told_as_they_are() -> None:
+def test_advice_has_other_errors_unchanged() -> None:
     found = advise(0x701, TARGET, UP, OWN, is_own=False)
     assert found.text == (
         f"island ({HOP}) or somebody behind it answers: error 0x701 (it does not know that service)"
@@ -183,7 +183,7 @@ def test_question_on_the_wire() -> None:
     assert question.encode() == bytes.fromhex("060101010101 e903 02 00")
 
 
-def test_what_is_here() -> None:
+def test_hop_report_of_local_address() -> None:
     here = ask(Station(rules=()), "5.1.1.1.2.1", 0xFFFF)
     assert (here.station, here.net_id, here.is_here, here.why) == ("island", ROUTER, True, "")
     assert here.may[Service.READ] is True
@@ -192,7 +192,7 @@ def test_what_is_here() -> None:
     assert missing.why == "nothing has port 7 of 5.1.1.1.2.1"
 
 
-def test_what_is_behind_a_route() -> None:
+def test_hop_report_of_routed_address() -> None:
     objects = AccessRule("objects", objects=(ObjectRange(0x8000, 0x8000),))
     near = NetId.parse("6.2.2.2.1.1")
     far = route("10.6.6.6.1.1", LINK, "far", router=near, real=NetId.parse(FAR))
@@ -203,7 +203,7 @@ def test_what_is_behind_a_route() -> None:
     assert onward.may[Service.WRITE] is None
 
 
-def test_why_nothing_goes_there() -> None:
+def test_hop_report_has_reason_without_route() -> None:
     station = Station([route(FAR, LINK, "far")])
     assert ask(station, "9.9.9.9.1.1", 1).why == "no route to 9.9.9.9.1.1"
     back = ask(station, FAR, 1, LINK)
@@ -231,6 +231,6 @@ def test_reports_survive_the_wire() -> None:
         b'{"station": "\\u001b[2J", "net_id": "1.2.3.4.5.6"}',
     ],
 )
-def test_what_is_no_report(data: bytes) -> None:
+def test_hop_report_refuses_malformed_data(data: bytes) -> None:
     with pytest.raises(CodecError):
         decode_report(data)

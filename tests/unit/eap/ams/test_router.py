@@ -28,7 +28,7 @@ TCP, UDP = Endpoint("tcp", "10.0.0.9:4711 #1"), Endpoint("segment", "02:00:00:00
 OWN = Endpoint("local", "1")
 
 
-def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
+def test_router_delivers_request_and_returns_answer() -> None:
     station = Station()
     asked = Ams(DEVICE, CLIENT, invoke_id=7, body=b"request")
     delivered = station.delivered(asked, TCP)
@@ -41,7 +41,7 @@ def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
     assert station.events() == []
 
 
-def test_what_is_at_hand_goes_back_at_once() -> None:
+def test_router_returns_immediate_answer() -> None:
     asked = []
 
     def answer_now(
@@ -62,7 +62,7 @@ def test_what_is_at_hand_goes_back_at_once() -> None:
     assert station.router.stats().in_flight == 1
 
 
-def test_what_a_service_says_of_a_refusal_is_kept() -> None:
+def test_router_keeps_reason_of_a_service() -> None:
     station = Station()
     delivered = station.delivered(Ams(DEVICE, CLIENT), TCP)
     why = "0x2000:00: object does not exist (0x06020000)"
@@ -121,7 +121,7 @@ def test_own_source_is_refused_unless_it_is_of_this_host() -> None:
     assert station.forwarded(asked._replace(target=FAR_DEVICE), Endpoint("local", "1"))
 
 
-def test_what_came_by_multicast_is_for_who_is_meant() -> None:
+def test_router_broadcast_is_answered_by_its_target_only() -> None:
     station = Station([route(FAR, LINK)])
     assert station.give(Ams(FAR_DEVICE, CLIENT), UDP, is_broadcast=True) == []
     assert station.give(Ams("9.9.9.9.9.9:1", CLIENT), UDP, is_broadcast=True) == []
@@ -139,7 +139,7 @@ def test_request_without_answer_gets_none() -> None:
     assert station.router.stats().in_flight == 0
 
 
-def test_doors_come_and_go() -> None:
+def test_router_adds_and_removes_transports() -> None:
     station = Station([route(FAR, Endpoint("new", "1"))])
     assert station.replied(Ams(FAR_DEVICE, CLIENT), TCP)[1].error == 0x1B
     station.router.add_transport(Transport("new"))
@@ -185,7 +185,7 @@ def test_hop_that_is_down_is_known() -> None:
     assert not station.router.is_down(LINK)
 
 
-def test_broken_packets_are_named_and_answered_by_nobody() -> None:
+def test_router_drops_malformed_packets_with_reason() -> None:
     station = Station()
     octets = Ams(DEVICE, CLIENT, body=b"abc").octets()
     for broken in (b"", octets[:31], octets[:-1]):
@@ -202,7 +202,7 @@ def test_surplus_octets_go_no_further() -> None:
     assert parse(*forward.packets).body == b"abc"
 
 
-def test_fragments_are_put_together_and_what_is_too_long_goes_in_fragments() -> None:
+def test_router_reassembles_and_sends_fragments() -> None:
     station = Station()
     narrow = Endpoint("narrow", "1")
     asked = Ams(DEVICE, CLIENT, invoke_id=9, body=bytes(range(90)))
@@ -218,7 +218,7 @@ def test_fragments_are_put_together_and_what_is_too_long_goes_in_fragments() -> 
     assert "no request waits for" in client.events()[0][1]  # it was put together: an answer
 
 
-def test_fragments_are_acknowledged_to_who_wants_it() -> None:
+def test_router_acknowledges_fragments_on_request() -> None:
     station = Station()
     first = parse(next(iter_fragments(Ams(DEVICE, CLIENT, body=bytes(50)).octets(), 4, 28)))
     wanting = first._replace(flags=StateFlags.ADS)
@@ -249,7 +249,7 @@ def test_time_of_routes_and_requests_is_one() -> None:
     assert station.router.stats().routes == 0
 
 
-def test_what_passes_is_counted() -> None:
+def test_router_counts_packets() -> None:
     station = Station([route(FAR, LINK)])
     asked = Ams(FAR_DEVICE, CLIENT, body=b"12")
     onward = station.forwarded(asked, TCP)

@@ -214,7 +214,7 @@ names = st.sampled_from("abcd")
 
 
 @given(st.dictionaries(names, names), st.sampled_from("abcd"), st.lists(st.integers(0, 9)))
-def test_stations_with_any_routes_answer_everything_and_nothing_goes_on_for_ever(
+def test_stations_with_any_routes_answer_all_requests_in_time(
     next_of: dict[str, str], first: str, order: list[int]
 ) -> None:
     """Each station has one way to the target, or none; "d" is where it is."""

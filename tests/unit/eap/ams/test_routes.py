@@ -54,7 +54,7 @@ def test_learned_route_never_replaces_a_configured_one() -> None:
     assert table.expire(9) == []
 
 
-def test_learned_route_is_no_way_around_a_configured_one_however_well_it_matches() -> None:
+def test_learned_route_never_bypasses_a_configured_one() -> None:
     table = RouteTable([route("5.1.1.1.1.1", A), route("0.0.0.0.0.0", C, octets=0)])
     for net_id in ("5.1.1.1.2.1", "6.1.1.1.1.1"):
         table.add(route(net_id, B, origin=Origin.LEARNED))
@@ -64,7 +64,7 @@ def test_learned_route_is_no_way_around_a_configured_one_however_well_it_matches
     assert hop_of(table, "5.1.1.1.2.1") == B
 
 
-def test_learned_routes_expire_unless_they_are_told_again() -> None:
+def test_learned_routes_expire_unless_renewed() -> None:
     table = RouteTable([route("5.1.1.1.1.1", A)])
     assert table.next_timeout() is None
     for expires_at_ns in (10, 20):
@@ -143,7 +143,7 @@ routes = st.builds(
 
 @given(st.lists(routes, max_size=20), st.lists(st.tuples(net_ids, st.sampled_from([A, B, C]))),
        net_ids)  # fmt: skip
-def test_found_is_what_a_search_through_all_finds(
+def test_find_equals_linear_search(
     given_routes: list[Route], removed: list[tuple[NetId, Endpoint]], target: NetId
 ) -> None:
     table = RouteTable(given_routes)

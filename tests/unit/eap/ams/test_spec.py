@@ -23,7 +23,7 @@ from eap.ams.spec import (
 )
 
 
-def test_rules_survive_the_way_to_another_process():
+def test_rules_round_trip_by_json():
     rule = AccessRule(
         "engineering",
         networks=("10.0.0.0/24",),
@@ -34,12 +34,12 @@ def test_rules_survive_the_way_to_another_process():
     assert msgspec.json.decode(msgspec.json.encode(rule), type=AccessRule) == rule
 
 
-def test_what_no_rule_has_is_refused():
+def test_rule_with_unknown_field_is_refused():
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(b'{"name": "x", "alow": true}', type=AccessRule)
 
 
-def test_what_a_router_is_told_comes_out_of_json_as_it_went_in():
+def test_routing_spec_round_trips_by_json():
     hop = HopSpec(TransportKind.AMS_TCP, "", "plc.example:48898")
     whole = RoutingSpec(
         routes=(RouteSpec(name="plc", net_id="5.1.2.3.1.1", hop=hop, virtual="10.0.0.9.1.1"),),
@@ -80,7 +80,7 @@ OLD = RoutingSpec(
 )
 
 
-def test_what_is_the_same_is_no_difference():
+def test_equal_specs_have_no_difference():
     assert describe_routing(OLD, replace(OLD)) == []
     assert routing_needs_new_start(OLD, replace(OLD)) == []
 

@@ -102,7 +102,7 @@ def test_subscription_is_restored_with_its_handle_and_the_one_before_is_deleted(
 
 
 @pytest.mark.parametrize("error", [0x702, 0x704, 0x70C, 0x710, 0x723])
-def test_subscription_that_is_refused_for_good_ends_and_its_client_is_told(error: int) -> None:
+def test_restorer_ends_subscription_refused_for_good(error: int) -> None:
     scene = Scene(CYCLIC)
     scene.lose_hop()
     scene.passes(0)
@@ -112,7 +112,7 @@ def test_subscription_that_is_refused_for_good_ends_and_its_client_is_told(error
     assert "cannot be restored" in scene.station.events()[-1][1]
 
 
-def test_subscription_at_a_server_that_starts_is_asked_for_again_for_some_time() -> None:
+def test_restorer_retries_at_starting_server_for_some_time() -> None:
     scene = Scene(CYCLIC)
     scene.lose_hop()
     scene.passes(0)
@@ -125,7 +125,7 @@ def test_subscription_at_a_server_that_starts_is_asked_for_again_for_some_time()
 
 
 @pytest.mark.parametrize("error", [0x7, 0x1B, 0x719, 0x708])
-def test_subscription_is_asked_for_as_long_as_the_way_is_bad(error: int) -> None:
+def test_restorer_retries_while_the_path_is_down(error: int) -> None:
     scene = Scene(CYCLIC)
     scene.lose_hop()
     scene.passes(0)
@@ -137,7 +137,7 @@ def test_subscription_is_asked_for_as_long_as_the_way_is_bad(error: int) -> None
     assert scene.sample(7)
 
 
-def test_restoration_tries_one_subscription_and_then_asks_in_groups() -> None:
+def test_restorer_tries_one_subscription_then_groups() -> None:
     scene = Scene(*[CYCLIC] * (GROUP + 5))
     scene.lose_hop()
     scene.passes(0)
@@ -151,7 +151,7 @@ def test_restoration_tries_one_subscription_and_then_asks_in_groups() -> None:
     assert [each.command for each in scene.asked[GROUP:]] == [DELETE_NOTIFICATION] * GROUP
 
 
-def test_many_clients_are_tried_soon_after_their_hop_comes_back() -> None:
+def test_restorer_tries_many_clients_soon_after_hop_is_up() -> None:
     scene = Scene()
     for number in range(1, 201):
         client = f"192.168.0.9.1.1:{30000 + number}"
@@ -210,7 +210,7 @@ def test_symbol_is_looked_up_again_by_its_name() -> None:
 
 
 @pytest.mark.parametrize(("group", "head"), [(0xF007, 8), (0xF009, 12)])
-def test_place_of_a_symbol_is_looked_up_again(group: int, head: int) -> None:
+def test_restorer_looks_up_symbol_location_again(group: int, head: int) -> None:
     scene = Scene()
     name = b"MAIN.level\0"
     look_up = ADD._replace(
@@ -239,7 +239,7 @@ def test_symbol_handle_of_unknown_name_is_not_trusted() -> None:
     assert end.body == END
 
 
-def test_subscription_that_its_server_ends_is_asked_for_again_but_not_for_ever() -> None:
+def test_restorer_retries_ended_subscription_a_few_times() -> None:
     scene = Scene(CYCLIC)
     for handle in range(1, MAX_ENDS):
         assert scene.sample(handle, b"") == []
@@ -249,7 +249,7 @@ def test_subscription_that_its_server_ends_is_asked_for_again_but_not_for_ever()
     assert end.body == END
 
 
-def test_quiet_subscription_is_checked_and_the_same_value_is_not_told_twice() -> None:
+def test_restorer_checks_quiet_subscription_without_repeated_sample() -> None:
     scene = Scene(ON_CHANGE)
     scene.sample(1, b"same")
     scene.passes(31 * SECOND)
@@ -286,7 +286,7 @@ def test_others_of_a_server_are_checked_when_it_has_forgotten_one() -> None:
     assert [AddNotification.decode(each.body).mode for each in scene.asked] == [4]
 
 
-def test_router_that_is_not_the_first_tells_the_one_before_it() -> None:
+def test_later_router_ends_subscription_at_previous_router() -> None:
     scene = Scene()
     marked = ADD._replace(invoke_id=InvokeIds(7).allocate(()), body=CYCLIC.encode())
     scene.station.replied(scene.station.forwarded(marked, ONE).answer(granted(1)), LINK)
@@ -346,7 +346,7 @@ def test_hop_that_was_lost_is_not_lost_again_by_its_restart_index() -> None:
     assert scene.station.router.interruptions() == []
 
 
-def test_hop_without_a_restart_index_is_asked_once() -> None:
+def test_hop_without_restart_index_is_probed_once() -> None:
     scene = Scene(CYCLIC, is_probing=True)
     scene.passes(SECOND)
     (state,) = [each for each in scene.asked if each.command == AmsCommand.READ]
@@ -356,7 +356,7 @@ def test_hop_without_a_restart_index_is_asked_once() -> None:
     assert not [each for each in scene.asked if each.command == AmsCommand.READ]
 
 
-def test_hop_that_comes_back_is_asked_for_its_restart_index_again() -> None:
+def test_hop_that_is_up_again_is_probed_for_restart_index() -> None:
     scene = Scene(CYCLIC, is_probing=True)
     scene.passes(SECOND)
     (state,) = [each for each in scene.asked if each.command == AmsCommand.READ]
@@ -421,7 +421,7 @@ def test_hop_with_subscriptions_is_awaited() -> None:
     assert not scene.station.router.is_awaited(LINK)
 
 
-def test_location_tells_of_interrupted_subscriptions() -> None:
+def test_location_counts_interrupted_subscriptions() -> None:
     scene = Scene(CYCLIC, CYCLIC)
     scene.lose_hop()
     header, _ = decode(ADD)

@@ -63,7 +63,7 @@ def divided(
     return divide(body, onward, all_, 7, lambda each: each == hop)
 
 
-def test_subscriptions_is_found_by_what_the_server_gave_and_by_what_the_client_knows() -> None:
+def test_subscriptions_finds_by_grant_and_by_client_handle() -> None:
     all_ = Subscriptions()
     first, second = added(all_, one(1), one(2, TWO))
     assert all_.find(ONWARD, 1) is first
@@ -76,7 +76,7 @@ def test_subscriptions_is_found_by_what_the_server_gave_and_by_what_the_client_k
     assert (len(all_), all_.hops, all_.endpoints(), first.is_closed) == (0, {}, [], True)
 
 
-def test_subscriptions_displaces_what_had_the_same_handle_before() -> None:
+def test_subscriptions_displaces_earlier_owner_of_grant() -> None:
     all_ = Subscriptions()
     kept, of_another_router = added(all_, one(1), one(2, TWO, request=None))
     third, fourth = one(1), one(2, TWO, request=None)
@@ -101,7 +101,7 @@ def test_subscriptions_suspended_keeps_what_is_to_be_deleted_unless_it_was_given
     assert second.handle == 2
 
 
-def test_subscriptions_of_few_hosts_leave_room_for_others(
+def test_subscriptions_of_few_hosts_leave_space_for_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "MAX_TOTAL", 100)
@@ -114,7 +114,7 @@ def test_subscriptions_of_few_hosts_leave_room_for_others(
     assert all_.is_within_limits(Endpoint("ams-tcp", "10.0.0.8:1"), ASKED, 6)
 
 
-def test_subscriptions_has_room_for_so_many_of_a_client() -> None:
+def test_subscriptions_limits_one_client() -> None:
     all_ = Subscriptions()
     added(all_, *(one(handle) for handle in range(MAX_PER_CLIENT - 1)))
     assert all_.is_within_limits(ONE, ASKED, 1)

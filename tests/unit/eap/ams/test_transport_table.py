@@ -22,13 +22,13 @@ PACKET = Ams("5.1.1.1.1.1:851", "6.1.1.1.1.1:3000", body=bytes(range(100))).octe
 WIDE, NARROW = Endpoint("tcp", "1"), Endpoint("box", "1")
 
 
-def test_packet_goes_in_one_piece_where_there_is_room() -> None:
+def test_transport_table_sends_short_packet_whole() -> None:
     transports = TransportTable([Transport("tcp"), Transport("box", max_size=132)])
     assert transports.reply(WIDE, PACKET) == Reply(WIDE, (PACKET,))
     assert transports.forward(NARROW, PACKET, 7) == Forward(NARROW, (PACKET,), 7)
 
 
-def test_packet_is_cut_where_there_is_not() -> None:
+def test_transport_table_sends_long_packet_in_fragments() -> None:
     transports = TransportTable([Transport("box", max_size=60)])
     for _ in range(2):
         assembler = FragmentAssembler()
@@ -45,7 +45,7 @@ def test_packets_have_numbers_of_their_own() -> None:
     assert first != second
 
 
-def test_what_comes_from_a_hop() -> None:
+def test_transport_table_matches_endpoints_of_a_hop() -> None:
     transports = TransportTable(
         [Transport("tcp"), Transport("segment"), Transport("broker", is_shared=True)]
     )
@@ -60,7 +60,7 @@ def test_what_comes_from_a_hop() -> None:
     assert not transports.is_from(named, Endpoint("tcp", "02:00:00:00:00:01"))
 
 
-def test_doors_that_cannot_be_are_refused() -> None:
+def test_transport_table_refuses_invalid_transports() -> None:
     with pytest.raises(ValueError, match="'a' exists already"):
         TransportTable([Transport("a"), Transport("a")])
     with pytest.raises(ValueError, match="expected more than 32"):

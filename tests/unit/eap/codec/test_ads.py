@@ -70,7 +70,7 @@ def test_codes_have_names() -> None:
     assert AdsError.name_of(0x7FF) == "0x7ff"
 
 
-def test_codes_are_told_in_words() -> None:
+def test_codes_have_words() -> None:
     assert AdsError.words_of(0x1B) == "error 0x1b (the link is down)"
     assert AdsError.words_of(0x710) == "error 0x710 (SYMBOL_NOT_FOUND)"
     assert AdsError.words_of(0) == "no error"

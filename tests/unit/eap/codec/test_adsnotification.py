@@ -23,7 +23,7 @@ SAMPLES = st.builds(Sample, U32, st.binary(max_size=20))
 STAMPS = st.builds(Stamp, st.integers(0, (1 << 64) - 1), st.lists(SAMPLES, max_size=4).map(tuple))
 
 
-def test_packet_lies_as_on_the_wire() -> None:
+def test_notification_packet_matches_wire_layout() -> None:
     stamps = [
         Stamp(0x01DA, (Sample(1, b"ab"), Sample(2, b""))),
         Stamp(0x01DB, (Sample(1, b"c"),)),

@@ -46,7 +46,7 @@ def test_attributes_stand_behind_the_texts() -> None:
     assert end == len(octets) == len(encode_entry(bare)) + len(behind)
 
 
-def test_info_has_the_newest_version_that_there_is_room_for() -> None:
+def test_upload_info_has_newest_version_that_fits() -> None:
     info = UploadInfo(1, 2, 3, 4)
     assert info.encode_for(8) == b"\1\0\0\0\2\0\0\0"
     assert info.encode_for(63) == info.encode()
@@ -54,7 +54,7 @@ def test_info_has_the_newest_version_that_there_is_room_for() -> None:
     assert info.encode_for(64) == info.encode_for(99) == third
 
 
-def test_entry_lies_as_in_the_description_of_pyads() -> None:
+def test_entry_matches_description_of_pyads() -> None:
     """The example in the class SAdsSymbolEntry of pyads, without what TwinCAT puts behind it."""
     entry = SymbolEntry(
         SymbolAddress(16448, 385000, 2),
@@ -76,7 +76,7 @@ def test_upload_info_has_24_octets() -> None:
     assert UploadInfo(3, 177).encode() == bytes.fromhex("03000000b1000000") + bytes(16)
 
 
-def test_what_stands_behind_the_texts_is_skipped() -> None:
+def test_entry_attributes_are_skipped() -> None:
     octets = bytearray(encode_entry(SymbolEntry(SymbolAddress(1, 2, 3), 4, 5, "n", "t")))
     octets[:4] = (len(octets) + 10).to_bytes(4, "little")
     entry, end = decode_entry(octets + bytes(30))

@@ -25,7 +25,7 @@ from tests.support.wirerecords import records
 headers = records(AmsHeader)
 
 
-def test_header_lies_as_on_the_wire() -> None:
+def test_header_matches_wire_layout() -> None:
     header = AmsHeader(
         NetId.parse("192.168.0.1.2.1"),
         1001,
@@ -68,7 +68,7 @@ def test_garbage_decodes_or_raises_codec_error(noise: bytes) -> None:
     assert noise.startswith(encode_packet(header, data))
 
 
-def test_unknown_command_is_kept_for_whoever_answers_it() -> None:
+def test_unknown_command_is_kept() -> None:
     header = AmsHeader(NetId(bytes(6)), 0, NetId(bytes(6)), 0, 0x1234)
     assert AmsHeader.decode(header.encode()).command == 0x1234
     assert AmsCommand.name_of(0x1234) == "0x1234"
@@ -96,7 +96,7 @@ def test_every_prefix_of_it_is_truncated(size: int) -> None:
         (AmsTcpHeader(0, 0), "length 0, expected 32 or more"),
     ],
 )
-def test_what_is_no_packet_is_refused(header: AmsTcpHeader, text: str) -> None:
+def test_prefix_without_packet_is_refused(header: AmsTcpHeader, text: str) -> None:
     with pytest.raises(MalformedError, match=text):
         decode_prefix(header.encode())
 

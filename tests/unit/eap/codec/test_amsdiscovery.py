@@ -28,7 +28,7 @@ HEADER = DiscoveryHeader(
 )
 
 
-def test_datagram_lies_as_on_the_wire() -> None:
+def test_datagram_matches_wire_layout() -> None:
     octets = encode_discovery(HEADER, [(Tag.HOST, encode_text("pc")), (Tag.RESULT, bytes(4))])
     assert octets.hex() == (
         "03661471" + "07000000" + "01000000" + "010203040506" + "1027" + "02000000"

@@ -27,7 +27,7 @@ def test_probe_has_no_sender_address() -> None:
     assert ArpMessage.decode(bytes.fromhex(PROBE)).is_probe
 
 
-def test_answer_to_a_probe_shows_who_has_the_address() -> None:
+def test_answer_to_probe_shows_owner_of_address() -> None:
     message = ArpMessage.decode(bytes.fromhex(ANSWER))
     assert message == (REPLY, THEIRS, ADDRESS, OURS, IPv4Address(0))
     assert message.shows_sender
@@ -74,5 +74,5 @@ def test_other_kinds_of_addresses_are_malformed(head: str) -> None:
         (ArpMessage(3, THEIRS, ADDRESS, OURS, OTHER), False),  # RARP
     ],
 )
-def test_who_has_an_address(message: ArpMessage, shows: bool) -> None:
+def test_request_for_owner_of_address(message: ArpMessage, shows: bool) -> None:
     assert message.shows_sender is shows

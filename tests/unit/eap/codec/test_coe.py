@@ -36,12 +36,12 @@ from tests.support.vectors import Vector, load, load_message
 from tests.support.wirerecords import records
 
 
-def test_header_lies_as_on_the_wire() -> None:
+def test_header_matches_wire_layout() -> None:
     assert CoeHeader(service=CoeService.SDO_RESPONSE).encode() == bytes.fromhex("0030")
     assert CoeHeader(0x1FF, service=CoeService.TX_PDO).encode() == bytes.fromhex("ff41")
 
 
-def test_emergency_lies_as_on_the_wire() -> None:
+def test_emergency_matches_wire_layout() -> None:
     emergency = Emergency(0x2310, 0x03, b"\1\2\3\4\5")
     octets = encode_message(CoeService.EMERGENCY, emergency.encode())
     assert octets == bytes.fromhex("0010 1023 03 0102030405")
@@ -128,7 +128,7 @@ def test_download_request(data: bytes, complete: bool, octets: str) -> None:
         (encode_abort(0x1018, 5, 0x06090011), "0020 80 1810 05 11000906"),
     ],
 )  # fmt: skip
-def test_message_lies_as_on_the_wire(sent: bytes, octets: str) -> None:
+def test_message_matches_wire_layout(sent: bytes, octets: str) -> None:
     assert sent == bytes.fromhex(octets)
 
 

@@ -12,7 +12,7 @@ def test_length_and_type_share_a_little_endian_word() -> None:
     assert EtherCatHeader.decode(b"\x15\x40") == EtherCatHeader(0x15, 0, FrameType.PROCESS_DATA)
 
 
-def test_type_that_nobody_documents_keeps_its_number() -> None:
+def test_undocumented_type_keeps_its_number() -> None:
     header = EtherCatHeader.decode(b"\x15\x70")
     assert (header.length, header.type) == (21, 7)
 

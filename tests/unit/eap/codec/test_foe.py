@@ -28,7 +28,7 @@ from tests.support.vectors import load_message
         ("06 00 0a006400 7761697421", (FoeOpcode.BUSY, Busy(10, 100).number, b"wait!")),
     ],
 )
-def test_message_lies_as_on_the_wire(octets: str, sent: tuple) -> None:
+def test_message_matches_wire_layout(octets: str, sent: tuple) -> None:
     assert encode_message(*sent) == bytes.fromhex(octets)
 
 

@@ -27,7 +27,7 @@ from tests.support.wirerecords import records
 headers = records(MailboxHeader)
 
 
-def test_header_lies_as_on_the_wire() -> None:
+def test_header_matches_wire_layout() -> None:
     header = MailboxHeader(10, 1001, channel=1, priority=3, type=MailboxType.COE, counter=2)
     assert header.encode() == bytes.fromhex("0a00 e903 c1 23")
 

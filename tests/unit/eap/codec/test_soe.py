@@ -34,12 +34,12 @@ from tests.support.vectors import load_message
 from tests.support.wirerecords import records
 
 
-def test_read_request_lies_as_on_the_wire() -> None:
+def test_read_request_matches_wire_layout() -> None:
     octets = encode_message(SoeOpcode.READ_REQUEST, Idn.parse("S-0-0032").number, drive=1)
     assert octets == bytes.fromhex("21 40 2000")
 
 
-def test_refusal_lies_as_on_the_wire() -> None:
+def test_refusal_matches_wire_layout() -> None:
     octets = encode_message(
         SoeOpcode.READ_RESPONSE, 0x8064, b"\x01\x10", elements=Element.NAME, error=True
     )
@@ -55,7 +55,7 @@ def test_error_code_is_the_last_two_octets() -> None:
         error_code_of(b"\1")
 
 
-def test_attribute_lies_as_on_the_wire() -> None:
+def test_attribute_matches_wire_layout() -> None:
     attribute = SoeAttribute(
         factor=1, length=1, is_list=1, display=Display.IDN, decimals=3, protected_op=1
     )
@@ -199,13 +199,13 @@ def test_list_and_text() -> None:
 
 
 @pytest.mark.parametrize("value", [-1, 1 << 32, "5", 1.5, None])
-def test_what_is_no_value_is_refused(value: object) -> None:
+def test_invalid_value_is_refused(value: object) -> None:
     expected = "is no value of 4 bytes: expected a whole number from 0 to 4294967295"
     with pytest.raises(ValueError, match=expected):
         encode_scalar(UNSIGNED, value)
 
 
-def test_what_is_expected_instead_is_said() -> None:
+def test_invalid_value_error_names_the_expected_one() -> None:
     signed = SoeAttribute(length=0, display=Display.SIGNED)
     with pytest.raises(ValueError, match="expected a whole number from -128 to 127"):
         encode_scalar(signed, 128)

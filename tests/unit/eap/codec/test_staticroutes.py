@@ -74,11 +74,11 @@ def test_other_files_are_refused(text: str, reason: str) -> None:
 
 
 @given(st.lists(st.builds(StaticRoute, NAMES, NAMES, NAMES, st.just("TCP_IP")), max_size=4))
-def test_what_is_written_is_read(routes: list[StaticRoute]) -> None:
+def test_static_routes_round_trip(routes: list[StaticRoute]) -> None:
     assert parse(dump("here <&>", "1.1.1.1.1.1", routes, tcp_port=48898)) == routes
 
 
-def test_file_tells_of_its_own_router() -> None:
+def test_file_describes_its_own_router() -> None:
     root = ET.fromstring(dump("a&b", "1.2.3.4.1.1", [PRESS], tcp_port=48898))
     assert [root.findtext(f"Local/{tag}") for tag in ("Name", "NetId", "TcpPort")] == [
         "a&b", "1.2.3.4.1.1", "48898"

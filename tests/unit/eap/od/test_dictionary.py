@@ -116,7 +116,7 @@ def test_complete_access_from_0_has_a_16_bit_count_and_from_1_has_none() -> None
     assert make().upload_complete(0x8000, 1, OP) == whole[2:]
 
 
-def test_complete_download_passes_over_what_is_read_only() -> None:
+def test_complete_download_skips_read_only_entries() -> None:
     dictionary = make()
     dictionary.download_complete(0x8000, 1, b"\x20\0" + b"\xff" + b"new\0\0\0\0\0", PREOP)
     assert dictionary.entry(0x8000, 1).value == 0x20
@@ -178,7 +178,7 @@ KINDS = st.sampled_from(["BOOL", "BIT3", "BIT7", "USINT", "UINT", "UDINT", "REAL
 
 
 @given(st.lists(KINDS, min_size=1, max_size=12), st.randoms(use_true_random=False))
-def test_what_complete_access_reads_it_writes_back(kinds: list[str], random: object) -> None:
+def test_complete_access_round_trips(kinds: list[str], random: object) -> None:
     def fill() -> ObjectDictionary:
         entries = {n: Entry(f"e{n}", kind, RW) for n, kind in enumerate(kinds, 1)}
         return ObjectDictionary([record(0x4000, "r", entries)])
@@ -292,7 +292,7 @@ def test_entry_that_may_not_be_read_is_zero_in_a_whole_object() -> None:
     assert dictionary.upload_complete(0x9000, 1, OP) == bytes.fromhex("0700 0000")
 
 
-def test_limits_mean_nothing_to_what_is_no_number() -> None:
+def test_limits_apply_to_numbers_only() -> None:
     dictionary = ObjectDictionary([variable(0x2000, "Block", "BLOCK(2)", RW, b"ab", maximum=1)])
     dictionary.download(0x2000, 0, b"zz", OP)
     assert dictionary.upload(0x2000, 0, OP) == b"zz"

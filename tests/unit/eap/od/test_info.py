@@ -56,7 +56,7 @@ def test_object_description() -> None:
     assert object_description(DICTIONARY, 0x6000) == expected
 
 
-def test_entry_description_holds_what_was_asked_for() -> None:
+def test_entry_description_holds_the_requested_parts() -> None:
     head = bytes.fromhex("0060 01")
     fixed = bytes.fromhex("0300 1000 8700")
     assert entry_description(DICTIONARY, 0x6000, 1, 0) == head + b"\0" + fixed + b"Level"
@@ -67,7 +67,7 @@ def test_entry_description_holds_what_was_asked_for() -> None:
     )
 
 
-def test_entry_description_leaves_out_what_there_is_not() -> None:
+def test_entry_description_omits_missing_parts() -> None:
     description = entry_description(DICTIONARY, 0x7000, 1, 0x7F)
     assert description[3] == 0x17  # no unit, no limits
     assert description.endswith(b"\0Valve")

@@ -28,7 +28,7 @@ def test_text_is_as_long_as_its_content() -> None:
     assert entry.octets == b"x"
 
 
-def test_live_entry_shows_what_lives_elsewhere() -> None:
+def test_live_entry_reads_its_source() -> None:
     cell = [1]
     entry = Entry("Quality", "UINT", RO, read=lambda: struct.pack("<H", cell[0]))
     cell[0] = 515

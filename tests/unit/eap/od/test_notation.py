@@ -93,7 +93,7 @@ def test_parse_says_what_was_expected(kind, text, reason):
     st.binary(min_size=24, max_size=24),
     st.sampled_from(["", "NetID", "Mapping 1", "PDO index"]),
 )
-def test_what_is_shown_reads_as_it_was(text, octets, name):
+def test_shown_value_is_parsed_back(text, octets, name):
     kind = datatypes.parse(text)
     value = kind.decode(octets[: kind.size], 0)
     numbers = value if isinstance(value, tuple) else (value,)

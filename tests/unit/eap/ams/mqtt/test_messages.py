@@ -98,7 +98,7 @@ def test_anything_else_in_front_belongs_to_the_packet(front: bytes) -> None:
 
 
 @given(st.binary(max_size=31))
-def test_what_has_not_even_a_header_is_refused(payload: bytes) -> None:
+def test_payload_without_header_is_truncated(payload: bytes) -> None:
     with pytest.raises(TruncatedError):
         decode_payload(payload)
 
@@ -137,7 +137,7 @@ def test_no_octets_and_a_nul_behind_are_understood() -> None:
     assert decode_info(b"<info><online> TRUE </online></info>\0") == Info("", is_online=True)
 
 
-def test_name_is_what_people_can_read() -> None:
+def test_info_name_is_printable_and_limited() -> None:
     told = decode_info(
         f'<info><online name=" a&#8238;&#10;[2J{"b" * 99}">true</online></info>'.encode()
     )
@@ -185,7 +185,7 @@ def asked_by(ports: ClientPorts, source: str) -> str:
     return out.source
 
 
-def test_client_asks_in_the_name_of_the_router_and_gets_its_answers() -> None:
+def test_client_ports_translate_requests_and_answers() -> None:
     ports = ClientPorts(NetId.parse(OWN_PORTS))
     asked = Ams(TARGET, TOOL, invoke_id=7, body=b"what")
     out = parse(ports.to_network(asked.octets()))
@@ -216,7 +216,7 @@ def test_answers_and_notifications_of_this_station_go_out_as_they_are() -> None:
     assert (ports.to_network(answer), ports.to_network(note)) == (answer, note)
 
 
-def test_requests_and_what_is_for_nobody_come_in_as_they_are() -> None:
+def test_requests_and_unknown_ports_are_not_translated() -> None:
     ports = ClientPorts(NetId.parse(OWN_PORTS))
     source = asked_by(ports, TOOL)
     request = Ams(source, TARGET).octets()
@@ -230,7 +230,7 @@ def test_requests_and_what_is_for_nobody_come_in_as_they_are() -> None:
         assert ports.to_client(answer) == answer
 
 
-def test_client_silent_for_longest_makes_room() -> None:
+def test_port_of_client_silent_for_longest_is_reused() -> None:
     ports = ClientPorts(NetId.parse(OWN_PORTS))
     first, second = asked_by(ports, TOOL), asked_by(ports, SECOND)
     for number in range(LAST_PORT - FIRST_PORT - 1):

@@ -44,14 +44,14 @@ def peers_with(table: RouteTable | None = None) -> Peers:
     return Peers(OWN, DOOR, RouteTable() if table is None else table)
 
 
-def test_router_comes_and_goes() -> None:
+def test_peers_report_router_online_and_offline() -> None:
     peers = peers_with()
     told = [peers.update(FAR, each, 1) for each in (HERE, HERE, GONE, GONE, HERE)]
     assert told == [Change.UP, Change.NOTHING, Change.DOWN, Change.NOTHING, Change.UP]
     assert len(peers) == 1
 
 
-def test_router_that_was_never_there_may_have_a_route_all_the_same() -> None:
+def test_peers_report_offline_for_router_never_online() -> None:
     assert peers_with().update(FAR, GONE, 1) is Change.DOWN
 
 
@@ -66,7 +66,7 @@ def test_route_is_learned_and_expires() -> None:
     assert table.expire(5 + EXPIRY_NS) == [route]
 
 
-def test_route_is_renewed_now_and_then_and_when_its_name_changes() -> None:
+def test_learned_route_is_renewed_in_time_and_for_new_name() -> None:
     table = RouteTable()
     peers = peers_with(table)
     peers.update(FAR, HERE, 0)
@@ -125,7 +125,7 @@ def test_silent_routers_are_forgotten_and_their_routes_too() -> None:
     assert [each.net_id for each in table] == [third]
 
 
-def test_route_that_somebody_added_meanwhile_is_not_forgotten() -> None:
+def test_added_route_survives_expiry_of_learned_one() -> None:
     table = RouteTable()
     peers = peers_with(table)
     peers.update(FAR, HERE, 1)
@@ -148,7 +148,7 @@ def test_sender_is_behind_the_router_that_is_nearest() -> None:
     assert peers.address_of(NetId.parse("6.1.2.1.2.1")) == "6.1.2.1.2.1"
 
 
-def test_there_is_room_for_so_many(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peers_ignore_routers_beyond_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt_peers, "MAX_PEERS", 1)
     table = RouteTable()
     peers = peers_with(table)
@@ -195,7 +195,7 @@ def own_info(*, is_retained: bool = True) -> Publish:
     return Publish(f"hall/{OWN_ID}/info", payload, 2, is_retained)
 
 
-def test_subscribes_first_then_tells_of_itself_and_leaves_a_will() -> None:
+def test_network_connected_subscribes_then_publishes_info() -> None:
     place = Place()
     assert place.first == [Subscribe((f"hall/{OWN_ID}/ams/#", "hall/+/info")), own_info()]
     will = place.network.will()
@@ -207,7 +207,7 @@ def test_subscribes_first_then_tells_of_itself_and_leaves_a_will() -> None:
     assert place.network.connected(1 << 60) == place.first
 
 
-def test_router_that_comes_is_a_hop_and_one_that_goes_is_none() -> None:
+def test_network_info_makes_hop_up_and_down() -> None:
     place = Place()
     assert place.hear_of(FAR_ID, HERE) == [HopUp(FAR_ID)]
     assert place.hear_of(FAR_ID, HERE) == []
@@ -218,7 +218,7 @@ def test_router_that_comes_is_a_hop_and_one_that_goes_is_none() -> None:
     ]
 
 
-def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
+def test_network_reports_routers_missing_after_reconnect() -> None:
     place = Place()
     place.hear_of(FAR_ID, HERE)
     place.hear_of("7.1.1.1.1.1", GONE)
@@ -237,7 +237,7 @@ def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
     assert [str(each.net_id) for each in place.table] == ["8.1.1.1.1.1"]
 
 
-def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
+def test_network_configured_hop_is_down_until_its_info() -> None:
     place = Place()
     far = NetId.parse(FAR_ID)
     place.table.add(Route(far, "far", Endpoint("mqtt:hall", FAR_ID), is_probed=False))
@@ -255,7 +255,7 @@ def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
     ]  # fmt: skip
 
 
-def test_all_are_asked_for_now_and_then() -> None:
+def test_network_requests_retained_infos_periodically() -> None:
     place = Place()
     place.wait(30)
     place.hear_of(FAR_ID, HERE)
@@ -265,7 +265,7 @@ def test_all_are_asked_for_now_and_then() -> None:
     assert place.wait(120)[0] == HopDown(FAR_ID, "it has sent no info for too long")
 
 
-def test_without_retained_messages_who_is_new_is_told_of_this_router() -> None:
+def test_network_without_retain_answers_new_router_with_info() -> None:
     place = Place(no_retain=True)
     assert place.first[1] == own_info(is_retained=False)
     assert not place.network.will().is_retained
@@ -339,9 +339,7 @@ def test_packet_arrives_and_its_answer_has_its_form(prefix: bytes) -> None:
 
 
 @pytest.mark.parametrize(("is_prefixed", "length"), [(False, 32), (True, 38)])
-def test_who_was_not_heard_yet_gets_the_form_of_the_settings(
-    is_prefixed: bool, length: int
-) -> None:
+def test_network_unknown_sender_gets_configured_packet_form(is_prefixed: bool, length: int) -> None:
     place = Place(is_prefixed=is_prefixed, qos=1)
     sent = place.network.message_for(FAR_ID, Ams(TOOL, DEVICE).octets())
     assert (sent.topic, len(sent.payload), sent.qos) == (f"hall/{FAR_ID}/ams", length, 1)
@@ -349,7 +347,7 @@ def test_who_was_not_heard_yet_gets_the_form_of_the_settings(
     assert place.network.message_for(FAR_ID, note).topic == f"hall/{FAR_ID}/ams/res"
 
 
-def test_client_behind_the_router_asks_and_is_answered() -> None:
+def test_network_forwards_client_request_and_answer() -> None:
     place = Place()
     asked = Ams(f"{FAR_ID}:851", "192.168.0.9.1.1:33000")
     sent = parse(place.network.message_for(FAR_ID, asked.octets()).payload)
@@ -372,7 +370,7 @@ def test_answers_go_to_the_router_that_the_sender_is_behind() -> None:
     assert place.asked(asked) == [PacketReceived(asked, FAR_ID)]
 
 
-def test_one_way_station_tells_so() -> None:
+def test_network_unidirectional_station_publishes_it() -> None:
     place = Place(is_unidirectional=True)
     assert b'unidirectional="true"' in place.first[1].payload
 
@@ -399,7 +397,7 @@ def test_too_long_a_request_is_answered_and_too_long_an_answer_is_not() -> None:
         (f"{OWN_ID}/ams", REQUEST, {"is_retained": True}, Drop.TOPIC, "retained packet"),
     ],
 )
-def test_what_comes_to_nothing_is_counted_and_said_once(
+def test_network_counts_dropped_messages_and_warns_once(
     topic: str, payload: bytes, more: dict[str, bool], reason: Drop, text: str
 ) -> None:
     place = Place()
@@ -421,7 +419,7 @@ def test_routers_and_senders_have_limits(monkeypatch: pytest.MonkeyPatch) -> Non
     assert closed == PeerClosed("7.1.1.1.1.1")
 
 
-def test_sender_that_nobody_told_of_is_forgotten_when_silent_for_an_hour() -> None:
+def test_network_forgets_sender_without_info_after_an_hour() -> None:
     place = Place()
     place.asked(Ams(DEVICE, "7.1.1.1.1.1:1").octets())
     place.now_ns += 1800 * SECOND

@@ -70,7 +70,7 @@ def test_companions_have_room_for_all_they_accompany():
         assert companion.last - companion.first == row.last - row.first
 
 
-def test_what_the_profile_says_of_process_data_is_where_it_says():
+def test_process_data_entries_have_sub_indexes_of_the_profile():
     """Sub-indexes 3, 4 and 6 of the first PD: ID, version and NetID of the publisher."""
     for row in (profile.TX_PD, profile.RX_PD):
         names = [row.row(subindex).name for subindex in (3, 4, 6)]

@@ -108,7 +108,7 @@ def test_any_octets_have_a_text_that_reads_back(form, octets):
         (Form.IP, "BLOCK(4)", "1.2.3.400"),
     ],
 )
-def test_what_has_not_the_form_is_refused(form, kind, text):
+def test_text_of_another_form_is_refused(form, kind, text):
     with pytest.raises(ValueError, match=text.split(":", maxsplit=1)[0][:3]):
         from_text(form, datatypes.parse(kind), text)
 
@@ -118,7 +118,7 @@ def test_numbers_may_be_typed_in_other_ways():
     assert from_text(Form.MAPPING, datatypes.parse("UDINT"), "0x60000110") == b"\x10\x01\0\x60"
 
 
-def test_live_entries_are_asked_for_and_written() -> None:
+def test_live_entries_are_read_and_written() -> None:
     written = []
     item = make_object(
         DIAGNOSIS, 0xA003, live_source(lambda key: 7 if key == MasterLive.AL_STATUS else 0),
