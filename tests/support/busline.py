@@ -194,7 +194,7 @@ class SlowServer(MailboxServer):
 def open_mailbox(line: Line, station: int = 1001, *, slow: bool = False) -> Mailbox:
     """Bring a slave of a :class:`Bench` to PREOP and return its mailbox.
 
-    What it sends unasked is in the attribute *heard* of the line.
+    What it sends unsolicited is in the attribute *unsolicited* of the line.
     """
     found = run(line, scan())[station - 1001]
     if slow:
@@ -204,8 +204,8 @@ def open_mailbox(line: Line, station: int = 1001, *, slow: bool = False) -> Mail
     area = MailboxArea(fixed.receive_offset, fixed.receive_size, fixed.send_offset, fixed.send_size)
     run(line, configure(station, area))
     run(line, change_state(station, AlState.PREOP))
-    line.heard = []
-    return Mailbox(station, area, line.core.runner, line.heard.append)
+    line.unsolicited = []
+    return Mailbox(station, area, line.core.runner, line.unsolicited.append)
 
 
 class Paced(Line):

@@ -268,13 +268,13 @@ def test_mailbox_unsolicited_message_is_reported_beside_a_request(line, box):
     line.elapse(2 * MS)
     box.poll(line.now_ns)
     line.elapse(2 * MS)
-    assert line.heard == [Unsolicited(1001, MailboxType.VOE, b"news")]
+    assert line.unsolicited == [Unsolicited(1001, MailboxType.VOE, b"news")]
     talker.unasked = [b"more"] * 3
     line.elapse(2 * MS)
     assert line.wait(start(line, box, vendor())) == VENDOR
     box.poll(line.now_ns)
     line.elapse(2 * MS)
-    assert len(line.heard) == 4
+    assert len(line.unsolicited) == 4
     assert box.stats().unsolicited == 4
 
 
@@ -364,7 +364,7 @@ def test_an_endless_talker_is_taken_in_portions(line, box):
     line.elapse(2 * MS)
     box.poll(line.now_ns)
     line.elapse(5 * MS)
-    assert len(line.heard) <= 16
+    assert len(line.unsolicited) <= 16
     assert line.wait(start(line, box, vendor())) == VENDOR
 
 

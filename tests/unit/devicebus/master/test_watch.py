@@ -53,7 +53,7 @@ def paced():
     return paced
 
 
-def heard(paced):
+def unsolicited(paced):
     events = iter(paced.core.next_event, None)
     return [(each.station, each.data) for each in events if isinstance(each, Unsolicited)]
 
@@ -62,7 +62,7 @@ def test_all_that_is_said_is_heard(paced):
     for number in (0, 3, 16):
         paced.tellers[number].news = [b"first", b"second"]
     paced.elapse(30 * MS)
-    assert sorted(heard(paced)) == [
+    assert sorted(unsolicited(paced)) == [
         (1001 + number, text) for number in (0, 3, 16) for text in (b"first", b"second")
     ]
 
@@ -78,7 +78,7 @@ def test_a_look_that_is_lost_is_made_again(paced):
     first = paced.frames
     paced.lose_back = lambda number: number < first + 6
     paced.elapse(400 * MS)
-    assert heard(paced) == [(1001, b"here")]
+    assert unsolicited(paced) == [(1001, b"here")]
 
 
 def counters(**at):
