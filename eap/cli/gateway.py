@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _JSON = json_option("Print one object per gateway; docs/control.md explains its fields.")
 _TARGET = click.argument("target", metavar="STATION[/PORT]")
 _SHOWN_CLIENTS = 10
-"""Each command is a client of its own, so there are soon hundreds."""
+"""Number of clients that are shown: each command is a client, so there may be hundreds."""
 
 
 @click.group(
@@ -120,7 +120,7 @@ def _all_rows(plant: str | None) -> list[GatewayRow]:
                 try:
                     found = client.call(GATEWAY_STATUS, station=station)
                 except ControlError as exc:
-                    if exc.code != ErrorCode.UNKNOWN_NAME:  # else it has no bus port
+                    if exc.code != ErrorCode.UNKNOWN_NAME:  # the station has no bus port
                         raise
                 else:
                     rows += found
@@ -263,6 +263,7 @@ def _behind_gateway(command: click.Command) -> click.Command:
         found = {name: _behind_gateway(each) for name, each in command.commands.items()}
         return CommandGroup(command.name, found, help=command.help, epilog=None)
     left_out = bus_parameters()
+    # The command keeps all its other parameters: only the choice of the bus differs.
     params = [each for each in command.params if each.name not in left_out]
     if len(params) == len(command.params):
         return command

@@ -233,6 +233,7 @@ def state(ctx: click.Context, wanted: str | None, target: Target, output: Render
         TargetState(str(target), answer.state, answer.error),
         lambda found: f"{target}: {found.state or 'no answer'}",
     )
+    # A station keeps the error of its last request, also when its state is only read.
     if answer.error is not None:
         what = f"{wanted} was refused" if is_refused else "the last request was refused"
         code = f" (0x{answer.error.code:04X})" if answer.error.code else ""
@@ -269,7 +270,7 @@ def _state_of_station(target: Target, wanted: str | None) -> StateAnswer:
     except ControlError as exc:
         if exc.code != ErrorCode.UNKNOWN_NAME or not target.port:
             raise
-        return _state_by_ads(target, wanted)  # a bus port has a master, or there is no such port
+        return _state_by_ads(target, wanted)  # the master of a bus port answers by ADS
 
 
 def _state_of_slave(target: Target, wanted: str | None) -> StateAnswer:

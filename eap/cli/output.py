@@ -92,6 +92,7 @@ def write_text(text: str, *, end: str = "\n") -> None:
 
 def _close_stdout() -> None:
     """Discard what is buffered: the interpreter would fail at its end when it flushes that."""
+    # dup2 keeps the descriptor number, which the interpreter flushes at its end.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -101,6 +102,7 @@ def write_view(view: View) -> None:
     Lines without a style are printed as they are, each as soon as it is there.
     """
     console: Console | None = None
+    # Each part is printed at once, so that a long listing appears while it is read.
     for part in (view,) if isinstance(view, str) else view:
         if isinstance(part, str):
             write_text(part)
@@ -131,6 +133,7 @@ def _console() -> Console:
     from rich.console import Console
 
     console = Console(highlight=False, emoji=False, markup=False)
+    # Rich assumes 80 columns for a pipe; a program that reads the output needs every column.
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = UNLIMITED
     return console

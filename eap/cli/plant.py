@@ -237,6 +237,7 @@ def apply(
         refusing = {each.station: each.refused for each in plan_all(link, wanted) if each.refused}
         is_on = keep_going or not refusing
         chosen = {name: spec for name, spec in wanted.items() if is_on and name not in refusing}
+        # Receivers first: a receiver accepts a new layout beside the old one.
         order = steps_to(link, chosen)
         steps = apply_steps(link, order, keep_going=keep_going, routed=chosen)
         _run_steps(ctx, steps, link, refusing, output)
@@ -466,7 +467,7 @@ def run(
     _check_form(ctx)
     from eap.runtime.handover import EngineOptions
 
-    # Processes and sockets: --help must not wait for them.
+    # Processes and sockets: imported here, so that --help does not wait for them.
     from eap.supervisor import process as supervisor
 
     options = EngineOptions(realtime=realtime, priority=priority, cpu=-1 if cpu is None else cpu)

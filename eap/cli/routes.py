@@ -238,7 +238,7 @@ def test(
     clients: set[tuple[str, str]] = set()
     if not chosen:
         for row in (row for each in list_routes(plant, station) for row in each.stations):
-            # A default route leads to no station of its own.
+            # A default route has no NetID of its own to test.
             targeted = [route for route in row.routes if route.octets]
             chosen += [(row.station, name) for name in dict.fromkeys(r.net_id for r in targeted)]
             clients |= {(row.station, r.net_id) for r in row.routes if r.state == "client"}

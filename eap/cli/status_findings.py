@@ -224,6 +224,7 @@ def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[St
 
 
 def _is_hung(station: Row) -> bool:
+    # A long device cycle is no fault: the limit is ten cycles, and at least two seconds.
     silent_us: int = station.get("cycle_age_us") or 0
     cycle_us: int = station.get("cycle_us", 0)
     return silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * cycle_us)
@@ -238,6 +239,7 @@ def _of_station(station: Row) -> Iterator[StatusFinding]:
         elif port.get("link") == "down" and port["kind"] != "bus":
             advice = f"check cable and interface of {port['interface']}"
             yield _error(where, "link down", advice)
+        # An engine that hangs exchanges no frames either: that is one finding, not one per bus.
         elif port.get("link") == "down" and not _is_hung(station):
             yield _error(where, "no frame comes back", "check cable and interface of the bus")
     for frame in filter(is_special, station.get("frames", ())):
@@ -246,6 +248,7 @@ def _of_station(station: Row) -> Iterator[StatusFinding]:
             yield _warning(f"{station['name']} → {frame['name']}", waits)
     for row in station["pd"]["tx"]:
         yield from _of_sent(f"{station['name']} → {row['name']}", row)
+    # A station in PREOP or SAFEOP receives nothing by request: its subscriptions are not stale.
     if station["state"] not in STATES:
         yield from _of_silent(station)
     for row in station["pd"]["rx"]:

@@ -96,7 +96,7 @@ def put_file(
 ) -> FileTransfer:
     """Write *source*, None for stdin, to a slave as the file *name*.
 
-    A transfer that the bus interrupts begins anew, unless *source* cannot be read again.
+    A transfer that the bus interrupts restarts, unless *source* cannot be read again.
 
     Raises:
         FoeError: the slave refuses.
@@ -106,6 +106,7 @@ def put_file(
     """
     start = time.monotonic()
     with _reading(source) as file:
+        # Only a regular file has a size and can be read again for a restart.
         is_regular = source is not None and source.is_file()
         progress = Progress(os.fstat(file.fileno()).st_size if is_regular else None)
         digest = hashlib.sha256()
@@ -167,7 +168,8 @@ class _FileCopy:
             rewind()
             meanwhile()
             select.select([], [], [], PAUSE_S)
-            with suppress(BusError):  # the next attempt says why it cannot be reached
+            # A slave that lost power has a new mailbox, and perhaps another position.
+            with suppress(BusError):  # the next attempt reports the reason
                 self._bus.scan()
                 self._unit = _find(self._bus, self._slave)
 
@@ -203,7 +205,7 @@ def _writing(target: Path | None) -> Iterator[BinaryIO]:
             yield sys.stdout.buffer
             sys.stdout.buffer.flush()
         except BrokenPipeError:
-            raise  # who reads it has seen enough
+            raise  # the reader closed the pipe: main() ends the command quietly
         except OSError as exc:
             raise EnvironmentalError(f"stdout cannot be written: {exc.strerror}") from None
         return

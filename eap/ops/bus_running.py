@@ -40,7 +40,7 @@ from eap.runtime.engine_messages import BusReport, SlaveReport, no_mailbox
 
 T = TypeVar("T")
 
-LOOK_S = 0.1
+REPORT_S = 0.1
 """Interval of calls of *meanwhile*."""
 
 _MARGIN_S = 10.0
@@ -65,12 +65,13 @@ class RunningBus:
         self._reports: dict[int, SlaveReport] = {}
 
     def scan(self) -> Sequence[Slave]:
-        """Return the slaves that the running master knows, and where they are now."""
+        """Return the slaves that the running master knows, with their present states."""
         slaves = self.known()
         if is_silent(self._report):
             finding, *_ = report_findings(self._report)
             raise FrameLostError(f"{finding.what}; {finding.advice}")
-        registers = self.run(_look([slave.station for slave in slaves]))
+        # The report of the master is from its last cycle; the registers are read now.
+        registers = self.run(_read_registers([slave.station for slave in slaves]))
         nodes = find_topology([dl_status for _, dl_status in registers])
         return [
             msgspec.structs.replace(slave, status=al_status, parent=node.parent, ports=node.ports)
@@ -78,7 +79,7 @@ class RunningBus:
         ]
 
     def known(self) -> Sequence[Slave]:
-        """Return the slaves as the running master has them, without asking them."""
+        """Return the slaves as the running master has them, without access to them."""
         self._report = self._describe()
         reports = self._report.slaves
         self._reports = {report.station: report for report in reports}
@@ -103,11 +104,11 @@ class RunningBus:
         ]
 
     def history(self) -> History:
-        """Return when the running master has seen faults, as of the last call of :meth:`known`."""
+        """Return the recorded faults of the running master, as of the last :meth:`known`."""
         return history_of(self._report)
 
     def forget(self) -> None:
-        """Have the running master forget faults that are over."""
+        """Clear past faults of the running master."""
         self._call(words.BUS_FORGET, words.WAIT_UP_S)
 
     def find(self, name: str) -> Slave:
@@ -124,12 +125,12 @@ class RunningBus:
         name: str,
         meanwhile: Callable[[], None] | None = None,
     ) -> T:
-        """Talk to a slave's mailbox until the conversation ends; return its result.
+        """Run a conversation with a slave's mailbox and return its result.
 
         Raises:
             BusError: the slave has no mailbox, or does not answer.
             SdoAbortError, SoeError, FoeError: it refuses.
-            ControlError: the appliance has gone, or others use the mailbox all the while.
+            ControlError: the appliance ended, or other clients occupy the mailbox.
         """
         del name  # the master has its own
         report = self._reports[slave.station]
@@ -145,8 +146,9 @@ class RunningBus:
             AlStatusError, StateTimeoutError: a slave refuses, or exceeds its time limit.
             BusError: several do.
         """
-        everyone = {slave.station for slave in slaves} == set(self._reports)
-        for station in [0] if everyone else [slave.station for slave in slaves]:
+        # Station 0 is all slaves: the master then brings them to the state together.
+        is_all = {slave.station for slave in slaves} == set(self._reports)
+        for station in [0] if is_all else [slave.station for slave in slaves]:
             self._call(words.BUS_BRING, words.BRING_S, slave=station, state=target.name)
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
@@ -172,22 +174,22 @@ class RunningBus:
     def _drive(
         self, slave: Slave, conversation: Conversation[T], meanwhile: Callable[[], None] | None
     ) -> T:
-        look_s = 0.0
+        report_s = 0.0
         number: int | None = None
 
         def exchange(request: MailboxRequest) -> MailboxMessage:
-            nonlocal look_s, number
+            nonlocal report_s, number
             if number is None:
                 number = self._open(slave, request)
-            elif meanwhile is not None and monotonic() >= look_s:
+            elif meanwhile is not None and monotonic() >= report_s:
                 meanwhile()
-                look_s = monotonic() + LOOK_S
-            return MailboxMessage(request.type, self._ask(number, request), monotonic_ns())
+                report_s = monotonic() + REPORT_S
+            return MailboxMessage(request.type, self._exchange(number, request), monotonic_ns())
 
         try:
             return drive(conversation, exchange)
         except KeyboardInterrupt:
-            number = None  # an answer may be under way: the end of the connection ends it all
+            number = None  # an answer may be pending: closing the connection ends the conversation
             raise
         finally:
             if number is not None:
@@ -199,7 +201,7 @@ class RunningBus:
         opened = self._call(words.BUS_OPEN, words.TURN_S, slave=slave.station, protocol=protocol)
         return opened.conversation
 
-    def _ask(self, number: int, request: MailboxRequest) -> bytes:
+    def _exchange(self, number: int, request: MailboxRequest) -> bytes:
         limit_s = (request.timeout_ns + request.delay_ns) / _S + words.MARGIN_S + _MARGIN_S
         answer = self._client.call(
             words.BUS_ASK,
@@ -224,7 +226,7 @@ def open_running(station: str, port: str, plant: str | None = None) -> Iterator[
         yield RunningBus(client, station, port)
 
 
-def _look(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:
+def _read_registers(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:
     """Read position and wiring of slaves; zeros for one that does not answer."""
     replies: list[DatagramReply] = []
     for start in range(0, len(stations), _PER_STEP):

@@ -41,7 +41,7 @@ T = TypeVar("T")
 CYCLE_NS = 2_000_000
 SPIN_NS = 200_000
 """Duration of the busy wait for the answer to a frame."""
-LOOK_NS = 100_000_000
+REPORT_NS = 100_000_000
 """Interval of calls of *meanwhile*."""
 
 
@@ -90,7 +90,7 @@ class BusSession:
         name: str,
         meanwhile: Callable[[], None] | None = None,
     ) -> T:
-        """Talk to a slave's mailbox until the conversation ends; return its result.
+        """Run a conversation with a slave's mailbox and return its result.
 
         Raises:
             BusError: the slave has no mailbox, or does not answer.
@@ -106,13 +106,14 @@ class BusSession:
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
         """Bring slaves to a state together; cycles run until all have reached it.
 
-        Process data of those that are to get some is laid out anew, so that they begin in PREOP.
+        For SAFEOP and OP the process data is laid out anew, starting from PREOP.
 
         Raises:
             AlStatusError, StateTimeoutError: a slave refuses, or exceeds its time limit.
             BusError: several do; the message has a line for each.
         """
         bus_slaves = [self._bus.slaves[slave.station] for slave in slaves]
+        # A slave accepts its process data layout in PREOP only: slaves go through PREOP first.
         if target in WITH_PROCESS_DATA:
             for bus_slave in bus_slaves:
                 if bus_slave.state in WITH_MAILBOX and bus_slave.found.sii.fixed.protocols:
@@ -137,15 +138,15 @@ class BusSession:
         return count_frames(self._bus.link.stats())
 
     def known(self) -> Sequence[Slave]:
-        """Return the slaves that a scan has found, which is made if there was none."""
+        """Return the slaves of the last scan, or scan."""
         return self._slaves or self.scan()
 
     def history(self) -> None:
-        """Return nothing: this master has not been there before."""
+        """Return None: this master has no record of the time before."""
         return
 
     def forget(self) -> None:
-        """Do nothing: this master remembers nothing."""
+        """Do nothing: this master keeps no record."""
 
     def _bring_all(self, bus_slaves: Sequence[BusSlave], target: AlState) -> None:
         self._run_all(bus_slaves, [bring(self._bus, bus_slave, target) for bus_slave in bus_slaves])
@@ -163,15 +164,16 @@ class BusSession:
             raise join_errors(errors)
 
     def _finish(self, task: Task[T], meanwhile: Callable[[], None] | None = None) -> T:
-        look_ns = 0
+        report_ns = 0
         try:
             while not task.is_done:
                 now_ns = self._step()
-                if meanwhile is not None and now_ns >= look_ns:
+                if meanwhile is not None and now_ns >= report_ns:
                     meanwhile()
-                    look_ns = now_ns + LOOK_NS
+                    report_ns = now_ns + REPORT_NS
         finally:
             task.cancel()
+        # The end of a conversation may have left a last message, such as an abort, to be sent.
         for frame in self._bus.link.frames_to_send(self._clock()):
             self._port.send(frame)
         return task.result()
@@ -186,10 +188,11 @@ class BusSession:
         frames = bus.link.frames_to_send(now_ns)
         for frame in frames:
             port.send(frame)
-        times = [bus.link.next_timeout(), bus.runner.next_timeout(), now_ns + LOOK_NS]
+        times = [bus.link.next_timeout(), bus.runner.next_timeout(), now_ns + REPORT_NS]
         if bus.cycle is not None:
             times.append(self._cycle_ns)
         due_ns = min(at_ns for at_ns in times if at_ns is not None)
+        # Only a frame of this step can return at once; otherwise a busy wait would only cost time.
         data = self._spin(now_ns) if frames else None
         if data is None:
             select.select([port], [], [], max(0, due_ns - now_ns) / 1e9)
@@ -289,7 +292,7 @@ class SlaveBus(Protocol):
         name: str,
         meanwhile: Callable[[], None] | None = None,
     ) -> T:
-        """Talk to a slave's mailbox until the conversation ends; return its result or raise."""
+        """Run a conversation with a slave's mailbox; return its result or raise."""
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
         """Bring slaves to a state, or raise."""
@@ -301,13 +304,13 @@ class SlaveBus(Protocol):
         """Return the counters of the master's frames."""
 
     def known(self) -> Sequence[Slave]:
-        """Return all slaves in the order of the line, without asking those that are known."""
+        """Return all slaves in the order of the line, without a new scan if they are known."""
 
     def history(self) -> History | None:
         """Return the times of faults; None without a record."""
 
     def forget(self) -> None:
-        """Forget faults that are over."""
+        """Clear past faults."""
 
 
 def choose(slaves: Sequence[Slave], name: str) -> Slave:
@@ -332,10 +335,10 @@ def choose(slaves: Sequence[Slave], name: str) -> Slave:
 
 
 def no_mailbox(slave: Slave, state: str) -> BusError:
-    """Return the error of a slave that cannot be talked to in *state*."""
+    """Return the error of a slave without a mailbox in *state*."""
     return NoMailboxError(
-        f"slave {slave.station} ({slave.name}) has no mailbox in {state}: nothing but its state,"
-        " its EEPROM and its registers can be reached"
+        f"slave {slave.station} ({slave.name}) has no mailbox in {state}: only its state,"
+        " EEPROM and registers are accessible"
     )
 
 

@@ -36,7 +36,7 @@ from eap.runtime.folder import ApplianceFolder, ApplianceInfo, describe_roots, f
 from eap.suggest import suggest
 
 TIMEOUT_S = 10.0
-"""Time for one answer: services may be on their way back from a restart."""
+"""Time for one answer: services may be restarting."""
 _CONNECT_PAUSE_S = 0.02
 _EVENT = partial(msgspec.convert, type=ValuesEvent)
 
@@ -93,6 +93,7 @@ class ControlClient(Closeable):
             raise self._gone(exc) from None
         while True:
             reply = self._next_reply()
+            # Events of an earlier subscription may precede the answer.
             if reply.subscription is None:
                 return _checked(reply).result
 
@@ -105,6 +106,7 @@ class ControlClient(Closeable):
             ControlError: the appliance refused, went away, or cannot read the values now.
         """
         self.call(SUBSCRIBE, **params)
+        # Events come when values change, which may take any time: no timeout from here on.
         self._socket.settimeout(None)
         while True:
             event = _checked(self._next_reply()).event
@@ -116,6 +118,7 @@ class ControlClient(Closeable):
 
     def close(self) -> None:
         """Hang up, also while another thread waits for an event."""
+        # Closing alone would not wake up a thread that waits in readline().
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._reader.close()
@@ -306,7 +309,7 @@ def _connect(connection: socket.socket, path: str) -> None:
     while True:
         try:
             connection.connect(path)
-        except BlockingIOError:
+        except BlockingIOError:  # the accept queue of a Unix socket is full
             if monotonic() > end_s:
                 raise
             select.select([], [], [], _CONNECT_PAUSE_S)

@@ -261,6 +261,7 @@ def unwrap(octets: bytes) -> Packet | None:
         return None
     ethertype = int.from_bytes(octets[12:14], "big")
     start, vlan_id = 14, None
+    # A frame may have several tags (802.1ad); the innermost VLAN is the one that is reported.
     while ethertype in _VLAN_TYPES and len(octets) >= start + 4:
         tag, ethertype = struct.unpack_from(">HH", octets, start)
         start, vlan_id = start + 4, tag & 0xFFF
@@ -277,8 +278,10 @@ def _unwrap_ipv4(octets: bytes, vlan_id: int | None) -> Packet | None:
         return None
     total, fragment, protocol = struct.unpack_from(">2xH2xHxB", octets)
     header = 4 * (octets[0] & 15)
-    body = octets[header : total or None]  # 0 where the sender's card cuts the segments
+    # The total length is 0 where the sender's network card segments the packets.
+    body = octets[header : total or None]
     least = {_UDP: 8, _TCP: 20}.get(protocol)
+    # A later fragment has no port numbers, so its frame cannot be recognised.
     if fragment & 0x1FFF or least is None or len(body) < least:
         return None
     ports = struct.unpack_from(">HH", body)
@@ -311,20 +314,22 @@ class Stream:
     def __init__(self) -> None:
         self._next: int | None = None
         self._waiting: dict[int, bytes] = {}
-        self._begun = bytearray()
+        self._incomplete = bytearray()
 
     def receive(self, segment: TcpSegment, payload: bytes) -> Iterator[bytes]:
         """Yield the frames that *payload* completes."""
         sequence = segment.sequence
         if segment.is_first:
             yield from self.flush()
+            # SYN occupies a sequence number of its own: the data begins behind it.
             sequence = (sequence + 1) % _SEQUENCES
             self._next = sequence
         if payload and len(payload) > len(self._waiting.get(sequence, b"")):
             self._waiting[sequence] = payload
+        # A capture may start in the middle of a connection: its first segment is the start.
         if self._next is None:
             self._next = sequence
-        yield from self._put_together()
+        yield from self._reassemble()
         if len(self._waiting) > _MOST_WAITING:
             yield from self._skip_gap()
 
@@ -332,27 +337,29 @@ class Stream:
         """Yield the remaining frames, incomplete ones included."""
         while self._waiting:
             yield from self._skip_gap()
-        yield from self._give_up_begun()
+        yield from self._discard_incomplete()
 
-    def _put_together(self) -> Iterator[bytes]:
+    def _reassemble(self) -> Iterator[bytes]:
         for sequence in sorted(self._waiting, key=self._distance):
             ahead = self._distance(sequence)
             if ahead > 0:
                 break
-            fresh = self._waiting.pop(sequence)[-ahead:]  # what a retransmission repeats is cut
-            self._begun += fresh
+            fresh = self._waiting.pop(sequence)[
+                -ahead:
+            ]  # a retransmission repeats the bytes before
+            self._incomplete += fresh
             self._next = (sequence - ahead + len(fresh)) % _SEQUENCES
-        yield from cut_frames(self._begun)
+        yield from cut_frames(self._incomplete)
 
     def _skip_gap(self) -> Iterator[bytes]:
-        yield from self._give_up_begun()
+        yield from self._discard_incomplete()
         self._next = min(self._waiting, key=self._distance)
-        yield from self._put_together()
+        yield from self._reassemble()
 
-    def _give_up_begun(self) -> Iterator[bytes]:
-        if self._begun:
-            yield bytes(self._begun)
-            self._begun.clear()
+    def _discard_incomplete(self) -> Iterator[bytes]:
+        if self._incomplete:
+            yield bytes(self._incomplete)
+            self._incomplete.clear()
 
     def _distance(self, sequence: int) -> int:
         """Return the distance of *sequence* from the next expected one; sequence numbers wrap."""

@@ -47,14 +47,16 @@ from eap.ops.od import Content, EntryInfo, ObjectInfo, OdDevice
 from eap.ops.routing import AmsDevice, AmsRefusedError, open_ams
 from eap.runtime.folder import find_running
 
-_ROOM = 0x20002
+_MAX_SIZE = 0x20002
 """Size of the longest description: a list of all possible indexes."""
 _COMPLETE = 0x100
 _LIST_TYPE = 2
 """Bytes before the indexes of a list."""
 _PADDED = 2
 """Size of subindex 0 in a whole object."""
-_UNTOLD = frozenset((AdsError.NOT_FOUND, AdsError.SERVICE, AdsError.INDEX_GROUP, AdsError.GENERAL))
+_NOT_DESCRIBED = frozenset(
+    (AdsError.NOT_FOUND, AdsError.SERVICE, AdsError.INDEX_GROUP, AdsError.GENERAL)
+)
 _OCTETS = 6
 _NOT_THERE = "is not STATION, STATION/PORT, STATION/PORT/SLAVE or NETID[:PORT]"
 
@@ -272,7 +274,7 @@ class AdsOd:
             body = self._read(IndexGroup.ENTRY_DESCRIPTION, offset, name)
             found = EntryDescription.decode(body)
         except AmsRefusedError as exc:
-            if exc.result in _UNTOLD:
+            if exc.result in _NOT_DESCRIBED:
                 return None
             raise
         except CodecError:
@@ -284,6 +286,7 @@ class AdsOd:
         name = str(ObjectId(index, subindex))
         if not complete:
             return self._read(IndexGroup.SDO, index << 16 | subindex, name)
+        # By ADS complete access begins with subindex 0, which takes two bytes there.
         octets = self._read(IndexGroup.SDO, index << 16 | _COMPLETE, name)
         return octets[_PADDED:] if subindex else octets
 
@@ -309,7 +312,7 @@ class AdsOd:
         return object_info(index, found)
 
     def _read(self, group: int, offset: int, what: str) -> bytes:
-        return self._device.demand(Read(group, offset, _ROOM), what)
+        return self._device.demand(Read(group, offset, _MAX_SIZE), what)
 
 
 class StationOd:
@@ -360,7 +363,7 @@ class StationOd:
         try:
             self._client.call(OD_WRITE, target=self._target, **where, data=octets.hex())
         except ControlError as exc:
-            # At the control word it is a state that was refused, and the reason says why.
+            # At the control word the state request itself was refused, and the text has the reason.
             if (
                 index != CONTROL
                 and exc.code == ErrorCode.ABORT
@@ -395,5 +398,5 @@ def _station_entry(row: DescribedEntry) -> EntryInfo:
     try:
         kind = datatypes.parse(row.type)
     except ValueError:
-        kind = None  # a later release may know more of them
+        kind = None  # a newer appliance may have more data types
     return EntryInfo(row.subindex, row.name, kind, row.access, row.unit)

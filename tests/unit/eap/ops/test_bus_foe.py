@@ -163,7 +163,7 @@ def test_transfer_interrupted_by_a_power_fault_begins_anew(
                 seen.append(1)
             seen.append(restarts)
 
-        monkeypatch.setattr(bus_session, "LOOK_NS", 1)
+        monkeypatch.setattr(bus_session, "REPORT_NS", 1)
         if is_write:
             row = put_file(bus, "drive", source, "firmware.bin", password=0, report=interrupt)
             get(bus, "firmware.bin", target, reports)
