@@ -18,8 +18,8 @@ class EchoStation:
 
     Attributes:
         send: How answers go back; to be set.
-        seen: Packets, with door and connection, that came.
-        closed: Doors and connections that were closed.
+        seen: Packets, with transport and connection, that came.
+        closed: Transports and connections that were closed.
         waiting: Answers that nobody has sent yet.
     """
 

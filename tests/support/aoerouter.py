@@ -1,4 +1,4 @@
-"""A router with the doors of a station, for tests: packets in, packets out."""
+"""A router with the transports of a station, for tests: packets in, packets out."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FAR = "6.1.1.1.1.1"
 FAR_DEVICE = f"{FAR}:851"
 LINK = Endpoint("link", "10.0.0.6")
 SECOND_LINK = Endpoint("link", "10.0.0.7")
-DOORS = (
+TRANSPORTS = (
     Transport("tcp", is_stream=True, is_hub=True),
     Transport("local", is_stream=True, is_hub=True),
     Transport("link", is_hub=True, is_stream=True),
@@ -50,7 +50,7 @@ class Station:
         net_id = NetId.parse(ROUTER)
         hop_prober = HopProber(net_id, self.table) if is_probing else None
         self.router = Router(
-            net_id, self.table, DOORS, first_invoke_id=first_id, limits=limits,
+            net_id, self.table, TRANSPORTS, first_invoke_id=first_id, limits=limits,
             hop_prober=hop_prober,
             access=AccessList([*rules]), answer_now=answer_now,
         )  # fmt: skip

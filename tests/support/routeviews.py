@@ -42,10 +42,10 @@ def _run(request: LocalRequest) -> AmsAnswer:
 
 
 class Left:
-    """Station left: its router has a door by UDP and one by AMS/TCP, and knows station right.
+    """Station left: its router has a transport by UDP and one by AMS/TCP, and knows station right.
 
     Attributes:
-        sent: What leaves by any door.
+        sent: What leaves by any transport.
     """
 
     def __init__(self) -> None:

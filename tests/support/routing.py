@@ -1,4 +1,4 @@
-"""Stations with routers for tests: services that echo, and carriers that keep what they get."""
+"""Stations with routers for tests: services that echo, and senders that record packets."""
 
 from __future__ import annotations
 

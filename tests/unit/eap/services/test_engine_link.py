@@ -1,4 +1,4 @@
-"""Services' end of the pair with the engine."""
+"""Link of services to the engine."""
 
 from __future__ import annotations
 

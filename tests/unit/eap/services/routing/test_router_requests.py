@@ -1,4 +1,4 @@
-"""Questions to other routers, and what is taken for an answer."""
+"""Requests to other routers, and matching of their answers."""
 
 from __future__ import annotations
 

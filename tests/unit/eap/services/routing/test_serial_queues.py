@@ -1,4 +1,4 @@
-"""The order in which services answer, and how many wait."""
+"""Order of answers, and limits of the queues."""
 
 from __future__ import annotations
 

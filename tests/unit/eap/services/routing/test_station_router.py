@@ -1,8 +1,9 @@
-"""A station's router in its loop: doors, services, time-outs, local clients."""
+"""A station's router in its loop: transports, services, time-outs, timer, local clients."""
 
 from __future__ import annotations
 
 import asyncio
+from time import monotonic_ns
 
 import pytest
 
@@ -15,10 +16,10 @@ from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.services.routing import station_router
-from eap.services.routing.station_router import StationRouter
+from eap.services.routing.station_router import RouterTimer, StationRouter
 from tests.support import aoe
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
-from tests.support.eventually import eventually, settle
+from tests.support.eventually import elapse, eventually, settle
 from tests.support.routing import RecordingSender, StubService, while_serving
 
 ROUTER, DEVICE = NetId.parse("1.1.1.1.1.1"), NetId.parse("1.1.1.1.2.1")
@@ -26,7 +27,7 @@ CLIENT = "192.168.9.9.1.1:33000"
 FAR = "7.7.7.7.1.1:851"
 HOP = Endpoint("out", "hop")
 PEER = Endpoint("in", "peer")
-DOORS = (
+TRANSPORTS = (
     Transport("in", is_stream=True, is_hub=True),
     Transport("out"),
     Transport("narrow", max_size=60),
@@ -35,14 +36,14 @@ DOORS = (
 
 
 class Scene:
-    """A station with doors whose packets are kept."""
+    """A station with transports whose packets are kept."""
 
     def __init__(self, **more: object) -> None:
         self.sender = RecordingSender()
         self.service = StubService()
         self.station = StationRouter("island", ROUTER, [DEVICE], **more)
         self.station.add_service(DEVICE, self.service)
-        for transport in DOORS:
+        for transport in TRANSPORTS:
             self.station.add_transport(transport, self.sender)
 
     def add_route(self, **more: object) -> None:
@@ -312,3 +313,97 @@ def test_route_observers_are_notified_of_each_change() -> None:
     scene.add_route()
     scene.station.remove_route(NetId.parse("7.7.7.7.1.1"), HOP)
     assert told == [HOP, HOP]
+
+
+MS = 1_000_000
+
+
+class Clock:
+    """Something with a next time-out; it notes when it was called."""
+
+    def __init__(self) -> None:
+        self.due_ns: int | None = None
+        self.rang_ns: list[int] = []
+        self.rang = asyncio.Event()
+        self.timer = RouterTimer(lambda: self.due_ns, self._handle)
+
+    def set(self, in_ms: int) -> int:
+        self.due_ns = monotonic_ns() + in_ms * MS
+        self.timer.set()
+        return self.due_ns
+
+    def _handle(self) -> None:
+        self.rang_ns.append(monotonic_ns())
+        self.due_ns = None
+        self.rang.set()
+
+
+def play(script):
+    async def run():
+        clock = Clock()
+        async with asyncio.timeout(10):
+            await script(clock)
+        clock.timer.stop()
+
+    asyncio.run(run())
+
+
+def test_timer_fires_at_the_due_time():
+    async def script(clock):
+        clock.timer.start()
+        clock.set(10_000)
+        due_ns = clock.set(30)  # the earlier one counts
+        clock.set(10_000)
+        await clock.rang.wait()
+        assert clock.rang_ns[0] >= due_ns - MS
+
+    play(script)
+
+
+def test_timer_overdue_does_not_keep_the_loop_busy():
+    async def script(clock):
+        clock.timer.start()
+        clock.set(-1000)
+        await asyncio.sleep(0)
+        assert not clock.rang_ns
+        await clock.rang.wait()
+
+    play(script)
+
+
+def test_timer_set_soon_is_shared():
+    async def script(clock):
+        clock.timer.start()
+        clock.set(10_000)
+        for _ in range(1000):
+            clock.timer.set_soon()
+            clock.set(1)  # it is looked up after the moment
+        await clock.rang.wait()
+        await elapse(0.05)
+        assert len(clock.rang_ns) == 1
+
+    play(script)
+
+
+def test_timer_does_not_fire_before_start_and_after_stop():
+    async def script(clock):
+        clock.set(1)
+        clock.timer.set_soon()
+        await elapse(0.05)
+        assert not clock.rang_ns
+        clock.timer.start()
+        clock.timer.stop()
+        clock.set(1)
+        await elapse(0.05)
+        assert not clock.rang_ns
+
+    play(script)
+
+
+def test_timer_start_handles_what_was_due_before():
+    async def script(clock):
+        clock.set(1)
+        clock.timer.start()
+        await clock.rang.wait()
+
+    play(script)

@@ -1,4 +1,4 @@
-"""Connections of clients: accepted and named."""
+"""Accepted connections, their limits and names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""UDP 48899: which routers are there."""
+"""UDP 48899: answers to requests for server info and routes."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ async def hear(reader) -> bytes:
 def play(
     script, *, patience_s: float = 5, stations: Sequence[EchoStation] = ()
 ) -> tuple[list[DropReason], list[EchoStation]]:
-    """Run ``script(connect, door)`` while a door serves stations, by default two."""
+    """Run ``script(connect, transport)`` while a transport serves stations, by default two."""
     refused: list[DropReason] = []
     there = list(stations) or [EchoStation(target) for target in TARGETS]
 

@@ -1,4 +1,4 @@
-"""All connections that a station opens."""
+"""Connections of a station to all of its peers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.net
 
 
 class Router:
-    """Has doors and routes; knows which hops are up."""
+    """Has transports and routes; knows which hops are up."""
 
     name = "left"
 

@@ -1,4 +1,4 @@
-"""Requests in flight of a connection."""
+"""Pending requests and subscriptions of a connection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two routers and a client of another make, joined by a real broker and nothing else."""
+"""Two routers and a client of another make, connected by a real broker only."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def spec(network: str = "hall", **more: object) -> MqttSpec:
 
 
 class Place:
-    """A station with its doors to brokers."""
+    """A station with its transports to brokers."""
 
     def __init__(self, net_id: NetId, *specs: MqttSpec, learns: bool = True) -> None:
         self.router = station(str(net_id), name=f"of {net_id[0]}")

@@ -1,4 +1,4 @@
-"""Routes that tools ask for: whose password, which route."""
+"""Add-route requests: users, passwords, and the added routes."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def frame(kind: int) -> bytes:
 
 
 class Scene:
-    """A door, the engine's end of its link, and what it refused."""
+    """A transport, the engine's end of its link, and what it refused."""
 
     def __init__(self, listener, engine, refused, listeners) -> None:
         self.listeners = listeners
@@ -47,7 +47,7 @@ class Scene:
         return await asyncio.open_connection(*self.address)
 
     async def send(self, data: bytes) -> bytes:
-        """Return what comes back until the door closes."""
+        """Return what comes back until the transport closes."""
         reader, writer = await self.connect()
         writer.write(data)
         try:

@@ -1,4 +1,4 @@
-"""Frames of type 5 as datagrams and on Ethernet: who is answered, and how."""
+"""Frames of type 5 as datagrams and on Ethernet: answers and dropped frames."""
 
 from __future__ import annotations
 

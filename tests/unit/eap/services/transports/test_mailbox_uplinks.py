@@ -1,4 +1,4 @@
-"""Connections to other stations, that come and go."""
+"""Connections of a stream transport to other stations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The devices of an appliance, from what services is handed."""
+"""The devices of an appliance, built from a handover."""
 
 from __future__ import annotations
 
