@@ -165,12 +165,12 @@ def encode_value(value: object) -> str:
 
 def decode_value(kind: type, text: object) -> NetId | InterfaceUri:
     """Read an address of a record (msgspec's ``dec_hook``); raise ValueError if it is invalid."""
-    if isinstance(text, str):
-        if kind is NetId:
-            return NetId.parse(text)
-        if kind is InterfaceUri:
-            return InterfaceUri.parse(text)
-    raise NotImplementedError(f"{kind.__name__} in a record")
+    if kind not in {NetId, InterfaceUri}:
+        raise NotImplementedError(f"{kind.__name__} in a record")
+    if not isinstance(text, str):
+        # msgspec reports a ValueError as a ValidationError with the path of the field.
+        raise ValueError(f"Expected `str`, got `{type(text).__name__}`")  # noqa: TRY004
+    return NetId.parse(text) if kind is NetId else InterfaceUri.parse(text)
 
 
 class DestinationKind(Enum):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,12 +16,19 @@ from eap.ids import (
     MacAddr,
     NetId,
     ObjectId,
+    decode_value,
+    encode_value,
     parse_host,
     prefix_text,
 )
 
 six_octets = st.binary(min_size=6, max_size=6)
 addresses = st.ip_addresses(v=4).map(str)
+
+
+class Bound(msgspec.Struct, frozen=True):
+    interface: InterfaceUri
+    net_id: NetId
 
 
 @given(six_octets)
@@ -211,3 +219,24 @@ def test_object_id_without_prefix_is_hexadecimal(text: str, object_id: tuple[int
 def test_object_id_refused(text: str) -> None:
     with pytest.raises(ValueError, match="such as 0x1018:01"):
         ObjectId.parse(text)
+
+
+def test_addresses_in_records_are_their_texts() -> None:
+    port = Bound(InterfaceUri.parse("udp://127.0.1.1:40000"), NetId.parse("127.0.1.1.2.1"))
+    text = msgspec.json.encode(port, enc_hook=encode_value)
+    assert text == b'{"interface":"udp://127.0.1.1:40000","net_id":"127.0.1.1.2.1"}'
+    assert msgspec.json.decode(text, type=Bound, dec_hook=decode_value) == port
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "reason"),
+    [
+        ("interface", "serial://a", "is not an interface"),
+        ("net_id", "1.2.3", "is not an AMS NetID"),
+        ("net_id", 5, r"got `int` - at `\$.net_id`"),
+    ],
+)
+def test_invalid_address_in_record_is_refused_with_its_field(key, text, reason) -> None:
+    fields = {"interface": "loop://a", "net_id": "1.1.1.1.1.1"} | {key: text}
+    with pytest.raises(msgspec.ValidationError, match=reason):
+        msgspec.convert(fields, Bound, dec_hook=decode_value)
