@@ -314,7 +314,7 @@ class AccessSection(Section, frozen=True):
     net_ids: tuple[str, ...] = ()
     transports: tuple[str, ...] = ()
     doors: tuple[str, ...] = ()
-    """Former name of *transports*; plant files of before have it."""
+    """Former name of *transports*, which older plant files use."""
     to: tuple[str, ...] = ()
     objects: tuple[str, ...] = ()
 

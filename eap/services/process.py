@@ -411,7 +411,7 @@ class Services:
             if bus.command_fd != NO_DESCRIPTOR:
                 segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
                 self._resources.callback(segments[bus.owner].close)
-        for bus in handover.buses:
+            # Imported here: a plant without buses does not need it.
             from eap.services.ads.bus_ads import BusService
 
             net_id = handover.port(bus.owner).net_id

@@ -93,7 +93,6 @@ class RouterTimer:
 
         This is cheap: the exact due time is looked up then, and not for each packet.
         """
-        # Once for any number of packets: the due time is not computed for each of them.
         if self._is_soon or self._loop is None:
             return
         self._is_soon = True
