@@ -29,7 +29,7 @@ Row = Mapping[str, Any]
 _HUNG_AFTER_US = 2_000_000
 _HUNG_AFTER_CYCLES = 10
 _NET_ID_DOTS = 5
-_NOT_REQUESTED = "other: not asked for"
+_NOT_REQUESTED = "other: not requested"
 _RECENT_US = 60_000_000
 """A sender that should not be there is a warning for so long, then a remark."""
 _LISTED = 3

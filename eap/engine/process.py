@@ -154,7 +154,7 @@ def _prepare(options: EngineOptions) -> realtime.Report:
     gc.collect()
     gc.freeze()
     gc.disable()
-    return {"scheduler": "other: not asked for"}
+    return {"scheduler": "other: not requested"}
 
 
 def main(handover_fd: int, startup: Startup) -> int:

@@ -189,8 +189,8 @@ def describe(error: MqttError, client: MqttClient, user: str) -> str:
     """Return the reason that there is no connection, as text."""
     if isinstance(error, MqttConnectError) and _code(error) in _LOGIN:
         if not user:
-            return "it wants to know who connects: give 'user' and 'password_file', or 'tls'"
-        return f"it refuses user {user!r} or the password: look at 'user' and 'password_file'"
+            return "a login is required: set 'user' and 'password_file', or 'tls'"
+        return f"user {user!r} or the password is rejected: check 'user' and 'password_file'"
     cause = error.__cause__ or error
     if _code(cause) == _UNSPECIFIED:
         return client.error_log.latest or "the connection broke"

@@ -93,7 +93,7 @@ def _set_scheduler(priority: int) -> str:
         except OSError as error:
             return f"other: {error.strerror} (priority {priority})"
         return f"fifo {priority}"
-    return "other: not asked for"
+    return "other: not requested"
 
 
 def _set_affinity(cpus: list[int]) -> list[int] | str:

@@ -152,7 +152,7 @@ FAULT_TEXTS = {
     FaultCode.TIME_OUT: "time-out is too short",
     FaultCode.DEFAULT: "default is no value of the type",
     FaultCode.PORT: "port cannot do this",
-    FaultCode.IN_USE: "station uses what is not there any more",
+    FaultCode.IN_USE: "station uses an object that is not there any more",
     FaultCode.POLL: "request and answer do not fit together",
     FaultCode.NO_ROOM: "does not fit into the dictionary",
     FaultCode.MONITORING: "subscriber cannot be monitored",
@@ -160,7 +160,7 @@ FAULT_TEXTS = {
 
 
 class DeviceFault(ConfigError):  # noqa: N818  what the standard calls it
-    """A state request was refused.
+    """A state request failed.
 
     Attributes:
         code: The error code.

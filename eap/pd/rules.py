@@ -89,7 +89,7 @@ def duplicates(items: Iterable[tuple[Hashable, _Item]]) -> Iterator[tuple[_Item,
 
 
 def check_phase(cycle_us: int, phase_us: int) -> Iterator[RuleViolation]:
-    """A station runs within its cycle."""
+    """The phase of a station is within its cycle."""
     if phase_us >= cycle_us:
         message = f"phase_us {phase_us} is not within the cycle"
         yield RuleViolation(FaultCode.CYCLE_TIME, "phase_us", message, f"less than {cycle_us}")
@@ -127,15 +127,15 @@ def check_frame_of(pd: TxPdSpec, frame: TxFrameSpec, line: str = "") -> Iterator
         expected = f"a frame to: {REQUESTER}"
     else:
         where = f"frame {frame.name!r}{', ' if line else ''}{line}"
-        message = f"PD {pd.name!r} goes to who asks for it ({where}), but nothing does"
-        expected = "poll: the subscription that asks, or another frame"
+        message = f"PD {pd.name!r} goes to the requester ({where}), but nothing polls it"
+        expected = "poll: the subscription that requests it, or another frame"
     yield RuleViolation(FaultCode.POLL, "frame", message, expected, entry="to")
 
 
 def check_monitoring(
     frame: TxFrameSpec, destination: Destination | None, uri: InterfaceUri
 ) -> Iterator[RuleViolation]:
-    """One station at a time can be looked for; *destination* is None for the requester."""
+    """Monitoring needs one unicast subscriber; *destination* is None for the requester."""
     key, interval = "monitor_interval_ms", frame.monitor_interval_ms
     message = f"frame {frame.name!r} is monitored but goes to "
     code = FaultCode.MONITORING
@@ -143,17 +143,21 @@ def check_monitoring(
         expected = f"at least {MIN_MONITOR_INTERVAL_MS}, or 0 for never"
         yield RuleViolation(code, key, f"monitor_interval_ms is {interval}", expected)
     elif interval and destination is None:
-        yield RuleViolation(code, key, f"{message}who asks", "it only on a unicast frame")
+        yield RuleViolation(
+            code, key, f"{message}the requester", "monitoring only of a unicast frame"
+        )
     elif interval and destination is not None:
         if destination.is_group:
-            yield RuleViolation(code, key, f"{message}many", "it only on a unicast frame")
+            yield RuleViolation(
+                code, key, f"{message}a group", "monitoring only of a unicast frame"
+            )
         elif destination.kind is DestinationKind.TCP or uri.scheme == "loop":
             yield RuleViolation(code, key, f"{message}{destination} by {uri}", "Ethernet or UDP")
     if not frame.monitor_ip:
         return
     if uri.scheme != "ethernet":
-        message = f"frame {frame.name!r} has a monitor_ip, but its own address says whom to look"
-        yield RuleViolation(code, "monitor_ip", f"{message} for", "monitor_ip only on Ethernet")
+        message = f"frame {frame.name!r} has a monitor_ip, but its destination is an IP address"
+        yield RuleViolation(code, "monitor_ip", message, "monitor_ip only on Ethernet")
     elif not interval:
         message = f"frame {frame.name!r} has a monitor_ip but no monitor_interval_ms"
         yield RuleViolation(code, "monitor_ip", message, "both or none")

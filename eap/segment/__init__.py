@@ -1,1 +1,1 @@
-"""A simulated segment as a process."""
+"""The process of a simulated EtherCAT segment."""

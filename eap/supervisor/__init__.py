@@ -1,1 +1,4 @@
-"""The supervisor: starts the other processes of an appliance and holds what must outlive them."""
+"""The supervisor: starts the child processes of an appliance and holds what must outlive them.
+
+``process`` is its main loop, ``child`` one child process, ``sockets`` the shared sockets.
+"""

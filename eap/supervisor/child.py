@@ -331,7 +331,7 @@ class Child:
         self.is_ready = False
         self.watch.end()
         self._process = None
-        return code, self._last_lines[-1] if self._last_lines else "it said nothing"
+        return code, self._last_lines[-1] if self._last_lines else "no output"
 
     def close(self) -> None:
         """Close the remaining descriptors."""

@@ -85,7 +85,7 @@ def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> 
                 store.bring_back()
             elif store.set_aside():
                 logger.warning(
-                    "station %s starts blank; --resume goes on with what it was configured to be",
+                    "station %s starts blank; --resume restores its last configuration",
                     station.name,
                 )
         return _run(info, plant, folder, options, DeviceState.PREOP)
@@ -128,7 +128,7 @@ def _log_stored_differences(plant: str, stations: Sequence[StationSpec]) -> None
             )
         if kept.state is not DeviceState.OP:
             logger.warning(
-                "station %s starts in %s, which was asked for last; 'eapctl state %s OP' ends that",
+                "station %s starts in %s, requested last; 'eapctl state %s OP' changes it",
                 spec.name,
                 kept.state.name,
                 spec.name,
@@ -359,7 +359,7 @@ class Supervisor:
             now_ns = self._clock()
             if now_ns >= deadline_ns:
                 for child in running:
-                    logger.warning("%s does not end when asked; killing it", child.name)
+                    logger.warning("%s does not end after SIGTERM: killing it", child.name)
                     child.send_signal(signal.SIGKILL)
                 deadline_ns = now_ns + GRACE_NS
             poll = select.poll()

@@ -187,7 +187,7 @@ def test_applied_configuration_survives_a_restart(line: Line) -> None:
     told = line.appliance.stop()[2].splitlines()
     assert [text.split()[2] for text in told] == [CHANGED, RECEIVER, "control"]
     assert told[0].endswith("configured last; 'eapctl plan' shows what differs from the plant file")
-    assert "starts in PREOP, which was asked for last" in told[2]
+    assert "starts in PREOP, requested last" in told[2]
     line.appliance = line.start()
     line.appliance.process.kill()
     line.appliance.process.wait()

@@ -112,7 +112,7 @@ def test_engine_without_realtime_is_one_warning() -> None:
     ]
 
 
-@pytest.mark.parametrize("scheduler", ["fifo 50", "other: not asked for"])
+@pytest.mark.parametrize("scheduler", ["fifo 50", "other: not requested"])
 def test_engine_that_got_all_it_requested_has_no_finding(scheduler: str) -> None:
     status = document()
     status["processes"]["engine"]["realtime"] = {"scheduler": scheduler, "pm_qos": True}

@@ -339,7 +339,7 @@ def test_matching_keys_have_no_findings(load_edited, edits):
         ),
         (
             [(SERVER, SERVER + ALSO)],
-            "27: PD 'more' goes to who asks for it (frame 'answer', line 24), but nothing does; ",
+            "27: PD 'more' goes to the requester (frame 'answer', line 24), but nothing polls it; ",
         ),
         (
             [(ANSWER_FRAME, "port: eap0, to: requester, divider: 2}")],

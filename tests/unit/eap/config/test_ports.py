@@ -356,11 +356,11 @@ def test_monitoring(load_plant):
     [
         (
             [to("255.255.255.255, monitor_interval_ms: 500")],
-            "13: frame 'out' is monitored but goes to many; it only on a unicast frame",
+            "13: frame 'out' is monitored but goes to a group; monitoring only of a unicast frame",
         ),
         (
             [*ETHERNET, to("multicast, monitor_interval_ms: 500, monitor_ip: 10.0.0.2")],
-            "13: frame 'out' is monitored but goes to many; it only on a unicast frame",
+            "13: frame 'out' is monitored but goes to a group; monitoring only of a unicast frame",
         ),
         (
             [to("tcp://127.0.9.2, monitor_interval_ms: 500"), TCP],
@@ -372,7 +372,7 @@ def test_monitoring(load_plant):
         ),
         (
             [to("127.0.9.2, monitor_interval_ms: 500, monitor_ip: 127.0.9.2")],
-            "13: frame 'out' has a monitor_ip, but its own address says whom to look for",
+            "13: frame 'out' has a monitor_ip, but its destination is an IP address",
         ),
         (
             [*ETHERNET, to("02:00:00:00:00:01, monitor_ip: 10.0.0.2")],

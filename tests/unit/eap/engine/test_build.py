@@ -109,7 +109,7 @@ def shared(tmp_path):
 
 
 @pytest.mark.net
-def test_udp_ports_share_nothing_but_the_network(start, shared):
+def test_udp_ports_are_independent(start, shared):
     stations = [left(), right(eap_port(2, wake=Wake.ARRIVAL))]
     running = start(stations, shared(*stations))
     running.run_cycles(3)

@@ -29,7 +29,7 @@ class Master:
         (BusLost(1), ""),
     ],
 )
-def test_what_happened_has_words(event, text):
+def test_bus_faults_have_texts(event, text):
     faults = SlaveFaults()
     faults.take_events(Master(event))
     assert faults.of(1001) == text
@@ -44,7 +44,7 @@ def test_the_last_counts_until_the_slave_is_back():
     assert (faults.of(1001), faults.of(1002)) == ("", "it does not answer")
 
 
-def test_what_is_over_is_counted():
+def test_bus_faults_that_ended_are_counted():
     faults = SlaveFaults()
     faults.take_events(
         Master(
@@ -60,7 +60,7 @@ def test_what_is_over_is_counted():
     assert faults.counts(1002) == FaultCounts()
 
 
-def test_what_slaves_send_unasked_is_told_on():
+def test_unsolicited_messages_are_forwarded():
     faults, heard = SlaveFaults(), []
     faults.on_unsolicited.append(heard.append)
     message = Unsolicited(1001, MailboxType.EOE, b"frame")

@@ -49,7 +49,7 @@ def test_the_exchange_goes_on_with_another_image(tmp_path):
     assert after.cycles == before.cycles + 12
 
 
-def test_a_bus_that_was_laid_out_anew_meanwhile_is_planned_anew(tmp_path):
+def test_mapping_is_planned_again_for_new_bus_image(tmp_path):
     rig = BusRig(tmp_path).start()
     rig.wait_op()
     move(rig, BusMapping)

@@ -89,7 +89,7 @@ def test_inputs_come_into_the_image_and_back():
     assert made.missing == ()
 
 
-def test_outputs_come_from_whoever_writes_them():
+def test_mapping_copies_outputs_of_each_writer():
     image = image_of(STATION)
     for name, value in (("p", True), ("q", True), ("r", 0x1234)):
         image.write(name, value)
@@ -106,14 +106,14 @@ def test_inputs_of_a_slave_are_one_copy():
     assert plan(*ALL).inputs.operations == 1
 
 
-def test_slaves_may_lie_elsewhere_than_described():
+def test_plan_finds_entries_at_other_offsets():
     image = image_of(STATION)
     moved = variables([INPUTS[3], *INPUTS[:3]], is_output=False, first_bit=8)
     plan(*moved).inputs.run(memoryview(b"\xff\xfe\xff\x02"), image.memory)
     assert [image.read(name) for name in ("a", "b", "c")] == [False, True, -2]
 
 
-def test_what_slaves_do_not_have_is_told_once_each():
+def test_plan_reports_each_missing_entry_once():
     there = [each for each in ALL if each.index not in {0x6001, 0x7001}]
     other = ProcessVariable(1001, "", False, 8, 32, 0, 0x6001, 0)
     made = plan(*there, other)
@@ -125,7 +125,7 @@ def test_what_slaves_do_not_have_is_told_once_each():
     made.outputs[Writer.APPLICATION].run(image_of(STATION).memory, memoryview(outputs))
 
 
-def test_what_is_mapped_twice_is_found_twice():
+def test_plan_finds_entry_mapped_twice():
     twice = (BusEntrySpec("a", 0x6000, 1, 1), BusEntrySpec("b", 0x6000, 1, 1))
     slave = BusSlaveSpec("io", 1001, 1, 2, inputs=twice)
     image = image_of(STATION)

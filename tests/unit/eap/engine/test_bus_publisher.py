@@ -66,9 +66,7 @@ def truth(rig: BusRig) -> dict[int, SlaveDescription]:
     }
 
 
-def test_publisher_sends_all_slaves_first_and_nothing_while_nothing_changes(
-    rig, receiver, publisher
-):
+def test_bus_publisher_sends_all_slaves_first_then_changes_only(rig, receiver, publisher):
     assert receiver.stations() == [[1001, 1002, 1003]]
     assert receiver.slaves == truth(rig)
     for _ in range(50):
@@ -87,7 +85,7 @@ def test_publisher_sends_only_the_slave_that_has_changed(rig, receiver, publishe
     assert receiver.slaves == truth(rig)
 
 
-def test_publisher_repeats_what_could_not_be_sent(rig, receiver, publisher):
+def test_bus_publisher_repeats_unsent_changes(rig, receiver, publisher):
     receiver.stations()
     receiver.is_full = True
     rig.fault(kind="power", slave="level", for_ms=300)

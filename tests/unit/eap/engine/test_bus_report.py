@@ -12,7 +12,7 @@ from tests.support.cyclic import MS
 from tests.support.enginebus import US, BusRig
 
 
-def test_before_it_is_up_the_expected_slaves_are_told(tmp_path):
+def test_bus_report_before_start_has_expected_slaves(tmp_path):
     rig = BusRig(tmp_path)
     rig.wire.is_deaf = True
     rig.start()
@@ -63,7 +63,7 @@ def test_a_bus_that_runs(tmp_path):
     assert report.slaves[2].to_slave == report.slaves[2].protocols == 0
 
 
-def test_a_slave_that_is_gone_says_why(tmp_path):
+def test_bus_report_of_lost_slave_has_reason(tmp_path):
     rig = BusRig(tmp_path).start()
     rig.wait_op()
     rig.fault(kind="power", slave="level")

@@ -125,7 +125,7 @@ def test_a_new_engine_greets(office):
     assert message == EngineStarted(os.getpid())
 
 
-def test_changes_come_before_the_answer_to_what_made_them(office):
+def test_changes_precede_reply_to_their_request(office):
     office.ask(Republish(id=1, bus=0))
     (first,) = office.changes
     assert first.stations == (1001, 1002, 1003) == tuple(each.station for each in first.slaves)
@@ -139,7 +139,7 @@ def test_changes_come_before_the_answer_to_what_made_them(office):
     assert (states[-1], messages[-1]["id"]) == (AlState.PREOP, 2)
 
 
-def test_changes_that_nobody_requested_come_with_the_next_look_or_answer(office):
+def test_unrequested_changes_come_with_next_publish_or_reply(office):
     office.ask(Republish(id=1, bus=0))
     for number, publish in enumerate((office.handler.publish, lambda: office.post(Ping(id=2)))):
         office.changes.clear()
@@ -177,19 +177,19 @@ def test_a_mailbox_answers(office):
     assert answer.message.counter in range(1, 8)
 
 
-def test_what_needs_no_reply_is_answered_when_it_is_sent(office):
+def test_datagrams_without_reply_are_answered_when_sent(office):
     abort = bytes.fromhex("0020 80 1810 01 00000008")
     reply = office.ask(ask(1, request=abort, expects_reply=False))
     assert (reply.error, reply.message.data) == (None, b"")
 
 
-def test_what_a_slave_sent_unasked_is_told(office):
+def test_unsolicited_message_reaches_services(office):
     office.handler.forward(0, Unsolicited(1001, MailboxType.EOE, b"frame"))
     message = msgspec.msgpack.decode(office.services.recv(100), type=EngineMessage)
     assert message == UnsolicitedMessage(0, Unsolicited(1001, MailboxType.EOE, b"frame"))
 
 
-def test_who_listens_gets_what_comes(office):
+def test_unsolicited_listener_is_called(office):
     answer = office.ask(ask(3, listen=True, timeout_ns=20 * MS))
     assert answer.error.kind == "MailboxTimeoutError"
     assert "no COE reply within 20 ms" in answer.error.message
@@ -218,7 +218,7 @@ def test_lost_datagrams_are_an_answer_too(office):
 @pytest.mark.parametrize(
     "command", [Command.BWR, Command.BRW, Command.LRW, Command.LWR, Command.LRD, Command.FRMW]
 )
-def test_what_disturbs_others_is_refused(office, command):
+def test_datagrams_that_disturb_slaves_are_rejected(office, command):
     error = office.ask(read(1, Command.FPRD, command)).error
     assert f"command {int(command)}: it would disturb" in error.message
 
@@ -240,7 +240,7 @@ def test_what_disturbs_others_is_refused(office, command):
         (BringSlaves(id=1, bus=0, station=9, target=8), "unknown slave 9"),
     ],
 )
-def test_what_cannot_be_is_refused(office, request_, reason):
+def test_invalid_bus_requests_are_rejected(office, request_, reason):
     assert reason in office.ask(request_).error.message
 
 
@@ -289,7 +289,7 @@ def test_all_together_have_an_end_too(office, monkeypatch):
     assert "3 requests are under way already" in office.collect()[4].error.message
 
 
-def test_who_cancels_hears_nothing_more(office):
+def test_cancelled_request_gets_no_reply(office):
     office.post(ask(1, listen=True), ask(2), Cancel(id=1), Cancel(id=99))
     office.rig.wait(lambda: 2 in office.collect())
     office.rig.run(1500 * MS)
@@ -297,13 +297,13 @@ def test_who_cancels_hears_nothing_more(office):
     assert office.rig.bus.tasks == set()
 
 
-def test_a_number_that_comes_again_is_somebody_elses(office):
+def test_reused_request_number_replaces_old_request(office):
     office.post(ask(5, listen=True), ask(5))
     office.rig.wait(lambda: 5 in office.collect())
     assert office.heard[5].message.data[:3] == bytes.fromhex("003043")
 
 
-def test_answers_that_nobody_reads_are_dropped(office):
+def test_replies_not_read_are_dropped(office):
     for number in range(2000):
         office.services.send(msgspec.msgpack.encode(DescribeBus(id=number, bus=0)))
         office.handler.serve(office.rig.now_ns)
@@ -321,7 +321,7 @@ def test_without_services_nothing_happens(office):
     assert office.handler.dropped == 1
 
 
-def test_what_is_asked_of_a_station_is_passed_on_and_answered_when_it_is_done(office):
+def test_station_request_is_forwarded_and_answered_when_done(office):
     configure = Configure(id=1, station="one", path="/a.spec")
     refused = SetState(id=2, station="two", state=4)
     office.post(configure, refused, Ping(id=3))
@@ -347,7 +347,7 @@ def test_tries_have_bounds(wanted, made):
         DatagramRequest(Command.FPRD, 0, 0, bytes(1487), 1),
     ],
 )
-def test_what_fits_no_frame_is_refused(datagram):
+def test_datagram_that_fits_no_frame_is_rejected(datagram):
     assert len(check_datagrams((DatagramRequest(Command.FPRD, 0, 0, bytes(1486), 1),))) == 1
     with pytest.raises(BusError, match="expected addresses of 16 bits and 1 to 1486 bytes"):
         check_datagrams((datagram,))

@@ -51,14 +51,14 @@ def test_the_lowest_state_is_that_of_the_bus(image):
     assert read(image) == [0, 8, 0, False]
 
 
-def test_what_another_engine_left_does_not_stay(image):
+def test_engine_bus_discards_frames_of_earlier_engine(image):
     for name in NAMES:
         image.write(name, 8)
     BusStateVariables("bus0", SLAVES, image).show(Master())
     assert read(image) == [0, 0, 0, False]
 
 
-def test_slaves_that_nobody_described_count(image):
+def test_engine_bus_runs_undescribed_slaves(image):
     BusStateVariables("bus0", SLAVES[:1], image).show(Master(Unit(AlState.OP), Unit(AlState.INIT)))
     assert read(image)[:3] == [1, 8, 0]
 

@@ -48,7 +48,7 @@ def test_outputs_reach_slaves_and_come_back_as_inputs(rig):
     assert rig.value("io.echo") is True
 
 
-def test_no_slave_sees_anything_before_what_the_application_wants(tmp_path):
+def test_first_outputs_are_those_of_the_application(tmp_path):
     rig = BusRig(tmp_path)
     rig.set("bus0.level.limit", 1234)
     rig.start()
@@ -84,7 +84,7 @@ def test_slaves_stay_where_the_plant_wants_them(tmp_path, target):
     assert rig.value("wkc_ok") is (target is BusTarget.SAFEOP)
 
 
-def test_another_bus_is_told_and_tried_again(tmp_path):
+def test_engine_bus_reports_unexpected_bus_and_retries(tmp_path):
     rig = BusRig(tmp_path)
     expected = msgspec.structs.replace(rig.bus._settings.expected[1], product=99)
     settings = msgspec.structs.replace(
@@ -134,7 +134,7 @@ def test_interface_that_is_switched_off_and_on(rig):
     assert rig.bus.fault == ""
 
 
-def test_entry_that_the_slave_does_not_have_is_told_and_the_rest_works(tmp_path):
+def test_engine_bus_reports_missing_entry_and_runs_the_rest(tmp_path):
     rig = BusRig(tmp_path)
     changed = BUS.replace(
         "{name: height, type: INT", '{name: height, object: "0x6001:0", type: INT'
@@ -221,7 +221,7 @@ def test_slow_cycles_do_not_slow_down_the_watch(tmp_path):
     assert rig.bus.next_timeout() is not None
 
 
-def test_what_an_earlier_engine_waited_for_is_thrown_away(tmp_path):
+def test_engine_start_drops_waiting_frames(tmp_path):
     rig = BusRig(tmp_path)
     for _ in range(200):
         rig.wire.send(bytes.fromhex("0d10 0707 0000 3001 0180 0000 0000 00"))
@@ -233,7 +233,7 @@ def test_what_an_earlier_engine_waited_for_is_thrown_away(tmp_path):
     rig.wait_op()
 
 
-def test_frames_that_nobody_waits_for_are_taken_on_arrival_only(rig):
+def test_unexpected_frames_are_received_on_arrival_only(rig):
     rig.wait(lambda: not rig.bus.master.is_waiting)
     rig.wire.send(bytes.fromhex("0d10 0707 0000 3001 0180 0000 0000 00"))
     rig.wire.settle()

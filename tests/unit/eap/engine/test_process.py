@@ -105,20 +105,20 @@ class Engine:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_engine_reports_its_start_and_ends_when_asked(tmp_path, number):
+def test_engine_reports_start_and_ends_on_sigterm(tmp_path, number):
     with Engine(handover(tmp_path)) as engine:
         *steps, ready = read_reports(engine.ready)
         assert [each.step for each in steps][-2:] == [
             "starting the stations", "running the first cycle"
         ]  # fmt: skip
-        assert ready.ready == {"realtime": {"scheduler": "other: not asked for"}}
+        assert ready.ready == {"realtime": {"scheduler": "other: not requested"}}
         assert min(cycles(tmp_path)) >= 1
         engine.process.send_signal(number)
         assert engine.process.communicate(timeout=20)[1] == ""
         assert engine.process.returncode == 0
 
 
-def test_what_is_missing_is_one_line_and_exit_code_2(tmp_path):
+def test_engine_missing_environment_is_exit_code_2(tmp_path):
     with Engine(handover(tmp_path / "nowhere")) as engine:
         error = engine.process.communicate(timeout=20)[1]
         assert engine.process.returncode == 2
@@ -195,7 +195,7 @@ def in_ms(milliseconds):
     return time.monotonic_ns() + milliseconds * MS
 
 
-def test_only_who_has_something_is_served(ticker, pipes):
+def test_cycle_waiter_serves_readable_descriptors_only(ticker, pipes):
     served = []
     handlers = {
         read: lambda now_ns, read=read: served.append((os.read(read, 1), now_ns))
@@ -212,7 +212,7 @@ def test_only_who_has_something_is_served(ticker, pipes):
     assert len(served) == 1
 
 
-def test_what_never_ends_gets_its_share_and_cycles_theirs(ticker, pipes, monkeypatch):
+def test_cycle_waiter_bounds_share_of_endless_descriptor(ticker, pipes, monkeypatch):
     monkeypatch.setattr(module, "WINDOW_NS", 50 * MS)
     monkeypatch.setattr(module, "SHARE_NS", 10 * MS)
     busy = 0

@@ -133,7 +133,7 @@ def listening_more(spec):
     )
 
 
-def test_a_pd_more_costs_the_others_nothing(running):
+def test_rebuild_with_added_pd_keeps_other_counters(running):
     running.cycles(5)
     running.write("left", setpoint=[1.5, 2.5], name="xyz")
     running.cycles(5)
@@ -173,7 +173,7 @@ def test_one_side_is_swapped_a_hundred_times_while_frames_flow(running, side):
     assert list(running.folder.path.glob(".*")) == []
 
 
-def test_what_needs_another_start_is_refused_and_the_old_goes_on(running):
+def test_rebuild_that_needs_new_start_is_rejected(running):
     running.cycles(3)
     other = replace(running.left, ports=(eap_port(1, "loop://y"),))
     error = running.configure(other)
@@ -184,7 +184,7 @@ def test_what_needs_another_start_is_refused_and_the_old_goes_on(running):
     assert running.word("left", StationWord.CYCLE) == cycle + 3
 
 
-def test_what_cannot_be_built_is_refused_and_leaves_nothing_behind(running):
+def test_rebuild_failure_leaves_no_files(running):
     pd = RxPdSpec("a", "eap0", 1, ("nothing",))
     error = running.configure(replace(running.right, subscriptions=(pd,)))
     assert isinstance(error, EngineRefusedError)
@@ -197,7 +197,7 @@ def test_what_cannot_be_built_is_refused_and_leaves_nothing_behind(running):
     assert running.status("right")["pd"]["rx"][0]["received"] > 0
 
 
-def test_an_image_that_cannot_be_put_in_its_place_changes_nothing(running, monkeypatch):
+def test_rebuild_with_failed_rename_changes_nothing(running, monkeypatch):
     running.cycles(3)
 
     def full(self, path):
@@ -225,7 +225,7 @@ def test_requests_are_done_one_after_the_other_and_not_without_limit(running):
     assert len(running.status("right")["pd"]["rx"]) == 2
 
 
-def test_what_runs_already_is_no_change(running):
+def test_rebuild_with_same_spec_changes_nothing(running):
     assert running.configure(running.left) is None
     with open_image(running.folder.image("left")) as file:
         assert file.generation == 1
@@ -281,7 +281,7 @@ def test_states_change_while_cycles_run(running):
     assert str(running.answers[number]) == "there is no station nobody"
 
 
-def test_an_engine_that_ends_waits_for_what_it_builds(tmp_path):
+def test_rebuilder_close_waits_for_build(tmp_path):
     running = Running(tmp_path)
     running.post(wider(running.left))
     running.plant.close()
@@ -301,7 +301,7 @@ def place(tmp_path):
     made.file.close()
 
 
-def test_nothing_that_is_written_at_the_moment_is_lost(place, tmp_path):
+def test_rebuild_loses_no_concurrent_writes(place, tmp_path):
     """A writer during the replacement finds the image retired, or is carried over."""
     engine = Engine([place.station])
     engine.start(0)
@@ -318,9 +318,7 @@ def test_nothing_that_is_written_at_the_moment_is_lost(place, tmp_path):
     program.close()
 
 
-def test_a_program_that_stopped_in_the_middle_of_writing_leaves_what_it_had_written(
-    place, tmp_path
-):
+def test_rebuild_keeps_partial_write_of_stopped_program(place, tmp_path):
     engine = Engine([place.station])
     engine.start(0)
     engine.handle_timeout(10 * MS)

@@ -39,7 +39,7 @@ def test_engine_gets_its_types_unknown_ones_and_short_datagrams():
     assert exchange(bpf.udp_filter(bpf.Role.ENGINE)) == ENGINE_TYPES | {0xEE}
 
 
-def test_services_gets_the_acyclic_types_and_nothing_else():
+def test_udp_pair_sorts_acyclic_types_to_services():
     assert exchange(bpf.udp_filter(bpf.Role.SERVICES)) == {2, 3, 5}
 
 

@@ -55,7 +55,7 @@ def test_pair(pair):
     assert exchange(*pair) == FRAME[:2] + b"\x08" + FRAME[3:]
 
 
-def test_other_end_that_reads_nothing_loses_frames_and_takes_them_again(pair):
+def test_bus_port_loses_frames_while_other_end_does_not_read(pair):
     master, far = pair
     for _ in range(2000):
         master.send(FRAME)
@@ -72,7 +72,7 @@ def test_empty_message_is_no_frame(pair):
     assert far.receive() is None
 
 
-def test_nobody_there_is_a_lost_frame():
+def test_bus_port_without_peer_loses_frame():
     master = open_bus_port(InterfaceUri.parse("udp://127.0.4.9:40002"))
     try:
         for _ in range(3):
@@ -125,7 +125,7 @@ def mirror(cable):
 
 
 @pytest.mark.root
-def test_slave_that_does_not_mark_frames_is_heard(mirror):
+def test_bus_port_receives_frames_not_marked_by_slave(mirror):
     master, far = mirror
     master.send(FRAME)
     assert select.select([far], [], [], 5)[0]
@@ -246,7 +246,7 @@ def test_udp_frame_goes_back_to_its_sender():
         end.close()
 
 
-def test_sender_that_has_gone_does_no_harm():
+def test_segment_socket_ignores_closed_sender():
     end = open_udp("udp://127.0.9.8:40001")
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as master:
@@ -268,7 +268,7 @@ def test_port_that_is_taken():
         end.close()
 
 
-def test_pair_whose_other_end_has_gone_does_no_harm():
+def test_segment_socket_ignores_closed_pair():
     near, distant = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     end = SegmentSocket(near)
     try:

@@ -114,7 +114,7 @@ def test_unicast_broadcast_and_joined_groups_are_taken(ends, raw):
     assert receiver.for_many == [False, True, True, True]
 
 
-def test_group_of_one_port_is_not_heard_by_another(ends, raw):
+def test_ethernet_group_reaches_only_ports_that_joined(ends, raw):
     joined, other = Listener(ends[0], join=[OTHER_GROUP]), Listener(ends[0])
     raw.send(raw_frame(1, OTHER_GROUP))
     raw.send(raw_frame(2))
@@ -248,7 +248,7 @@ def test_neighbours_on_one_interface_answer_each_other(ends):
     assert client.drain(1) == [expect(2)]
 
 
-def test_nobody_answers_a_group(ends, raw):
+def test_ethernet_group_is_no_sender(ends, raw):
     server = Listener(ends[0])
     head = bytes.fromhex("010105040000 010105040000 88a4")
     raw.send((head + bytes([1, 0x40, 1])).ljust(60, b"\0"))

@@ -82,7 +82,7 @@ def test_cpu_percent_is_the_share_since_the_reading_before(root):
         (Measure.TEMPERATURE, "thermal_zone9", "thermal_zone9"),
     ],
 )
-def test_what_a_host_lacks_is_named(root, measure, argument, words):
+def test_host_error_names_missing_source(root, measure, argument, words):
     with pytest.raises(EnvironmentalError, match=words):
         Host(root).read(measure, argument)
 
@@ -170,7 +170,7 @@ def test_octets_that_are_no_text(tmp_path):
         read_password_text(file)
 
 
-def test_what_is_no_regular_file_is_refused_at_once(tmp_path):
+def test_password_file_must_be_regular(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for name in ("pipe", "."):
         with pytest.raises(EnvironmentalError, match=r"kept in a regular file|Is a directory"):

@@ -128,7 +128,7 @@ def test_a_failure_half_way_leaves_nothing_behind(path, monkeypatch):
     ("octets", "message"),
     [(None, "no process image: No such file"), (b"", "empty"), (bytes(200), "magic is missing")],
 )
-def test_what_is_no_image_is_refused_by_path_and_reason(path, octets, message):
+def test_open_image_error_has_path_and_reason(path, octets, message):
     if octets is not None:
         path.write_bytes(octets)
     with pytest.raises(ImageError, match=message) as error:
@@ -144,7 +144,7 @@ def test_two_processes_see_the_same_variables(path, engine):
     assert engine.image.read("x") == 4711
 
 
-def test_a_second_writer_is_told_who_the_first_is(path, engine):
+def test_acquire_writer_conflict_names_holder(path, engine):
     process = spawn(
         path, 'file.acquire_writer(Writer.APPLICATION); print("mine", flush=True); input()'
     )
@@ -181,7 +181,7 @@ for _ in range(2):
     ended(process)
 
 
-def test_closing_gives_up_the_right_while_somebody_still_looks(path, engine):
+def test_close_releases_writer_while_views_exist(path, engine):
     first = open_image(path)
     first.acquire_writer(Writer.APPLICATION)
     image = first.image
@@ -279,7 +279,7 @@ def test_waiting_for_a_cycle_that_has_passed_returns_at_once(engine):
 
 
 @pytest.mark.parametrize("between_the_words", [False, True])
-def test_a_gone_engine_ends_the_waiting_when_the_time_is_up(engine, between_the_words):
+def test_wait_cycle_times_out_without_engine(engine, between_the_words):
     """Also one that was killed after it moved the counter and before it moved the futex."""
     engine.image.words[StationWord.CYCLE] = 5
     engine.image.words[StationWord.FUTEX] = 4 if between_the_words else 5
@@ -373,7 +373,7 @@ def test_moves_to_the_newest_image(station_image, move):
     before.read("setpoint")  # what somebody still holds stays as it was
 
 
-def test_newest_image_that_cannot_be_opened_is_told(station_image, move, image_path):
+def test_station_image_error_when_newest_image_is_missing(station_image, move, image_path):
     move()
     image_path.unlink()
     with pytest.raises(ImageError, match="no process image"):
@@ -393,7 +393,7 @@ def test_right_to_write_moves_too(station_image, move, image_path):
     assert "more1" in station_image.image.slots
 
 
-def test_lost_right_to_write_is_told_and_the_old_image_kept(station_image, move, image_path):
+def test_station_image_keeps_old_image_after_writer_conflict(station_image, move, image_path):
     station_image.acquire_writer(Writer.APPLICATION)
     move()
     with open_image(image_path) as other:
@@ -430,7 +430,7 @@ def test_values_written_while_the_image_changes_are_in_the_new_one(
     assert station_image.image.read("running") is True
 
 
-def test_variable_that_went_meanwhile_is_told(station_image, move):
+def test_station_image_write_of_removed_variable_fails(station_image, move):
     station_image.acquire_writer(Writer.APPLICATION)
     move(without="running")
     with pytest.raises(ImageError, match="no variable 'running'"):

@@ -74,7 +74,7 @@ def test_each_process_gets_its_types_of_a_group(group):
         close(sender, *pairs)
 
 
-def test_a_receiver_gets_all_types_and_shares_with_nobody():
+def test_udp_receiver_gets_all_types_and_is_exclusive():
     receiver, other = open_udp_receiver("127.0.3.14", PORT), open_udp_pair("127.0.3.15")
     try:
         send_all_types(other[0], "127.0.3.14")
@@ -186,7 +186,7 @@ def test_our_own_appliance_is_recognised(proc):
     assert describe(proc).endswith("stop that appliance or give this one another address")
 
 
-def test_long_paths_do_not_hide_whose_process_it_is(proc):
+def test_holder_text_shortens_long_paths(proc):
     add_socket(proc, f"0101007F:{PORTHOLDER_PORT}")
     add_process(proc, 44, f"/{'long/' * 30}python /{'long/' * 30}eapctl run plant.yaml")
     text = describe(proc)
@@ -200,7 +200,7 @@ def test_a_command_that_is_no_text_is_shown_all_the_same(proc):
     assert "process 45 (serv\ufffder -x)" in describe(proc)
 
 
-def test_client_on_an_ephemeral_port_is_told_from_a_server(proc):
+def test_describe_holder_recognizes_client_on_ephemeral_port(proc):
     add_socket(proc, f"0101007F:{PORTHOLDER_PORT}", remote="08080808:0035")
     text = describe(proc)
     assert "an unknown process, a client connected to 8.8.8.8:53; clients get any port" in text
@@ -224,7 +224,7 @@ def test_missing_sysctl_is_no_trouble(proc):
 pytestmark = pytest.mark.net
 
 
-def test_both_are_opened_and_a_second_of_each_is_told_what_to_do():
+def test_ams_sockets_second_open_names_remedy():
     address = own_address(0)
     with open_ams_listener(address) as listener, open_ams_socket(address) as datagrams:
         assert listener.getsockname() == (address, 48898)
@@ -259,7 +259,7 @@ def test_foreign_address_is_refused():
 @pytest.mark.parametrize(
     ("group", "bound"), [("", "127.255.255.255"), ("255.255.255.255", "255.255.255.255")]
 )
-def test_what_goes_to_a_whole_network_arrives_at_each_station(group, bound):
+def test_ams_broadcast_reaches_each_station(group, bound):
     sockets = [open_ams_broadcast(address, group) for address in ("127.9.6.1", "127.9.6.2")]
     try:
         assert [sock.getsockname() for sock in sockets] == [(bound, 48899)] * 2

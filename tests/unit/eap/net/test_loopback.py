@@ -43,7 +43,7 @@ def run(options, count=200):
     return receiver.numbers()
 
 
-def test_every_other_port_of_the_name_hears_a_frame():
+def test_loopback_frame_reaches_all_other_ports():
     lines = LoopbackLines()
     first, second, third = (Listener(lines) for _ in range(3))
     stranger = Listener(lines, "loop://other")
@@ -54,7 +54,7 @@ def test_every_other_port_of_the_name_hears_a_frame():
     assert first.got == stranger.got == []
 
 
-def test_frame_is_copied_when_it_is_sent_and_headroom_left_out():
+def test_loopback_copies_frame_without_headroom():
     lines = LoopbackLines()
     sender, receiver = Listener(lines), Listener(lines)
     out = frame(1, headroom=4)
@@ -131,7 +131,7 @@ def test_drain_is_bounded_and_the_rest_waits():
     assert receiver.numbers() == [n % 256 for n in range(DRAIN_LIMIT + 5)]
 
 
-def test_closed_port_hears_no_more():
+def test_loopback_closed_port_receives_nothing():
     lines = LoopbackLines()
     sender, receiver = Listener(lines), Listener(lines)
     receiver.channel.close()
@@ -139,7 +139,7 @@ def test_closed_port_hears_no_more():
     assert receiver.channel.drain(0) == 0
 
 
-def test_line_asks_for_no_headroom():
+def test_loopback_has_no_headroom():
     channel = Listener(LoopbackLines()).channel
     assert channel.link_header("239.0.0.1") == b""
     assert channel.minimum_size == 0
@@ -160,7 +160,7 @@ def test_wrong_option_is_named(options, message):
         LoopbackLines().open(InterfaceUri.parse("loop://line" + options))
 
 
-def test_an_answer_reaches_nobody_but_who_asked():
+def test_loopback_answer_reaches_requester_only():
     lines = LoopbackLines()
     asking, asked, third = (Listener(lines) for _ in range(3))
     asking.channel.send([frame(1)], 0)

@@ -195,7 +195,7 @@ def test_refusal_of_a_frame_is_not_held_against_the_next_one(pair):
     assert len(read_errors(sender)) == 4
 
 
-def test_what_is_refused_for_its_own_sake_is_counted_after_a_second_try(pair):
+def test_send_batch_counts_own_error_after_second_try(pair):
     sender, receiver = pair
     out = SendBatch(sender, _socket_address)
     small, other, large = frames_to(receiver, 3)
@@ -226,7 +226,7 @@ def test_unknown_errno_is_counted_by_number():
     assert errors == {"99999": 1, "ENOBUFS": 2}
 
 
-def test_what_is_kept_of_frames_that_come_and_go_is_bounded(
+def test_send_batch_caches_are_bounded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(mmsg, "_CACHED_FRAMES", 8)
@@ -241,7 +241,7 @@ def test_what_is_kept_of_frames_that_come_and_go_is_bounded(
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_who_sent_a_message_is_known_as_long_as_it_is_held(pair, count):
+def test_receive_batch_gives_sender_of_held_message(pair, count):
     sender, receiver = pair
     SendBatch(sender, _socket_address).send(frames_to(receiver, count))
     batch = ReceiveBatch()

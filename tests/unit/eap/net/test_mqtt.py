@@ -84,7 +84,7 @@ def clients(monkeypatch):
     return made
 
 
-def test_link_subscribes_tells_and_says_goodbye(tmp_path):
+def test_mqtt_link_subscribes_publishes_and_disconnects(tmp_path):
     async def story():
         one, two = Peer(), Peer("two")
         async with running(two):
@@ -134,7 +134,7 @@ def test_link_comes_back_with_its_broker(tmp_path, caplog, clients):
         play(lambda: story(server))
 
 
-def test_user_and_password_are_asked_for_and_a_wrong_one_is_named(tmp_path, caplog):
+def test_mqtt_login_errors_name_user(tmp_path, caplog):
     right, wrong = tmp_path / "right", tmp_path / "wrong"
     right.write_text("secret\n")
     wrong.write_text("guess\n")
@@ -153,16 +153,16 @@ def test_user_and_password_are_asked_for_and_a_wrong_one_is_named(tmp_path, capl
         play(story)
     name = "MQTT broker 127.0.3.40:1883: "
     assert (
-        f"{name}it refuses user 'island' or the password: look at 'user' and 'password_file';"
+        f"{name}user 'island' or the password is rejected: check 'user' and 'password_file';"
         " trying again"
     ) in caplog.text
-    assert f"{name}it wants to know who connects: give 'user' and 'password_file'" in caplog.text
+    assert f"{name}a login is required: set 'user' and 'password_file'" in caplog.text
     assert "/nowhere: No such file or directory" in caplog.text
     assert "secret" not in caplog.text
     assert "guess" not in caplog.text
 
 
-def test_tls_names_the_broker_and_shows_who_connects(tmp_path, caplog, monkeypatch):
+def test_mqtt_tls_checks_names_of_both_ends(tmp_path, caplog, monkeypatch):
     # aiomqtt waits that long for an answer, although the connection is gone.
     monkeypatch.setattr(mqttclient, "ANSWER_S", 1.0)
     files = write_certificates(tmp_path, ADDRESS)
@@ -187,7 +187,7 @@ def test_tls_names_the_broker_and_shows_who_connects(tmp_path, caplog, monkeypat
         play(lambda: story(server))
 
 
-def test_certificate_of_another_name_is_refused_unless_told_otherwise(tmp_path, caplog):
+def test_mqtt_tls_rejects_other_name_unless_disabled(tmp_path, caplog):
     files = write_certificates(tmp_path, "127.0.3.99")
     settings = ("allow_anonymous true", f"certfile {files['broker']}",
                 f"keyfile {files['broker_key']}")  # fmt: skip
@@ -247,7 +247,7 @@ def test_too_much_at_once_is_not_taken(tmp_path, monkeypatch):
         play(story)
 
 
-def test_message_without_room_is_told_of():
+def test_mqtt_overrun_is_reported():
     class Client:
         inbox = mqttclient.Inbox(1)
 
@@ -265,14 +265,14 @@ def test_message_without_room_is_told_of():
     play(story)
 
 
-def test_without_aiomqtt_one_is_told_how_to_get_it(monkeypatch):
+def test_mqtt_without_aiomqtt_error_has_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "aiomqtt", None)
     with pytest.raises(EnvironmentalError, match=r"pip install 'eap-appliance\[mqtt\]'"):
         Peer()
 
 
 @pytest.mark.parametrize("refusal", [b"\x20\x02\0\x01", b"\x20\x03\0\x84\0", b""], ids=repr)
-def test_broker_of_before_is_spoken_to_as_it_understands(refusal, caplog, monkeypatch):
+def test_mqtt_falls_back_to_3_1_1(refusal, caplog, monkeypatch):
     monkeypatch.setattr(mqttclient, "ANSWER_S", 0.3)
     versions = []
 
@@ -334,7 +334,7 @@ def test_broker_behind_a_wall_does_not_hold_the_end_up(monkeypatch, caplog):
         assert time.monotonic() - began < 2
 
 
-def test_second_client_of_a_name_is_told_of(tmp_path, caplog):
+def test_mqtt_duplicate_client_id_is_reported(tmp_path, caplog):
     async def story():
         one, two = Peer("same"), Peer("same")
         async with running(one):

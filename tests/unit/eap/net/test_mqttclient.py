@@ -38,7 +38,7 @@ def in_loop(play):
     return asyncio.run(run())
 
 
-def test_what_waits_is_limited_by_number_and_by_octets(monkeypatch):
+def test_mqtt_inbox_is_limited_by_number_and_bytes(monkeypatch):
     def play():
         inbox, lost = Inbox(3), []
         inbox.put_nowait(message(0))
@@ -74,20 +74,20 @@ def test_refused_subscriptions_are_named(codes, monkeypatch):
 @pytest.mark.parametrize(
     ("error", "user", "text"),
     [
-        (MqttConnectError(REFUSED), "me", "it refuses user 'me' or the password"),
-        (MqttConnectError(4), "me", "it refuses user 'me' or the password"),
-        (MqttConnectError(REFUSED), "", "it wants to know who connects"),
+        (MqttConnectError(REFUSED), "me", "user 'me' or the password is rejected"),
+        (MqttConnectError(4), "me", "user 'me' or the password is rejected"),
+        (MqttConnectError(REFUSED), "", "a login is required"),
         (MqttError("[Errno 111] Connection refused"), "", "[Errno 111] Connection refused"),
         (MqttError(), "", "MqttError"),
         (MqttCodeError(7), "", "The connection was lost"),
         (MqttCodeError(ReasonCode(PacketTypes.DISCONNECT, "Unspecified error")), "", "broke"),
     ],
 )
-def test_reason_is_told_in_words(error, user, text):
+def test_mqtt_error_is_described(error, user, text):
     assert text in describe(error, in_loop(client), user)
 
 
-def test_reason_that_only_paho_knows_is_told():
+def test_mqtt_error_of_paho_log_is_described():
     made = in_loop(client)
     made._logger.warning("nobody hears this")
     made._logger.error("failed to receive on socket: %s", "bad certificate")
@@ -103,7 +103,7 @@ def test_broker_of_before_is_recognised():
     assert not is_too_new(MqttError("timed out"))
 
 
-def test_client_speaks_the_version_that_it_should():
+def test_mqtt_client_uses_requested_version():
     assert in_loop(client)._client._protocol == 5
     assert in_loop(lambda: client(is_old=True))._client._protocol == 4
 
@@ -118,7 +118,7 @@ def test_tls_needs_files_that_are_there():
 
 @pytest.mark.net
 @pytest.mark.parametrize("tls", [None, TlsSpec()])
-def test_who_says_nothing_is_not_waited_for_and_nothing_stays_open(tls, monkeypatch):
+def test_mqtt_silent_broker_times_out_and_socket_is_closed(tls, monkeypatch):
     monkeypatch.setattr(mqttclient, "CONNECT_S", 0.2)
     monkeypatch.setattr(mqttclient, "ANSWER_S", 0.2)
 

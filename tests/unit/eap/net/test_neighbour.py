@@ -62,7 +62,7 @@ def test_routes(table):
         assert table.look(nowhere) is ProbeResult.BLIND
 
 
-def test_no_entry_is_nothing_new(table):
+def test_neighbour_without_entry_is_pending(table):
     assert table.neighbour(THERE, socket.if_nametoindex("left")) is None
     assert table.look(THERE) is ProbeResult.PENDING
 
@@ -85,13 +85,13 @@ def test_states(table, state, evidence):
     assert entry == NeighbourEntry(NeighbourState[state.upper()], known)
 
 
-def test_behind_a_gateway_only_that_the_gateway_is_gone(table):
+def test_neighbour_behind_gateway_is_absent_only_with_gateway(table):
     for state, evidence in (("reachable", ProbeResult.BLIND), ("failed", ProbeResult.ABSENT)):
         set_state(state, "10.77.0.254")
         assert table.look("10.88.3.4") is evidence
 
 
-def test_question_at_the_wrong_interface_is_answered_with_nothing(table):
+def test_neighbour_at_other_interface_is_none(table):
     set_state("reachable")
     assert table.neighbour(THERE, 9999) is None
 
@@ -156,7 +156,7 @@ def wait_heard(prober):
     return found
 
 
-def test_probe_as_rfc_5227_has_it(make_prober, host):
+def test_arp_probe_matches_rfc_5227(make_prober, host):
     prober = make_prober()
     assert prober.probe(ADDRESS)
     frame, asked = host.hear()
@@ -165,14 +165,14 @@ def test_probe_as_rfc_5227_has_it(make_prober, host):
     assert asked == ArpMessage.probe(prober.mac, ADDRESS)
 
 
-def test_answer_tells_who_has_the_address(make_prober, host):
+def test_arp_reply_reports_owner(make_prober, host):
     prober = make_prober()
     prober.probe(ADDRESS)
     host.answer(host.hear()[1])
     assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
 
 
-def test_announcements_and_questions_of_the_host_show_it_too(make_prober, host):
+def test_arp_announcements_and_requests_report_sender(make_prober, host):
     prober = make_prober()
     host.say(ArpMessage(REQUEST, host.mac, ADDRESS, MacAddr(bytes(6)), ADDRESS).encode())
     assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
@@ -180,13 +180,13 @@ def test_announcements_and_questions_of_the_host_show_it_too(make_prober, host):
     assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
 
 
-def test_who_asks_whether_it_may_have_the_address_claims_it(make_prober, host):
+def test_arp_probe_of_other_host_is_claim(make_prober, host):
     prober = make_prober()
     host.say(ArpMessage.probe(host.mac, ADDRESS).encode())
     assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=True)]
 
 
-def test_other_addresses_and_nonsense_are_not_heard(make_prober, host):
+def test_arp_ignores_other_addresses_and_malformed_messages(make_prober, host):
     prober = make_prober()
     host.say(ArpMessage(REPLY, host.mac, OTHER, prober.mac, IPv4Address(0)).encode())
     host.say(ArpMessage(REPLY, BROADCAST_MAC, ADDRESS, prober.mac, OTHER).encode())
@@ -212,7 +212,7 @@ def test_each_vlan_by_itself(make_prober, host):
     assert tagged.drain() == []
 
 
-def test_own_addresses_cannot_be_asked_for(make_prober, cable):
+def test_arp_probe_of_own_address_is_not_sent(make_prober, cable):
     ip(f"addr add {ADDRESS}/24 dev {cable[1]}")
     prober = make_prober()
     assert not prober.probe(ADDRESS)
@@ -220,7 +220,7 @@ def test_own_addresses_cannot_be_asked_for(make_prober, cable):
     assert prober.probe(OTHER)
 
 
-def test_nobody_answers_on_the_loopback_interface(cable):
+def test_arp_probe_on_loopback_is_not_sent(cable):
     del cable
     prober = ArpProber(open_arp("lo"))
     assert not prober.probe(ADDRESS)

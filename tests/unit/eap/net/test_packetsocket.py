@@ -71,7 +71,7 @@ def test_interface_of_another_kind_is_refused(cable, opener):
 
 
 @pytest.mark.host_root
-def test_ordinary_user_is_told_a_command_that_works():
+def test_missing_capability_names_working_command():
     done = subprocess.run(
         [sys.executable, "-c", AS_NOBODY], capture_output=True, text=True, check=True
     )

@@ -95,7 +95,7 @@ def test_ordinary_user_gets_reasons():
 
 def test_wrong_processor_and_priority_are_reported():
     report = prepare(priority=0, cpus="(4095,)")
-    assert report["scheduler"] == "other: not asked for"
+    assert report["scheduler"] == "other: not requested"
     assert report["cpus"] == "Invalid argument: [4095]"
     report = prepare(priority=1000)
     assert report["scheduler"] == "other: Invalid argument (priority 1000)"
@@ -117,7 +117,7 @@ def test_child_dies_with_its_parent():
         wait_until(lambda: not is_alive(child))
 
 
-def test_child_of_a_parent_already_gone_ends_at_once():
+def test_die_with_parent_ends_orphan_at_once():
     done = subprocess.run([sys.executable, "-c", CHILD, "1"], capture_output=True, check=False)
     assert (done.returncode, done.stdout) == (-signal.SIGTERM, b"")
 

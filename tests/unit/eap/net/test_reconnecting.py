@@ -8,7 +8,7 @@ import pytest
 from eap.net.reconnecting import Backoff, ReconnectingLink, ReconnectPolicy, connect_tcp
 
 
-def test_waits_grow_up_to_a_limit_and_begin_anew() -> None:
+def test_backoff_grows_to_limit_and_resets() -> None:
     backoff = Backoff(0.5, 3)
     for _ in range(2):
         for longest in (0.5, 1, 2, 3, 3):
@@ -39,7 +39,7 @@ class Link(ReconnectingLink):
         return bool(self.reasons)
 
 
-def test_link_connects_again_until_it_ends_orderly() -> None:
+def test_reconnecting_link_reconnects_until_orderly_end() -> None:
     link = Link(["refused", "refused", "silent", ""], ReconnectPolicy(0.001, 0.001, 10))
     asyncio.run(asyncio.wait_for(link.run(), 10))
     reported = [("refused", True), ("refused", False), ("silent", True), ("", True)]

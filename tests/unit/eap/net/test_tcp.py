@@ -122,7 +122,7 @@ def test_refused_connection_is_tried_again_ever_more_slowly(sender):
     assert gaps == [100, 200, 400, 800, 1600, 2000, 2000]
 
 
-def test_connection_is_made_once_somebody_listens(sender):
+def test_tcp_sender_connects_once_peer_listens(sender):
     until(sender, lambda: sender._errors)
     with open_tcp_listener(THERE) as listener:
         sender.poll(99 * MS)
@@ -163,7 +163,7 @@ def test_peer_that_leaves_is_noticed_and_sought_again(joined, listener):
     listener.accept()[0].close()
 
 
-def test_what_the_peer_says_is_thrown_away(joined):
+def test_tcp_sender_without_handlers_drops_received_data(joined):
     sender, connection = joined
     connection.sendall(b"x" * 5000)
     for _ in range(10):
@@ -278,7 +278,7 @@ def test_listener_on_a_foreign_address_is_refused():
         open_tcp_listener("203.0.113.9")
 
 
-def test_answers_go_back_on_the_connection_that_asked(receiving):
+def test_tcp_answer_uses_connection_of_request(receiving):
     client, receiver, got = receiving
     client.sendall(frame_octets(1))
     drain_until(receiver, got, 1)
@@ -288,7 +288,7 @@ def test_answers_go_back_on_the_connection_that_asked(receiving):
     assert read(client, 22) == frame_octets(2)
 
 
-def test_who_does_not_read_the_answers_goes_without_and_disturbs_nobody(receiving):
+def test_tcp_slow_reader_loses_answers_without_effect_on_others(receiving):
     client, receiver, got = receiving
     client.sendall(frame_octets(1))
     drain_until(receiver, got, 1)
@@ -307,7 +307,7 @@ def test_who_does_not_read_the_answers_goes_without_and_disturbs_nobody(receivin
     assert received == expected
 
 
-def test_an_answer_to_who_has_left_ends_the_connection(receiving):
+def test_tcp_answer_to_closed_peer_ends_connection(receiving):
     client, receiver, _ = receiving
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     client.close()
@@ -319,7 +319,7 @@ def test_an_answer_to_who_has_left_ends_the_connection(receiving):
     assert receiver.drain(7) == 0
 
 
-def test_what_comes_back_is_taken_by_who_wants_it(listener):
+def test_tcp_sender_hands_answers_to_handlers(listener):
     got = []
     errors = {}
 
@@ -403,7 +403,7 @@ def test_a_peer_that_does_not_read_costs_no_time_and_no_memory(ends):
     assert writer.send(frame(1))
 
 
-def test_what_was_begun_does_not_follow_its_buffer(ends):
+def test_tcp_writer_unfinished_frame_keeps_its_content(ends):
     writer, peer = ends
     out = frame(7)
     count = 0

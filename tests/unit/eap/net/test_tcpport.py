@@ -99,7 +99,7 @@ def test_port_needs_no_headroom():
     assert port.drain(0) == 0
 
 
-def test_an_answer_takes_the_connection_that_asked_and_comes_back_to_the_asker():
+def test_tcp_port_answer_returns_to_requester():
     answers, requests = Listener(), Listener()
     near, far = TcpPort(HERE, None, [answers.take]), TcpPort(THERE)
     with open_tcp_listener(THERE) as listener:
@@ -123,7 +123,7 @@ def test_an_answer_takes_the_connection_that_asked_and_comes_back_to_the_asker()
     far.close()
 
 
-def test_answers_that_nobody_reads_are_returned_and_counted(plant):
+def test_tcp_port_returns_and_counts_unsent_answers(plant):
     near, far, _, taken = plant
     near.send([frame(1, TCP)], 0)
     drain_until(far, lambda: taken.got)

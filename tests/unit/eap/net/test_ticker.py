@@ -64,7 +64,7 @@ def test_readable_descriptor_ends_the_wait(ticker, pipe):
     assert wait_us(ticker, 500)[0]
 
 
-def test_forgotten_descriptor_ends_nothing(ticker, pipe):
+def test_ticker_ignores_unregistered_descriptor(ticker, pipe):
     ticker.register(pipe[0])
     os.write(pipe[1], b"x")
     ticker.unregister(pipe[0])

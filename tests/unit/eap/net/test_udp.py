@@ -115,7 +115,7 @@ def test_destination_without_a_port_goes_to_the_usual_one():
     assert _socket_address("127.0.3.13:9")[1] == ("127.0.3.13", 9)
 
 
-def test_an_answer_goes_to_the_address_and_port_that_asked(channels):
+def test_udp_answer_goes_to_address_and_port_of_requester(channels):
     server, _ = channels
     senders, sources = [], []
     server.handlers.append(lambda view, _size, _at, origin: senders.append(origin.sender_of(view)))
@@ -138,7 +138,7 @@ def test_an_answer_goes_to_the_address_and_port_that_asked(channels):
     ("host", "port", "destination"),
     [("10.0.0.1", 34980, "10.0.0.1:34980"), ("10.0.0.1", 0, "10.0.0.1"), ("0.0.0.0", 9, "")],
 )
-def test_who_has_no_address_or_no_port_of_its_own(host, port, destination):
+def test_udp_sender_without_address_or_port(host, port, destination):
     assert _destination((port, socket.inet_aton(host))) == destination
 
 
@@ -160,7 +160,7 @@ def closed_port():
         return sock.getsockname()
 
 
-def test_nobody_listens(sender, closed_port):
+def test_udp_error_without_listener(sender, closed_port):
     sender.sendto(b"frame", closed_port)
     select.select([], [], [sender], 1)
     expected = UdpError(*closed_port, True, "ECONNREFUSED")
@@ -168,7 +168,7 @@ def test_nobody_listens(sender, closed_port):
     assert read_errors(sender) == []
 
 
-def test_taking_the_last_one_clears_what_the_next_call_would_meet(sender, closed_port):
+def test_udp_reading_last_error_clears_pending_error(sender, closed_port):
     sender.sendto(b"frame", closed_port)
     read_errors(sender)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
@@ -184,7 +184,7 @@ def test_some_are_left_for_the_next_time(sender, closed_port):
     assert [len(read_errors(sender, 2)) for _ in range(3)] == [2, 1, 0]
 
 
-def test_too_large_says_nothing_of_who_is_there(sender):
+def test_udp_error_too_large_is_not_unreachable(sender):
     sender.setsockopt(socket.IPPROTO_IP, 10, 2)  # IP_MTU_DISCOVER, IP_PMTUDISC_DO
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
@@ -193,7 +193,7 @@ def test_too_large_says_nothing_of_who_is_there(sender):
         assert all(not error.unreachable for error in read_errors(sender))
 
 
-def test_nothing_is_queued_unless_asked_for(closed_port):
+def test_udp_errors_are_queued_only_if_enabled(closed_port):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         sock.sendto(b"frame", closed_port)

@@ -25,7 +25,7 @@ def test_round_trip(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "5.23.91.23.2.1", "whoever asks"])
-def test_what_is_no_address_is_zero(text: str) -> None:
+def test_to_word_of_invalid_address_is_zero(text: str) -> None:
     assert to_word(text) == 0
 
 
@@ -34,7 +34,7 @@ def test_zero_is_no_address() -> None:
     assert from_word(to_word("00:00:00:00:00:00")) is not None
 
 
-def test_net_ids_are_told_from_addresses() -> None:
+def test_net_id_of_returns_none_for_other_addresses() -> None:
     assert net_id_of("5.23.91.23.2.1") == NetId.parse("5.23.91.23.2.1")
     for text in ("10.0.0.1", "02:00:00:00:00:01", "tcp://10.0.0.1", "", "a.b.c.d.e.f"):
         assert net_id_of(text) is None
@@ -61,7 +61,7 @@ def rows(r: Receiver, now_ns: int = 0) -> list[dict[str, object]]:
     return station_status(r.image, now_ns)["pd"]["rx"]
 
 
-def test_subscriber_drops_frames_of_another_source_and_names_it():
+def test_subscriber_drops_frame_of_other_source_and_reports_it():
     r = receiver()
     r.give(frame(1, 1), 1 * MS, OWN_SOURCE)
     for cycle in range(2, 7):
@@ -188,7 +188,7 @@ def test_sender_of_a_sought_net_id_is_learned_and_the_frame_handed_over():
     assert port.taken == [FRAME]
 
 
-def test_others_teach_nothing():
+def test_learner_ignores_other_publishers():
     port = Port(OWN)
     port.give(FRAME, THEIR_MAC)
     nobody = Port()
@@ -206,7 +206,7 @@ def test_only_process_data_has_a_publisher():
     assert len(port.taken) == 4
 
 
-def test_frame_without_a_sender_teaches_nothing():
+def test_learner_ignores_frame_without_sender():
     port = Port(PEER)
     port.give(FRAME, "")
     assert port.learned == []
@@ -220,7 +220,7 @@ def test_address_is_looked_at_now_and_then():
     assert [mac for _, mac in port.learned] == [THEIR_MAC, OTHER_MAC, THEIR_MAC]
 
 
-def test_nothing_is_wanted_before_somebody_says_so():
+def test_learner_wants_no_net_id_at_first():
     taken: list[int] = []
     learner = NetIdLearner(lambda _data, size, *_: taken.append(size))
     learner.take(memoryview(FRAME), len(FRAME), 0, From(THEIR_MAC))

@@ -58,7 +58,7 @@ def plans(draw: st.DrawFn) -> tuple[list[Move], int]:
 
 
 @given(plans(), SOURCES, st.integers(0, 255))
-def test_every_plan_does_what_copying_bit_by_bit_does(planned, source, filling):
+def test_copy_plan_equals_copying_bit_by_bit(planned, source, filling):
     moves, size = planned
     target = bytes([filling]) * size
     assert copied(CopyPlan(moves), source, target) == copied_bit_by_bit(moves, source, target)
@@ -91,7 +91,7 @@ def test_bits_of_one_octet_are_taken_in_one_step():
     assert copied(plan, b"\x0b", b"\0\xff") == b"\0\xd0"
 
 
-def test_padding_that_nobody_uses_is_copied_along():
+def test_copy_plan_copies_unused_padding_along():
     """Two slaves of 4 bits and one of 16, each from an octet on, then another variable's bit."""
     moves = [*(Move(bit, 80 + bit, 1) for bit in range(4)), Move(8, 88, 1), Move(16, 96, 16)]
     assert CopyPlan(moves).operations == 3
@@ -109,13 +109,13 @@ def test_a_plan_may_copy_within_one_memory():
     assert memory == b"\x01\x02\x03\x01\x01\x02\0"
 
 
-def test_an_empty_plan_does_nothing():
+def test_copy_plan_without_moves_copies_nothing():
     assert copied(CopyPlan([]), b"", b"\x55") == b"\x55"
     assert CopyPlan([], used=[(0, 3)]).operations == 0
 
 
 @pytest.mark.parametrize("move", [(0, 0, 0), (-1, 0, 1), (0, -1, 1)])
-def test_what_is_no_copy_is_refused(move):
+def test_copy_plan_rejects_invalid_moves(move):
     with pytest.raises(ValueError, match="expected at least 1 bit, from bit 0 on"):
         CopyPlan([move])
 

@@ -35,7 +35,7 @@ def test_states_are_numbered_as_the_al_status_is():
 
 
 @pytest.mark.parametrize(("state", "request_"), list(product(DeviceState, StateRequest)))
-def test_every_request_goes_where_the_table_says_or_names_what_was_possible(state, request_):
+def test_device_request_follows_table_or_names_possible_states(state, request_):
     device = EapDevice()
     device.state = state
     if (state, request_) in TRANSITIONS:
@@ -61,7 +61,7 @@ def test_codes_leave_room_for_those_of_the_standard():
     assert all(code < 0x20 or code >= 0x8000 for code in FaultCode)
 
 
-def test_a_fault_says_where_what_and_why():
+def test_device_fault_text_has_object_reason_and_detail():
     fault = DeviceFault(FaultCode.CYCLE_TIME, "1500 us", 0xD001, 7, "eap0")
     assert fault.text == str(fault)
     assert fault.text == "0xD001:07: cycle time does not fit the device cycle: 1500 us"

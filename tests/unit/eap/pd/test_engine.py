@@ -69,7 +69,7 @@ def test_a_start_before_the_phase_of_this_cycle_does_not_wait_for_the_next():
     assert engine.next_timeout() == 5 * MS + 700_000
 
 
-def test_it_is_under_way_when_every_station_has_run_but_those_with_long_cycles():
+def test_engine_is_under_way_without_stations_with_long_cycles():
     fast, _ = make("fast")
     slow, _ = make("slow", cycle_us=4000)
     minute, _ = make("minute", cycle_us=60_000_000, phase_us=59_000_000)
@@ -86,7 +86,7 @@ def test_it_is_under_way_when_every_station_has_run_but_those_with_long_cycles()
     assert engine.is_under_way
 
 
-def test_early_calls_do_nothing():
+def test_engine_early_timeout_does_nothing():
     made, wire = make()
     engine = Engine([made])
     engine.start(0)
@@ -185,7 +185,7 @@ def test_stations_come_before_buses():
     assert bus.log.count(f"timeout {4 * MS}") == late.log.count(f"timeout {4 * MS}") == 1
 
 
-def test_buses_are_asked_for_frames_as_these_arrive():
+def test_engine_receives_bus_frames_on_arrival():
     made, bus = with_bus()
     engine = Engine([made])
     engine.start(0)

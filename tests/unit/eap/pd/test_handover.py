@@ -149,7 +149,7 @@ def shared(image: Image) -> dict[str, int]:
 
 @examples(200)
 @given(specs(), specs(), st.integers(0, 1 << 30))
-def test_what_has_the_same_name_goes_on(before, after, seed):
+def test_handover_keeps_objects_of_same_name(before, after, seed):
     old, new = image_of(before), image_of(after)
     Station(before, old, lambda: None)  # gives subscriptions their trackers
     used(old, seed)
@@ -243,7 +243,7 @@ def test_trackers_that_have_parted_are_noticed():
     assert not handover.is_current
 
 
-def test_a_station_configured_anew_keeps_the_addresses_that_it_learned():
+def test_handover_keeps_learned_addresses():
     made, wire = assemble(addressed())
     made.start(0)
     take, frame = made.handlers["eap0"], octets([(9, b"\0\0")])
@@ -261,7 +261,7 @@ def test_a_station_configured_anew_keeps_the_addresses_that_it_learned():
     assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:08"
 
 
-def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
+def test_handover_of_frame_to_other_net_id_resets_address_and_presence():
     made, _ = assemble(addressed())
     made.start(0)
     frame = octets([(9, b"\0\0")])
@@ -293,7 +293,7 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     assert station_status(empty.image, 0)["frames"] == []
 
 
-def test_triggers_go_on_in_a_station_configured_anew():
+def test_handover_continues_triggers():
     made, wire = assemble(moody())
     made.start(0)
     made.cycle(MS, MS)
@@ -378,7 +378,7 @@ def test_a_gap_at_a_change_of_rate_is_of_the_old_rate_or_the_new_and_no_loss():
     assert (row["received"], row["lost"]) == (5, 1)
 
 
-def test_what_was_replaced_can_be_taken_apart():
+def test_replaced_station_can_be_released():
     made, wire = assemble(moody())
     made.start(0)
     wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
@@ -408,12 +408,12 @@ def test_all_but_ports_may_change():
     assert needs_new_start(left(), replace(left(), frames=(), variables=(), cycle_us=7)) == []
 
 
-def test_what_frames_say_of_a_port_may_change():
+def test_needs_new_start_ignores_frame_fields_of_port():
     port = replace(eap_port(1), net_id=NetId.parse("9.9.9.9.1.1"), eap_sm=True)
     assert needs_new_start(left(), left(port)) == []
 
 
-def test_what_was_opened_is_named():
+def test_needs_new_start_names_changed_fields():
     port = replace(
         eap_port(1), interface=InterfaceUri.parse("udp://127.9.2.9"), join=("239.1.1.1",), tcp=True
     )
@@ -439,7 +439,7 @@ def test_a_bus_is_not_written_out():
     assert needs_new_start(before, after) == [f"port bus0: bus is another one{END}"]
 
 
-def test_nor_is_what_a_gateway_is_told():
+def test_needs_new_start_reports_changed_gateway():
     before = replace(left(), ports=(replace(BUS, gateway=GatewaySpec()),))
     after = replace(left(), ports=(replace(BUS, gateway=GatewaySpec(silent=True)),))
     assert needs_new_start(before, after) == [f"port bus0: gateway is another one{END}"]

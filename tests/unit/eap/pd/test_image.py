@@ -47,7 +47,7 @@ def packed() -> Image:
 
 
 @given(st.data())
-def test_what_is_written_is_read_and_nothing_else_changes(data):
+def test_image_write_changes_one_variable_only(data):
     kinds = data.draw(st.lists(st.sampled_from(sorted(VALUES)), min_size=1, max_size=8))
     names = tuple(f"v{i}" for i in range(len(kinds)))
     variables = received(*(f"v{i}:{kind}" for i, kind in enumerate(kinds)))
@@ -76,7 +76,7 @@ _ranges = [parse(kind).scalar_range for kind in STORED]
         )
     )
 )
-def test_a_storer_writes_what_write_writes(values):
+def test_image_storer_equals_write(values):
     names = tuple(f"v{i}" for i in range(len(STORED)))
     variables = received(*(f"v{i}:{kind}" for i, kind in enumerate(STORED)))
     spec = station(variables=variables, subscriptions=(RxPdSpec("r", "eap0", 1, names),))
@@ -94,7 +94,7 @@ def test_bits_are_read_from_where_they_were_packed():
     assert image.read_all() == {"on": False, "mode": 5, "wide": 0x53, "off": True, "speed": 0x1234}
 
 
-def test_a_value_that_does_not_fit_is_refused_and_nothing_written():
+def test_image_rejects_unfit_value_and_writes_nothing():
     image = packed()
     with pytest.raises(ValueError, match="BIT3"):
         image.write("mode", 8)
@@ -231,7 +231,7 @@ def test_snapshot_into_which_a_cycle_falls_is_not_taken(word):
     assert reader.try_snapshot() is None
 
 
-def test_snapshot_of_an_engine_that_stopped_within_a_cycle_is_what_it_left():
+def test_snapshot_after_engine_stopped_within_cycle_is_last_content():
     image = image_of(station())
     image.words[StationWord.CYCLE] = 3
     pauses = []
@@ -240,7 +240,7 @@ def test_snapshot_of_an_engine_that_stopped_within_a_cycle_is_what_it_left():
     assert len(pauses) == SNAPSHOT_ATTEMPTS
 
 
-def test_a_formatted_image_says_what_it_holds():
+def test_read_header_returns_layout_of_formatted_image():
     layout = plan_layout(station(variables=(VariableSpec("x", "UINT"),)))
     memory = memoryview(bytearray(layout.size))
     format_image(memory, layout, 5)
@@ -298,7 +298,7 @@ def damaged(change: str) -> memoryview:
         ("samples", "contradicts the header"),
     ],
 )
-def test_a_damaged_image_is_refused_by_what_is_wrong(change, message):
+def test_read_header_of_damaged_image_names_the_damage(change, message):
     with pytest.raises(ImageError, match=message):
         read_header(damaged(change))
 
@@ -338,7 +338,7 @@ def seen(image: Image, inputs: Inputs, name: str) -> int:
     return int.from_bytes(inputs.memory[at : at + 2], "little")
 
 
-def test_only_what_moved_is_copied():
+def test_inputs_copy_changed_regions_only():
     image = make()
     inputs = Inputs(image)
     assert seen(image, inputs, "mine") == 1
@@ -350,7 +350,7 @@ def test_only_what_moved_is_copied():
     assert seen(image, inputs, "host") == 5
 
 
-def test_what_the_engine_writes_is_not_an_input():
+def test_inputs_leave_out_engine_region():
     image = make()
     inputs = Inputs(image)
     inputs.refresh()
@@ -435,7 +435,7 @@ def run(made, cycles, *, first_ns=0):
         made.cycle(first_ns + number * MS, first_ns + number * MS + 7)
 
 
-def test_no_samples_are_taken_unless_somebody_wants_them(running):
+def test_sampler_takes_no_samples_without_request(running):
     made, samples = running
     run(made, 3)
     assert samples.newest == 3

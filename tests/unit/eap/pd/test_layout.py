@@ -83,7 +83,7 @@ def test_every_frame_and_pd_of_a_station_gets_a_control_variable():
     assert all(slot.writer is Writer.APPLICATION for slot in controls.values())
 
 
-def test_a_tx_slot_knows_whether_the_clock_alone_sends_it():
+def test_tx_slot_by_schedule_is_false_with_other_triggers():
     triggers = {
         "each": TriggerSpec(),
         "cyclic": TriggerSpec(cycle_us=2000),
@@ -232,7 +232,7 @@ def test_without_alternates_there_are_no_slots():
     assert slots().alternates == ()
 
 
-def test_each_alternate_knows_what_it_brings_and_what_it_does_not():
+def test_alternate_slot_has_moves_and_untouched_variables():
     slot = slots(alternate(0, "on:BOOL", ":REAL"), alternate(2, ":BIT3", "n:uint16"))
     data = 8 * (slot.offset + 8)
     quality = (48, data - 16, 16)
@@ -256,7 +256,7 @@ def test_each_alternate_knows_what_it_brings_and_what_it_does_not():
         ([alternate(2, "n:FOO")], "'FOO' is not a data type"),
     ],
 )  # fmt: skip
-def test_what_does_not_belong_to_the_pd_is_refused(alternates, told):
+def test_alternate_with_foreign_variable_is_rejected(alternates, told):
     with pytest.raises(ValueError, match=re.escape(told)):
         slots(*alternates)
 
@@ -283,7 +283,7 @@ def bits(buffer: bytes, first: int, count: int) -> int:
 
 
 @given(layouts(), st.randoms())
-def test_any_alternate_brings_its_variables_and_nothing_else(pair, random):
+def test_alternate_copies_its_variables_only(pair, random):
     own, brought = pair
     pd = RxPdSpec(
         "r", "eap0", 1, tuple(name for name, _ in own),

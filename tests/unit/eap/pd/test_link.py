@@ -67,7 +67,7 @@ def test_the_octet_is_zero_otherwise():
     assert _octets_of(eap_sm=False) == [0, 0, 0, 0]
 
 
-def test_all_else_is_as_the_channel_does_it():
+def test_state_channel_delegates_to_channel():
     spec = station()
     image = image_of(spec)
     image.words[11] = DeviceState.SAFEOP

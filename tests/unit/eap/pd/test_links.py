@@ -69,7 +69,7 @@ def test_bits_of_a_word_go_where_they_are_wanted():
     assert (image.read("fault"), image.read("mode")) == (True, 0xAF)
 
 
-def test_a_link_reads_what_an_earlier_one_wrote_and_not_what_a_later_one_writes():
+def test_link_reads_results_of_earlier_links_only():
     image = linked(
         LinkSpec("a", "b"),
         LinkSpec("b", "c", scale=2.0),
@@ -111,7 +111,7 @@ def test_numbers_are_computed_within_the_limits_of_the_target(types, scale, offs
 
 
 @pytest.mark.parametrize("nothing", [math.nan, math.inf, -math.inf])
-def test_what_is_no_number_leaves_the_target_as_it_is_and_is_counted(nothing):
+def test_link_from_nan_keeps_target_and_is_counted(nothing):
     image = linked(
         LinkSpec("a", "b", scale=2.0),
         LinkSpec("a", "c", offset=1.0),
@@ -219,7 +219,7 @@ def compute_one(image: Image, link: LinkSpec, value: float, target: DataType) ->
 
 
 @given(st.lists(st.sampled_from(TYPES), min_size=2, max_size=6), st.data())
-def test_links_do_what_one_after_the_other_would(kinds, data):
+def test_links_equal_sequential_execution(kinds, data):
     """Also on a bus, where bits lie packed, and in an image of arbitrary octets."""
     types = {f"e{n}": kind for n, kind in enumerate(kinds)} | {"x0": "REAL", "x1": "UINT"}
     variables = tuple(

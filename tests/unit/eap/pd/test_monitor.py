@@ -56,7 +56,7 @@ def target(name: str = "a", interval_ms: int = 1000, mac: MacAddr | None = None)
     return MonitorTarget(name, interval_ms * MS, mac)
 
 
-def test_asked_at_once_and_then_once_an_interval() -> None:
+def test_monitor_probes_at_once_and_then_once_an_interval() -> None:
     run = Run(target(interval_ms=2000))
     run.until(6 * SECOND, lambda _: THEIRS)
     assert [at for at, _ in run.asked] == [0, 2 * SECOND, 4 * SECOND, 6 * SECOND]
@@ -75,7 +75,7 @@ def test_silence_is_missing_after_three_questions(interval_ms: int) -> None:
     assert early.presence() is UNKNOWN
 
 
-def test_in_doubt_it_is_asked_sooner() -> None:
+def test_monitor_probes_sooner_in_doubt() -> None:
     run = Run(target(interval_ms=60_000))
     run.until(59 * SECOND, lambda _: THEIRS)
     run.until(70 * SECOND)
@@ -161,7 +161,7 @@ def test_claims_of_many_hosts_take_bounded_memory() -> None:
     assert run.presence() is PRESENT
 
 
-def test_who_looks_instead_of_asking_says_at_once() -> None:
+def test_monitor_accepts_result_without_probe() -> None:
     run = Run(target())
     assert run.monitor.probes_to_send(0) == ["a"]
     run.monitor.receive_result("a", ProbeResult.ABSENT, 0)
@@ -170,7 +170,7 @@ def test_who_looks_instead_of_asking_says_at_once() -> None:
     assert run.monitor.probes_to_send(SECOND) == ["a"]
 
 
-def test_forgotten_targets_are_not_asked_for() -> None:
+def test_monitor_does_not_probe_removed_targets() -> None:
     run = Run(target(), target("b"))
     run.monitor.remove("a")
     run.monitor.remove("nobody")
@@ -184,7 +184,7 @@ def test_forgotten_targets_are_not_asked_for() -> None:
     assert run.monitor.next_event() is None
 
 
-def test_target_of_the_same_name_starts_anew() -> None:
+def test_monitor_resets_target_of_same_name() -> None:
     run = Run(target())
     run.until(5 * SECOND, lambda _: THEIRS)
     run.monitor.add(target(mac=OTHER), run.now_ns)
@@ -193,7 +193,7 @@ def test_target_of_the_same_name_starts_anew() -> None:
     assert run.presence() is MISSING
 
 
-def test_nothing_to_watch_needs_no_wake_up() -> None:
+def test_monitor_without_targets_has_no_timeout() -> None:
     assert SubscriberMonitor(0).next_timeout() is None
 
 
@@ -208,7 +208,7 @@ actions = st.lists(
 
 
 @given(actions)
-def test_whatever_happens_a_target_goes_on_being_asked_for(
+def test_monitor_keeps_probing_after_any_results(
     steps: list[tuple[str, str, int]],
 ) -> None:
     run = Run(target("a", 700, THEIRS), target("b", 300))
@@ -271,7 +271,7 @@ def test_an_answer_in_between_starts_the_count_again() -> None:
     assert run(SEEN, MISSED, MISSED, SEEN, MISSED, MISSED)[-1] is PRESENT
 
 
-def test_what_is_certain_needs_no_second_round() -> None:
+def test_presence_changes_at_once_on_proof() -> None:
     assert run(SEEN, ABSENT) == [PRESENT, MISSING]
     assert run(ABSENT) == [MISSING]
 
@@ -281,7 +281,7 @@ def test_missing_is_present_again_after_two_answers() -> None:
     assert run(ABSENT, SEEN, MISSED, SEEN) == [MISSING] * 4
 
 
-def test_a_round_counts_once_however_much_is_heard() -> None:
+def test_presence_round_counts_once_despite_many_results() -> None:
     judge = PresenceTracker(SECOND, 0)
     run(ABSENT, judge=judge)
     judge.begin_round()
@@ -304,7 +304,7 @@ def test_blind_rounds_end_in_unknown() -> None:
     assert run(ABSENT, BLIND, BLIND, BLIND)[-1] is UNKNOWN
 
 
-def test_what_was_told_last_holds_for_a_while_only() -> None:
+def test_presence_becomes_unknown_after_validity() -> None:
     judge = PresenceTracker(SECOND, 0)
     judge.take(SEEN, 0)
     assert judge.take(PENDING, DEFAULT_POLICY.valid_ns) is PRESENT

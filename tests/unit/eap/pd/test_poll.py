@@ -50,7 +50,7 @@ def test_requests_are_taken_once_and_by_sender():
     assert requests.take() == {}
 
 
-def test_more_requesters_than_a_cycle_answers_are_turned_away():
+def test_poll_requests_drop_requesters_beyond_limit():
     requests = PollRequests(["a"])
     taken = [requests.add(f"10.0.0.{n}", ["a"]) for n in range(REQUESTERS_PER_CYCLE + 1)]
     assert taken == [True] * REQUESTERS_PER_CYCLE + [False]
@@ -121,7 +121,7 @@ def test_waiting_begins_with_the_first_request_that_has_no_answer():
     assert poll.requested_since("a") is poll.requested_since("b") is None
 
 
-def test_an_answer_that_comes_twice_changes_nothing_for_who_waits():
+def test_poll_duplicate_answer_does_not_affect_waiting():
     asked = Asked(TriggerSpec(event=True))
     asked.send(10 * MS)
     asked.send(20 * MS)
@@ -130,7 +130,7 @@ def test_an_answer_that_comes_twice_changes_nothing_for_who_waits():
     assert asked.poll.requested_since("a") is None
 
 
-def test_a_question_goes_on_when_the_station_is_configured_anew():
+def test_poll_continues_after_handover():
     before, after = Asked(TriggerSpec(event=True)), Asked(TriggerSpec(event=True))
     before.send(10 * MS)
     before.poll.enter_answer("b", 11 * MS)
@@ -143,7 +143,7 @@ def test_a_question_goes_on_when_the_station_is_configured_anew():
     assert after.poll.enter_answer("a", 13 * MS) == 3 * MS
 
 
-def test_requests_that_wait_are_answered_by_the_station_as_it_is_configured_then():
+def test_pending_requests_are_answered_after_handover():
     before, after = PollRequests(["old", "both"]), PollRequests(["both", "new"])
     before.add("left", ["old", "both"])
     before.add("right", ["old"])
@@ -151,7 +151,7 @@ def test_requests_that_wait_are_answered_by_the_station_as_it_is_configured_then
     assert after.take() == {"left": {"both"}}
 
 
-def test_what_asks_and_is_asked_for_is_found_by_port():
+def test_polls_and_requests_are_found_by_port():
     spec = server("mill", MILL, 71, pds=2)
     assert requests_at(spec, "eap0").names == {"asked"}
     assert requests_at(spec, "eap1").names == frozenset()
@@ -267,7 +267,7 @@ def test_quality_grows_with_the_cycles_of_the_client_until_the_next_answer():
     assert exchange.row("desk", "rx", "a")["late"] == 0
 
 
-def test_what_is_asked_for_in_vain_times_out_and_comes_back():
+def test_poll_without_answer_times_out_and_recovers():
     exchange = Exchange(timeout_ms=15, substitute=Substitute.ZERO)
     exchange.run_until(100 * MS)
     assert exchange.row("desk", "rx", "a")["timeouts"] == 0
@@ -294,7 +294,7 @@ def test_what_is_asked_for_in_vain_times_out_and_comes_back():
     assert exchange.row("mill", "tx", "part1")["var_state"] == 0
 
 
-def test_what_nobody_asks_for_again_does_not_time_out():
+def test_polled_pd_does_not_time_out_without_new_request():
     exchange = Exchange(timeout_ms=15)
     exchange.run_until(95 * MS)
     with exchange.images["desk"].writing(Writer.APPLICATION):

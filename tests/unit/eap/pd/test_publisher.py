@@ -90,7 +90,7 @@ def test_all_frames_of_a_port_go_in_one_batch_with_the_counter_of_the_cycle():
     assert sender.cycle(0x1_0004) == [[1, 2], [3]]
 
 
-def test_every_pd_says_how_often_it_was_sent_and_why():
+def test_publisher_counts_each_pd_by_reason():
     sender = two_frames()
     for cycle in range(1, 7):
         sender.put(x=cycle // 3)
@@ -121,7 +121,7 @@ def test_a_suppressed_pd_leaves_the_others_and_comes_back():
     assert p["reason"] == {"cycle": 2}
 
 
-def test_a_suppressed_frame_says_so_in_its_state_until_it_is_sent_again():
+def test_suppressed_frame_has_not_sent_state_until_sent_again():
     sender = two_frames()
     sender.put(f_FrameCtrl=1)
     assert sender.cycle(1) == [[4]]
@@ -196,7 +196,7 @@ def test_restarted_engine_goes_on_with_the_address_that_was_learned():
     assert sorted(after.cycle(1)) == [[1], [3]]
 
 
-def test_configured_mac_is_used_and_nothing_is_learned():
+def test_publisher_uses_configured_mac_without_learning():
     sender = Sender(by_net_id(mac=THEIR_MAC))
     assert sender.publisher.wanted == {}
     assert sender.frames["f"]["address"] == THEIR_MAC
@@ -281,11 +281,11 @@ class Server:
         return next(r for r in station_status(self.image, 0)["pd"]["tx"] if r["name"] == name)
 
 
-def test_nothing_is_sent_unasked():
+def test_poll_responder_sends_nothing_without_request():
     assert Server().cycle(1) == []
 
 
-def test_who_asks_gets_all_that_answers_in_one_frame_once():
+def test_poll_responder_sends_all_answers_in_one_frame_once():
     server = Server()
     server.put(x=0x1234, y=1)
     server.requests.add("left", ["r"])
@@ -299,7 +299,7 @@ def test_who_asks_gets_all_that_answers_in_one_frame_once():
     assert server.row("s")["sent"] == 0
 
 
-def test_each_requester_is_answered_what_it_asked_for():
+def test_poll_responder_answers_each_requester_its_request():
     server = Server()
     server.requests.add("left", ["r", "t"])
     server.requests.add("right", ["t"])
@@ -317,7 +317,7 @@ def test_values_are_those_of_the_cycle_that_answers():
     assert [octets[-3:-1] for octets in server.wire.sent] == [b"\x07\0", b"\x08\0"]
 
 
-def test_what_is_suppressed_is_skipped_and_the_request_used_up():
+def test_poll_responder_skips_suppressed_pd_and_clears_request():
     server = Server()
     server.put(p_VarCtrl=1, g_FrameCtrl=1)
     server.requests.add("left", ["r", "t"])
@@ -333,7 +333,7 @@ def test_what_is_suppressed_is_skipped_and_the_request_used_up():
     assert server.row("s")["frame_state"] == 0
 
 
-def test_what_the_network_refuses_is_skipped():
+def test_poll_responder_counts_unsent_frames_as_skipped():
     server = Server()
     server.wire.refuse = True
     server.requests.add("left", ["r"])
@@ -347,7 +347,7 @@ def test_what_the_network_refuses_is_skipped():
     assert (server.row("q")["var_state"], server.row("q")["frame_state"]) == (0, 0)
 
 
-def test_buffers_of_those_who_asked_long_ago_are_given_up():
+def test_poll_responder_drops_buffers_of_oldest_requesters():
     server = Server()
     for number in range(3 * ANSWERS_KEPT):
         server.requests.add(f"station {number}", ["t"])

@@ -70,7 +70,7 @@ class NaiveQuality:
     ),
     idle=st.integers(0, 100),
 )
-def test_quality_is_what_counting_in_every_cycle_gives(cycle_us, steps, idle):
+def test_quality_equals_counting_in_every_cycle(cycle_us, steps, idle):
     r = receiver(cycle_us=cycle_us)
     naive = NaiveQuality(cycle_us)
     arrived = False
@@ -99,7 +99,7 @@ def test_quality_saturates():
     assert quality(r.image, r.slot("r")) == 65_535
 
 
-def test_what_arrives_between_two_cycles_is_fresh_in_the_next():
+def test_quality_of_frame_between_cycles_is_fresh():
     r = receiver()
     r.image.words[StationWord.CYCLE] = 5
     r.give(octets([(7, b"ab", 0, 30)]), 0)
@@ -110,7 +110,7 @@ def test_what_arrives_between_two_cycles_is_fresh_in_the_next():
     assert quality(r.image, r.slot("r")) == 40
 
 
-def test_a_subscription_that_waits_knows_nothing():
+def test_report_of_waiting_subscription_has_nulls():
     row = station_status(receiver().image, 99 * MS)["pd"]["rx"][0]
     assert row == {
         "name": "r",
@@ -136,7 +136,7 @@ def test_a_subscription_that_waits_knows_nothing():
     }
 
 
-def test_a_subscription_that_runs_tells_it_all():
+def test_report_of_running_subscription_is_complete():
     r = receiver()
     for cycle, at_us in ((65_534, 0), (65_535, 1004), (2, 4000)):
         r.give(octets([(7, b"ab")], cycle=cycle), at_us * 1000)
@@ -209,7 +209,7 @@ def test_values_that_links_held_back_are_counted():
     assert station_status(image, 0)["links_held"] == 3
 
 
-def test_the_state_of_a_frame_has_what_its_publisher_and_its_monitor_know():
+def test_frame_state_combines_publisher_and_monitor():
     spec = station(
         variables=written("x:UINT"),
         frames=(TxFrameSpec("f", "eap0", "10.0.0.9", (TxPdSpec("p", 1, ("x",)),)),),
@@ -278,7 +278,7 @@ def test_status_of_a_frame(image: Image) -> None:
     }
 
 
-def test_nobody_is_looked_for_where_nothing_is_monitored(image: Image) -> None:
+def test_frame_status_without_monitoring_is_unknown(image: Image) -> None:
     row = frame_status(image, image.layout.frames[1])
     assert (row["monitor_interval_ms"], row["subscriber"]) == (None, "unknown")
     assert row["address"] is None
@@ -306,7 +306,7 @@ def outcome_image() -> tuple[Image, TxSlot, TxSlot]:
     return made, *made.layout.tx
 
 
-def test_what_is_sent_on_its_own_tracker_is_counted_under_its_reason():
+def test_enter_sent_counts_pd_under_its_reason():
     made, p, _ = outcome_image()
     enter_sent(made.words, p, CHANGE, 700)
     enter_sent(made.words, p, CHANGE, 800)
@@ -316,7 +316,7 @@ def test_what_is_sent_on_its_own_tracker_is_counted_under_its_reason():
     assert tx_var_state(made.words, p) == 0
 
 
-def test_a_pd_is_unsent_from_when_it_is_skipped_until_it_is_sent():
+def test_tx_var_state_is_set_from_skip_until_sent():
     made, p, q = outcome_image()
     assert tx_var_state(made.words, p) == 0
     enter_skipped(made.words, [p, q], 500)
@@ -336,7 +336,7 @@ def test_a_frame_that_goes_whole_sends_its_pds_but_none_that_is_polled():
     assert (tx_var_state(made.words, p), tx_var_state(made.words, q)) == (0, 1)
 
 
-def test_a_frame_says_why_it_was_not_sent_until_it_is():
+def test_unsent_state_has_reason_until_sent():
     made, p, _ = outcome_image()
     (frame,) = made.layout.frames
     out = OutFrame(bytearray(20), 0, "10.0.0.1")

@@ -54,5 +54,5 @@ def test_names_have_no_spaces_and_no_slashes():
     ]  # fmt: skip
 
 
-def test_doubles_are_told_with_the_first_of_their_key():
+def test_duplicates_are_yielded_with_first_of_key():
     assert list(duplicates([(1, "a"), (2, "b"), (1, "c"), (1, "d")])) == [("c", "a"), ("d", "a")]

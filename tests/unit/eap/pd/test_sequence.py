@@ -38,7 +38,7 @@ class Book:
         return tuple(getattr(self, name) for name in COUNTERS)
 
 
-def test_frames_in_order_are_received_and_nothing_else():
+def test_tracker_counts_frames_in_order_as_received_only():
     book = Book()
     assert book.tracker.state is RxState.WAITING
     assert book.feed(5, 6, 7) == [True] * 3
@@ -47,7 +47,7 @@ def test_frames_in_order_are_received_and_nothing_else():
     assert (book.last_cycle, book.tracker.arrived_at_ns, book.arrived_in_cycle) == (7, 3 * MS, 7)
 
 
-def test_what_came_before_the_first_frame_taken_is_not_lost():
+def test_tracker_counts_no_loss_before_first_frame():
     book = Book()
     book.feed(40_000)
     assert book.lost == 0
@@ -69,7 +69,7 @@ def test_missing_steps_are_lost(step, cycles, lost):
     assert book.lost == lost
 
 
-def test_without_a_known_step_nothing_counts_as_lost():
+def test_tracker_without_step_counts_no_loss():
     book = Book(step=0, sender_cycle_ns=MS)
     book.feed(1, 50, 51, 700)
     assert book.counts()[:4] == (4, 0, 0, 0)
@@ -97,7 +97,7 @@ def test_an_older_frame_is_reordered_not_taken_and_no_longer_lost():
     assert book.last_cycle == 5
 
 
-def test_a_second_copy_that_comes_late_gives_nothing_back():
+def test_tracker_late_duplicate_does_not_reduce_loss():
     book = Book()
     book.feed(1, 2, 4, 3, 3)
     assert book.counts()[:4] == (3, 0, 0, 2)
@@ -111,7 +111,7 @@ def test_any_number_of_frames_that_were_missed_may_come_late():
     assert book.counts()[:4] == (2, 0, 0, 10)
 
 
-def test_holes_of_two_losses_are_told_apart_also_across_the_wrap():
+def test_tracker_separates_holes_of_two_losses_across_wrap():
     book = Book(step=2)
     book.feed(65532, 65534, 2, 4, 10)  # 0, 6 and 8 are missing
     assert book.lost == 3
@@ -129,14 +129,14 @@ def test_a_hole_farther_back_than_the_window_stays_lost():
     assert book.lost == 3
 
 
-def test_the_third_older_frame_in_a_row_that_nobody_missed_is_a_restarted_sender():
+def test_tracker_takes_third_older_frame_for_restarted_sender():
     book = Book()
     assert book.feed(*range(20), 0, 1, 2, 3) == [True] * 20 + [False, False, True, True]
     assert book.counts()[:4] == (22, 0, 0, 2)
     assert book.last_cycle == 3
 
 
-def test_a_good_frame_between_begins_the_count_anew():
+def test_tracker_good_frame_resets_count_of_older_frames():
     book = Book()
     taken = book.feed(10, 8, 9, 11, 9, 10, 12)
     assert taken == [True, False, False, True, False, False, True]
@@ -242,7 +242,7 @@ def test_parting_copies_the_history_and_then_each_counts_alone():
     assert (book.received, book.lost, book.reordered) == (3, 0, 1)
 
 
-def test_an_tracker_goes_on_where_an_earlier_engine_left_it():
+def test_tracker_continues_state_of_earlier_engine():
     book = Book()
     book.feed(1, 2)
     book.tracker = SequenceTracker(book.words, 0, book.timing)
@@ -297,7 +297,7 @@ def test_any_counters_and_times_are_taken_without_an_exception(frames, step, sen
     assert book.lost >= 0
 
 
-def test_an_answer_is_late_when_it_missed_the_senders_next_cycle_too():
+def test_tracker_answer_is_late_after_next_sender_cycle():
     book = Book(sender_cycle_ns=4 * MS)
     book.tracker.enter_response(5 * MS)
     assert (book.late, book.jitter_max_us) == (0, 5000)
@@ -308,7 +308,7 @@ def test_an_answer_is_late_when_it_missed_the_senders_next_cycle_too():
     assert (bins[histogram_bin(5000)], bins[histogram_bin(300)]) == (2, 1)
 
 
-def test_answers_of_a_sender_that_tells_no_cycle_are_never_late():
+def test_tracker_answers_without_sender_cycle_are_never_late():
     book = Book(sender_cycle_ns=0)
     book.tracker.enter_response(SECOND)
     assert book.late == 0
@@ -320,7 +320,7 @@ def test_answers_have_no_jitter_however_they_come():
     assert (book.received, book.lost, book.late, book.jitter_max_us) == (3, 0, 0, 0)
 
 
-def test_what_was_entered_last_was_taken_or_not():
+def test_tracker_has_taken_reports_last_frame():
     book = Book()
     assert book.feed(0x1_0005, 0x1_0006, 0x1_0005) == [True, True, False]
     assert book.tracker.has_taken(6)

@@ -80,7 +80,7 @@ def test_a_specification_crosses_as_json():
     assert msgspec.json.decode(msgspec.json.encode(told), type=GatewaySpec) == told
 
 
-def test_fields_that_nobody_knows_are_refused():
+def test_spec_rejects_unknown_fields():
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(b'{"quiet": true}', type=GatewaySpec)
 
@@ -117,6 +117,6 @@ def test_anything_else_is_no_record(octets):
         record_from_lines(octets, StationSpec)
 
 
-def test_a_line_of_no_field_is_told():
+def test_record_from_lines_rejects_unknown_field():
     with pytest.raises(KeyError, match="wheels"):
         record_from_lines(record_to_lines(spec(1)) + b"\nwheels []", StationSpec)

@@ -93,7 +93,7 @@ def test_the_order_of_a_cycle():
     assert station_status(wire.image, 0)["pd"]["rx"][0]["timeouts"] == 1
 
 
-def test_a_restarted_engine_goes_on_as_if_it_had_never_stopped():
+def test_station_continues_cycle_of_restarted_engine():
     spec = forwarder()
     made, wire = assemble(spec)
     engine = Engine([made])
@@ -211,7 +211,7 @@ def test_frames_to_a_net_id_go_where_its_own_frames_come_from():
     assert (by_id["address"], by_mac["address"]) == ("02:00:00:00:00:07", "02:00:00:00:00:05")
 
 
-def test_below_op_nothing_is_received_and_below_safeop_nothing_sent():
+def test_station_receives_in_op_only_and_sends_from_safeop():
     made, wire = assemble(moody())
     made.start(0, DeviceState.PREOP)
     take = made.handlers["eap0"]

@@ -102,7 +102,7 @@ def test_timers_of_a_bus_run_in_the_cycle_only_when_they_are_due():
     assert f"timeout {2 * MS}" in bus.log
 
 
-def test_a_station_may_have_two_buses_and_nothing_else():
+def test_station_runs_with_two_buses_only():
     spec = station(
         ports=(
             bus_port(slave(entries("in0:8"), entries("out0:8"))),

@@ -60,7 +60,7 @@ def test_a_pd_that_fits_is_copied_to_its_variables():
         (EtherCatHeader(21, type=5).encode() + bytes(21), "wrong_type", 0),
     ],
 )  # fmt: skip
-def test_what_is_not_taken_is_counted_under_its_reason(frame, reason, per_subscription):
+def test_subscriber_counts_dropped_pds_by_reason(frame, reason, per_subscription):
     r = receiver()
     for count in (1, 2):  # learned, then recognized
         r.give(frame, count * MS)
@@ -70,7 +70,7 @@ def test_what_is_not_taken_is_counted_under_its_reason(frame, reason, per_subscr
     assert r.image.read("x") == 0
 
 
-def test_a_pd_inside_the_frame_is_never_read_from_octets_behind_it():
+def test_subscriber_reads_no_pd_behind_end_of_frame():
     frame = octets([(7, b"ab", 3)])
     r = receiver()
     r.give(frame, 0)
@@ -103,7 +103,7 @@ def test_the_version_can_be_ignored():
     assert r.word("r", RxWord.RECEIVED) == 1
 
 
-def test_an_alternate_is_told_by_version_and_length():
+def test_subscriber_selects_alternate_by_version_and_length():
     other = RxAlternateSpec(2, (SentVariableSpec("", "BOOL"), SentVariableSpec("x", "UINT")))
     r = receiver(alternates=(other,))
     r.give(octets([(7, b"\xff\x34\x12", 2, 50)], cycle=1), MS)
@@ -182,7 +182,7 @@ def test_the_same_pd_twice_in_a_frame_is_one_arrival_with_the_last_data():
     assert r.word("r", RxWord.RECEIVED) == 1
 
 
-def test_var_state_says_what_differs_until_a_pd_fits_again():
+def test_var_state_reports_mismatch_until_pd_fits():
     r = receiver()
 
     def state() -> int:
@@ -196,7 +196,7 @@ def test_var_state_says_what_differs_until_a_pd_fits_again():
     assert state() == 0
 
 
-def test_what_waited_since_before_the_start_is_stale_and_after_the_stop_suppressed():
+def test_subscriber_drops_stale_frames_at_start_and_suppressed_after_stop():
     r = receiver()
     r.start(10 * MS)
     frame = octets([(7, b"ab", 3), (8, b"")])
@@ -242,7 +242,7 @@ def test_without_a_time_out_data_stays_for_ever():
     assert r.subscriber.next_timeout() is None
 
 
-def test_what_never_came_does_not_time_out():
+def test_subscriber_without_data_does_not_time_out():
     r = receiver(timeout_ms=3)
     for now in range(20):
         r.subscriber.handle_timeout(now * MS)
@@ -295,7 +295,7 @@ def test_made_up_layouts_cost_bounded_memory_and_do_not_disturb_real_ones():
     assert (r.word("r", RxWord.RECEIVED), r.word("r", RxWord.LOST)) == (400, 0)
 
 
-def test_layouts_that_differ_late_are_told_apart_however_many_there_are():
+def test_subscriber_distinguishes_many_layouts_with_one_key():
     r = receiver()
     for n in range(100):
         r.give(octets([(1, b""), (7 if n % 3 else 1000 + n, b"ab", 3)], cycle=n), n * MS)

@@ -51,14 +51,14 @@ def test_the_version_may_be_of_no_interest_but_never_the_length():
     assert made.mismatch(4, 3, b"") is PdDropReason.LENGTH
 
 
-def test_what_comes_by_itself_is_too_old_when_nothing_has_come_for_so_long():
+def test_subscription_deadline_counts_from_last_arrival():
     made, _ = subscription()
     made.tracker.arrived(1, 10 * MS, 1)
     assert made.answer is None
     assert made.deadline_ns() == 15 * MS
 
 
-def test_an_answer_is_too_old_when_it_was_asked_for_so_long_ago():
+def test_subscription_deadline_of_polled_pd_counts_from_request():
     made, words = subscription(polled=True)
     made.tracker.arrived(1, 10 * MS, 1)
     assert made.deadline_ns() is None
@@ -80,7 +80,7 @@ DATA = bytes([0b1011, 0xAA, 0xBB])
         (Substitute.DEFAULT, {"on": False, "mode": 6, "speed": 1500}),
     ],
 )
-def test_substitute_replaces_the_data_and_nothing_else(substitute, values):
+def test_substitute_replaces_data_only(substitute, values):
     variables = (
         VariableSpec("on", "BOOL", Writer.ENGINE),
         VariableSpec("mode", "BIT3", Writer.ENGINE, default=6),
@@ -180,7 +180,7 @@ def test_every_frame_that_is_cut_off_is_dropped(size):
     assert walked(FRAME, size) is PdDropReason.TRUNCATED
 
 
-def test_what_is_no_process_data_is_told_apart():
+def test_walk_reports_frames_without_process_data():
     assert walked(EtherCatHeader(0, 0, 1).encode() + bytes(20)) is PdDropReason.WRONG_TYPE
 
 

@@ -71,7 +71,7 @@ def test_a_frame_is_built_once_and_patched_with_counter_and_data():
     assert frame.whole.out.buffer is before
 
 
-def test_the_channel_decides_what_stands_before_and_behind():
+def test_tx_frame_has_headroom_and_padding_of_channel():
     frame, _ = build(TriggerSpec(), wire=Wire(header=b"\xaa" * 14, minimum_size=60))
     out = frame.whole.out
     frame.whole.patch(3)
@@ -106,7 +106,7 @@ def test_the_gate_comes_before_everything():
     assert ids(selection) == [1]
 
 
-def test_what_is_suppressed_is_skipped_and_the_rest_goes():
+def test_tx_frame_skips_suppressed_pds_and_sends_the_rest():
     frame, _ = build(TriggerSpec(), TriggerSpec())
     frame.pds[0].trigger.suppressed = True
     assert not frame.is_plain
@@ -131,7 +131,7 @@ def test_a_selection_is_kept_but_not_without_limit():
         assert len(frame._selections) <= 64
 
 
-def test_retargeted_frame_is_built_anew_for_its_new_destination():
+def test_tx_frame_retarget_rebuilds_buffers():
     frame, _ = build(TriggerSpec(), TriggerSpec())
     before = frame.whole.out
     frame.retarget("10.0.0.10")
@@ -141,7 +141,7 @@ def test_retargeted_frame_is_built_anew_for_its_new_destination():
     assert frame.select(1, 0)[0] is frame.whole
 
 
-def test_frame_without_an_address_is_held_and_says_what_was_due():
+def test_tx_frame_without_address_is_held_and_reports_due_pds():
     frame, _ = build(TriggerSpec(), TriggerSpec(divider=2))
     frame.retarget("")
     assert frame.is_held
@@ -400,7 +400,7 @@ def predicted(given: dict[str, bool]) -> dict[int, str]:
         ({"on_change": "on_change: {timeout_ms: 1, inhibit_us: 2000}"}, "before changes may be"),
     ],
 )
-def test_what_could_never_be_sent_as_written_is_refused(changes, message, tmp_path):
+def test_trigger_combinations_that_never_send_are_rejected(changes, message, tmp_path):
     given = dict.fromkeys(KEYS, False) | dict.fromkeys(changes, True) | {"frame divider": True}
     spec, findings = read(tmp_path, plant(given, VALUES | changes))
     assert spec is None
@@ -442,7 +442,7 @@ def test_an_event_bit_that_was_set_before_the_start_is_no_event():
     assert line.run(5) == {}
 
 
-def test_an_event_bit_without_an_event_trigger_does_nothing():
+def test_event_bit_without_event_trigger_is_ignored():
     line = sending(on_change=OnChangeSpec())
     line.run()
     line.put(p_VarCtrl=EVENT_BIT)
@@ -462,7 +462,7 @@ def test_the_inhibit_time_holds_back_changes_only():
     assert line.run() == {15: "change"}
 
 
-def test_a_change_that_went_back_while_it_was_held_is_not_sent():
+def test_change_reverted_while_held_is_not_sent():
     line = sending(on_change=OnChangeSpec(inhibit_us=5000))
     assert line.run() == {1: "change"}
     line.put(x=1)

@@ -36,7 +36,7 @@ def test_no_word_means_two_things(block):
 
 
 @given(st.integers(0, 1 << 40))
-def test_bins_hold_what_their_edges_say(value):
+def test_histogram_bins_match_their_edges(value):
     index = histogram_bin(value)
     assert 0 <= index < HISTOGRAM_BINS
     if index:

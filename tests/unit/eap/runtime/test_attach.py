@@ -130,7 +130,7 @@ def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield folder.image("mixer")
 
 
-def test_reads_defaults_and_what_the_engine_computes(path: Path) -> None:
+def test_attach_reads_defaults_and_computed_values(path: Path) -> None:
     with running(path, spec()), eap.attach("mixer") as station:
         assert station.name == "mixer"
         assert station["setpoint"] == 7
@@ -199,7 +199,7 @@ def test_writes_are_seen_together(path: Path) -> None:
         assert station["mode"] == 4
 
 
-def test_a_value_that_does_not_fit_writes_nothing(path: Path) -> None:
+def test_attach_write_of_unfit_value_writes_nothing(path: Path) -> None:
     with running(path, spec()), eap.attach("mixer") as station:
         with pytest.raises(ValueError, match="70000 is not a value of UINT"):
             station.write({"mode": 9, "setpoint": 70000})
@@ -221,7 +221,7 @@ def test_unknown_names_suggest_the_near_one(path: Path) -> None:
             station["xyzzy"]
 
 
-def test_only_what_goes_by_event_can_be_fired(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attach_fire_requires_event_trigger(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 60.0)  # nobody runs this image
     pds = (
         TxPdSpec("state", 1, ("mode",)),
@@ -264,7 +264,7 @@ def test_station_of_two_plants_must_be_chosen(path: Path) -> None:
             assert station.name == "mixer"
 
 
-def test_a_gone_engine_is_an_error_not_a_hang(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attach_without_engine_raises(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 0.1)
     runner = Runner(path, spec())
     with eap.attach("mixer") as station:
@@ -315,7 +315,7 @@ def test_no_write_and_no_cycle_is_lost_while_the_station_is_changed(path: Path) 
         assert runner.file.image.read("setpoint") == 60
 
 
-def test_an_image_whose_engine_died_while_it_was_replaced_is_found(
+def test_attach_finds_image_of_engine_that_died_during_replacement(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 0.1)

@@ -98,7 +98,7 @@ def described(tmp_path, text=GOOD):
     return busfile.describe(write(tmp_path, text)).slaves
 
 
-def test_description_has_what_a_master_finds(tmp_path):
+def test_bus_description_equals_master_scan(tmp_path):
     coupler, analogue = described(tmp_path)
     assert (coupler.name, coupler.vendor, coupler.product) == ("a", 0x0E5A, 1)
     assert (coupler.inputs, coupler.outputs) == ((), ())
@@ -118,7 +118,7 @@ def test_description_of_bits_has_their_padding(tmp_path):
     assert [e.bit_length for e in slave.inputs] == [1, 7]
 
 
-def test_what_a_bus_file_leaves_open_may_be_anything(tmp_path):
+def test_bus_description_leaves_open_values_none(tmp_path):
     given = "name: b\n    revision: 0x10000\n    serial: 5\n    alias: 6"
     first, second = described(tmp_path, GOOD.replace("name: b", given))
     assert (first.revision, first.serial, first.alias) == (None, None, None)

@@ -50,20 +50,20 @@ def test_dictionaries_are_those_of_eap_ports(spec):
     assert eap_ports(spec) == ["eap0"]
 
 
-def test_what_was_stored_goes_before_the_specification(spec, dictionaries):
+def test_fill_all_prefers_stored_objects(spec, dictionaries):
     blank = {"eap0": EapDictionary(replace(spec, variables=(), frames=(), sources=()), "eap0")}
     fill_all(blank, dump_all(dictionaries))
     assert dump_all(blank) == dump_all(dictionaries)
 
 
 @pytest.mark.parametrize("plain", [None, {}, {"version": 99}])
-def test_what_was_stored_and_cannot_be_used_does_not(spec, dictionaries, plain):
+def test_fill_all_ignores_unusable_stored_objects(spec, dictionaries, plain):
     made = {"eap0": EapDictionary(spec, "eap0")}
     fill_all(made, {"eap0": plain})
     assert dump_all(made) == dump_all(dictionaries)
 
 
-def test_plan_tells_all_kinds_of_changes(spec, dictionaries):
+def test_plan_lists_all_kinds_of_changes(spec, dictionaries):
     wanted = replace(spec, cycle_us=20_000, sources=(CounterSource("ticks", 3),))
     plan = make_plan(spec, dictionaries, wanted, {})
     assert [(port, change.name) for port, change in plan.changes] == [
@@ -76,7 +76,7 @@ def test_plan_tells_all_kinds_of_changes(spec, dictionaries):
     assert make_plan(spec, dictionaries, spec, {}).is_empty
 
 
-def test_plan_of_what_cannot_be(spec, dictionaries):
+def test_plan_lists_refused_changes(spec, dictionaries):
     assert make_plan(spec, dictionaries, replace(spec, ports=()), {}).refused
     (frame,) = spec.frames
     nowhere = replace(spec, frames=(replace(frame, pds=()),))
@@ -138,7 +138,7 @@ def test_same_specification(plain):
     assert describe_rest(plain, plain) == []
 
 
-def test_what_the_dictionaries_hold_is_not_told_here(plain):
+def test_describe_rest_leaves_out_dictionary_changes(plain):
     variables = (*plain.variables, VariableSpec("more", "UINT"))
     changed = replace(plain, cycle_us=20_000, variables=variables, frames=())
     assert find_refusals(plain, changed) == []
@@ -170,13 +170,13 @@ def test_plan_reports_changed_layout_with_same_version(plain):
         (lambda s: with_port(s, tcp=True), "port eap0: tcp False -> True"),
     ],
 )
-def test_what_needs_a_new_start(plain, change, words):
+def test_find_refusals_lists_changes_that_need_new_start(plain, change, words):
     (reason,) = find_refusals(plain, change(plain))
     assert reason.startswith(words)
     assert reason.endswith("restart the appliance")
 
 
-def test_sources_links_and_variables_of_buses_are_told(plain):
+def test_describe_rest_lists_sources_links_and_bus_variables(plain):
     on_bus = VariableSpec("bus0.valve.valve", "BOOL", Writer.ENGINE)
     before = replace(
         plain,

@@ -25,7 +25,7 @@ def test_a_file_that_cannot_be_made_is_named(tmp_path):
         DropCounters(tmp_path / "nowhere" / "discards", ["a"])
 
 
-def test_a_tally_carries_over_what_has_come_since(tmp_path):
+def test_drop_counter_feed_adds_new_counts(tmp_path):
     source = {"other_vlan": 2}
     with DropCounters(tmp_path / "discards", ["a", "b"]) as counters:
         tally = DropCounterFeed(

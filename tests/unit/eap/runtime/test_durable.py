@@ -12,7 +12,7 @@ from eap.runtime.durable import digest, put_aside, replace_file, seal, unseal, w
 from tests.support.limits import largest_file
 
 
-def test_content_comes_out_as_it_went_in():
+def test_unseal_returns_sealed_content():
     assert unseal(seal(b'{"a":[1]}', 3), 3) == b'{"a":[1]}'
     assert digest(b"a") != digest(b"b")
 
@@ -39,7 +39,7 @@ def test_a_file_is_replaced_and_nothing_is_left_beside_it(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["x.json"]
 
 
-def test_what_cannot_be_written_leaves_what_there_was(tmp_path, monkeypatch):
+def test_replace_file_failure_keeps_old_content(tmp_path, monkeypatch):
     path = tmp_path / "x.json"
     replace_file(path, b"one")
 
@@ -53,7 +53,7 @@ def test_what_cannot_be_written_leaves_what_there_was(tmp_path, monkeypatch):
     assert len(os.listdir(tmp_path)) == 1  # noqa: PTH208  names only
 
 
-def test_what_is_damaged_is_put_aside_or_told(tmp_path, caplog):
+def test_damaged_file_is_put_aside_or_reported(tmp_path, caplog):
     path = tmp_path / "x.json"
     path.touch()
     put_aside(path, tmp_path / "x.damaged")
@@ -71,7 +71,7 @@ def test_whole_file_appears_once_it_is_complete(tmp_path):
 
 
 @pytest.mark.parametrize("before", [None, b"before"])
-def test_whole_file_on_a_full_disk_leaves_what_there_was(tmp_path, before):
+def test_whole_file_on_full_disk_keeps_old_content(tmp_path, before):
     target = tmp_path / "a.bin"
     if before:
         target.write_bytes(before)

@@ -68,7 +68,7 @@ def test_answers(message):
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=EngineMessage) == message
 
 
-def test_requests_are_told_apart_by_what_to_do():
+def test_engine_requests_are_decoded_by_tag():
     octets = msgspec.msgpack.encode(Configure(id=1, station="a", path="/x"))
     assert msgspec.msgpack.decode(octets) == {
         "do": "configure",

@@ -40,7 +40,7 @@ def test_restart_follows_faults_of_the_bus_only(progress, error, is_allowed):
     assert (restarts.count, progress.done) == ((1, 0) if is_allowed else (0, 100))
 
 
-def test_restart_of_what_never_began_is_refused(progress):
+def test_foe_restart_before_first_data_is_refused(progress):
     progress.done = 0
     restarts = Restarts(progress, lambda: True, lambda: 0.0)
     assert not restarts.allows(FrameLostError("x"))

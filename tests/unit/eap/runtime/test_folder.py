@@ -163,7 +163,7 @@ def test_a_directory_that_cannot_be_made_names_the_variable(tmp_path, monkeypatc
     assert find_appliances() == []
 
 
-def test_a_directory_of_somebody_else_is_not_emptied(root):
+def test_claim_does_not_empty_foreign_directory(root):
     (root / "demo").mkdir(parents=True)
     (root / "demo" / "thesis.txt").write_text("")
     with pytest.raises(EnvironmentalError, match="no folder of an appliance"):
@@ -171,7 +171,7 @@ def test_a_directory_of_somebody_else_is_not_emptied(root):
     assert [entry.name for entry in (root / "demo").iterdir()] == ["thesis.txt"]
 
 
-def test_find_running_leaves_out_what_cannot_be_read(root):
+def test_find_running_skips_unreadable_folders(root):
     with ApplianceFolder.claim("demo") as folder, ApplianceFolder.claim("starting") as starting:
         folder.write_info(info())
         assert [found.plant for _, found in find_running()] == ["demo"]

@@ -91,7 +91,7 @@ def test_a_message_without_a_descriptor_is_dropped(link):
     assert receive_connection(engine) is None
 
 
-def test_a_full_or_closed_link_is_told(link):
+def test_pass_connection_returns_false_for_full_or_closed_link(link):
     services, engine = link
     with socket.socket() as connection:
         for _ in range(100_000):

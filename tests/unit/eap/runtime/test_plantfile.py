@@ -48,7 +48,7 @@ def test_a_plant_comes_with_its_buses(tmp_path):
     ]
 
 
-def test_what_is_wrong_with_a_bus_is_wrong_with_its_plant(tmp_path):
+def test_load_plant_includes_findings_of_bus_file(tmp_path):
     path = write(tmp_path, bus=BUS.replace("kind: digital, inputs", "kind: digial, inputs"))
     result = load_plant(path)
     assert result.plant is None

@@ -35,7 +35,7 @@ def test_startup_reports_each_step_once_and_then_that_it_runs(pipe: tuple[int, i
     assert os.read(pipe[0], 1) == b""
 
 
-def test_startup_goes_on_when_nobody_reads_its_steps(pipe: tuple[int, int]) -> None:
+def test_startup_continues_without_reader(pipe: tuple[int, int]) -> None:
     os.set_blocking(pipe[1], False)
     startup = Startup(pipe[1])
     for number in range(3000):
@@ -64,7 +64,7 @@ def test_imports_that_take_long_are_reported_with_their_number(
     assert steps == ["importing modules, 1 so far", "importing modules, 2 so far"]
 
 
-def test_no_step_says_nothing() -> None:
+def test_no_step_reports_nothing() -> None:
     module.no_step("building station a")
 
 

@@ -77,7 +77,7 @@ def test_nothing_is_written_for_stations_that_never_changed(stations):
     assert not state_root().exists()
 
 
-def test_what_was_stored_runs(stations):
+def test_effective_returns_stored_configuration(stations):
     left, right = stations
     kept("left").save(configured(left, state=DeviceState.PREOP))
     assert kept("left").read() == configured(left, state=DeviceState.PREOP)
@@ -135,7 +135,7 @@ def test_file_that_cannot_be_read_stays(stations, caplog):
     assert "cannot be read" in caplog.text
 
 
-def test_damaged_file_that_cannot_be_renamed_is_told(stations, caplog):
+def test_damaged_file_that_cannot_be_renamed_is_logged(stations, caplog):
     kept("left").save(configured(stations[0]))
     kept("left").path.write_bytes(b"?")
     (kept("left").path.with_suffix(".damaged") / "folder").mkdir(parents=True)
@@ -143,7 +143,7 @@ def test_damaged_file_that_cannot_be_renamed_is_told(stations, caplog):
     assert "cannot be renamed" in caplog.text
 
 
-def test_refused_write_keeps_what_there_was(stations, monkeypatch, caplog):
+def test_failed_save_keeps_old_value(stations, monkeypatch, caplog):
     left, _ = stations
     kept("left").save(configured(left))
 
@@ -282,7 +282,7 @@ def test_another_file_is_one_change_of_all_stations(stations):
     assert left.previous.spec == changed(stations[0])
 
 
-def test_nothing_to_settle(stations):
+def test_adopt_plant_file_without_stored_configuration(stations):
     left, right = stations
     adopt_plant_file("demo", stations)
     assert not state_root().exists()
@@ -339,7 +339,7 @@ def test_anything_else_is_refused(data):
         kept("left").decode(data)
 
 
-def test_digest_tells_specifications_apart(stations):
+def test_digest_of_distinguishes_specifications(stations):
     left, right = stations
     assert digest_of(left) == digest_of(replace(left))
     assert digest_of(left) != digest_of(right)
@@ -392,7 +392,7 @@ def test_a_damaged_file_is_put_aside(file, caplog, data, reason):
     assert file.read() is None
 
 
-def test_what_cannot_be_read_or_kept_says_so(file, caplog):
+def test_unreadable_or_unwritable_store_is_logged(file, caplog):
     file.path.mkdir(parents=True)
     assert file.read() is None
     assert "cannot be read (Is a directory)" in caplog.text
@@ -456,7 +456,7 @@ def test_routes_that_cannot_be_read_or_written_say_so(store, caplog):
         store.save(ROUTES)
 
 
-def test_what_was_applied_is_kept_beside_the_added_routes(store, tmp_path):
+def test_applied_routing_is_stored_beside_added_routes(store, tmp_path):
     routing = StationStore("demo", "left").routing
     assert routing.read() is None
     applied = AppliedRouting(base="x", spec=RoutingSpec(routes=ROUTES), previous=RoutingSpec())
@@ -466,7 +466,7 @@ def test_what_was_applied_is_kept_beside_the_added_routes(store, tmp_path):
     assert routing.path == tmp_path / "demo/routing/left.json"
 
 
-def test_a_station_can_start_as_if_nothing_was_kept_and_go_on_with_it_later(store):
+def test_store_set_aside_and_bring_back(store):
     store.save(ROUTES)
     StationStore("demo", "left").set_aside()
     assert store.read() is None

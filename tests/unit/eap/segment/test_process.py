@@ -85,7 +85,7 @@ def run_with(script):
     return said
 
 
-def test_answers_until_it_is_asked_to_end(master):
+def test_segment_answers_until_signal(master):
     assert run_with(lambda _: scan(master)) == [{"ready": True, "slaves": 2}]
 
 
@@ -208,7 +208,7 @@ def bus_file(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_child_answers_what_came_after_its_start_and_ends_when_asked(bus_file, number):
+def test_segment_child_answers_new_frames_and_ends_on_sigterm(bus_file, number):
     with Child(bus_file, stale=[SCAN] * 20) as child:
         assert read_reports(child.ready)[-1].ready == {"slaves": 2}
         assert child.scan() == 2
@@ -227,7 +227,7 @@ def test_child_takes_commands_one_a_message(bus_file):
         assert child.scan() == 2
 
 
-def test_child_that_nobody_listens_to_goes_on(bus_file):
+def test_segment_child_runs_without_reader(bus_file):
     with Child(bus_file) as child:
         read_reports(child.ready)
         for _ in range(2000):
@@ -245,7 +245,7 @@ def test_child_without_a_bus_file_says_so_in_its_exit_code(bus_file):
     assert "the bus has no slaves" in error
 
 
-def test_child_of_a_supervisor_that_has_gone_does_not_start(bus_file):
+def test_segment_child_without_supervisor_does_not_start(bus_file):
     with Child(bus_file, supervisor=1) as child:
         child.process.communicate(timeout=20)
         assert child.process.returncode == -signal.SIGKILL

@@ -96,7 +96,7 @@ def test_from_start_to_end(tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.net
-def test_one_that_dies_before_it_is_ready(tmp_path, monkeypatch):
+def test_child_that_dies_before_ready(tmp_path, monkeypatch):
     child = make(tmp_path, monkeypatch, "import signal; signal.pause()")
     child.start(HANDOVER, [], monotonic_ns())
     assert not child.forward_output()
@@ -105,7 +105,7 @@ def test_one_that_dies_before_it_is_ready(tmp_path, monkeypatch):
     while child.report_fd >= 0:
         child.take_reports()
     assert not child.is_ready
-    assert child.reap() == (-signal.SIGKILL, "it said nothing")
+    assert child.reap() == (-signal.SIGKILL, "no output")
     child.send_signal(signal.SIGTERM)  # nobody is there: nothing happens
 
 
@@ -133,7 +133,7 @@ def test_child_that_is_interrupted_while_it_starts_ends_without_a_traceback(tmp_
     child.start(HANDOVER, [], monotonic_ns())
     child.send_signal(signal.SIGINT)
     wait(child.pid_fd)
-    assert child.reap() == (-signal.SIGTERM, "it said nothing")
+    assert child.reap() == (-signal.SIGTERM, "no output")
 
 
 @pytest.mark.net
@@ -163,7 +163,7 @@ def read(fd: int) -> str:
     return found.decode()
 
 
-def test_lines_go_where_somebody_reads(pipe):
+def test_output_writes_lines(pipe):
     output = Output(pipe[1])
     for line in ("first", "second ä", "x" * 10_000):
         output.write(line)
@@ -171,7 +171,7 @@ def test_lines_go_where_somebody_reads(pipe):
     assert output.dropped == 0
 
 
-def test_what_nobody_takes_is_left_out_and_counted(pipe):
+def test_output_drops_and_counts_lines_of_slow_reader(pipe):
     output = Output(pipe[1])
     while not output.dropped:
         output.write("y" * 1000)
@@ -181,7 +181,7 @@ def test_what_nobody_takes_is_left_out_and_counted(pipe):
     assert read(pipe[0]) == "(2 lines dropped here: the reader was too slow)\nand this again\n"
 
 
-def test_a_reader_that_has_gone_is_no_fault(pipe):
+def test_output_ignores_closed_reader(pipe):
     output = Output(pipe[1])
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, pipe[0])  # closes the reading end, and leaves a descriptor to close
@@ -190,7 +190,7 @@ def test_a_reader_that_has_gone_is_no_fault(pipe):
     assert output.dropped == 1
 
 
-def test_line_after_one_that_a_full_disk_cut_begins_anew(tmp_path):
+def test_output_line_after_full_disk_starts_new_line(tmp_path):
     with (tmp_path / "log").open("wb") as file:
         output = Output(file.fileno())
         output.write("first")
@@ -206,7 +206,7 @@ def test_line_after_one_that_a_full_disk_cut_begins_anew(tmp_path):
     ]  # fmt: skip
 
 
-def test_line_after_one_that_a_full_pipe_cut_begins_anew(pipe):
+def test_output_line_after_full_pipe_starts_new_line(pipe):
     output = Output(pipe[1])
     output.write("y" * 100_000)
     found = read(pipe[0])

@@ -196,7 +196,7 @@ def test_stations_that_start_in_preop():
     assert found.states == {"left": DeviceState.SAFEOP, "right": DeviceState.PREOP}
 
 
-def test_what_was_configured_last_runs_in_the_state_asked_for():
+def test_stored_configuration_runs_in_requested_state():
     changed = replace(left(), frames=())
     store(changed, DeviceState.SAFEOP)
     found = with_stored_configuration(handover())
@@ -204,7 +204,7 @@ def test_what_was_configured_last_runs_in_the_state_asked_for():
     assert found.states == {"left": DeviceState.SAFEOP, "right": DeviceState.OP}
 
 
-def test_what_needs_other_sockets_does_not_run(caplog):
+def test_stored_configuration_with_other_sockets_does_not_run(caplog):
     store(left(eap_port(9)), DeviceState.SAFEOP)
     with caplog.at_level(logging.WARNING):
         found = with_stored_configuration(handover())
@@ -212,7 +212,7 @@ def test_what_needs_other_sockets_does_not_run(caplog):
     assert "station left: the plant file runs: port eap0: interface" in caplog.text
 
 
-def test_what_no_engine_can_run_does_not_run(caplog):
+def test_stored_configuration_that_cannot_be_built_does_not_run(caplog):
     store(replace(left(), variables=()))
     with caplog.at_level(logging.WARNING):
         found = with_stored_configuration(handover())
@@ -230,7 +230,7 @@ def test_whatever_a_plant_file_says_can_be_built():
     assert find_build_errors(right()) == []
 
 
-def test_what_does_not_fit_together_is_told():
+def test_incompatible_sockets_are_reported():
     unknown = replace(right(), subscriptions=(RxPdSpec("a", "eap0", 1, ("nothing",)),))
     assert find_build_errors(unknown) == ["it cannot be built: KeyError: 'nothing'"]
     many = tuple(TxPdSpec(f"p{n}", n, ("name",)) for n in range(200))

@@ -51,7 +51,7 @@ def ams_of(*stations: StationSpec) -> list[tuple[str, str, tuple[PortName, ...]]
     return [(s.kind, s.address, s.owners) for s in plan_sockets(stations) if s.kind in kinds]
 
 
-def test_stations_of_one_address_share_what_ams_needs():
+def test_stations_of_one_address_share_ams_sockets():
     lodger = right(eap_port(2, "tcp://127.9.2.1:5000"))
     assert ams_of(left(), lodger) == [
         (SocketKind.AMS_TCP, "127.9.2.1", (LEFT, RIGHT)),
@@ -63,7 +63,7 @@ def test_stations_of_one_address_share_what_ams_needs():
     ]
 
 
-def test_who_listens_at_every_address_shares_it_with_all():
+def test_wildcard_address_shares_ams_sockets_with_all():
     everywhere = right(eap_port(2, "udp://0.0.0.0:5000"))
     assert ams_of(left(), everywhere) == [
         (SocketKind.AMS_TCP, "0.0.0.0", (LEFT, RIGHT)),
@@ -119,7 +119,7 @@ def test_stations_share_an_ethernet_interface():
     assert [s.vlan_id for s in planned] == [0, 5, 0]
 
 
-def test_what_stays_in_the_engine_needs_none():
+def test_loopback_ports_need_no_sockets():
     assert plan_sockets([left(eap_port(1, "loop://line"))]) == ()
     tcp_only = plan_sockets([left(eap_port(1, "tcp://127.9.2.1", ams=False))])
     assert [s.kind for s in tcp_only] == [SocketKind.TCP]
@@ -172,7 +172,7 @@ def test_buses_add_theirs(tmp_path):
 
 
 @pytest.mark.net
-def test_nothing_stays_open_when_one_fails(tmp_path):
+def test_shared_sockets_close_all_when_one_fails(tmp_path):
     before = open_descriptors()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
         squatter.bind(("127.9.2.2", 34980))
