@@ -31,7 +31,7 @@ def reply(
     return encode_packet(header, b"answer")
 
 
-def test_exchange_takes_the_answer_to_its_request() -> None:
+def test_aoe_exchange_returns_the_answer_to_its_request() -> None:
     others = [
         reply(source=HERE),
         reply(port=1002),
@@ -64,7 +64,7 @@ def test_aoe_exchange_with_mailboxes_of_any_size(
     assert max(map(len, line.sent)) <= to_slave - 6
 
 
-def test_fragments_lie_as_on_the_wire() -> None:
+def test_aoe_client_fragments_as_the_vector() -> None:
     sizes = MailboxSizes(47, 60)
     _, asked = run_with(AOE, aoe_client.exchange(READ, bytes(range(10)), sizes), [reply()])
     assert [packet[16:24].hex() for packet in asked] == [
@@ -135,7 +135,7 @@ def test_fragments_that_break_the_protocol(answers: list[bytes], reason: str) ->
 
 
 @given(st.lists(st.binary(max_size=24), max_size=20))
-def test_any_fragments_end_in_an_answer_or_a_named_error(noise: list[bytes]) -> None:
+def test_aoe_any_fragments_end_in_an_answer_or_an_error(noise: list[bytes]) -> None:
     answers = [part(n, body) for n, body in enumerate(noise)]
     with suppress(BusError):
         talk_to(AOE, aoe_client.exchange(READ, b"", SIZES), *answers)

@@ -125,7 +125,7 @@ def test_device_and_state(server):
         (AmsCommand.READ_WRITE, (0xF302, 0x1000_0000, 4, 1), b"", 0x705),
     ],
 )
-def test_refusals(server, command, numbers, data, result):
+def test_aoe_server_refusals(server, command, numbers, data, result):
     length = b"" if command is AmsCommand.WRITE else bytes(4)
     assert call(server, command, *numbers, data=data)[:2] == (u32(result) + length, 0)
 
@@ -189,7 +189,7 @@ def test_aoe_server_handler_may_return_no_answer() -> None:
     assert (header.error_code, bytes(body)) == (7, b"")
 
 
-def test_long_answer_goes_in_fragments() -> None:
+def test_aoe_server_long_answer_is_fragmented() -> None:
     long = bytes(n % 251 for n in range(300))
     server = AoeServer(lambda header, data: AmsAnswer(long), MailboxSizes(128, 128))
     assembler = FragmentAssembler()

@@ -104,7 +104,7 @@ def test_late_and_unsolicited_messages_are_not_taken() -> None:
 
 
 @pytest.mark.parametrize("service", ["0020", "0030"])
-def test_abort_is_raised_with_its_code(service: str) -> None:
+def test_sdo_abort_is_raised_with_its_code(service: str) -> None:
     with pytest.raises(SdoAbortError, match=r"0x1018:05: subindex does not exist") as caught:
         talk_to(COE, coe_client.upload(0x1018, 5), f"{service} 80 1810 05 11000906")
     assert caught.value.code == AbortCode.NO_SUBINDEX
@@ -150,7 +150,7 @@ def test_answer_that_breaks_the_protocol(
         assert not asked[-1].expects_reply
 
 
-def test_endless_short_segments_end_with_the_limit() -> None:
+def test_upload_endless_short_segments_end_with_the_limit() -> None:
     answers = (f"0030 {(n % 2) << 4 | 0x0A:02x} 01020000000000" for n in itertools.count())
     first = "0030 41 1810 01 00000001 01"
     with pytest.raises(MailboxProtocolError, match="1001 short segments"):
@@ -204,14 +204,16 @@ def test_echo_of_the_data_is_a_confirmation_too() -> None:
     talk_to(COE, coe_client.download(0x1C13, 1, b"\x00\x1a", SIZES), answer)
 
 
-def test_refused_segment_of_a_download() -> None:
+def test_download_refused_segment() -> None:
     answers = ["0030 60 1810 01 00000000", "0020 80 1810 01 12000706"]
     with pytest.raises(SdoAbortError, match="longer than the entry"):
         talk_to(COE, coe_client.download(0x1018, 1, bytes(40), SIZES), *answers)
 
 
 @given(st.lists(st.binary(max_size=24), max_size=30), st.booleans())
-def test_any_answers_end_in_data_or_a_named_error(noise: list[bytes], is_upload: bool) -> None:
+def test_coe_client_any_answers_end_in_data_or_an_error(
+    noise: list[bytes], is_upload: bool
+) -> None:
     answers = [b"\0\x30" + octets for octets in noise]
     talk = (
         coe_client.upload(0x1018, 1)
@@ -386,7 +388,7 @@ def test_descriptions(size: int) -> None:
     assert entry == EntryDescription(0x6000, 1, 3, 16, 0x87, "Level", 7, b"\5\0", None, b"\x09\0")
 
 
-def test_refusal_is_raised() -> None:
+def test_coe_client_refusal_is_raised() -> None:
     line = serve_info()
     with pytest.raises(SdoAbortError, match="0x3000:00: object does not exist"):
         line.run(coe_client.object_description(0x3000))
@@ -394,7 +396,7 @@ def test_refusal_is_raised() -> None:
         line.run(coe_client.entry_description(0x6000, 9))
 
 
-def test_requests_lie_as_on_the_wire() -> None:
+def test_coe_client_requests_as_the_vector() -> None:
     answer = "0080 02 00 0000 0100 0010"
     listed, asked = run_with(COE, coe_client.object_list(), [answer])
     assert (listed, asked) == ([0x1000], [bytes.fromhex("0080 01 00 0000 0100")])
@@ -450,7 +452,7 @@ def test_description_that_is_cut_breaks_the_protocol() -> None:
 
 
 @given(st.lists(st.binary(max_size=16), max_size=10))
-def test_any_answers_end_in_a_description_or_a_named_error(noise: list[bytes]) -> None:
+def test_coe_client_any_answers_end_in_a_description_or_an_error(noise: list[bytes]) -> None:
     answers = [b"\0\x80" + octets for octets in noise]
     with suppress(BusError, SdoAbortError):
         talk_to(COE, coe_client.object_description(0x1018), *answers)

@@ -130,11 +130,11 @@ def test_complete_download_sets_the_count_and_confirms_in_kind() -> None:
         ("60 0000 00 00000000", AbortCode.COMMAND),
     ],
 )
-def test_refusal(asked: str, code: AbortCode) -> None:
+def test_coe_server_refusal(asked: str, code: AbortCode) -> None:
     assert Slave().abort_code(asked) is code
 
 
-def test_abort_lies_as_on_the_wire() -> None:
+def test_sdo_server_abort_as_the_vector() -> None:
     answer = Slave().server.receive_request(bytes.fromhex("40 1810 05 00000000"))
     assert answer == [bytes.fromhex("0020 80 1810 05 00000206")]
 
@@ -199,7 +199,7 @@ def test_broken_segments_abort_the_download(segments: list[str], code: AbortCode
     assert slave.abort_code("10 00000000000000") is AbortCode.COMMAND
 
 
-def test_value_that_is_refused_aborts_at_the_last_segment() -> None:
+def test_sdo_server_refused_value_aborts_at_the_last_segment() -> None:
     slave = Slave()
     assert slave.ask("21 0120 00 02000000") == "60 01 20 00 00 00 00 00"
     assert slave.ask("0b 6500 0000000000").startswith("80 01 20 00")
@@ -212,7 +212,7 @@ def test_wrong_toggle_aborts_an_upload() -> None:
     assert slave.abort_code("60 00000000000000") is AbortCode.COMMAND
 
 
-def test_abort_of_the_client_ends_its_transfer_without_an_answer() -> None:
+def test_sdo_server_abort_of_the_client_ends_the_transfer() -> None:
     slave = Slave(to_master=32)
     slave.ask("40 0220 00 00000000")
     assert slave.server.receive_request(bytes.fromhex("80 0220 00 00000405")) == []
@@ -229,7 +229,7 @@ def test_sdo_server_new_transfer_and_reset_end_a_transfer() -> None:
     assert slave.abort_code("60 00000000000000") is AbortCode.COMMAND
 
 
-def test_request_that_is_too_short_gets_a_mailbox_error() -> None:
+def test_sdo_server_short_request_has_a_mailbox_error() -> None:
     with pytest.raises(MailboxRefusedError) as caught:
         Slave().server.receive_request(bytes(7))
     assert caught.value.detail == MailboxError.SIZE_TOO_SHORT
@@ -316,7 +316,7 @@ def test_sdo_info_refusal(asked: str, code: str) -> None:
 
 
 @given(st.binary(max_size=12))
-def test_any_request_gets_an_answer(noise: bytes) -> None:
+def test_sdo_info_server_answers_any_request(noise: bytes) -> None:
     assert ask_info(noise.hex(), 16)
 
 
@@ -371,7 +371,7 @@ def test_coe_server_answers_unknown_services_with_a_mailbox_error(octets: str) -
     assert refusal(make()[0], octets) == "SERVICE_NOT_SUPPORTED"
 
 
-def test_slave_without_pdos_refuses_them() -> None:
+def test_coe_server_without_pdos_refuses_them() -> None:
     server = CoeServer(DICTIONARY, lambda: OdState.PREOP, MailboxSizes())
     assert refusal(server, "0160") == "SERVICE_NOT_SUPPORTED"
     assert refusal(server, "0250 0102") == "SERVICE_NOT_SUPPORTED"
@@ -408,7 +408,7 @@ def test_coe_server_reset_discards_the_queue() -> None:
 
 
 @given(st.binary(max_size=24))
-def test_any_octets_are_answered_or_refused(noise: bytes) -> None:
+def test_coe_server_any_bytes_are_answered_or_refused(noise: bytes) -> None:
     try:
         answers = make()[0].receive_message(noise, 0)
     except MailboxRefusedError:

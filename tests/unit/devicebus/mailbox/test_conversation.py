@@ -30,7 +30,7 @@ def test_a_conversation_is_resumed_with_each_reply() -> None:
     assert end.value.value == b"12"
 
 
-def test_progress_starts_at_nothing() -> None:
+def test_progress_starts_at_zero() -> None:
     assert (Progress().done, Progress().total, Progress(5).total) == (0, None, 5)
 
 

@@ -32,13 +32,13 @@ def receive(assembler: FrameAssembler, *messages: bytes) -> list[bytes]:
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_captured_frame_is_read_and_written_again(number: int) -> None:
+def test_eoe_captured_frame_round_trip(number: int) -> None:
     (frame,) = receive(FrameAssembler(), CAPTURED[number])
     assert frame == CAPTURED[number][4:]
     assert fragments(frame, number, 1014) == [CAPTURED[number]]
 
 
-def test_fragments_lie_as_on_the_wire() -> None:
+def test_eoe_fragments_as_the_vector() -> None:
     words = [message[:4].hex(" ") for message in fragments(number=5, data_size=40)]
     assert words == ["00 00 00 51", "00 00 41 50", "00 00 82 50", "00 01 c3 50"]
     assert [len(message) - 4 for message in fragments(data_size=70)] == [64, 36]
@@ -51,7 +51,7 @@ def test_round_trip(frame: bytes, room: int, number: int) -> None:
     assert receive(FrameAssembler(), *messages) == [frame]
 
 
-def test_short_frame_fits_a_small_mailbox() -> None:
+def test_eoe_short_frame_in_a_small_mailbox() -> None:
     assert receive(FrameAssembler(), *fragments(b"short", data_size=6)) == [b"short"]
 
 
@@ -107,7 +107,7 @@ def test_eoe_reset_discards_the_incomplete_frame() -> None:
 
 
 @given(st.lists(st.binary(min_size=4, max_size=700), max_size=20))
-def test_any_fragments_give_frames_or_codec_error(noise: list[bytes]) -> None:
+def test_eoe_any_fragments_end_in_frames_or_codec_error(noise: list[bytes]) -> None:
     assembler = FrameAssembler()
     for octets in noise:
         message = bytes((0, octets[1])) + octets[2:]
@@ -138,7 +138,7 @@ def test_settings_go_to_our_slave_and_back() -> None:
     assert line.run(eoe.get_ip()) == settings
 
 
-def test_refusal_is_raised_with_its_result() -> None:
+def test_eoe_refusal_is_raised_with_its_result() -> None:
     with pytest.raises(EoeError, match=r"EoE set IP: DHCP is not supported \(0x0202\)") as caught:
         talk_to(EOE, eoe.set_ip(IpSettings()), "0300 0202")
     assert caught.value.result == EoeResult.NO_DHCP
@@ -151,7 +151,7 @@ def test_answer_that_breaks_the_protocol(answer: str) -> None:
 
 
 @given(st.lists(st.binary(max_size=20), max_size=5))
-def test_any_answers_end_in_settings_or_a_named_error(noise: list[bytes]) -> None:
+def test_eoe_any_answers_end_in_settings_or_an_error(noise: list[bytes]) -> None:
     # A mailbox never carries an empty message, so a slave cannot send one.
     with suppress(BusError):
         talk_to(EOE, eoe.get_ip(), *[b"\7" + octets for octets in noise])
@@ -173,7 +173,7 @@ def drain(server: EoeServer) -> list[bytes]:
     return [frame for frame in found if frame is not None]
 
 
-def test_captured_request_gets_the_captured_answer() -> None:
+def test_eoe_server_answers_the_captured_request() -> None:
     server = EoeServer(MailboxSizes(1024, 1024))
     assert server.receive_message(IP_REQUEST, 0) == [IP_RESPONSE]
     assert server.settings == IpSettings.decode(IP_REQUEST[4:])
@@ -188,7 +188,7 @@ def test_settings_that_are_not_given_stay() -> None:
     assert ask(server, "1600 0000")[0].startswith("17 00 00 00 22 00 00 00 02 00 00 0a 6f 6c 64")
 
 
-def test_settings_that_are_refused_or_cut_change_nothing() -> None:
+def test_eoe_server_refused_settings_change_nothing() -> None:
     server = EoeServer(MailboxSizes(), accept=lambda settings: EoeResult.NO_DHCP)
     assert ask(server, "0200 0000 02000000 0200000a") == ["03 00 02 02"]
     assert ask(server, "0200 0000 02000000 0200") == ["03 00 01 00"]
@@ -263,7 +263,7 @@ def test_frame_that_cannot_be_sent_is_an_error_of_the_caller_or_dropped() -> Non
 
 
 @given(st.binary(max_size=60))
-def test_any_octets_are_answered_or_refused(noise: bytes) -> None:
+def test_eoe_any_bytes_are_answered_or_refused(noise: bytes) -> None:
     try:
         answers = EoeServer(MailboxSizes()).receive_message(noise, 0)
     except MailboxRefusedError:

@@ -105,7 +105,7 @@ def test_endless_busy_ends_in_a_timeout() -> None:
         read(itertools.repeat(BUSY))
 
 
-def test_slave_that_takes_its_time_to_be_busy_ends_in_a_timeout_too() -> None:
+def test_foe_slow_busy_answers_time_out() -> None:
     talk = foe_client.write(NAME, io.BytesIO(b"ab").read, SIZES)
     next(talk)
     slow = (MailboxMessage(FOE, bytes.fromhex(BUSY), n * 2_900_000_000) for n in itertools.count())
@@ -132,7 +132,7 @@ def test_late_messages_are_not_taken() -> None:
     assert len(asked) == 3
 
 
-def test_refusal_is_raised_with_its_code_and_text() -> None:
+def test_foe_error_is_raised_with_code_and_text() -> None:
     answer = "05 00 02800000" + b"locked\0".hex()
     with pytest.raises(
         FoeError, match=r"read of 'f': access denied \(0x8002\).*'locked'"
@@ -157,7 +157,7 @@ def test_read_that_breaks_the_protocol(answers: list[str], reason: str) -> None:
         read(answers)
 
 
-def test_endless_file_ends_with_the_limit() -> None:
+def test_foe_read_endless_file_ends_with_the_limit() -> None:
     packets = (f"03 00 {n.to_bytes(4, 'little').hex()} 61626364" for n in itertools.count(1))
     with pytest.raises(MailboxProtocolError, match="4 bytes, at most"):
         read(packets, max_size=402)
@@ -179,7 +179,7 @@ def test_write_that_breaks_the_protocol(answers: list[str], reason: str) -> None
         write(b"abcdef", answers)
 
 
-def test_name_longer_than_the_mailbox_is_refused_at_once() -> None:
+def test_foe_name_longer_than_the_mailbox_is_refused() -> None:
     with pytest.raises(MailboxSizeError, match="'abcde' has 5 bytes, the mailbox holds 4"):
         next(foe_client.read("abcde", bytearray().extend, SIZES))
 
@@ -207,7 +207,7 @@ def test_foe_local_error_is_sent_to_the_slave() -> None:
 
 
 @given(st.lists(st.binary(max_size=14), max_size=20), st.booleans())
-def test_any_answers_end_in_a_file_or_a_named_error(noise: list[bytes], is_read: bool) -> None:
+def test_foe_any_answers_end_in_a_file_or_an_error(noise: list[bytes], is_read: bool) -> None:
     with suppress(BusError):
         if is_read:
             read(noise)

@@ -61,7 +61,7 @@ def test_foe_server_file_of_full_packets_ends_with_an_empty_one(content: bytes) 
         assert answer == "03 00 01 00 00 00"
 
 
-def test_busy_client_gets_the_same_packet_again() -> None:
+def test_foe_server_repeats_the_packet_for_a_busy_client() -> None:
     slave = Slave(b"abcdefg")
     assert slave.ask(READ) == slave.ask("06 00 00000000")
 
@@ -127,12 +127,12 @@ def test_password_decides() -> None:
     assert Slave().ask("01 00 78563412 736563726574 00") == "03 00 01 00 00 00"
 
 
-def test_refusal_of_the_store_is_sent_with_as_much_text_as_fits() -> None:
+def test_foe_server_store_error_is_sent_with_its_text() -> None:
     answer = Slave().ask("02 00 00000000 6e6f746865726521")
     assert bytes.fromhex(answer) == bytes.fromhex("05 00 01800000") + b"noth"
 
 
-def test_refusal_while_writing_ends_the_transfer() -> None:
+def test_foe_server_store_error_ends_the_write() -> None:
     slave = Slave(b"old")
     slave.ask(WRITE)
     slave.ask("03 00 01000000 61626364")
@@ -142,7 +142,7 @@ def test_refusal_while_writing_ends_the_transfer() -> None:
     assert slave.file.content == b"old"
 
 
-def test_error_of_the_client_ends_its_transfer_without_an_answer() -> None:
+def test_foe_server_error_of_the_client_ends_the_transfer() -> None:
     slave = Slave(b"abcdefg")
     slave.ask(READ)
     assert slave.ask("05 00 03800000") == ""
@@ -165,7 +165,7 @@ def test_message_without_a_header_is_too_short() -> None:
     assert caught.value.detail == MailboxError.SIZE_TOO_SHORT
 
 
-def test_any_file_object_can_be_read() -> None:
+def test_foe_server_reads_any_file_object() -> None:
     class Folder:
         opened = io.BytesIO(b"abcdefg")
 
@@ -192,7 +192,7 @@ def test_foe_server_any_request_has_one_answer_at_most(requests: list[bytes]) ->
 
 @pytest.mark.parametrize("code", FoeErrorCode)
 @pytest.mark.parametrize("request_", [READ, WRITE])
-def test_every_request_is_refused_with_a_code_and_its_text(code, request_) -> None:
+def test_foe_server_forced_error_refuses_every_request(code, request_) -> None:
     slave = Slave(b"ab")
     slave.server.forced_error = code
     assert slave.error(request_) is code
@@ -283,14 +283,14 @@ def test_rules_of_a_file(
             assert code_of(call, name, password).name == code
 
 
-def test_content_that_grows_too_large_is_refused() -> None:
+def test_memory_store_refuses_too_large_content() -> None:
     writer = make().open_write("plain", 0)
     writer.write(b"0123456789")
     writer.write(b"ab")
     assert code_of(writer.write, b"c") is FoeErrorCode.DISK_FULL
 
 
-def test_content_that_fails_its_check_is_not_taken() -> None:
+def test_memory_store_check_refuses_content() -> None:
     store = make()
     writer = store.open_write("checked", 0)
     writer.write(b"\x01\xfe")
@@ -311,7 +311,7 @@ def test_memory_store_new_file_appears_when_complete() -> None:
     assert code_of(store.open_write, "", 0) is FoeErrorCode.NOT_FOUND
 
 
-def test_existing_file_may_be_kept() -> None:
+def test_memory_store_refuses_to_overwrite() -> None:
     assert code_of(make(overwrites=False).open_write, "plain", 0) is FoeErrorCode.ALREADY_EXISTS
 
 

@@ -153,6 +153,6 @@ def test_has_more_by_protocol(kind: MailboxType, reply: str, *, expected: bool) 
 
 
 @given(st.sampled_from(list(MailboxType)), st.binary(max_size=12), st.binary(max_size=12))
-def test_any_octets_are_judged(kind: MailboxType, request_: bytes, reply: bytes) -> None:
+def test_answers_accepts_any_bytes(kind: MailboxType, request_: bytes, reply: bytes) -> None:
     assert answers(kind, request_, reply) in {True, False}
     assert has_more(kind, reply) in {True, False}

@@ -23,18 +23,18 @@ def test_mailbox_sizes_include_the_header() -> None:
 
 
 @pytest.mark.parametrize("sizes", [(15, 128), (128, 15), (0, 0)])
-def test_mailbox_that_is_too_small_is_refused(sizes: tuple[int, int]) -> None:
+def test_mailbox_sizes_refuse_too_small_mailboxes(sizes: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="expected at least 16"):
         MailboxSizes(*sizes)
 
 
-def test_refusal_carries_the_detail_of_the_standard() -> None:
+def test_mailbox_error_has_the_detail_of_the_standard() -> None:
     with pytest.raises(MailboxRefusedError, match="INVALID_HEADER: no length") as caught:
         raise_mailbox_error(MailboxError.INVALID_HEADER, "no length")
     assert caught.value.detail == 5
 
 
-def test_counter_goes_from_1_to_7_and_never_to_0() -> None:
+def test_next_counter_counts_from_1_to_7() -> None:
     seen = [0]
     for _ in range(9):
         seen.append(next_counter(seen[-1]))
@@ -47,7 +47,7 @@ def test_same_counter_is_a_repeat() -> None:
     assert (watch.repeated, watch.gaps) == (2, 0)
 
 
-def test_counter_0_is_always_new_and_starts_again() -> None:
+def test_counter_check_accepts_0() -> None:
     watch = CounterCheck()
     assert all(watch.is_new(counter) for counter in (0, 0, 5, 0, 5))
     assert (watch.repeated, watch.gaps) == (0, 0)
@@ -59,7 +59,7 @@ def test_missing_counters_are_gaps() -> None:
     assert watch.gaps == 2
 
 
-def test_restart_takes_any_counter_and_keeps_the_counts() -> None:
+def test_counter_check_restart_keeps_the_counts() -> None:
     watch = CounterCheck()
     assert watch.is_new(1)
     assert not watch.is_new(1)

@@ -84,7 +84,7 @@ class Box:
         return MailboxError(MailboxErrorReply.decode(data).detail).name
 
 
-def test_reply_has_the_address_of_its_request_and_an_own_counter() -> None:
+def test_mailbox_server_reply_has_the_request_address_and_own_counter() -> None:
     box = Box()
     box.send(b"a", counter=5, address=0x1001, now_ns=9)
     box.send(b"bc", counter=6, address=0)
@@ -140,7 +140,7 @@ def test_mailbox_server_answers_unsupported_protocols_with_a_mailbox_error(
     assert box.server.stats().refused == 1
 
 
-def test_error_reply_lies_as_on_the_wire() -> None:
+def test_mailbox_server_error_reply_as_the_vector() -> None:
     box = Box()
     box.send(b"a", kind=MailboxType.FOE, address=0x03E9)
     assert box.server.next_message(0) == bytes.fromhex("0400 e903 00 10 0100 0200")
@@ -152,14 +152,14 @@ def test_longest_message_fills_the_mailbox() -> None:
     assert box.echo.received == [(bytes(26), 0)]
 
 
-def test_answer_longer_than_the_mailbox_becomes_an_error() -> None:
+def test_mailbox_server_too_long_answer_becomes_an_error() -> None:
     box = Box()
     box.echo.unasked = [bytes(26), bytes(27)]
     assert box.fetch()[1] == bytes(26)
     assert box.refusal() == "INVALID_SIZE"
 
 
-def test_no_request_is_taken_while_many_answers_wait() -> None:
+def test_mailbox_server_with_a_full_queue_accepts_no_request() -> None:
     box = Box()
     assert box.server.is_ready
     box.send(bytes(MAX_QUEUED), counter=1)
@@ -210,7 +210,7 @@ def test_mailbox_server_repeats_the_last_read_message() -> None:
     assert box.server.stats().repeated_replies == 2
 
 
-def test_repeat_before_anything_was_read_changes_nothing() -> None:
+def test_mailbox_server_repeat_before_the_first_read_has_no_effect() -> None:
     box = Box()
     assert box.server.repeat_message() is None
     box.send(b"a")
@@ -221,7 +221,7 @@ def test_repeat_before_anything_was_read_changes_nothing() -> None:
     assert box.server.next_message(0) is None
 
 
-def test_start_forgets_everything_but_the_counts() -> None:
+def test_mailbox_server_start_keeps_the_counters_only() -> None:
     box = Box()
     box.send(b"ab", counter=1)
     box.fetch()
@@ -236,7 +236,7 @@ def test_start_forgets_everything_but_the_counts() -> None:
 
 
 @given(st.lists(st.binary(max_size=40), max_size=12))
-def test_any_octets_get_an_answer_or_are_counted(messages: list[bytes]) -> None:
+def test_mailbox_server_any_bytes_are_answered_or_counted(messages: list[bytes]) -> None:
     box = Box()
     for octets in messages:
         box.server.receive_message(octets, 0)

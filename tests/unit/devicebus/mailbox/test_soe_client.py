@@ -64,7 +64,7 @@ def test_late_messages_are_not_taken() -> None:
     assert talk_to(SOE, soe_client.read(MODE), *answers) == bytes(range(1, 11))
 
 
-def test_refusal_is_raised_with_its_code() -> None:
+def test_soe_client_refusal_is_raised_with_its_code() -> None:
     with pytest.raises(
         SoeError, match=r"SoE read of S-0-0032 at drive 2: no unit \(0x4001\)"
     ) as caught:
@@ -91,7 +91,7 @@ def test_read_that_breaks_the_protocol(answers: list[str], reason: str) -> None:
         talk_to(SOE, soe_client.read(MODE), *answers)
 
 
-def test_endless_fragments_end_with_the_limit() -> None:
+def test_soe_client_endless_fragments_end_with_the_limit() -> None:
     answers = (f"0a 40 {n & 255:02x}{n >> 8:02x} {'00' * 1000}" for n in range(0xFFFF, 0, -1))
     with pytest.raises(MailboxProtocolError, match="more than 524320 bytes"):
         talk_to(SOE, soe_client.read(MODE), *itertools.islice(answers, 600))
@@ -118,7 +118,7 @@ def test_write(data: bytes, sent: list[str]) -> None:
     assert (progress.done, progress.total) == (len(data), len(data))
 
 
-def test_fragment_may_be_refused_under_any_idn() -> None:
+def test_soe_refused_fragment_has_any_idn() -> None:
     with pytest.raises(SoeError, match="value is too long"):
         talk_to(SOE, soe_client.write(MODE, bytes(8), SIZES), "14 40 0100 0370")
 
@@ -165,7 +165,7 @@ def test_procedure_command_that_fails_is_cleared_too(
     assert asked[-1] == bytes.fromhex("03 40 6300 0000")
 
 
-def test_procedure_command_that_takes_its_time_to_be_busy_ends_too() -> None:
+def test_execute_slow_busy_answers_time_out() -> None:
     talk = soe_client.execute(RESET, SIZES, timeout_ns=30_000_000_000)
     next(talk)
     ask = talk.send(MailboxMessage(SOE, bytes.fromhex("04 40 6300")))
@@ -193,7 +193,7 @@ def test_data_state_that_is_cut_breaks_the_protocol() -> None:
 
 
 @given(st.lists(st.binary(max_size=12), max_size=20), st.booleans())
-def test_any_answers_end_in_data_or_a_named_error(noise: list[bytes], is_read: bool) -> None:
+def test_soe_client_any_answers_end_in_data_or_an_error(noise: list[bytes], is_read: bool) -> None:
     talk = soe_client.read(MODE) if is_read else soe_client.write(MODE, bytes(8), SIZES)
     with suppress(BusError):
         talk_to(SOE, talk, *noise)
@@ -346,7 +346,7 @@ def test_list_that_is_no_list_breaks_the_protocol() -> None:
 
 
 @given(st.lists(st.binary(max_size=12), max_size=10))
-def test_any_answers_end_in_a_description_or_a_named_error(noise: list[bytes]) -> None:
+def test_soe_client_any_answers_end_in_a_description_or_an_error(noise: list[bytes]) -> None:
     answers = [b"\2\4\x24\0" + octets for octets in noise]
     with suppress(BusError):
         talk_to(SOE, soe_client.describe(Idn.parse("S-0-0036")), *answers)

@@ -69,7 +69,7 @@ def test_command_that_does_not_succeed_has_failed() -> None:
     assert procedure.state(0) == 0
 
 
-def test_start_may_be_refused() -> None:
+def test_procedure_command_start_refused() -> None:
     def refuse() -> None:
         raise SoeError("no power", code=SoeErrorCode.COMMAND_NOT_NOW)
 
@@ -174,7 +174,7 @@ def test_value_is_written_and_default_stays() -> None:
         (Element.VALUE, number(201), "ABOVE_MAXIMUM"),
     ],
 )
-def test_write_that_is_refused(element: int, data: bytes, code: str) -> None:
+def test_soe_parameter_refuses_writes(element: int, data: bytes, code: str) -> None:
     parameter = speed()
     assert refusal_of(parameter.write, element, data, PREOP, 0).name == code
     assert parameter.read(Element.VALUE, 0) == number(-5)
@@ -212,7 +212,7 @@ def test_list_has_a_head() -> None:
         ("0400 0400 01006400", "ABOVE_MAXIMUM"),
     ],
 )
-def test_list_that_is_refused(octets: str, code: str) -> None:
+def test_soe_parameter_refuses_lists(octets: str, code: str) -> None:
     parameter = SoeParameter("S-0-0016", "", LIST, [1], max_length=8, limits=(None, 99))
     write = (Element.VALUE, bytes.fromhex(octets), PREOP, 0)
     assert refusal_of(parameter.write, *write).name == code
@@ -257,7 +257,7 @@ def test_procedure_command_has_a_data_state() -> None:
     assert parameter.read(Element.VALUE, 9) == b"\3\0"
 
 
-def test_refusal_names_the_idn() -> None:
+def test_soe_parameter_error_names_the_idn() -> None:
     with pytest.raises(SoeError, match=r"P-0-0001: no unit \(0x4001\)"):
         SoeParameter("P-0-0001", "", SIGNED).read(Element.UNIT, 0)
 
@@ -307,7 +307,7 @@ def test_value_is_read_and_written() -> None:
         ("03 02 2000 0c00", "14 02 20 00 04 20"),
     ],
 )
-def test_refusal(asked: str, answer: str) -> None:
+def test_soe_server_refusal(asked: str, answer: str) -> None:
     assert Drive().ask(asked) == [answer]
 
 
@@ -317,7 +317,7 @@ def test_state_of_the_slave_counts() -> None:
     assert drive.ask("03 40 2000 0c000000") == ["14 40 20 00 05 70"]
 
 
-def test_long_answer_goes_in_fragments_that_count_down() -> None:
+def test_soe_server_long_answer_fragments_count_down() -> None:
     drive = Drive()
     drive.list.octets = bytes(range(10))
     assert drive.ask("01 40 1000") == [
@@ -341,7 +341,7 @@ def test_fragments_of_a_write_are_joined() -> None:
     assert drive.list.octets == bytes.fromhex("01000200")
 
 
-def test_fragments_may_be_counted_as_total_by_room() -> None:
+def test_soe_server_accepts_fragments_counted_as_soem_does() -> None:
     drive = Drive()
     assert drive.ask("0b 40 0200 080008000100") == []
     assert drive.ask("03 40 1000 020003000400") == ["04 40 10 00"]
@@ -411,7 +411,7 @@ def test_procedure_command_ends_with_a_notification() -> None:
     assert drive.unasked(99) == []
 
 
-def test_emergency_lies_as_on_the_wire() -> None:
+def test_soe_server_emergency_as_the_vector() -> None:
     drive = Drive()
     drive.server.send_emergency(0x2310, 3, b"\7", drive=1)
     assert drive.unasked() == ["26 00 00 00 10 23 03 07 00 00 00 00"]
@@ -448,7 +448,7 @@ def test_drive_number_has_three_bits() -> None:
 
 
 @given(st.lists(st.tuples(st.binary(max_size=12), st.integers(0, 1 << 33)), max_size=20))
-def test_any_requests_are_answered_or_refused(requests: list[tuple[bytes, int]]) -> None:
+def test_soe_server_any_requests_are_answered_or_refused(requests: list[tuple[bytes, int]]) -> None:
     drive = Drive()
     for request, now_ns in requests:
         try:

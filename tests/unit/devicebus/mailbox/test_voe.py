@@ -12,7 +12,7 @@ from tests.support.mailbox import open_line, run_with, talk_to
 VOE = MailboxType.VOE
 
 
-def test_exchange_takes_the_answer_of_its_vendor_and_type() -> None:
+def test_voe_exchange_returns_the_answer_of_vendor_and_type() -> None:
     answers = ["03000000 3412 ff", "02000000 3512 ff", "0200", "02000000 3412 0708"]
     answer, asked = run_with(VOE, voe.exchange(2, 0x1234, b"\1"), answers)
     assert (answer, asked) == (b"\7\x08", [bytes.fromhex("02000000 3412 01")])
@@ -28,7 +28,7 @@ def test_voe_server_without_answer() -> None:
         talk_to(VOE, voe.exchange(2, 1, b""), "02000000 02")
 
 
-def test_send_waits_for_nothing() -> None:
+def test_voe_send_has_no_reply() -> None:
     _, asked = run_with(VOE, voe.send(2, 1, b"\1"), [])
     assert asked == [bytes.fromhex("02000000 0100 01")]
 

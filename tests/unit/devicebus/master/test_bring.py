@@ -62,7 +62,7 @@ def test_process_data_is_set_up_and_cleared(line):
     run(line, clear(1001, fmmus=255, sync_managers=255))
 
 
-def test_the_watchdog_is_set_in_milliseconds(line):
+def test_set_watchdog_in_milliseconds(line):
     run(line, set_watchdog(1001, 250))
     memory = line.segment.slaves[0].esc.memory
     assert memory[Register.WATCHDOG_DIVIDER : Register.WATCHDOG_DIVIDER + 2] == b"\xc2\x09"
@@ -72,7 +72,7 @@ def test_the_watchdog_is_set_in_milliseconds(line):
         run(line, set_watchdog(1001, 7000))
 
 
-def test_a_slave_that_is_gone(line):
+def test_bring_lost_slave_fails(line):
     (place,) = plan_image([shape(1005, (8,))]).slaves.values()
     with pytest.raises(WorkingCounterError, match="slave 1005: writing sync manager 2"):
         run(line, set_process_data(place))
@@ -102,7 +102,7 @@ def test_mailboxes_open_and_close_with_the_states():
     assert unit.state is AlState.PREOP
 
 
-def test_a_choice_of_pdos_is_written_before_they_are_read():
+def test_bring_writes_the_pdo_configuration_before_reading():
     choice = PdoConfiguration(assignment={2: (), 3: (0x1A00,)})
     line = Paced(Master(MasterSettings(pdo_configurations={1001: choice})), segment(slave("a")))
     line.wait(line.core.bring_up(line.now_ns))
@@ -143,7 +143,7 @@ def test_bring_leaves_a_slave_without_eeprom_alone():
     assert line.frames == frames
 
 
-def test_a_procedure_may_wait_for_a_task():
+def test_wait_for_returns_the_result_of_a_task():
     line = line_of(slave("a"))
     scanning = line.core.scan(line.now_ns)
     assert len(line.wait(line.core.run(wait_for(scanning), line.now_ns))) == 1

@@ -77,7 +77,7 @@ def test_bus_reset_ends_running_tasks():
     assert not bus.needs_check
 
 
-def test_the_reference_is_followed_in_every_cycle():
+def test_bus_distributes_the_reference_time_in_every_cycle():
     bus, _ = made()
     bus.distribute_time(1001)
     assert bus.reference == 1001

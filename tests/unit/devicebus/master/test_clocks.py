@@ -69,7 +69,7 @@ def test_delays_along_a_line_with_branches():
     assert "none" not in by_name
 
 
-def test_times_of_32_bits_that_wrap():
+def test_clocks_receive_times_wrap_at_32_bits():
     nodes = {
         0: TopologyNode((0, 1), None, 0, 0),
         1: TopologyNode((0,), 0, 1, 0),
@@ -82,7 +82,7 @@ def test_times_of_32_bits_that_wrap():
     assert find_delays(nodes, latched) == {0: 0, 1: 350}
 
 
-def test_a_bus_without_clocks_has_nothing_to_do():
+def test_clocks_bus_without_clocks_is_not_set():
     line, found = line_of(slave("a", clock=None))
     assert run(line, synchronize(found, TIME)) == ()
 
@@ -143,7 +143,7 @@ def test_sync0_starts_at_a_whole_cycle_plus_shift():
     assert clock.take_sync0(line.now_ns + 110 * MS) >= 8
 
 
-def test_a_slave_that_is_gone_is_named():
+def test_clocks_lost_slave_is_named():
     line, found = line_of(clocked("a"), clocked("b"))
     line.segment.cut(1)
     with pytest.raises(WorkingCounterError, match="slave 1002: reading receive times"):

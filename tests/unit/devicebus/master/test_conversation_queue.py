@@ -83,7 +83,7 @@ def test_reply_matcher_removes_the_expired_request_of_a_late_reply(matcher):
     assert give(matcher)
 
 
-def test_without_echo_a_mailbox_error_may_be_late_too(matcher):
+def test_reply_matcher_without_echo_drops_a_late_mailbox_error(matcher):
     matcher.expire(ASK)
     matcher.next_address()
     assert not give(matcher, kind=ERR)
@@ -184,7 +184,7 @@ def test_conversation_queue_alternates_requesters():
     assert queue.next_job(0) is None
 
 
-def test_a_conversation_of_a_protocol_ends_before_the_next_begins():
+def test_conversation_queue_runs_one_conversation_of_a_protocol():
     queue = ConversationQueue()
     queue.add(job("first"))
     queue.add(job("second", "s"))
@@ -227,7 +227,7 @@ def test_cancelled_conversations_are_passed_by():
     assert (queue.next_job(0), queue.next_ready()) == (None, None)
 
 
-def test_all_fail_at_once():
+def test_conversation_queue_fails_all_conversations():
     queue = ConversationQueue()
     jobs = [job("a"), job("b"), job("c", kind=FOE)]
     for each in jobs:
@@ -241,7 +241,7 @@ def test_all_fail_at_once():
     assert queue.next_job(0) is None
 
 
-def test_each_protocol_has_its_own_judge():
+def test_conversation_queue_has_a_matcher_for_each_protocol():
     queue = ConversationQueue()
     assert queue.matcher(COE) is queue.matcher(COE)
     assert queue.matcher(COE) is not queue.matcher(FOE)

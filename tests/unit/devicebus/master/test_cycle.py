@@ -51,7 +51,7 @@ def test_slaves_that_do_not_know_lrw_are_written_and_read():
     assert f.image.inputs == b"WXYZ"
 
 
-def test_a_wrong_working_counter_leaves_the_inputs_alone():
+def test_cycle_wrong_working_counter_keeps_the_inputs():
     f = Fixture()
     f.round(7, b"...WXYZ")
     f.round(4, b"...abcd", now_ns=MS)
@@ -150,13 +150,13 @@ def test_more_datagrams_go_with_a_cycle():
     assert taken[0].data == b"...WXYZ\0"
 
 
-def test_a_bus_without_process_data_sends_nothing():
+def test_cycle_without_process_data_sends_nothing():
     cycle = Cycle(link := Link(), BusImage(plan_image([])), lambda now: None, knows_lrw=True)
     cycle.start(0)
     assert (link.frames_to_send(0), cycle.stats().cycles) == ([], 0)
 
 
-def test_whether_the_last_cycle_came_back_well_is_known_at_any_time():
+def test_cycle_is_good_follows_the_last_cycle():
     f = Fixture()
     f.round(7)
     assert f.cycle.is_good

@@ -22,7 +22,7 @@ def count(line, name, register, value):
     found.esc.memory[register] = value
 
 
-def test_a_bus_in_order(line):
+def test_diagnose_bus_without_errors(line):
     found = run(line, diagnose(STATIONS))
     assert found.first_fault is None
     assert [(each.station, each.answers, each.state) for each in found.slaves] == [
@@ -68,7 +68,7 @@ def test_counters_are_cleared(line):
     assert run(line, diagnose(STATIONS)).first_fault is None
 
 
-def test_a_slave_that_does_not_answer(line):
+def test_diagnosis_slave_without_answer(line):
     found = run(line, diagnose((*STATIONS, 1009)))
     assert [each.answers for each in found.slaves] == [True, True, True, False]
     assert found.slaves[3].ports == ()

@@ -49,7 +49,7 @@ class Chip:
         return DatagramReply(control + self.commands[-1][2:6] + data, self.wkc)
 
 
-def test_an_image_is_read_up_to_its_end(line):
+def test_read_image_ends_at_the_end_mark(line):
     image = run(line, eeprom.read_image(1001))
     assert line.segment.slaves[0].esc.image.startswith(image)
     assert image.endswith(b"\xff\xff")
@@ -79,18 +79,18 @@ def test_write_image_writes_changed_words_only(line, monkeypatch):
     assert run(line, eeprom.read_image(1001)) == image
 
 
-def test_odd_images_are_refused():
+def test_write_image_refuses_odd_lengths():
     with pytest.raises(SiiError, match="3 bytes, expected whole words"):
         drive(eeprom.write_image(1001, b"abc"), Chip(b""))
 
 
-def test_a_busy_chip_is_waited_for_up_to_twenty_milliseconds():
+def test_eeprom_busy_times_out_after_20_ms():
     assert drive(eeprom.read_words(1001, 0), Chip(b"abcd", busy=100)) == b"abcd"
     with pytest.raises(SiiError, match="slave 1001: EEPROM, reading word 0x0004: busy"):
         drive(eeprom.read_words(1001, 4), Chip(b"abcd", busy=300))
 
 
-def test_commands_that_are_not_acknowledged_are_given_again():
+def test_eeprom_command_without_acknowledge_is_repeated():
     chip = Chip(b"abcd", refuse=3)
     assert drive(eeprom.read_words(1001, 0), chip) == b"abcd"
     assert len(chip.commands) == 4
@@ -110,14 +110,14 @@ def watched(procedure, pauses):
             return end.value
 
 
-def test_a_chip_that_stores_a_word_is_given_ten_milliseconds():
+def test_eeprom_write_waits_10_ms_for_a_word():
     pauses = []
     chip = Chip(b"abcd", refuse=3)
     assert drive(watched(eeprom.read_words(1001, 0), pauses), chip) == b"abcd"
     assert sum(pauses) >= 10_000_000
 
 
-def test_a_slave_that_is_gone_is_named():
+def test_eeprom_lost_slave_is_named():
     with pytest.raises(WorkingCounterError, match="slave 1001"):
         drive(eeprom.read_image(1001), Chip(b"", wkc=0))
 

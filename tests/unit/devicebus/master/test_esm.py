@@ -52,7 +52,7 @@ def line():
     return line
 
 
-def test_a_state_is_reached(line):
+def test_change_state_reaches_the_state(line):
     run(line, change_state(1001, PREOP))
     assert run(line, read_status(1001)).state == PREOP
     before = line.frames
@@ -70,7 +70,7 @@ def test_change_state_refused_reports_code_text_and_state(line):
     assert (caught.value.code, caught.value.state) == (0x16, INIT)
 
 
-def test_an_error_is_acknowledged_first(line):
+def test_change_state_acknowledges_an_error_first(line):
     with pytest.raises(AlStatusError):
         run(line, change_state(1002, OP))
     assert run(line, read_status(1002)).error
@@ -83,7 +83,7 @@ def test_an_error_is_acknowledged_first(line):
     run(line, change_state(1001, PREOP))
 
 
-def test_a_slave_that_does_not_answer(line):
+def test_esm_slave_without_answer(line):
     with pytest.raises(WorkingCounterError, match="slave 1003"):
         run(line, change_state(1003, PREOP))
 
@@ -102,16 +102,16 @@ def stuck(state, *, error=0, code=0):
         ({"timeout_ns": 3 * MS}, "expected SAFEOP within 3 ms"),
     ],
 )
-def test_a_slave_that_does_not_move(options, text):
+def test_change_state_times_out(options, text):
     with pytest.raises(StateTimeoutError, match=text):
         drive(change_state(7, SAFEOP, **options), stuck(INIT))
 
 
-def test_every_state_has_its_time():
+def test_change_state_has_a_time_out_for_every_state():
     assert set(TIMEOUT_NS) == set(AlState)
 
 
-def test_an_error_that_stays():
+def test_acknowledge_times_out():
     with pytest.raises(
         StateTimeoutError,
         match=r"slave 7: keeps its error 0x001B .sync manager watchdog. in SAFEOP",
@@ -119,12 +119,12 @@ def test_an_error_that_stays():
         drive(acknowledge(7), stuck(SAFEOP, error=1, code=0x1B))
 
 
-def test_a_state_that_does_not_exist():
+def test_acknowledge_refuses_an_undefined_state():
     with pytest.raises(BusError, match="slave 7: state 5 is no AL state"):
         drive(change_state(7, OP), stuck(5))
 
 
-def test_a_controller_that_emulates_a_device_mirrors_the_acknowledge_bit():
+def test_acknowledge_in_device_emulation_ignores_the_mirrored_bit():
     written = [b"\x11\0"]
 
     def emulate(access):

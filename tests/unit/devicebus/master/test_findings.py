@@ -136,7 +136,7 @@ def test_findings_both_ends_of_a_cable_are_one():
     assert (finding.slaves, finding.port, finding.is_over) == ((1002,), 1, True)
 
 
-def test_errors_from_before_the_master_looked_are_over_at_an_unknown_time():
+def test_findings_errors_before_the_first_poll_have_no_time():
     (finding,) = find_causes(line(), diagnosis(Fault(1002, 0, 1001)), History())
     assert (finding.is_over, finding.until_ns) == (True, None)
 

@@ -58,7 +58,7 @@ def test_entries_have_names_and_bits():
     ]  # fmt: skip
 
 
-def test_more_than_a_frame_holds_goes_in_several():
+def test_plan_image_splits_into_several_datagrams():
     layout = plan_image([shape(at, (8,) * 200, (8,) * 300) for at in range(1, 7)])
     assert [group.outputs_size + group.inputs_size for group in layout.groups] == [1000] * 3
     assert [group.address for group in layout.groups] == [BASE, BASE + 0x800, BASE + 0x1000]
@@ -67,7 +67,7 @@ def test_more_than_a_frame_holds_goes_in_several():
 
 
 @given(st.lists(st.tuples(st.integers(0, 700), st.integers(0, 700)), max_size=12))
-def test_no_octet_is_used_twice_and_no_slave_is_split(sizes):
+def test_plan_image_bytes_are_disjoint_and_slaves_whole(sizes):
     slaves = [shape(n, (8,) * out, (8,) * into) for n, (out, into) in enumerate(sizes)]
     layout = plan_image(slaves)
     used = []
@@ -81,7 +81,7 @@ def test_no_octet_is_used_twice_and_no_slave_is_split(sizes):
     assert len(used) == len(set(used)) == sum(map(sum, sizes))
 
 
-def test_a_bus_without_process_data_has_none():
+def test_plan_image_without_process_data_is_empty():
     layout = plan_image([shape(1), SlaveProcessData(2, ())])
     assert layout == ({}, (), ())
 
@@ -119,7 +119,7 @@ def image():
     )
 
 
-def test_values_lie_side_by_side(image):
+def test_image_values_share_bytes(image):
     image.write(1001, "lamp", True)
     image.write(1001, "mode", 5)
     image.write(1001, "speed", -2)
@@ -160,7 +160,7 @@ def test_image_unknown_entry_names_the_known_ones(image):
         image.write(1001, "speed", 40000)
 
 
-def test_a_type_of_another_width_is_a_number_of_those_bits(image):
+def test_image_type_of_another_width_is_unsigned(image):
     variable = image.variable(1001, "mode")
     assert data_type_of(variable).text == "BIT3"
     assert data_type_of(image.variable(1001, "lamp")).text == "BOOL"

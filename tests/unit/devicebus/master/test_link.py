@@ -94,7 +94,7 @@ def quick():
     return link
 
 
-def test_accesses_of_several_share_a_frame_and_each_gets_its_own_answer(link):
+def test_link_shares_frames_between_exchanges(link):
     one, two = Client(link), Client(link)
     one.ask(READ, fpwr(1001, 0x120, b"\2\0"))
     two.ask(READ)
@@ -137,7 +137,7 @@ def test_link_refuses_a_datagram_longer_than_a_frame(link, accesses):
         Client(link).ask(*accesses)
 
 
-def test_link_sends_an_overdue_frame_again_less_often_each_time_and_gives_up(quick):
+def test_link_repeats_with_growing_pauses_and_fails(quick):
     client = Client(quick)
     client.ask(READ)
     now = 0
@@ -182,7 +182,7 @@ def test_link_reply_has_the_number_of_tries(quick):
     assert client.outcomes == [([DatagramReply(b"abcdef", 1, 2)], 2 * MS)]
 
 
-def test_link_takes_the_answer_of_a_late_frame_and_drops_the_second_one(quick):
+def test_link_accepts_a_late_frame_and_drops_the_second(quick):
     client = Client(quick)
     client.ask(READ)
     (late,) = quick.frames_to_send(0)
@@ -258,7 +258,7 @@ def test_link_learns_the_round_trip_from_late_frames(quick):
         fpwr(1001, 0x130, bytes(6)),
     ],
 )
-def test_a_frame_with_the_right_index_but_of_something_else_answers_nothing(link, other):
+def test_link_frame_with_other_datagrams_is_malformed(link, other):
     client = Client(link)
     client.ask(READ)
     link.frames_to_send(0)
@@ -278,7 +278,7 @@ def test_link_matches_incremented_positions(link):
 
 
 @given(st.binary(max_size=40))
-def test_nothing_that_comes_back_does_harm(octets):
+def test_link_survives_any_frame(octets):
     link = Link()
     client = Client(link)
     client.ask(READ)
@@ -329,7 +329,7 @@ def test_indexes_go_round_and_pass_by_those_that_are_awaited(link):
     assert (seen[254], seen[255], 0 in seen) == (255, 1, False)
 
 
-def test_cyclic_frames_go_first_and_take_a_little_along():
+def test_link_sends_cyclic_frames_first_with_short_acyclic_datagrams():
     link = Link(acyclic_octets=3000)
     client = Client(link)
     long = fprd(1001, 0x1000, MAX_PIGGYBACK)

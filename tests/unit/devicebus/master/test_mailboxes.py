@@ -67,7 +67,7 @@ def number(n):
     return coe_client.upload(0x8000, n)
 
 
-def test_a_request_takes_two_frames(line, box):
+def test_mailbox_request_takes_two_frames(line, box):
     frames = line.frames
     assert line.wait(start(line, box, vendor())) == VENDOR
     assert line.frames - frames == 2
@@ -108,7 +108,7 @@ def test_mailbox_too_long_message_is_refused_before_sending(line, box):
     assert server(line).stats().gaps == 0
 
 
-def test_conversations_that_end_before_they_begin(line, box):
+def test_mailbox_conversation_without_requests(line, box):
     def nothing():
         return 5
         yield
@@ -147,7 +147,7 @@ def test_many_requesters_and_protocols_at_once_get_their_own_answers(line, box):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_nothing_is_lost_mixed_or_done_twice_under_loss(line, box, seed):
+def test_mailbox_with_lost_frames_executes_each_request_once(line, box, seed):
     dice = random.Random(seed)
     line.lose_out = lambda _: dice.random() < 0.1
     line.lose_back = lambda _: dice.random() < 0.1
@@ -162,7 +162,7 @@ def test_nothing_is_lost_mixed_or_done_twice_under_loss(line, box, seed):
     assert stats.repeats > 0
 
 
-def test_a_slave_that_does_not_answer_is_given_up_and_its_late_reply_answers_nothing(line, slow):
+def test_mailbox_late_reply_after_a_time_out_is_dropped(line, slow):
     server(line).delay_ns = 2500 * MS
     begun = line.now_ns
     with pytest.raises(MailboxTimeoutError, match="slave 1001: no COE reply within 2000 ms"):
@@ -175,7 +175,7 @@ def test_a_slave_that_does_not_answer_is_given_up_and_its_late_reply_answers_not
 
 
 @pytest.mark.parametrize("echoes", [True, False])
-def test_a_late_reply_is_not_taken_for_the_same_request_made_again(line, slow, echoes):
+def test_mailbox_late_reply_does_not_answer_the_repeated_request(line, slow, echoes):
     server(line).echoes = echoes
     server(line).delay_ns = 2100 * MS
     with pytest.raises(MailboxTimeoutError):
@@ -204,7 +204,7 @@ def test_mailbox_that_stays_full_has_its_own_error(line, box):
     assert line.wait(start(line, box, vendor())) == VENDOR
 
 
-def test_a_slave_that_is_gone_is_noticed_at_once(line, box):
+def test_mailbox_lost_slave_fails_at_once(line, box):
     line.segment.switch(0, on=False)
     line.segment.switch(0, on=True)
     begun = line.now_ns
@@ -224,7 +224,7 @@ def test_cancelling_leaves_the_mailbox_usable(line, slow):
     assert slow.stats().timeouts == 0
 
 
-def test_closing_ends_everything(line, slow):
+def test_mailbox_close_fails_all_conversations(line, slow):
     server(line).delay_ns = 100 * MS
     tasks = [start(line, slow, number(n)) for n in (1, 2)]
     line.elapse(10 * MS)
@@ -291,7 +291,7 @@ def echo(data=b"abc", **options):
     return talk()
 
 
-def test_a_conversation_may_wait_send_without_reply_and_listen(line, box):
+def test_mailbox_conversation_delays_sends_and_listens(line, box):
     server(line).protocols[MailboxType.VOE] = Talker()
 
     def talk():
@@ -340,7 +340,7 @@ def test_errors_of_files_end_the_conversation_only(line, box):
     assert line.wait(start(line, box, echo())) == b"abc"
 
 
-def test_a_reply_to_a_request_that_seemed_not_to_be_taken_is_its_reply(line, box):
+def test_mailbox_reply_during_a_repeated_write_is_accepted(line, box):
     device = line.segment.slaves[0]
     device.esc.channels[0].is_stuck = True
     first = line.frames
@@ -358,7 +358,7 @@ def test_a_reply_to_a_request_that_seemed_not_to_be_taken_is_its_reply(line, box
     assert line.wait(start(line, box, number(2))) == b"\2\0\0\0"
 
 
-def test_an_endless_talker_is_taken_in_portions(line, box):
+def test_mailbox_endless_unsolicited_messages_are_read_in_portions(line, box):
     talker = server(line).protocols[MailboxType.VOE] = Talker()
     talker.messages_to_send = lambda now: [b"again"]
     line.elapse(2 * MS)

@@ -65,13 +65,13 @@ class Wire:
         return DatagramReply(self.reply, self.wkc, self.tries)
 
 
-def test_a_message_fills_its_mailbox():
+def test_mailbox_port_writes_the_whole_mailbox():
     wire = Wire()
     assert drive(MailboxPort(7, AREA).write_message(b"abc"), wire) == WriteResult(True, False)
     assert wire.accesses == [DatagramRequest(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 0)]
 
 
-def test_a_full_mailbox_takes_nothing():
+def test_mailbox_port_full_mailbox_refuses_a_message():
     assert drive(MailboxPort(7, AREA).write_message(b"abc"), Wire(wkc=0)) == WriteResult(
         False, False
     )
@@ -123,7 +123,7 @@ def test_mailbox_port_without_any_frame_back_asks_again_with_the_same_bit():
     assert port.repeats == 1
 
 
-def test_a_slave_that_does_not_repeat_is_not_waited_for_longer_than_a_tenth_of_a_second():
+def test_mailbox_port_repeat_without_acknowledge_times_out():
     wire = Wire(acknowledges=False)
     port = MailboxPort(7, AREA)
     lose_read(port)

@@ -139,7 +139,7 @@ def test_master_requests_one_state_at_a_time_and_keeps_it():
     assert line.events() == []
 
 
-def test_a_master_without_a_bus_waits_for_nothing():
+def test_master_without_a_bus_has_no_timers():
     master = Master()
     assert (master.next_timeout(), master.image, master.next_event()) == (None, None, None)
     master.start_cycle(0)

@@ -89,7 +89,7 @@ def test_read_channels_falls_back_to_the_eeprom():
     assert line.wait(box.converse(read_channels(SII), line.now_ns)) == channels_from_sii(SII)
 
 
-def test_a_choice_is_written_in_the_order_that_slaves_want():
+def test_write_configuration_clears_counts_first():
     line = Line(Bench(), segment(slave("a")))
     box = open_mailbox(line)
     empty = PdoConfiguration(assignment={2: (), 3: (0x1A00,)})
@@ -102,7 +102,7 @@ def test_a_choice_is_written_in_the_order_that_slaves_want():
         line.wait(box.converse(write_configuration(wrong, box.sizes), line.now_ns))
 
 
-def test_a_mapping_is_written_as_index_subindex_and_bits():
+def test_write_configuration_encodes_index_subindex_and_bits():
     writing = write_configuration(
         PdoConfiguration(mapping={0x1600: ((0x7010, 2, 16),)}), MailboxSizes()
     )
@@ -126,7 +126,7 @@ def response(index, subindex, octets):
         ([(0x1C12, 0, b"\1"), (0x1C12, 1, b"\0")], "0x1C12:01 has 1 bytes, expected 2"),
     ],
 )
-def test_lists_that_are_none_are_refused(replies, text):
+def test_read_channels_refuses_invalid_lists(replies, text):
     asking = read_channels(SII)
     next(asking)
     for reply in replies[:-1]:

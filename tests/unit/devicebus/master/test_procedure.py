@@ -143,7 +143,7 @@ def test_closing_closes_all():
     assert closed == [True, True]
 
 
-def test_nothing_together_ends_at_once():
+def test_together_without_procedures_ends_at_once():
     none = together([])
     next(none)
     assert finish(none, StepReplies((), 0)) == []
@@ -167,7 +167,7 @@ def test_procedures_run_side_by_side(bench):
     assert [task.result() for task in tasks] == [b"x"] * 3
 
 
-def test_errors_of_a_procedure_are_those_of_its_task(bench):
+def test_runner_error_of_a_procedure_is_its_task_error(bench):
     task = bench.runner.start(read(1, 0, 1), 0)
     reply(bench, 0, wkc=0)
     with pytest.raises(WorkingCounterError):
@@ -207,7 +207,7 @@ def test_sleepers_wake_in_the_order_of_their_times(bench):
 
 
 @pytest.mark.parametrize("asleep", [True, False])
-def test_a_cancelled_procedure_is_closed_and_sends_nothing_more(bench, asleep):
+def test_runner_cancelled_procedure_sends_nothing_more(bench, asleep):
     closed = []
 
     def endless():

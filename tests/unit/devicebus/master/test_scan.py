@@ -91,7 +91,7 @@ def test_sixteen_slaves_share_frames():
     assert line.frames < 5 * one.frames
 
 
-def test_an_empty_bus_and_no_bus_at_all():
+def test_scan_of_an_empty_bus_and_without_frames():
     line = bench_line(slave("a"))
     line.segment.cut(0)
     with pytest.raises(FrameLostError):
@@ -99,19 +99,19 @@ def test_an_empty_bus_and_no_bus_at_all():
     assert drive(scan(), lambda _: DatagramReply(b"\0", 0)) == ()
 
 
-def test_more_slaves_than_can_be_are_refused():
+def test_scan_refuses_too_many_slaves():
     with pytest.raises(BusError, match="65000 slaves answered"):
         drive(scan(), lambda _: DatagramReply(b"\0", 65000))
 
 
-def test_a_scan_survives_lost_frames():
+def test_scan_with_lost_frames_succeeds():
     line = bench_line(*[slave(f"s{n}") for n in range(4)])
     line.lose_out = lambda number: number % 7 == 3
     line.lose_back = lambda number: number % 5 == 2
     assert [each.name for each in run(line, scan())] == ["s0", "s1", "s2", "s3"]
 
 
-def test_an_eeprom_that_cannot_be_read_spoils_only_its_own_slave():
+def test_scan_unreadable_eeprom_concerns_its_slave_only():
     line = bench_line(slave("a"), slave("b"))
     esc = line.segment.slaves[0].esc
     esc.eeprom.image[128:132] = b"\x0a\0\xff\x0f"
@@ -121,7 +121,7 @@ def test_an_eeprom_that_cannot_be_read_spoils_only_its_own_slave():
     assert (found[1].fault, found[1].name) == ("", "b")
 
 
-def test_a_slave_that_goes_away_meanwhile_is_an_error():
+def test_scan_slave_lost_meanwhile_is_an_error():
     line = bench_line(slave("a"), slave("b"))
     with pytest.raises(WorkingCounterError, match="position 2"):
         run(line, assign_stations([(0, 1001), (2, 1003)]))
@@ -163,7 +163,7 @@ def differences(*expected, found=FOUND):
     return list(iter_differences(expected, found))
 
 
-def test_the_bus_as_expected():
+def test_check_bus_accepts_the_expected_slaves():
     check_bus([COUPLER, VALVE, DRIVE], FOUND)
     exact = ExpectedSlave(name="v", vendor=0xE5A, product=2, revision=0x10000, serial=12, alias=5)
     check_bus([COUPLER, exact, DRIVE], FOUND)
@@ -185,7 +185,7 @@ def test_check_bus_additional_slave_is_one_difference():
     )
 
 
-def test_another_slave_in_its_place():
+def test_check_bus_other_slave_is_a_difference():
     (line,) = differences(COUPLER, DRIVE, DRIVE)
     assert line == (
         "position 1 (station 1002): vendor 0x00000E5A, product 0x00000002, revision 0x00010000,"

@@ -39,7 +39,7 @@ SLAVES = (
 
 
 @pytest.mark.parametrize("target", [AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP])
-def test_all_slaves_get_to_the_state_together(target):
+def test_startup_brings_all_slaves_to_the_state(target):
     line = line_of(*SLAVES)
     line.wait(line.core.bring_up(line.now_ns, target))
     assert set(states(line)) == {target}
@@ -78,7 +78,7 @@ def test_startup_slaves_with_an_alias_keep_name_and_station():
     assert not any(unit.is_lost for unit in units.values())
 
 
-def test_a_bus_that_runs_is_taken_over():
+def test_startup_takes_over_a_running_bus():
     line = line_of(*SLAVES)
     line.wait(line.core.bring_up(line.now_ns))
     line.wait(line.core.bring_up(line.now_ns))
@@ -101,7 +101,7 @@ def test_names_are_those_that_were_expected():
     assert [unit.name for unit in line.core.slaves.values()] == ["n0", "n1"]
 
 
-def test_another_bus_is_left_in_init():
+def test_startup_leaves_an_unexpected_bus_in_init():
     expected = [ExpectedSlave(name="n", vendor=0xE5A, product=8)]
     line = line_of(slave("a"), expected=expected)
     with pytest.raises(IdentityError, match="expected n with vendor"):
@@ -221,19 +221,19 @@ def test_slaves_that_need_sync0_reach_op_with_their_clocks_together():
     assert all(each.esc.clock.sync0_is_active for each in line.segment.slaves)
 
 
-def test_without_clocks_such_slaves_refuse():
+def test_startup_without_clocks_slaves_with_sync0_refuse():
     line = line_of(clocked("a"))
     with pytest.raises(AlStatusError, match="0x0030, invalid DC SYNC configuration"):
         line.wait(line.core.bring_up(line.now_ns))
 
 
-def test_a_bus_without_any_clock_runs_all_the_same():
+def test_startup_bus_without_clocks_reaches_op():
     line = line_of(slave("a", clock=None), clocks=True)
     line.wait(line.core.bring_up(line.now_ns))
     assert states(line) == [AlState.OP]
 
 
-def test_a_bus_that_is_shut_down_stays_in_init():
+def test_shut_down_bus_stays_in_init():
     line = line_of(*SLAVES)
     line.wait(line.core.bring_up(line.now_ns))
     assert line.core.cycle is not None

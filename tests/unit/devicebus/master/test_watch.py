@@ -58,7 +58,7 @@ def unsolicited(paced):
     return [(each.station, each.data) for each in events if isinstance(each, Unsolicited)]
 
 
-def test_all_that_is_said_is_heard(paced):
+def test_poll_mailboxes_reports_all_messages(paced):
     for number in (0, 3, 16):
         paced.tellers[number].news = [b"first", b"second"]
     paced.elapse(30 * MS)
@@ -67,13 +67,13 @@ def test_all_that_is_said_is_heard(paced):
     ]
 
 
-def test_a_look_at_seventeen_takes_two_frames(paced):
+def test_poll_mailboxes_of_17_slaves_takes_two_frames(paced):
     looking = poll_mailboxes(paced.core._bus)
     assert len(next(looking)) == 15
     assert len(looking.send(StepReplies([DatagramReply(b"\0", 1)] * 15, 0))) == 2
 
 
-def test_a_look_that_is_lost_is_made_again(paced):
+def test_poll_mailboxes_lost_frame_is_polled_again(paced):
     paced.tellers[0].news = [b"here"]
     first = paced.frames
     paced.lose_back = lambda number: number < first + 6
@@ -116,7 +116,7 @@ def test_port_error_log_counters_that_were_cleared_end_older_times():
     assert log.of(1001) == {1: ErrorPeriod(8, 8)}
 
 
-def test_port_error_log_forgets():
+def test_port_error_log_clear_drops_all_times():
     log = PortErrorLog()
     for now_ns in (5, 6):
         log.take(1001, counters(crc0=now_ns), now_ns)
@@ -164,7 +164,7 @@ def by_name(line):
     return {each.device.name: each for each in line.segment.slaves}
 
 
-def test_a_slave_that_leaves_op_is_brought_back_at_once(line):
+def test_watch_slave_that_leaves_op_is_brought_back(line):
     by_name(line)["b"].fail(0x1A)
     begun = line.now_ns
     line.elapse(130 * MS)
@@ -176,7 +176,7 @@ def test_a_slave_that_leaves_op_is_brought_back_at_once(line):
     assert line.core.stats().cycle.wkc_errors == 0
 
 
-def test_a_slave_that_was_switched_off_comes_back_with_its_address(line):
+def test_watch_slave_without_power_gets_its_address_back(line):
     line.segment.switch(1, on=False)
     line.elapse(30 * MS)
     assert kinds(line.events()) == [("SlaveLost", 1002)]
@@ -209,7 +209,7 @@ def test_watch_slaves_behind_a_cut_come_back(line):
     assert {each.state for each in line.segment.slaves} == {AlState.OP}
 
 
-def test_two_that_lost_their_addresses_get_their_own_again(line):
+def test_watch_two_slaves_get_their_own_addresses_back(line):
     for number in (1, 3):
         line.segment.switch(number, on=False)
     line.elapse(50 * MS)
@@ -221,7 +221,7 @@ def test_two_that_lost_their_addresses_get_their_own_again(line):
     assert stations == {"a": 1001, "branch": 1002, "b": 1003, "c": 1004}
 
 
-def test_a_slave_that_cannot_come_back_is_tried_each_second(line):
+def test_watch_failing_slave_is_retried_each_second(line):
     line.period_ns = 4 * MS
     slave_b = by_name(line)["b"]
     slave_b.refused_states[AlState.OP] = 0x1A
@@ -238,7 +238,7 @@ def test_a_slave_that_cannot_come_back_is_tried_each_second(line):
     assert kinds(line.events()) == [("SlaveBack", 1003)]
 
 
-def test_another_slave_in_its_place_is_refused(line):
+def test_watch_other_slave_at_the_position_is_refused(line):
     line.segment.switch(3, on=False)
     line.elapse(50 * MS)
     line.events()
@@ -320,7 +320,7 @@ def test_watch_return_interrupted_by_a_silent_bus_reopens_the_mailbox(line, sile
         assert unit.mailbox is not None
 
 
-def test_a_reference_clock_that_is_gone_is_followed_no_longer():
+def test_watch_lost_reference_clock_is_not_distributed():
     line = Paced(
         Master(MasterSettings(clocks=True)),
         segment(

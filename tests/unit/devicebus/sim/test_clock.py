@@ -61,7 +61,7 @@ def test_difference_is_sign_and_magnitude(memory):
 
 
 @given(st.integers(-200, 200))
-def test_loop_takes_out_drift(drift_ppm):
+def test_clock_loop_corrects_drift(drift_ppm):
     memory = bytearray(0x1000)
     clock = Clock(memory, drift_ppm=drift_ppm)
     clock.local_time(0)
@@ -108,7 +108,7 @@ def test_clock_register_is_the_time_at_the_reference(memory):
     assert get(memory, Register.DC_SYSTEM_TIME_DIFFERENCE, 4) == 0
 
 
-def test_sync0_counts_cycles_since_its_start(memory):
+def test_clock_sync0_counts_cycles(memory):
     clock = Clock(memory)
     clock.local_time(0)
     assert clock.take_sync0(10**6) == 0
@@ -125,7 +125,7 @@ def test_sync0_counts_cycles_since_its_start(memory):
 
 
 @pytest.mark.parametrize(("activation", "cycle"), [(1, 500), (2, 500), (3, 0)])
-def test_sync0_needs_both_bits_and_a_cycle(memory, activation, cycle):
+def test_clock_sync0_needs_activation_and_cycle(memory, activation, cycle):
     clock = Clock(memory)
     activate(memory, clock, activation, sync0=cycle)
     assert not clock.sync0_is_active

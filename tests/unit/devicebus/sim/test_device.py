@@ -41,7 +41,7 @@ def test_state_gives_the_rights_in_the_dictionary(state, rights):
     assert device.od_state() is rights
 
 
-def test_behaviour_gets_state_and_time():
+def test_device_behaviour_receives_state_and_time():
     seen = []
 
     class Recorder:
@@ -92,7 +92,7 @@ def test_device_override_refuses_an_invalid_value():
         device.override(0x6001, 0, 1)
 
 
-def test_error_of_a_device_without_mailbox_shows_in_its_register():
+def test_device_without_mailbox_sets_its_error_register():
     device = Device("d", ObjectDictionary([variable(0x1001, "Error", "USINT", RO)]))
     device.report_error(0x1000)
     assert device.dictionary.entry(0x1001, 0).value == 1

@@ -51,7 +51,7 @@ def test_read_gives_eight_octets(eeprom, memory):
     [(EepromCommand.READ, READ_NS), (EepromCommand.WRITE, WRITE_NS),
      (EepromCommand.RELOAD, RELOAD_NS)],
 )  # fmt: skip
-def test_command_takes_its_time(eeprom, memory, what, took_ns):
+def test_eeprom_command_takes_time(eeprom, memory, what, took_ns):
     control = EepromControl(write_enable=1, command=what)
     memory[0x0502:0x0504] = control.encode()
     memory[0x0508:0x050A] = b"\x55\xaa"
@@ -66,7 +66,7 @@ def test_command_takes_its_time(eeprom, memory, what, took_ns):
     assert (eeprom.image[:2] == b"\x55\xaa") is (what is EepromCommand.WRITE)
 
 
-def test_broken_eeprom_acknowledges_nothing(eeprom, memory):
+def test_eeprom_broken_acknowledges_nothing(eeprom, memory):
     eeprom.is_broken = True
     status = command(eeprom, memory, EepromCommand.WRITE, 4, write_enable=1, data=b"\x78\x56")
     assert (status.command_error, status.busy) == (1, 0)
@@ -87,7 +87,7 @@ def test_eeprom_write_needs_write_enable(eeprom, memory):
     assert eeprom.image[:12] == IMAGE[:8] + b"\x78\x56" + IMAGE[10:12]
 
 
-def test_write_behind_the_end_and_unknown_command_are_errors(eeprom, memory):
+def test_eeprom_write_behind_the_end_and_unknown_command(eeprom, memory):
     last = len(IMAGE) // 2
     assert command(eeprom, memory, EepromCommand.WRITE, last, write_enable=1).command_error
     assert command(eeprom, memory, 3).command_error
@@ -102,7 +102,7 @@ def test_reload_judges_the_check_sum_and_leaves_the_alias(eeprom, memory):
     assert memory[0x0012:0x0014] == b"\x34\x12"
 
 
-def test_image_with_a_wrong_check_sum_loads_nothing(memory):
+def test_eeprom_with_wrong_check_sum_loads_nothing(memory):
     Eeprom(memory, bytearray(256))
     assert EepromControl.decode(memory, Register.EEPROM_CONTROL).crc_error
     assert memory[0x0012:0x0014] == bytes(2)

@@ -113,7 +113,7 @@ def test_full_mailbox_is_an_event_for_the_master(esc):
 
 
 @pytest.mark.parametrize("group", [0x0300, 0x030C, 0x030D, 0x0310, 0x0442])
-def test_any_write_clears_a_counter(esc, group):
+def test_esc_any_write_clears_error_counters(esc, group):
     esc.memory[group] = 7
     esc.memory[0x0309] = 7
     assert esc.write(group, b"\x55", 0)
@@ -148,7 +148,7 @@ def test_eeprom_outlives_the_power(esc):
     assert esc.image[16:18] == b"\x99\x00"
 
 
-def test_fmmu_takes_effect(esc):
+def test_esc_fmmu_write_takes_effect(esc):
     unit = Fmmu(0x10000, 4, physical_start=0x1100, type=1, activate=1)
     esc.write(0x0610, unit.encode(), 0)
     ((first, last, physical, *_),) = esc.windows

@@ -423,7 +423,7 @@ def test_faults_begin_and_end(commanded):
         (b'{"kind": "tx-pdo", "slave": "slave", "object": "0x1600"}', "is no TxPDO"),
     ],
 )
-def test_refusals(commanded, command, reason):
+def test_fault_refusals(commanded, command, reason):
     with pytest.raises(ValueError, match=reason):
         obey(FaultySegment(commanded.segment), command, 0)
 
@@ -440,7 +440,7 @@ VALUES = st.recursive(
     VALUES,
     st.sampled_from(FaultKind),
 )
-def test_nothing_but_value_errors(entry, value, kind):
+def test_execute_command_raises_value_errors_only(entry, value, kind):
     commanded = Bench(generic())
     faulty = FaultySegment(commanded.segment)
     commands = (

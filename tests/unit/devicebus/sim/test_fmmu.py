@@ -55,7 +55,7 @@ def insert(data, found):
     data[:] = frame[2:]
 
 
-def test_only_active_units_with_a_length_count():
+def test_fmmu_windows_are_active_with_a_length():
     off = Fmmu(0, 4, type=1, activate=0)
     assert windows(off, unit(0, 0, 0), unit(8, 2, 3)) == windows(unit(8, 2, 3))
     assert windows(unit(0, 1, 0, bits=(5, 3, 0))) == ()
@@ -78,7 +78,7 @@ def test_direction_and_refusal():
     assert not write(memory, windows(unit(0, 2, 200)), 0, b"ab")
 
 
-def test_bits_leave_their_neighbours_alone():
+def test_fmmu_bits_keep_their_neighbours():
     memory = Memory(b"\xff" * 256)
     one_bit = windows(unit(0, 1, 5, bits=(3, 3, 6)))
     assert write(memory, one_bit, 0, b"\x00")

@@ -23,7 +23,7 @@ def mapped(kinds: list[str], assign: int, pdo: int) -> ObjectDictionary:
     return dictionary
 
 
-def test_nothing_assigned_is_nothing():
+def test_process_data_without_assignment_is_empty():
     process_data = ProcessData(ObjectDictionary())
     process_data.configure()
     assert (process_data.outputs.size, process_data.inputs.pack()) == (0, b"")
@@ -39,7 +39,7 @@ def test_plan_by_hand():
     assert process_data.inputs.pack() == bytes.fromhex("010203 ffff01")
 
 
-def test_padding_and_missing_entries_take_room():
+def test_process_data_padding_and_missing_entries_take_bits():
     dictionary = mapped(["USINT"], 0x1C12, 0x1600)
     dictionary.add(array(0x1600, "PDO", "UDINT", [8, 0x9999_0008, 0x2000_0008, 0x2000_0908], RW))
     process_data = ProcessData(dictionary)

@@ -31,7 +31,7 @@ def u16(number):
     return number.to_bytes(2, "little")
 
 
-def test_nop_does_nothing():
+def test_chain_nop_has_no_effect():
     chain, _ = line()
     assert send(chain, Command.NOP, 5, 0x1F00, b"ab")[:3] == (b"ab", 0, 5)
 
@@ -48,7 +48,7 @@ def test_by_position(position):
     assert [esc.peek(0x1F00, 2) == b"zz" for esc in escs].count(True) == 1
 
 
-def test_position_behind_the_line_counts_nothing():
+def test_chain_position_behind_the_segment_counts_0():
     chain, _ = line()
     assert send(chain, Command.APRD, 0xFFFD, 0x1F00, bytes(2))[:3] == (bytes(2), 0, 0)
     assert send(chain, Command.APRD, 7, 0x1F00, bytes(2))[:3] == (bytes(2), 0, 10)
@@ -96,7 +96,7 @@ def test_chain_read_multiple_write(command, adp):
     assert [esc.peek(0x1F00, 2) for esc in escs] == [b"pq", b"\x20\x01", b"\x20\x01"]
 
 
-def test_unknown_command_passes_untouched():
+def test_chain_unknown_command_is_unchanged():
     chain, _ = line()
     frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
     frame[2] = 15
@@ -133,7 +133,7 @@ def test_logical_read_and_write_move_the_right_octets():
     assert send(chain, Command.LRD, 4, 1, b"uv")[:2] == (b"uv", 0)
 
 
-def test_new_units_count_at_once():
+def test_chain_new_fmmus_apply_at_once():
     chain, _ = line(2)
     map_octets(chain, 1001, 0x10000, 1, 1)
     assert send(chain, Command.LRD, 0, 1, b"\0")[:2] == (b"\x10", 1)

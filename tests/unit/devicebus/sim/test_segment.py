@@ -35,7 +35,7 @@ def links(*cables, ring_end=None, master=True):
     return found
 
 
-def test_line_is_worked_off_in_its_order():
+def test_segment_line_is_processed_in_order():
     path = trace_path(links((1, 0, 1), (2, 1, 1)), (0, 0))
     assert (path.order, path.exit, path.closed_at) == ((0, 1, 2), SegmentEnd.PRIMARY, None)
     assert path.arrivals == {
@@ -93,7 +93,7 @@ def test_every_slave_answers():
     assert count(line(4)) == 4
 
 
-def test_segment_without_slaves_answers_nothing():
+def test_segment_without_slaves_loses_frames():
     frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
     assert SimulatedSegment([]).process_frame(frame, 0) is None
 
@@ -117,7 +117,7 @@ def test_cut_at_the_master_loses_frames():
     assert bench.segment.process_frame(frame, 0) is None
 
 
-def test_slave_without_power_comes_back_new():
+def test_segment_slave_returns_reset_after_power_off():
     bench = line(3)
     bench.bring(AlState.PREOP, 1)
     bench.segment.switch(1, on=False)
@@ -129,7 +129,7 @@ def test_slave_without_power_comes_back_new():
     assert bench.read(Register.AL_STATUS, 2, STATION + 2).wkc == 1
 
 
-def test_closed_port_takes_the_rest_away():
+def test_segment_closed_port_hides_the_slaves_behind():
     bench = line(3)
     assert bench.write(Register.DL_CONTROL + 1, b"\x0c") == 1
     assert count(bench) == 1
@@ -220,7 +220,7 @@ def test_next_timeout_is_never_over(late_ns):
     assert bench.slaves[0].state is AlState.SAFEOP
 
 
-def test_slave_without_power_waits_for_nothing():
+def test_segment_slave_without_power_has_no_timer():
     bench = line(2)
     bench.bring(AlState.OP)
     bench.cycle()

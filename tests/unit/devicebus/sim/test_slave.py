@@ -121,13 +121,13 @@ def test_slave_steps_up_to_op(bench, state):
         (AlState.OP, 7, AlState.SAFEOP, AlStatusCode.UNKNOWN_STATE),
     ],
 )
-def test_refused_request(bench, start, asked, status, code):
+def test_slave_refuses_invalid_requests(bench, start, asked, status, code):
     bench.bring(start)
     bench.ask(asked)
     assert bench.status() == (status | ERROR, code)
 
 
-def test_error_is_acknowledged_or_ended_by_init(bench):
+def test_slave_error_ends_by_acknowledge_or_init(bench):
     bench.bring(AlState.PREOP)
     bench.ask(AlState.OP)
     bench.ask(AlState.SAFEOP)
@@ -147,7 +147,7 @@ def test_slave_steps_down_to_init(bench, state):
     assert bench.slaves[0].next_timeout() is None
 
 
-def test_preop_needs_its_mailboxes(bench):
+def test_slave_refuses_preop_without_mailboxes(bench):
     bench.ask(AlState.PREOP)
     assert bench.status() == (AlState.INIT | ERROR, AlStatusCode.MAILBOX_PREOP)
     bench.ask(AlState.BOOT | ERROR)
@@ -184,14 +184,14 @@ def test_op_needs_outputs(bench):
     assert bench.status() == (AlState.OP, 0)
 
 
-def test_op_without_outputs_is_refused_in_time(bench):
+def test_slave_refuses_op_without_outputs(bench):
     bench.bring(AlState.SAFEOP)
     bench.ask(AlState.OP)
     bench.now_ns = OUTPUTS_TIMEOUT_NS
     assert bench.status() == (AlState.SAFEOP | ERROR, AlStatusCode.NO_OUTPUTS)
 
 
-def test_slave_without_outputs_goes_to_op_at_once():
+def test_slave_without_output_data_reaches_op_at_once():
     bench = Bench(generic(outputs=()))
     bench.bring(AlState.SAFEOP)
     bench.ask(AlState.OP)
@@ -266,7 +266,7 @@ def test_own_error_falls_out_of_op(bench):
     assert bench.slaves[0].code == AlStatusCode.SYNCHRONIZATION
 
 
-def test_refused_state_of_a_script(bench):
+def test_slave_refuses_states_of_a_fault(bench):
     bench.slaves[0].refused_states[AlState.PREOP] = 0x8000
     bench.set_channels(0, 0, 2)
     bench.ask(AlState.PREOP)
@@ -291,7 +291,7 @@ def test_mailbox_answers(bench):
     assert bench.fetch().wkc == 0
 
 
-def test_mailbox_is_dead_in_init(bench):
+def test_slave_mailbox_is_closed_in_init(bench):
     bench.set_channels(0, 0, 2)
     assert bench.post(UPLOAD_VENDOR) == 1
     assert bench.fetch().wkc == 0
@@ -311,7 +311,7 @@ def test_boot_knows_files_only(bench):
     assert bench.fetch().data[8] == 0x43
 
 
-def test_lost_reply_comes_again_by_the_repeat_bit(bench):
+def test_slave_repeats_a_lost_reply(bench):
     bench.bring(AlState.PREOP)
     bench.post(upload(1))
     first = bench.fetch().data
@@ -333,7 +333,7 @@ def test_message_not_read_yet_follows_the_repeated_one(bench):
     assert (second.wkc, second.data[11]) == (1, 2)
 
 
-def test_second_request_waits_in_the_queue(bench):
+def test_slave_queues_a_second_request(bench):
     bench.bring(AlState.PREOP)
     assert bench.post(upload(1, 0x1018, 1)) == 1
     assert bench.post(upload(2, 0x1018, 2)) == 1
@@ -357,7 +357,7 @@ def test_simple_device_exchanges_without_a_mailbox():
     assert bench.slaves[0].device.dictionary.entry(0x7000, 1).value is True
 
 
-def test_power_forgets(bench):
+def test_slave_power_cycle_resets_it(bench):
     bench.bring(AlState.OP)
     bench.slaves[0].switch(on=False)
     assert not bench.slaves[0].is_powered

@@ -10,7 +10,7 @@ from devicebus.sim.spec import BusSpec, DeviceKind
 SMALL = {"bus": "b", "slaves": [{"name": "x", "kind": "generic"}]}
 
 
-def test_a_name_and_a_kind_are_enough():
+def test_slave_spec_needs_name_and_kind():
     bus = msgspec.convert(SMALL, BusSpec)
     (slave,) = bus.slaves
     assert (slave.kind, slave.mailbox.coe, slave.after) == (DeviceKind.GENERIC, True, "")

@@ -34,7 +34,7 @@ def status(memory: bytearray, number: int = 0) -> int:
     return memory[Register.SYNC_MANAGER + 8 * number + 5]
 
 
-def test_mailbox_to_the_slave_is_full_with_its_last_octet():
+def test_sync_channel_mailbox_is_full_with_its_last_byte():
     channel, memory = mailbox_out()
     assert channel.write_by_master(START, b"head") == 0
     assert (channel.is_full, channel.take()) == (False, None)
@@ -52,7 +52,7 @@ def test_access_opens_with_the_first_octet():
     assert channel.read_by_master(START, START + SIZE) == -1
 
 
-def test_mailbox_to_the_master_is_empty_with_its_last_octet():
+def test_sync_channel_mailbox_is_empty_with_its_last_byte():
     channel, memory = mailbox_in()
     assert channel.read_by_master(START, START + SIZE) == -1
     assert channel.put(b"answer")

@@ -30,7 +30,7 @@ def values(signals, dictionary, times_ms):
     return found
 
 
-def test_nothing_to_do_is_false():
+def test_signals_without_sources_are_false():
     signals, _ = make(ChannelSpec(name="a"))
     assert not signals
 
@@ -55,7 +55,7 @@ def test_values_are_cut_to_the_type():
     assert values(*made, (0,)) == [0.5]
 
 
-def test_noise_stays_within_its_bounds_and_repeats():
+def test_signals_noise_is_bounded_and_repeatable():
     channel = ChannelSpec(name="a", type="INT", value=100, noise=5, period_ms=1)
     first = values(*make(channel), range(200))
     assert first == values(*make(channel), range(200))
