@@ -176,6 +176,7 @@ class NotificationTable:
         """
         if request.mode not in _CYCLIC and request.mode not in _ON_CHANGE:
             raise AdsRefusedError(AdsError.TRANS_MODE)
+        # An empty sample means the end of a notification, so a length of 0 cannot be watched.
         if not 0 < request.length <= MAX_WATCHED:
             raise AdsRefusedError(AdsError.WATCH_SIZE)
         pending = self._clients.get(client)

@@ -106,6 +106,7 @@ class ObjectSpace(AdsSpace):
 
 
 def _is_complete(low: int) -> bool:
+    # Bits from 9 on, such as TwinCAT's long time-out, mean nothing to a dictionary.
     if low >> 9:
         raise AdsRefusedError(AdsError.INDEX_OFFSET)
     return bool(low & _COMPLETE)

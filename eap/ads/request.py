@@ -117,6 +117,7 @@ def accept_request(command: int, body: bytes) -> AdsRequest | AmsAnswer:
     try:
         return parse_request(command, body)
     except AdsRefusedError as exc:
+        # An unknown command has no answer layout, so the error goes into the AMS header.
         if exc.result is AdsError.COMMAND:
             return AmsAnswer(error_code=exc.result)
         return AmsAnswer(encode_refusal(command, exc.result))
@@ -199,6 +200,7 @@ _PARSERS: dict[int, Callable[[bytes], Operation]] = {
 def _parse_sum(request: ReadWrite) -> AdsRequest:
     kind = SUM_COMMANDS[request.group]
     count = request.offset
+    # SUM_READ with offset 0 gives no count: the items fill the data, and have no results.
     if not count and request.group == IndexGroup.SUM_READ:
         count = len(request.data) // kind.item_size
     if count * kind.item_size > len(request.data):

@@ -119,6 +119,7 @@ class Grants:
         """Decide on one operation."""
         service = service_of(operation)
         accessed = objects_of(operation)
+        # The first rule that fits decides, as in the plant file.
         for rule in self._by_service[service]:
             if not rule.objects or (accessed is not None and _is_about(rule, accessed)):
                 verb = "allows" if rule.allow else "refuses"
@@ -220,6 +221,7 @@ class _Matcher:
             return False
         if not (self._networks or self._macs):
             return True
+        # Ethernet has no IP address: the MAC address alone identifies the peer.
         if endpoint.kind == TransportKind.ETHERNET:
             return endpoint.connection in self._macs
         return address is not None and any(address in each for each in self._networks)

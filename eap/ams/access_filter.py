@@ -240,6 +240,7 @@ class AccessFilter:
         if header.command == _NOTIFICATION:
             return data, None  # samples reach only clients that subscribed
         grants = self.access.grants(endpoint, header.source, header.target, header.target_port)
+        # Most requests only read: they pass by command or group, without parsing their operations.
         if grants.may_read and (
             header.command in _READS
             or (header.command == _READ_WRITE and data[_GROUP] in _READ_GROUPS)
@@ -284,6 +285,7 @@ class AccessFilter:
         """Refuse a request as a whole, unless some of its items may be done."""
         request, text = authorized.request, _describe(authorized)
         count = len(authorized.decisions)
+        # A sum with a result for each item is forwarded without the denied items.
         if has_results(request) and len(authorized.denied) < count:
             header, endpoint, code = authorized.header, authorized.endpoint, AdsError.ACCESS_DENIED
             text = f"{describe(header, endpoint)}: {text}"

@@ -124,6 +124,7 @@ class Admission:
         if found is None:
             return RoutingError(AdsError.TARGET_MACHINE, f"no route to {header.target}")
         route, octets = found
+        # Matched by a default route only.
         if octets < STATION_OCTETS and header.target.station == self._net_id.station:
             # A router with a route for this station's NetIDs would send it back here.
             text = f"this station has no NetID {header.target}"
@@ -132,6 +133,7 @@ class Admission:
 
     def is_duplicate(self, header: AmsHeader, onward: bytes, endpoint: Endpoint) -> bool:
         """Return whether the same request, repeated or doubled, waits already."""
+        # On TCP nothing arrives twice; two equal requests there are two requests.
         if self._transports[endpoint.transport].is_stream:
             return False
         return self._in_flight.has_request(endpoint, onward, header.invoke_id)
@@ -153,6 +155,7 @@ class Admission:
         if waiting >= self._limits.per_connection:
             text = f"{self._limits.per_connection} requests of the connection wait already"
             return RoutingError(AdsError.MAILBOX_FULL, text)
+        # A connection gets at most as much as all connections of its transport leave.
         if waiting >= self._limits.per_transport - of_transport:
             by = endpoint.transport
             text = f"{of_transport} requests by {by} wait already, {waiting} of this connection"

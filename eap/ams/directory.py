@@ -194,6 +194,7 @@ def ip_hop(port: str, here: InterfaceUri, there: InterfaceUri) -> HopSpec | None
     Both are of IP.  None says that they cannot reach each other: one of them is on its host only.
     """
     own, other = read_address(here.host), read_address(there.host)
+    # An address of all interfaces is no target; a loopback address is reached on its host only.
     if other.is_unspecified or (not own.is_unspecified and own.is_loopback != other.is_loopback):
         return None
     kind = TransportKind.UDP if here.scheme == there.scheme == "udp" else TransportKind.TCP

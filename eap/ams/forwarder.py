@@ -139,10 +139,12 @@ class Forwarder:
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
     ) -> list[Action]:
         """Forward a request to another station, or reply with an error."""
+        # Only three commands can concern notifications; the others skip the parsing of their body.
         is_tracked = header.command in TRACKED_COMMANDS
         own = (
             self.notification_forwarder.find_deleted(header, data, endpoint) if is_tracked else None
         )
+        # A subscription that this router restores is ended here: its path may be down just now.
         if own is not None and own[0].request is not None:
             return self._delete(header, data, own, endpoint, now_ns)
         found = self._authorize(header, data, endpoint, now_ns)
@@ -184,6 +186,7 @@ class Forwarder:
     ) -> list[Action]:
         """Return an answer to its client, unless it is late or from another hop."""
         pending = self.in_flight.get(header.invoke_id)
+        # An ID alone is no proof: hop, command and addresses have to be those of the request.
         if pending is None or not self._is_answer(header, data, endpoint, pending):
             return self._error_replier.drop(
                 endpoint, None, Outcome.LATE, _describe_late(header), now_ns
@@ -261,6 +264,7 @@ class Forwarder:
 
     def connection_closed(self, endpoint: Endpoint, now_ns: int) -> list[Action]:
         """Forget the requests of *endpoint*, and end its notifications."""
+        # Forwarded requests stay until their deadline: without them a loop would not be found.
         for pending in self.in_flight.abandon(endpoint):
             self._give_up(pending)
             if pending.route is None:
@@ -328,6 +332,7 @@ class Forwarder:
         found = self._authorize(header, packet, endpoint, now_ns)
         if isinstance(found, RoutingError):
             return found
+        # The restorer sends the request itself, so nothing is audited by its answer.
         route, _, authorized = found
         if authorized is not None:
             self._access_filter.abandon(authorized)
@@ -370,6 +375,7 @@ class Forwarder:
         if authorized is not None:
             self._access_filter.abandon(authorized, AdsError.NO_MORE_HANDLES)
         text = f"no more than {MAX_PER_CLIENT} notifications a client, {MAX_TOTAL} in all"
+        # In the body, not in the AMS header: the target can be reached, but refuses.
         body = AdsError.NO_MORE_HANDLES.to_bytes(4, "little") + bytes(4)
         why = RoutingError(AdsError.NO_MORE_HANDLES, text, body=body)
         return self._error_replier.reply_error(header, endpoint, why, now_ns)
@@ -389,6 +395,7 @@ class Forwarder:
         route: Route | None, authorized: AuthorizedRequest | None, now_ns: int,
     ) -> Pending | list[Action]:  # fmt: skip
         """Add a request that has an answer, unless a limit or a loop forbids it."""
+        # UDP and Ethernet may double packets: the copy is dropped, the original is answered.
         if self._admission.is_duplicate(header, onward, endpoint):
             if authorized is not None:
                 self._access_filter.abandon(authorized)
@@ -401,6 +408,7 @@ class Forwarder:
                 self._access_filter.abandon(authorized, why.error)
             return self._error_replier.reply_error(header, endpoint, why, now_ns)
         invoke_id = header.invoke_id
+        # The ID of another router is kept, so that a loop is found, unless it is in use here.
         if route is None or not is_marked(invoke_id) or invoke_id in self.in_flight:
             invoke_id = self._ids.allocate(self.in_flight)
         allowed = self._limits.timeout_ns

@@ -159,6 +159,7 @@ class HopProber:
         hop = self._by_number.get(header.invoke_id)
         if hop is None or not is_from(hop, endpoint):
             return None
+        # Errors count as well: a router that refuses the read is alive.
         self.note_answer(hop, now_ns)
         known = self._hops[hop]
         known.is_down = False
@@ -199,6 +200,7 @@ class HopProber:
             endpoint = self._by_number[number]
             heappush(self._schedule, (now_ns + interval_ns, number))
             hop = self._hops[endpoint]
+            # Without an open probe the first one after the pause counts no miss.
             if endpoint in self._paused or endpoint.transport in self._closed:
                 hop.probed_at_ns = None
             elif endpoint in self.watched or hop.is_due(now_ns, interval_ns):

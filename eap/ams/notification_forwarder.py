@@ -237,6 +237,7 @@ class NotificationForwarder:
             granted.new.append(subscription)
             if displaced is not None:
                 granted.displaced.append(displaced)
+            # The client has this handle already, from another server: it gets one of this router.
             if subscription.handle != handle:
                 new = subscription.handle.to_bytes(_HANDLE, "little")
                 body = body[: at + _HANDLE] + new + body[at + _GRANTED.size :]
@@ -287,6 +288,7 @@ class NotificationForwarder:
         if place is None or len(pending.request_body) > _LONGEST_LOOKUP:
             return
         mine = self._symbols.setdefault(endpoint, OrderedDict())
+        # A handle is valid at one server only, so the addresses belong to the key.
         key = _addresses(pending.header), *place
         mine[key] = pending.request_body
         mine.move_to_end(key)

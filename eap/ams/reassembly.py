@@ -100,6 +100,7 @@ class AmsStreamDecoder:
         if int.from_bytes(self._buffer[:2], "little") in _COMMANDS:
             return self._cut_command()
         length = decode_prefix(self._buffer)
+        # The packet is skipped, not the connection: its sender still gets an answer by the header.
         if length > self._limit:
             return self._cut_header(length)
         if len(self._buffer) < start + length:
@@ -220,6 +221,7 @@ class FragmentAssembler:
         number, fragment = header.invoke_id >> 16, header.invoke_id & 0xFFFF
         key = number, header.source, header.source_port
         self.expire(now_ns)
+        # Fragment 0 always begins anew: packet numbers of 16 bits repeat.
         if fragment == 0:
             self._start(key)
         partial = self._partial.get(key)

@@ -164,6 +164,7 @@ class RouteTable:
             if before.route.origin < route.origin:
                 return False
             self.remove(*key)
+            # A replaced route keeps its rank among the routes of its origin.
             rank = route.origin.value, before.rank[1]
         elif route.origin is Origin.LEARNED and self._learned >= MAX_LEARNED:
             return False
@@ -200,6 +201,7 @@ class RouteTable:
         by_prefix = self._by_prefix
         learned = None
         for level in _LEVELS:
+            # A learned route goes before a default route, and behind all others.
             if not level and learned is not None:
                 return learned
             ranked = by_prefix.get(target[:level])

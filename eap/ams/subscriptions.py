@@ -197,6 +197,7 @@ class Subscriptions:
         elif displaced is not None:
             self.detach(displaced)
         mine = self._by_client.setdefault(endpoint, {}).setdefault(subscription.addresses, {})
+        # Two servers behind one address may give the same handle; the client sees distinct ones.
         while subscription.handle in mine:
             subscription.handle = _FIRST_OWN_HANDLE + self._own_handle % (1 << 30)
             self._own_handle += 1
@@ -330,6 +331,7 @@ def divide(
                 is_as_it_came = False
                 continue
             hop = found.grant.route.hop
+            # A sample without bytes ends a subscription, unless zero bytes were requested.
             if not sample.data and (found.request is None or found.request.length):
                 ended.append(found)
                 is_as_it_came = False
@@ -342,6 +344,7 @@ def divide(
                 else:
                     mine.append((stamp.time, Sample(found.handle, sample.data)))
                     is_as_it_came = False
+    # The usual case, one client and nothing to change: the body is sent without encoding it again.
     if len(parts) == 1 and is_as_it_came:
         bodies = [(*client, body) for client in parts]
     else:

@@ -161,6 +161,7 @@ def decode_prefix(data: Buffer, offset: int = 0) -> int:
 
 def encode_with_prefix(packet: bytes) -> bytes:
     """Return a whole AMS packet with its prefix."""
+    # Reserved is 0, so the prefix is one number of six bytes.
     return (len(packet) << _LENGTH_AT).to_bytes(AmsTcpHeader.SIZE, "little") + packet
 
 

@@ -169,6 +169,7 @@ def encode_segment(
     specifier: SdoRequest | SdoResponse, data: Buffer = b"", *, toggle: int, last: bool = False
 ) -> bytes:
     """Return a segment that carries *data*."""
+    # Segments have at least seven bytes of data; *unused* counts the padding.
     unused = max(0, SEGMENT_MINIMUM - len(data))
     head = SdoSegmentHeader(last, unused, toggle, specifier)
     return head.encode() + bytes(data) + bytes(unused)
@@ -183,6 +184,7 @@ def decode_segment(body: Buffer) -> tuple[SdoSegmentHeader, bytes]:
     """Return header and data of a segment; raise TruncatedError if it is empty."""
     head = SdoSegmentHeader.decode(body)
     data = bytes(body[SdoSegmentHeader.SIZE :])
+    # In a longer segment *unused* has no meaning (ETG.1000.6, SDO segment).
     if len(data) <= SEGMENT_MINIMUM:
         data = data[: SEGMENT_MINIMUM - head.unused]
     return head, data
@@ -190,6 +192,7 @@ def decode_segment(body: Buffer) -> tuple[SdoSegmentHeader, bytes]:
 
 def encode_abort(index: int, subindex: int, code: int) -> bytes:
     """Return the data of a mailbox message that aborts a transfer, from either side."""
+    # Either side aborts with the service SDO request, never with SDO response.
     head = SdoHeader(0, 0, 0, 0, SdoRequest.ABORT, index, subindex, code)
     return encode_message(CoeService.SDO_REQUEST, head.encode())
 

@@ -150,6 +150,7 @@ class IpSettings(msgspec.Struct, frozen=True):
             if not flags & flag:
                 return None
             part, view = bytes(view[:size]), view[size:]
+            # Some masters cut the name to its length instead of padding it.
             if len(part) < size and flag is not _Flag.NAME:
                 raise TruncatedError(f"{flag.name} is not all there", layout="IpSettings")
             return part

@@ -120,12 +120,18 @@ def decode_frame(data: Buffer) -> tuple[MailboxHeader, memoryview]:
         MalformedError: the frame is of another type, or its protocol is unknown.
     """
     if len(data) >= _HEADS.size:  # the usual frame in one step
-        word, size, address, lane, kind = _HEADS.unpack_from(data)
+        word, size, address, channel, kind = _HEADS.unpack_from(data)
         end, protocol = _HEADS.size + size, _TYPES.get(kind & _TYPE_MASK)
         whole = EtherCatHeader.SIZE + (word & _LENGTH_MASK)
         if word >> _TYPE_AT == _MAILBOX and end <= whole <= len(data) and protocol is not None:
             header = MailboxHeader(
-                size, address, lane & 0x3F, lane >> 6, protocol, kind >> _COUNTER_AT & 7, kind >> 7
+                size,
+                address,
+                channel & 0x3F,
+                channel >> 6,
+                protocol,
+                kind >> _COUNTER_AT & 7,
+                kind >> 7,
             )
             return header, memoryview(data)[_HEADS.size : end]
     ethercat = EtherCatHeader.decode(data)
@@ -171,6 +177,7 @@ def encode_plain_frame(kind: MailboxType, address: int, counter: int, body: byte
     length = size + MailboxHeader.SIZE
     if length >> _LENGTH_BITS:
         return encode_frame(MailboxHeader(0, address, type=kind, counter=counter), body)
+    # Both headers in one pack: a station does this for each AMS packet of type 5.
     word = length | _MAILBOX << _TYPE_AT
     return _HEADS.pack(word, size, address, 0, kind | counter << _COUNTER_AT) + body
 

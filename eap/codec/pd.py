@@ -64,6 +64,7 @@ def decode_frame_header(data: Buffer) -> PdFrameHeader:
             layout="EtherCatHeader",
         )
     header = PdFrameHeader.decode(data, PD_FRAME_START)
+    # A count that cannot fit is refused here, before a loop runs over 65535 PDs.
     needed = PdFrameHeader.SIZE + header.count * PdHeader.SIZE
     if needed > ethercat.length:
         raise TruncatedError(

@@ -195,6 +195,7 @@ def encode_fragments(header: SoeHeader, body: Buffer, room: int) -> list[bytes]:
             header.error,
             header.drive,
             header.elements,
+            # The IDN is in the last fragment only; the others count down in its place.
             left or header.idn,
         )
         messages.append(head.encode() + piece)

@@ -60,6 +60,7 @@ class ObjectDictionary:
         try:
             return item.entries[subindex]
         except KeyError:
+            # As IgH answers: a gap exists but has no data, an index above the last does not exist.
             gap = subindex <= item.max_subindex
             code = AbortCode.NOT_STORED if gap else AbortCode.NO_SUBINDEX
             raise SdoAbortError(code, index, subindex) from None
@@ -132,6 +133,7 @@ class ObjectDictionary:
             raise SdoAbortError(code, index, first, f"{len(data)} bytes for entries of {plan.size}")
         accepted = []
         for (subindex, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
+            # Read-only entries are part of the data too, and ignored.
             if not entry.access & state.write_right:
                 continue
             octets = extract_bits(data, bit_offset, entry.kind)
@@ -139,6 +141,7 @@ class ObjectDictionary:
             accepted.append((subindex, entry, octets))
         if count is not None:
             counter = self[index].entries[0]
+            # With subindex 0 at 0 a half-written list is never used.
             accepted = [(0, counter, b"\0"), *accepted, (0, counter, bytes((count,)))]
         else:
             _check_any_writable([entry for _, entry in chosen], index, first, state)

@@ -196,6 +196,7 @@ class ClientPorts:
         if not is_request(packet):
             return packet
         client = packet[_SOURCE]
+        # The router itself needs no port of a client.
         if client[:6] == self._net_id and not _is_given(_port(client)):
             return packet
         source = self._net_id + self._port_of(client).to_bytes(2, "little")

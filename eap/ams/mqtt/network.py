@@ -296,6 +296,7 @@ class MqttNetwork:
     def connected(self, now_ns: int) -> list[Action]:
         """Return what to do first on a new connection, in this order."""
         self._connected_at_ns = now_ns
+        # Retained infos may be older than the connection: live routers publish theirs again.
         self._refresh_at_ns = now_ns + CONFIRM_NS
         return [
             *self._report_missing(),
@@ -386,6 +387,7 @@ class MqttNetwork:
     def _receive_own_info(self, info: Info, now_ns: int, *, is_retained: bool) -> list[Action]:
         if not info.is_online:
             return self._schedule_info(now_ns)  # the last will of a connection before this one
+        # The own info comes back from the broker.
         if info == self._info or is_retained:
             return []
         text = f"{info.name!r} tells that it has the NetID {self._net_id}, which is this station's"
