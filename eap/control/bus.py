@@ -238,6 +238,7 @@ def to_octets(text: str) -> bytes:
 
 
 def _to_ms(ns: int) -> int:
+    # Rounded up: a short time-out must not become 0.
     return -(-ns // MS)
 
 

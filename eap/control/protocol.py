@@ -306,6 +306,7 @@ def encode_request(number: int, method: str, params: dict[str, Any]) -> bytes:
 def encode_result(number: int | None, result: Any) -> bytes:
     """Return the line of an answer, or of an error if the answer would be too long."""
     line = _line({"v": VERSION, "id": number, "result": result})
+    # The client's reader has the same limit, and would lose the connection over a longer line.
     if len(line) <= MAX_LINE:
         return line
     reason = f"the answer has {len(line)} bytes, at most {MAX_LINE}: ask for fewer names"

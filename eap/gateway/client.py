@@ -84,6 +84,7 @@ class GatewayClient(Closeable):
         kind = socket.SOCK_STREAM if tcp else socket.SOCK_DGRAM
         self._place = f"gateway {host}:{port}"
         self._conversations = GatewayConversations(
+            # TCP repeats lost data by itself: one request waits as long as all tries of a datagram.
             timeout_ns=round(timeout_s * (tries if tcp else 1) * _S),
             tries=1 if tcp else tries,
             silence=f"{self._place} {silence(timeout_s * tries, 'TCP' if tcp else 'UDP')}",

@@ -237,6 +237,7 @@ class GatewayConversations:
                 until_ns = now_ns + self.timeout_ns
                 queue.late.append(_LateReplies(request, None, request.sends, until_ns))
             queue.conversations.remove(conversation)
+        # Slaves handle one SDO or file at a time (ETG.1000.6): an abandoned one would block them.
         if was_sent and not request.is_taken and request.ask.type in ABORT_MESSAGES:
             abort = ABORT_MESSAGES[request.ask.type]
             frame = encode_plain_frame(abort.type, address.number, 0, abort.request)
@@ -325,6 +326,7 @@ class GatewayConversations:
         """Send the one request again, without delay, that a mailbox error has to belong to."""
         if len(address.queues) == 1:
             return
+        # A mailbox error names no protocol; with one request left it can only belong to that.
         left = [request for _, request in address.pending() if request.is_in_flight]
         if len(left) == 1 and left[0].is_single:
             left[0].deadline_ns = now_ns
@@ -345,6 +347,7 @@ class GatewayConversations:
         request = queue.pending
         if request is None:
             return False
+        # A fragment is awaited without a request, so it cannot be requested again either.
         if request.ask.listen and not request.sends:
             request.sends = request.tries = 1
             request.deadline_ns = now_ns + self.timeout_ns * self.tries

@@ -48,6 +48,7 @@ class MemoryBudget:
     def grant(self, host: str, more: int) -> bool:
         """Change the bytes held by a host by *more*; return False if that exceeds a limit."""
         own = self._hosts.get(host, 0) + more
+        # Releasing memory never fails, also above a limit.
         if more > 0 and (own > self._of_host or self.held + more > self._in_all):
             return False
         self.held += more
@@ -134,6 +135,7 @@ class RequestTracker:
         client = self._client(endpoint, now_ns)
         if client is None:
             return RequestAdmission.CROWDED
+        # A repeat is recognised before any limit: it costs nothing, and its answer is on the way.
         if frame in client.waiting:
             client.counts.repeated += 1
             return RequestAdmission.REPEATED
@@ -195,6 +197,7 @@ class RequestTracker:
         rate = self._limits.rate
         if not rate:
             return True
+        # Token bucket: the burst is as large as the rate of one second.
         earned = client.credit + (now_ns - client.last_ns) * rate / _S
         client.credit, client.last_ns = min(rate, earned), now_ns
         if client.credit < 1:
@@ -223,6 +226,7 @@ class Ticket:
 
     def release(self) -> None:
         """The request waits no more; harmless the second time."""
+        # Called again when the task of the request ends, however that was.
         tracker, self._tracker = self._tracker, None
         if tracker is not None:
             tracker.answered(self._endpoint, self._frame)

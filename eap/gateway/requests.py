@@ -101,9 +101,11 @@ class AddressMap:
             return MasterAddress()
         if address == ALL_SLAVES:
             return GroupAddress(stations)
+        # Virtual addresses go first: a slave that was exchanged is found where tools look for it.
         found = self._virtual.get(address)
         if found is not None:
             return found
+        # A slave may have a station address with bit 15 set; then the bit is no mark.
         if address & VIRTUAL_BIT and address not in stations:
             return SlaveAddress(address & ~VIRTUAL_BIT)
         return SlaveAddress(address)
@@ -148,6 +150,7 @@ def _of_coe(body: bytes) -> Operation | None:
         return _of_info(body)
     if service != _REQUEST:
         return _RAW
+    # Too short for an index: nothing to decide on, and the codec answers with an error.
     if len(body) < CoeHeader.SIZE + 4:
         return None
     command, index, subindex = body[2], body[3] | body[4] << 8, body[5]
@@ -210,6 +213,7 @@ def _of_aoe(body: bytes) -> Operation:
         operations = parse_request(header.command, bytes(data)).operations
     except (CodecError, AdsRefusedError):
         return _RAW
+    # A client may acknowledge fragments of an answer; rules cannot see into those.
     is_answer = header.state_flags & StateFlags.RESPONSE
     return operations[0] if len(operations) == 1 and not is_answer else _RAW
 
@@ -274,6 +278,7 @@ def _coe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     if service == CoeService.SDO_INFORMATION:
         body = SdoInfoHeader(SdoInfoOpcode.ERROR).encode() + InfoError(code).encode()
         return encode_coe(CoeService.SDO_INFORMATION, body)
+    # Emergencies and PDOs are no requests and have no abort.
     if service != CoeService.SDO_REQUEST:
         return None
     subindex = request[_SUBINDEX] if len(request) > _SUBINDEX else 0
@@ -295,6 +300,7 @@ def _soe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     if opcode not in {SoeOpcode.READ_REQUEST, SoeOpcode.WRITE_REQUEST}:
         return None
     return encode_soe(
+        # The response opcode of SoE is that of its request plus one.
         SoeOpcode(opcode + 1),
         int.from_bytes(request[2:4], "little"),
         cause.soe.to_bytes(2, "little"),
@@ -307,6 +313,7 @@ def _soe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
 def _aoe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     try:
+        # Without a whole AMS header there is no address to answer to.
         asked = AmsHeader.decode(request)
     except CodecError:
         return None

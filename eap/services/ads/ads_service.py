@@ -46,6 +46,7 @@ def begin_answer(command: int, body: bytes, perform: Perform) -> AmsAnswer | Awa
     if request.sum_group:
         return _perform_all(Outcomes(request), request.operations, perform)
     outcome = perform(request.operations[0])
+    # An operation that is done already needs no task.
     if isinstance(outcome, OperationOutcome):
         return _encode(command, outcome)
     return _finish(command, outcome)
@@ -71,6 +72,7 @@ async def _perform_all(
     for number, operation in enumerate(operations, start=1):
         outcome = perform(operation)
         outcomes.add(outcome if isinstance(outcome, OperationOutcome) else await outcome)
+        # A sum command may have hundreds of operations; other clients are served in between.
         if not number % _AT_ONCE:
             await asyncio.sleep(0)
     return outcomes.answer()
@@ -91,6 +93,7 @@ async def control_state(device: StationDevice, request: WriteControl) -> Operati
 
 def first_handle() -> int:
     """Return a handle to begin with: another one at each start, see ``NotificationTable``."""
+    # A client that keeps a handle over a restart must not reach another notification with it.
     return randbelow(1 << 31) + 1
 
 
@@ -150,6 +153,7 @@ class AdsService:
 
 def device_info(name: str, release: str) -> AdsDeviceInfo:
     """Return name and version of a device; *release* is such as ``0.1.0``."""
+    # A pre-release such as 0.1.0rc1 has parts that are no numbers.
     numbers = [int(part) if part.isdecimal() else 0 for part in release.split(".")]
     major, minor, build = (*numbers, 0, 0, 0)[:3]
     return AdsDeviceInfo(major & 0xFF, minor & 0xFF, build & 0xFFFF, device_name(name))

@@ -146,6 +146,7 @@ class SlaveAds:
                 if isinstance(operation, Write):
                     return b""
                 found = await self._read(target, group, offset)
+        # An ADS client cannot detect a truncated value, so a longer one is an error.
         if len(found) > length:
             why = f"{len(found)} bytes, the client has room for {length}"
             raise AdsRefusedError(AdsError.SIZE, why)
@@ -246,6 +247,7 @@ async def _execute(access: LocalSlave, place: SoeOffset) -> None:
         await asyncio.sleep(_POLL_S)
         octets = await access.read_elements(place.idn, Element.DATA_STATE, drive=place.drive)
         state = DataState(int.from_bytes(octets[:2], "little") & DataState.FAILED)
+    # A command stays active until it is cleared, also after an error (IEC 61800-7-300).
     await access.write_elements(place.idn, Element.VALUE, _CLEAR, drive=place.drive)
     if state & DataState.ERROR:
         raise SoeError(f"{what}: failed", code=SoeErrorCode.GENERAL)
@@ -276,6 +278,7 @@ class AoeForwarder:
             await self._set_address(target)
             self._addressed.add(station)
         outcome = await self._exchange(target, operation, source)
+        # The slave has forgotten its AMS address, as after a power cycle.
         if outcome.result in _OTHER_ADDRESS:
             await self._set_address(target)
             outcome = await self._exchange(target, operation, source)
@@ -308,6 +311,7 @@ def _protocol(slave: SlaveDescription, group: int) -> SiiProtocol:
         name = str(protocol.name).replace("OE", "oE")
         why = f"slave {slave.station} does not speak {name}"
         raise AdsRefusedError(AdsError.SERVICE, why)
+    # A slave that is missing on the bus: an exchange would only run into its time-out.
     if not slave.state:
         raise AdsRefusedError(AdsError.TIMEOUT, f"slave {slave.station} does not answer")
     if not slave.to_slave:
@@ -407,6 +411,7 @@ class BusService:
         perform_in_time = partial(_perform_until, end_s, perform)
         answer = await answer_request(header.command, request.body, perform_in_time)
         result = int.from_bytes(answer.data[:_RESULT_SIZE], "little")
+        # Routers put errors of the route into the AMS header, and clients look for them there.
         return AmsAnswer(error_code=result, why=answer.why) if result in _IN_HEADER else answer
 
     def client_gone(self, endpoint: Endpoint) -> None:
@@ -432,6 +437,7 @@ class BusService:
         found = slave
 
         async def perform(operation: Operation) -> OperationOutcome:
+            # State and name are cached: a client can read them to see why the bus is down.
             if not isinstance(operation, ReadState | ReadDeviceInfo):
                 check_up(self._name, bus)
             return await self._slaves.perform(found, client, operation)

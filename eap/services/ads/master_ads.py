@@ -80,6 +80,7 @@ class StateRequests:
 
     def request(self, station: int, state: int) -> None:
         """Bring a slave, or with station 0 all of them, to a state."""
+        # Two requests for one slave would pull it to and fro; the later one wins.
         if (before := self._tasks.pop(station, None)) is not None:
             before.cancel()
         task = self._running.start(self._bring(station, AlState(state)))
@@ -211,6 +212,7 @@ class MasterAds:
         return answer
 
     async def _refresh(self) -> None:
+        # An engine that hangs sends no events; a request shows that it is alive.
         await self._view.confirm()
         for index in self._watched:
             await self._provider.refresh(index)
@@ -293,6 +295,7 @@ class RawCommands:
     def accesses(self) -> list[DatagramRequest]:
         """Return the datagrams to send, behind one that counts the slaves."""
         return [
+            # The working counter of a BRD is the number of slaves, which the answers need.
             brd(0, 1),
             *(
                 DatagramRequest(Command(head.command), head.adp, head.ado, octets, _TRIES)
@@ -313,6 +316,7 @@ class RawCommands:
 
 def _returned_header(head: DatagramHeader, slaves: int) -> DatagramHeader:
     """Return the header as it is behind all slaves."""
+    # On a real bus every slave increments the address; clients such as AdsLib count slaves by it.
     adp = head.adp + slaves if head.command in _COUNTING else head.adp
     return DatagramHeader(
         head.command, head.index, adp & 0xFFFF, head.ado, head.length, more=head.more

@@ -120,6 +120,7 @@ class SlaveFiles:
         is_write: bool,
     ) -> bytes:
         owner = client.net_id
+        # A slave handles one file at a time (ETG.1000.6): an abandoned one would block the next.
         self._drop_abandoned(owner, station)
         self._check_limits(owner)
         text = _text(name)
@@ -200,6 +201,7 @@ class SlaveFiles:
     def _new_handle(self) -> int:
         handle = 0
         while not handle or handle in self._open:
+            # Random: a handle from before a restart must not reach another file.
             handle = secrets.randbits(8 * _HANDLE_SIZE)
         return handle
 
@@ -245,6 +247,7 @@ async def _in_time(work: Awaitable[T], what: str) -> T:
 
 def _text(name: bytes) -> str:
     try:
+        # Clients written in C send the name with its terminating NUL.
         return name.rstrip(b"\0").decode()
     except UnicodeDecodeError:
         raise AdsRefusedError(AdsError.VALUE, "the file name is not UTF-8") from None

@@ -290,6 +290,7 @@ class EapAds(AdsService):
 
         Most requests are such.
         """
+        # The common request, a plain read, is answered without an operation or a task.
         if header.command != _READ or len(body) != AdsRange.SIZE:
             return None
         asked = AdsRange.decode(body)
@@ -309,6 +310,7 @@ class EapAds(AdsService):
         if _changes_objects(operation):
             return self._change(perform)
         outcome = perform()
+        # A write that found another writer is not repeated: its client decides which value counts.
         if outcome.result == AdsError.BUSY and not isinstance(operation, Write):
             return _retry_busy(perform)
         return outcome

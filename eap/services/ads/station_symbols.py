@@ -65,6 +65,7 @@ class ImageVariables:
 
     def read(self, name: str) -> bytes:
         """Return the bytes of a value; refuse with BUSY while its writer is in the middle."""
+        # Values of one notification come from one sample, not from the running image.
         if self._sample is not None:
             return take(self._image.slots[name], self._sample, self._first_bit)
         try:
@@ -234,6 +235,7 @@ class NotificationPump:
         if self._samples is None or self._samples.image is not image:
             self._samples = ImageSamples(image)
         is_done = self._send_due(self._samples, unix_ns - now_ns)
+        # The engine samples only on request, so an idle station pays nothing.
         self._samples.want(2 + _SAMPLE_LEASE_NS // (1000 * image.layout.cycle_us))
         return self._delay_ns(now_ns) if is_done else _SHORT_PAUSE_NS
 

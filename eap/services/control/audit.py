@@ -39,6 +39,7 @@ MAX_BYTES = 8 << 20
 """Of the file before it is put aside."""
 KEPT = 4
 """Older files."""
+# O_NOFOLLOW: a link in the folder must not redirect the audit.
 _FLAGS = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 LOCK_S = 0.2
 """Longest wait for the lock, which others hold as long as it takes to write a few lines.
@@ -73,6 +74,7 @@ class AuditFile:
             try:
                 _write_all(fd, lines)
             except OSError:
+                # A part of a line would hide the next one from readers.
                 os.ftruncate(fd, size)
                 raise
             if size + len(lines) >= MAX_BYTES:
@@ -88,6 +90,7 @@ class AuditFile:
             if monotonic() >= deadline_s:
                 self._wait_s = 0.0
                 raise OSError(errno.EAGAIN, "another process holds its lock")
+            # No sleep: another process holds the lock for as long as one write takes.
             os.sched_yield()
         self._wait_s = LOCK_S
         return fd
@@ -99,6 +102,7 @@ class AuditFile:
         try:
             with suppress(BlockingIOError, FileNotFoundError):
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Another process may have rotated the file between open and lock.
                 is_locked = os.path.samestat(os.fstat(fd), self.path.stat())
         finally:
             if not is_locked:
@@ -254,6 +258,7 @@ class Audit:
         head = self._head(station, entry)
         lines = []
         for each in entry.operations:
+            # The rate of a required audit was charged when the change began.
             has_begun = self.is_required and each.decision.is_allowed
             if has_begun or self._allow(client):
                 lines.append(head | _result_fields(each))

@@ -152,6 +152,7 @@ class BusConnection:
         kind = records.kind_of(wanted.protocol)
         try:
             async with asyncio.timeout(records.TURN_S):
+                # The connection is the requester: its conversations queue as those of one client.
                 turn = await client.lock_mailbox(wanted.slave, kind, id(self))
         except TimeoutError:
             reason = f"slave {wanted.slave}: its {kind.name} mailbox was busy with other clients"
@@ -164,6 +165,7 @@ class BusConnection:
     async def _ask(self, wanted: records.BusAskParameters) -> records.MailboxData:
         held = self._of(wanted.conversation)
         request = records.to_request(held.kind, wanted)
+        # A slow slave is no idle client: the timer runs between requests only.
         self._end_idle(held)
         try:
             message = await held.turn.exchange(request)

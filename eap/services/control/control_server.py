@@ -229,6 +229,7 @@ class ControlServer:
             logger.debug("control client disconnected: %s", group.exceptions[0])
         finally:
             bus.close()
+            # Not close(): it would wait for a client that does not read.
             transport.abort()
 
 
@@ -363,6 +364,7 @@ class _Client:
                 return
             async with reader.while_there():
                 result = await self._call_audited(request)
+        # The client has disconnected, see while_there(): no answer can be sent.
         except TimeoutError:
             raise
         except ControlError as exc:

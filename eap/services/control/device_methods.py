@@ -183,6 +183,7 @@ def _page(
     for item in items:
         if item.index < first:
             continue
+        # The last row may exceed the page: the longest line has room for 32 pages.
         if room <= 0:
             return rows, item.index
         rows.append(row(item))

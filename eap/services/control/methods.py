@@ -186,7 +186,9 @@ def _snapshot(image: Image, places: list[VariableSlot]) -> control.Values:
 
     Values that the engine writes are those of the cycle that is named.
     """
+    # The engine's values are copied between two cycles, so that all are of one cycle.
     engine = image.snapshot()
+    # One value is read without copying the regions of all writers.
     if len(places) == 1:
         (place,) = places
         source = engine if place.writer is Writer.ENGINE else image

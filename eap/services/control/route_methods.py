@@ -204,6 +204,7 @@ class RouteMethods:
     ) -> records.RemoteRouteResult:
         view, address = self._view(wanted.station), _address(wanted.address)
         name = wanted.name or view.router.name
+        # Texts of the UDP service end with a NUL: one inside would truncate them silently.
         if "\0" in name + wanted.user + wanted.password:
             raise ControlError("NUL in name, user or password", code=ErrorCode.VALUE)
         route = RemoteRouteRequest(name, view.router.net_id, wanted.user, wanted.password)
@@ -242,6 +243,7 @@ class RouteMethods:
         view = self._view(wanted.station)
         routes, left_out = [], []
         for route in view.router.table:
+            # StaticRoutes files know neither default routes nor virtual NetIDs.
             is_plain = route.octets and route.real is None
             if is_plain and route.hop.kind == TransportKind.AMS_TCP:
                 address = route.hop.connection.removesuffix(_USUAL_PORT)

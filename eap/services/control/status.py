@@ -53,9 +53,11 @@ class ProcessMeter:
         times (CLOCK_BOOTTIME).
         """
         at_ns, before_ns, known = self._samples.get(pid, (0, 0, NOTHING_MEASURED))
+        # The kernel counts in ticks: a share over a few milliseconds would be 0 or 100 %.
         if at_ns and now_ns - at_ns < MIN_SAMPLE_NS:
             return known
         try:
+            # The process name in brackets may itself contain spaces and brackets (proc(5)).
             fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
             resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
         except (OSError, IndexError):
@@ -91,6 +93,7 @@ class SharedAnswer:
 
     async def _run(self) -> dict[str, Any]:
         async with self._lock:
+            # From here on the answer is in the making: later requests get the next one.
             self._next = None
             return await self._make()
 

@@ -122,6 +122,7 @@ def _encode(kind: DataType, number: int) -> bytes:
     """Return *number* as near as *kind* can hold it."""
     limits = kind.scalar_range
     if limits is not None:
+        # Counters of the image have 64 bits, entries of the profile fewer: they stay at the limit.
         number = int(min(max(number, limits[0]), limits[1]))
     return kind.encode(number)
 

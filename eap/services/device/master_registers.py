@@ -82,12 +82,14 @@ def read_registers(stations: Sequence[int]) -> Procedure[dict[int, SlaveRegister
         replies, _ = yield [access for station in part for access in _accesses(station)]
         for number, station in enumerate(part):
             al, dl, loops, errors = own = replies[number * _EACH : (number + 1) * _EACH]
+            # A slave that answers only some of the reads is just leaving or joining the bus.
             if all(reply.wkc for reply in own):
                 found[station] = SlaveRegisters(
                     AlStatus.decode(al.data),
                     DlStatus.decode(dl.data),
                     int.from_bytes(dl.data, "little"),
                     loops.data[0],
+                    # Each port has two counters: invalid frames, and RX errors, which are left out.
                     tuple(errors.data[::2]),
                 )
     return found

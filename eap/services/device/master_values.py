@@ -205,6 +205,7 @@ class MasterView:
         """Refresh what the object at *index* shows; a bus that is down has no slaves."""
         if self.is_fresh(index):
             return
+        # Concurrent readers wait for one read of the bus instead of causing one each.
         async with self._lock:
             with suppress(EapError):
                 await self._view.current()
@@ -309,6 +310,7 @@ class MasterView:
         elif key is MasterLive.LINK_CONTROL:
             access = [fpwr(station, LOOPS, bytes((value,)))]
             self._start(self._bus.transfer(access))
+            # The next reader must see the loops as they are after the write.
             self._registers.expire()
         elif value:
             self._fixed.add(station)
@@ -359,6 +361,7 @@ class MasterView:
             report = BusReport(is_up=False)
         now_s, last = asyncio.get_running_loop().time(), self._counters.value.rates
         rates = last
+        # The counts of a restarted engine begin at 0.
         if not last.at_s or report.cycles < last.cycles:
             rates = Rates(now_s, report.cycles, report.frames_sent)
         elif now_s - last.at_s >= _RATE_S:
@@ -375,6 +378,7 @@ class MasterView:
             found = await self._bus.run(read_registers(self.configured()))
         except EapError:
             return {}
+        # A slave clears its code when the error is acknowledged; the dictionary keeps the last one.
         self._codes |= {at: each.al.code for at, each in found.items() if each.al.code}
         return found
 

@@ -87,12 +87,14 @@ async def _play(
             if str(exc) != complaint:
                 complaint = str(exc)
                 logger.warning("%s keeps its value: %s", label, exc)
+        # Periods that were missed are left out, not made up for.
         due = max(due + period_ms / 1000, clock())
         await asyncio.sleep(due - clock())
 
 
 def _sources(station: StationSpec) -> list[tuple[Source, str]]:
     """Return the sources that services plays, with the types of their variables."""
+    # The same source with another type of its variable has to be started again.
     types = {variable.name: variable.type for variable in station.variables}
     played = (each for each in station.sources if isinstance(each, (HostSource, CsvSource)))
     return [(each, types[each.variable]) for each in played]

@@ -54,6 +54,7 @@ class EngineClient:
                 started runs what has been stored.
             EnvironmentalError: the runtime folder cannot be written.
         """
+        # By file: a specification of a thousand PDs is longer than a message of the pair.
         path = self._folder / f".{os.getpid()}-{next(self._numbers)}.spec"
         try:
             path.write_bytes(record_to_lines(spec))
@@ -191,6 +192,7 @@ class StationKeeper:
     async def _run(self, record: Stored) -> None:
         spec = record.spec
         try:
+            # Stored before the engine is asked, see rule 1.
             await self._save(record)
             if spec != self.spec or self._is_engine_unknown:
                 await self._engine.configure(self.spec.name, spec)
@@ -219,6 +221,7 @@ class StationKeeper:
         try:
             await self._engine.set_state(self.spec.name, state)
         except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
+            # On the way down the station is stopped in any case: without an engine nothing runs.
             if state > self.state:
                 raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
             self._is_engine_unknown = True

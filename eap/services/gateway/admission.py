@@ -84,6 +84,7 @@ class GatewayAdmission:
 
     def may_read(self, endpoint: Endpoint, target: RuleTarget, operation: Operation) -> bool:
         """Return whether an operation is a read where the client may read everything."""
+        # Reads are most of the traffic: where all may be read, no decision object is made.
         if not isinstance(operation, Read):
             return False
         return self._access().grants(endpoint, NO_SOURCE, *target).may_read
@@ -93,6 +94,7 @@ class GatewayAdmission:
     ) -> Decision:
         """Decide on an operation; *by_rule*: a change only if a rule says so."""
         decision = self._access().grants(endpoint, NO_SOURCE, *target).decide(operation)
+        # A default permission is meant for one slave; a group write changes all of them at once.
         if by_rule and decision.service is not AccessService.READ and not decision.is_by_rule:
             why = "only a rule allows it for several slaves at once"
             return decision._replace(is_allowed=False, why=why)
@@ -161,6 +163,7 @@ def error_in(kind: MailboxType, body: bytes) -> int:
             return AdsError.SERVICE
         case MailboxType.COE if len(body) >= CoeHeader.SIZE + SdoHeader.SIZE:
             head = SdoHeader.decode(body, CoeHeader.SIZE)
+            # An abort may come with the service of a request or of a response.
             if body[1] >> 4 in _SDO and head.specifier == SdoRequest.ABORT:
                 return ads_result(SdoAbortError(head.value, head.index, head.subindex))
         case MailboxType.SOE if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR:

@@ -175,6 +175,7 @@ async def _read_file(name: str, access: SlaveAccess, max_size: int) -> bytes:
         raise DialectError(DialectFailure.FILE_NAME, "no file name")
     file = access.open_file(name, 0, is_write=False)
     try:
+        # One byte more than fits shows that the file is too long, without reading all of it.
         return await file.read(max_size + 1)
     finally:
         file.close()

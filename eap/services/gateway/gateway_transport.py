@@ -30,6 +30,7 @@ class GatewayTransport:
         self._gateway: MailboxGateway | None = None
         self._name = ""
         if gateways:
+            # A mailbox address names no bus: several gateways need sockets of their own.
             self._gateway, self._name = gateways[0]
 
     @property

@@ -129,6 +129,7 @@ class ElementCodec(MessageCodec):
         return encode_fragments(back, answer, self.sizes.data_to_master - SoeHeader.SIZE)
 
     def _take(self, data: bytes) -> None:
+        # Collected first: a client that pauses between fragments does not block the slave.
         self._written += data
         if len(self._written) > MAX_WRITTEN:
             raise GatewayError(Cause.TOO_LONG)
@@ -225,6 +226,7 @@ class EoeListeners:
         of_slave = self._by_station.setdefault(station, OrderedDict())
         of_slave[endpoint] = EoeListener(address, send, now_ns + LISTENS_NS)
         of_slave.move_to_end(endpoint)
+        # EoE names no client, so each listener gets a copy of every frame of the slave.
         if len(of_slave) > MAX_LISTENERS:
             of_slave.popitem(last=False)
 

@@ -79,6 +79,7 @@ def open_gateways(
             AddressMap({each.address: _destination(each) for each in spec.addresses}),
             partial(_open_remote, router, settings),
         )
+        # A disabled gateway exists all the same, so that it can be started at run time.
         gateway.is_open = spec.enabled
         gateways[bus.owner] = gateway
     return gateways

@@ -96,6 +96,7 @@ class GatewayStatistics:
         """Count one request; *reasons* has None for each message that a slave answered with."""
         row = self._rows.get((station, kind))
         if row is None:
+            # Addresses are free to invent; the table is not.
             if len(self._rows) >= _MAX_ROWS:
                 return
             row = self._rows[station, kind] = _StatisticsRow()
@@ -187,6 +188,7 @@ class ReplyEncoder:
         self._count_errors(request, kind, reasons)
         if replies and replies[0].is_repeat:
             self._count_repeat(request.endpoint)
+        # Released before the answer goes out: the client may send the same bytes anew at once.
         if address == request.header.address:  # not one of many
             request.release()
         for reply in replies:

@@ -141,6 +141,7 @@ class ClientSession:
     async def _handle(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[GatewayReply]:
         if self._is_repeated(body):
             return [replace(each, is_repeat=True) for each in self._replies or ()]
+        # A step after a time-out of the session: its transfer is over at the slave, too.
         if is_step and not self.is_running:
             return self._error_replies(body, Cause.SERVICE, "no active transfer")
         self._stop_timer()
@@ -172,6 +173,7 @@ class ClientSession:
         except TimeoutError:
             self.close()
             return self._error_replies(body, Cause.TIMEOUT)
+        # The session goes on: a mailbox error of the slave ends one request, not the client.
         except MailboxRefusedError as exc:
             self.codec.reset()
             return [GatewayReply(*mailbox_error(exc.detail))]

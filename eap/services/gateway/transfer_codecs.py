@@ -151,6 +151,7 @@ class ObjectCodec:
         where, complete = (head.index, head.subindex), bool(head.complete)
         stream = self._stream = await self._access.open_object(*where, complete=complete)
         size, room = stream.size, self.sizes.to_master - INITIATE_OVERHEAD
+        # Up to 4 bytes go in the header itself, whatever the size of the mailbox.
         if size <= max(room, EXPEDITED_SIZE):
             data = await stream.read(size)
             self.reset()
@@ -162,6 +163,7 @@ class ObjectCodec:
 
     async def _download(self, head: SdoHeader, data: bytes) -> None:
         where, complete = (head.index, head.subindex), bool(head.complete)
+        # Without a size the slave's own entry decides how many of the 4 bytes count (ETG.1000.6).
         if head.expedited and not head.has_size and not complete:
             await self._access.write_unsized(*where, head.data)
             return
@@ -333,6 +335,7 @@ class FileCodec:
 
     async def _open(self, body: bytes, name: str, head: FoeHeader) -> list[bytes]:
         file = self._file
+        # The same request again continues an opening that was answered BUSY.
         if file is None or self._number is not None or body != self._opened:
             self.reset()
             self._opened, self._is_write = body, head.opcode is FoeOpcode.WRITE
@@ -351,6 +354,7 @@ class FileCodec:
         room = self.sizes.to_master - DATA_OVERHEAD
         data = await file.read(room)
         self._number = (self._number or 0) + 1
+        # A file whose size is a multiple of the packet ends with an empty packet (ETG.1000.6).
         self._is_last = len(data) < room
         self._sent = encode_foe(FoeOpcode.DATA, self._number, data)
         return [self._sent]
@@ -361,6 +365,7 @@ class FileCodec:
         if not self._is_taken:
             await file.write(data)
             self._is_taken = True  # also if its end takes longer
+        # A packet that does not fill the mailbox is the last one of a file (ETG.1000.6).
         if len(data) < self.sizes.to_slave - DATA_OVERHEAD:
             await file.finish()
             self.reset()

@@ -213,6 +213,7 @@ class LocalSlave:
             turn.close()
             raise
         stream = ObjectStream(*start)
+        # The object came whole: the mailbox is free before its reader has taken it.
         if len(start.data) == start.size:
             turn.close()
         else:

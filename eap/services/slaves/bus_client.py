@@ -168,8 +168,10 @@ class MailboxQueues:
             client = next(iter(clients))
             turns = clients.pop(client)
             turn = turns.popleft()
+            # At the end of the queue: behind each request of a client comes the next client.
             if turns:
                 clients[client] = turns
+            # A waiter whose request was cancelled is skipped.
             if not turn.done():
                 turn.set_result(None)
                 return
@@ -203,6 +205,7 @@ class MailboxLock:
             EngineGoneError: there is no engine, or not the one with which it began.
         """
         self._is_idle = False
+        # The engine answers at the time-out of the slave itself; this limit is for a dead engine.
         limit_s = (request.delay_ns + request.timeout_ns) / _NS_PER_S + MARGIN_S
         reply = await self._link.request(lambda number: self._step(number, request), limit_s)
         return reply.message or MailboxMessage(self._kind, b"")
@@ -318,6 +321,7 @@ class BusClient:
         await self._wait_up()
         mailbox = station, kind
         try:
+            # A free mailbox, as mostly, is taken without the price of a time-out.
             async with asyncio.timeout(None if self._queues.is_free(mailbox) else lock_s):
                 await self._queues.acquire(mailbox, requester)
         except TimeoutError:

@@ -120,6 +120,7 @@ class FileStream(ABC):
         """Wake all waiters to check their conditions again."""
         self.has_lock |= has_lock
         self.is_open |= is_open
+        # Waiters of the old event check their conditions; later ones wait for the next event.
         self._changed.set()
         self._changed = asyncio.Event()
 
@@ -132,6 +133,7 @@ class FileStream(ABC):
 
     async def wait_space(self) -> None:
         """Wait until more is to be read: once there was no room, until there is for a half."""
+        # Hysteresis: one packet for each packet fetched would be one stall each.
         if len(self.buffer) >= max(self._ahead, self._wanted):
             await self._wait_stalled(lambda: len(self.buffer) < max(self._ahead // 2, self._wanted))
 
@@ -193,6 +195,7 @@ class FileHistory:
         if self._is_kept and self.can_rewind:
             self._data += data
             FileHistory.all_kept += len(data)
+            # Beyond the limit the file goes on, but a fault of the bus ends it.
             if len(self._data) > MAX_KEPT or FileHistory.all_kept > MAX_ALL_KEPT:
                 self.can_rewind = False
                 self.forget()
@@ -284,6 +287,7 @@ class LocalFile(FileStream):
             if not self.is_write:
                 await self.wait_space()
             message = await turn.exchange(request)
+            # Waits between packets, where slaves allow pauses, not within one.
             if self.is_write and message.data[:1] == _ACK:
                 self.notify(is_open=True)
                 await self.wait_data(room)

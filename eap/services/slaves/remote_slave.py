@@ -337,7 +337,9 @@ class RemoteFile(FileStream):
             self.buffer += data
             self.progress.done += len(data)
             self.notify()
+            # By ADS a file ends with a block shorter than requested.
             is_last = len(data) < size
+            # The first block comes soon, later ones save round trips.
             size = min(2 * size, BLOCK)
 
     async def _drain(self) -> None:
@@ -369,6 +371,7 @@ class RemoteFile(FileStream):
                     ReadWrite(group, offset, length, data), timeout_s=STEP_S
                 )
             except RemoteAccessError as exc:
+                # BUSY has done nothing at the other station, so the same request is safe to repeat.
                 if exc.result != AdsError.BUSY or self._is_closed:
                     raise
             await asyncio.sleep(PAUSE_S)

@@ -68,6 +68,7 @@ class SegmentLink:
             return
         with suppress(msgspec.MsgspecError):
             answer = msgspec.json.decode(octets, type=dict[str, Any])
+            # An answer after its time-out has no waiter any more.
             future = self._waiting.get(answer.get("id", 0))
             if future is not None and not future.done():
                 future.set_result(answer)
