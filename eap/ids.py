@@ -247,14 +247,15 @@ def parse_host(text: str, usual_port: int) -> tuple[str, int]:
         raise ValueError(f"{number!r} is not a port (1 to 65535)")
     labels = host.rstrip(".").split(".")
     if all(each.isdecimal() for each in labels):
-        if not _is_host(host):
+        if not is_host(host):
             raise ValueError(f"{host!r} is not the IPv4 address of a host")
     elif len(host) > _MAX_HOST_NAME or not all(map(_LABEL.fullmatch, labels)):
         raise ValueError(f"{host!r} is no name of a host")
     return host, int(number) if separator else usual_port
 
 
-def _is_host(text: str) -> bool:
+def is_host(text: str) -> bool:
+    """Return whether *text* is an IPv4 address that a single host can have."""
     try:
         address = IPv4Address(text)
     except ValueError:

@@ -153,9 +153,8 @@ def _targets(index: Index, text: str, shared: set[str]) -> list[AccessTarget]:
 
 def _slave(index: Index, station: StationSection, port: PortSection, slave: str) -> int:
     """Return the station address of a slave; without a bus file any number is valid."""
-    bus = index.buses.get((station.name, port.name))
     # Without a bus file any slave may be there, and any station address is accepted.
-    known = {each.name: each.station for each in bus.slaves} if bus else {}
+    known = {each.name: each.station for each in index.slaves(station, port.name)}
     if port.kind is not PortKind.BUS:
         raise SectionError("", f"{station.name}/{port.name} has no slaves", "a bus port")
     if slave in known:
@@ -248,8 +247,9 @@ def _check_rule(
 def _transports(station: StationSection) -> list[str]:
     """Return all that ``transports`` may name at *station*."""
     found = [*map(str, TransportKind)]
-    names = [port.name for port in station.ports if port.kind is PortKind.EAP]
-    transports = [f"{kind}:{name}" for name in names for kind in ("udp", "tcp", "ethernet")]
+    transports = [
+        f"{kind}:{name}" for name in station.eap_ports for kind in ("udp", "tcp", "ethernet")
+    ]
     return [*found, *transports, *(f"mqtt:{route.network}" for route in brokers_of(station))]
 
 

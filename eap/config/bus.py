@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from ipaddress import IPv4Address
 from pathlib import Path
 from typing import TypeAlias
 
@@ -13,8 +12,8 @@ from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import ExpectedBus, Index
 from eap.config.routes import SectionError
 from eap.config.structs import Plain, PlantFile, PortSection, StationSection
-from eap.ids import InterfaceUri
-from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
+from eap.ids import InterfaceUri, is_host
+from eap.pd.spec import GatewayAddress, GatewaySpec, PortKind
 from eap.suggest import suggest
 
 DescribeBus: TypeAlias = Callable[[Path], ExpectedBus | tuple[PlantFinding, ...]]
@@ -35,10 +34,8 @@ def check_bus_port(port: PortSection, uri: InterfaceUri, report: FindingReport) 
         return
     if uri.options:
         report.add(path, f"{uri.scheme}:// takes no options", f"{uri.scheme}://{uri.host}")
-    if uri.scheme == "udp":
-        address = IPv4Address(uri.host)
-        if address.is_multicast or address.is_unspecified or uri.host == "255.255.255.255":
-            report.add(path, f"{uri.host} is no address of a bus", "the address of one segment")
+    if uri.scheme == "udp" and not is_host(uri.host):
+        report.add(path, f"{uri.host} is no address of a bus", "the address of one segment")
     if uri.scheme == "sim" and port.bus and Path(port.bus) != Path(uri.host):
         message = f"port {port.name} simulates {uri.host}, but is described by {port.bus}"
         report.add(f"{port.at}.bus", message, "no key bus: the simulated file is the description")
@@ -162,7 +159,7 @@ def gateway_port(station: StationSection, port: PortSection) -> int:
 
 def ip_addresses_of(index: Index, station: StationSection) -> Iterator[str]:
     """Yield the IP addresses of a station, each once."""
-    uris = (index.uris.get((station.name, each.name)) for each in _eap_ports(station))
+    uris = (index.uris.get((station.name, name)) for name in station.eap_ports)
     found = (uri.host for uri in uris if uri is not None and uri.scheme in {"udp", "tcp"})
     yield from dict.fromkeys(found)
 
@@ -222,7 +219,7 @@ def _member(
 
 def _slave(index: Index, station: StationSection, port: PortSection, slave: object) -> int:
     """Return the station address of a slave, given by that address or by its name."""
-    slaves = slaves_of(index, station, port)
+    slaves = index.slaves(station, port.name)
     for each in slaves:
         if slave in {each.name, each.station} or str(slave) == str(each.station):
             return each.station
@@ -238,12 +235,6 @@ def _slave(index: Index, station: StationSection, port: PortSection, slave: obje
     raise SectionError("", f"{name} has no slave {text!r}{hint}", TARGET)
 
 
-def slaves_of(index: Index, station: StationSection, port: PortSection) -> tuple[BusSlaveSpec, ...]:
-    """Return the described slaves of a bus, none if no bus file describes it."""
-    bus = index.buses.get((station.name, port.name))
-    return bus.slaves if bus else ()
-
-
 def _virtual(port: PortSection) -> dict[int, Plain]:
     found: dict[int, Plain] = {}
     for text, target in port.gateway.addresses.items():
@@ -252,10 +243,6 @@ def _virtual(port: PortSection) -> dict[int, Plain]:
         except SectionError:
             continue  # a finding of its own
     return found
-
-
-def _eap_ports(station: StationSection) -> Iterator[PortSection]:
-    return (port for port in station.ports if port.kind is PortKind.EAP)
 
 
 def _is_bus(port: PortSection) -> bool:
@@ -281,7 +268,7 @@ def _check_addresses(
 ) -> None:
     path = f"{port.at}.gateway.addresses"
     first: dict[int, str] = {}
-    stations = {slave.station for slave in slaves_of(index, station, port)}
+    stations = {slave.station for slave in index.slaves(station, port.name)}
     is_unresolved = port.name in index.unread_buses(station)
     for text, target in port.gateway.addresses.items():
         try:

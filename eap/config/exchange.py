@@ -33,7 +33,7 @@ from eap.ids import NetId
 from eap.pd import rules
 from eap.pd.address import is_group_source, source_octets
 from eap.pd.device import FaultCode
-from eap.pd.spec import REQUESTER, PortKind
+from eap.pd.spec import REQUESTER
 from eap.suggest import suggest
 
 
@@ -54,7 +54,7 @@ def check_port_reference(
     index: Index, report: FindingReport, station: StationSection, at: str, name: str
 ) -> None:
     """Report a *name* at *at* that is not an EAP port of *station*."""
-    known = [port.name for port in station.ports if port.kind is PortKind.EAP]
+    known = station.eap_ports
     if name in known or name in report.broken:
         return
     if (station.name, name) in index.ports:

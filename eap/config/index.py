@@ -237,6 +237,11 @@ class Index:
         """Return the bus ports of *station* without a readable description."""
         return [port for name, port in self._unread if name == station.name]
 
+    def slaves(self, station: StationSection, port: str) -> tuple[BusSlaveSpec, ...]:
+        """Return the described slaves of a bus port, none if no bus file describes it."""
+        bus = self.buses.get((station.name, port))
+        return bus.slaves if bus else ()
+
     def names(self, station: StationSection) -> list[str]:
         """Return the names of all variables of *station*."""
         names = [*station.variables]

@@ -287,7 +287,7 @@ def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
         kind=port.kind,
         interface=index.uris[station.name, port.name],
         net_id=port.net_id,
-        vlan_id=port.vlan.id if port.vlan else 0,
+        vlan_id=port.vlan_id,
         vlan_priority=port.vlan.priority if port.vlan else 0,
         join=tuple(dict.fromkeys(groups)),
         broadcast=port.broadcast or any(each.host == IP_BROADCAST for each in destinations),
@@ -372,18 +372,15 @@ def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
                     is_bus=port.kind is PortKind.BUS,
                     net_id=port.net_id,
                     interface=index.uris[station.name, port.name],
-                    slaves=_slaves(index, station, port.name),
+                    slaves={
+                        slave.name: slave.station for slave in index.slaves(station, port.name)
+                    },
                 )
                 for port in station.ports
             ),
         )
         for station in index.plant.stations
     )
-
-
-def _slaves(index: Index, station: StationSection, port: str) -> dict[str, int]:
-    bus = index.buses.get((station.name, port))
-    return {slave.name: slave.station for slave in bus.slaves} if bus else {}
 
 
 def _configured_routes(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import msgspec
 
 from eap.errors import ConfigError
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, is_host
 
 MIN_STATIONS = 2
 MAX_STATIONS = 250
@@ -116,9 +116,8 @@ def _place(number: int, address: str, count: int) -> _StationAddress:
     except ValueError as exc:
         raise ConfigError(f"address {address!r}: {exc}") from None
     if uri.scheme == "udp":
-        host = IPv4Address(uri.host)
-        if host.is_multicast or host.is_unspecified or host == IPv4Address("255.255.255.255"):
-            raise ConfigError(f"address {address!r}: {host} is no address of a station")
+        if not is_host(uri.host):
+            raise ConfigError(f"address {address!r}: {uri.host} is no address of a station")
         net_id = uri.host
     elif uri.scheme == "ethernet":
         if not _INTERFACE.fullmatch(uri.host):

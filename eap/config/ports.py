@@ -22,6 +22,7 @@ from eap.ids import (
     InterfaceUri,
     MacAddr,
     NetId,
+    is_host,
 )
 from eap.od.profiles import eap1000 as profile
 from eap.pd import rules
@@ -137,7 +138,7 @@ def reaches(
         is_for_it = destination.kind is DestinationKind.MAC or port.net_id == NetId.parse(
             destination.host
         )
-        return uri.scheme == "ethernet" and _vid(sender[0]) == _vid(port) and is_for_it
+        return uri.scheme == "ethernet" and sender[0].vlan_id == port.vlan_id and is_for_it
     if (destination.port or EAP_PORT) != (uri.port or EAP_PORT):
         return False
     if destination.kind is DestinationKind.TCP:
@@ -157,10 +158,6 @@ def group_of(destination: Destination) -> str | None:
         usual = {str(EAP_MULTICAST_MAC), str(BROADCAST_MAC)}
         return None if destination.host in usual else destination.host
     return destination.host
-
-
-def _vid(port: PortSection) -> int:
-    return port.vlan.id if port.vlan else 0
 
 
 def check_net_id_destination(
@@ -227,21 +224,11 @@ def check_frame_monitoring(
     *destination* is None for frames to the requester.
     """
     spec = frame.spec(str(destination))
-    if frame.monitor_ip and uri.scheme == "ethernet" and not _is_host(frame.monitor_ip):
+    if frame.monitor_ip and uri.scheme == "ethernet" and not _is_remote_host(frame.monitor_ip):
         path = f"{frame.at}.monitor_ip"
         report.add(path, f"monitor_ip is {frame.monitor_ip!r}", "the IPv4 address of one host")
         spec = replace(spec, monitor_ip="")
     report.add_breaches(frame.at, rules.check_monitoring(spec, destination, uri))
-
-
-def _is_host(text: str) -> bool:
-    try:
-        address = IPv4Address(text)
-    except ValueError:
-        return False
-    return not (address.is_multicast or address.is_loopback or address.is_unspecified) and (
-        text != "255.255.255.255"
-    )
 
 
 _EAP_SCHEMES = {"udp", "ethernet", "tcp", "loop"}
@@ -354,6 +341,10 @@ def _check_keys(port: PortSection, report: FindingReport) -> None:
             report.add(f"{port.at}.{key}", f"{message} ports", f"no {key} on {what} ports")
 
 
+def _is_remote_host(text: str) -> bool:
+    return is_host(text) and not IPv4Address(text).is_loopback
+
+
 def _is_own(host: str) -> bool:
     address = IPv4Address(host)
     return not address.is_multicast and str(address) != "255.255.255.255"
@@ -423,7 +414,7 @@ def _own_addresses(station: str, port: PortSection, uri: InterfaceUri) -> Iterat
         yield "TCP", uri.host, str(uri.port or EAP_PORT)
     if uri.scheme == "ethernet":
         # Stations share an interface, ports of one station would take each frame twice.
-        vid = port.vlan.id if port.vlan and port.kind is PortKind.EAP else 0
+        vid = port.vlan_id if port.kind is PortKind.EAP else 0
         yield station, port.kind.value, uri.host, str(vid)
 
 

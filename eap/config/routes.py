@@ -18,7 +18,7 @@ from eap.codec.ethercat import EAP_PORT
 from eap.config.brokers import HOST, brokers_of, check_brokers, find_network
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
-from eap.config.structs import PortSection, RouteSection, StationSection
+from eap.config.structs import RouteSection, StationSection
 from eap.ids import (
     STATION_OCTETS,
     Destination,
@@ -29,7 +29,6 @@ from eap.ids import (
     parse_host,
     prefix_text,
 )
-from eap.pd.spec import PortKind
 from eap.suggest import suggest
 
 VIA = "STATION/PORT, mqtt:NETWORK, an IPv4 address, tcp:// and one, a MAC address or a NetID"
@@ -100,7 +99,7 @@ def next_hop(index: Index, station: StationSection, route: RouteSection) -> Next
 
 def _check_own_port(index: Index, station: StationSection, route: RouteSection) -> None:
     if route.port and index.eap_port(station, route.port) is None:
-        names = [port.name for port in station.ports if port.kind is PortKind.EAP]
+        names = station.eap_ports
         message = (
             f"station {station.name} has no EAP port {route.port!r}{suggest(route.port, names)}"
         )
@@ -130,7 +129,7 @@ def _other_port(
     if other is station:
         raise SectionError(key, f"{text} is of station {name} itself", "a port of another station")
     if index.eap_port(other, port) is None:
-        names = [f"{name}/{each.name}" for each in other.ports if each.kind is PortKind.EAP]
+        names = [f"{name}/{each}" for each in other.eap_ports]
         raise SectionError(key, f"station {name} has no EAP port {port!r}", one_of(names))
     return other, port
 
@@ -322,10 +321,9 @@ def find_hop(
 
 
 def _eap_ports(index: Index, station: StationSection, name: str) -> Iterator[str]:
-    for port in station.ports:
-        known = port.kind is PortKind.EAP and (station.name, port.name) in index.uris
-        if known and name in {"", port.name}:
-            yield port.name
+    for port in station.eap_ports:
+        if (station.name, port) in index.uris and name in {"", port}:
+            yield port
 
 
 def _hop(
@@ -342,14 +340,10 @@ def _hop(
         return None if hop is None else (hop, bits)
     if uri.scheme == target.scheme == "ethernet":
         port, there = index.ports[own], index.ports[other]
-        if is_wanted or (uri.host == target.host and _vid(port) == _vid(there)):
+        if is_wanted or (uri.host == target.host and port.vlan_id == there.vlan_id):
             address = MacAddr.parse(there.mac) if there.mac else there.net_id
             return HopSpec(TransportKind.ETHERNET, own[1], str(address)), 0
     return None
-
-
-def _vid(port: PortSection) -> int:
-    return port.vlan.id if port.vlan else 0
 
 
 _OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four numbers"

@@ -109,6 +109,11 @@ class PortSection(Section, frozen=True):
     frame_retries: FrameRetries = 4
     gateway: GatewaySection = GatewaySection()
 
+    @property
+    def vlan_id(self) -> int:
+        """VID of the frames, 0 if they have no tag."""
+        return self.vlan.id if self.vlan else 0
+
     EAP_KEYS: ClassVar[tuple[str, ...]] = (
         "vlan",
         "join",
@@ -344,6 +349,11 @@ class StationSection(Section, frozen=True):
     learn: bool | tuple[str, ...] = True
     access: tuple[AccessSection, ...] = ()
     users: tuple[UserSection, ...] = ()
+
+    @property
+    def eap_ports(self) -> list[str]:
+        """Names of the EAP ports."""
+        return [port.name for port in self.ports if port.kind is PortKind.EAP]
 
 
 class Defaults(Section, frozen=True):

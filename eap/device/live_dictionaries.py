@@ -27,7 +27,7 @@ _MAX_ROUTES = router9000.ROUTE.last - router9000.ROUTE.first + 1
 
 
 class RouterValues(Protocol):
-    """The running router; values are numbers, octets or texts, as the router9000's types say."""
+    """The running router; values are numbers, bytes or texts, as the types of the profile say."""
 
     def number(self, key: RouterLive) -> int:
         """Return the value of *key* for the router as a whole."""
@@ -150,7 +150,7 @@ _DETECT = 0xF002
 
 
 class MasterValues(Protocol):
-    """The running master; values are numbers, octets or texts, as the profile's types say."""
+    """The running master; values are numbers, bytes or texts, as the types of the profile say."""
 
     def configured(self) -> Sequence[int]:
         """Return the station addresses of the configuration, in the order of the bus."""

@@ -49,7 +49,7 @@ class PdVariable(NamedTuple):
 
 
 class PdLayout(NamedTuple):
-    """A version, and the variables that it stands for; *size* in octets."""
+    """A version, and the variables that it stands for; *size* in bytes."""
 
     version: int
     size: int
