@@ -36,6 +36,7 @@ def drive(
         result: T = end.value
         return result
     finally:
+        # Also after an error of *exchange*, so that a transfer under way is released at once.
         conversation.close()
 
 

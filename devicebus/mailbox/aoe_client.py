@@ -21,8 +21,8 @@ from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ams import AmsHeader, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxHeader, MailboxType
 
+# Limit for dropped fragments of other answers before a request fails.
 _MAX_LATE = 16
-"""Limit for dropped fragments of other answers before a request fails."""
 
 
 def exchange(

@@ -216,8 +216,8 @@ class _Sdo:
 
 MAX_INFO_SIZE = 0x20002
 """Limit for a description in bytes: a list of all 65,536 indexes."""
+# Limit for dropped fragments of other answers before a request fails.
 _MAX_LATE = 16
-"""Limit for dropped fragments of other answers before a request fails."""
 
 
 def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:

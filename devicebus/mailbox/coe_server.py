@@ -243,8 +243,8 @@ class SdoServer:
         write(index, subindex, data, self._state())
 
 
+# Bytes in front of the body: headers of mailbox, CoE and SDO information.
 _OVERHEAD = 12
-"""Bytes in front of the body: headers of mailbox, CoE and SDO information."""
 
 
 class SdoInfoServer:

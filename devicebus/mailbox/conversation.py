@@ -104,8 +104,8 @@ def reading(what: str) -> Iterator[None]:
         raise MailboxProtocolError(f"{what}: {exc}") from None
 
 
+# Short: a slave that accepts no messages must not delay other clients by this one.
 _ABORT_TIMEOUT_NS = 50_000_000
-"""Short: a slave that accepts no messages must not delay other clients by this one."""
 ABORT_MESSAGES = {
     MailboxType.COE: MailboxRequest(
         MailboxType.COE,

@@ -31,12 +31,12 @@ INFO_START = CoeHeader.SIZE + SdoInfoHeader.SIZE
 _FRAGMENT = AmsCommand.FRAGMENT.to_bytes(2, "little")
 _AMS_REST = 16
 _SDO_END = CoeHeader.SIZE + SdoHeader.SIZE
+# Length of the request's body that the answer repeats: list type, index, index and subindex.
 _INFO_KEYS: dict[int, int] = {
     SdoInfoOpcode.LIST_REQUEST: 2,
     SdoInfoOpcode.OBJECT_REQUEST: 2,
     SdoInfoOpcode.ENTRY_REQUEST: 3,
 }
-"""Length of the request's body that the answer repeats: list type, index, index and subindex."""
 _PDO_NUMBER = 0x01FF
 _REMOTE: dict[int, int] = {
     CoeService.TX_PDO_REMOTE_REQUEST: CoeService.TX_PDO,
@@ -170,13 +170,13 @@ _ANSWERS: dict[MailboxType, Callable[[bytes, bytes], bool]] = {
     MailboxType.SOE: _answers_soe,
     MailboxType.VOE: _answers_voe,
 }
+# Minimum length of a request that can be answered.
 _SHORTEST = {
     MailboxType.EOE: 1,
     MailboxType.COE: CoeHeader.SIZE,
     MailboxType.FOE: FoeHeader.SIZE,
     MailboxType.SOE: 1,
 }
-"""Minimum length of a request that can be answered."""
 
 
 def answers(kind: MailboxType, request: bytes, reply: bytes) -> bool:

@@ -43,10 +43,10 @@ from eap.codec.soe import (
 
 MAX_SIZE = 0x80020
 """Limit for an answer in bytes: eight elements, each a list of maximum length."""
+# Limit for dropped answers to other requests before a read fails.
 _MAX_LATE = 16
-"""Limit for dropped answers to other requests before a read fails."""
+# Bytes of a request in front of the IDN, which fragments do not carry.
 _NAMELESS = 2
-"""Bytes of a request in front of the IDN, which fragments do not carry."""
 POLL_DELAY_NS = 10_000_000
 EXECUTION_TIMEOUT_NS = 60_000_000_000
 

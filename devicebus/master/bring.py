@@ -86,8 +86,8 @@ T = TypeVar("T")
 # A message of a conversation takes about a cycle.  Checks every 100 µs resumed the procedures of
 # 200 slaves 770,000 times during one start-up.
 _FIRST_PAUSE_NS = 100_000
+# Pause between two checks of a task; it doubles from the first to this.
 _MAX_PAUSE_NS = 2_000_000
-"""Pause between two checks of a task; it doubles from the first to this."""
 
 
 def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
@@ -161,6 +161,7 @@ def _prepare(bus: BusState, slave: BusSlave, current: AlState, step: AlState) ->
 def _prepare_mailbox(bus: BusState, slave: BusSlave, step: AlState) -> Procedure[None]:
     bus.close_mailbox(slave)
     esc, fixed = slave.found.esc, slave.found.sii.fixed
+    # Another master may have left FMMUs and sync managers that overlap ours.
     yield from clear(slave.station, fmmus=esc.fmmus, sync_managers=esc.sync_managers)
     area = boot_mailbox(fixed) if step is AlState.BOOT else standard_mailbox(fixed)
     if area.is_there:
@@ -172,6 +173,7 @@ def _prepare_mailbox(bus: BusState, slave: BusSlave, step: AlState) -> Procedure
 
 def _end_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Remove the slave from the cycle."""
+    # Without FMMUs: a controller answers logical datagrams in any AL state.
     yield from clear(slave.station, fmmus=slave.found.esc.fmmus, sync_managers=0)
     bus.set_participation(slave, Participation.ABSENT)
 
@@ -205,5 +207,6 @@ def _prepare_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     sync0 = bus.settings.sync0.get(slave.station)
     if sync0 is not None and bus.reference is not None:
         yield from start_sync0(slave.station, sync0)
+    # Between the write of the first FMMU and SAFEOP the slave counts partly or fully.
     bus.set_participation(slave, Participation.UNCERTAIN)
     yield from set_process_data(layout)

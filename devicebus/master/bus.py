@@ -109,8 +109,8 @@ class ChangeCount:
         return self.count
 
 
+# Attributes of a slave whose changes users of the bus see.
 _NOTED = frozenset(("state", "target", "is_lost", "mailbox", "work"))
-"""Attributes of a slave whose changes users of the bus see."""
 _UNSET = object()
 
 
@@ -210,6 +210,7 @@ class BusState:
     def emit(self, event: Event) -> None:
         """Queue an event."""
         self._events.append(event)
+        # A message of a slave is no change of its state.
         if isinstance(event, Unsolicited):
             return
         if isinstance(event, BusLost | BusBack):

@@ -25,8 +25,8 @@ _DRIFT_FRAMES = 20
 _DRIFT_PER_FRAME = 15
 SYNC_LEAD_NS = 100_000_000
 """Lead time of the first SYNC0 pulse, within which its registers must be written."""
+# Cyclic operation and SYNC0, in the activation register.
 _CYCLIC_OUT = 0x03
-"""Cyclic operation and SYNC0, in the activation register."""
 
 
 class Sync0(msgspec.Struct, frozen=True):
@@ -72,12 +72,14 @@ def synchronize(
     clocks = [slave for slave in slaves if slave.esc.has_clock]
     if not clocks:
         return ()
+    # A broadcast write to 0x0900 latches the receive times of all slaves by one frame.
     yield [bwr(Register.DC_RECEIVE_TIME, bytes(4))]
     latched: dict[int, Latched] = {}
     for slave in clocks:
         latched[slave.position] = yield from _read_latched(slave.station)
     delays = find_delays({each.position: each.node for each in slaves}, latched)
     start_ns = time_ns
+    # Clocks that run keep their time: a returned slave is set to the system time of the others.
     running = [slave for slave in clocks if only is not None and slave.station not in only]
     if running:
         base = running[0]

@@ -23,8 +23,8 @@ SAME_TIME_NS = 2_000_000_000
 """Faults that ended within this time have one cause: error counters are read each second."""
 RECENT_NS = 2_500_000_000
 """Errors of a port counted within this time are still going on."""
+# Limit for naming slaves one by one.
 _LISTED = 3
-"""Limit for naming slaves one by one."""
 _SLAVE = re.compile(r"^slave \d+(?: \([^)]*\))?:? ")
 _NO_FRAME = "no frame came back"
 

@@ -23,8 +23,8 @@ BASE = 0x0001_0000
 """First logical address."""
 MAX_FMMUS = 16
 """Limit for the FMMUs of a controller."""
+# Distance of the logical addresses of two datagrams, longer than one datagram.
 _STRIDE = 0x0800
-"""Distance of the logical addresses of two datagrams, longer than one datagram."""
 
 
 class SlaveProcessData(NamedTuple):

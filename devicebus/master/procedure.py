@@ -144,13 +144,14 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
     Returns the result of each procedure, or the error that ended it.
 
     Raises:
-        FrameLostError: no frame comes back, so that no procedure can continue.
+        FrameLostError: no frame comes back, which gives no information about any slave.
     """
     _, now_ns = yield Sleep(0)
     children = [_Child(procedure, now_ns) for procedure in procedures]
     try:
         while running := [child for child in children if child.is_running]:
             waiting = [child for child in running if child.datagrams]
+            # Datagrams go first: a pause would delay the procedures that only wait for a reply.
             if waiting:
                 now_ns = yield from _exchange_step(waiting)
             else:

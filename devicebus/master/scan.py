@@ -69,8 +69,8 @@ FIRST_STATION = 1001
 """Station address of the first slave, as TwinCAT counts."""
 MAX_SLAVES = 0xFFFF - FIRST_STATION
 _IDENTITY_WORD = 8
+# Datagrams in flight at once while slaves are read one by one.
 _DATAGRAMS_PER_STEP = 60
-"""Datagrams in flight at once while slaves are read one by one."""
 
 
 class EscInfo(WireStruct, frozen=True):

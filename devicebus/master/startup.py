@@ -31,6 +31,7 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
         BusError: slaves did not reach the state; the message has a line for each cause.
     """
     bus.reset()
+    # The slaves may run under another master: outputs go off before anything is reconfigured.
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
     found = yield from scan(bus.settings.first_station)
     slaves = yield from _identify(bus, found)
@@ -60,6 +61,7 @@ def shut_down(bus: BusState) -> Procedure[None]:
     _, now_ns = yield Sleep(0)
     deadline_ns = now_ns + TIMEOUT_NS[AlState.INIT]
     while now_ns < deadline_ns:
+        # BRD ORs the states of all slaves: INIT (1) alone means that all are there.
         (reply,), _ = yield [brd(Register.AL_STATUS, AlStatus.SIZE)]
         if AlStatus.decode(reply.data).state in {0, AlState.INIT}:
             return
@@ -105,8 +107,10 @@ def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusS
 
 def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState) -> Procedure[None]:
     """Plan the process image and bring the remaining slaves to SAFEOP or OP."""
+    # Failed slaves get a part of the image by their EEPROM: they can return without a new layout.
     for slave, _ in starting.errors:
         slave.channels = _channels_by_eeprom(slave)
+    # Clocks are set before SAFEOP, where slaves with SYNC0 check them.
     if bus.settings.clocks:
         yield from set_clocks(bus)
     set_up_cycle(bus)

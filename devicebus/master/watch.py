@@ -41,8 +41,8 @@ from devicebus.wire.datagram import fprd, fpwr
 from devicebus.wire.register import AlStatus, Register, SmStatus
 from eap.errors import EapError
 
+# Slaves whose registers share one frame.
 _PER_STEP = 15
-"""Slaves whose registers share one frame."""
 
 
 def poll_mailboxes(bus: BusState) -> Procedure[None]:
@@ -173,15 +173,16 @@ def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     slave.mark_lost()
     slave.retry_ns = 0
     slave.missing_since_ns = slave.missing_since_ns or now_ns
+    # Cleared first: the end of a cancelled task is not a failed attempt.
     work, slave.work = slave.work, None
     if work is not None:
         work.cancel()
     bus.close_mailbox(slave)
+    # Its registers may still be configured: it counts again as soon as it is back on the cable.
     bus.set_participation(slave, Participation.UNCERTAIN)
     if slave.station == bus.reference:
-        bus.distribute_time(
-            None
-        )  # otherwise the others would receive the time of an empty datagram
+        # Otherwise the others would receive the time of an empty datagram.
+        bus.distribute_time(None)
     bus.emit(SlaveLost(slave.station, now_ns))
 
 
@@ -212,6 +213,7 @@ def _report_back(bus: BusState, slave: BusSlave, now_ns: int) -> None:
 
 
 def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> None:
+    # A slave that only left OP keeps its registers; all others are configured from INIT again.
     stays = (
         not slave.is_lost
         and status.state in WITH_PROCESS_DATA
@@ -226,6 +228,7 @@ def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> Non
             return  # the slave was lost meanwhile, or no frame came back: the next poll tries again
         if error is None:
             _report_back(bus, slave, task.result())
+        # A lost slave that does not answer yet has had its event: no failure is reported.
         elif not (slave.is_lost and isinstance(error, WorkingCounterError)):
             slave.retry_ns = now_ns + RETRY_NS
             if isinstance(error, IdentityError):

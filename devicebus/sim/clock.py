@@ -13,10 +13,10 @@ _U32 = 1 << 32
 _U64 = 1 << 64
 _PHASE_SHIFT = 3
 _RATE_SHIFT = 8
+# Larger differences come from offsets, not from the drift of the quartz.
 _LOCKED_NS = 100_000
-"""Larger differences come from offsets, not from the drift of the quartz."""
+# Maximum frequency correction of the loop: the limit of an ESC is near 0.1 %.
 _MAX_PPB = 1_000_000
-"""Maximum frequency correction of the loop: the limit of an ESC is near 0.1 %."""
 _SYNC_OUT, _SYNC0, _SYNC1 = 0x01, 0x02, 0x04
 _SYNC0_PENDING, _SYNC1_PENDING, _START_IS_PAST = 0x01, 0x02, 0x04
 
@@ -103,8 +103,10 @@ class Clock:
         received = int.from_bytes(data[:size], "little")
         received += self._get(Register.DC_SYSTEM_TIME_DELAY, 4)
         error = (self.system_time(now_ns) - received) % modulus
+        # The difference is signed modulo the width of the written time.
         if error >= modulus // 2:
             error -= modulus
+        # 0x092C holds sign and magnitude.
         behind = 1 << 31 if error < 0 else 0
         magnitude = min(abs(error), (1 << 31) - 1)
         self._set(Register.DC_SYSTEM_TIME_DIFFERENCE, magnitude | behind, 4)

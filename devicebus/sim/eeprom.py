@@ -77,6 +77,8 @@ class Eeprom:
         elif command == EepromCommand.WRITE and not control & _WRITE_ENABLE:
             self._status(_WRITE_ENABLE_ERROR)
         else:
+            # Executed at the end of the busy time; writes to these registers are refused until
+            # then.
             self._control = control
             self.busy_until_ns = now_ns + _DURATION[command] + self.extra_ns
             self._status(_BUSY | control & _COMMAND)

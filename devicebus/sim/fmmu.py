@@ -85,6 +85,7 @@ def find_slices(windows: Iterable[FmmuWindow], address: int, size: int) -> tuple
     """Return the overlaps of *windows* with ``address`` to ``address + size``."""
     slices = []
     for window in windows:
+        # All positions in bits: an FMMU may begin and end within bytes on both sides.
         begin = 8 * (window.first - address) + window.first_bit
         start = max(begin, 0)
         bits = min(begin + window.bits, 8 * size) - start

@@ -28,8 +28,8 @@ _HEADER = struct.Struct("<BBHHHH")
 _SIZE = _HEADER.size
 _MORE, _CIRCULATING, _LENGTH = 0x8000, 0x4000, 0x07FF
 _ADDRESS_END = Register.DL_CONTROL + 4
+# Ends of the registers of station addresses, and of the ECAT event mask.
 _MASK_END = Register.ECAT_EVENT_MASK + 2
-"""Ends of the registers of station addresses, and of the ECAT event mask."""
 _READS = frozenset((Command.APRD, Command.FPRD, Command.BRD, Command.APRW, Command.FPRW,
                     Command.BRW))  # fmt: skip
 _WRITES = frozenset((Command.APWR, Command.FPWR, Command.BWR, Command.APRW, Command.FPRW,
@@ -41,8 +41,8 @@ _LOGICAL_WRITES: dict[int, int] = {Command.LWR: 1, Command.LRW: 2}
 _LOGICAL = frozenset((Command.LRD, *_LOGICAL_WRITES))
 _NOP, _LAST, _LWR = int(Command.NOP), int(Command.FRMW), int(Command.LWR)
 _CAN_READ, _CAN_WRITE = attrgetter("can_read"), attrgetter("can_write")
+# Limit for cached plans, for a master that sends other logical addresses in every frame.
 _MAX_PLANS = 64
-"""Limit for cached plans, for a master that sends other logical addresses in every frame."""
 
 
 class _LogicalAccess(NamedTuple):

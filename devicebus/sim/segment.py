@@ -197,6 +197,7 @@ class SimulatedSegment:
         self._poll_at_ns = now_ns + POLL_NS
         first = self._next_polled
         end = first + MAX_POLLED
+        # In turn, so that every slave is polled, whatever their number.
         self._next_polled = end if end < len(self.slaves) else 0
         for slave in self.slaves[first:end]:
             slave.handle_timeout(now_ns)
@@ -215,6 +216,7 @@ class SimulatedSegment:
             esc = slave.esc
             if esc.al_event:
                 slave.run(now_ns)
+            # Rewired after the frame only: it keeps the path on which it entered.
             is_changed |= esc.loops_changed
         if is_changed:
             self._update_wiring()

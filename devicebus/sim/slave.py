@@ -206,6 +206,8 @@ class SimulatedSlave:
             self.esc.set_al_status(self.state | _IDENTIFY, self.device.identification)
 
     def _emulate(self, control: int) -> None:
+        # The acknowledge bit is mirrored as the error bit, as a controller without application
+        # does.
         self.device.al_state = AlState(control & 0x0F) if control & 0x0F in _STATES else self.state
         self.device.process_data.configure()
         self.esc.set_al_status(control & 0x1F, 0)

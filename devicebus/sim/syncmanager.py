@@ -11,8 +11,8 @@ from devicebus.wire.register import Register, SmStatus
 
 _BUFFERED_EMPTY = 0x30
 _WRITTEN, _READ, _FULL = map(int, SmStatus)
+# Next value of status bits 4 and 5 by the present one; 3 is before the first buffer.
 _NEXT_BUFFER = (0x10, 0x20, 0x00, 0x00)
-"""Next value of status bits 4 and 5 by the present one; 3 is before the first buffer."""
 _ACTIVATE, _STATUS, _PDI_CONTROL = 6, 5, 7
 
 
@@ -46,6 +46,7 @@ class SyncChannel:
         at = self._register
         octets = self._memory[at : at + 8]
         setting = bytes((*octets[:5], octets[_ACTIVATE] & 1, octets[_PDI_CONTROL] & 1))
+        # A toggle of the repeat bit must not empty the mailbox.
         if setting == self._setting:
             return False
         self._setting = setting
@@ -163,6 +164,7 @@ class SyncChannel:
             self._memory[self.start : self.end] = octets
             self._set_status(_FULL | _WRITTEN)
             return True
+        # While the master reads, the new data waits in the third buffer.
         if self._open:
             self._waiting = octets
         else:
@@ -184,8 +186,8 @@ class SyncChannel:
 
 
 _WATCHDOG_STATUS = int(Register.WATCHDOG_STATUS)
+# The watchdog divider counts periods of 25 MHz.
 _TICK_NS = 40
-"""The watchdog divider counts periods of 25 MHz."""
 
 
 class Watchdog:

@@ -149,6 +149,7 @@ def build_image(
             fixed=fixed,
             strings=tuple(strings.texts),
             general=_general(spec, ports),
+            # Category FMMU counts 1 outputs, 2 inputs, 3 mailbox state, unlike the register's bits.
             fmmus=(1, 2, 3) if mailbox else (1, 2),
             sync_managers=layout.channels,
             rx_pdos=rx_pdos,
@@ -161,6 +162,7 @@ def build_image(
 def _fill(image: Sii) -> bytes:
     """Return the image padded to the size of its EEPROM, with that size set."""
     octets = sii.encode(image)
+    # EEPROM chips have sizes of powers of two; word 0x3E holds the size in KiBit less one.
     size = IMAGE_SIZE
     while size < len(octets):
         size *= 2
