@@ -156,7 +156,7 @@ def test_one_variable_more_in_one_pd(line: Line) -> None:
     assert line.exported() == line.old
 
     done = line.command("apply").splitlines()
-    assert done[-1] == "2 stations changed, 13 as before"
+    assert done[-1] == "2 stations changed, 13 unchanged"
     assert not any("refused" in text for text in done)
     assert line.exported() == line.new
     line.appliance.command("pd", "set", CHANGED, "rejected", "7")
@@ -167,7 +167,7 @@ def test_one_variable_more_in_one_pd(line: Line) -> None:
     assert line.command("plan") == "no differences: all 15 stations are as the file says\n"
 
     before = line.subscriptions()
-    assert line.command("rollback").splitlines()[-1] == "2 stations changed, 13 as before"
+    assert line.command("rollback").splitlines()[-1] == "2 stations changed, 13 unchanged"
     assert line.exported() == line.old
     assert_nothing_lost(before, line)
 

@@ -60,7 +60,7 @@ def test_a_rule_comes_goes_and_outlives_services_and_a_new_start(farm, file):
     assert "  * access rule nobody: added" in change(appliance, "plan", words)
     assert "left (access rule nobody: added): ok" in change(appliance, "apply", words)
     assert both() == [DENIED, DENIED]
-    assert "nothing differs" in change(appliance, "plan", words)
+    assert "no differences" in change(appliance, "plan", words)
     os.kill(appliance.pid("services"), signal.SIGKILL)
     wait_until(lambda: both() == [DENIED, DENIED])
     assert "left (access rule nobody: removed): ok" in change(appliance, "rollback", words)
@@ -70,7 +70,7 @@ def test_a_rule_comes_goes_and_outlives_services_and_a_new_start(farm, file):
     wait_until(lambda: all(map(is_free, (LEFT, RIGHT))))
     again = farm.run(file)
     assert both() == [DENIED, DENIED]
-    assert "nothing differs" in change(again, "plan", words)
+    assert "no differences" in change(again, "plan", words)
 
 
 def test_a_broker_needs_a_new_start(farm, file):
