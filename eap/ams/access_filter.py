@@ -221,10 +221,6 @@ class AccessFilter:
         grants = self.access.grants(endpoint, header.source, header.target, header.target_port)
         return {service: grants.may(service) for service in AccessService}
 
-    def is_this_host(self, endpoint: Endpoint) -> bool:
-        """Return whether *endpoint* can only be a program of this host."""
-        return self.access.is_this_host(endpoint)
-
     def filter_request(
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int, route: str = ""
     ) -> tuple[bytes, AuthorizedRequest | None] | RoutingError:

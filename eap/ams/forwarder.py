@@ -22,7 +22,7 @@ from eap.ams.notification_forwarder import (
     encode_deleted,
 )
 from eap.ams.record import Outcome, Record, Trace, describe
-from eap.ams.report import Obstacle, RouteState
+from eap.ams.report import RouteState
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import SubscriptionRestorer
 from eap.ams.subscriptions import MAX_PER_CLIENT, MAX_TOTAL, Subscription
@@ -42,6 +42,7 @@ class Forwarder:
     """Forwards requests, answers and notifications of a router.
 
     Attributes:
+        admission: Finds routes, and knows the hops that are down.
         in_flight: Requests that wait for an answer.
         notification_forwarder: Notifications across this router.
         subscription_restorer: Subscriptions that are interrupted.
@@ -70,7 +71,7 @@ class Forwarder:
         self._limits = limits
         self._hop_prober = hop_prober
         self._ids = InvokeIds(first_invoke_id)
-        self._admission = Admission(
+        self.admission = Admission(
             net_id, table, transports.transports, self.in_flight, limits, hop_prober
         )
         self._loop_detector = LoopDetector()
@@ -108,7 +109,7 @@ class Forwarder:
                 self._hop_prober.note_answer(samples.hop, now_ns)
             actions = [*samples.replies, *self.subscription_restorer.ended(samples.ended, now_ns)]
             return actions + self._end_unwanted(header, samples, endpoint)
-        found = None if is_own else self._admission.find_route(header, endpoint)
+        found = None if is_own else self.admission.find_route(header, endpoint)
         if found is not None and not self._is_refused_for_good(found):
             return self.forward_request(header, data, endpoint, now_ns)
         text = "no client here subscribed to it, or not any more"
@@ -124,7 +125,7 @@ class Forwarder:
             return False
         if found.error == AdsError.TARGET_MACHINE:
             return True
-        obstacle = None if found.route is None else self._admission.find_obstacle(found.route)
+        obstacle = None if found.route is None else self.admission.find_obstacle(found.route)
         return obstacle is not None and obstacle.state is RouteState.CLIENT
 
     def _end_unwanted(
@@ -273,7 +274,7 @@ class Forwarder:
 
     def hop_down(self, transport: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Fail the pending requests of a hop, and all later ones until it is up."""
-        self._admission.hop_down(transport, address, text)
+        self.admission.hop_down(transport, address, text)
         return self.hop_lost(transport, address, text, now_ns)
 
     def hop_lost(self, transport: str, address: str | None, text: str, now_ns: int) -> list[Action]:
@@ -290,26 +291,6 @@ class Forwarder:
         """Restore the subscriptions by a hop, or end them at the previous router."""
         lost = self.notification_forwarder.subscriptions.of_hop(transport, address)
         return self.subscription_restorer.interrupt(lost, text, now_ns)
-
-    def hop_up(self, transport: str, address: str | None) -> None:
-        """Forward requests to a hop again."""
-        self._admission.hop_up(transport, address)
-
-    def transport_removed(self, name: str) -> None:
-        """Forget everything about a transport."""
-        self._admission.transport_removed(name)
-
-    def find_obstacle(self, route: Route) -> Obstacle | None:
-        """Return the reason that *route* cannot be used now; None if it can."""
-        return self._admission.find_obstacle(route)
-
-    def find_route(self, header: AmsHeader, endpoint: Endpoint) -> Route | RoutingError:
-        """Return the route that a request would take, or an error."""
-        return self._admission.find_route(header, endpoint)
-
-    def is_down(self, hop: Endpoint) -> bool:
-        """Return whether a hop is known to be down."""
-        return self._admission.is_down(hop)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
@@ -384,7 +365,7 @@ class Forwarder:
         self, header: AmsHeader, data: bytes, endpoint: Endpoint, now_ns: int
     ) -> tuple[Route, bytes, AuthorizedRequest | None] | RoutingError:
         """Return the route of a request, its packet and its authorization, or an error."""
-        route = self._admission.find_route(header, endpoint)
+        route = self.admission.find_route(header, endpoint)
         if isinstance(route, RoutingError):
             return route
         through = self._access_filter.filter_request(header, data, endpoint, now_ns, route.name)
@@ -396,13 +377,13 @@ class Forwarder:
     ) -> Pending | list[Action]:  # fmt: skip
         """Add a request that has an answer, unless a limit or a loop forbids it."""
         # UDP and Ethernet may double packets: the copy is dropped, the original is answered.
-        if self._admission.is_duplicate(header, onward, endpoint):
+        if self.admission.is_duplicate(header, onward, endpoint):
             if authorized is not None:
                 self._access_filter.abandon(authorized)
             text = "the same request waits already"
             return self._error_replier.drop(endpoint, header, Outcome.DROPPED, text, now_ns)
-        why = None if route is None else self._admission.find_loop(header, onward, route)
-        why = why or self._admission.check_limits(endpoint)
+        why = None if route is None else self.admission.find_loop(header, onward, route)
+        why = why or self.admission.check_limits(endpoint)
         if why is not None:
             if authorized is not None:
                 self._access_filter.abandon(authorized, why.error)

@@ -101,7 +101,7 @@ class Router:
         for endpoint in self._forwarder.endpoints_of(name):
             actions += self.connection_closed(*endpoint, now_ns)
         actions += self._forwarder.hop_lost(name, None, f"{name} is there no more", now_ns)
-        self._forwarder.transport_removed(name)
+        self._forwarder.admission.transport_removed(name)
         self._transports.remove(name)
         return actions
 
@@ -193,11 +193,11 @@ class Router:
         """Pass requests on again; the arguments are those of :meth:`hop_down`."""
         if self._hop_prober is not None:
             self._hop_prober.resume(transport, address)
-        self._forwarder.hop_up(transport, address)
+        self._forwarder.admission.hop_up(transport, address)
 
     def is_down(self, hop: Endpoint) -> bool:
         """Return whether a hop is known not to answer now."""
-        return self._forwarder.is_down(hop)
+        return self._forwarder.admission.is_down(hop)
 
     def is_awaited(self, hop: Endpoint) -> bool:
         """Return whether an answer from a hop is waited for, or subscriptions come from it."""
@@ -256,7 +256,7 @@ class Router:
     def report(self, route: Route) -> RouteReport:
         """Return what is known of one of the routes."""
         traffic = self.record.routes.get(route.key)
-        obstacle = self._forwarder.find_obstacle(route)
+        obstacle = self._forwarder.admission.find_obstacle(route)
         name = self._table.next_name(route)
         return report_route(route, obstacle, traffic, self._hop_prober, next_name=name)
 
@@ -267,7 +267,7 @@ class Router:
         if ports is not None:
             text = _no_port(header)
             return Location(True, None, "" if header.target_port in ports else text, may)
-        found = self._forwarder.find_route(header, endpoint)
+        found = self._forwarder.admission.find_route(header, endpoint)
         route, why = (found.route, found.text) if isinstance(found, RoutingError) else (found, "")
         found_route = None if route is None else self.report(route)
         missing = [each for each in self.interruptions() if each.addresses[:6] == header.target]
@@ -324,7 +324,7 @@ class Router:
             return self._forwarder.forward_notification(
                 header, data, endpoint, now_ns, is_own=is_own
             )
-        if header.source in self._devices and not self.access_filter.is_this_host(endpoint):
+        if header.source in self._devices and not self.access_filter.access.is_this_host(endpoint):
             text = f"it comes back to where it began: {header.source} is of this station"
             why = RoutingError(AdsError.TARGET_MACHINE, text, outcome=Outcome.LOOP)
             return self._error_replier.reply_error(header, endpoint, why, now_ns)

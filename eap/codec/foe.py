@@ -9,7 +9,6 @@ from eap.codec.wire import Buffer, Scalar, WireStruct, u8, u32
 
 DATA_OVERHEAD = 12
 """Bytes of a mailbox that a DATA message takes before its data."""
-PASSWORD_MAX = 0xFFFFFFFF
 
 
 class FoeOpcode(IntEnum):
