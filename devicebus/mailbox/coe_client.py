@@ -152,7 +152,7 @@ def download(
     progress.total = len(data)
     data_size = sizes.to_slave - INITIATE_OVERHEAD
     first = encode_initiate(
-        SdoRequest.DOWNLOAD, index, subindex, data, complete=complete, room=data_size
+        SdoRequest.DOWNLOAD, index, subindex, data, complete=complete, max_size=data_size
     )
     yield from sdo.exchange(first)
     progress.done = len(data) if len(data) <= EXPEDITED_SIZE else min(data_size, len(data))

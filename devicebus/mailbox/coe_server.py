@@ -177,7 +177,9 @@ class SdoServer:
         data_size = self._sizes.to_master - INITIATE_OVERHEAD
         if len(data) > max(data_size, EXPEDITED_SIZE):
             self._transfer = SegmentedTransfer(head, len(data), data[data_size:])
-        return encode_initiate(_UPLOADED, index, subindex, data, complete=complete, room=data_size)
+        return encode_initiate(
+            _UPLOADED, index, subindex, data, complete=complete, max_size=data_size
+        )
 
     def _start_download(self, head: SdoHeader, rest: bytes) -> bytes:
         where = (head.index, head.subindex)

@@ -484,9 +484,9 @@ class Forwarder:
         else:
             allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
             route = pending.route
-            who = "its service" if route is None else self._table.describe_beyond(route)
+            target = "its service" if route is None else self._table.describe_beyond(route)
             why = RoutingError(
-                AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route
+                AdsError.TIMEOUT, f"no answer from {target} within {allowed_s:g} s", route
             )
             actions = self._refuse(pending, why, now_ns)
         if pending.handles:

@@ -181,14 +181,14 @@ def _advise_on_route(
         return Advice(is_reached=False, text=f"no answer from {where} in time", hint=hint)
     if error == AdsError.TARGET_MACHINE:
         hint = f"the router there needs a route to {target}, or it is not the NetID that is meant"
-        return Advice(is_reached=False, text=f"{where} knows no way to {target}", hint=hint)
+        return Advice(is_reached=False, text=f"{where} has no route to {target}", hint=hint)
     if error == AdsError.HOST_UNREACHABLE:
         hint = "'eapctl trace' names the hop"
-        return Advice(is_reached=False, text=f"the way is cut behind {where}", hint=hint)
+        return Advice(is_reached=False, text=f"the link is down behind {where}", hint=hint)
     if error == AdsError.ACCESS_DENIED:
         hint = "allow it under access in the plant file, of this station or of one on the way"
         return Advice(is_reached=False, text="access rules forbid to ask for its state", hint=hint)
-    return Advice(is_reached=False, text=f"{where} or somebody behind it answers: {words}")
+    return Advice(is_reached=False, text=f"{where} or a station behind it answers: {words}")
 
 
 MAX_FURTHER = 16

@@ -140,11 +140,11 @@ def encode_initiate(
     data: Buffer = b"",
     *,
     complete: bool = False,
-    room: int = 0,
+    max_size: int = 0,
 ) -> bytes:
     """Return the first message of a transfer that carries data, without CoE header.
 
-    One to four bytes go expedited; else the size, and as many bytes of *data* as *room* allows.
+    One to four bytes go expedited; else the size, and as many bytes of *data* as *max_size* allows.
     """
     size = len(data)
     if 0 < size <= EXPEDITED_SIZE:
@@ -155,7 +155,7 @@ def encode_initiate(
         value = int.from_bytes(data, "little")
         return SdoHeader(1, 1, unused, complete, specifier, index, subindex, value).encode()
     head = SdoHeader(1, 0, 0, complete, specifier, index, subindex, size)
-    return head.encode() + bytes(data[:room])
+    return head.encode() + bytes(data[:max_size])
 
 
 def encode_plain(

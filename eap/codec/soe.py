@@ -183,10 +183,10 @@ def error_code_of(body: Buffer) -> int:
     return int.from_bytes(body[-2:], "little")
 
 
-def encode_fragments(header: SoeHeader, body: Buffer, room: int) -> list[bytes]:
-    """Return the messages that carry *body*, with at most *room* bytes of it in each."""
+def encode_fragments(header: SoeHeader, body: Buffer, max_size: int) -> list[bytes]:
+    """Return the messages that carry *body*, with at most *max_size* bytes of it in each."""
     view = memoryview(body)
-    pieces = [view[at : at + room] for at in range(0, len(view), room)] or [view]
+    pieces = [view[at : at + max_size] for at in range(0, len(view), max_size)] or [view]
     messages = []
     for left, piece in zip(range(len(pieces) - 1, -1, -1), pieces, strict=True):
         head = SoeHeader(

@@ -243,7 +243,7 @@ def encode_done(request: bytes, task: Task, data: bytes) -> bytes:
     match task:
         case ReadSdo(index, subindex, complete):
             body = encode_initiate(
-                SdoResponse.UPLOAD, index, subindex, data, complete=complete, room=len(data)
+                SdoResponse.UPLOAD, index, subindex, data, complete=complete, max_size=len(data)
             )
             return encode_coe(CoeService.SDO_RESPONSE, body)
         case WriteSdo(index, subindex, _):

@@ -155,7 +155,9 @@ class ObjectCodec:
         if size <= max(room, EXPEDITED_SIZE):
             data = await stream.read(size)
             self.reset()
-            return encode_initiate(SdoResponse.UPLOAD, *where, data, complete=complete, room=size)
+            return encode_initiate(
+                SdoResponse.UPLOAD, *where, data, complete=complete, max_size=size
+            )
         self._hold(head, size)
         self._transfer = SegmentedTransfer(head, size)
         answer = SdoHeader(1, 0, 0, head.complete, SdoResponse.UPLOAD, *where, size)

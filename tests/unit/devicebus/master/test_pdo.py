@@ -114,7 +114,9 @@ def test_write_configuration_encodes_index_subindex_and_bits():
 
 
 def response(index, subindex, octets):
-    body = encode_initiate(SdoResponse.UPLOAD, index, subindex, octets, complete=False, room=100)
+    body = encode_initiate(
+        SdoResponse.UPLOAD, index, subindex, octets, complete=False, max_size=100
+    )
     return MailboxMessage(MailboxType.COE, encode_message(CoeService.SDO_RESPONSE, body))
 
 

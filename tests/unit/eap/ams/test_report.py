@@ -145,9 +145,9 @@ BEYOND = DOWN._replace(next_name="near")
             f"island ({HOP}) is a client, not listening: refused",
             "nothing is wrong",
         ),
-        (0x1B, UP, f"the way is cut behind island ({HOP})", "eapctl trace"),
+        (0x1B, UP, f"the link is down behind island ({HOP})", "eapctl trace"),
         (0x719, UP, f"no answer from island ({HOP}) in time", f"add one to {ROUTER}"),
-        (7, UP, f"island ({HOP}) knows no way to {FAR}", f"needs a route to {FAR}"),
+        (7, UP, f"island ({HOP}) has no route to {FAR}", f"needs a route to {FAR}"),
         (0x723, UP, "access rules forbid to ask for its state", "under access in the plant"),
     ],
 )
@@ -162,7 +162,8 @@ def test_advice_has_error_and_hint(
 def test_advice_has_other_errors_unchanged() -> None:
     found = advise(0x701, TARGET, UP, OWN, is_own=False)
     assert found.text == (
-        f"island ({HOP}) or somebody behind it answers: error 0x701 (it does not know that service)"
+        f"island ({HOP}) or a station behind it answers: error 0x701"
+        " (it does not know that service)"
     )
     found = advise(4, TARGET, None, OWN, is_own=True)
     assert found.text.startswith("this station itself answers: error 0x4")

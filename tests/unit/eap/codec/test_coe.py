@@ -104,7 +104,7 @@ DOWN, UP = REQUEST.DOWNLOAD_SEGMENT, RESPONSE.UPLOAD_SEGMENT
     ],
 )
 def test_download_request(data: bytes, complete: bool, octets: str) -> None:
-    sent = encode_initiate(REQUEST.DOWNLOAD, 0x1012, 1, data, complete=complete, room=6)
+    sent = encode_initiate(REQUEST.DOWNLOAD, 0x1012, 1, data, complete=complete, max_size=6)
     assert sent == bytes.fromhex(octets)
 
 
@@ -116,7 +116,7 @@ def test_download_request(data: bytes, complete: bool, octets: str) -> None:
         (encode_plain(RESPONSE.DOWNLOAD, 0x1018, 1), "60 1810 01 00000000"),
         (encode_initiate(RESPONSE.UPLOAD, 0x1018, 1, b"\x02\0\0\0"), "43 1810 01 02000000"),
         (encode_initiate(RESPONSE.UPLOAD, 0x1018, 1, b"\x02"), "4f 1810 01 02000000"),
-        (encode_initiate(RESPONSE.UPLOAD, 0x1008, 0, b"EK1914", room=9),
+        (encode_initiate(RESPONSE.UPLOAD, 0x1008, 0, b"EK1914", max_size=9),
          "41 0810 00 06000000 454b31393134"),
         (encode_segment(DOWN, b"1234567", toggle=0), "00 31323334353637"),
         (encode_segment(DOWN, b"123", toggle=1, last=True), "19 31323300000000"),
@@ -148,7 +148,7 @@ def test_captured_message_encodes_to_the_same_octets(vector: Vector) -> None:
     elif sdo.has_size:
         content = bytes(body[SdoHeader.SIZE :])
         assert sdo.value == len(content)
-        again = encode_initiate(kind, *where, content, complete=bool(sdo.complete), room=999)
+        again = encode_initiate(kind, *where, content, complete=bool(sdo.complete), max_size=999)
     else:
         # EL3004 echoes what was written.
         echoed = SdoHeader(0, 0, 0, sdo.complete, kind, *where, sdo.value).encode()

@@ -378,7 +378,7 @@ def test_odd_answers_are_answers(data: str, text: str) -> None:
 def test_probe_reports_errors_with_a_hint() -> None:
     found = probe(RIGHT, data=b"", error=7)
     assert (found.ok, found.rtt_us, found.error) == (False, None, 7)
-    assert "knows no way to 127.0.9.2.1.1" in found.text
+    assert "has no route to 127.0.9.2.1.1" in found.text
     assert "needs a route" in found.hint
     found = probe(RIGHT, down="no carrier")
     assert found.text == "right (127.0.9.2:34980 by udp:eap0) is down: no carrier"
@@ -408,8 +408,8 @@ def test_request_beyond_a_router_that_finds_a_fault_names_it(monkeypatch) -> Non
     why = "right: third (127.0.9.3:34980 by udp:eap1) is down: it does not answer"
     assert probe(target, data=b"", error=0x1B, more=BEYOND).text == why
     why = ""
-    assert "the way is cut behind right" in probe(target, data=b"", error=0x1B, more=BEYOND).text
-    assert probe(RIGHT, data=b"", error=0x1B).text.startswith("the way is cut behind right")
+    assert "the link is down behind right" in probe(target, data=b"", error=0x1B, more=BEYOND).text
+    assert probe(RIGHT, data=b"", error=0x1B).text.startswith("the link is down behind right")
 
 
 def test_probe_limits_the_time_of_the_fault_search(monkeypatch) -> None:
