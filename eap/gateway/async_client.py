@@ -67,7 +67,7 @@ class AsyncGatewayClient:
     ) -> None:
         self.mailboxes: dict[int, MailboxSizes] = {}
         self._has_dictionary = True
-        self._place = host, port
+        self._address = host, port
         self._link = _Datagrams(
             GatewayConversations(
                 timeout_ns=round(timeout_s * _S),
@@ -79,9 +79,9 @@ class AsyncGatewayClient:
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
         try:
-            await loop.create_datagram_endpoint(lambda: self._link, remote_addr=self._place)
+            await loop.create_datagram_endpoint(lambda: self._link, remote_addr=self._address)
         except OSError as exc:
-            host, port = self._place
+            host, port = self._address
             raise EnvironmentalError(f"gateway {host}:{port}: {exc.strerror or exc}") from None
         return self
 
@@ -105,8 +105,8 @@ class AsyncGatewayClient:
         """Write an entry, or with *complete* a whole object."""
         is_short = len(data) <= EXPEDITED_SIZE
         sizes = MailboxSizes() if is_short else await self._sizes_or_default(address)
-        talk = coe_client.download(index, subindex, data, sizes, complete=complete)
-        await self.converse(address, talk)
+        conversation = coe_client.download(index, subindex, data, sizes, complete=complete)
+        await self.converse(address, conversation)
 
     async def od_list(self, address: int) -> list[int]:
         """Read the indexes of all objects."""
@@ -126,8 +126,10 @@ class AsyncGatewayClient:
         """Read a file."""
         content = io.BytesIO()
         sizes = await self.sizes_of(address)
-        talk = foe_client.read(name, content.write, sizes, password=password, progress=progress)
-        await self.converse(address, talk)
+        conversation = foe_client.read(
+            name, content.write, sizes, password=password, progress=progress
+        )
+        await self.converse(address, conversation)
         return content.getvalue()
 
     async def foe_write(
@@ -142,8 +144,8 @@ class AsyncGatewayClient:
         """Write a file."""
         sizes = await self.sizes_of(address)
         source = io.BytesIO(data).read
-        talk = foe_client.write(name, source, sizes, password=password, progress=progress)
-        await self.converse(address, talk)
+        conversation = foe_client.write(name, source, sizes, password=password, progress=progress)
+        await self.converse(address, conversation)
 
     async def idn_read(
         self, address: int, idn: Idn, elements: int = Element.VALUE, *, drive: int = 0
@@ -166,8 +168,8 @@ class AsyncGatewayClient:
     ) -> None:
         """Write an element of an IDN; a list or text with its head."""
         sizes = await self._sizes_or_default(address)
-        talk = soe_client.write(idn, data, sizes, elements=element, drive=drive)
-        await self.converse(address, talk)
+        conversation = soe_client.write(idn, data, sizes, elements=element, drive=drive)
+        await self.converse(address, conversation)
 
     async def voe(self, address: int, vendor_id: int, vendor_type: int, data: bytes) -> bytes:
         """Send data of a vendor's protocol; return the data of its answer."""

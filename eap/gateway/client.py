@@ -82,12 +82,12 @@ class GatewayClient(Closeable):
         self._is_stream = tcp
         self._rest = b""
         kind = socket.SOCK_STREAM if tcp else socket.SOCK_DGRAM
-        self._place = f"gateway {host}:{port}"
+        self._label = f"gateway {host}:{port}"
         self._conversations = GatewayConversations(
             # TCP repeats lost data by itself: one request waits as long as all tries of a datagram.
             timeout_ns=round(timeout_s * (tries if tcp else 1) * _S),
             tries=1 if tcp else tries,
-            silence=f"{self._place} {silence(timeout_s * tries, 'TCP' if tcp else 'UDP')}",
+            silence=f"{self._label} {silence(timeout_s * tries, 'TCP' if tcp else 'UDP')}",
         )
         self._socket = socket.socket(socket.AF_INET, kind)
         self._socket.settimeout(timeout_s * tries if tcp else timeout_s)
@@ -98,10 +98,10 @@ class GatewayClient(Closeable):
             raise self._failure(exc) from None
         except OSError as exc:
             self._socket.close()
-            raise EnvironmentalError(f"{self._place}: {exc.strerror or exc}") from None
+            raise EnvironmentalError(f"{self._label}: {exc.strerror or exc}") from None
         except TypeError:  # as sockets put it
             self._socket.close()
-            raise EnvironmentalError(f"{self._place}: it is no name of a host") from None
+            raise EnvironmentalError(f"{self._label}: it is no name of a host") from None
         self._readable = select.poll()
         self._readable.register(self._socket, select.POLLIN)
 
@@ -131,8 +131,8 @@ class GatewayClient(Closeable):
     ) -> None:
         """Write an entry, or with *complete* a whole object."""
         sizes = self._sizes_or_default(address) if len(data) > EXPEDITED_SIZE else MailboxSizes()
-        talk = coe_client.download(index, subindex, data, sizes, complete=complete)
-        self.converse(address, talk)
+        conversation = coe_client.download(index, subindex, data, sizes, complete=complete)
+        self.converse(address, conversation)
 
     def od_list(self, address: int) -> list[int]:
         """Read the indexes of all objects."""
@@ -167,8 +167,8 @@ class GatewayClient(Closeable):
     ) -> None:
         """Write an element of an IDN; a list or text with its head."""
         sizes = self._sizes_or_default(address)
-        talk = soe_client.write(idn, data, sizes, elements=element, drive=drive)
-        self.converse(address, talk)
+        conversation = soe_client.write(idn, data, sizes, elements=element, drive=drive)
+        self.converse(address, conversation)
 
     def foe_read(
         self, address: int, name: str, *, password: int = 0, progress: Progress | None = None
@@ -176,8 +176,10 @@ class GatewayClient(Closeable):
         """Read a file."""
         content = io.BytesIO()
         sizes = self.sizes_of(address)
-        talk = foe_client.read(name, content.write, sizes, password=password, progress=progress)
-        self.converse(address, talk)
+        conversation = foe_client.read(
+            name, content.write, sizes, password=password, progress=progress
+        )
+        self.converse(address, conversation)
         return content.getvalue()
 
     def foe_write(
@@ -192,8 +194,8 @@ class GatewayClient(Closeable):
         """Write a file."""
         sizes = self.sizes_of(address)
         source = io.BytesIO(data).read
-        talk = foe_client.write(name, source, sizes, password=password, progress=progress)
-        self.converse(address, talk)
+        conversation = foe_client.write(name, source, sizes, password=password, progress=progress)
+        self.converse(address, conversation)
 
     def voe(self, address: int, vendor_id: int, vendor_type: int, data: bytes) -> bytes:
         """Send data of a vendor's protocol; return the data of its answer."""
@@ -282,12 +284,12 @@ class GatewayClient(Closeable):
             if not self._is_stream:
                 return octets
             if not octets:
-                raise BusError(f"{self._place} has closed the connection")
+                raise BusError(f"{self._label} has closed the connection")
             self._rest += octets
 
     def _failure(self, error: OSError) -> BusError:
         hint = ": no gateway listens there" if isinstance(error, ConnectionRefusedError) else ""
-        return BusError(f"{self._place} does not answer: {error.strerror or error}{hint}")
+        return BusError(f"{self._label} does not answer: {error.strerror or error}{hint}")
 
 
 def cut_frame(octets: bytes) -> tuple[bytes | None, bytes]:

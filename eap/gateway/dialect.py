@@ -286,8 +286,8 @@ def encode_failure(
             opcode = SoeOpcode.WRITE_RESPONSE if is_write else SoeOpcode.READ_RESPONSE
             return _soe_head(request, opcode | _SOE_ERROR) + number.to_bytes(2, "little")
         case MailboxType.FOE:
-            words = text.encode() + b"\0" if text else b""
-            return bytes((FoeOpcode.ERROR, 0, 0, 0, 0)) + number.to_bytes(4, "little") + words
+            text_bytes = text.encode() + b"\0" if text else b""
+            return bytes((FoeOpcode.ERROR, 0, 0, 0, 0)) + number.to_bytes(4, "little") + text_bytes
     return request[: VoeHeader.SIZE].ljust(VoeHeader.SIZE, b"\0") + number.to_bytes(4, "little")
 
 

@@ -286,12 +286,12 @@ def _coe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
 
 
 def _foe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
-    words = text.encode() + b"\0"
+    text_bytes = text.encode() + b"\0"
     if not request:
         return None
     if cause in _TEMPORARY:  # no end of the transfer, only of patience
-        return encode_foe(FoeOpcode.BUSY, _NOT_BEGUN.number, words)
-    return encode_foe(FoeOpcode.ERROR, cause.foe, words)
+        return encode_foe(FoeOpcode.BUSY, _NOT_BEGUN.number, text_bytes)
+    return encode_foe(FoeOpcode.ERROR, cause.foe, text_bytes)
 
 
 def _soe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
@@ -314,10 +314,10 @@ def _aoe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     try:
         # Without a whole AMS header there is no address to answer to.
-        asked = AmsHeader.decode(request)
+        header = AmsHeader.decode(request)
     except CodecError:
         return None
-    return response_to(asked, AmsAnswer(error_code=cause.ads))
+    return response_to(header, AmsAnswer(error_code=cause.ads))
 
 
 _ERROR_ENCODERS = {

@@ -52,7 +52,7 @@ def _read_slave(number: int) -> Conversation[MasterSlave]:
     name = yield from coe_client.upload(index, 3)
     state = yield from coe_client.upload(0xA000 + number, 1)
     protocols = None
-    # Subindex 39 is an own extension; other masters end their objects before it.
+    # Objects of other masters may end before subindex 39.
     with suppress(SdoAbortError):
         protocols = int.from_bytes((yield from coe_client.upload(index, 39)), "little")
     return MasterSlave(

@@ -293,9 +293,9 @@ class EapAds(AdsService):
         # The common request, a plain read, is answered without an operation or a task.
         if header.command != _READ or len(body) != AdsRange.SIZE:
             return None
-        asked = AdsRange.decode(body)
+        requested = AdsRange.decode(body)
         try:
-            data = self._ads.read(asked.group, asked.offset, asked.length)
+            data = self._ads.read(requested.group, requested.offset, requested.length)
         except AdsRefusedError:
             return None
         return AmsAnswer(encode_result(_DONE, data))

@@ -141,13 +141,13 @@ class StationSymbols(AdsSpace):
         return SymbolTable(variables, self._file.generation)
 
 
-def _variable(place: VariableSlot) -> SymbolVariable:
-    unit = f"[{place.unit}]" if place.unit else ""
+def _variable(slot: VariableSlot) -> SymbolVariable:
+    unit = f"[{slot.unit}]" if slot.unit else ""
     return SymbolVariable(
-        place.name,
-        datatypes.parse(place.type),
-        " ".join(filter(None, (place.comment, unit))),
-        "" if place.writer is Writer.APPLICATION else f"is written by the {place.writer}",
+        slot.name,
+        datatypes.parse(slot.type),
+        " ".join(filter(None, (slot.comment, unit))),
+        "" if slot.writer is Writer.APPLICATION else f"is written by the {slot.writer}",
     )
 
 
@@ -259,14 +259,14 @@ class NotificationPump:
 
     def _send_cycle(self, at_ns: int, time: int) -> int:
         """Send the notifications of one cycle; return the number of values compared, at most."""
-        looked_at = 0
+        compared = 0
         for table, net_id, port in self._devices:
             due_ns = table.next_timeout()
             if due_ns is not None and due_ns <= at_ns:
-                looked_at += len(table)
+                compared += len(table)
                 for notice in table.handle_cycle(at_ns, time):
                     self._send(notice.client.endpoint, notice.encode(net_id, port))
-        return looked_at
+        return compared
 
     def _due_ns(self) -> int | None:
         times = (device.table.next_timeout() for device in self._devices)

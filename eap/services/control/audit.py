@@ -232,7 +232,7 @@ class Audit:
         lines = [head | _intent_fields(each) for each in entry.operations]
         return "" if self._append(lines, are_counted=False) else self._refusal_text()
 
-    def begin_request(self, who: str, station: str, fields: dict[str, Any]) -> str:
+    def begin_request(self, peer: str, station: str, fields: dict[str, Any]) -> str:
         """Write the intended change of a client of the control socket, if the audit is required.
 
         Returns:
@@ -241,12 +241,12 @@ class Audit:
         if not self.is_required:
             return ""
         why = TOO_MANY
-        if self._allow((station, CONTROL, who)):
-            line = self._request_head(who, station) | fields | {"begins": True}
+        if self._allow((station, CONTROL, peer)):
+            line = self._request_head(peer, station) | fields | {"begins": True}
             if self._append([line], are_counted=False):
                 return ""
             why = self._refusal_text()
-        self._write_limited(who, station, fields | {"error": why})
+        self._write_limited(peer, station, fields | {"error": why})
         return why
 
     def _refusal_text(self) -> str:
@@ -267,25 +267,25 @@ class Audit:
         if lines:
             self._append(lines)
 
-    def write_request(self, who: str, station: str, fields: dict[str, Any]) -> None:
+    def write_request(self, peer: str, station: str, fields: dict[str, Any]) -> None:
         """Write a change of a client of the control socket, made or denied.
 
         If that is required, :meth:`begin_request` has limited it already.
         """
         if self.is_required:
-            self._append([self._request_head(who, station) | fields])
+            self._append([self._request_head(peer, station) | fields])
         else:
-            self._write_limited(who, station, fields)
+            self._write_limited(peer, station, fields)
 
-    def _write_limited(self, who: str, station: str, fields: dict[str, Any]) -> None:
-        client = station, CONTROL, who
+    def _write_limited(self, peer: str, station: str, fields: dict[str, Any]) -> None:
+        client = station, CONTROL, peer
         if self._allow(client):
-            self._append([self._request_head(who, station) | fields])
+            self._append([self._request_head(peer, station) | fields])
         else:
             self._skip(client)
 
-    def _request_head(self, who: str, station: str) -> dict[str, Any]:
-        return {"time": self._time(), "station": station, "transport": CONTROL, "from": who}
+    def _request_head(self, peer: str, station: str) -> dict[str, Any]:
+        return {"time": self._time(), "station": station, "transport": CONTROL, "from": peer}
 
     def write_skipped(self) -> None:
         """Write how many lines were left out, for each client that had some."""
@@ -295,17 +295,17 @@ class Audit:
                 "time": self._time(),
                 "station": station,
                 "transport": transport,
-                "from": who,
+                "from": peer,
                 "skipped": count,
             }
-            for (station, transport, who), count in skipped.items()
+            for (station, transport, peer), count in skipped.items()
         ]
         if lines:
             self._append(lines)
 
     def _allow(self, client: _Client) -> bool:
         """Take one line for a client; return whether the rates allow it."""
-        station, transport, who = client
+        station, transport, peer = client
         now = self._clock()
         limiter = self._limiters.get((station, transport))
         if limiter is None:
@@ -314,7 +314,7 @@ class Audit:
             limiter = self._limiters[station, transport] = SourceRateLimiter(
                 rates, _MAX_CLIENTS, now
             )
-        return limiter.take(who, now)
+        return limiter.take(peer, now)
 
     def _skip(self, client: _Client) -> None:
         """Count a line that is left out."""
@@ -393,8 +393,8 @@ def _text_of(time_s: float) -> str:
 
 def _intent_fields(each: AuditedOperation) -> dict[str, Any]:
     decision = each.decision
-    said = {"service": decision.service, "allowed": True, "why": decision.why, "begins": True}
-    return dict(operation_fields(each.operation)) | said
+    fields = {"service": decision.service, "allowed": True, "why": decision.why, "begins": True}
+    return dict(operation_fields(each.operation)) | fields
 
 
 def _result_fields(each: AuditedOperation) -> dict[str, Any]:

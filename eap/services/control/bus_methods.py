@@ -91,9 +91,9 @@ class _OpenMailbox:
     """A conversation that a connection has open, with its turn."""
 
     def __init__(
-        self, turn: MailboxLock, kind: MailboxType, opened: records.BusOpenParameters
+        self, lock: MailboxLock, kind: MailboxType, opened: records.BusOpenParameters
     ) -> None:
-        self.turn = turn
+        self.lock = lock
         self.kind = kind
         self.opened = opened
         self.idle: asyncio.TimerHandle | None = None
@@ -110,10 +110,10 @@ class BusConnection:
             (
                 records.BUS_DESCRIBE.served_by(self._describe),
                 records.BUS_OPEN.served_by(self._open),
-                records.BUS_ASK.served_by(self._ask),
+                records.BUS_ASK.served_by(self._exchange),
                 records.BUS_CLOSE.served_by(self._close),
                 records.BUS_TRANSFER.served_by(self._transfer),
-                records.BUS_BRING.served_by(self._bring),
+                records.BUS_BRING.served_by(self._set_state),
                 records.BUS_FAULT.served_by(self._fault),
                 records.BUS_FORGET.served_by(self._forget),
             )
@@ -132,8 +132,8 @@ class BusConnection:
 
     def opened(self, number: int) -> records.BusOpenParameters | None:
         """Return how a conversation was opened, None if it is not open."""
-        held = self._open_mailboxes.get(number)
-        return held.opened if held is not None else None
+        mailbox = self._open_mailboxes.get(number)
+        return mailbox.opened if mailbox is not None else None
 
     def close(self) -> None:
         """End all open conversations."""
@@ -153,29 +153,29 @@ class BusConnection:
         try:
             async with asyncio.timeout(records.TURN_S):
                 # The connection is the requester: its conversations queue as those of one client.
-                turn = await client.lock_mailbox(wanted.slave, kind, id(self))
+                lock = await client.lock_mailbox(wanted.slave, kind, id(self))
         except TimeoutError:
             reason = f"slave {wanted.slave}: its {kind.name} mailbox was busy with other clients"
             raise ControlError(reason, code=ErrorCode.BUSY) from None
         self._last += 1
-        self._open_mailboxes[self._last] = _OpenMailbox(turn, kind, wanted)
+        self._open_mailboxes[self._last] = _OpenMailbox(lock, kind, wanted)
         self._begin_idle(self._last)
         return records.OpenConversation(self._last)
 
-    async def _ask(self, wanted: records.BusAskParameters) -> records.MailboxData:
-        held = self._of(wanted.conversation)
-        request = records.to_request(held.kind, wanted)
+    async def _exchange(self, wanted: records.BusAskParameters) -> records.MailboxData:
+        mailbox = self._of(wanted.conversation)
+        request = records.to_request(mailbox.kind, wanted)
         # A slow slave is no idle client: the timer runs between requests only.
-        self._end_idle(held)
+        self._end_idle(mailbox)
         try:
-            message = await held.turn.exchange(request)
+            message = await mailbox.lock.exchange(request)
         finally:
             self._begin_idle(wanted.conversation)
         return records.MailboxData(message.data.hex())
 
     def _close(self, wanted: records.BusCloseParameters) -> records.ClosedConversation:
         self._of(wanted.conversation)
-        self._drop(wanted.conversation).turn.close()
+        self._drop(wanted.conversation).lock.close()
         return records.ClosedConversation(wanted.conversation)
 
     async def _transfer(self, wanted: records.BusTransferParameters) -> records.DatagramReplies:
@@ -183,7 +183,7 @@ class BusConnection:
         replies = await client.transfer([records.to_datagram(row) for row in wanted.datagrams])
         return records.DatagramReplies([records.reply_row(reply) for reply in replies])
 
-    async def _bring(self, wanted: records.BusBringParameters) -> records.ReachedState:
+    async def _set_state(self, wanted: records.BusBringParameters) -> records.ReachedState:
         await self._buses.find(wanted).bring(wanted.slave, AlState[wanted.state])
         return records.ReachedState(wanted.state)
 
@@ -213,17 +213,17 @@ class BusConnection:
         loop = asyncio.get_running_loop()
         self._open_mailboxes[number].idle = loop.call_later(records.IDLE_S, self._abandon, number)
 
-    def _end_idle(self, held: _OpenMailbox) -> None:
-        if held.idle is not None:
-            held.idle.cancel()
+    def _end_idle(self, mailbox: _OpenMailbox) -> None:
+        if mailbox.idle is not None:
+            mailbox.idle.cancel()
 
     def _abandon(self, number: int) -> None:
-        self._drop(number).turn.abandon()
+        self._drop(number).lock.abandon()
 
     def _drop(self, number: int) -> _OpenMailbox:
-        held = self._open_mailboxes.pop(number)
-        self._end_idle(held)
-        return held
+        mailbox = self._open_mailboxes.pop(number)
+        self._end_idle(mailbox)
+        return mailbox
 
 
 def _check_kind(command: Mapping[str, Any]) -> None:

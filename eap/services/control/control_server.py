@@ -99,9 +99,11 @@ def change_of(
         return None if conversation is None else _conversation_change(conversation, params)
     if request.method not in _CHANGES or (request.method == "bus_transfer" and _are_reads(params)):
         return None
-    told = {key: _shortened(value) for key, value in params.items() if key not in _HIDDEN}
-    station = str(told.pop("station", "") or str(told.get("target", "")).partition("/")[0])
-    return station, {"operation": request.method, "asked": told}
+    described = {key: _shortened(value) for key, value in params.items() if key not in _HIDDEN}
+    station = str(
+        described.pop("station", "") or str(described.get("target", "")).partition("/")[0]
+    )
+    return station, {"operation": request.method, "asked": described}
 
 
 def error_in_result(result: Any, conversation: BusOpenParameters | None = None) -> str:

@@ -179,15 +179,15 @@ def _page(
 ) -> tuple[list[RowT], int | None]:
     """Return as many rows as one answer may have, and the index at which it goes on."""
     rows: list[RowT] = []
-    room = records.PAGE
+    budget = records.PAGE
     for item in items:
         if item.index < first:
             continue
         # The last row may exceed the page: the longest line has room for 32 pages.
-        if room <= 0:
+        if budget <= 0:
             return rows, item.index
         rows.append(row(item))
-        room -= len(msgspec.json.encode(rows[-1]))
+        budget -= len(msgspec.json.encode(rows[-1]))
     return rows, None
 
 

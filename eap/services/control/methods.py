@@ -90,7 +90,7 @@ class Methods:
                 code=ErrorCode.BAD_REQUEST,
             )
         station = self._station(wanted.station)
-        _places(station.image, wanted.names)
+        _slots_of(station.image, wanted.names)
         return Watch(station, wanted.names, wanted.period_ms, only_changes=wanted.on == "change")
 
     def _hello(self, wanted: control.NoParameters) -> control.Hello:
@@ -107,18 +107,18 @@ class Methods:
 
     def _variables(self, wanted: control.VariablesParameters) -> list[control.VariableRow]:
         return [
-            control.VariableRow(place.name, place.type, place.writer, place.unit, place.comment)
-            for place in self._image(wanted.station).layout.variables
+            control.VariableRow(slot.name, slot.type, slot.writer, slot.unit, slot.comment)
+            for slot in self._image(wanted.station).layout.variables
         ]
 
     def _read(self, wanted: control.ReadParameters) -> control.Values:
         image = self._image(wanted.station)
-        return _snapshot(image, _places(image, wanted.names))
+        return _snapshot(image, _slots_of(image, wanted.names))
 
     def _write(self, wanted: control.WriteParameters) -> control.Written:
         station = self._station(wanted.station)
-        places = _places(station.image, wanted.values)
-        values = {place.name: _checked(place, wanted.values[place.name]) for place in places}
+        slots = _slots_of(station.image, wanted.values)
+        values = {slot.name: _checked(slot, wanted.values[slot.name]) for slot in slots}
         try:
             station.write_once(Writer.APPLICATION, values)
         except WriterConflictError as exc:
@@ -155,7 +155,7 @@ class Watch:
         self._names = names
         self._only_changes = only_changes
         self._last: dict[str, Any] = {}
-        self._looked_in: int | None = None
+        self._last_cycle: int | None = None
         self._skipped = 0
 
     def next_event(self) -> control.ValuesEvent | None:
@@ -166,10 +166,10 @@ class Watch:
             ControlError: the station was configured anew, and one of the variables is gone.
         """
         image = self._station.image
-        now = _snapshot(image, _places(image, self._names))
-        if self._looked_in is not None:
-            self._skipped += max(now.cycle - self._looked_in - 1, 0)
-        self._looked_in = now.cycle
+        now = _snapshot(image, _slots_of(image, self._names))
+        if self._last_cycle is not None:
+            self._skipped += max(now.cycle - self._last_cycle - 1, 0)
+        self._last_cycle = now.cycle
         values, quality = now.values, now.quality
         if self._only_changes:
             last, self._last = self._last, values
@@ -181,21 +181,21 @@ class Watch:
         return control.ValuesEvent(now.station, now.cycle, values, quality, skipped)
 
 
-def _snapshot(image: Image, places: list[VariableSlot]) -> control.Values:
-    """Return the values of *places*; those of one writer belong to one moment.
+def _snapshot(image: Image, slots: list[VariableSlot]) -> control.Values:
+    """Return the values of *slots*; those of one writer belong to one moment.
 
     Values that the engine writes are those of the cycle that is named.
     """
     # The engine's values are copied between two cycles, so that all are of one cycle.
     engine = image.snapshot()
     # One value is read without copying the regions of all writers.
-    if len(places) == 1:
-        (place,) = places
-        source = engine if place.writer is Writer.ENGINE else image
-        values = {place.name: source.read(place.name)}
+    if len(slots) == 1:
+        (slot,) = slots
+        source = engine if slot.writer is Writer.ENGINE else image
+        values = {slot.name: source.read(slot.name)}
     else:
         values = engine.read_all((Writer.ENGINE,)) | image.read_all(_OTHERS)
-    plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in places}
+    plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in slots}
     cycle = engine.words[StationWord.CYCLE]
     return control.Values(image.layout.station, cycle, plain, _qualities(engine, plain))
 
@@ -210,7 +210,7 @@ def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
     return qualities
 
 
-def _places(image: Image, names: Iterable[str]) -> list[VariableSlot]:
+def _slots_of(image: Image, names: Iterable[str]) -> list[VariableSlot]:
     """Return the places of *names*, of all variables when there are none."""
     chosen = list(names)
     if not chosen:
@@ -225,14 +225,14 @@ def _places(image: Image, names: Iterable[str]) -> list[VariableSlot]:
     return [image.slots[name] for name in chosen]
 
 
-def _checked(place: VariableSlot, value: Any) -> Any:
-    if place.writer is not Writer.APPLICATION:
+def _checked(slot: VariableSlot, value: Any) -> Any:
+    if slot.writer is not Writer.APPLICATION:
         raise ControlError(
-            f"variable {place.name} is written by the {place.writer}; only variables of the"
+            f"variable {slot.name} is written by the {slot.writer}; only variables of the"
             f" application can be set",
             code=ErrorCode.REFUSED,
         )
     try:
-        return datatypes.parse(place.type).from_plain(value)
+        return datatypes.parse(slot.type).from_plain(value)
     except ValueError as exc:
-        raise ControlError(f"variable {place.name}: {exc}", code=ErrorCode.VALUE) from None
+        raise ControlError(f"variable {slot.name}: {exc}", code=ErrorCode.VALUE) from None

@@ -77,7 +77,7 @@ class AmsMethods:
         return records.PlantScan(stations, via)
 
     async def _trace(self, wanted: records.TraceParameters) -> records.TracedPath:
-        router, address = self._router(wanted.via), _found(self._directory.find, wanted.target)
+        router, address = self._router(wanted.via), _resolve(self._directory.find, wanted.target)
         found = await trace(router, *address)
         return records.TracedPath(
             wanted.target,
@@ -91,7 +91,7 @@ class AmsMethods:
 
     async def _ask(self, wanted: records.AskParameters) -> records.AmsReply:
         find = self._directory.find_device if wanted.device else self._directory.find
-        router, address = self._router(wanted.via), _found(find, wanted.target)
+        router, address = self._router(wanted.via), _resolve(find, wanted.target)
         timeout_s = wanted.timeout_ms / 1000
         data = to_octets(wanted.data)
         answer = await router.request(*address, wanted.command, data, timeout_s=timeout_s)
@@ -101,7 +101,7 @@ class AmsMethods:
         return of_station(via or next(iter(self._routers)), self._routers)
 
 
-def _found(find: Callable[[str], AmsAddress], target: str) -> AmsAddress:
+def _resolve(find: Callable[[str], AmsAddress], target: str) -> AmsAddress:
     try:
         return find(target)
     except ValueError as exc:

@@ -53,7 +53,7 @@ class ImageValues:
 
     def __init__(self, station: StationImage) -> None:
         self._station = station
-        self._found: _Places | None = None
+        self._cached: _Slots | None = None
         self._moment: Image | None = None
 
     def octets(self, key: str, name: str) -> bytes | None:
@@ -64,7 +64,7 @@ class ImageValues:
                 return _value(image, name)
             # What programs write has no place in a snapshot: it may be cut in two there.
             source = image if key in _CONTROLS else self._moment or image
-            number = self._places(source.layout).number(source, key, name)
+            number = self._slots(source.layout).number(source, key, name)
         except ImageError:
             return None
         return None if number is None else _encode(_KINDS[key], number)
@@ -79,20 +79,20 @@ class ImageValues:
         finally:
             self._moment = None
 
-    def _places(self, layout: ImageLayout) -> _Places:
-        if self._found is None or self._found.layout is not layout:
-            self._found = _Places(layout)
-        return self._found
+    def _slots(self, layout: ImageLayout) -> _Slots:
+        if self._cached is None or self._cached.layout is not layout:
+            self._cached = _Slots(layout)
+        return self._cached
 
 
-class _Places:
+class _Slots:
     """Places in images of one layout, by name."""
 
     def __init__(self, layout: ImageLayout) -> None:
         self.layout = layout
-        self._frames = {place.name: place for place in layout.frames}
-        self._tx = {place.name: place for place in layout.tx}
-        self._rx = {place.name: place for place in layout.rx}
+        self._frames = {slot.name: slot for slot in layout.frames}
+        self._tx = {slot.name: slot for slot in layout.tx}
+        self._rx = {slot.name: slot for slot in layout.rx}
 
     def number(self, image: Image, key: str, name: str) -> int | None:
         if key in _OF_STATION:
@@ -106,15 +106,15 @@ class _Places:
         return None
 
 
-def _applied(function: Callable[[Image, Any], int], image: Image, place: Any) -> int | None:
-    return None if place is None else function(image, place)
+def _applied(function: Callable[[Image, Any], int], image: Image, slot: Any) -> int | None:
+    return None if slot is None else function(image, slot)
 
 
 def _value(image: Image, name: str) -> bytes | None:
-    place = image.slots.get(name)
-    if place is None:
+    slot = image.slots.get(name)
+    if slot is None:
         return None
-    kind = datatypes.parse(place.type)
+    kind = datatypes.parse(slot.type)
     return kind.encode(image.read(name)).ljust(kind.size, b"\0")
 
 
@@ -128,42 +128,42 @@ def _encode(kind: DataType, number: int) -> bytes:
 
 
 def _frame_word(word: FrameWord) -> Callable[[Image, FrameSlot], int]:
-    return lambda image, place: int(image.words[place.words + word])
+    return lambda image, slot: int(image.words[slot.words + word])
 
 
 def _tx_word(word: TxWord) -> Callable[[Image, TxSlot], int]:
-    return lambda image, place: int(image.words[place.words + word])
+    return lambda image, slot: int(image.words[slot.words + word])
 
 
 def _sent(reason: Reason) -> Callable[[Image, TxSlot], int]:
-    return lambda image, place: int(tx_status(image, place)["reason"].get(reason.value, 0))
+    return lambda image, slot: int(tx_status(image, slot)["reason"].get(reason.value, 0))
 
 
-def _last_reason(image: Image, place: TxSlot) -> int:
-    last = tx_status(image, place)["last_reason"]
+def _last_reason(image: Image, slot: TxSlot) -> int:
+    last = tx_status(image, slot)["last_reason"]
     return 0 if last is None else REASON_INDEX[Reason(last)]
 
 
 def _control(suffix: str) -> Callable[[Image, FrameSlot | TxSlot], int]:
-    return lambda image, place: int(image.read(place.name + suffix))
+    return lambda image, slot: int(image.read(slot.name + suffix))
 
 
 def _tracked(word: RxWord) -> Callable[[Image, RxSlot], int]:
-    return lambda image, place: int(image.words[tracker_word(image, place) + word])
+    return lambda image, slot: int(image.words[tracker_word(image, slot) + word])
 
 
 def _discarded(reason: PdDropReason) -> Callable[[Image, RxSlot], int]:
     offset = RxWord.DISCARDED + PD_DROP_INDEX[reason]
-    return lambda image, place: int(image.words[place.words + offset])
+    return lambda image, slot: int(image.words[slot.words + offset])
 
 
-def _quality(image: Image, place: RxSlot) -> int:
-    return quality(image, place) if _tracked(RxWord.RECEIVED)(image, place) else _NEVER
+def _quality(image: Image, slot: RxSlot) -> int:
+    return quality(image, slot) if _tracked(RxWord.RECEIVED)(image, slot) else _NEVER
 
 
-def _cycle_index(image: Image, place: RxSlot) -> int:
-    last = _tracked(RxWord.LAST_CYCLE)(image, place)
-    return last & 0xFFFF if _tracked(RxWord.RECEIVED)(image, place) else 0
+def _cycle_index(image: Image, slot: RxSlot) -> int:
+    last = _tracked(RxWord.LAST_CYCLE)(image, slot)
+    return last & 0xFFFF if _tracked(RxWord.RECEIVED)(image, slot) else 0
 
 
 _CONTROLS = frozenset((EapLive.FRAME_CTRL, EapLive.TX_VAR_CTRL))
@@ -180,14 +180,14 @@ _OF_STATION: dict[str, int] = {
     if (key := f"station_discarded_{reason}") in _KINDS
 }
 _OF_FRAME: dict[str, Callable[[Image, FrameSlot], int]] = {
-    EapLive.FRAME_STATE: lambda image, place: frame_state(image, place.words),
+    EapLive.FRAME_STATE: lambda image, slot: frame_state(image, slot.words),
     EapLive.FRAME_CTRL: _control(FRAME_CTRL),
     EapLive.FRAME_WHOLE: _frame_word(FrameWord.WHOLE),
     EapLive.FRAME_PARTIAL: _frame_word(FrameWord.PARTIAL),
     EapLive.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
 }
 _OF_TX: dict[str, Callable[[Image, TxSlot], int]] = {
-    EapLive.TX_VAR_STATE: lambda image, place: tx_var_state(image.words, place),
+    EapLive.TX_VAR_STATE: lambda image, slot: tx_var_state(image.words, slot),
     EapLive.TX_VAR_CTRL: _control(VAR_CTRL),
     EapLive.TX_LAST_REASON: _last_reason,
     EapLive.TX_SKIPPED: _tx_word(TxWord.SKIPPED),

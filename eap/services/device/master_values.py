@@ -214,9 +214,12 @@ class MasterView:
 
     def is_fresh(self, index: int) -> bool:
         """Return whether :meth:`refresh` has nothing to do."""
-        return self._view.is_current and all(
-            value.is_younger(age_s) for value, age_s in self._values_behind(index)
-        )
+        if not self._view.is_current:
+            return False
+        for value, age_s in self._values_behind(index):  # noqa: SIM110  all() takes longer
+            if not value.is_younger(age_s):
+                return False
+        return True
 
     def _values_behind(self, index: int) -> Iterator[tuple[CachedValue[Any], float]]:
         """Yield the cached values that the object at *index* shows, with their greatest ages."""

@@ -69,7 +69,7 @@ class UdpSubscriberProbe:
             self._is_enabled = True
 
     def collect(self, now_ns: int) -> None:
-        """Take what ICMP told, for :meth:`hear`.
+        """Take what ICMP told, for :meth:`refused_targets`.
 
         While errors wait, whoever waits for frames at these sockets is woken again and again.
         """
@@ -84,13 +84,13 @@ class UdpSubscriberProbe:
                 if len(errors) < ERRORS_PER_CALL:
                     break
 
-    def hear(self, now_ns: int) -> set[tuple[str, int]]:
+    def refused_targets(self, now_ns: int) -> set[tuple[str, int]]:
         """Return address and port of the targets that were not reached since the last call."""
         self.collect(now_ns)
         found, self._refused = self._refused, set()
         return found & self._refused_at_ns.keys()
 
-    def look(self, target: Destination, sent_at_ns: int) -> ProbeResult:
+    def evidence_of(self, target: Destination, sent_at_ns: int) -> ProbeResult:
         """Return the evidence about *target*, to which a frame was sent last at *sent_at_ns*.
 
         A refusal holds until frames have been sent for a while without another one.
@@ -301,14 +301,15 @@ class SubscriberWatch:
 
     def _receive_replies(self, now_ns: int) -> None:
         for hop_prober in set(self._endpoints.arp.values()):
-            for heard in hop_prober.drain():
-                for name in self._pending.get((hop_prober, heard.address), ()):
-                    if heard.is_claim:
-                        self._monitor.receive_claim(name, heard.mac, now_ns)
+            for reply in hop_prober.drain():
+                for name in self._pending.get((hop_prober, reply.address), ()):
+                    if reply.is_claim:
+                        self._monitor.receive_claim(name, reply.mac, now_ns)
                     else:
-                        self._monitor.receive_reply(name, heard.mac, now_ns)
+                        self._monitor.receive_reply(name, reply.mac, now_ns)
         refused = {
-            endpoint: endpoint.hear(now_ns) for endpoint in set(self._endpoints.udp.values())
+            endpoint: endpoint.refused_targets(now_ns)
+            for endpoint in set(self._endpoints.udp.values())
         }
         for row in self._rows_by_udp():
             target = _ip_of(row)
@@ -327,7 +328,7 @@ class SubscriberWatch:
         target, endpoint = _ip_of(row), self._endpoints.udp.get(row.port)
         if target is None or endpoint is None:
             return ProbeResult.BLIND
-        return endpoint.look(target, row.word(FrameWord.SENT_AT_NS))
+        return endpoint.evidence_of(target, row.word(FrameWord.SENT_AT_NS))
 
     def _hop_prober(self, row: _Row) -> ArpProber | None:
         """Return the ARP prober for the subscriber of *row*, None where ARP cannot reach it."""

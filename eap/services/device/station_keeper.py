@@ -145,7 +145,7 @@ class StationKeeper:
             self.undone = stored.undone
             if stored.spec == spec:
                 self.objects = stored.objects
-        self._kept = self._record()
+        self._stored = self._record()
 
     async def change(
         self, spec: StationSpec, objects: dict[str, Any], *, cause: str = "", applied: bool = False
@@ -262,7 +262,7 @@ class StationKeeper:
     async def _save(self, record: Stored) -> None:
         # Other clients do not wait for the disk.
         await asyncio.to_thread(self._store.save, record)
-        self._kept = record
+        self._stored = record
         self.unsaved = None
 
     async def _save_back(self) -> None:
@@ -271,6 +271,6 @@ class StationKeeper:
         try:
             await self._save(record)
         except EnvironmentalError as exc:
-            if self.unsaved is None and record != self._kept:
+            if self.unsaved is None and record != self._stored:
                 logger.warning("%s; a start restores the configuration before", exc)
                 self.unsaved = Unsaved(str(exc), time())

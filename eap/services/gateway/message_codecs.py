@@ -176,11 +176,11 @@ class AdsCodec(MessageCodec):
                 return [acknowledgement] if acknowledgement else []
             header, data = decode_packet(whole)
         packet = await self._access.exchange_ads(header, bytes(data))
-        room = self.sizes.data_to_master
-        if len(packet) <= room:
+        max_size = self.sizes.data_to_master
+        if len(packet) <= max_size:
             return [packet] if packet else []
         self._number += 1
-        return list(iter_fragments(packet, self._number, room - AmsHeader.SIZE))
+        return list(iter_fragments(packet, self._number, max_size - AmsHeader.SIZE))
 
 
 class EthernetCodec(MessageCodec):

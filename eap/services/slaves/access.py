@@ -200,27 +200,27 @@ class LocalSlave:
         self, index: int, subindex: int, *, complete: bool = False
     ) -> ObjectStream:
         """Begin to read as :meth:`read_object` does; the stream is closed by the caller."""
-        turn = await self.bus.lock_mailbox(
+        lock = await self.bus.lock_mailbox(
             self._slave.station, MailboxType.COE, self._requester, self._lock_s
         )
         try:
             begin = coe_client.begin_upload(index, subindex, complete=complete)
-            start = await drive_async(begin, turn.exchange)
+            start = await drive_async(begin, lock.exchange)
         except asyncio.CancelledError:
-            turn.abandon()
+            lock.abandon()
             raise
         except BaseException:
-            turn.close()
+            lock.close()
             raise
         stream = ObjectStream(*start)
         # The object came whole: the mailbox is free before its reader has taken it.
         if len(start.data) == start.size:
-            turn.close()
+            lock.close()
         else:
             rest = coe_client.continue_upload(index, subindex, start, sink=stream.take)
-            task = stream.follow(drive_async(rest, turn.exchange))
+            task = stream.follow(drive_async(rest, lock.exchange))
             # Not within the coroutine: one that is cancelled before its first step never runs.
-            task.add_done_callback(partial(_end_turn, turn))
+            task.add_done_callback(partial(_end_lock, lock))
         return stream
 
     async def write_object(
@@ -295,10 +295,10 @@ class LocalSlave:
         return await self.bus.converse(station, conversation, self._requester, self._lock_s)
 
 
-def _end_turn(turn: MailboxLock, task: asyncio.Task[object]) -> None:
+def _end_lock(lock: MailboxLock, task: asyncio.Task[object]) -> None:
     if task.cancelled():
-        turn.abandon()
-    turn.close()
+        lock.abandon()
+    lock.close()
 
 
 def _single(ask: MailboxRequest) -> Conversation[MailboxMessage]:

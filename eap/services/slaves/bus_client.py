@@ -152,12 +152,12 @@ class MailboxQueues:
         if self.is_free(mailbox):
             self._waiting[mailbox] = {}
             return
-        turn = asyncio.get_running_loop().create_future()
-        self._waiting[mailbox].setdefault(client, deque()).append(turn)
+        lock = asyncio.get_running_loop().create_future()
+        self._waiting[mailbox].setdefault(client, deque()).append(lock)
         try:
-            await turn
+            await lock
         except asyncio.CancelledError:
-            if turn.done() and not turn.cancelled():  # it came in the same moment
+            if lock.done() and not lock.cancelled():  # it came in the same moment
                 self.release(mailbox)
             raise
 
@@ -166,14 +166,14 @@ class MailboxQueues:
         clients = self._waiting[mailbox]
         while clients:
             client = next(iter(clients))
-            turns = clients.pop(client)
-            turn = turns.popleft()
+            waiters = clients.pop(client)
+            lock = waiters.popleft()
             # At the end of the queue: behind each request of a client comes the next client.
-            if turns:
-                clients[client] = turns
+            if waiters:
+                clients[client] = waiters
             # A waiter whose request was cancelled is skipped.
-            if not turn.done():
-                turn.set_result(None)
+            if not lock.done():
+                lock.set_result(None)
                 return
         del self._waiting[mailbox]
 
@@ -347,23 +347,23 @@ class BusClient:
             SdoAbortError: it refuses an SDO.
             EngineGoneError: there is no engine, or not the one with which it began.
         """
-        turn: MailboxLock | None = None
+        lock: MailboxLock | None = None
 
         async def exchange(request: MailboxRequest) -> MailboxMessage:
-            nonlocal turn
-            if turn is None:
-                turn = await self.lock_mailbox(station, request.type, requester, lock_s)
-            return await turn.exchange(request)
+            nonlocal lock
+            if lock is None:
+                lock = await self.lock_mailbox(station, request.type, requester, lock_s)
+            return await lock.exchange(request)
 
         try:
             return await drive_async(conversation, exchange)
         except asyncio.CancelledError:
-            if turn is not None:
-                turn.abandon()
+            if lock is not None:
+                lock.abandon()
             raise
         finally:
-            if turn is not None:
-                turn.close()
+            if lock is not None:
+                lock.close()
 
     async def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; return its result or raise its error."""

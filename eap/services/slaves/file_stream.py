@@ -257,7 +257,7 @@ class LocalFile(FileStream):
     ) -> None:
         super().__init__(name, sizes, is_write=is_write, ahead=ahead)
         self._password = password
-        self._open_turn = lock_mailbox
+        self._lock_mailbox = lock_mailbox
         self._history = FileHistory(is_kept=is_write)
 
     async def move(self) -> None:
@@ -280,13 +280,13 @@ class LocalFile(FileStream):
 
     async def _move_once(self) -> None:
         room = self.sizes.to_slave - DATA_OVERHEAD
-        turn = await self._open_turn(self)
+        lock = await self._lock_mailbox(self)
         self.notify(has_lock=True)
 
         async def exchange(request: MailboxRequest) -> MailboxMessage:
             if not self.is_write:
                 await self.wait_space()
-            message = await turn.exchange(request)
+            message = await lock.exchange(request)
             # Waits between packets, where slaves allow pauses, not within one.
             if self.is_write and message.data[:1] == _ACK:
                 self.notify(is_open=True)
@@ -296,10 +296,10 @@ class LocalFile(FileStream):
         try:
             await drive_async(self._begin(), exchange)
         except asyncio.CancelledError:
-            turn.abandon()
+            lock.abandon()
             raise
         finally:
-            turn.close()
+            lock.close()
         self._history.end()
 
     def _begin(self) -> Conversation[int]:

@@ -260,8 +260,8 @@ class RemoteSlave:
             listed = await self.perform(
                 Read(IndexGroup.SDO, offset, 2 + 2 * _LISTED), port=DEVICE_PORT
             )
-            places = range(2, min(len(listed) - 1, 2 + 2 * _LISTED), 2)
-            stations = [int.from_bytes(listed[at : at + 2], "little") for at in places]
+            positions = range(2, min(len(listed) - 1, 2 + 2 * _LISTED), 2)
+            stations = [int.from_bytes(listed[at : at + 2], "little") for at in positions]
             if self._port in stations:
                 return number * _LISTED + stations.index(self._port)
             if len(stations) < _LISTED:

@@ -54,42 +54,43 @@ def send(endpoint, target):
 def test_closed_port_of_a_subscriber_is_evidence(endpoint, closed):
     endpoint.watch([closed])
     send(endpoint, closed)
-    assert endpoint.hear(5 * SECOND) == {key_of(closed)}
-    assert endpoint.hear(5 * SECOND) == set()
-    assert endpoint.look(closed, 5 * SECOND) is ProbeResult.ABSENT
+    assert endpoint.refused_targets(5 * SECOND) == {key_of(closed)}
+    assert endpoint.refused_targets(5 * SECOND) == set()
+    assert endpoint.evidence_of(closed, 5 * SECOND) is ProbeResult.ABSENT
 
 
 def test_refusal_holds_until_frames_went_on_without_another(endpoint, closed):
     endpoint.watch([closed])
     send(endpoint, closed)
-    endpoint.hear(5 * SECOND)
-    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS - 1) is ProbeResult.ABSENT
-    assert endpoint.look(closed, 5 * SECOND + REFUSAL_NS) is ProbeResult.BLIND  # our own machine
-    assert endpoint.look(closed, 5 * SECOND) is ProbeResult.BLIND
+    endpoint.refused_targets(5 * SECOND)
+    assert endpoint.evidence_of(closed, 5 * SECOND + REFUSAL_NS - 1) is ProbeResult.ABSENT
+    # The neighbour table has no entry for our own machine.
+    assert endpoint.evidence_of(closed, 5 * SECOND + REFUSAL_NS) is ProbeResult.BLIND
+    assert endpoint.evidence_of(closed, 5 * SECOND) is ProbeResult.BLIND
 
 
 def test_unwatched_targets_are_ignored(endpoint, closed):
     endpoint.watch([closed])
     send(endpoint, closed)
     endpoint.watch([Destination.parse("127.9.2.9:9")])
-    assert endpoint.hear(5 * SECOND) == set()
+    assert endpoint.refused_targets(5 * SECOND) == set()
 
 
 def test_a_target_that_stays_keeps_its_refusal(endpoint, closed):
     endpoint.watch([closed])
     send(endpoint, closed)
-    endpoint.hear(5 * SECOND)
+    endpoint.refused_targets(5 * SECOND)
     endpoint.watch([closed, Destination.parse("127.9.2.9:9")])
-    assert endpoint.look(closed, 5 * SECOND) is ProbeResult.ABSENT
+    assert endpoint.evidence_of(closed, 5 * SECOND) is ProbeResult.ABSENT
 
 
 def test_probe_without_targets_does_not_query_the_kernel(endpoint, closed):
     send(endpoint, closed)
-    assert endpoint.hear(SECOND) == set()
+    assert endpoint.refused_targets(SECOND) == set()
     endpoint.watch([])
     send(endpoint, closed)
     endpoint.watch([closed])
-    assert endpoint.hear(SECOND) == set()
+    assert endpoint.refused_targets(SECOND) == set()
 
 
 def test_more_errors_than_one_call_takes(endpoint, closed):
@@ -97,8 +98,8 @@ def test_more_errors_than_one_call_takes(endpoint, closed):
     for _ in range(600):
         send(endpoint, closed)
         endpoint.sockets[0].getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    assert endpoint.hear(5 * SECOND) == {key_of(closed)}
-    assert endpoint.hear(6 * SECOND) == set()
+    assert endpoint.refused_targets(5 * SECOND) == {key_of(closed)}
+    assert endpoint.refused_targets(6 * SECOND) == set()
 
 
 def test_listener_of_this_machine_is_unknown(endpoint):
@@ -107,8 +108,8 @@ def test_listener_of_this_machine_is_unknown(endpoint):
         target = Destination.parse("{}:{}".format(*listener.getsockname()))
         endpoint.watch([target])
         send(endpoint, target)
-        assert endpoint.hear(SECOND) == set()
-        assert endpoint.look(target, SECOND) is ProbeResult.BLIND
+        assert endpoint.refused_targets(SECOND) == set()
+        assert endpoint.evidence_of(target, SECOND) is ProbeResult.BLIND
 
 
 def test_usual_port_has_no_need_to_be_named():
@@ -138,5 +139,5 @@ def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog,
     with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
         endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
         endpoint = endpoints.udp[PortName("left", "eap0")]
-        assert endpoint.look(closed, 0) is ProbeResult.BLIND
+        assert endpoint.evidence_of(closed, 0) is ProbeResult.BLIND
     assert "forbidden; missing subscribers on UDP are detected by ICMP only" in caplog.text
