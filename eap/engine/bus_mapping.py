@@ -72,7 +72,7 @@ class BusMapping:
         if self._plan is not None and self.bus_image is not None:
             self._plan.kept.run(self._memory, memoryview(self.bus_image.inputs))
 
-    def take_inputs(self, master: Master) -> None:
+    def copy_inputs(self, master: Master) -> None:
         """Copy the inputs of the last exchange and the states of the slaves into the image."""
         if self._plan is not None and self.bus_image is not None:
             self._plan.inputs.run(memoryview(self.bus_image.inputs), self._memory)

@@ -176,7 +176,7 @@ class BusPublisher:
         revision = bus.revision
         if revision == self._sent:
             return
-        bus.faults.take_events(master)  # a change that they bring is counted already
+        bus.faults.handle_events(master)  # a change that they bring is counted already
         bus_slaves = master.slaves
         if bus_slaves is self._bus_slaves:
             presets = self._presets

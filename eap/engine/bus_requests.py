@@ -138,6 +138,7 @@ class BusRequestHandler:
 
     def serve(self, now_ns: int) -> None:
         """Serve a few of the waiting requests."""
+        # Bounded, so that requests do not delay the cycles.
         for _ in range(PER_WAKE_UP):
             try:
                 message = self._sock.recv(_MAX_MESSAGE)

@@ -97,7 +97,7 @@ class SlaveFaults:
             if each.until_ns is None:
                 self._end(station, now_ns)
 
-    def take_events(self, master: Master) -> None:
+    def handle_events(self, master: Master) -> None:
         """Take the events of the master."""
         while (event := master.next_event()) is not None:
             self._remember(event)
@@ -205,7 +205,7 @@ class EngineBus:
     def start(self, now_ns: int) -> None:
         """Begin to bring the bus up."""
         for _ in range(_MAX_STALE):
-            if self._take_frame() is None:
+            if self._receive_frame() is None:
                 break  # the rest was for an engine that has died
         self._guarded(self._start, now_ns)
 
@@ -240,9 +240,9 @@ class EngineBus:
         """Use another image from now on; it holds what the one before held."""
         self._mapping = mapping
 
-    def take_inputs(self) -> None:
+    def copy_inputs(self) -> None:
         """Copy the inputs of the last exchange and the states of the slaves into the image."""
-        self._mapping.take_inputs(self.master)
+        self._mapping.copy_inputs(self.master)
 
     def exchange(self, now_ns: int) -> None:
         """Run due timers, copy the outputs out of the image and send them."""
@@ -290,7 +290,7 @@ class EngineBus:
 
     def _restart_master(self, exc: Exception, now_ns: int) -> None:
         """Replace a master that has failed."""
-        self.faults.take_events(self.master)
+        self.faults.handle_events(self.master)
         self.faults.end_all(now_ns)
         self.master = Master(self._settings)
         self._mapping.lay_out(None)
@@ -308,29 +308,30 @@ class EngineBus:
         if self.master.image is not self._mapping.bus_image:
             self._mapping.lay_out(self.master.image)
             self._mapping.keep_inputs()
+        # The outputs of this cycle leave at its end; the inputs they cause come in the next one.
         self._mapping.put_outputs()
         self.master.start_cycle(now_ns)
         self._send(now_ns)
-        self.faults.take_events(self.master)
+        self.faults.handle_events(self.master)
 
     def _handle_timeout(self, now_ns: int) -> None:
-        self._take_frames(now_ns)
+        self._receive_frames(now_ns)
         self.master.handle_timeout(now_ns)
         self._send(now_ns)
 
     def _receive(self, now_ns: int) -> None:
-        self._take_frames(now_ns)
+        self._receive_frames(now_ns)
         self._send(now_ns)
 
-    def _take_frames(self, now_ns: int) -> None:
+    def _receive_frames(self, now_ns: int) -> None:
         """Receive a batch of frames first: a frame that waits in the socket is not overdue."""
         for _ in range(BATCH):
-            frame = self._take_frame()
+            frame = self._receive_frame()
             if frame is None:
                 break
             self.master.receive_frame(frame, now_ns)
 
-    def _take_frame(self) -> bytes | None:
+    def _receive_frame(self) -> bytes | None:
         try:
             return self._port.receive()
         except EnvironmentalError as exc:

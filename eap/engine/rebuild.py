@@ -205,7 +205,7 @@ class _Job:
             self._before = None
         notify()
 
-    def take(self, engine: Engine, now_ns: int) -> None:
+    def finish(self, engine: Engine, now_ns: int) -> None:
         """Swap in the replacement, if there is one; note whether it has to be built again."""
         self.is_built = False
         successor = self.successor
@@ -314,7 +314,8 @@ class StationRebuilder:
         self.is_ready = False
         job = self._job
         assert job is not None  # noqa: S101  is_ready said so
-        job.take(self._engine, now_ns)
+        job.finish(self._engine, now_ns)
+        # The new objects live as long as the station: the collector need not look through them.
         gc.freeze()
         if not job.is_stale:
             job.reply(job.error)

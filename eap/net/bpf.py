@@ -50,6 +50,7 @@ MAX_ADDRESSES = 1000
 
 def _by_type(offset: int, services: int, others: int) -> list[Instruction]:
     """Return *services* or *others* by the type nibble of the frame at *offset*."""
+    # Each comparison jumps to the last instruction, so its offset shrinks by one per step.
     types = SERVICES_TYPES
     last = len(types) - 1
     checks: list[Instruction] = [

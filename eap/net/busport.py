@@ -84,6 +84,7 @@ class BusPort:
                 raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
             if not self._header:
                 return data or None
+            # Without bit 1, which the first slave sets (ETG.1000.4) and some emulators do not.
             if len(data) > _HEADER and _source(data) == _source(self._header):
                 return data[_HEADER:]
 

@@ -261,6 +261,7 @@ def _find_victim(
             order = 0
         else:
             continue
+        # The lowest rank loses: by rule, then of the host that holds most, least active, oldest.
         rank = order, -count, each.activity, each.used_at_ns
         if best is None or rank < best:
             victim, best = each, rank

@@ -154,8 +154,8 @@ class EthernetInterface:
         if not handlers:
             return 0
         view, size, at_ns = self._batch.arrival()
-        for take in handlers:
-            take(view, size - ETHERNET_HEADER, at_ns, self)
+        for handle in handlers:
+            handle(view, size - ETHERNET_HEADER, at_ns, self)
         return 1
 
     def _dispatch(self, count: int) -> int:
@@ -166,9 +166,9 @@ class EthernetInterface:
         if heads.count(heads[0]) == tags.count(tags[0]) == count:
             only = self._routes.get(tags[0] & _VID, {}).get(heads[0] & _MAC_MASK, [])
             if len(only) == 1:  # a burst of one sender for one port: nothing to tell apart
-                take = only[0]
+                handle = only[0]
                 for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):
-                    take(view, size - ETHERNET_HEADER, at_ns, self)
+                    handle(view, size - ETHERNET_HEADER, at_ns, self)
                 return count
         find = self._handlers
         for view, size, at_ns, head, tag in zip(
@@ -176,8 +176,8 @@ class EthernetInterface:
         ):
             if handlers := find(head, tag):
                 taken += 1
-                for take in handlers:
-                    take(view, size - ETHERNET_HEADER, at_ns, self)
+                for handle in handlers:
+                    handle(view, size - ETHERNET_HEADER, at_ns, self)
         return taken
 
     def _handlers(self, head: int, tag: int) -> Sequence[FrameHandler]:
@@ -191,8 +191,8 @@ class EthernetInterface:
     def _drain_local(self) -> int:
         count = len(self._local)
         for _ in range(count):
-            take, data, at_ns = self._local.popleft()
-            take(data, len(data), at_ns, self)
+            handle, data, at_ns = self._local.popleft()
+            handle(data, len(data), at_ns, self)
         return count
 
 

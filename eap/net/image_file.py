@@ -202,6 +202,7 @@ def _replace(existing: ImageFile | None, fresh: ImageFile, path: Path) -> ImageF
         fresh.discard()
         raise
     if existing is not None:
+        # Before the copy: a program that still writes the old file sees RETIRED and writes again.
         existing.retire()
         handover = ImageHandover(existing.image, fresh.image)
         handover.carry_words()

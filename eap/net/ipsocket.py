@@ -57,6 +57,7 @@ def open_udp_pair(address: str, port: int = EAP_PORT) -> tuple[socket.socket, so
         if address != "0.0.0.0":  # noqa: S104  a comparison
             out = socket.inet_aton(address)
             engine.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, out)
+        # Process data does not leave the local network.
         engine.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
         engine.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
     except BaseException:
@@ -73,6 +74,7 @@ def open_tcp_listener(address: str, port: int = EAP_PORT) -> socket.socket:
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
+        # Connections in TIME_WAIT of an appliance that has ended must not prevent a new start.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((address, port))
         sock.listen(_BACKLOG)

@@ -107,8 +107,8 @@ class LoopbackChannel:
             self._queue.remove(frame)
         for frame in due:
             self._sender = frame.sender
-            for take in self.handlers:
-                take(frame.data, len(frame.data), frame.due_ns, self)
+            for handle in self.handlers:
+                handle(frame.data, len(frame.data), frame.due_ns, self)
         return len(due)
 
     def sender_of(self, data: memoryview) -> str:

@@ -268,6 +268,7 @@ class SendBatch:
         done = 0
         tried_again = -1
         while True:
+            # An ICMP error belongs to an earlier datagram: the call is made once more.
             if sent < 0 and ctypes.get_errno() in ICMP_ERRNOS and tried_again != done:
                 tried_again, sent = done, 0
             elif sent < 0:

@@ -117,6 +117,7 @@ def _closed_socket(interface: str) -> socket.socket:
 
 
 def _join(sock: socket.socket, interface: str, protocol: int) -> None:
+    # Without it the socket also receives the frames that this host sends.
     sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
     sock.bind((interface, protocol))
     if sock.getsockname()[3] not in (_ARPHRD_ETHER, ARPHRD_LOOPBACK):

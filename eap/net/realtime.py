@@ -45,6 +45,7 @@ def prepare(priority: int, cpus: Iterable[int] = ()) -> Report:
         "pm_qos": _hold_latency(),
         "timer_slack_ns": _set_timer_slack(),
     }
+    # The cycles make no reference cycles: an automatic collection would only delay them.
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -68,6 +69,7 @@ def die_with_parent(parent_pid: int, number: signal.Signals = signal.SIGKILL) ->
     another parent now, and the signal is sent at once.
     """
     _library["prctl"](_PR_SET_PDEATHSIG, int(number), 0, 0, 0)
+    # A parent that ended before prctl causes no signal.
     if os.getppid() != parent_pid:
         os.kill(os.getpid(), number)
 

@@ -30,6 +30,7 @@ class TcpWriter:
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
+        # Without it the kernel delays a frame until the one before is confirmed (Nagle).
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         # What does not go out soon is stale: neither queue much of it nor retry for minutes.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
@@ -352,6 +353,7 @@ class TcpReceiver:
             if self._end - start < EtherCatHeader.SIZE:
                 return count
             frame_type = buffer[start + 1] >> 4
+            # The length of another type cannot be trusted, so the stream has lost its framing.
             if frame_type != FrameType.PROCESS_DATA:
                 self.close(f"frame of type {frame_type}, only type 4 may follow a type 4")
                 return count
@@ -359,8 +361,8 @@ class TcpReceiver:
             if self._end - start < size:
                 return count
             self._start += size
-            for take in self.handlers:
-                take(self._view[start : start + size], size, now_ns, self)
+            for handle in self.handlers:
+                handle(self._view[start : start + size], size, now_ns, self)
         return limit
 
 

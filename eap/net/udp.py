@@ -54,17 +54,18 @@ class UdpChannel:
             count = self._receive()
             if count == 1:
                 view, size, at_ns = self._batch.arrival()
-                for take in self.handlers:
-                    take(view, size, at_ns, self)
+                for handle in self.handlers:
+                    handle(view, size, at_ns, self)
                 return total + 1
             if count < 0:
+                # An ICMP error of a datagram sent before: received ones still wait.
                 if note_receive_error(self.errors):
                     continue
                 break
             sizes, times = self._batch.arrivals(count)
             for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):
-                for take in self.handlers:
-                    take(view, size, at_ns, self)
+                for handle in self.handlers:
+                    handle(view, size, at_ns, self)
             total += count
             if count < BATCH:
                 break

@@ -157,6 +157,7 @@ class SourceWatch:
         before, self.source = self.source, source
         self._note(source_word(source))
         if before is not None:
+            # A single change is a new address of one sender; two in a short time are two senders.
             if at_ns - self._changed_at_ns < ALTERNATION_NS:
                 other = source_word(before)
                 for first in self._accepting:
@@ -191,7 +192,7 @@ class NetIdLearner:
         self._handler = handler
         self._looked_at_ns: dict[bytes, int] = {}
 
-    def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
+    def handle(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Note the sender of a frame, and hand the frame over."""
         if self.wanted and size >= _PUBLISHER.stop and data[1] >> 4 == FrameType.PROCESS_DATA:
             publisher = bytes(data[_PUBLISHER])

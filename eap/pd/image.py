@@ -91,7 +91,7 @@ class Image:
         """
         slot = self._slot(name)
         first, last = slot.bit_offset // 8, _end_octet(slot)
-        return take(slot, self._stable_copy(slot.writer, first, last, attempts), 8 * first)
+        return extract_value(slot, self._stable_copy(slot.writer, first, last, attempts), 8 * first)
 
     def read_all(self, writers: Collection[Writer] = tuple(Writer)) -> dict[str, Any]:
         """Return all variables of *writers*; those of one writer belong to one moment."""
@@ -116,6 +116,7 @@ class Image:
         cycle, sequence = words[_CYCLE], words[_SEQUENCE]
         if sequence % 2 or words[_FUTEX] != cycle & 0xFFFFFFFF:
             return None
+        # Copied without a lock and checked afterwards: the engine never waits for a reader.
         copy = self._copy()
         return copy if words[_SEQUENCE] == sequence and words[_CYCLE] == cycle else None
 
@@ -214,6 +215,7 @@ def put(memory: memoryview, bit_offset: int, bit_length: int, octets: bytes) -> 
     if not bit and not bit_length % 8:
         memory[offset:end] = octets
         return
+    # Adjacent bits may belong to other variables: read, mask and write back.
     mask = (1 << bit_length) - 1 << bit
     word = int.from_bytes(memory[offset:end], "little") & ~mask | octets[0] << bit
     memory[offset:end] = word.to_bytes(end - offset, "little")
@@ -260,6 +262,7 @@ def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
         (samples.last, samples.offset),
         (samples.offset + samples.count * samples.size, offset),
     )
+    # A damaged directory must not lead readers to offsets outside the regions.
     if layout.directory_offset != offset or any(end > start for end, start in ends):
         raise ImageError("process image has a damaged directory: it contradicts the header")
     return layout, generation
@@ -280,7 +283,7 @@ def _end_octet(slot: VariableSlot) -> int:
     return -(-(slot.bit_offset + datatypes.parse(slot.type).bit_length) // 8)
 
 
-def take(slot: VariableSlot, data: bytes, first_bit: int) -> bytes:
+def extract_value(slot: VariableSlot, data: bytes, first_bit: int) -> bytes:
     """Return the bytes of a variable out of *data*, a copy of the image from *first_bit* on."""
     kind = datatypes.parse(slot.type)
     offset, bit = divmod(slot.bit_offset - first_bit, 8)
@@ -291,7 +294,7 @@ def take(slot: VariableSlot, data: bytes, first_bit: int) -> bytes:
 
 
 def _decode(slot: VariableSlot, data: bytes, first_bit: int) -> Any:
-    return datatypes.parse(slot.type).decode(take(slot, data, first_bit), 0)
+    return datatypes.parse(slot.type).decode(extract_value(slot, data, first_bit), 0)
 
 
 _TORN = int(StationWord.TORN)

@@ -205,6 +205,7 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
     octets = _Allocator(WORDS_OFFSET + 8 * words.used)
     start = octets.used
     slots: dict[str, VariableSlot] = {}
+    # First in the region and in frame order, so that one copy takes all PDs of a frame.
     rx = tuple(_rx_slots(spec, rx_words, slots, octets))
     regions = {}
     for writer in Writer:

@@ -84,7 +84,7 @@ class CyclicBus(Protocol):
     cycles of all stations continue.
     """
 
-    def take_inputs(self) -> None:
+    def copy_inputs(self) -> None:
         """Put what the last exchange brought, inputs and states, into the station's image.
 
         Called in each cycle, while the engine's region is marked as changing.
@@ -142,6 +142,7 @@ class StateChannel:
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* with state and toggle; return those that could not be sent."""
+        # Bits 0 to 3 as in the AL status; their place in the octet is not public (ETG.1005).
         state = self._words[StationWord.STATE] & 0x0F
         for frame in frames:
             self._toggle ^= TOGGLE_BIT

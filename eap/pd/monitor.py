@@ -84,7 +84,7 @@ class PresenceTracker:
         """True if the next round may change the presence, and so should come soon."""
         return bool(self._hits if self.presence is SubscriberPresence.MISSING else self._misses)
 
-    def take(self, result: ProbeResult, now_ns: int) -> SubscriberPresence:
+    def enter(self, result: ProbeResult, now_ns: int) -> SubscriberPresence:
         """Enter *result* and return the presence that follows."""
         before = self.presence
         match result:
@@ -262,6 +262,7 @@ class SubscriberMonitor:
         """Return the names of the targets to probe now, the one that has waited longest first."""
         self.handle_timeout(now_ns)
         names = []
+        # A leaky bucket: _booked_ns is the next probe at the full rate, _slack_ns the burst.
         while self._queue and now_ns >= self._booked_ns - self._slack_ns:
             watch = self._queue.popleft()
             if self._watches.get(watch.target.name) is not watch:
@@ -284,7 +285,7 @@ class SubscriberMonitor:
                 continue
             watch.due_ns = _NOT_PLANNED
             if watch.waits:
-                self._take(watch, ProbeResult.MISSED, now_ns)
+                self._enter(watch, ProbeResult.MISSED, now_ns)
             elif watch.claimed_until_ns > now_ns:
                 self._postpone(watch)
             else:
@@ -298,7 +299,7 @@ class SubscriberMonitor:
             return
         watch.answered_by = mac
         if watch.target.mac in {None, mac}:
-            self._take(watch, ProbeResult.SEEN, now_ns)
+            self._enter(watch, ProbeResult.SEEN, now_ns)
 
     def receive_claim(self, name: str, mac: MacAddr, now_ns: int) -> None:
         """Note that *mac* probes whether the address of target *name* is free.
@@ -307,22 +308,22 @@ class SubscriberMonitor:
         """
         watch = self._watches.get(name)
         if watch is not None and watch.note_claim(mac, now_ns, self._policy):
-            self._take(watch, ProbeResult.PENDING, now_ns)
+            self._enter(watch, ProbeResult.PENDING, now_ns)
 
     def receive_result(self, name: str, result: ProbeResult, now_ns: int) -> None:
         """Enter *result* for target *name*; unknown names are ignored."""
         watch = self._watches.get(name)
         if watch is not None:
-            self._take(watch, result, now_ns)
+            self._enter(watch, result, now_ns)
 
     def next_event(self) -> PresenceChanged | None:
         """Return the next change of a presence, None when there is none."""
         return self._events.popleft() if self._events else None
 
-    def _take(self, watch: _Watch, result: ProbeResult, now_ns: int) -> None:
+    def _enter(self, watch: _Watch, result: ProbeResult, now_ns: int) -> None:
         watch.waits = False
         old = watch.tracker.presence
-        new = watch.tracker.take(result, now_ns)
+        new = watch.tracker.enter(result, now_ns)
         if new is not old:
             name = watch.target.name
             self._events.append(PresenceChanged(name, old, new, result, watch.answered_by))
@@ -342,6 +343,7 @@ class SubscriberMonitor:
         elif watch.tracker.in_doubt:
             pause_ns = min(pause_ns, self._policy.retry_ns)
         due_ns = watch.probed_at_ns + pause_ns
+        # An old heap entry stays and is ignored by its due_ns: removal from a heap costs more.
         if due_ns != watch.due_ns:
             watch.due_ns = due_ns
             heapq.heappush(self._heap, (due_ns, watch.target.name))

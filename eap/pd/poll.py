@@ -40,7 +40,7 @@ class PollRequests:
         asked.update(names)
         return True
 
-    def take(self) -> dict[str, set[str]]:
+    def pop_all(self) -> dict[str, set[str]]:
         """Return the RxPDs that were received, by sender, and clear the table."""
         if not self._pending:
             return self._pending
@@ -49,7 +49,7 @@ class PollRequests:
 
     def follow(self, before: PollRequests) -> None:
         """Take over the requests of *before* that this port answers too."""
-        for sender, names in before.take().items():
+        for sender, names in before.pop_all().items():
             if known := names & self.names:
                 self.add(sender, known)
 
@@ -101,6 +101,7 @@ class OutgoingPoll:
 
         What arrived before the last request, and is taken only now, answers the one before.
         """
+        # An answer carries nothing of its request: it belongs to the last one sent before it.
         request_ns = self._sent_at_ns if at_ns >= self._sent_at_ns else self._before_ns
         if not 0 < request_ns <= at_ns:
             return None

@@ -167,6 +167,7 @@ class Publisher:
 
     def _group_frames(self) -> None:
         """Sort out the frames that need no decision."""
+        # Frames with one schedule need one comparison a cycle for all of them.
         plain: dict[Schedule, list[TxFrame]] = {}
         for frame in self.frames:
             if frame.is_plain and frame.schedule is not None:
@@ -223,6 +224,7 @@ class Publisher:
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the frames due in this cycle, patched; :meth:`sent` must follow."""
+        # All frames are due in each cycle: neither a selection nor a new list is needed.
         if (always := self._always) is not None:
             for patch in always.patches:
                 patch(cycle)
@@ -376,7 +378,7 @@ class PollResponder:
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the answers to all pending requests, patched; :meth:`sent` must follow."""
         self._sending.clear()
-        for sender, names in self._requests.take().items():
+        for sender, names in self._requests.pop_all().items():
             for frame in self._frames:
                 due = [pd for pd in frame.pds if pd.slot.poll_request in names]
                 chosen = tuple(p for p in due if not (frame.suppressed or p.trigger.suppressed))

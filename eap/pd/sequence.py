@@ -195,6 +195,7 @@ class SequenceTracker:
         """Of all gaps that the wrapped counter can mean, return the one nearest to the time."""
         if not self._sender_cycle_ns:
             return gap - 0x10000 if gap > 0x7FFF else gap
+        # The counter has 16 bits: after a long silence it may have wrapped any number of times.
         return gap + 0x10000 * round((elapsed_ns / self._sender_cycle_ns - gap) / 0x10000)
 
     def _enter_loss(self, lost: int, position: int) -> None:

@@ -103,7 +103,7 @@ class Station:
             name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
         }
         self._learners = {port: NetIdLearner(self.handlers[port]) for port in _learning_ports(spec)}
-        self.handlers.update((port, learner.take) for port, learner in self._learners.items())
+        self.handlers.update((port, learner.handle) for port, learner in self._learners.items())
 
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
@@ -190,6 +190,7 @@ class Station:
             return int(previous_ns + (elapsed + 1) * self.cycle_ns)
         words[_CYCLE_AT_NS] = 0  # of a time before the host was booted
         phase_ns = self.spec.phase_us * 1000
+        # All stations start on one grid, so that their phases stagger them.
         grid_ns = now_ns - now_ns % self.cycle_ns + phase_ns
         return grid_ns if grid_ns > now_ns else grid_ns + self.cycle_ns
 
@@ -228,7 +229,7 @@ class Station:
         self._sending = self._publishers if state.sends else []
         if not state.receives:
             for requests in self._requests.values():
-                requests.take()
+                requests.pop_all()
 
     def channel(self, port: str) -> FrameChannel:
         """Return the channel of *port*."""
@@ -326,6 +327,7 @@ class Station:
         """Write the engine's region; return whether services or applications wrote something."""
         words = self._words
         sequence = words[_SEQUENCE]
+        # Odd for the whole block, so that a reader sees inputs and their results in one cycle.
         words[_SEQUENCE] = sequence + 1
         for drain in self._drains:
             drain(now_ns)
@@ -358,7 +360,7 @@ def _supervise(bus: CyclicBus, now_ns: int) -> None:
     due_ns = bus.next_timeout()
     if due_ns is not None and due_ns <= now_ns:
         bus.handle_timeout(now_ns)
-    bus.take_inputs()
+    bus.copy_inputs()
 
 
 def _pds_of(frames: Iterable[FrameRow], *, polled: bool) -> list[FrameRow]:

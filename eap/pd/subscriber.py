@@ -173,6 +173,7 @@ class Subscriber:
             if deadline_ns is None:
                 following = min(following, now_ns + timeout_ns)
             elif deadline_ns <= now_ns:
+                # A tracker is shared: its time-out counts once, for all its subscriptions.
                 expired.setdefault(tracker, []).append(subscription)
                 following = min(following, now_ns + timeout_ns)
             else:
@@ -271,6 +272,7 @@ class SubscriptionTable:
                 chosen += [(subscription, header, offset) for subscription in match]
         taking = [subscription for subscription, _, _ in chosen]
         if self._part_trackers(set(taking)):
+            # Plans hold trackers, so those made before the split are no longer valid.
             self._forget_plans()
         plan = FramePlan(
             PD_FRAME_START + EtherCatHeader.decode(data).length,
@@ -289,6 +291,7 @@ class SubscriptionTable:
             self._forget_plans()
         self._pds_planned += 1 + len(pds)
         same_key = self._plans.setdefault(_KEY(data), [])
+        # Bounded: a sender could otherwise fill the memory with invented layouts.
         if len(same_key) >= _PLANS_PER_KEY:
             same_key.clear()
         same_key.append(plan)

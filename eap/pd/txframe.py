@@ -342,6 +342,7 @@ class TxFrame:
 
     def _select(self, pds: tuple[TxPd, ...]) -> Selection:
         if (selection := self._selections.get(pds)) is None:
+            # Bounded: n PDs that are sent on change have 2**n selections.
             if len(self._selections) >= _SELECTIONS_KEPT:
                 self._selections.clear()
             selection = self._selections[pds] = Selection(self._build(pds), pds)

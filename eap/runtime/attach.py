@@ -123,6 +123,7 @@ class AttachedStation(Closeable):
         """
         image = self._current()
         before = image.words[StationWord.CYCLE]
+        # The wait ends early without a cycle: in a new layout, or when the engine is gone.
         while not self._file.wait_cycle(before, self._gone_after_s()):
             image = self._current()  # a new layout, which counts on, or the engine is gone
         return int(image.words[StationWord.CYCLE])

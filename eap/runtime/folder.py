@@ -233,6 +233,7 @@ class ApplianceFolder(Closeable):
             return False
         try:
             request = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+            # Tests the lock without taking it, so that a start at the same moment succeeds.
             answer = fcntl.fcntl(fd, fcntl.F_OFD_GETLK, request)
         finally:
             os.close(fd)

@@ -99,6 +99,7 @@ class InheritedRecord(SpecRecord, frozen=True):
 
     def to_descriptor(self) -> int:
         """Return the descriptor of a file that holds this; the caller closes it."""
+        # No file in a directory: nothing is left behind, and no size limit of a pipe applies.
         fd = os.memfd_create("eap-handover", os.MFD_CLOEXEC)
         with os.fdopen(os.dup(fd), "wb") as file:
             file.write(msgspec.json.encode(self, enc_hook=encode_value))

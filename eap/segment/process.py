@@ -44,7 +44,7 @@ class Commands(Protocol):
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when there is a command."""
 
-    def take(self) -> Iterable[bytes] | None:
+    def read(self) -> Iterable[bytes] | None:
         """Return the commands that wait, None when no more will come."""
 
     def answer(self, outcome: dict[str, Any]) -> None:
@@ -63,7 +63,7 @@ class CommandLines:
         """Return the descriptor."""
         return self._fd
 
-    def take(self) -> Iterable[bytes] | None:
+    def read(self) -> Iterable[bytes] | None:
         """Return all whole lines that are there."""
         data = os.read(self._fd, _MAX_COMMAND)
         *lines, rest = (self._partial + data).split(b"\n")
@@ -82,7 +82,7 @@ class CommandMessages:
         """Return the descriptor."""
         return self._sock.fileno()
 
-    def take(self) -> Iterable[bytes] | None:
+    def read(self) -> Iterable[bytes] | None:
         """Return the next message."""
         try:
             data = self._sock.recv(_MAX_COMMAND)
@@ -206,10 +206,10 @@ class _Loop:
 
     def _receive_commands(self) -> bool:
         assert self._commands is not None  # noqa: S101  only called when it is readable
-        taken = self._commands.take()
-        for text in taken or ():
+        commands = self._commands.read()
+        for text in commands or ():
             self._commands.answer(self._obey(text))
-        return taken is not None
+        return commands is not None
 
     def _obey(self, text: bytes) -> dict[str, Any]:
         outcome: dict[str, Any] = {"ok": True}

@@ -279,7 +279,7 @@ class Child:
         self._last_lines.clear()
         self._partial_report = b""
 
-    def take_reports(self) -> list[Report]:
+    def read_reports(self) -> list[Report]:
         """Return what the process reported since the last time.
 
         *report_fd* is closed when the process runs, and also if it died before.

@@ -271,7 +271,7 @@ class Supervisor:
 
     def _follow_start(self, child: Child) -> None:
         running = {each.name for each in self._children if each.is_ready}
-        reports = child.take_reports()
+        reports = child.read_reports()
         for each in reports:
             waits_for = "" if each.waits_for in running else each.waits_for
             child.watch.advance(each.step, self._clock(), waits_for=waits_for)
@@ -299,6 +299,7 @@ class Supervisor:
     def _handle_exit(self, child: Child) -> None:
         lived_ns = self._clock() - child.started_ns
         code, last_line = child.reap()
+        # A process that has never run would fail again: the appliance ends with its exit code.
         if not child.watch.has_run and not child.watch.is_stuck:
             if code < 0:
                 logger.error("%s was %s while starting", child.name, describe_end(code))

@@ -121,6 +121,7 @@ def plan_sockets(stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
         for wanted in _sockets_of(port):
             owners.setdefault(wanted, []).append(PortName(station, port.name))
     ams = [(PortName(station, port.name), _ams_address(port)) for station, port in ports]
+    # A socket on 0.0.0.0 occupies the port at every address, so all stations share it.
     every = any(address == EVERY_ADDRESS for _, address in ams)
     for name, address in ams:
         if address:

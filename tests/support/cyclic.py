@@ -221,7 +221,7 @@ class FakeBus:
         self.due_ns: int | None = None
         self.log: list[str] = [] if log is None else log
 
-    def take_inputs(self) -> None:
+    def copy_inputs(self) -> None:
         changing = self._image.words[StationWord.ENGINE_SEQUENCE] % 2
         self.log.append("take changing" if changing else "take calm")
         for moves in self._inputs.values():

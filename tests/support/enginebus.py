@@ -151,7 +151,7 @@ class BusRig:
             self._next_ns += self.cycle_ns
             self.bus.receive(self.now_ns)
             with self.image.writing(Writer.ENGINE):
-                self.bus.take_inputs()
+                self.bus.copy_inputs()
             self.bus.exchange(self.now_ns)
 
     def run(self, duration_ns: int) -> None:

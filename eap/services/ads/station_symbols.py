@@ -31,7 +31,7 @@ from eap.codec.values import String
 from eap.errors import ImageError, TornReadError, WriterConflictError
 from eap.ids import NetId
 from eap.net.image_file import StationImage
-from eap.pd.image import Image, ImageSamples, take
+from eap.pd.image import Image, ImageSamples, extract_value
 from eap.pd.layout import VariableSlot
 from eap.pd.spec import Writer
 from eap.pd.words import StationWord
@@ -67,7 +67,7 @@ class ImageVariables:
         """Return the bytes of a value; refuse with BUSY while its writer is in the middle."""
         # Values of one notification come from one sample, not from the running image.
         if self._sample is not None:
-            return take(self._image.slots[name], self._sample, self._first_bit)
+            return extract_value(self._image.slots[name], self._sample, self._first_bit)
         try:
             return self._image.load(name, attempts=_ATTEMPTS)
         except TornReadError as exc:

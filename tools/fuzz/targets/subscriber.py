@@ -122,7 +122,7 @@ def _run_cycle(now_ns: int) -> None:
     words[StationWord.CYCLE] += 1
     if words[StationWord.CYCLE] % _CYCLE_INPUTS:
         return
-    if len(_REQUESTS.take()) > REQUESTERS_PER_CYCLE:
+    if len(_REQUESTS.pop_all()) > REQUESTERS_PER_CYCLE:
         raise AssertionError("more requests were noted than are answered")
     words[_LAYOUT.frames[0].words + FrameWord.WHOLE] += 1
     for question in _QUESTIONS.values():

@@ -31,22 +31,22 @@ class Master:
 )
 def test_bus_faults_have_texts(event, text):
     faults = SlaveFaults()
-    faults.take_events(Master(event))
+    faults.handle_events(Master(event))
     assert faults.of(1001) == text
     assert faults.of(1002) == ""
 
 
 def test_the_last_counts_until_the_slave_is_back():
     faults = SlaveFaults()
-    faults.take_events(Master(SlaveLost(1001, 1), SlaveLost(1002, 1), SlaveFailed(1001, "x", 2)))
+    faults.handle_events(Master(SlaveLost(1001, 1), SlaveLost(1002, 1), SlaveFailed(1001, "x", 2)))
     assert (faults.of(1001), faults.of(1002)) == ("x", "it does not answer")
-    faults.take_events(Master(SlaveBack(1001, 1, 3)))
+    faults.handle_events(Master(SlaveBack(1001, 1, 3)))
     assert (faults.of(1001), faults.of(1002)) == ("", "it does not answer")
 
 
 def test_bus_faults_that_ended_are_counted():
     faults = SlaveFaults()
-    faults.take_events(
+    faults.handle_events(
         Master(
             SlaveLost(1001, 1),
             SlaveBack(1001, 1, 2),
@@ -64,6 +64,6 @@ def test_unsolicited_messages_are_forwarded():
     faults, heard = SlaveFaults(), []
     faults.on_unsolicited.append(heard.append)
     message = Unsolicited(1001, MailboxType.EOE, b"frame")
-    faults.take_events(Master(message, SlaveLost(1001, 1)))
+    faults.handle_events(Master(message, SlaveLost(1001, 1)))
     assert heard == [message]
     assert faults.of(1001) == "it does not answer"

@@ -59,7 +59,7 @@ def publisher(rig, receiver):
 def truth(rig: BusRig) -> dict[int, SlaveDescription]:
     """Return all descriptions as an explicit report has them."""
     names = SlaveDescription.__struct_fields__
-    rig.bus.faults.take_events(rig.bus.master)
+    rig.bus.faults.handle_events(rig.bus.master)
     return {
         slave.station: SlaveDescription(**{name: asdict(slave)[name] for name in names})
         for slave in report_bus(rig.bus, rig.now_ns).slaves

@@ -178,7 +178,7 @@ class Port:
 
     def give(self, frame: bytes, sender: str, at_ns: int = 0) -> None:
         view = memoryview(frame + bytes(40))
-        self.learner.take(view, len(frame), at_ns, From(sender))
+        self.learner.handle(view, len(frame), at_ns, From(sender))
 
 
 def test_sender_of_a_sought_net_id_is_learned_and_the_frame_handed_over():
@@ -223,6 +223,6 @@ def test_address_is_looked_at_now_and_then():
 def test_learner_wants_no_net_id_at_first():
     taken: list[int] = []
     learner = NetIdLearner(lambda _data, size, *_: taken.append(size))
-    learner.take(memoryview(FRAME), len(FRAME), 0, From(THEIR_MAC))
+    learner.handle(memoryview(FRAME), len(FRAME), 0, From(THEIR_MAC))
     learner.learn(bytes(6), THEIR_MAC)
     assert taken == [len(FRAME)]

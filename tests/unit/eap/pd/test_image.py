@@ -16,9 +16,9 @@ from eap.pd.image import (
     Inputs,
     Sampler,
     default_value,
+    extract_value,
     format_image,
     read_header,
-    take,
 )
 from eap.pd.layout import HEADER, MAX_SAMPLES, MIN_SAMPLES, SAMPLES_SIZE, plan_layout
 from eap.pd.spec import CounterSource, RxPdSpec, VariableSpec, Writer
@@ -418,7 +418,7 @@ def counting(**more):
 def values(image, data):
     first = image.layout.samples.first
     return {
-        name: parse(slot.type).decode(take(slot, data, 8 * first), 0)
+        name: parse(slot.type).decode(extract_value(slot, data, 8 * first), 0)
         for name, slot in image.slots.items()
     }
 

@@ -248,13 +248,13 @@ UNKNOWN, PRESENT, MISSING = (
 )
 
 
-def run(*rounds: ProbeResult, judge: PresenceTracker | None = None) -> list[SubscriberPresence]:
+def run(*rounds: ProbeResult, tracker: PresenceTracker | None = None) -> list[SubscriberPresence]:
     """Return what each of *rounds*, one a second, made of the presence."""
-    judge = judge or PresenceTracker(SECOND, 0)
+    tracker = tracker or PresenceTracker(SECOND, 0)
     found = []
     for number, result in enumerate(rounds, 1):
-        judge.begin_round()
-        found.append(judge.take(result, number * SECOND))
+        tracker.begin_round()
+        found.append(tracker.enter(result, number * SECOND))
     return found
 
 
@@ -282,21 +282,21 @@ def test_missing_is_present_again_after_two_answers() -> None:
 
 
 def test_presence_round_counts_once_despite_many_results() -> None:
-    judge = PresenceTracker(SECOND, 0)
-    run(ABSENT, judge=judge)
-    judge.begin_round()
-    assert [judge.take(SEEN, 2 * SECOND) for _ in range(5)] == [MISSING] * 5
-    judge.begin_round()
-    assert judge.take(SEEN, 3 * SECOND) is PRESENT
+    tracker = PresenceTracker(SECOND, 0)
+    run(ABSENT, tracker=tracker)
+    tracker.begin_round()
+    assert [tracker.enter(SEEN, 2 * SECOND) for _ in range(5)] == [MISSING] * 5
+    tracker.begin_round()
+    assert tracker.enter(SEEN, 3 * SECOND) is PRESENT
 
 
 def test_silence_after_an_answer_in_the_same_round_is_no_miss() -> None:
-    judge = PresenceTracker(SECOND, 0)
+    tracker = PresenceTracker(SECOND, 0)
     for number in range(5):
-        judge.begin_round()
-        judge.take(SEEN, number * SECOND)
-        assert judge.take(MISSED, number * SECOND) is PRESENT
-        assert not judge.in_doubt
+        tracker.begin_round()
+        tracker.enter(SEEN, number * SECOND)
+        assert tracker.enter(MISSED, number * SECOND) is PRESENT
+        assert not tracker.in_doubt
 
 
 def test_blind_rounds_end_in_unknown() -> None:
@@ -305,17 +305,17 @@ def test_blind_rounds_end_in_unknown() -> None:
 
 
 def test_presence_becomes_unknown_after_validity() -> None:
-    judge = PresenceTracker(SECOND, 0)
-    judge.take(SEEN, 0)
-    assert judge.take(PENDING, DEFAULT_POLICY.valid_ns) is PRESENT
-    assert judge.take(PENDING, DEFAULT_POLICY.valid_ns + 1) is UNKNOWN
+    tracker = PresenceTracker(SECOND, 0)
+    tracker.enter(SEEN, 0)
+    assert tracker.enter(PENDING, DEFAULT_POLICY.valid_ns) is PRESENT
+    assert tracker.enter(PENDING, DEFAULT_POLICY.valid_ns + 1) is UNKNOWN
 
 
 def test_long_intervals_are_trusted_for_longer() -> None:
-    judge = PresenceTracker(60 * SECOND, 0)
-    judge.take(SEEN, 0)
-    assert judge.take(PENDING, 180 * SECOND) is PRESENT
-    assert judge.take(PENDING, 180 * SECOND + 1) is UNKNOWN
+    tracker = PresenceTracker(60 * SECOND, 0)
+    tracker.enter(SEEN, 0)
+    assert tracker.enter(PENDING, 180 * SECOND) is PRESENT
+    assert tracker.enter(PENDING, 180 * SECOND + 1) is UNKNOWN
 
 
 @pytest.mark.parametrize(
@@ -323,9 +323,9 @@ def test_long_intervals_are_trusted_for_longer() -> None:
     [((SEEN,), False), ((SEEN, MISSED), True), ((ABSENT,), False), ((ABSENT, SEEN), True)],
 )
 def test_doubt_is_one_round_that_disagrees(rounds: tuple[ProbeResult, ...], doubt: bool) -> None:
-    judge = PresenceTracker(SECOND, 0)
-    run(*rounds, judge=judge)
-    assert judge.in_doubt is doubt
+    tracker = PresenceTracker(SECOND, 0)
+    run(*rounds, tracker=tracker)
+    assert tracker.in_doubt is doubt
 
 
 @given(st.lists(st.sampled_from([MISSED, ABSENT, PENDING, BLIND])))

@@ -42,12 +42,12 @@ CLIENT, MILL, LATHE = "5.0.0.1.1.1", "5.0.0.2.1.1", "5.0.0.3.1.1"
 
 def test_requests_are_taken_once_and_by_sender():
     requests = PollRequests(["a", "b"])
-    assert requests.take() == {}
+    assert requests.pop_all() == {}
     assert requests.add("left", ["a"])
     assert requests.add("right", ["b"])
     assert requests.add("left", ["b", "a"])
-    assert requests.take() == {"left": {"a", "b"}, "right": {"b"}}
-    assert requests.take() == {}
+    assert requests.pop_all() == {"left": {"a", "b"}, "right": {"b"}}
+    assert requests.pop_all() == {}
 
 
 def test_poll_requests_drop_requesters_beyond_limit():
@@ -55,7 +55,7 @@ def test_poll_requests_drop_requesters_beyond_limit():
     taken = [requests.add(f"10.0.0.{n}", ["a"]) for n in range(REQUESTERS_PER_CYCLE + 1)]
     assert taken == [True] * REQUESTERS_PER_CYCLE + [False]
     assert requests.add("10.0.0.0", ["a"])  # it has a place already
-    assert len(requests.take()) == REQUESTERS_PER_CYCLE
+    assert len(requests.pop_all()) == REQUESTERS_PER_CYCLE
     assert requests.add("10.0.0.99", ["a"])
 
 
@@ -148,7 +148,7 @@ def test_pending_requests_are_answered_after_handover():
     before.add("left", ["old", "both"])
     before.add("right", ["old"])
     after.follow(before)
-    assert after.take() == {"left": {"both"}}
+    assert after.pop_all() == {"left": {"both"}}
 
 
 def test_polls_and_requests_are_found_by_port():

@@ -455,9 +455,9 @@ def test_a_request_is_noted_with_its_sender_and_taken_like_any_other_pd():
     for cycle in (1, 2):
         frame = octets([(1, b"ab"), (2, b"cd")], cycle=cycle)
         give(r.subscriber.receive_frame, frame, cycle * MS, "10.0.0.1:7")
-        assert requests.take() == {"10.0.0.1:7": {"r"}}
+        assert requests.pop_all() == {"10.0.0.1:7": {"r"}}
     give(r.subscriber.receive_frame, octets([(2, b"cd")], cycle=3), 3 * MS, "10.0.0.1:7")
-    assert requests.take() == {}
+    assert requests.pop_all() == {}
     assert (r.word("r", RxWord.RECEIVED), r.word("s", RxWord.RECEIVED)) == (2, 3)
     assert r.discarded() == {}
 
@@ -465,18 +465,18 @@ def test_a_request_is_noted_with_its_sender_and_taken_like_any_other_pd():
 def test_a_request_that_is_not_taken_is_not_answered():
     r, requests = asking("r")
     r.give(octets([(1, b"ab")], cycle=9), MS)
-    requests.take()
+    requests.pop_all()
     r.give(octets([(1, b"ab")], cycle=8), 2 * MS)  # reordered
     r.give(octets([(1, b"abc")], cycle=10), 3 * MS)
     r.subscriber.close()
     r.give(octets([(1, b"ab")], cycle=11), 4 * MS)
-    assert requests.take() == {}
+    assert requests.pop_all() == {}
 
 
 def test_a_request_from_nowhere_is_counted_and_its_data_taken():
     r, requests = asking("r", "s")
     give(r.subscriber.receive_frame, octets([(1, b"ab"), (2, b"cd")], cycle=1), MS, "")
-    assert requests.take() == {}
+    assert requests.pop_all() == {}
     assert r.discarded() == {"no_sender": 2}
     assert r.discarded("r") == r.discarded("s") == {"no_sender": 1}
     assert r.image.read("x") == 0x6261
@@ -488,6 +488,6 @@ def test_requests_of_too_many_are_counted():
         publisher = f"10.0.0.{number}.1.1"
         frame = octets([(2, b"cd")], cycle=7, publisher=publisher)
         give(r.subscriber.receive_frame, frame, MS, publisher)
-    assert len(requests.take()) == REQUESTERS_PER_CYCLE
+    assert len(requests.pop_all()) == REQUESTERS_PER_CYCLE
     assert r.discarded() == r.discarded("s") == {"too_many_requests": 3}
     assert r.word("s", RxWord.RECEIVED) == REQUESTERS_PER_CYCLE + 3

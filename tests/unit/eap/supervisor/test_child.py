@@ -83,7 +83,7 @@ def test_from_start_to_end(tmp_path, monkeypatch, capfd):
     steps = []
     while not child.is_ready:
         wait(child.report_fd)
-        steps += [each.step for each in child.take_reports()]
+        steps += [each.step for each in child.read_reports()]
     assert [steps[0], *steps[-2:]] == ["importing modules", "reading", ""]
     assert steps.count("reading") == 1
     assert child.report == {"plant": "demo"}
@@ -103,7 +103,7 @@ def test_child_that_dies_before_ready(tmp_path, monkeypatch):
     child.send_signal(signal.SIGKILL)
     wait(child.pid_fd)
     while child.report_fd >= 0:
-        child.take_reports()
+        child.read_reports()
     assert not child.is_ready
     assert child.reap() == (-signal.SIGKILL, "no output")
     child.send_signal(signal.SIGTERM)  # nobody is there: nothing happens
