@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tests.integration.test_ams_doors import is_free
+from tests.integration.test_ams_listeners import is_free
 from tests.support.appliance import (
     Appliance,
     Plants,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.test_ams_doors import AmsClient, is_free
+from tests.integration.test_ams_listeners import AmsClient, is_free
 from tests.support import aoe
 from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 

@@ -13,7 +13,7 @@ from functools import partial
 
 import pytest
 
-from tests.integration.test_ams_doors import AmsClient, is_free
+from tests.integration.test_ams_listeners import AmsClient, is_free
 from tests.support import aoe
 from tests.support.appliance import Appliance, Plants, SharedAppliance, plants, wait_until
 from tests.support.machine import slowness

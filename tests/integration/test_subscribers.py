@@ -144,7 +144,7 @@ def test_arp_tells_whether_a_station_on_ethernet_is_there(farm: Plants) -> None:
         waiting = frame(left)
         assert (waiting["address"], waiting["sent"], waiting["frame_state"]) == (None, 0, 1)
         assert waiting["subscriber"] == "unknown"
-        assert "waits for a frame of 127.9.8.2.2.1" in left.command("status")
+        assert "MAC address of 127.9.8.2.2.1 unknown" in left.command("status")
 
         right = farm.run(path, "--station", "right", prefix=there.prefix)
         wait_for(left, "present")
