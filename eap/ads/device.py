@@ -84,7 +84,7 @@ class AdsDevice:
         return outcomes.answer()
 
     def read(self, group: int, offset: int, length: int) -> bytes:
-        """Return what a Read reads; raise AdsRefusedError."""
+        """Return the data of a Read; raise AdsRefusedError."""
         return _fitting(self._space(group).read(group, offset, length), length)
 
     def perform(self, operation: Operation, client: AdsClient, now_ns: int) -> OperationOutcome:

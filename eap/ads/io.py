@@ -172,7 +172,7 @@ class MasterSpace(AdsSpace):
             raise AdsRefusedError(AdsError.ACCESS)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives states; a list that gets shorter ends it."""
+        """Return a source of states; a list that gets shorter ends it."""
         return fixed_size_source(lambda: self.read(group, offset, length), length)
 
     def _slave(self, address: int) -> SlaveState:

@@ -86,7 +86,7 @@ class ObjectSpace(AdsSpace):
         return self.read(group, offset, length)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives an entry or an object; one of another length ends it."""
+        """Return a source of an entry or an object; another length ends it."""
         if group != IndexGroup.SDO:
             raise AdsRefusedError(AdsError.ACCESS)
         return fixed_size_source(lambda: self.read(group, offset, length), length)

@@ -22,7 +22,7 @@ class ReadState(NamedTuple):
 
 
 class Read(NamedTuple):
-    """*length*: bytes that the client has room for."""
+    """*length*: bytes that the client accepts."""
 
     group: int
     offset: int
@@ -38,7 +38,7 @@ class Write(NamedTuple):
 
 
 class ReadWrite(NamedTuple):
-    """*length*: bytes that the client has room for."""
+    """*length*: bytes that the client accepts."""
 
     group: int
     offset: int

@@ -62,7 +62,7 @@ class AdsRequest(NamedTuple):
     sum_group: int = 0
     """Of a sum command, else 0."""
     read_length: int = 0
-    """Bytes that a client has room for in the answer of a sum command."""
+    """Bytes that a client accepts in the answer to a sum command."""
     index_offset: int = 0
     """Of a sum command: how many items it has, or 0."""
 

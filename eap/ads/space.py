@@ -21,7 +21,7 @@ It raises AdsRefusedError: BUSY and NOT_READY for now, anything else for good.
 
 
 def fixed_size_source(read: Callable[[], bytes], length: int) -> Source:
-    """Return what gives *length* bytes whenever it is called; what gets longer or shorter ends it.
+    """Return a source of *length* bytes; another length ends its notification.
 
     Raises:
         AdsRefusedError: there are not as many even now, or what *read* raises.
@@ -62,7 +62,7 @@ class AdsSpace:
         _refuse()
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives exactly *length* bytes of this place; raise AdsRefusedError."""
+        """Return a source of exactly *length* bytes at this offset; raise AdsRefusedError."""
         del group, offset, length
         _refuse()
 
@@ -129,7 +129,7 @@ class DeviceDataSpace(AdsSpace):
         return self._states().encode()[offset : offset + length]
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives the states."""
+        """Return a source of the states."""
         if len(self.read(group, offset, length)) != length:
             raise AdsRefusedError(AdsError.SIZE)
         return partial(self.read, group, offset, length)

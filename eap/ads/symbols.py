@@ -57,7 +57,7 @@ class SymbolType(NamedTuple):
     """Bytes for a client."""
 
     def describe(self) -> list[DataTypeEntry]:
-        """Return what clients may want to know of this type, and of its elements."""
+        """Return the data type entries of this type and of its elements."""
         if isinstance(self.kind, Array):
             (of,) = symbol_type(self.kind.element).describe()
         elif isinstance(self.kind, Block):
@@ -67,7 +67,7 @@ class SymbolType(NamedTuple):
         return [of, DataTypeEntry(self.name, self.id, self.size, of.name, self.size // of.size)]
 
     def to_client(self, octets: bytes) -> bytes:
-        """Return what a client reads of a value; *octets* are those of our type."""
+        """Convert the bytes of our type to those that a client reads."""
         if self.size == self.kind.size:
             return octets
         if isinstance(self.kind, String):
@@ -158,7 +158,7 @@ class SymbolVariable(NamedTuple):
     type: DataType
     comment: str = ""
     read_only: str = ""
-    """Why clients do not write it, as what follows its name; empty if they do."""
+    """Reason clients may not write it, as text behind its name; empty if they may."""
 
 
 class Symbol(NamedTuple):
@@ -257,7 +257,7 @@ class SymbolTable:
         return self._symbols[index]
 
     def successor_of(self, symbol: Symbol) -> Symbol:
-        """Return what *symbol* of an older table is here; refuse with SYMBOL_VERSION."""
+        """Return the symbol here for *symbol* of an older table; refuse with SYMBOL_VERSION."""
         index = self._indexes.get(symbol.variable.name)
         if index is None or self._symbols[index].type != symbol.type:
             raise AdsRefusedError(AdsError.SYMBOL_VERSION)
@@ -351,7 +351,7 @@ class SymbolSpace(AdsSpace):
         self._store.write(symbol.variable.name, symbol.type.from_client(data))
 
     def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
-        """Return what belongs to the name in *data*."""
+        """Return value, handle or description of the name in *data*."""
         if group not in _BY_NAME:
             return super().read_write(group, offset, length, data)
         name = decode_name(data)
@@ -369,7 +369,7 @@ class SymbolSpace(AdsSpace):
         return _whole(symbol.describe(), length)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
-        """Return what gives a value, the first *length* bytes of it, or the version."""
+        """Return a source of the first *length* bytes of a value, or of the version."""
         if group == IndexGroup.SYMBOL_VERSION:
             if length != 1:
                 raise AdsRefusedError(AdsError.SIZE)

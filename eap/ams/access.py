@@ -22,7 +22,7 @@ from eap.codec.adsnotification import AddNotification
 from eap.ids import MacAddr, NetId
 
 _MAX_KNOWN = 4096
-"""Pairs of a client and a target whose rules are remembered."""
+"""Cached pairs of a client and a target."""
 
 _RAW = frozenset((IndexGroup.RAW_COMMAND, IndexGroup.VOE, *SUM_COMMANDS))
 """Sum commands: one inside another, which is not parsed."""

@@ -128,7 +128,7 @@ class AuthorizedRequest(NamedTuple):
         return body, self._entry(results)
 
     def abandon(self, error_code: int | None) -> AuditEntry:
-        """Return what the audit says of a request that nothing came back for.
+        """Return the audit entry of a request without an answer.
 
         Args:
             error_code: That its client got; None if it got nothing.
@@ -217,7 +217,7 @@ class AccessFilter:
         return self._entries.popleft() if self._entries else None
 
     def may(self, header: AmsHeader, endpoint: Endpoint) -> dict[AccessService, bool | None]:
-        """Return what a client may do with its target; None if that depends on the object."""
+        """Return the rights of a client at its target; None if they depend on the object."""
         grants = self.access.grants(endpoint, header.source, header.target, header.target_port)
         return {service: grants.may(service) for service in AccessService}
 

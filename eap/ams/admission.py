@@ -170,7 +170,7 @@ class Admission:
     ) -> RoutingError | None:
         back = self._table.find(header.source)
         if back is not None and back[1] >= STATION_OCTETS and back[0].is_unidirectional:
-            text = f"route {back[0].name} is unidirectional: nothing may be asked from there"
+            text = f"route {back[0].name} is unidirectional: requests from there are refused"
             return RoutingError(AdsError.ACCESS_DENIED, text, back[0])
         hop = route.hop
         if hop.transport not in self._transports:

@@ -29,7 +29,7 @@ _WRITE = Struct("<III")  # group, offset, length
 class NotificationCleanup:
     """Ends notifications at their servers when no client here has them any more.
 
-    A client may be gone, may have got its answer too late, or may have asked a router that was
+    A client may be gone, may have got its answer too late, or may have used a router that was
     restarted since; without this the server would send samples for ever.
 
     Args:
@@ -72,7 +72,7 @@ class NotificationCleanup:
         return [self._ask(grant, AmsCommand.WRITE, body, now_ns)]
 
     def end_unwanted(self, header: AmsHeader, handle: int, endpoint: Endpoint) -> list[Action]:
-        """Return what ends a notification that no client here has, at the server that sent it.
+        """Return the request that ends a notification without a client here, at its server.
 
         Not while the answer with its handle may still arrive: datagrams overtake each other.
         """

@@ -90,7 +90,7 @@ def report_route(
     *,
     next_name: str,
 ) -> RouteReport:  # fmt: skip
-    """Return what is known of a route.
+    """Return the report of a route.
 
     Args:
         route: The route.
@@ -138,7 +138,7 @@ class Advice(NamedTuple):
 def advise(
     error: int, target: NetId, route: RouteReport | None, own: NetId, *, is_own: bool
 ) -> Advice:
-    """Say what the *error* of an AMS header means.
+    """Return the meaning of the *error* in an AMS header.
 
     Args:
         error: 0 for none.
@@ -166,7 +166,7 @@ def advise(
 def _advise_on_route(
     error: int, words: str, target: NetId, report: RouteReport, own: NetId
 ) -> Advice:
-    """Say what is wrong with a route, or behind it."""
+    """Return the fault of a route, or of a hop behind it."""
     hop = report.route.hop
     where = f"{report.next_name} ({hop})"
     if report.state in {RouteState.DOWN, RouteState.CLIENT}:
@@ -248,7 +248,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 def report_of(
     station: str, net_id: NetId, target: NetId, location: Location, now_ns: int
 ) -> HopReport:
-    """Return what the router of *station* says of *target*, for which it found *location*."""
+    """Return the report of the router of *station* on *target*, which it found at *location*."""
     found, since_ns = location.route, location.interrupted_at_ns
     report = HopReport(
         station=station, net_id=str(net_id), is_here=location.is_here, why=location.why,

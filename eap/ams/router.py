@@ -254,7 +254,7 @@ class Router:
         return self.record.next_event()
 
     def report(self, route: Route) -> RouteReport:
-        """Return what is known of one of the routes."""
+        """Return the report of one of the routes."""
         traffic = self.record.routes.get(route.key)
         obstacle = self._forwarder.admission.find_obstacle(route)
         name = self._table.next_name(route)

@@ -57,7 +57,7 @@ class Route(msgspec.Struct, frozen=True):
         is_probed: Whether the next hop is probed; a router that answers only peers with a route
             would seem dead.
         router: NetID of the router at the hop; None if that is not known, and the station itself
-            is asked instead.
+            is probed instead.
         is_client: Whether its own end requested it by "add route": it may be a client, which has
             connections of its own and does not listen.
 

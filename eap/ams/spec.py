@@ -281,7 +281,7 @@ _NEW_START = "restart the appliance"
 
 
 def describe_routing(old: RoutingSpec, new: RoutingSpec) -> list[str]:
-    """Return what differs and can change while a station runs, one line each."""
+    """Return the differences that can be applied at run time, one line each."""
     found = [
         *_differences(_routes(old.routes), _routes(new.routes)),
         *_differences(_rules(old.access), _rules(new.access)),
@@ -296,7 +296,7 @@ def describe_routing(old: RoutingSpec, new: RoutingSpec) -> list[str]:
 
 
 def routing_needs_new_start(old: RoutingSpec, new: RoutingSpec) -> list[str]:
-    """Return what differs and cannot change while a station runs, one line each."""
+    """Return the differences that need a restart, one line each."""
     lines = list(_differences(_brokers(old.mqtt), _brokers(new.mqtt)))
     if any(
         old.learns_by_mqtt(each.network) != new.learns_by_mqtt(each.network) for each in new.mqtt

@@ -9,7 +9,7 @@ Rule 2: it is requested again until the server grants it, whatever fails on the 
 that says that there is no such object, or that access is refused, ends it, and its client gets a
 sample without bytes.
 Rule 3: what was granted before is deleted at the server after the new one was granted, and never
-while requests for others with the same addresses are under way: a server that was started again may
+while requests for others with the same addresses are pending: a server that was restarted may
 give a handle twice.
 Rule 4: after a failure one subscription for each pair of addresses tries the path repeatedly; when
 it is granted, the others follow in groups.
@@ -265,7 +265,7 @@ class SubscriptionRestorer:
         return actions + self._continue(step.session, now_ns)
 
     def interruptions(self) -> list[Interruption]:
-        """Return what is interrupted now, by client and server."""
+        """Return the interrupted subscriptions, by client and server."""
         found: dict[tuple[Endpoint, bytes], Interruption] = {}
         for each in self._subscriptions if self._sessions else ():
             since_ns = each.interrupted_at_ns
@@ -357,7 +357,7 @@ class SubscriptionRestorer:
             # Where a symbol is may be another place since its server was started again.
             command, body = AmsCommand.READ_WRITE, subscription.symbol
         elif is_by_handle:
-            text = "it is of a symbol whose name is not known"
+            text = "the name of its symbol is unknown"
             return self._give_up(session, subscription, text, now_ns)
         step = _Step(session, subscription, symbol_handle=symbol_handle)
         invoke_id = self._ids.allocate(self._in_flight)

@@ -149,7 +149,7 @@ def encode_entry(entry: SymbolEntry) -> bytes:
 
 
 def _encode_attributes(attributes: tuple[tuple[str, str], ...]) -> bytes:
-    """Return what stands behind the texts, as the open client ads-client reads it."""
+    """Return the part behind the texts, as the open client ads-client reads it."""
     if not attributes:
         return b""
     octets = bytearray(len(attributes).to_bytes(2, "little"))

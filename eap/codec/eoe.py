@@ -56,7 +56,7 @@ _TEXTS = {
 
 
 def name_of(result: int) -> str:
-    """Return what *result* means, also when the standard does not know it."""
+    """Return the meaning of *result*, which may be of the vendor."""
     try:
         return _TEXTS[EoeResult(result)]
     except ValueError:

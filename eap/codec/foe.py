@@ -58,7 +58,7 @@ _TEXTS = {
 
 
 def name_of(code: int) -> str:
-    """Return what *code* means, also when the standard does not know it."""
+    """Return the meaning of *code*, which may be of the vendor."""
     try:
         return _TEXTS[FoeErrorCode(code)]
     except ValueError:

@@ -46,7 +46,7 @@ class MailboxHeader(WireStruct, frozen=True):
 
 
 class MailboxError(IntEnum):
-    """Why a message was refused (ETG.1000.4, mailbox error reply)."""
+    """Reason a message is refused (ETG.1000.4, mailbox error reply)."""
 
     SYNTAX = 1
     UNSUPPORTED_PROTOCOL = 2

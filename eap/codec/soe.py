@@ -325,7 +325,7 @@ for _number, _element in (
 
 
 def name_of(code: int) -> str:
-    """Return what *code* means, also when the standard does not know it."""
+    """Return the meaning of *code*, which may be of the vendor."""
     try:
         return _TEXTS[SoeErrorCode(code)]
     except ValueError:

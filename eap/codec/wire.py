@@ -77,7 +77,7 @@ class WireStruct(msgspec.Struct, frozen=True, gc=False):
 
 
 def _reader(wrap: type | None) -> Callable[[Any], Any] | None:
-    """Return what makes a value of *wrap*; for an enum a look-up, because calling one is slow."""
+    """Return a converter to *wrap*; for an enum a look-up, because calling one is slow."""
     if wrap is None or not issubclass(wrap, Enum):
         return wrap
     members = wrap._value2member_map_

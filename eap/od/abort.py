@@ -90,7 +90,7 @@ _TEXTS = {
 
 
 def name_of(code: int) -> str:
-    """Return what *code* means, also when the standard does not know it."""
+    """Return the meaning of *code*, which may be of the vendor."""
     try:
         return _TEXTS[AbortCode(code)]
     except ValueError:

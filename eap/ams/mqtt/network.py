@@ -294,7 +294,7 @@ class MqttNetwork:
         return Publish(self._topics.info, payload, 2, not self._spec.no_retain)
 
     def connected(self, now_ns: int) -> list[Action]:
-        """Return what to do first on a new connection, in this order."""
+        """Return the first actions on a new connection, in this order."""
         self._connected_at_ns = now_ns
         # Retained infos may be older than the connection: live routers publish theirs again.
         self._refresh_at_ns = now_ns + CONFIRM_NS
@@ -390,7 +390,7 @@ class MqttNetwork:
         # The own info comes back from the broker.
         if info == self._info or is_retained:
             return []
-        text = f"{info.name!r} tells that it has the NetID {self._net_id}, which is this station's"
+        text = f"{info.name!r} announces the NetID {self._net_id}, which is this station's"
         return self._warn("double", f"{text}; each router of a network needs one of its own")
 
     def _receive_packet(self, kind: TopicKind, payload: Payload, now_ns: int) -> list[Action]:

@@ -648,7 +648,7 @@ _BY_PAGE = {
 
 
 def find(index: int) -> ProfileObject | None:
-    """Return what the profile has at *index*, None if nothing."""
+    """Return the row of the profile at *index*, None if there is none."""
     for row in _BY_PAGE[index >> 8]:
         if row.first <= index <= row.last:
             return row
@@ -656,7 +656,7 @@ def find(index: int) -> ProfileObject | None:
 
 
 def row_of(index: int) -> ProfileObject:
-    """Return what the profile has at *index*, of an object that exists."""
+    """Return the row of an existing object at *index*."""
     row = find(index)
     if row is None:
         raise LookupError(f"the profile has nothing at 0x{index:04X}")

@@ -321,7 +321,7 @@ def test_second_router_with_the_net_id_is_named_once() -> None:
     assert place.hear_of(OWN_ID, Info("before", is_online=True), is_retained=True) == []
     (warning,) = place.hear_of(OWN_ID, Info("twin", is_online=True))
     assert warning == Warn(
-        f"'twin' tells that it has the NetID {OWN_ID}, which is this station's;"
+        f"'twin' announces the NetID {OWN_ID}, which is this station's;"
         " each router of a network needs one of its own"
     )
     assert place.hear_of(OWN_ID, Info("twin", is_online=True)) == []
