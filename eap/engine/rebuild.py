@@ -233,7 +233,7 @@ class _Job:
                 self.successor = StationReplacement(self.entry, spec)
         except EngineRefusedError as exc:
             self.error = exc
-        except Exception as exc:  # noqa: BLE001  the engine goes on, whatever it was given
+        except Exception as exc:  # noqa: BLE001  no specification may end the engine
             text = str(exc) if isinstance(exc, EapError) else f"{type(exc).__name__}: {exc}"
             self.error = EngineRefusedError(f"station {self.request.station}: {text}")
 

@@ -133,7 +133,7 @@ def _hold_latency() -> bool | str:
     except OSError as error:
         os.close(fd)
         return f"{_DMA_LATENCY}: {error.strerror}"
-    return True  # the request lasts as long as the descriptor, which nobody closes
+    return True  # the request lasts until the descriptor is closed at the end of the process
 
 
 def _set_timer_slack() -> int:

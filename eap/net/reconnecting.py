@@ -120,7 +120,7 @@ async def connect_tcp(
         async with asyncio.timeout(timeout_s):
             await asyncio.get_running_loop().sock_connect(sock, (host, port))
         if sock.getsockname() == sock.getpeername():
-            raise ConnectionRefusedError  # noqa: TRY301  it met itself: nobody listens there
+            raise ConnectionRefusedError  # noqa: TRY301  connected to itself: no listener
     except BaseException:
         sock.close()
         raise

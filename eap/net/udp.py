@@ -131,7 +131,7 @@ class UdpError(NamedTuple):
     """Destination of the datagram, like *port*."""
     port: int
     unreachable: bool
-    """True if it did not arrive, because nobody listens there or because of the way there."""
+    """True if it did not arrive, for want of a listener or of a route."""
     reason: str
     """The errno's name, such as ECONNREFUSED."""
 

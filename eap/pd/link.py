@@ -38,7 +38,7 @@ class OutFrame:
     """One frame ready to go: the bytes that a channel puts on its wire, patched in place.
 
     *buffer* holds *headroom* bytes that belong to the channel (an Ethernet header, or nothing),
-    then the EtherCAT frame, then padding.  A channel may cache whatever it derives from the
+    then the EtherCAT frame, then padding.  A channel may cache values derived from the
     object: buffer and destination never change, only the content of the buffer does.
 
     Attributes:

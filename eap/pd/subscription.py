@@ -158,7 +158,7 @@ class FramePlan:
         accepted_words: First words of the RxPDs that take one of its PDs.
         has_more: Whether there is anything of the next four.
         alternates: PDs that are laid out otherwise: tracker, offset in the frame, copy to make.
-        refused: The PDs that no subscription takes.
+        refused: The PDs that no subscription accepts.
         requests: RxPDs that request PDs of this station, with their trackers.
         answers: RxPDs that this station polled, likewise.
         any_publisher: Trackers that follow any publisher.

@@ -146,7 +146,7 @@ def run_for_appliance(handover: SegmentHandover, startup: Startup) -> None:
         stack.callback(frames.close)
         commands = stack.enter_context(socket.socket(fileno=handover.command_fd))
         while frames.receive() is not None:
-            continue  # sent while nobody was here, and awaited no longer
+            continue  # sent while no segment ran; the engine no longer waits for it
         gc.collect()
         gc.freeze()
         startup.finish({"slaves": len(bus.spec.slaves)})

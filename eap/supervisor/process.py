@@ -454,6 +454,6 @@ def find_build_errors(spec: StationSpec) -> list[str]:
         for port in spec.ports:
             if port.kind is PortKind.EAP:
                 station.connect(port.name, lines.open(InterfaceUri("loop", "trial")))
-    except Exception as exc:  # noqa: BLE001  whatever it is, an engine would fail with it too
+    except Exception as exc:  # noqa: BLE001  an engine would fail with it, too
         return [f"it cannot be built: {type(exc).__name__}: {exc}"]
     return []
