@@ -79,7 +79,7 @@ ROUTE = ProfileObject(
              "How many bytes of it have to match: 6, 5 "
              "or 4; 0 a default route."),
         live(3, "Name", NAME, RouterLive.ROUTE_NAME, "For operators."),
-        live(4, "Door", NAME, RouterLive.ROUTE_TRANSPORT, "By which packets leave."),
+        live(4, "Transport", NAME, RouterLive.ROUTE_TRANSPORT, "By which packets leave."),
         live(5, "Address", NAME, RouterLive.ROUTE_ADDRESS, "Where they go from there."),
         live(6, "Origin", "USINT", RouterLive.ROUTE_ORIGIN,
              "0 the plant file, 1 added at run time, 2 "
