@@ -183,8 +183,8 @@ def _advise_on_route(
         hint = f"the router there needs a route to {target}, or it is not the NetID that is meant"
         return Advice(is_reached=False, text=f"{where} has no route to {target}", hint=hint)
     if error == AdsError.HOST_UNREACHABLE:
-        hint = "'eapctl trace' names the hop"
-        return Advice(is_reached=False, text=f"the link is down behind {where}", hint=hint)
+        hint = "'eapctl trace' names the hop and the cause"
+        return Advice(is_reached=False, text=f"host unreachable behind {where}", hint=hint)
     if error == AdsError.ACCESS_DENIED:
         hint = "allow it under access in the plant file, of this station or of one on the way"
         return Advice(is_reached=False, text="access rules forbid to ask for its state", hint=hint)
@@ -225,6 +225,8 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         may: Rights of the client by access rules; null if they depend on the object.
         interrupted: How many subscriptions to the NetID it is restoring.
         interrupted_s: For how many seconds; None for none.
+        last_failure: Reason of the latest failed request of the sender to the target, if that is
+            here.
         error: Of ADS, why the next router did not answer; 0 for none.
     """
 
@@ -243,6 +245,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     error: int = 0
     interrupted: int = 0
     interrupted_s: int | None = None
+    last_failure: str = ""
 
 
 def report_of(
@@ -293,6 +296,6 @@ def decode_report(data: bytes) -> HopReport:
 def _require_printable(report: HopReport) -> None:
     """Raise ValueError for a text that would do something to a terminal."""
     texts = (report.station, report.route, report.next_name, report.transport, report.address)
-    for text in (*texts, report.why):
+    for text in (*texts, report.why, report.last_failure):
         if not text.isprintable():
             raise ValueError(f"{text!r} cannot be printed")

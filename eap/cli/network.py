@@ -190,8 +190,8 @@ def _next_hop(hop: HopRow) -> str:
 def _answer_text(answer: TargetAnswer) -> str:
     from eap.codec.ads import AdsState
 
-    if answer.error:
-        return f"answers: {answer.text}"
+    if answer.text:
+        return f"answers: {answer.text}" if answer.error else answer.text
     known = AdsState._value2member_map_.get(answer.ads_state)
     state = known.name if isinstance(known, AdsState) else answer.ads_state
     return f"answers: {state}, device state {answer.device_state}"

@@ -76,7 +76,7 @@ _WORDS: dict[int, str] = {
     AdsError.MAILBOX_FULL: "too much waits there already",
     AdsError.TARGET_PORT: "nothing has that AMS port",
     AdsError.TARGET_MACHINE: "no route to that NetID",
-    AdsError.HOST_UNREACHABLE: "the link is down",
+    AdsError.HOST_UNREACHABLE: "host unreachable",
     AdsError.SERVICE: "it does not know that service",
     AdsError.ACCESS: "not permitted: read only, protected, or a wrong user or password",
     AdsError.TIMEOUT: "no answer in time",

@@ -8,6 +8,7 @@ from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import ReadWrite
 from eap.ads.request import parse_request
 from eap.ams.access import AccessList
+from eap.ams.record import Record
 from eap.ams.report import HopQuestion, Location, encode_report
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
@@ -54,6 +55,10 @@ class Station:
         )
         self.router.add_device(self.net_id, {300, SYSTEM_PORT})
         self.router.add_device(NetId.parse(f"5.1.1.{number}.3.1"), {0xFFFF, 1001})
+
+    @property
+    def record(self) -> Record:
+        return self.router.record
 
     def locate(self, header: AmsHeader, endpoint: Endpoint) -> Location:
         return self.router.locate(header, endpoint)

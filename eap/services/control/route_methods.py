@@ -31,7 +31,7 @@ from eap.services.routing.route_rows import RouterView, route_row
 from eap.services.routing.scanning import scan, scan_targets
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routing import StationRouting
-from eap.services.routing.tracing import TraceResult, find_target, probe_target, trace
+from eap.services.routing.tracing import NO_SLAVE, TraceResult, find_target, probe_target, trace
 from eap.suggest import suggest
 
 _NS_PER_US = 1000
@@ -122,9 +122,10 @@ def _target_answer(found: TraceResult) -> records.TargetAnswer | None:
     if found.answer is None:
         return None
     states, result = found.states, found.answer.result
+    is_missing = found.why.endswith(NO_SLAVE)
     return records.TargetAnswer(
         result,
-        AdsError.words_of(result) if result else "",
+        AdsError.words_of(result) if result else NO_SLAVE if is_missing else "",
         None if states is None else states.ads_state,
         None if states is None else states.device_state,
         found.took_ns // _NS_PER_US,

@@ -18,6 +18,7 @@ from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome, ReadState, ReadWrite
 from eap.ads.request import decode_outcome, encode_outcome, encode_query, parse_request
 from eap.ams.directory import AmsAddress, Directory
+from eap.ams.record import Outcome, reason_of
 from eap.ams.report import (
     MAX_FURTHER,
     MAX_REPORT,
@@ -33,7 +34,7 @@ from eap.ams.report import (
 )
 from eap.ams.spec import TransportKind
 from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
-from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
+from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.control.protocol import ErrorCode
 from eap.control.routes import TestResult
 from eap.errors import CodecError, ControlError
@@ -62,6 +63,11 @@ _ON_THE_WAY = frozenset(
 """Errors that a router before the target reports."""
 _NO_ANSWER = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsError.TIMEOUT))
 """Errors that another router reports in place of the queried one."""
+_LAST_FAILURE_NS = 10_000_000_000
+"""Age of a failure that may be that of the request of a trace."""
+_REPLIED = frozenset((Outcome.ANSWERED, Outcome.FAILED, Outcome.DENIED))
+NO_SLAVE = "its master answers: the slave does not answer"
+"""Result for a slave without an AL state: ReadState is answered from the memory of its master."""
 
 
 class Hop(NamedTuple):
@@ -79,7 +85,8 @@ class TraceResult(NamedTuple):
     """Path to a target, and the answer of the target.
 
     *answer* is that to ReadState, None if no request was sent because the path ends before the
-    target.  *why* is the reason of a missing answer and begins with the hop; empty with an answer.
+    target.  *why* begins with the hop and is the reason of a missing answer, of the target or of
+    the slave behind it; empty with an answer.
     """
 
     hops: tuple[Hop, ...]
@@ -125,6 +132,8 @@ async def answer_hop_query(
     header = AmsHeader(query.target, query.port, source, 0, 0)
     location = station.locate(header, endpoint)
     report = report_of(station.name, station.net_id, query.target, location, monotonic_ns())
+    if report.is_here:
+        report = replace(report, last_failure=_last_failure(station, header))
     if not query.further or report.is_here or report.why or not report.next_net_id:
         return report
     # Bounded, because each router on a loop would forward the query once more.
@@ -142,6 +151,21 @@ async def answer_hop_query(
         return replace(report, error=AdsError.SERVICE)
 
 
+def _last_failure(station: StationRouter, header: AmsHeader) -> str:
+    """Return the reason of the latest failed request with the addresses of *header*, or ""."""
+    oldest_ns = monotonic_ns() - _LAST_FAILURE_NS
+    addresses = header.target, header.target_port, header.source
+    for each in reversed(station.record.latest):
+        if each.at_ns < oldest_ns:
+            break
+        found = each.header
+        if found is None or not each.text or each.outcome not in _REPLIED:
+            continue
+        if (found.target, found.target_port, found.source) == addresses:
+            return reason_of(each)
+    return ""
+
+
 async def trace(
     station: StationRouter, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
 ) -> TraceResult:
@@ -155,14 +179,29 @@ async def trace(
     began_ns = clock()
     answer = await run_operation(station, target, port, ReadState(), timeout_s)
     took_ns = clock() - began_ns
+    where = last.report.station + ("" if last.report.is_here else " or behind it")
     # Every other error comes from the target, so the path to it is complete.
     if answer.result not in _ON_THE_WAY:
-        return TraceResult(tuple(hops), answer, took_ns, "")
+        found = TraceResult(tuple(hops), answer, took_ns, "")
+        is_missing = is_slave_missing(port, found.states)
+        return found._replace(why=f"{where}: {NO_SLAVE}") if is_missing else found
     if why:
         return TraceResult(tuple(hops), None, 0, why)
-    where = last.report.station + ("" if last.report.is_here else " or behind it")
-    why = f"{where}: {AdsError.words_of(answer.result)}"
+    reason = ""
+    if last.report.is_here:
+        # Queried again: only the router that answered with the error knows its reason.
+        query = HopQuestion(target, port, len(hops) - 1)
+        again = await answer_hop_query(station, query, HERE, station.net_id)
+        reason = again.last_failure
+    code = f" (0x{answer.result:x})" if reason and "0x" not in reason else ""
+    why = f"{where}: {reason or AdsError.words_of(answer.result)}{code}"
     return TraceResult(tuple(hops), answer, took_ns, why)
+
+
+def is_slave_missing(port: int, states: AdsStates | None) -> bool:
+    """Return whether an answer to ReadState is that of a master whose slave has no AL state."""
+    is_slave = port not in {DEVICE_PORT, SYSTEM_PORT}
+    return is_slave and states == AdsStates(AdsState.INVALID, 0)
 
 
 async def find_fault(station: StationRouter, target: NetId, port: int) -> str:
@@ -321,15 +360,18 @@ async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: flo
     advice = advise(answer.error_code, target.net_id, report, router.net_id, is_own=is_own)
     if not advice.is_reached and report is not None and _leads_further(report):
         advice = await _with_fault(router, target, advice)
-    state = _state(answer.data) if not answer.error_code else ""
+    states = None if answer.error_code else _states(answer.data)
+    state = "" if states is None else _state_name(states)
+    text = f"{advice.text}: {state}" if state else advice.text
+    is_missing = is_slave_missing(target.port, states)
     return TestResult(
         target=str(target),
         name="" if route is None else route.name,
-        ok=advice.is_reached,
+        ok=advice.is_reached and not is_missing,
         rtt_us=took_us if advice.is_reached else None,
         state=state,
         error=answer.error_code,
-        text=f"{advice.text}: {state}" if state else advice.text,
+        text=NO_SLAVE if is_missing else text,
         hint=advice.hint,
     )
 
@@ -349,10 +391,14 @@ async def _with_fault(router: StationRouter, target: AmsAddress, advice: Advice)
     return Advice(is_reached=False, text=why, hint=_TRACE_HINT) if why else advice
 
 
-def _state(data: bytes) -> str:
-    """Return the ADS state in the answer to ReadState; empty if it has none."""
+def _states(data: bytes) -> AdsStates | None:
+    """Return the states in the answer to ReadState; None if it has none."""
     try:
-        state = AdsStates.decode(data, _RESULT_SIZE).ads_state
+        return AdsStates.decode(data, _RESULT_SIZE)
     except CodecError:
-        return ""
+        return None
+
+
+def _state_name(states: AdsStates) -> str:
+    state = states.ads_state
     return AdsState(state).name if state in AdsState._value2member_map_ else f"state {state}"

@@ -145,7 +145,7 @@ BEYOND = DOWN._replace(next_name="near")
             f"island ({HOP}) is a client, not listening: refused",
             "nothing is wrong",
         ),
-        (0x1B, UP, f"the link is down behind island ({HOP})", "eapctl trace"),
+        (0x1B, UP, f"host unreachable behind island ({HOP})", "eapctl trace"),
         (0x719, UP, f"no answer from island ({HOP}) in time", f"add one to {ROUTER}"),
         (7, UP, f"island ({HOP}) has no route to {FAR}", f"needs a route to {FAR}"),
         (0x723, UP, "access rules forbid to ask for its state", "under access in the plant"),

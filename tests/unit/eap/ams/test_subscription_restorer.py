@@ -270,7 +270,7 @@ def test_quiet_subscriptions_are_interrupted_when_their_server_does_not_answer()
     scene.answer(scene.asked[0], b"", 0x1B)
     (missing,) = scene.station.router.interruptions()
     where = "far (10.0.0.6 by link) or from behind it"
-    assert (missing.number, missing.why) == (3, f"error 0x1b (the link is down) from {where}")
+    assert (missing.number, missing.why) == (3, f"error 0x1b (host unreachable) from {where}")
 
 
 def test_others_of_a_server_are_checked_when_it_has_forgotten_one() -> None:

@@ -71,7 +71,7 @@ def test_codes_have_names() -> None:
 
 
 def test_codes_have_words() -> None:
-    assert AdsError.words_of(0x1B) == "error 0x1b (the link is down)"
+    assert AdsError.words_of(0x1B) == "error 0x1b (host unreachable)"
     assert AdsError.words_of(0x710) == "error 0x710 (SYMBOL_NOT_FOUND)"
     assert AdsError.words_of(0) == "no error"
 

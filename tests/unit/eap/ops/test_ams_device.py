@@ -27,7 +27,7 @@ def test_ams_device_sends_requests_through_an_appliance(target):
 @pytest.mark.parametrize(
     ("error", "text"),
     [
-        (0x1B, r"state: error 0x1b \(the link is down\); 'eapctl trace far/bus0/1001' shows where"),
+        (0x1B, r"state: error 0x1b \(host unreachable\); 'eapctl trace far/bus0/1001' shows where"),
         (0x704, r"state: it may not be read or written so \(error 0x704\)$"),
         (0x723, r"state: error 0x723 \(access rules forbid it\); 'eapctl trace"),
     ],

@@ -58,7 +58,7 @@ def test_refusals(far, target):
     with pytest.raises(AmsRefusedError, match=r"0x9999:00: there is no such object or entry"):
         far.read(0x9999, 0)
     target.error = 0x1B
-    with pytest.raises(AmsRefusedError, match="the link is down"):
+    with pytest.raises(AmsRefusedError, match="host unreachable"):
         far.entry(0xD000, 7)
 
 

@@ -164,7 +164,7 @@ def test_a_bus_that_is_down_says_so() -> None:
     _, far = look(first)
     assert not far["error"]
     bus = far["ports"][1]
-    assert bus["error"] == "5.1.1.2.3.1:65535: error 0x1b (the link is down)"
+    assert bus["error"] == "5.1.1.2.3.1:65535: error 0x1b (host unreachable)"
     assert bus["slaves"] == [{"address": 1001, "name": "drive", "state": None}]
 
 

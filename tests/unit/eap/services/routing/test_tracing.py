@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable
 from itertools import count
+from time import monotonic_ns
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.operation import Operation, Read, ReadState, ReadWrite
 from eap.ads.request import decode_outcome, encode_query
 from eap.ams.directory import AmsAddress
+from eap.ams.record import Outcome, Trace, describe
 from eap.ams.report import HopQuestion, decode_report
 from eap.ams.routes import Route
 from eap.ams.spec import AccessRule
@@ -84,6 +86,36 @@ def test_trace_local_target_has_one_hop() -> None:
     traced = follow(first, NetId.parse("5.1.1.1.3.1"))
     assert names(traced) == ["island-01"]
     assert traced.states is not None
+
+
+def test_trace_of_a_missing_slave_fails_although_its_master_answers() -> None:
+    line = Line()
+    first = line.add(1, to(2))
+    line.add(2, to(1), serve=lambda *_: AmsAnswer(bytes(8)))
+    traced = follow(first, NetId.parse("5.1.1.2.3.1"))
+    assert traced.why == "island-02: its master answers: the slave does not answer"
+    assert traced.states == AdsStates(0, 0)
+    assert not follow(first, NetId.parse("5.1.1.2.3.1"), 0xFFFF).why  # the master itself
+
+
+def test_trace_carries_the_reason_that_the_last_router_logged() -> None:
+    line = Line()
+    first = line.add(1, to(2))
+    last = line.add(2, to(1))
+    target = NetId.parse("5.1.1.2.3.1")
+
+    def fail(port: int, command: int, body: bytes) -> AmsAnswer:
+        header = AmsHeader(target, port, NetId.parse("9.9.9.9.1.1"), 1, command)
+        text = f"{describe(header)}: the engine does not answer"
+        at_ns = monotonic_ns()
+        last.record.add(Trace(at_ns, Outcome.ANSWERED, None, None, header, 0x1B, 0, text))
+        return AmsAnswer(error_code=AdsError.HOST_UNREACHABLE)
+
+    last.serve = fail
+    assert follow(first, target).why == "island-02: the engine does not answer (0x1b)"
+    last.record.latest.clear()
+    last.serve = lambda *_: AmsAnswer(error_code=AdsError.HOST_UNREACHABLE)
+    assert follow(first, target).why == "island-02: error 0x1b (host unreachable)"
 
 
 def test_trace_names_a_dead_hop_and_the_router_before_it() -> None:
@@ -387,6 +419,12 @@ def test_probe_reports_errors_with_a_hint() -> None:
     assert "eapctl routes add" in found.hint
 
 
+def test_probe_of_a_missing_slave_fails() -> None:
+    found = probe(RIGHT._replace(port=1003), data=bytes(8))
+    assert (found.ok, found.text) == (False, "its master answers: the slave does not answer")
+    assert probe(RIGHT, data=bytes(8)).ok  # of a router it says nothing about a slave
+
+
 def test_request_beyond_a_dead_router_names_the_router() -> None:
     left = Left()
     left.router.add_route(BEYOND)
@@ -408,8 +446,8 @@ def test_request_beyond_a_router_that_finds_a_fault_names_it(monkeypatch) -> Non
     why = "right: third (127.0.9.3:34980 by udp:eap1) is down: it does not answer"
     assert probe(target, data=b"", error=0x1B, more=BEYOND).text == why
     why = ""
-    assert "the link is down behind right" in probe(target, data=b"", error=0x1B, more=BEYOND).text
-    assert probe(RIGHT, data=b"", error=0x1B).text.startswith("the link is down behind right")
+    assert "host unreachable behind right" in probe(target, data=b"", error=0x1B, more=BEYOND).text
+    assert probe(RIGHT, data=b"", error=0x1B).text.startswith("host unreachable behind right")
 
 
 def test_probe_limits_the_time_of_the_fault_search(monkeypatch) -> None:
