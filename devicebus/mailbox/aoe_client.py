@@ -88,11 +88,13 @@ def _reassemble(what: str, first: bytes, more: MailboxRequest) -> Conversation[b
         with reading(what):
             header, body = decode_packet(message)
         request = more
+        # The low word of a fragment's invoke id is its number, the high word that of the packet.
         if not is_begun and header.invoke_id & 0xFFFF:
             late += 1  # the rest of an answer whose request has ended
         else:
             is_begun = True
             with reading(what):
+                # Time 0: the conversation's time-out is the limit, not that of the assembler.
                 packet, acknowledgement = assembler.receive(header, bytes(body), 0)
             if packet is not None:
                 if answers(more.type, more.request, packet):

@@ -157,5 +157,6 @@ class AoeServer:
         room = self._sizes.data_to_master - AmsHeader.SIZE
         if len(packet) <= self._sizes.data_to_master or room < 1:
             return [packet]
+        # Receivers tell packets apart by this number, the source NetID and the source port.
         self._number += 1
         return list(iter_fragments(packet, self._number, room))

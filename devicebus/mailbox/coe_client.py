@@ -108,6 +108,7 @@ def continue_upload(
     content = bytearray(start.data)
     progress = progress or Progress()
     progress.done, progress.total = len(content), size
+    # The first segment has toggle bit 0; the initiate message has no toggle bit.
     toggle = short = 0
     # The end is decided by the size of the first answer, not by the last bit: a slave that sets it
     # too early or too late breaks the protocol.
@@ -119,9 +120,11 @@ def continue_upload(
         content += data
         if len(content) > size:
             yield from sdo.abort(AbortCode.TOO_LONG, f"more than the {size} bytes announced")
+        # No abort here: with the last bit the slave has ended the transfer itself.
         if segment.last and len(content) < size:
             raise MailboxProtocolError(f"{sdo}: {len(content)} bytes of {size} announced")
         short += len(data) < SEGMENT_MINIMUM
+        # Without a limit a slave with empty or tiny segments would hold its mailbox for ever.
         if not data or short > MAX_SHORT:
             reason = f"{short} short segments" if data else "a segment without data"
             yield from sdo.abort(AbortCode.GENERAL, reason)
@@ -150,6 +153,7 @@ def download(
     sdo = _Sdo(index, subindex)
     progress = progress or Progress()
     progress.total = len(data)
+    # Unlike in CANopen, the first message of a normal download already carries data.
     data_size = sizes.to_slave - INITIATE_OVERHEAD
     first = encode_initiate(
         SdoRequest.DOWNLOAD, index, subindex, data, complete=complete, max_size=data_size
@@ -210,6 +214,7 @@ class _Sdo:
     def abort(self, code: AbortCode, reason: str) -> Conversation[NoReturn]:
         """Abort the transfer and raise."""
         abort = encode_abort(self.index, self.subindex, code)
+        # An abort is never answered (ETG.1000.6): nothing is awaited.
         yield MailboxRequest(MailboxType.COE, abort, expects_reply=False)
         raise MailboxProtocolError(f"{self}: {reason}")
 
@@ -231,6 +236,7 @@ def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:
     if len(body) % 2:
         what = f"object list {list_type.name}"
         raise MailboxProtocolError(f"{what}: {len(body)} bytes, expected whole indexes")
+    # The first word of the answer is the list type.
     return list(struct.unpack(f"<{len(body) // 2}H", body))[1:]
 
 
@@ -313,12 +319,14 @@ def _ask(
         if left is None:
             message = yield MailboxRequest(MailboxType.COE, sent)
         else:
+            # Later fragments repeat the headers only, neither list type nor index.
             message = yield MailboxRequest(MailboxType.COE, sent[:INFO_START], listen=True)
         with reading(what):
             header = SdoInfoHeader.decode(message.data, CoeHeader.SIZE)
             if header.opcode is SdoInfoOpcode.ERROR:
                 code = InfoError.decode(message.data, INFO_START).abort_code
                 raise SdoAbortError(code, index, subindex)
+        # A count that does not fall belongs to an answer whose request has timed out.
         if left is not None and header.fragments_left >= left and late < _MAX_LATE:
             late += 1
             continue

@@ -175,6 +175,7 @@ class SdoServer:
         read = self._dictionary.upload_complete if complete else self._dictionary.upload
         data = read(index, subindex, self._state())
         data_size = self._sizes.to_master - INITIATE_OVERHEAD
+        # Up to four bytes go into the header (expedited) and fit every mailbox.
         if len(data) > max(data_size, EXPEDITED_SIZE):
             self._transfer = SegmentedTransfer(head, len(data), data[data_size:])
         return encode_initiate(
@@ -186,6 +187,8 @@ class SdoServer:
         complete = bool(head.complete)
         data = self._expedited(head) if head.expedited else rest
         size = len(data) if head.expedited else size_of_download(head, data)
+        # Rights and size are checked before the first segment: a refusal after the last one would
+        # cost the client the whole transfer.
         self._dictionary.check_download(*where, size, self._state(), complete=complete)
         if len(data) == size:
             self._store(head.index, head.subindex, data, complete=complete)
@@ -195,12 +198,14 @@ class SdoServer:
 
     def _expedited(self, head: SdoHeader) -> bytes:
         data = head.data
+        # Complete access has no single entry that tells a size: all four bytes count.
         if head.has_size or head.complete:
             return data
         # The client did not say how many of the four bytes count, so the entry does.
         return data[: self._dictionary.entry(head.index, head.subindex).kind.size]
 
     def _continue(self, segment: bytes) -> bytes:
+        # Any error ends the transfer; only a good segment keeps it.
         running, self._transfer = self._transfer, None
         try:
             transfer = transfer_of(segment, running)

@@ -74,6 +74,7 @@ def read(
         try:
             sink(data)
         except OSError:
+            # Without it the slave would wait for an ACK and keep its file open.
             yield from transfer.send_error(FoeErrorCode.DISK_FULL)
             raise
         progress.done += len(data)
@@ -115,6 +116,7 @@ def write(
     yield from transfer.exchange(sent)
     number = 0
     size = packet_size
+    # A packet that is not full ends the file; after full packets only, it is an empty one.
     while size == packet_size:
         try:
             data = _read_fully(source, packet_size)
@@ -145,6 +147,7 @@ def _request(opcode: FoeOpcode, password: int, name: str, sizes: MailboxSizes) -
 
 
 def _read_fully(source: Callable[[int], bytes], size: int) -> bytes:
+    # A pipe may give fewer bytes than requested, and a short packet would end the file.
     data = source(size)
     while data and len(data) < size:
         more = source(size - len(data))
@@ -177,6 +180,7 @@ class _Transfer:
             since_ns = message.at_ns if since_ns is None else since_ns
             if message.at_ns - since_ns > BUSY_TIMEOUT_NS:
                 break
+            # BUSY acknowledges nothing: the same packet is sent again (ETG.1000.6).
             request = replace(request, delay_ns=BUSY_DELAY_NS)
         yield from self.send_error(FoeErrorCode.NOT_DEFINED)
         raise MailboxTimeoutError(f"{self.what}: still busy after {times} answers")

@@ -136,6 +136,7 @@ class FoeServer:
             return self._write_packet(self._writer, header.number, body, now_ns)
         if opcode is FoeOpcode.ACK and self._reader is not None:
             return self._confirm(self._reader, header.number)
+        # A client may be busy as well: its BUSY asks for the last packet again.
         if opcode is FoeOpcode.BUSY and self._reader is not None:
             return [self._sent]
         raise FoeError(f"{opcode.name} without a transfer", code=FoeErrorCode.ILLEGAL)
@@ -310,6 +311,7 @@ class MemoryWriter:
     def commit(self) -> None:
         """Replace the file's content by the written data."""
         content = bytes(self._content)
+        # Checked before the content is replaced: a refused file leaves the old one intact.
         if self._file.check is not None:
             self._file.check(content)
         self._file.content = content

@@ -91,6 +91,7 @@ def _answers_info(request: bytes, reply: bytes) -> bool:
     if len(reply) < INFO_START:
         return True
     opcode, found = request[2] & 0x7F, reply[2] & 0x7F
+    # An error repeats neither opcode nor index of its request.
     if found == SdoInfoOpcode.ERROR:
         return True
     key = request[INFO_START : INFO_START + _INFO_KEYS.get(opcode, 0)]
@@ -98,6 +99,7 @@ def _answers_info(request: bytes, reply: bytes) -> bool:
 
 
 def _answers_foe(request: bytes, reply: bytes) -> bool:
+    # ERROR and BUSY carry no packet number that would tell a late one.
     if len(reply) < FoeHeader.SIZE or reply[0] in {FoeOpcode.ERROR, FoeOpcode.BUSY}:
         return True
     requested, found = request[0], reply[0]
@@ -112,6 +114,8 @@ def _answers_foe(request: bytes, reply: bytes) -> bool:
         return found == FoeOpcode.DATA
     if requested == FoeOpcode.WRITE:
         return found == FoeOpcode.ACK and number == 0
+    # An ACK of the packet before is a repetition; other wrong numbers go to the conversation, which
+    # reports them.
     return requested == FoeOpcode.DATA and found == FoeOpcode.ACK and number != sent - 1
 
 
@@ -159,6 +163,7 @@ def _answers_eoe(request: bytes, reply: bytes) -> bool:
 
 
 def _answers_voe(request: bytes, reply: bytes) -> bool:
+    # VoE defines vendor id and vendor type only; the rest has no known request number.
     return reply.startswith(request[: VoeHeader.SIZE])
 
 

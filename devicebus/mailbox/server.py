@@ -93,6 +93,7 @@ class MailboxServer:
         # already.
         if not self._watch.is_new(message[5] >> 4 & 7):
             return
+        # Gateways and this project's master recognize their replies by the echoed address.
         address = int.from_bytes(message[2:4], "little")
         try:
             kind, replies = self._dispatch(message, now_ns)
@@ -105,6 +106,7 @@ class MailboxServer:
     def next_message(self, now_ns: int) -> bytes | None:
         """Return and remove the next message for the empty mailbox to the master."""
         if not self._queue:
+            # Replies come first: unsolicited messages, with address 0, wait until none is queued.
             for kind, protocol in self.protocols.items():
                 for data in protocol.messages_to_send(now_ns):
                     self._enqueue(kind, data, 0)
@@ -168,6 +170,7 @@ class MailboxServer:
         return kind, protocol.receive_message(data, now_ns)
 
     def _enqueue(self, kind: MailboxType, data: bytes, address: int) -> None:
+        # A protocol could not divide the answer: an error is better than a cut message.
         if len(data) > self.sizes.data_to_master:
             self._refused += 1
             kind, data = (

@@ -84,6 +84,7 @@ def _read(
         if left is None and not late:
             message = yield MailboxRequest(MailboxType.SOE, request, delay_ns=delay_ns)
         else:
+            # Fragments do not carry the IDN: they are matched by opcode and drive.
             listened = request if left is None else request[:_NAMELESS]
             message = yield MailboxRequest(MailboxType.SOE, listened, listen=True)
         with reading(what):
@@ -91,6 +92,8 @@ def _read(
         # While fragments follow, the IDN field holds the number of fragments left.
         is_foreign = not header.incomplete and header.idn != number
         now_left = header.idn if header.incomplete else 0
+        # A growing count begins another answer: the fragments before it belong to a late one, which
+        # a foreign IDN ends.
         if is_foreign or (left is not None and now_left > left):
             content.clear()
             late += 1
@@ -165,6 +168,7 @@ def execute(
     yield from write(idn, COMMAND_START.to_bytes(2, "little"), sizes, drive=drive)
     state = DataState.BUSY
     since_ns: int | None = None
+    # Limited by count as well: without a clock, the messages carry no time.
     for _ in range(max(1, timeout_ns // POLL_DELAY_NS)):
         message, octets = yield from _read(idn, Element.DATA_STATE, drive, None, POLL_DELAY_NS)
         if len(octets) < 2:
@@ -176,6 +180,7 @@ def execute(
         if message.at_ns - since_ns > timeout_ns:
             break
     try:
+        # Cleared in every case, or the drive refuses the next start (IEC 61800-7-300).
         yield from write(idn, COMMAND_CLEAR.to_bytes(2, "little"), sizes, drive=drive)
     except BusError:
         if not state & DataState.EXECUTING:
@@ -250,6 +255,8 @@ def describe(idn: Idn, *, drive: int = 0) -> Conversation[IdnDescription]:
 
 def _read_if_any(idn: Idn, element: Element, drive: int) -> Conversation[bytes | None]:
     try:
+        # Each missing element has an error code of its own, such as 0x2001 for the name; a request
+        # for several elements at once would fail as a whole.
         return (yield from read(idn, element, drive=drive))
     except SoeError:
         return None

@@ -221,6 +221,7 @@ class SoeParameter:
             OdState.SAFEOP: attribute.protected_safeop,
             OdState.OP: attribute.protected_op,
         }
+        # Protected in every state is "read only" (0x7004), in some states "protected now" (0x7005).
         if all(protected.values()):
             raise self.error(SoeErrorCode.VALUE_READ_ONLY)
         if protected[state]:
@@ -284,6 +285,7 @@ class _PendingWrite:
     def add(self, header: SoeHeader, body: bytes, now_ns: int) -> None:
         """Add a fragment; data beyond the longest list is counted and not stored."""
         self.left = header.idn
+        # One byte beyond the limit is kept, so that the excess is noticed at the end.
         self.content += body[: _MAX_WRITTEN + 1 - len(self.content)]
         self.deadline_ns = now_ns + FRAGMENT_TIMEOUT_NS
 

@@ -20,6 +20,7 @@ from devicebus.wire.register import Fmmu, Register, SyncManager
 from devicebus.wire.sii import SiiFixed, SiiProtocol
 
 MAX_SYNC_MANAGERS = 16
+# The register counts (n + 2) periods of 40 ns.
 WATCHDOG_DIVIDER = 2498
 """Watchdog divider for steps of 100 µs."""
 _STEPS_PER_MS = 10
@@ -151,6 +152,7 @@ def wait_for(task: Task[T]) -> Procedure[T]:
 def _prepare(bus: BusState, slave: BusSlave, current: AlState, step: AlState) -> Procedure[None]:
     """Write the registers that the slave checks on its way to *step*."""
     if current in WITH_PROCESS_DATA and step not in WITH_PROCESS_DATA:
+        # Before the request: cycles with and without this slave are valid until it has left.
         bus.set_participation(slave, Participation.UNCERTAIN)
     if current is AlState.INIT:
         yield from _prepare_mailbox(bus, slave, step)

@@ -31,6 +31,8 @@ _COE_UNSOLICITED = frozenset(
     (CoeService.EMERGENCY, CoeService.TX_PDO, CoeService.TX_PDO_REMOTE_REQUEST)
 )
 _SOE_UNSOLICITED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
+# Masters send address 0; the gateways of KickCAT and libethercat mark their requests on the bus by
+# bit 15 as well.
 _TAG = 0x8000
 _TAGS = 0x3FFF
 MAX_STORED = 64

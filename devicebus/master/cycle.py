@@ -173,6 +173,7 @@ class Cycle:
         if datagram.command is not Command.LRD:
             data = bytes(self._image.outputs[group.outputs : group.outputs + group.outputs_size])
         if datagram.command is not Command.LWR:
+            # LRW covers both by one address range: outputs first, then the place of the inputs.
             data += bytes(group.inputs_size)
         return logical(datagram.command, datagram.address, data)
 
@@ -180,6 +181,7 @@ class Cycle:
         self, replies: list[DatagramReply], allowed: tuple[int, ...], now_ns: int
     ) -> None:
         is_good = True
+        # Not strict: the replies of the extra datagrams follow.
         for datagram, reply, counts in zip(self._datagrams, replies, allowed, strict=False):
             if counts >> reply.wkc & 1:
                 self._copy_inputs(datagram, reply.data)
@@ -235,6 +237,7 @@ class Cycle:
 
 
 def _datagrams_of(number: int, group: DatagramGroup, *, knows_lrw: bool) -> list[_CyclicDatagram]:
+    # Half the datagrams, but a controller may lack LRW (features register, bit 9).
     if knows_lrw and group.outputs_size and group.inputs_size:
         return [_CyclicDatagram(Command.LRW, group.address, number)]
     datagrams = []

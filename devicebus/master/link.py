@@ -296,6 +296,7 @@ class Link:
 
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
         """Handle a frame that came back; one that answers nothing is counted."""
+        # Index of the first datagram; all datagrams of a frame carry the same one.
         index = data[3] if len(data) > EtherCatHeader.SIZE + DatagramHeader.SIZE else -1
         sent = self._in_flight.get(index)
         is_late = sent is None

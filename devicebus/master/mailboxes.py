@@ -376,6 +376,7 @@ class Mailbox:
             self._counters.malformed += 1
             return None
         data = bytes(body)
+        # After a repeat request the slave may send a message that has arrived all the same.
         if not self._watch.is_new(header.counter):
             return None
         if step is not None and self._queue.matcher(step.type).answers(header, data, step):

@@ -59,6 +59,7 @@ def find_topology(statuses: Sequence[DlStatus]) -> tuple[TopologyNode, ...]:
         while exits and not exits[-1][1]:
             exits.pop()
         parent, port = (exits[-1][0], exits[-1][1].pop(0)) if exits else (None, 0)
+        # The last slave of a line has no link at port 0 if it is entered by another port.
         entry = 0 if 0 in ports or not ports else ports[0]
         nodes.append(TopologyNode(ports, parent, port, entry))
         exits.append((position, [each for each in _ORDER if each in ports and each != entry]))
@@ -329,6 +330,7 @@ def iter_differences(
         None,
         [(each.vendor, each.product) for each in expected],
         [(each.identity.vendor, each.identity.product) for each in found],
+        # A bus has many equal slaves, which autojunk would ignore as noise.
         autojunk=False,
     )
     for _, start, end, there, there_end in matcher.get_opcodes():

@@ -284,6 +284,8 @@ def _missing_addresses(
     places = []
     last = -1
     for position, station in enumerate(stations):
+        # A slave that lost its power has no station address; the known slaves around its position
+        # tell which one it is.
         if station in order:
             last = max(last, order[station])
             continue

@@ -157,6 +157,7 @@ class Esc:
         self._areas: dict[tuple[int, int], SyncChannel] = {}
         self.windows: tuple[FmmuWindow, ...] = ()
         self.set_al_status(AlState.INIT, 0)
+        # INIT at power-on is no change that the master has to learn.
         self.ecat_event = 0
 
     def _describe(self) -> None:
@@ -274,6 +275,7 @@ class Esc:
     def _refresh(self, page: int, now_ns: int) -> None:
         memory = self.memory
         if page == 0x09:
+            # The time is that of the frame's entry into the segment: it reaches this slave later.
             self.clock.refresh(now_ns + (self.port_delays[0] or 0))
             return
         if page == 0x05:
@@ -289,6 +291,7 @@ class Esc:
         return self.eeprom.is_with_master and self.eeprom.busy_until_ns is None
 
     def _events(self) -> int:
+        # The register has event bits for sync managers 0 to 7 only.
         full = sum(1 << 4 + n for n, each in enumerate(self.channels[:8]) if each.is_full)
         return self.ecat_event | full
 
@@ -355,6 +358,7 @@ class Esc:
             self.clock.activate(now_ns)
 
     def _read_memory(self, start: int, end: int) -> bytes | None:
+        # Almost every access is one whole sync manager area: one look-up instead of a search.
         channel = self._areas.get((start, end))
         if channel is not None:
             return self._read_guarded(channel, start, end)
@@ -363,6 +367,7 @@ class Esc:
                 if start < channel.start or end > channel.end:
                     return self._read_across(start, end)
                 return self._read_guarded(channel, start, end)
+        # A read partly behind the memory's end counts, one wholly behind it does not.
         data = bytes(self.memory[start:end])
         return data.ljust(end - start, b"\0") if data else None
 

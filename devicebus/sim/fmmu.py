@@ -142,6 +142,7 @@ def write_slices(
         octets = bytes(frame[start + part.first : start + part.end])
         if part.mask:
             value = int.from_bytes(octets, "little") >> part.shift & part.mask
+            # Bits outside the mask keep their value; a read in place of peek would have effects.
             old = int.from_bytes(memory.peek(part.physical, part.size), "little")
             old &= ~(part.mask << part.physical_shift)
             octets = (old | value << part.physical_shift).to_bytes(part.size, "little")

@@ -113,9 +113,11 @@ class Chain:
             else:
                 count = self._access(command, self._addressed(command, adp), ado, data, now_ns)
             if command in _BY_POSITION or command in _BROADCAST:
+                # Every slave on the way increments ADP, whether it acts or not.
                 struct.pack_into("<H", frame, offset + 2, (adp + len(self._escs)) & 0xFFFF)
             if count:
                 frame[start:end] = data
+                # Station addresses or event masks may have changed: the caches of both are rebuilt.
                 if ado < _MASK_END and (command in _WRITES or command in _MULTIPLE):
                     self._masked = None
                     if ado < _ADDRESS_END:

@@ -13,6 +13,7 @@ from devicebus.wire.alstatus import ERROR, WITH_MAILBOX, WITH_PROCESS_DATA, AlSt
 from devicebus.wire.register import AlEvent, Register
 from eap.codec.mailbox import MailboxType
 
+# A buffered sync manager uses its area and the two areas of the same length behind it.
 _BUFFERS = 3
 
 ALLOWED: dict[AlState, frozenset[AlState]] = {
@@ -202,6 +203,7 @@ class SimulatedSlave:
             self._refuse(code)
         elif self._deadline_ns is None:
             self._enter(target)
+        # AL status bit 5 says that the AL status code register holds the identification.
         if control & _IDENTIFY and not self._code:
             self.esc.set_al_status(self.state | _IDENTIFY, self.device.identification)
 
@@ -223,6 +225,8 @@ class SimulatedSlave:
             return self._start_inputs(now_ns)
         if target is AlState.OP:
             code = check_clock(self.esc, self.device)
+            # OP needs valid outputs (0x0019 otherwise): the request stays open until the first
+            # arrive.
             waits = self.device.process_data.outputs.size and not self._has_outputs
             if not code and waits:
                 self._deadline_ns = now_ns + OUTPUTS_TIMEOUT_NS
@@ -333,6 +337,7 @@ class SimulatedSlave:
                 if self._deadline_ns is not None:
                     self._deadline_ns = None
                     self._enter(AlState.OP)
+                # In SAFEOP outputs are received, as proof that they arrive, but not applied.
                 if self.state is AlState.OP:
                     process_data.outputs.unpack(data)
         self._offer_inputs(now_ns)

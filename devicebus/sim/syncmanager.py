@@ -102,6 +102,8 @@ class SyncChannel:
         Returns:
             -1 if it is refused, else the AL event that it causes, or 0.
         """
+        # A refused access leaves the working counter at 0: by that the master polls an empty
+        # mailbox.
         if self.master_writes or self.is_locked or (self.is_mailbox and not self.is_full):
             return -1
         # The first byte opens the buffer: until the last byte is read it must not change.
@@ -126,6 +128,7 @@ class SyncChannel:
         Returns:
             -1 if it is refused, else the AL event that it causes, or 0.
         """
+        # A full mailbox refuses further writes until the slave has read its last byte.
         if not self.master_writes or self.is_locked or (self.is_mailbox and self.is_full):
             return -1
         if start == self.start:
@@ -151,6 +154,7 @@ class SyncChannel:
             return None
         self._dirty = False
         if not self.is_mailbox:
+            # The last complete write, not the memory: the master may be halfway through the next.
             return self._buffer
         self._set_status(_READ)
         return bytes(self._memory[self.start : self.end])

@@ -59,6 +59,7 @@ _TEXTS = {
     0x002B: "no valid inputs and outputs",
     0x002C: "fatal sync error",
     0x002D: "no sync error",
+    # Stacks give this code two meanings, so the text names both.
     0x002E: "cycle time too small, or invalid input FMMU configuration",
     0x0030: "invalid DC SYNC configuration",
     0x0031: "invalid DC latch configuration",

@@ -104,6 +104,7 @@ def iter_datagrams(frame: Buffer) -> Iterator[Datagram]:
             f"length {ethercat.length}, but {len(frame) - EtherCatHeader.SIZE} bytes follow",
             layout="EtherCatHeader",
         )
+    # Ethernet padding may follow: only Length ends the frame.
     view = memoryview(frame)[:end]
     offset = EtherCatHeader.SIZE
     more = 1
@@ -170,6 +171,7 @@ class DatagramReply(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 def aprd(position: int, ado: int, size: int) -> DatagramRequest:
     """Read from the slave at a position in the segment, counted from 0."""
+    # Each slave increments ADP, and the slave that receives 0 acts: position n is sent as -n.
     return DatagramRequest(Command.APRD, -position & 0xFFFF, ado, bytes(size))
 
 

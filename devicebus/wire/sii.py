@@ -233,6 +233,7 @@ def iter_categories(data: Buffer) -> Iterator[tuple[int, memoryview]]:
     view = memoryview(data)
     offset = SiiFixed.SIZE
     while True:
+        # The end mark is a type without a length: the image may end right behind it.
         if offset + 2 <= len(view) and view[offset] == view[offset + 1] == 0xFF:
             return
         header = CategoryHeader.decode(view, offset)
@@ -267,6 +268,7 @@ def decode(data: Buffer) -> Sii:
             case SiiCategory.SYNC_MANAGER:
                 found["sync_managers"] = _decode_records(SiiSyncManager, body)
             case SiiCategory.TX_PDO:
+                # A category may occur several times: the PDOs of all are joined.
                 found["tx_pdos"] = (*found.get("tx_pdos", ()), *_iter_pdos(body))
             case SiiCategory.RX_PDO:
                 found["rx_pdos"] = (*found.get("rx_pdos", ()), *_iter_pdos(body))
@@ -285,6 +287,7 @@ def encode(sii: Sii) -> bytes:
     """
     fixed = sii.fixed.encode()
     image = bytearray(fixed)
+    # The check sum is the low byte of word 7; it covers the words that an ESC loads at power-on.
     image[CHECKED : CHECKED + 2] = bytes((checksum(fixed[:CHECKED]), 0))
     parts = [
         (SiiCategory.STRINGS, _encode_strings(sii.strings) if sii.strings else b""),
@@ -298,6 +301,7 @@ def encode(sii: Sii) -> bytes:
     ]
     for kind, body in parts:
         if body:
+            # Lengths are in words, so an odd body gets one byte of padding.
             padded = body + bytes(len(body) % 2)
             image += CategoryHeader(kind, len(padded) // 2).encode() + padded
     return bytes(image + _END.to_bytes(2, "little"))
@@ -313,6 +317,7 @@ def _decode_strings(body: memoryview) -> tuple[str, ...]:
             raise TruncatedError(
                 f"a string of {size} bytes, but {len(octets)} follow", layout="StringCount"
             )
+        # Latin-1 decodes every byte: an odd character in a name must not fail the image.
         strings.append(bytes(octets).decode("latin-1"))
         offset += 1 + size
     return tuple(strings)
