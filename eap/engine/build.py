@@ -98,6 +98,7 @@ class EngineBuses:
     def rest(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         """Bring all slaves to INIT, or as far as they get in REST_NS."""
         now_ns = clock()
+        # Slaves that do not answer must not delay the end: their watchdogs stop the outputs too.
         end_ns = now_ns + REST_NS
         tasks = {bus: bus.shut_down(now_ns) for bus in self.buses}
         while (now_ns := clock()) < end_ns:
@@ -205,6 +206,8 @@ class EnginePlant:
             station = Station(spec, file.image, file.wake_waiters)
             self._stations[spec.name] = EngineStation(station, file)
         step("opening ports")
+        # Loopback lines and outgoing TCP need no socket of the supervisor: nothing of them has to
+        # outlive the engine.
         self._open_own()
         for shared in handover.sockets:
             if shared.kind is SocketKind.PACKET:
@@ -238,6 +241,7 @@ class EnginePlant:
         except OSError:
             connection.close()  # the peer has left again
             return
+        # Services accepts for all; only the engine knows how many connections the port has.
         if not port.accept(receiver, monotonic_ns(), spare_descriptors=spare):
             receiver.close()
             for station in {owner.station for owner in passed.owners}:

@@ -129,6 +129,7 @@ class BusPlanner:
         on_bus = [(each.bit_offset, each.bit_length) for each in bus.variables if each.is_output]
         return BusPlan(
             CopyPlan(inputs, used=self._used),
+            # Not run in each cycle, so it need not be bridged into few copies.
             CopyPlan([Move(target, source, bits) for source, target, bits in inputs]),
             {writer: CopyPlan(moves, used=on_bus) for writer, moves in outputs.items()},
             tuple(missing),
@@ -146,6 +147,7 @@ def _by_entry(variables: Iterable[ProcessVariable]) -> dict[_Entry, list[Process
     """Return the variables of each entry, the first one last."""
     by_entry: dict[_Entry, list[ProcessVariable]] = defaultdict(list)
     for each in variables:
+        # An entry may be mapped more than once: the description and the bus name them in one order.
         by_entry[each.station, each.is_output, each.index, each.subindex].insert(0, each)
     return by_entry
 
@@ -184,6 +186,7 @@ class BusStateVariables:
             return
         self._seen = seen
         slaves = master.slaves
+        # The bus as a whole is as far as its last slave.
         lowest = min([slave.al_state for slave in slaves.values()], default=0)
         values = [lowest, int(seen[2])]
         values += [slaves[at].al_state if at in slaves else 0 for at in self._stations]

@@ -141,6 +141,7 @@ class BusRequestHandler:
         # Bounded, so that requests do not delay the cycles.
         for _ in range(PER_WAKE_UP):
             try:
+                # SOCK_SEQPACKET keeps the borders of messages, so one recv is one request.
                 message = self._sock.recv(_MAX_MESSAGE)
             except OSError:
                 return
@@ -230,6 +231,7 @@ class BusRequestHandler:
     def _transfer(self, bus: EngineBus, request: ExchangeDatagrams, now_ns: int) -> None:
         self._check_limits((request.bus, 0))
         procedure = _one_step(check_datagrams(request.datagrams))
+        # One step only: a requester that dies in the middle leaves nothing under way on the bus.
         task = bus.master.run(procedure, now_ns, "a transfer")
         self._watch(bus, request, 0, task, _with_replies, now_ns)
 

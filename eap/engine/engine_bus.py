@@ -258,6 +258,7 @@ class EngineBus:
 
     def receive(self, now_ns: int) -> None:
         """Receive frames that came back, at most a batch, if any are under way."""
+        # Spares a system call in each cycle for a bus on which nothing is under way.
         if self.master.is_waiting:
             self._guarded(self._receive, now_ns)
 
@@ -297,6 +298,7 @@ class EngineBus:
         self._starting = None
         self.is_up = False
         self._start_fault = f"the master has failed: {type(exc).__name__}: {exc}"
+        # Not at once: a fault that returns with each start would keep the slaves in transitions.
         self._retry_ns = now_ns + RETRY_NS
         for task in list(self.tasks):
             task.fail(BusError(f"{task.name}: {self._start_fault}"))
@@ -307,6 +309,8 @@ class EngineBus:
             self._start(now_ns)
         if self.master.image is not self._mapping.bus_image:
             self._mapping.lay_out(self.master.image)
+            # A new bus image starts with zeros, which would reach the variables before the first
+            # exchange.
             self._mapping.keep_inputs()
         # The outputs of this cycle leave at its end; the inputs they cause come in the next one.
         self._mapping.put_outputs()

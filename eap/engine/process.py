@@ -50,6 +50,8 @@ class CycleWaiter:
                 return True
             self._serve()
             return False
+        # The descriptors are unregistered, not ignored: a readable one would end every wait at
+        # once.
         is_due = self._ticker.wait(min(deadline_ns, self._window_end_ns))
         now_ns = monotonic_ns()
         if now_ns >= self._window_end_ns:

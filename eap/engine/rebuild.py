@@ -95,6 +95,7 @@ class StationReplacement:
         try:
             image = self._file.image
             self._images = ImageHandover(before.image, image)
+            # Before Station(): its subscribers read from the words which trackers they share.
             self._images.carry_words()
             self._images.carry_values(before.inputs.memory)
             self._station = Station(spec, image, self._file.wake_waiters)
@@ -125,6 +126,7 @@ class StationReplacement:
         before = entry.station
         self._images.carry_words()
         self._images.carry_values(before.inputs.memory)
+        # The last step that can fail: nothing of the running station has changed before it.
         self._file.move_to(entry.file.path)
         entry.file.retire()
         # Who writes from now on sees that the image is retired, and writes in the new one again.
@@ -201,6 +203,7 @@ class _Job:
         self._taken.acquire()
         self.successor = None
         if self._before is not None:
+            # Here and not in the cycle's thread: freeing thousands of objects takes milliseconds.
             self._before.release()
             self._before = None
         notify()
@@ -270,6 +273,7 @@ class StationRebuilder:
     def close(self) -> None:
         """Wait for the thread, and abandon its result."""
         if self._job is not None and self._thread is not None:
+            # Polled: the thread waits for `_taken` behind its build, so a join alone would hang.
             while not self._job.is_built and self._thread.is_alive():
                 self._thread.join(_LOOK_S)
             self._job.abandon()

@@ -38,6 +38,7 @@ SERVICES_TYPES = (FrameType.AMS, FrameType.RAW_IO, FrameType.MAILBOX)
 _LOAD_WORD, _LOAD_HALF, _LOAD_BYTE, _LOAD_SIZE = 0x20, 0x28, 0x30, 0x80
 _SHIFT_RIGHT, _RETURN = 0x74, 0x06
 _EQUAL, _GREATER, _NOT_LESS = 0x15, 0x25, 0x35
+# Loads at negative offsets read what the kernel knows of a packet, not its bytes.
 _PACKET_TYPE = 0xFFFFF000 + 4  # SKF_AD_OFF + SKF_AD_PKTTYPE
 _ALL = 0x40000
 _UDP_HEADER = 8
@@ -82,6 +83,8 @@ def udp_filter(role: Role) -> list[Instruction]:
     short = _ALL if role is Role.ENGINE else 0
     return [
         (_LOAD_SIZE, 0, 0, 0),
+        # A load beyond the end ends the program with 0, which drops the datagram: the engine would
+        # not count it.
         (_NOT_LESS, 1, 0, _UDP_HEADER + 2),
         (_RETURN, 0, 0, short),
         *_by_type(_UDP_HEADER, *_actions(role)),
@@ -98,6 +101,8 @@ def packet_filter(role: Role) -> list[Instruction]:
         (_EQUAL, 1, 0, ETHERTYPE),
         (_RETURN, 0, 0, 0),
         (_LOAD_WORD, 0, 0, _PACKET_TYPE),
+        # PACKET_HOST, BROADCAST and MULTICAST are 0 to 2: what is above is a frame to another host,
+        # which a promiscuous interface shows too.
         (_GREATER, 0, 1, socket.PACKET_MULTICAST),
         (_RETURN, 0, 0, 0),
         *_by_type(_ETHERNET_HEADER, *_actions(role)),
@@ -138,6 +143,7 @@ def arp_filter(addresses: Iterable[IPv4Address]) -> list[Instruction]:
         (_LOAD_WORD, 0, 0, _ARP_TARGET),
     ]
     for address in wanted:
+        # A return of its own for each address: a jump over more than 255 instructions does not fit.
         program += [(_EQUAL, 0, 1, int(address)), (_RETURN, 0, 0, _ALL)]
     return [*program, (_RETURN, 0, 0, 0)]
 
@@ -147,6 +153,7 @@ def attach(
 ) -> None:
     """Attach *program* to *sock*; raise OSError if the kernel rejects it."""
     code = b"".join(struct.pack("@HBBI", *instruction) for instruction in program)
+    # The kernel copies the program during the call, so the memory may go afterwards.
     memory = ctypes.create_string_buffer(code, len(code))
     fprog = struct.pack("@HP", len(program), ctypes.addressof(memory))
     sock.setsockopt(socket.SOL_SOCKET, option, fprog)

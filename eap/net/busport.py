@@ -27,6 +27,7 @@ BUS_MULTICAST_MAC = MacAddr.parse("01:01:05:01:00:00")
 _HEADER = 14
 _PROCESSED = 0x02
 _LARGEST = 2048
+# Not every driver pads a short frame of a packet socket (IEEE 802.3: 60 bytes without FCS).
 _MINIMUM = 60
 _LOST = (BlockingIOError, ConnectionRefusedError)
 
@@ -65,6 +66,8 @@ class BusPort:
         except _LOST:
             return
         except OSError as error:
+            # A packet socket stays bound to the index of its interface; one that was made again
+            # under the same name has another index.
             if self._interface and error.errno == errno.ENXIO:
                 self._join_again()
             raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
@@ -118,6 +121,7 @@ def open_bus_socket(interface: InterfaceUri) -> socket.socket:
 def _open_udp(address: str, port: int) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
+        # Connected, so that the kernel drops datagrams of all other hosts.
         sock.connect((address, port))
     except OSError as error:
         sock.close()

@@ -150,6 +150,8 @@ class Listener:
             if self.by_host[host] >= per_host:
                 mine = [each for each in self.connections if each.host == host]
                 return f"{host} has {len(mine)} connections, its share", mine
+            # Many hosts together must not take the places that are kept for this one, even if each
+            # is within its share.
             foreign = len(self.connections) - self.by_host[OWN_HOST]
             if reserved and foreign >= total - reserved:
                 others = [each for each in self.connections if each.host != OWN_HOST]
@@ -249,6 +251,8 @@ def _find_victim(
         count = held[each.host]
         is_fresh = each.activity is Activity.UNUSED and now_ns - each.used_at_ns < FRESH_NS
         if is_fresh or _is_in_use(each, now_ns):
+            # More than one above: with a difference of one the two hosts would only change places,
+            # and evict each other in turn.
             if (is_fresh or each.host != OWN_HOST) and count > mine + 1:
                 order = 1
             elif is_fresh and each.host == newcomer_host:

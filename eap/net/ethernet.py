@@ -81,11 +81,13 @@ class EthernetInterface:
         groups = {EAP_MULTICAST_MAC, *(MacAddr.parse(text) for text in join)}
         index = socket.if_nametoindex(self.name)
         for group in groups:
+            # Without it the network adapter filters the group out before any socket sees it.
             membership = struct.pack("@iHH8s", index, PACKET_MR_MULTICAST, len(group), group)
             self._sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
         by_address = self._routes.setdefault(vlan_id, {})
         for address in (self.address, BROADCAST_MAC, *groups):
             by_address.setdefault(_key(address), []).append(handler)
+        # Copies for other ports cost time in each cycle, so a single port makes none.
         self.has_neighbours = self._has_ports
         self._has_ports = True
         return EthernetPort(self, handler, vlan_id, priority)
@@ -116,6 +118,7 @@ class EthernetInterface:
             others = [handler for handler in handlers if handler is not sender.handler]
             if not others:
                 continue
+            # A copy: the publisher patches the buffer again before the other port is drained.
             data = memoryview(bytes(frame.view[frame.headroom :]))
             for handler in others:
                 if len(self._local) >= _LOCAL_LIMIT:
@@ -208,6 +211,7 @@ class EthernetPort:
         self.handler = handler
         self.vlan_id = vlan_id
         self._send = interface.sender.send
+        # VID 0 with a priority is a priority tag (802.1Q); without both the frame is untagged.
         tag = priority << 13 | vlan_id
         self._tag = struct.pack("!HH", _TPID, tag) if tag else b""
 

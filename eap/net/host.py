@@ -104,6 +104,8 @@ class Host:
     def _cpu_share(self) -> float:
         busy, total = self._cpu()
         busy_before, total_before = self._cpu_before
+        # The counters grow by ticks of 10 ms: two readings within one tick have no share between
+        # them.
         if total > total_before:
             self._cpu_percent = 100.0 * max(busy - busy_before, 0) / (total - total_before)
             self._cpu_before = busy, total
@@ -144,6 +146,7 @@ def open_replay(path: Path, column: str, *, period_ms: int) -> CsvReplay:
         EnvironmentalError: the file cannot be read, or has no such column or no rows.
     """
     try:
+        # utf-8-sig: spreadsheet programs put a byte order mark before the first name.
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file, strict=True)
             if column not in (rows.fieldnames or ()):

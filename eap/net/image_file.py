@@ -30,6 +30,7 @@ from eap.pd.spec import Writer
 from eap.pd.words import StationWord
 
 _libc = ctypes.CDLL(None, use_errno=True)
+# The C library has no function for it, and the number depends on the architecture.
 _SYS_FUTEX = {"x86_64": 202, "aarch64": 98, "armv7l": 240, "riscv64": 98}.get(os.uname().machine)
 _FUTEX_WAIT, _FUTEX_WAKE = 0, 1
 _ALL_WAITERS = 0x7FFFFFFF
@@ -161,12 +162,16 @@ class ImageFile(Closeable):
             remaining_ns = deadline_ns - time.monotonic_ns()
             if remaining_ns <= 0 or words[StationWord.RETIRED]:
                 return False
+            # Before the sleep: the engine wakes only for about as long as a waiter was announced
+            # lately.
             words[StationWord.WAITERS] = cycle
             limit = (ctypes.c_long * 2)(*divmod(remaining_ns, 1_000_000_000))
             _libc.syscall(
                 _SYS_FUTEX,
                 ctypes.byref(self._futex),
                 _FUTEX_WAIT,
+                # A cycle that ended since `seen` was read makes the kernel return at once: no
+                # wake-up is lost.
                 ctypes.c_uint32(seen),
                 limit,
                 None,
@@ -197,6 +202,8 @@ def create_image(path: Path, layout: ImageLayout) -> ImageFile:
 
 def _replace(existing: ImageFile | None, fresh: ImageFile, path: Path) -> ImageFile:
     try:
+        # Still retired at that moment: a program that opens the path waits until the content is
+        # there.
         fresh.move_to(path)
     except EnvironmentalError:
         fresh.discard()
@@ -348,6 +355,7 @@ class StationImage:
             with file.image.writing(writer):
                 for name, each in octets.items():
                     file.image.store(name, each)
+            # A write that came too late for the handover is made again in the new file.
             if not file.retired:
                 return
 

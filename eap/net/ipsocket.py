@@ -52,6 +52,7 @@ def open_udp_pair(address: str, port: int = EAP_PORT) -> tuple[socket.socket, so
             prepare_receiver(sock)
         engine.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         _bind(engine, address, port)
+        # Before the second socket joins: the kernel would spread datagrams by a hash in between.
         bpf.attach(engine, bpf.reuseport_index(), bpf.SO_ATTACH_REUSEPORT_CBPF)
         _bind(services, address, port)
         if address != "0.0.0.0":  # noqa: S104  a comparison
@@ -59,6 +60,7 @@ def open_udp_pair(address: str, port: int = EAP_PORT) -> tuple[socket.socket, so
             engine.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, out)
         # Process data does not leave the local network.
         engine.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+        # Stations of one host may subscribe to each other's groups.
         engine.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
     except BaseException:
         _close(pair)
@@ -121,8 +123,12 @@ def open_udp_group_pair(
             prepare_receiver(sock)
             bpf.attach(sock, bpf.udp_filter(role))
             if _is_multicast(group):
+                # By default a socket gets the groups that any socket of the host has joined at any
+                # interface.
                 sock.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0)
             else:
+                # A broadcast address is the same on all interfaces, and has no membership to limit
+                # it to one.
                 _bind_to_interface(sock, interface_address)
             _bind(sock, group, port)
             if _is_multicast(group):
@@ -137,6 +143,7 @@ def prepare_receiver(sock: socket.socket) -> None:
     """Ask for kernel time stamps and for as much receive buffer as this process may have."""
     sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     try:
+        # FORCE goes beyond net.core.rmem_max and takes CAP_NET_ADMIN; without it the limit applies.
         sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, _RECEIVE_BUFFER)
     except PermissionError:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
@@ -222,6 +229,7 @@ def find_holders(protocol: str, address: str, port: int, *, proc: Path = _PROC) 
     Raises nothing: what this user may not see is left out.
     """
     holders = []
+    # A socket of IPv6 at :: takes the port of IPv4 too, and is listed only in the other table.
     for name in (protocol.lower(), protocol.lower() + "6"):
         try:
             lines = (proc / "net" / name).read_text().splitlines()[1:]

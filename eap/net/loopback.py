@@ -154,6 +154,7 @@ class LoopbackChannel:
                     frame.due_ns += HOLD_NS
                     self._held.append(frame)
         for frame in overtaken:
+            # Held frames leave behind the one that overtook them; HOLD_NS has not passed yet.
             if frame.due_ns > due_ns:
                 self._order += 1
                 frame.due_ns, frame.order = due_ns, self._order

@@ -133,6 +133,8 @@ class ReceiveBatch:
         """Return view, whole size and monotonic arrival time of the only message of a batch."""
         now_ns = self._read_clocks()
         words, stamps = self._words, self._stamps
+        # The kernel writes the length that it used: a message without a stamp shortens the header
+        # for all that follow in that place.
         if words[5] != self._control_size:
             words[5] = self._control_size
             return self.views[0], words[7], now_ns
@@ -182,6 +184,7 @@ class ReceiveBatch:
         readings makes it look smaller: a smaller distance is accepted only if measured again.
         """
         now_ns = monotonic_ns()
+        # SO_TIMESTAMPNS has the wall clock only, while deadlines here are monotonic.
         offset = now_ns - time_ns()
         if offset > self._offset:
             self._offset = offset
@@ -291,6 +294,8 @@ class SendBatch:
 
     def _prepare(self, frames: tuple[OutFrame, ...]) -> tuple[Callable[[], int], bytearray]:
         known = self._headers
+        # Cleared as a whole: which frames are still in use is not known here, and refilling is
+        # cheap.
         if len(self._batches) >= _CACHED_BATCHES or len(known) >= _CACHED_FRAMES:
             # Together: a batch points into the descriptions of its frames.
             self._batches.clear()

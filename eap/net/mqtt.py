@@ -99,6 +99,8 @@ class MqttLink(ReconnectingLink):
         """Log another reason (ReconnectingLink)."""
         if has_lasted:
             self._connections = 0
+        # A broker disconnects the client that has a name already when another connects with it, so
+        # two of them throw each other out in turn.
         elif self._connections > max(self._connections_before, 1):
             reason += f"; has another client the name {self._client_id!r} (client_id) too?"
         if self._is_new_reason(reason):  # a broker that is away for long is no flood of lines
@@ -125,6 +127,7 @@ class MqttLink(ReconnectingLink):
                 await self._serve(client)
             why = "it was closed"
         except MqttError as exc:
+            # Tried by turns, since the reason is not certain: some brokers just say nothing.
             if not self._is_connected and is_too_new(exc):
                 self._is_old = not self._is_old
             why = describe(exc, client, self._spec.user)
@@ -176,6 +179,7 @@ class MqttLink(ReconnectingLink):
             self._handlers.message(message.topic.value, message.payload, message.retain)
 
     async def _write(self, client: MqttClient, group: asyncio.TaskGroup) -> None:
+        # QoS 1 and 2 wait for the broker; one after the other would take a round trip each.
         room = asyncio.Semaphore(_UNCONFIRMED)
 
         async def confirm(message: Publish) -> None:

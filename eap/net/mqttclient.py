@@ -61,6 +61,7 @@ class Inbox(asyncio.Queue[Message]):
         elif self.overrun is not None:
             self.overrun()
 
+    # asyncio.Queue calls these two for each item, also where a getter waits already.
     def _put(self, item: Message) -> None:
         self.octets += len(item.payload)
         super()._put(item)
@@ -150,6 +151,7 @@ def make_client(
     properties = None
     if not is_old:
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        # paho reads a packet as a whole before it is seen here; only the broker can prevent that.
         properties.MaximumPacketSize = MAX_MESSAGE
         properties.ReceiveMaximum = _UNCONFIRMED
     user, password = login or (None, None)

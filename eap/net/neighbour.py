@@ -130,6 +130,7 @@ class NeighbourTable:
             return ProbeResult.BLIND
         neighbour = self.neighbour(route.neighbour, route.interface)
         evidence = ProbeResult.PENDING if neighbour is None else neighbour.state.evidence
+        # A gateway that is there proves nothing of a host behind it.
         if route.kind is RouteKind.GATEWAY and evidence is not ProbeResult.ABSENT:
             return ProbeResult.BLIND
         return evidence
@@ -206,6 +207,7 @@ def _attributes(data: bytes, offset: int) -> Iterator[tuple[int, bytes]]:
         if size < _ATTRIBUTE.size:
             return
         yield kind, data[offset + _ATTRIBUTE.size : offset + size]
+        # Attributes are aligned to 4 bytes (rtnetlink), and their length is that without padding.
         offset += size + 3 & ~3
 
 

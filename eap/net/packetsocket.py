@@ -79,6 +79,7 @@ def join_type1(sock: socket.socket, interface: str, group: bytes) -> None:
         EnvironmentalError: it is no Ethernet.
     """
     _join(sock, interface, ETHERTYPE)
+    # Slaves process frames to any destination, so a simulated segment has to see all of them.
     kind = PACKET_MR_MULTICAST if group else PACKET_MR_PROMISC
     index = socket.if_nametoindex(interface)
     membership = struct.pack("iHH8s", index, kind, len(group), group)

@@ -112,6 +112,7 @@ def _lock_memory() -> bool | str:
     if limit != resource.RLIM_INFINITY and not _has_capability(_CAP_IPC_LOCK):
         # Within a limit the lock would succeed and a later allocation fail.
         return f"needs CAP_IPC_LOCK or no limit for memlock (ulimit -l is {limit // 1024} kB)"
+    # ONFAULT: a thread's stack of several MB would else be in memory as a whole.
     if _library["mlockall"](_MCL_CURRENT) or _library["mlockall"](_MCL_FUTURE | _MCL_ONFAULT):
         return os.strerror(ctypes.get_errno())
     return True
@@ -129,6 +130,7 @@ def _hold_latency() -> bool | str:
     except OSError as error:
         return f"{_DMA_LATENCY}: {error.strerror}"
     try:
+        # A latency of 0 us, as a binary number of 32 bits.
         os.write(fd, bytes(4))
     except OSError as error:
         os.close(fd)
@@ -137,6 +139,7 @@ def _hold_latency() -> bool | str:
 
 
 def _set_timer_slack() -> int:
+    # 1 ns: 0 would mean the default of 50 us.
     _library["prctl"](_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     return int(_library["prctl"](_PR_GET_TIMERSLACK, 0, 0, 0, 0))
 
@@ -160,6 +163,8 @@ def raise_descriptor_limit() -> int:
 
 def descriptor_reserve() -> int:
     """Return how many descriptors are kept for files, buses, routes and the control socket."""
+    # A quarter, where a limit is so low that the whole reserve would leave no place for
+    # connections.
     return min(_MOST_RESERVED, _limit() // 4)
 
 

@@ -119,6 +119,8 @@ async def connect_tcp(
             sock.bind((source, 0))
         async with asyncio.timeout(timeout_s):
             await asyncio.get_running_loop().sock_connect(sock, (host, port))
+        # To an ephemeral port of this host, a connect may get that port as its own (simultaneous
+        # open).
         if sock.getsockname() == sock.getpeername():
             raise ConnectionRefusedError  # noqa: TRY301  connected to itself: no listener
     except BaseException:

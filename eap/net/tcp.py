@@ -56,6 +56,7 @@ class TcpWriter:
         except BlockingIOError:
             return False
         if sent < len(frame.buffer):
+            # A copy: the next cycle patches the buffer, and half of each frame would arrive.
             self._rest = memoryview(bytes(frame.view[sent:]))
         return True
 
@@ -182,6 +183,7 @@ class TcpSender:
         self._sock = sock
         self._next_ns = now_ns + _CONNECT_NS
         try:
+            # The address of the port, by which the peer knows this publisher.
             sock.bind((self._source, 0))
             self._writer = TcpWriter(sock)
         except OSError as error:
@@ -190,6 +192,7 @@ class TcpSender:
         self._continue_connecting(sock, now_ns)
 
     def _continue_connecting(self, sock: socket.socket, now_ns: int) -> None:
+        # Called again while it connects: EALREADY or EISCONN tells the progress without a poll.
         number = sock.connect_ex(self._address)
         if number in _CONNECTED:
             self._connected = True
@@ -217,6 +220,8 @@ class TcpSender:
                 self._fail(errno.ECONNRESET, now_ns)
             return count
         try:
+            # Read even if nothing is expected: otherwise an end of the peer is noticed only by
+            # sending.
             if not sock.recv_into(self._scratch):
                 self._fail(errno.ECONNRESET, now_ns)
         except BlockingIOError:
@@ -283,6 +288,7 @@ class TcpReceiver:
         if self.closed:
             return 0
         self._write(None)
+        # What is left of the last call comes first: the buffer has no room for more before.
         count = self._take_frames(now_ns, FRAMES_PER_DRAIN)
         if count < FRAMES_PER_DRAIN and not self.closed and self._read():
             count += self._take_frames(now_ns, FRAMES_PER_DRAIN - count)

@@ -60,6 +60,7 @@ class TcpPort:
 
     def follow(self, destinations: Collection[str], answers: Iterable[FrameHandler]) -> None:
         """Keep connections to *destinations* only, and hand received frames to *answers*."""
+        # In place: every TcpSender holds this list.
         self._answers[:] = answers
         for gone in self._senders.keys() - destinations:
             self._senders.pop(gone).close()

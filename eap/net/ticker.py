@@ -83,6 +83,7 @@ class Ticker:
     def arrivals(self) -> list[int]:
         """Return the descriptors that the last wait found readable, at most eight of them."""
         events = (_EVENT.unpack_from(self._events, n * _EVENT.size) for n in range(self._count))
+        # Without the timer: it only ends the wait.
         return [fd for _, fd in events if fd in self._registered]
 
     def close(self) -> None:

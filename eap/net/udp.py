@@ -152,6 +152,8 @@ def read_errors(sock: socket.socket, limit: int = ERRORS_PER_CALL) -> list[UdpEr
         except OSError:  # empty: what is pending without an entry says nothing of a destination
             break
         for level, kind, data in control:
+            # The address of recvmsg is that of the datagram's destination, not of the host that
+            # reports.
             if (level, kind) == (socket.IPPROTO_IP, IP_RECVERR):
                 found.append(_parse(data, address))
     return found

@@ -46,6 +46,7 @@ def source_word(source: bytes) -> int:
         return _KINDS[DestinationKind.MAC] << _KIND_SHIFT | int.from_bytes(source)
     if not source:
         return 0
+    # The port stays 0: a restarted publisher may send from another one and is still the same host.
     return _KINDS[DestinationKind.IP] << _KIND_SHIFT | int.from_bytes(source) << 16
 
 
@@ -144,6 +145,7 @@ class SourceWatch:
         """
         self._accepting.update(accepting)
         self._dropping.update(dropping)
+        # The address is noted when it changes; a new RxPD would wait for the next change.
         if self.source is not None:
             self._note(source_word(self.source))
 
@@ -194,6 +196,8 @@ class NetIdLearner:
 
     def handle(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Note the sender of a frame, and hand the frame over."""
+        # `wanted` comes first: it is empty unless a frame goes to a NetID, and this runs for each
+        # frame.
         if self.wanted and size >= _PUBLISHER.stop and data[1] >> 4 == FrameType.PROCESS_DATA:
             publisher = bytes(data[_PUBLISHER])
             if publisher in self.wanted:
@@ -202,6 +206,8 @@ class NetIdLearner:
 
     def _look(self, publisher: bytes, data: memoryview, at_ns: int, origin: FrameOrigin) -> None:
         looked_at_ns = self._looked_at_ns.get(publisher)
+        # A negative age means that the time stamps went back, as they do when the wall clock is
+        # set.
         if looked_at_ns is None or not 0 <= at_ns - looked_at_ns < LOOK_NS:
             self._looked_at_ns[publisher] = at_ns
             if sender := origin.sender_of(data):

@@ -58,6 +58,8 @@ class CopyPlan:
         pieces: dict[tuple[int, int], list[Piece]] = {}
         for run in runs:
             for part in _split(run):
+                # Bits go through tables of 256 entries: one lookup shifts and masks a byte, and
+                # several pieces of one pair of bytes share it.
                 if part.target_bit % 8 or part.bits < 8:
                     for octets, piece in _pieces(part):
                         pieces.setdefault(octets, []).append(piece)
@@ -88,6 +90,7 @@ class CopyPlan:
         first, shift = divmod(part.source_bit, 8)
         where = slice(part.target_bit // 8, part.target_bit // 8 + size)
         if shift:
+            # A shifted run of whole bytes covers one byte more in its source.
             what = slice(first, first + size + 1)
             self._shifts.append((where, what, shift, (1 << part.bits) - 1, size))
         else:

@@ -45,6 +45,7 @@ class StateRequest(Enum):
 
 TRANSITIONS: dict[tuple[DeviceState, StateRequest], DeviceState] = {
     (DeviceState.INIT, StateRequest.START): DeviceState.PREOP,
+    # The present state may be requested: a client that repeats its request gets no error.
     (DeviceState.PREOP, StateRequest.PREOP): DeviceState.PREOP,
     (DeviceState.PREOP, StateRequest.SAFEOP): DeviceState.SAFEOP,
     (DeviceState.SAFEOP, StateRequest.PREOP): DeviceState.PREOP,
@@ -86,6 +87,7 @@ class EapDevice:
         """Go to *state* by all states between; raise LocalProtocolError for Init."""
         if state is DeviceState.INIT:
             raise LocalProtocolError("INIT cannot be requested, only PREOP, SAFEOP or OP")
+        # No transition leads from PreOp to Op directly; downwards one step reaches every state.
         while self.state < state:
             self.request(_UP[self.state])
         if self.state > state:

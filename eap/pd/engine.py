@@ -44,10 +44,13 @@ class Engine:
 
     def replace(self, old: Station, new: Station, now_ns: int) -> None:
         """Run *new*, which has the buses of *old*, in its place; its cycle counter continues."""
+        # The index in `_due` stays valid, so the heap is untouched unless the cycle time changes.
         index = self._stations.index(old)
         self._stations[index] = new
         if new.cycle_ns != old.cycle_ns:
             by_station = {number: due_ns for due_ns, number in self._due}
+            # Counted from the last cycle that ran, so that the first new interval is one new cycle
+            # time.
             due_ns = by_station[index] - old.cycle_ns + new.cycle_ns
             by_station[index] = (
                 due_ns + max(0, -(-(now_ns - due_ns) // new.cycle_ns)) * new.cycle_ns

@@ -147,6 +147,8 @@ class _Sent:
         for was, first in self._split:
             count = old[was.frame_words + FrameWord.WHOLE]
             if count:
+                # A PD without a trigger of its own does not count what it sends: its frame counts
+                # for it. Outside of that frame the count has to become its own.
                 reason = REASON_INDEX[Reason.CYCLE if was.cyclic else Reason.DIVIDER]
                 new[first + TxWord.REASON + reason] += count
                 new[first + TxWord.LAST_REASON] = reason
@@ -202,6 +204,8 @@ class _Received:
         new[self._new_column] = self._owners
         for first in self._restarted:
             new[first + RxWord.LAST_CYCLE] = -1
+            # They describe the frames of the previous sender or rate, with which the next is not
+            # compared.
             for word in (RxWord.BEHIND, RxWord.HOLES, RxWord.SENDER):
                 new[first + word] = 0
         for first in self._source_changed:
@@ -263,6 +267,7 @@ def _plan_values(old: Image, new: Image) -> tuple[CopyPlan, CopyPlan]:
     others: list[Move] = []
     for name, slot in new.slots.items():
         was = old.slots.get(name)
+        # Compared as parsed types: the same type can be written in more than one way.
         if was is None or datatypes.parse(was.type) != datatypes.parse(slot.type):
             continue
         bits = datatypes.parse(slot.type).bit_length

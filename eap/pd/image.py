@@ -195,6 +195,7 @@ class Image:
     ) -> bytes:
         words, sequence = self.words, self.layout.regions[writer].sequence
         for _ in range(attempts):
+            # A sequence lock: a writer never waits for a reader, so the engine cannot be held up.
             before = words[sequence]
             if not before % 2:
                 data = bytes(self.memory[first:last])
@@ -289,6 +290,7 @@ def extract_value(slot: VariableSlot, data: bytes, first_bit: int) -> bytes:
     offset, bit = divmod(slot.bit_offset - first_bit, 8)
     if not kind.is_bits:
         return data[offset : offset + kind.size]
+    # A bit field of up to 8 bits may reach into the next byte.
     word = int.from_bytes(data[offset : offset + 2], "little") >> bit
     return bytes((word & (1 << kind.bit_length) - 1,))
 
@@ -319,6 +321,7 @@ class Inputs:
             for writer, slot in image.layout.regions.items()
             if writer is not Writer.ENGINE and slot.size
         ]
+        # No sequence word is negative: the first refresh copies every region.
         self._seen = [-1] * len(self._regions)
         self._settled: tuple[int, ...] = ()
         """Both sequence words, when all that they guard has been copied."""
@@ -327,6 +330,8 @@ class Inputs:
 
     def reload(self) -> None:
         """Copy the values that were put into the image before its writers write there."""
+        # A handover wrote the values without touching the sequence words, so these prove nothing
+        # here.
         for index, (sequence, region) in enumerate(self._regions):
             if self.memory[region] == self._image.memory[region]:
                 self._seen[index] = self._words[sequence]
@@ -356,6 +361,8 @@ class Inputs:
             if before == self._seen[index]:
                 continue
             if before % 2:
+                # The previous whole copy stays in use: a cycle never waits for a program that
+                # writes.
                 words[_TORN] += 1
                 continue
             copy = bytes(self._image.memory[region])
@@ -399,6 +406,8 @@ class Sampler:
         slot, memory = self._slot, self._memory
         number = cycle % slot.count
         head = number * (slot.size // 8)
+        # The cycle number is cleared first and written last: a reader that sees the same number
+        # before and after its copy has a whole sample.
         self._heads[head] = _NO_CYCLE
         self._heads[head + 1] = now_ns
         start = slot.offset + number * slot.size + SAMPLE_HEAD
@@ -448,6 +457,7 @@ class ImageSamples:
     def read(self, cycle: int) -> bytes | None:
         """Return the variables at the end of *cycle*; None if there is no sample of it."""
         start = self._slot.offset + cycle % self._slot.count * self._slot.size + SAMPLE_HEAD
+        # Copied first and checked afterwards: the engine may reuse the slot at any moment.
         data = bytes(self.image.memory[start : start - SAMPLE_HEAD + self._slot.size])
         return data if self._heads[self._head(cycle)] == cycle else None
 

@@ -40,6 +40,8 @@ from eap.pd.spec import (
 )
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 
+# Header first, at fixed offsets: a program of another release finds the version, and stops, before
+# it relies on anything else.
 MAGIC = b"EAPIMAGE"
 LAYOUT_VERSION = 4
 HEADER = struct.Struct("<8sIIQQQ")
@@ -200,6 +202,7 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
     frames = tuple(_frame_slot(frame, words) for frame in spec.frames)
     types = {variable.name: datatypes.parse(variable.type) for variable in spec.variables}
     tx = tuple(_tx_slots(spec, frames, types, words))
+    # In one piece, so that a slice with a stride reaches one word of all RxPDs.
     rx_words = [words.take(RxWord.SIZE) for _ in spec.subscriptions]
 
     octets = _Allocator(WORDS_OFFSET + 8 * words.used)
@@ -215,8 +218,11 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
             slots,
             octets,
         )
+        # Control variables are commands of the application; it writes them, and the engine reads
+        # them.
         if writer is Writer.APPLICATION:
             _lay_out_variables(_control_variables(spec), slots, octets)
+        # Words are loaded and stored whole only at multiples of 8, and samples begin with words.
         octets.align()
         sequence = StationWord[f"{writer.name}_SEQUENCE"]
         regions[writer] = RegionSlot(start, octets.used - start, sequence)
@@ -443,6 +449,7 @@ def _lay_out_alternate(
     moves = [Move(_QUALITY, header + _QUALITY, _QUALITY_BITS)]
     missing = dict(own)
     for each, kind, start in zip(alternate.variables, theirs, plan.bit_offsets, strict=True):
+        # A variable without a name is a gap of the other layout: it only moves those behind it.
         if not each.name:
             continue
         expected, bit = missing.pop(each.name, (None, 0))
@@ -481,6 +488,7 @@ def mirror(entries: Iterable[BusEntrySpec], types: Mapping[str, DataType]) -> Mi
     end = 0
     for entry in entries:
         if entry.variable:
+            # Readers take all other types by whole bytes (struct), and never shift.
             if not types[entry.variable].is_bits:
                 end = -(-end // 8) * 8
             offsets[entry.variable] = end

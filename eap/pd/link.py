@@ -145,6 +145,7 @@ class StateChannel:
         # Bits 0 to 3 as in the AL status; their place in the octet is not public (ETG.1005).
         state = self._words[StationWord.STATE] & 0x0F
         for frame in frames:
+            # For each frame and not for each call: the bit flips with every new telegram.
             self._toggle ^= TOGGLE_BIT
             frame.view[frame.headroom + EAP_SM_OFFSET] = state | self._toggle
         return self._channel.send(frames, now_ns)

@@ -69,6 +69,7 @@ class _BoundLink(NamedTuple):
         link, source, target = self.link, self.source.kind, self.target.kind
         if link.scale != 1.0 or link.offset:
             return True
+        # Equal types are copied even if they are numbers: a conversion would lose NaN and infinity.
         if link.bits or source == target or (link.swap and source.size == target.size):
             return False
         return source.scalar_range is not None and target.scalar_range is not None
@@ -124,6 +125,8 @@ def _stages(bound: Iterable[_BoundLink]) -> list[list[_BoundLink]]:
     read_in: dict[int, int] = {}
     written_in: dict[int, int] = {}
     for each in bound:
+        # A link runs behind those that write what it reads, and behind all that read or write what
+        # it writes: the result is that of running the links one after the other.
         before = [written_in[bit] for bit in each.reads if bit in written_in]
         for bit in each.writes:
             before += [stage[bit] for stage in (read_in, written_in) if bit in stage]
@@ -185,6 +188,7 @@ def _reader(source: _LinkEnd, *, swap: bool) -> Callable[[], Any]:
     first, shift = divmod(source.slot.bit_offset, 8)
     if kind.is_bits:
         mask = (1 << kind.bit_length) - 1
+        # A bit field may reach into the next byte; the slice is cut off at the end of the memory.
         two = memory[first : first + 2]
         return lambda: int.from_bytes(two, "little") >> shift & mask
     octets = memory[source.octets]
@@ -250,6 +254,7 @@ def _generator_step(image: Image, source: EngineSource) -> Callable[[int], None]
     if limits is None or not whole:
         return lambda tick: store(value(tick))
     low, span = int(limits[0]), int(limits[1]) - int(limits[0]) + 1
+    # Whole numbers wrap as the counter of a controller does, instead of staying at a limit.
     return lambda tick: store((value(tick) - low) % span + low)
 
 
@@ -271,6 +276,7 @@ def _random_step(
     memory = image.memory[offset : offset + size]
 
     def fill(tick: int) -> None:
+        # From the time alone (rule 4): a skipped cycle does not shift the values that follow.
         position = tick * _STRIDE % _POSITIONS
         memory[:] = sequence[position : position + size]
 
@@ -290,4 +296,5 @@ def _generator_value(
         span = source.high - source.low
         return lambda tick: finish(source.low + span * (tick % period) / period)
     turn = 2 * math.pi / period
+    # The remainder keeps the argument small: the sine of a large float has lost its precision.
     return lambda tick: finish(source.offset + source.amplitude * math.sin(turn * (tick % period)))

@@ -111,6 +111,7 @@ class PresenceTracker:
             self.presence = SubscriberPresence.PRESENT
 
     def _miss(self, result: ProbeResult, now_ns: int) -> None:
+        # A reply proves presence; the time-out of an older probe in the same round proves nothing.
         if result is ProbeResult.MISSED and self._round_result is ProbeResult.SEEN:
             return
         self._result_at_ns = now_ns
@@ -195,6 +196,7 @@ class _Watch:
         self.answered_by: MacAddr | None = None
         self.waits = False
         self.queued = False
+        # As if the last probe was an interval ago: the first one is due at once.
         self.probed_at_ns = now_ns - target.interval_ns
         self.due_ns = self.claimed_until_ns = now_ns
         self.claims: dict[MacAddr, _AddressClaim] = {}
@@ -209,6 +211,7 @@ class _Watch:
         """Note a claim of *mac*; return whether to keep quiet for it."""
         known = self.claims.get(mac)
         if known is None or now_ns - known.last_ns > policy.claimant_ns:
+            # Forged senders must not fill memory; the oldest claim is the first one.
             if len(self.claims) >= _MAX_CLAIMANTS:
                 del self.claims[next(iter(self.claims))]
             known = self.claims[mac] = _AddressClaim(now_ns)

@@ -49,6 +49,7 @@ class PollRequests:
 
     def follow(self, before: PollRequests) -> None:
         """Take over the requests of *before* that this port answers too."""
+        # Requests that came just before a reconfiguration are answered by the new station.
         for sender, names in before.pop_all().items():
             if known := names & self.names:
                 self.add(sender, known)
@@ -90,6 +91,8 @@ class OutgoingPoll:
         self._state = state
         self._before_ns, self._sent_at_ns = self._sent_at_ns, now_ns
         for answer in self._answers:
+            # The first request without an answer counts: a time-out must not begin anew with each
+            # request.
             self._waiting.setdefault(answer, now_ns)
 
     def requested_since(self, answer: str) -> int | None:

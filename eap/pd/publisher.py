@@ -178,6 +178,8 @@ class Publisher:
         if not self._others and len(self._groups) == 1 and self._groups[0].step == 1:
             self._always = self._groups[0]
             self._due = self._groups
+            # sent() goes through `_due` and `_sending` in any case, so both have to fit the
+            # shortcut.
             self._sending.clear()
 
     def forget(self) -> None:
@@ -288,6 +290,8 @@ class Publisher:
         enter_skipped(self._words, (pd.slot for pd in pds), now_ns)
         for pd in pds:
             if frame.suppressed or pd.trigger.suppressed:  # else it waits for the address
+                # An event that was suppressed is over: it must not be sent when the suppression
+                # ends.
                 pd.trigger.clear_event()
 
 
@@ -319,6 +323,7 @@ class _ResponseFrame:
         selection = kept.get((sender, pds))
         if selection is None:
             if len(kept) >= ANSWERS_KEPT:
+                # The oldest goes; requesters may forge addresses, so the table has to stay bounded.
                 del kept[next(iter(kept))]
             selection = Selection(build_frame(publisher, pds, channel, sender), pds)
             kept[sender, pds] = selection

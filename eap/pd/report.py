@@ -146,6 +146,7 @@ def quality(image: Image, slot: RxSlot) -> int:
     first = tracker_word(image, slot)
     cycles = words[StationWord.CYCLE] - words[first + RxWord.ARRIVED_IN_CYCLE]
     own_ns = max(cycles, 0) * image.layout.cycle_us * 1000 + words[slot.words + RxWord.RESPONSE_NS]
+    # Derived when it is read: counting it up in each cycle would cost the cycle for each PD.
     sent = PdHeader.decode(image.memory, slot.offset).quality
     return min(sent + own_ns // _QUALITY_NS, _QUALITY_MAX)
 
@@ -180,6 +181,7 @@ def tx_status(image: Image, slot: TxSlot) -> dict[str, Any]:
     counts = words[slot.words + TxWord.REASON : slot.words + TxWord.SIZE].tolist()
     whole = 0 if slot.poll_request else words[slot.frame_words + FrameWord.WHOLE]
     scheduled = REASON_INDEX[Reason.CYCLE if slot.cyclic else Reason.DIVIDER]
+    # Frames that leave whole count once for all their PDs, see publisher.py.
     counts[scheduled] += whole
     last = words[slot.words + TxWord.LAST_REASON] if not whole else scheduled
     return {
@@ -220,6 +222,7 @@ def _rx(image: Image, slot: RxSlot, now_ns: int, wall_ns: int | None) -> dict[st
         "var_state": var_state(image, slot),
         "age_us": max(age_ns, 0) // 1000 if received else None,
         "last_good": round((wall_ns - age_ns) / 1e9, 3) if received and wall_ns else None,
+        # Answers have no rhythm to deviate from; the same words hold their response times.
         "jitter_us": _spread([], 0) if slot.poll_request else spread,
         "response_us": {"last": last_us, **spread} if slot.poll_request else None,
         "source": source_text(words[slot.words + RxWord.SOURCE]),

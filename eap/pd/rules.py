@@ -129,6 +129,8 @@ def check_frame_of(pd: TxPdSpec, frame: TxFrameSpec, line: str = "") -> Iterator
         where = f"frame {frame.name!r}{', ' if line else ''}{line}"
         message = f"PD {pd.name!r} goes to the requester ({where}), but nothing polls it"
         expected = "poll: the subscription that requests it, or another frame"
+    # The dictionary has the destination at the frame, while the plant file names the frame at the
+    # PD.
     yield RuleViolation(FaultCode.POLL, "frame", message, expected, entry="to")
 
 
@@ -151,6 +153,7 @@ def check_monitoring(
             yield RuleViolation(
                 code, key, f"{message}a group", "monitoring only of a unicast frame"
             )
+        # The connection itself shows whether the peer is there.
         elif destination.kind is DestinationKind.TCP or uri.scheme == "loop":
             yield RuleViolation(code, key, f"{message}{destination} by {uri}", "Ethernet or UDP")
     if not frame.monitor_ip:
@@ -166,6 +169,7 @@ def check_monitoring(
 def check_triggers(pd: TxPdSpec) -> Iterator[RuleViolation]:
     """Triggers of a PD that exclude each other."""
     trigger, on_change, code = pd.trigger, pd.trigger.on_change, FaultCode.TRIGGERS
+    # TwinCAT leaves overlapping triggers undefined; here they are errors (docs/triggers.md).
     if trigger.cycle_us and trigger.divider:
         message = f"PD {pd.name!r} has a cycle_us and a divider"
         yield RuleViolation(code, "divider", message, "one of the two")

@@ -92,6 +92,7 @@ class SequenceTracker:
         self._usual_ns = timing.step * timing.sender_cycle_ns
         known = self._usual_ns > 0 and timing.step <= _NEAR
         self._usual_gap = timing.step if known else -1
+        # A quarter of the 16 bits: within that time a step of the counter has one meaning only.
         self._wrap_ns = timing.sender_cycle_ns << 14 or 1 << 62
         self._words = words[first_word + TRACKER_START : first_word + RxWord.SIZE]
         if not self._words[_RECEIVED]:
@@ -160,6 +161,7 @@ class SequenceTracker:
         if last >= 0:
             elapsed_ns = at_ns - last_at_ns
             gap = cycle - last & 0xFFFF
+            # The usual case first, with two comparisons: this runs for each frame.
             if gap == self._usual_gap and elapsed_ns <= self._wrap_ns:
                 self._enter_jitter(elapsed_ns - self._usual_ns)
             else:
@@ -204,6 +206,7 @@ class SequenceTracker:
         words[_LOST] += lost
         holes = words[_HOLES]
         if holes:
+            # Bounded: after a long silence the shift would make a number of any size.
             holes <<= min((position - words[_HOLES_BELOW]) // self._step, REORDER_WINDOW)
         holes |= (1 << min(lost, REORDER_WINDOW)) - 1
         words[_HOLES] = holes & (1 << REORDER_WINDOW) - 1

@@ -148,6 +148,7 @@ class Station:
 
     def drain_also(self, channel: FrameChannel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""
+        # Two ports may share an interface: drained once, its frames go to the handlers of both.
         if channel not in self._channels:
             self._channels.append(channel)
             self._drains.append(channel.drain)
@@ -185,6 +186,7 @@ class Station:
         if 0 < previous_ns <= now_ns:
             words[StationWord.RESTARTS] += 1
             elapsed = (now_ns - previous_ns) // self.cycle_ns
+            # The counter follows the time: receivers see missing frames, not a restarted sender.
             words[_CYCLE] += elapsed
             words[_FUTEX] = words[_CYCLE] & 0xFFFFFFFF  # no cycle is under way
             return int(previous_ns + (elapsed + 1) * self.cycle_ns)
@@ -265,6 +267,7 @@ class Station:
         replaced = [subscriber.handle_timeout for subscriber in self._subscribers.values()]
         self._supervisors = [each for each in self._supervisors if each not in replaced]
         for port, subscriber in before._subscribers.items():
+            # The object stays and gets the parts of the new one: channels hold its bound method.
             subscriber.swap_in(self._subscribers[port], now_ns)
             if subscriber.has_timeouts:
                 self._supervisors.append(subscriber.handle_timeout)
@@ -337,6 +340,7 @@ class Station:
         for supervise in self._supervisors:
             supervise(now_ns)
         if self._computes:
+            # Skipped cycles count: a generated value follows the time and not the number of runs.
             self._generate(cycle + words[_OVERRUNS])
             changed = self._inputs.refresh()
             if self._run_links is not None:

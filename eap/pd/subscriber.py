@@ -116,6 +116,7 @@ class Subscriber:
         """Take one EtherCAT frame of *size* bytes that arrived at *at_ns* from *origin*."""
         source = origin.source_of(data)
         table = self._table
+        # A layout is walked once; the same layout of the same publisher then costs one lookup.
         plan = table.find_plan(data, size, source, at_ns) or table.learn(data, size, source, at_ns)
         if plan is None:
             return
@@ -130,6 +131,7 @@ class Subscriber:
         if outside:
             words[_SEQUENCE] += 1
         (cycle,) = _CYCLE_COUNTER(data, CYCLE_OFFSET)
+        # Outside of a cycle the data counts as that of the next one, which is the first to use it.
         own_cycle = words[_CYCLE] + outside
         for tracker, copies in plan.parts:
             if tracker.arrived(cycle, at_ns, own_cycle):
@@ -171,6 +173,8 @@ class Subscriber:
                 continue
             deadline_ns = subscription.deadline_ns()
             if deadline_ns is None:
+                # A polled PD that is not requested cannot be late; its time runs from the next
+                # request.
                 following = min(following, now_ns + timeout_ns)
             elif deadline_ns <= now_ns:
                 # A tracker is shared: its time-out counts once, for all its subscriptions.
@@ -229,6 +233,8 @@ class SubscriptionTable:
 
     def learn_from(self, before: SubscriptionTable) -> None:
         """Plan for all layouts of frames that *before* knows, so that none is new."""
+        # Copies: the running cycle may learn a layout while the thread that rebuilds reads the
+        # tables.
         for plans in list(before._plans.values()):
             for plan in list(plans):
                 self.learn(plan.example(), plan.end, plan.watch.source or b"", 0)
@@ -306,6 +312,8 @@ class SubscriptionTable:
         refused: Iterable[DroppedPd],
     ) -> SourceWatch:
         """Return the watch over the frames of *publisher* with the class of *source*."""
+        # Addresses without a subscription share one watch: a sender that forges them makes no new
+        # ones.
         expected = source if source in self._sources else b""
         watch = self._watches.get((publisher, expected))
         if watch is None:
@@ -329,6 +337,7 @@ class SubscriptionTable:
     ) -> list[RxSubscription] | DroppedPd:
         """Return the subscriptions that accept a PD, or the counters of a dropped one."""
         pd_id = header.pd_id
+        # All that fit take the PD: two subscriptions may map one PD to variables of their own.
         candidates = self._by_key.get((publisher, pd_id), []) + self._by_key.get((b"", pd_id), [])
         if not candidates:
             others = self._by_id.get(pd_id, [])
@@ -360,6 +369,7 @@ class SubscriptionTable:
         """Enter how long the answers in a frame took."""
         entered: set[SequenceTracker] = set()
         for tracker, answer in plan.answers:
+            # An older frame than the last one was dropped, and answers nothing.
             if not tracker.has_taken(cycle):
                 continue
             response_ns = answer.poll.enter_answer(answer.name, at_ns)
@@ -376,6 +386,7 @@ class SubscriptionTable:
         if not names:
             return
         sender = origin.sender_of(data)
+        # The data of the request was taken all the same; only its answer is missing.
         if not sender or not self._requests.add(sender, names):
             reason = PdDropReason.TOO_MANY_REQUESTS if sender else PdDropReason.NO_SENDER
             refused = [s.slot.words for s in self.subscriptions if s.slot.name in names]

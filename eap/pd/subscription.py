@@ -72,8 +72,10 @@ class RxSubscription:
         """Return the reason to drop such a PD from the address *source*, None to accept it."""
         if self.source and source != self.source:
             return PdDropReason.WRONG_SOURCE
+        # Before the version is compared: an alternate has another one by its nature.
         if (version, length) in self.alternates:
             return None
+        # VarState tells the two apart (bit 0 version, bit 1 length); the version is named first.
         if version != self.slot.version and not self.ignore_version:
             return PdDropReason.VERSION
         if length != self.slot.size:
@@ -83,6 +85,7 @@ class RxSubscription:
     def deadline_ns(self) -> int | None:
         """Return when its data is too old, None as long as it was not requested again."""
         since_ns: int | None = self.tracker.arrived_at_ns
+        # The time-out of polled data runs from the request: without one nothing can be late.
         if self.answer is not None:
             since_ns = self.answer.poll.requested_since(self.answer.name)
         return None if since_ns is None else since_ns + self.timeout_ns
@@ -198,6 +201,8 @@ class FramePlan:
     ) -> None:
         """Build the plan from (header without quality, data length) of each PD and their fate."""
         pds = tuple(pds)
+        # The quality is skipped with the data: it is the one header field that changes between
+        # frames.
         layout = struct.Struct("<" + "".join(f"6s{2 + length}x" for _, length in pds))
         self.headers: Callable[..., tuple[Any, ...]] = layout.unpack_from
         self.expected: tuple[Any, ...] = tuple(header for header, _ in pds)
@@ -274,6 +279,7 @@ def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | PdDropReas
         end = PD_FRAME_START + ethercat.length
         frame = data[: min(end, size)]
         count = PdFrameHeader.decode(frame, PD_FRAME_START).count
+        # Checked before the loop: a forged count of 65535 would cost a cycle its time.
         if FIRST_PD + count * PdHeader.SIZE > end:
             return PdDropReason.COUNT_TOO_LARGE
         pds = []
@@ -284,4 +290,5 @@ def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | PdDropReas
             offset += PdHeader.SIZE + header.length
     except TruncatedError:
         return PdDropReason.TRUNCATED
+    # Bytes behind the last PD and behind Length are ignored: padding, and what later versions add.
     return pds if offset <= end <= size else PdDropReason.TRUNCATED

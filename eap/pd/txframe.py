@@ -60,6 +60,7 @@ def plan_schedule(trigger: TriggerSpec, cycle_us: int, gate: tuple[int, int]) ->
         gate: Divider and modulo of its frame; divider 0 is no gate.
     """
     if trigger.cycle_us:
+        # Exact: rules.check_times() requires a multiple of the device cycle.
         return Schedule(trigger.cycle_us // cycle_us, 0, _CYCLE)
     if trigger.divider:
         return Schedule(trigger.divider, trigger.modulo, _DIVIDER)
@@ -121,6 +122,7 @@ class Trigger:
             return self.schedule.reason
         if not self._on_change:
             return None
+        # None after a start: the first data is a change, since no subscriber has it yet.
         if data != self._sent_data:
             last_ns = self._sent_for_change_ns
             if last_ns is None or now_ns - last_ns >= self._inhibit_ns:
@@ -138,6 +140,8 @@ class Trigger:
         self._event = False
         self._sent_at_ns = now_ns
         self._sent_data = data
+        # Only changes count for the inhibit time; an event or a time-out does not delay the next
+        # change.
         if reason == _CHANGE:
             self._sent_for_change_ns = now_ns
 
@@ -209,6 +213,7 @@ class Gather:
 
     def bits_into(self, buffer: memoryview, offset: int) -> None:
         """Write the bits among the variables, packed."""
+        # Put together first: several bit fields share a byte, which then is written once.
         octets: dict[int, int] = {}
         for memory, source, target, length in self._bits:
             start, shift = divmod(source, 8)
@@ -331,6 +336,8 @@ class TxFrame:
     def select(self, cycle: int, now_ns: int) -> tuple[Selection | None, list[TxPd]]:
         """Return the selection to send in this cycle, if any, and PDs due but held back."""
         divider, modulo = self.gate
+        # Before the triggers are asked: events and changes wait for the gate and are not skipped
+        # (rule 1).
         if divider and cycle % divider != modulo:
             return None, []
         due = [pd for pd in self.pds if pd.is_due(cycle, now_ns)]
@@ -357,10 +364,12 @@ def build_frame(
 ) -> OutFrame:
     """Return a frame with all headers and no data yet."""
     header = channel.link_header(destination)
+    # The cycle counter is 0 here; patch() writes it in each cycle, at CYCLE_OFFSET.
     body = PdFrameHeader(publisher, len(pds), 0).encode()
     for pd in pds:
         body += PdHeader(pd.slot.pd_id, pd.slot.version, pd.slot.size).encode()
         body += bytes(pd.slot.size)
+    # Length does not count the padding behind it, by which receivers tell the two apart.
     octets = header + EtherCatHeader(len(body)).encode() + body
     buffer = bytearray(octets.ljust(channel.minimum_size, b"\0"))
     return OutFrame(buffer, len(header), destination)
@@ -376,4 +385,5 @@ def _data_offsets(pds: tuple[TxPd, ...], headroom: int) -> Iterator[int]:
 
 def _common_schedule(pds: tuple[TxPd, ...]) -> Schedule | None:
     schedules = {pd.trigger.schedule if pd.slot.by_schedule else None for pd in pds}
+    # Common only without change and event triggers: then the cycle counter alone decides.
     return schedules.pop() if len(schedules) == 1 else None

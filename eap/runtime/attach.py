@@ -141,6 +141,8 @@ class AttachedStation(Closeable):
         image = file.image
         ran_at_ns = image.words[StationWord.CYCLE_AT_NS]
         silent_s = (monotonic_ns() - (ran_at_ns or self._opened_ns)) / 1e9
+        # An engine that died between renaming the new file and retiring the old one left no mark
+        # there.
         if silent_s > self._gone_after_s() and self._station.reopen_if_replaced():
             return self._current()
         if silent_s > self._gone_after_s():

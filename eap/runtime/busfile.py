@@ -151,6 +151,7 @@ def _files(slave: SlaveSpec) -> Iterator[str]:
 def _read_resource(bus: BusFile, path: Path, name: str, report: FindingReport, at: str) -> None:
     try:
         with path.open("rb") as file:
+            # Read with a limit, not measured first: a pipe or /proc file has no size.
             octets = file.read(MAX_RESOURCE + 1)
     except (OSError, ValueError) as exc:
         reason = getattr(exc, "strerror", None) or exc

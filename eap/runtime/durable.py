@@ -66,6 +66,7 @@ def replace_file(path: Path, data: bytes) -> None:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
+            # Before the rename: else a loss of power may leave the new name with no content.
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError:
@@ -87,6 +88,7 @@ def whole_file(target: Path) -> Iterator[BinaryIO]:
     Raises:
         EnvironmentalError: it cannot be written; the old content is still there.
     """
+    # Behind a symbolic link: the rename would replace the link itself.
     whole = target.resolve()
     partial = whole.with_name(f".{whole.name}.{os.getpid()}")
     try:
@@ -94,6 +96,7 @@ def whole_file(target: Path) -> Iterator[BinaryIO]:
             with whole.open("wb") as file:
                 yield file
             return
+        # A rename needs rights in the folder only, and would replace a file that is read only.
         if whole.exists() and not os.access(whole, os.W_OK):
             raise PermissionError(errno.EACCES, "it is read only")
         try:

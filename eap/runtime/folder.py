@@ -109,6 +109,8 @@ def _require_private(path: Path) -> None:
     """
     try:
         path.mkdir(mode=0o700, exist_ok=True)
+        # lstat, and after mkdir: a link that another user put there would lead to that user's
+        # folder.
         found = path.lstat()
     except OSError as exc:
         reason = exc.strerror
@@ -141,6 +143,7 @@ def folder_name(plant: str, subset: Sequence[str] = ()) -> str:
     """Return the folder of *plant*, or of the *subset* of its stations that an appliance runs."""
     name = f"{plant}@{'+'.join(subset)}" if subset else plant
     safe = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in name)
+    # A digest where characters were replaced: two names that differ in them only need two folders.
     if safe == name and len(name) <= _MAX_NAME and not name.startswith("."):
         return name
     digest = hashlib.sha256(name.encode()).hexdigest()[:8]
@@ -306,6 +309,8 @@ def _lock(path: Path) -> int:
                 f"appliance {path.name} already runs (process {holder}); stop it first, or choose"
                 f" other stations with --station"
             ) from None
+        # The last owner may have removed the file between open and lock: the lock would be on a
+        # file that no one finds any more.
         if _is_same_file(fd, path / "lock"):
             os.ftruncate(fd, 0)
             os.pwrite(fd, str(os.getpid()).encode(), 0)

@@ -34,6 +34,7 @@ def require_own_buses(stations: Sequence[StationSpec]) -> None:
                 continue
             label = f"{station.name}/{port.name}"
             is_bus = port.kind is PortKind.BUS
+            # EAP ports may share an interface; a bus may share it with nothing.
             taken = buses.get(uri.host) or (others.get(uri.host) if is_bus else None)
             if taken is not None:
                 raise ConfigError(

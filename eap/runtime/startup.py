@@ -33,6 +33,7 @@ def catch_end_signals() -> Iterator[int]:
     The handlers from before are back when the block ends.
     """
     read_end, write_end = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+    # A handler in Python alone would not end a poll that waits: PEP 475 repeats it.
     old_fd = signal.set_wakeup_fd(write_end)
     old = [signal.signal(number, lambda *_: None) for number in _NUMBERS]
     try:
@@ -120,6 +121,7 @@ class _Finder:
         if not self._folder:
             return None
         spec = PathFinder.find_spec(name, path, target)
+        # Bytecode beside the module is used as it is, even if no new one may be written.
         if spec is None or spec.cached is None or os.path.exists(spec.cached):  # noqa: PTH110
             return spec
         if type(spec.loader) is SourceFileLoader:
@@ -153,6 +155,7 @@ def main(arguments: list[str]) -> int:
     """Run ``main`` of a module, with its handover and its start-up; return its exit code."""
     module, handover, report, folder = arguments
     signal.signal(signal.SIGINT, _interrupted)
+    # The supervisor blocked it before the fork, until there is a handler.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     startup = Startup(int(report))
     startup.step("importing modules")

@@ -166,6 +166,8 @@ class Output:
 
     def _take(self, octets: bytes) -> int:
         """Write without waiting; return the number of bytes written."""
+        # Not O_NONBLOCK: that flag belongs to the open file, which the shell and other programs
+        # share.
         if not self._poll.poll(0):
             return 0
         try:
@@ -251,6 +253,7 @@ class Child:
             theirs.callback(os.close, report_end)
             self.error_fd, error_end = os.pipe2(os.O_CLOEXEC)
             theirs.callback(os.close, error_end)
+            # This end alone: the child may wait for its output to be read, the supervisor may not.
             os.set_blocking(self.error_fd, False)
             described = handover.to_descriptor()
             theirs.callback(os.close, described)
@@ -267,6 +270,8 @@ class Child:
                 process_group=0,  # a terminal's Ctrl-C reaches the supervisor alone
             )
         try:
+            # A descriptor can be polled with the others, and never means another process of the
+            # same id.
             self.pid_fd = os.pidfd_open(process.pid)
         except OSError:  # its end would not be noticed
             process.kill()
@@ -284,6 +289,7 @@ class Child:
 
         *report_fd* is closed when the process runs, and also if it died before.
         """
+        # A report may come in two pieces; what follows the last newline waits for the rest.
         data = os.read(self.report_fd, 65536)
         *lines, self._partial_report = (self._partial_report + data).split(b"\n")
         reports = [msgspec.json.decode(line, type=Report) for line in lines]

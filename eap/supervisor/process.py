@@ -258,6 +258,7 @@ class Supervisor:
                     poll.register(fd, select.POLLIN)
         fired = {fd for fd, _ in poll.poll(timeout_ms)}
         if wake_fd in fired:
+            # All bytes of it: signals that came together count once.
             os.read(wake_fd, 64)
             self._exit_code = 0
             return

@@ -146,6 +146,8 @@ def _sockets_of(port: PortSpec) -> Iterator[SharedSocket]:
         if port.broadcast:
             yield SharedSocket(SocketKind.GROUP, uri.host, number, group=BROADCAST)
     if uri.scheme in {"udp", "tcp"}:
+        # Beside UDP too: gateway requests and published frames may come by TCP to the same port
+        # (ETG.8200 has TCP as an option).
         yield SharedSocket(SocketKind.TCP, uri.host, number)
 
 
