@@ -29,6 +29,7 @@ ALL = "all"
 SERVICES = (ALL, *map(str, AccessService))
 TARGET = "STATION, STATION/PORT, STATION/PORT/SLAVE, or four to six numbers of a NetID and :PORT"
 OBJECTS = "INDEX, INDEX:SUB or FIRST-LAST in hexadecimal, such as 0x8000:01"
+# A service that is added later counts as a write, so no existing rule lets it through.
 _WRITES = tuple(each for each in AccessService if each is not AccessService.READ)
 _TOP_PORT = 0xFFFF
 _MAC_COLONS = 5
@@ -148,6 +149,7 @@ def _targets(index: Index, text: str, shared: set[str]) -> list[AccessTarget]:
     net_id = str(port.net_id)
     if not slave:
         return [AccessTarget(net_id)]
+    # The AMS port of a slave is its station address (ADS to the master's NetID).
     return [AccessTarget(net_id, _slave(index, station, port, slave))]
 
 
@@ -190,6 +192,7 @@ def check_access(index: Index, report: FindingReport, folder: Path) -> None:
         named = ((each.at, each.name) for each in station.access if each.name)
         check_names(named, "access rule", report)
         fine = [_check_rule(index, station, each, shared, report) for each in station.access]
+        # Only as a whole: a rule with errors, once it is corrected, may cover another one.
         if all(fine):
             _check_order(index, station, shared, report)
         check_names(((user.at, user.name) for user in station.users), "user", report)
@@ -282,6 +285,7 @@ def _check_order(
 
 
 def _reason_never_matching(rule: AccessRule) -> str:
+    # Only IP transports know the network of a client, and only Ethernet its MAC address.
     kinds = {_kind(transport) for transport in rule.transports}
     is_known = kinds.isdisjoint(IP_TRANSPORTS) if rule.networks else bool(rule.macs)
     if kinds and is_known and not (rule.macs and TransportKind.ETHERNET in kinds):
@@ -327,6 +331,7 @@ def _all_in(outer: tuple[T, ...], inner: tuple[T, ...], is_in: Callable[[T, T], 
     """Return whether each of *inner* is in one of *outer*; an empty list stands for everything."""
     if not outer:
         return True
+    # An empty inner list matches everything, so no list that names something can cover it.
     return bool(inner) and _within(outer, inner, is_in)
 
 
@@ -335,6 +340,7 @@ def _in_network(outer: str, inner: str) -> bool:
 
 
 def _is_prefix(outer: str, inner: str) -> bool:
+    # With the final dot: 5.23.91.2 is no prefix of 5.23.91.23.
     return f"{inner}.".startswith(f"{outer}.")
 
 

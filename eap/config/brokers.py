@@ -29,6 +29,7 @@ class Broker(NamedTuple):
 
 def parse_url(text: str) -> Broker:
     """Read the URL of a broker; raise ValueError if it is invalid."""
+    # A user in the URL is refused below: passwords stay in files of their own.
     scheme, separator, rest = text.partition("://")
     if not separator or scheme not in _PORTS:
         raise ValueError(f"{text!r} is no broker")
@@ -63,6 +64,7 @@ def shared_network(station: StationSection, other: StationSection) -> str:
 def broker_spec(route: RouteSection, folder: Path) -> MqttSpec:
     """Return the specification of the broker of *route* for services; its files are in *folder*."""
     broker = parse_url(route.mqtt)
+    # mqtts:// alone means TLS with the certificate authorities of this host.
     tls = route.tls or (TlsSection() if broker.needs_tls else None)
     return MqttSpec(
         network=route.network,
@@ -222,6 +224,7 @@ def warn_of_open_brokers(index: Index, report: FindingReport) -> tuple[PlantFind
     """
     found = []
     for station in index.plant.stations:
+        # Naming the network in `learn` says that its clients are trusted, and silences the warning.
         for route in brokers_of(station) if station.learn is True else ():
             if _is_anonymous(route):
                 message = (

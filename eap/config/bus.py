@@ -58,11 +58,13 @@ def describe_buses(
             report.add(path, f"bus file {file} {reason}", _FILE)
             description = None
         else:
+            # A simulated bus may be named by several stations; building its slaves takes long.
             if file not in known:
                 known[file] = _describe(file, describe, report)
             description = known[file]
         if description is not None and not _has_names(path, port, description, report):
             description = None
+        # The first of two ports of one name counts, as everywhere in the index.
         found.setdefault((station.name, port.name), description)
     return found
 
@@ -196,6 +198,7 @@ def resolve_gateway_address(
         raise SectionError("", f"there is no bus port for {target!r}{hint}", TARGET)
     number = _slave(index, other, other_port, names[2]) if len(names) == 3 else MASTER_PORT
     if other_port is port and number != MASTER_PORT:
+        # On the same bus no router is needed between gateway and slave.
         return GatewayAddress(address, station=number)
     return GatewayAddress(address, net_id=str(other_port.net_id), port=number)
 
@@ -207,6 +210,7 @@ def _member(
     member: object,
     known: dict[int, Plain],
 ) -> int:
+    # YAML 1.2 reads 0x1001 as a number already; a quoted one is still a text here.
     text = str(member)
     if text.lower().startswith("0x") or isinstance(member, int):
         number = int(text, 0)
@@ -303,6 +307,7 @@ def _check_port_number(
         return
     path = f"{port.at}.gateway.port"
     if path not in report.lines:
+        # A number that was not given has no line: the finding goes to the port.
         path = port.at
     for host in ip_addresses_of(index, station):
         for other_host, other_number, what, at in taken:
@@ -326,4 +331,5 @@ def _used_ports(index: Index) -> Iterator[tuple[str, int, str, str]]:
             yield uri.host, uri.port or EAP_PORT, f"{station}/{name}", path
             if port.kind is PortKind.EAP and port.ams:
                 yield uri.host, AMS_TCP_PORT, f"AMS at {station}/{name}", path
+                # UDP 48899, on which tools ask for routers.
                 yield uri.host, AMS_TCP_PORT + 1, f"AMS at {station}/{name}", path

@@ -100,6 +100,8 @@ def _text(path: Path) -> str:
         if not path.is_file():
             raise _UnreadableError(0, "is not a regular file", "a YAML file")
         with path.open("rb") as file:
+            # One byte more than allowed: the size of the file could change between a check and the
+            # read.
             octets = file.read(MAX_FILE + 1)
     except (OSError, ValueError) as exc:  # ValueError: a NUL in the path
         reason = exc.strerror if isinstance(exc, OSError) else None
@@ -214,6 +216,7 @@ class _Builder:
         return {**merged, **own}
 
     def _merge(self, merged: dict[str, tuple[int, Node]], node: Node, line: int) -> None:
+        # The first source that has a key wins, and own keys win over all (YAML merge key).
         for source in node.value if isinstance(node.value, list) else [node]:
             if not isinstance(source.value, dict):
                 self._report.add("", "<< merges something else", "a mapping", line=line)
@@ -381,6 +384,7 @@ class _Converter:
 
     def _struct(self, node: Node, kind: inspect.StructType, path: str, key: str) -> Any:
         short = getattr(kind.cls, "SHORT", "")
+        # SHORT names the key that a plain value stands for.
         if short and isinstance(node.value, bool | int | float | str):
             node = Node(node.line, {short: (node.line, node)})
         if not isinstance(node.value, dict):
@@ -405,6 +409,8 @@ class _Converter:
                 if field.required and exc.number is not None:
                     values[field.name] = exc.number
                 else:
+                    # An optional key that is wrong has its finding; its section is still worth
+                    # checking.
                     broken |= field.required
         if broken:
             raise _ReportedError
@@ -460,6 +466,7 @@ class _Converter:
             try:
                 found[name] = self.value(item, kind, f"{path}.{name}", name)
             except _ReportedError:
+                # References to it would otherwise be findings of their own, one for each.
                 self._report.broken.add(name)
         return found
 
@@ -470,10 +477,12 @@ class _Converter:
     def _scalar(self, node: Node, kind: inspect.Type, path: str, key: str) -> Any:
         value = node.value
         match kind:
+            # The text as written: a name such as 0x10 or 1.0 must not become a number and back.
             case inspect.StrType() if isinstance(node, ScalarNode) and value is not None:
                 return node.text
             case inspect.BoolType() if isinstance(value, bool):
                 return value
+            # In Python true is an int.
             case inspect.IntType() if isinstance(value, int) and not isinstance(value, bool):
                 low, high = kind.ge, kind.le
                 if (low is None or value >= low) and (high is None or value <= high):

@@ -70,6 +70,7 @@ def _check_frame(
     report.add_breaches(frame.at, rules.check_modulo(frame.name, frame.divider, frame.modulo))
     pds = [pd for pd in station.publish if pd.frame == frame.name]
     known = {each.name for each in station.frames}
+    # A PD with errors may be the one that belongs here.
     if not pds and not report.broken and all(pd.frame in known for pd in station.publish):
         expected = f"a PD under publish with frame: {frame.name}"
         report.add(frame.at, f"frame {frame.name!r} carries no PD", expected)
@@ -89,6 +90,7 @@ def _check_frame(
     for pd in pds:
         sent = index.sent.get((station.name, pd.name))
         kinds = index.types(sent) if sent else None
+        # PDs lie back to back in a frame, without alignment (ETG.1005).
         size += PdHeader.SIZE + (datatypes.layout(kinds).size if kinds else 0)
     kind = None if destination is None else destination.kind
     if size > (budget := rules.frame_budget(uri.scheme, kind)):
@@ -418,6 +420,7 @@ def _check_arrival(
             destination = resolve_destination(sent.frame.to, sender_uri, index)
         except ValueError:
             return  # reported with the frame
+        # One is enough: with any publisher a subscription may match several PDs.
         if reaches(destination, (sent.port, sender_uri), (receiver, uri)):
             return
         line = report.line_of(f"{sent.frame.at}.to")

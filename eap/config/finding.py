@@ -67,6 +67,7 @@ class FindingReport:
         if first.path != path:
             self._further_uses.setdefault(first, set()).add(path)
         else:
+            # Two checks may find the same: one line for the user.
             self._findings.setdefault((where, message, expected), finding)
 
     def add_breaches(self, at: str, breaches: Iterable[RuleViolation]) -> None:
@@ -97,6 +98,7 @@ class FindingReport:
             known = _parent(known)
         if not known:
             return 0, path, message
+        # The uses of an anchor differ in the names of their stations only; those must not count.
         words = (word for word in message.split() if word.strip(":,") not in self.stations)
         shape = _VARYING.sub("", " ".join(words))
         # Uses of an anchor share a node, so its identity tells them from equal text without one.

@@ -136,6 +136,7 @@ def _unique_names(entries: Sequence[DescribedPdoEntry]) -> list[str]:
     """Return the last part of the name of each entry; a duplicate gets its object index."""
     plain = [_plain(entry) for entry in entries]
     counts = Counter([STATE, *(name for name, e in zip(plain, entries, strict=True) if e.type)])
+    # `state` is the AL state of the slave, which each slave has.
     taken = {name for name, times in counts.items() if times == 1} | {STATE}
     names = []
     for entry, name in zip(entries, plain, strict=True):

@@ -80,6 +80,8 @@ def adopt_configuration(dictionary: EapDictionary, wanted: EapDictionary) -> Non
     changed = {index: kept for index, kept in after.items() if before.get(index) != kept}
     for index in before:
         row = profile.row_of(index)
+        # Removed and made again: entries that the new object does not give have their defaults
+        # then.
         if row.dynamic and (index in changed or index not in after):
             dictionary.remove(index)
         elif row.list_row is not None and index in changed:
@@ -153,6 +155,7 @@ def _put(
     check_value(entry, index, subindex, octets)
     if subindex == 0 and row.code is not ObjectCode.VAR:
         last = max(dictionary[index].entries)
+        # Only a mapping can have more entries written than it counts, see eap_dictionary.
         if octets[0] != last and not (row.mapping and octets[0] < last):
             raise SdoAbortError(AbortCode.VALUE, index, 0, f"{octets[0]} of {last} entries")
     else:
@@ -160,6 +163,8 @@ def _put(
             is_usual = eap_rules.checked(row, subindex, entry, octets) == octets
         except ValueError as exc:
             raise SdoAbortError(AbortCode.VALUE, index, subindex, str(exc)) from None
+        # Stored data went through the same rules when it was written: another form is a damaged
+        # file.
         if not is_usual:
             raise SdoAbortError(AbortCode.VALUE, index, subindex, "not in its usual form")
     dictionary.put(index, subindex, octets)
@@ -214,6 +219,7 @@ class _Comparison:
         yield from self._static()
         # Frames first: as long as they list a PD, it cannot be deleted.
         yield from self._removed(profile.TX_FRAME)
+        # Before anything grows: no interim frame is longer than the old or the new one.
         yield from self._cut_lists()
         rewritten = self._mappings_to_write()
         yield from self._emptied(rewritten)

@@ -195,6 +195,7 @@ class EapDictionary(ObjectDictionary):
         if not row.mapping:
             item.entries[NAME_AT[index >> 12][1]].value = f"{_STEMS[index >> 12]}{number}"
         if row is profile.TX_PD:
+            # Read only: the publisher ID of a PD is the NetID of the port that sends it.
             item.entries[Tx.PUBLISHER].octets = self._net_id
         return item
 
@@ -216,6 +217,7 @@ class EapDictionary(ObjectDictionary):
         item, row = self[index], profile.row_of(index)
         list_row, source = row.list_row, partial(self._source, index)
         if list_row is not None:
+            # A mapping may be written entry by entry while sub-index 0 is still 0, as in slaves.
             for subindex in range(max(max(item.entries) + 1, list_row.subindex), last + 1):
                 item.entries[subindex] = make_entry(list_row, subindex, source)
 
@@ -354,6 +356,7 @@ class EapDictionary(ObjectDictionary):
         with self._all_or_nothing(index):
             is_new = self._create_missing(index, subindex, state)
             row = profile.row_of(index)
+            # Deleting what does not exist must not make it first.
             if is_new and subindex == 0 and data == b"\0" and not row.mapping:
                 raise SdoAbortError(AbortCode.NO_OBJECT, index, 0)
             self._write(row, index, subindex, data, state)
@@ -449,6 +452,7 @@ class EapDictionary(ObjectDictionary):
     def _resize(self, row: ProfileObject, item: OdObject, count: int, state: OdState) -> None:
         """Empty a mapping and add *count* entries, or resize a list; 0 may delete the object."""
         if row.mapping:
+            # A mapping has to be empty before its entries can be written, also within one access.
             self._write_count(row, item, b"\0", state)
             self.grow(item.index, min(count, profile.MAX_ENTRIES))
         else:
@@ -531,6 +535,8 @@ class EapDictionary(ObjectDictionary):
             return
         frames = {
             frame: subindex
+            # Reversed, so that the first entry that concerns a frame is the one that an abort
+            # names.
             for subindex in reversed(written)
             for frame in self._frames_to_check(row, index, subindex)
         }
@@ -596,5 +602,7 @@ def _part(
         code = AbortCode.DEVICE_STATE if writable else AbortCode.READ_ONLY
         raise SdoAbortError(code, index, 1)
     for (subindex, entry), offset in zip(chosen, plan.bit_offsets, strict=True):
+        # Read-only entries take their place in the data and are skipped, so that a client can send
+        # back what it has read.
         if entry.access & state.write_right:
             yield subindex, extract_bits(data, offset, entry.kind)

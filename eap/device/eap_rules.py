@@ -58,11 +58,13 @@ def checked(row: ProfileObject, subindex: int, entry: Entry, data: bytes) -> byt
     elif ruled is not None:
         data = _RULES[ruled.rule](data, entry)
     elif entry.kind.code == _BOOL:
+        # Any value but 0 is true; it reads back as 1.
         data = bytes((data != b"\0",))
     return data
 
 
 def _text(data: bytes) -> bytes:
+    # Clients pad texts to the length of the entry.
     data = data.rstrip(b"\0")
     if 0 in data:
         raise ValueError("text with a NUL in it")
@@ -84,6 +86,7 @@ def _check_reference(index: int, ranges: tuple[int, ...]) -> None:
 
 def _name(data: bytes, _entry: Entry) -> bytes:
     name = data.decode()
+    # The names become names in the plant file and on the command line.
     if not is_name(name):
         raise ValueError(f"{name!r} is no name: {NAME}")
     if name.endswith(MADE_SUFFIXES):
@@ -210,6 +213,7 @@ def check_mapped(
     """
     mapped = MappingEntry.decode(word)
     if not mapped.target:
+        # Eight bits or more would be a gap that no variable needs.
         if mapped.subindex or not 0 < mapped.bits < 8:
             detail = f"padding of sub-index {mapped.subindex} and {mapped.bits} bits"
             raise SdoAbortError(AbortCode.NOT_MAPPABLE, index, subindex, f"{detail}: 1 to 7 bits")
@@ -351,6 +355,7 @@ def _breaches_of_frame(frame: TxFrameSpec, uri: InterfaceUri) -> Iterator[RuleVi
     is_answer = frame.destination == REQUESTER
     destination = None if is_answer else Destination.parse(frame.destination)
     return chain(
+        # A dictionary cannot tell "no modulo" from 0.
         rules.check_modulo(frame.name, frame.divider, frame.modulo or None),
         rules.check_answers(frame),
         chain.from_iterable(rules.check_frame_of(pd, frame) for pd in frame.pds),

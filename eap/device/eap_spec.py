@@ -296,6 +296,7 @@ def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -
         subscriptions=_in_order([each.record for each in subscriptions], station.subscriptions),
     )
     check_station(station, spec, frames, pds, subscriptions)
+    # Behind the check: alternates are in no dictionary, and were checked when they were made.
     return _with_alternates(spec, station)
 
 
@@ -409,6 +410,7 @@ class PortReader:
         if value(PortSub.VLAN_PRIORITY) and not value(PortSub.VLAN_ID):
             detail = "a priority needs a VLAN"
             raise self.fault(FaultCode.PORT, detail, profile.PORT, PortSub.VLAN_PRIORITY)
+        # Fields without an entry, such as the interface, stay as the station was started with.
         own = msgspec.to_builtins(self._dictionary.port, enc_hook=encode_value)
         fields = {**own, **self._fields(profile.PORT), "join": list(self._groups())}
         return msgspec.convert(fields, PortSpec, dec_hook=decode_value)
@@ -500,6 +502,7 @@ class PortReader:
             )
             number = value(FrameSub.PORT_NUMBER)
         destination = Destination(kind, host, number)
+        # Checked here, because the profile has one entry for addresses of UDP and TCP.
         is_tcp_group = kind is DestinationKind.TCP and destination.is_group
         if not any(value(subindex)) or is_tcp_group:
             raise self.fault(FaultCode.NO_DESTINATION, str(destination), index, subindex)

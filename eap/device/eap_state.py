@@ -116,6 +116,7 @@ class EapStateMachine:
         device, actions = self._device, self._actions
         while device.state < wanted:
             if device.state is DeviceState.PREOP:
+                # The state changes behind the action: if that fails the device has not left PreOp.
                 actions.start_sending(self._check())
                 device.request(StateRequest.SAFEOP)
             else:
