@@ -117,6 +117,7 @@ def _command(station: int, request: bytes, what: str) -> Procedure[bytes]:
             yield Sleep(RETRY_NS)
         yield from write(station, Register.EEPROM_CONTROL, request, "EEPROM control")
         octets = yield from _wait_idle(station, what)
+        # An EEPROM that stores a word does not acknowledge: that is no fault yet.
         if not EepromControl.decode(octets).command_error:
             return octets
     raise SiiError(f"slave {station}: EEPROM, {what}: not acknowledged, tried {TRIES} times")
@@ -130,6 +131,7 @@ def _wait_idle(station: int, what: str) -> Procedure[bytes]:
         )
         if not EepromControl.decode(octets).busy:
             return octets
+        # The first pause is 0: it only brings the time, from which the time-out counts.
         _, now_ns = yield Sleep(0 if deadline_ns is None else POLL_NS)
         deadline_ns = deadline_ns or now_ns + BUSY_TIMEOUT_NS
         if now_ns >= deadline_ns:

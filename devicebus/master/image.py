@@ -130,6 +130,7 @@ def _group(slaves: Sequence[SlaveProcessData]) -> Iterator[list[SlaveProcessData
             raise BusError(
                 f"slave {slave.station}: {size} bytes of process data, expected at most {MAX_DATA}"
             )
+        # Outputs and inputs together: one LRW carries both.
         if members and total + size > MAX_DATA:
             yield members
             members, total = [], 0
@@ -186,6 +187,7 @@ def _sync_manager(channel: ProcessDataChannel) -> SyncManager:
         ecat_interrupt=control >> 4 & 1,
         pdi_interrupt=control >> 5 & 1,
         watchdog=control >> 6 & 1,
+        # A sync manager without data stays off: slaves check its length on the way to SAFEOP.
         enable=int(channel.size > 0),
     )
 
@@ -200,6 +202,7 @@ def _variables(slave: SlaveProcessData, layout: SlaveLayout) -> Iterator[Process
             if entry.index:
                 plain = f"{entry.index:04X}:{entry.subindex:02X}"
                 name = entry.name or plain
+                # Entries of several channels may have one name; the index makes it unique.
                 if (channel.is_output, name) in names:
                     name = f"{name} {plain}"
                 names.add((channel.is_output, name))
@@ -287,6 +290,7 @@ class BusImage:
 def data_type_of(variable: ProcessVariable) -> DataType | None:
     """Return the data type of an entry; without one, an unsigned number of its bit length."""
     kind = _KINDS.get(variable.data_type)
+    # A type of another length than the mapped one is wrong: the mapped length counts.
     if kind is not None and kind.bit_length == variable.bit_length:
         return kind
     bits = variable.bit_length

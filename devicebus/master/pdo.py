@@ -83,6 +83,7 @@ def channels_from_sii(sii: Sii) -> tuple[ProcessDataChannel, ...]:
             tuple(
                 _pdo(sii, pdo)
                 for pdo in (sii.rx_pdos if is_output else sii.tx_pdos)
+                # PDOs of other values (0xFF) are not assigned by default.
                 if pdo.header.sync_manager == number
             ),
             manager.length if manager.enable & 1 else 0,
@@ -118,6 +119,7 @@ def read_channels(sii: Sii) -> Conversation[tuple[ProcessDataChannel, ...]]:
                 mapped = yield from _read_list(index, 4)
                 pdos.append(Pdo(index, tuple(_entry(number, texts) for number in mapped)))
         except SdoAbortError:
+            # No assignment object: the slave's PDOs are fixed, as the EEPROM has them.
             channels.append(channel)
             continue
         if asks_names:
@@ -142,6 +144,7 @@ def write_configuration(choice: PdoConfiguration, sizes: MailboxSizes) -> Conver
 def _is_output(manager: SiiSyncManager) -> bool | None:
     if manager.type in {OUTPUTS, INPUTS}:
         return manager.type == OUTPUTS
+    # An EEPROM without types has 0: then mode and direction of the control byte decide.
     is_buffered = manager.control & 3 == 0
     if manager.type == 0 and is_buffered and manager.length:
         return bool(manager.control & _WRITES)
@@ -163,6 +166,7 @@ def _pdo(sii: Sii, pdo: SiiPdo) -> Pdo:
 def _entry(number: int, texts: Mapping[tuple[int, int], PdoEntry]) -> PdoEntry:
     index, subindex, bits = number >> 16, number >> 8 & 0xFF, number & 0xFF
     known = texts.get((index, subindex))
+    # Index 0 is padding and has no name.
     if known is None or not index:
         return PdoEntry(index, subindex, bits)
     return PdoEntry(index, subindex, bits, known.name, known.data_type)

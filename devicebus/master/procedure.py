@@ -187,6 +187,7 @@ class _Child(Generic[T]):
         except StopIteration as end:
             self.is_running, self.result = False, end.value
         except FrameLostError:
+            # A lost frame says nothing about one slave: it ends all children.
             self.is_running = False
             raise
         except EapError as error:

@@ -173,12 +173,14 @@ class Clock:
         """
         sync0 = self._get(Register.DC_SYNC0_CYCLE, 4)
         sync1 = self._get(Register.DC_SYNC1_CYCLE, 4)
+        # With a SYNC1 cycle time below that of SYNC0, each SYNC0 pulse has its SYNC1.
         return start_ns + sync1, (sync1 // sync0 + 1) * sync0 if sync0 else 0
 
     def _has(self, bits: int) -> bool:
         return self._memory[Register.DC_ACTIVATION] & bits == bits
 
     def _rebase(self, now_ns: int, step_ns: int) -> None:
+        # The past keeps its rate: a new rate counts from now on only.
         local = self.local_time(now_ns)
         self._base_now = now_ns
         self._base_local = local + step_ns

@@ -176,6 +176,7 @@ class SimulatedSegment:
             return
         position = path.order.index(number)
         reached = self._reached[side]
+        # A chain of its own: the cached one of the segment belongs to whole paths.
         Chain([slave.esc for slave in reached[:position]]).process(frame, now_ns)
         self._run_slaves(side, now_ns)
         reached[position].esc.count_error(Register.RX_ERROR)

@@ -245,6 +245,7 @@ class SymbolTable:
             index = self._folded.get(name.casefold())
         if index is None:
             raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND)
+        # Plus 1: no handle is 0, even with version 0.
         return self.version << _INDEX_BITS | index + 1
 
     def by_handle(self, handle: int) -> Symbol:

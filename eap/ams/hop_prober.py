@@ -205,6 +205,8 @@ class HopProber:
                 hop.probed_at_ns = None
             elif endpoint in self.watched or hop.is_due(now_ns, interval_ns):
                 yield self._probe(endpoint, hop, now_ns)
+                # A router that restarts between two probes misses none, but has lost its
+                # subscriptions.
                 if endpoint in self.watched and hop.has_restart_index and not hop.is_down:
                     yield Probe(endpoint, self._header(hop, AmsCommand.READ) + _STATE, False)
 

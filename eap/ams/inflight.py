@@ -48,6 +48,7 @@ def is_marked(invoke_id: int) -> bool:
 
 
 def _mark(serial: int) -> int:
+    # Never 0: the upper bits of a client's ID are 0 while it counts from 1.
     return (serial * _FACTOR >> 12 & 0x3FF) or 1
 
 

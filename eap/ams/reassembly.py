@@ -97,6 +97,7 @@ class AmsStreamDecoder:
         start = AmsTcpHeader.SIZE
         if len(self._buffer) < start:
             return None
+        # Local clients put a router command where the prefix has its 0; no AMS header follows it.
         if int.from_bytes(self._buffer[:2], "little") in _COMMANDS:
             return self._cut_command()
         length = decode_prefix(self._buffer)
@@ -157,6 +158,7 @@ def iter_fragments(packet: bytes, number: int, max_size: int) -> Iterator[bytes]
         max_size: Bytes behind the header of each.
     """
     header = AmsHeader.decode(packet)
+    # Each fragment repeats the addresses; the rest of the original header goes with the data.
     content = packet[_ADDRESSES:]
     for fragment, at in enumerate(range(0, len(content), max_size)):
         head = AmsHeader(
@@ -270,6 +272,7 @@ def _missing(content: bytearray) -> int:
     if len(content) < _REST:
         return _REST - len(content)
     length = int.from_bytes(content[4:8], "little")
+    # Refused by its first fragment, before memory is spent on the others.
     if length > MAX_LENGTH:
         return MAX_LENGTH - length
     return _REST + length - len(content)

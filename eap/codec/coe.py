@@ -298,6 +298,7 @@ class EntryDescription(msgspec.Struct, frozen=True):
         size = (head.bit_length + 7) // 8
         offset = _EntryDescriptionHead.SIZE
         parts: list[bytes | None] = []
+        # In the order of the flags; access rights, category and mapping (bits 0 to 2) add no data.
         for flag, length in ((0x08, 4), (0x10, size), (0x20, size), (0x40, size)):
             if not head.value_info & flag:
                 parts.append(None)
@@ -315,4 +316,5 @@ class EntryDescription(msgspec.Struct, frozen=True):
 
 
 def _text(octets: Buffer) -> str:
+    # Names end with the message; a NUL that a peer adds is no part of them.
     return bytes(octets).rstrip(b"\0").decode(errors="replace")

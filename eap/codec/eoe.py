@@ -167,6 +167,7 @@ class IpSettings(msgspec.Struct, frozen=True):
 
 
 def _reversed(address: IPv4Address | None) -> bytes | None:
+    # As 32-bit little-endian numbers, the other way round than in IP; so TwinCAT sends them.
     return None if address is None else address.packed[::-1]
 
 

@@ -110,4 +110,5 @@ def decode_message(data: Buffer) -> tuple[FoeHeader, memoryview]:
 
 def text_of(body: Buffer) -> str:
     """Return the file name or error text of a body; NULs that end it are no part of it."""
+    # SOEM sends file names without a NUL; other peers end them with one.
     return bytes(body).rstrip(b"\0").decode(errors="replace")

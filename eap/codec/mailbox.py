@@ -42,6 +42,7 @@ class MailboxHeader(WireStruct, frozen=True):
     priority: bits2 = 0
     type: Annotated[MailboxType, Bits(4, MailboxType)] = MailboxType.ERR
     counter: bits3 = 0
+    # Newer Wireshark shows it as the mark of an error: accepted when received, never sent.
     reserved: bit = 0
 
 

@@ -98,6 +98,7 @@ def iter_pds(data: Buffer) -> Iterator[tuple[PdHeader, memoryview]]:
                 offset=offset,
             )
         yield pd, payload
+        # The next PD follows without alignment, also behind an odd length.
         offset += pd.length
 
 

@@ -276,6 +276,7 @@ class SoeErrorCode(IntEnum):
     NO_DEFAULT = 0x8001
     DEFAULT_TOO_LONG = 0x8002
     DEFAULT_READ_ONLY = 0x8004
+    # SOEM prints the text of 0x800A for all three; the numbers are those of IgH.
     INVALID_DRIVE = 0x800A
     GENERAL = 0x800B
     NO_ELEMENT = 0x800C

@@ -296,5 +296,6 @@ def cut_frame(octets: bytes) -> tuple[bytes | None, bytes]:
     """Return the first whole frame of a stream, None if there is none yet, and the rest."""
     if len(octets) < EtherCatHeader.SIZE:
         return None, octets
+    # On TCP frames follow each other with nothing between: their Length alone delimits them.
     end = EtherCatHeader.SIZE + EtherCatHeader.decode(octets).length
     return (octets[:end], octets[end:]) if len(octets) >= end else (None, octets)

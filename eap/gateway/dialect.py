@@ -121,6 +121,7 @@ class DialectFailure(IntEnum):
     FILE_NAME = 7
 
 
+# Other meanings than in the standard: SoE 0x1009 is a missing IDN, FoE 0x8002 a missing file.
 _CODES: dict[MailboxType, dict[DialectFailure, int]] = {
     MailboxType.COE: {
         DialectFailure.GENERAL: 0x08000000,
@@ -158,6 +159,7 @@ def kind_of(header: MailboxHeader) -> MailboxType | None:
     """Return the protocol of a message in the dialect, None for one of the standard."""
     if header.type is not MailboxType.ERR:
         return None
+    # The high nibble is what the standard reads as counter and reserved bit.
     return _TYPES.get(header.counter | (_HIGH_BIT if header.reserved else 0))
 
 
@@ -178,6 +180,7 @@ def decode(kind: MailboxType, body: bytes) -> Task:
 
 
 def _decode_coe(body: bytes) -> Task:
+    # These clients send uploads of eight bytes, without the last two of the standard's ten.
     if len(body) < _SDO_BODY:
         raise _short("CoE", body, _SDO_BODY)
     command, index, subindex = body[2], int.from_bytes(body[3:5], "little"), body[5]
@@ -203,6 +206,7 @@ def _decode_coe(body: bytes) -> Task:
 def _decode_soe(body: bytes) -> Task:
     if len(body) < SoeHeader.SIZE:
         raise _short("SoE", body, SoeHeader.SIZE)
+    # The element is a number here, and the drive is above it; the standard has a mask of elements.
     element = body[1] & 0x07
     drive, idn = body[1] >> 3, int.from_bytes(body[2:4], "little")
     if drive > 7:

@@ -104,6 +104,7 @@ class ObjectDictionary:
         Gaps and entries that may not be read now are left out, and are zero, respectively.
         """
         chosen = self._whole(index, first)
+        # Gaps take no place, as KickCAT and pyetg1510 have it.
         plan = datatypes.layout([entry.kind for _, entry in chosen])
         data = bytearray(plan.size)
         with self.consistent_values():
@@ -174,6 +175,7 @@ class ObjectDictionary:
 
 
 def _count_word(item: OdObject) -> bytes:
+    # Subindex 0 takes 16 bits in complete access (ETG.1000.6): its byte and one of padding.
     return bytes((item.max_subindex, 0))
 
 

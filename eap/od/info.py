@@ -82,6 +82,7 @@ def entry_description(
         ValueInfo.MINIMUM: _limit(entry, entry.minimum),
         ValueInfo.MAXIMUM: _limit(entry, entry.maximum),
     }
+    # pyetg1510 takes units, defaults and limits for the name: a master's dictionary gives none.
     wanted = value_info if dictionary.describes_values else 0
     given = {flag: octets for flag, octets in parts.items() if octets and wanted & flag}
     # Rights, category and mappability are in the fixed part, so they are always there.

@@ -170,6 +170,7 @@ class EngineLink:
     def _restarted(self) -> None:
         for future in self._waiting.values():
             if not future.done():
+                # The new engine knows nothing of requests to the old one.
                 future.set_exception(EngineGoneError("the engine was started again"))
         for call in self.on_restart:
             call()

@@ -338,6 +338,8 @@ class MqttNetwork:
     def message_for(self, connection: str, packet: bytes) -> Publish:
         """Return the message that brings *packet* to the router with the NetID *connection*."""
         sender = self._senders.get(connection)
+        # Open clients differ: some send packets bare, some with the AMS/TCP prefix. Each gets its
+        # own.
         is_prefixed = self._spec.is_prefixed if sender is None else sender.is_prefixed
         kind = TopicKind.REQUESTS if is_request(packet) else TopicKind.ANSWERS
         payload = encode_payload(Payload(self._ports.to_network(packet), is_prefixed))

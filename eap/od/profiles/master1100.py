@@ -172,6 +172,7 @@ FIXED = (
     single(0xF000, "Modular device profile", "How the objects are numbered.",
            fixed(1, "Module index distance", "UINT", "Between two slaves.", default=1),
            fixed(2, "Maximum number of modules", "UINT", "Slaves.", default=MAX_SLAVES),
+           # The values that IgH and libethercat answer with.
            fixed(3, "Available entries in 0x8nnn", "UDINT", "One bit for each of the first.",
                  default=0xFF),
            fixed(4, "Available entries in 0x9nnn", "UDINT", "One bit for each of the first.",

@@ -339,6 +339,7 @@ async def _exchange_vendor(access: LocalSlave, operation: Read | Write | ReadWri
 def _sdo_place(offset: int) -> SdoOffset:
     """Take the offset apart; the subindex means nothing with complete access."""
     place = SdoOffset.decode(offset.to_bytes(4, "little"))
+    # Beckhoff's slave stack code refuses reserved bits of the offset as well.
     if place.reserved:
         raise AdsRefusedError(AdsError.INDEX_OFFSET)
     return SdoOffset(0, 1, index=place.index) if place.is_complete else place

@@ -146,6 +146,7 @@ class SlaveFiles:
     ) -> bytes:
         stream = item.stream
         match group:
+            # Own format: closing would make an incomplete file complete.
             case IndexGroup.FOE_PROGRESS if data:
                 self._drop(handle)
             case IndexGroup.FOE_PROGRESS:
@@ -207,6 +208,7 @@ class SlaveFiles:
 
     def _find(self, station: int, client: AdsClient, handle: int) -> _OpenFile:
         item = self._open.get(handle)
+        # By NetID and not by connection: a client that reconnects goes on with its file.
         if item is None or (item.owner, item.station) != (client.net_id, station):
             why = f"slave {station}: {client.net_id} has no file open by the handle 0x{handle:X}"
             raise AdsRefusedError(AdsError.INDEX_OFFSET, why)

@@ -157,6 +157,8 @@ def _is_read_row(row: Any) -> bool:
         case [command, *_] if command in _READ_COMMANDS:
             return True
         case [_, _, place, data, *_]:
+            # Registers 0x0500 and 0x0502: taking the EEPROM over and a read command change no
+            # content.
             is_command = place == _EEPROM_CONTROL and str(data).startswith(_EEPROM_READ)
             return is_command or place == _EEPROM_OWNER
     return False
@@ -427,6 +429,7 @@ class _Client:
             raise ControlError(reason, code=ErrorCode.BUSY)
         watch = self._methods.watch(params)
         self._last_subscription += 1
+        # The number is sent before the first event can follow.
         subscription = self._last_subscription
         await self.send(encode_result(number, Subscribed(subscription)))
         self.subscriptions[subscription] = group.create_task(self._events(subscription, watch))

@@ -326,6 +326,7 @@ class MasterView:
             if self._detection.status != _BUSY:
                 self._detection = self._detection._replace(status=_BUSY)
                 self._start(self._detect())
+        # The entry always reads 0, so each write of another value is a rising edge.
         elif any(data):
             self._reset()
 
@@ -413,10 +414,12 @@ class MasterView:
     def _last_code(self, station: int) -> int:
         """Return the AL status code of when a slave last left its state, or that was seen last."""
         slave = self.slaves.get(station)
+        # The code of the slave's last departure goes before codes of requests that it refused.
         has_left = self._since_reset(station, MasterLive.ABNORMAL_CHANGES)
         return (has_left and slave and slave.al_code) or self._codes.get(station, 0)
 
     def _since_reset(self, station: int, key: MasterLive) -> int:
+        # A controller counts from 0 again after a power failure, or when another tool clears it.
         return max(0, self._counter(station, key) - self._base.get((station, key), 0))
 
     def _reset(self) -> None:

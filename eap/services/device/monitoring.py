@@ -81,6 +81,7 @@ class UdpSubscriberProbe:
                     if each.unreachable and target in self._refused_at_ns:
                         self._refused_at_ns[target] = now_ns
                         self._refused.add(target)
+                # Fewer than a call can take: the queue is empty.
                 if len(errors) < ERRORS_PER_CALL:
                     break
 

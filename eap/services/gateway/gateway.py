@@ -232,6 +232,7 @@ class MailboxGateway:
         if request.header.type is MailboxType.ERR:
             self._encoder.reply_error(request, Cause.SERVICE)
             return
+        # The master's dictionary answers without the bus, which may be down.
         stations = () if address == MASTER_ADDRESS else await self._stations()
         match self._addresses.resolve(address, stations):
             case GroupAddress(members):
@@ -334,6 +335,7 @@ class MailboxGateway:
     ) -> None:
         """Write the audit, count, and answer from *address*."""
         operation, decision = authorized.operation, authorized.decision
+        # The audit comes first: no client may know of a change that the audit has not.
         if operation is not None and decision is not None:
             self.admission.record(
                 request.endpoint, authorized.target, operation, decision, result_of(replies)

@@ -114,6 +114,7 @@ class ElementCodec(MessageCodec):
                 case SoeOpcode.WRITE_REQUEST:
                     opcode = SoeOpcode.WRITE_RESPONSE
                     self._take(data)
+                    # Only the last fragment of a write is answered.
                     if head.incomplete:
                         return []
                     written = bytes(self._written)
@@ -179,6 +180,7 @@ class AdsCodec(MessageCodec):
         max_size = self.sizes.data_to_master
         if len(packet) <= max_size:
             return [packet] if packet else []
+        # The packet number is the gateway's own: the slave's fragments were joined before.
         self._number += 1
         return list(iter_fragments(packet, self._number, max_size - AmsHeader.SIZE))
 

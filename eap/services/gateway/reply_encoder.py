@@ -219,6 +219,8 @@ class ReplyEncoder:
 
     def send(self, send: Send, address: int, kind: MailboxType, body: bytes) -> None:
         """Send a message from *address*, counted as those of one slave are."""
+        # Answers of the slave and of the gateway mix, so the slave's own counter cannot be passed
+        # on.
         counter = self._counters[address] = next_counter(self._counters[address])
         send(encode_plain_frame(kind, address, counter, body))
 

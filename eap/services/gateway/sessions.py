@@ -289,6 +289,7 @@ class SessionTable(Generic[S]):
             self._open.popitem()[1].close()
 
     def _drop_oldest(self) -> None:
+        # A session with an active transfer is dropped only if all have one.
         idle = (key for key, each in self._open.items() if not each.is_running)
         self.drop(next(idle, next(iter(self._open))))
 

@@ -120,6 +120,7 @@ class ObjectCodec:
 
     async def _sdo(self, body: bytes) -> list[bytes]:
         specifier = body[0] >> 5 if body else None
+        # An abort of the client has no answer (ETG.1000.6).
         if specifier == SdoRequest.ABORT:
             self.reset()
             return []
@@ -308,6 +309,7 @@ class FileCodec:
             async with asyncio.timeout(self._wait_s):
                 return await self._step(head, body)
         except TimeoutError:
+            # BUSY would keep the client waiting for ever if the station of the slave is gone.
             await self._access.probe()
             return [_BUSY]
         except FoeError as exc:

@@ -269,6 +269,7 @@ class RouterRequests:
 def network_of(address: str) -> str:
     """Return the broadcast address of the network of a local *address*."""
     is_any = IPv4Address(address).is_unspecified  # its networks may change later
+    # A directed broadcast leaves by the interface of that network only.
     return BROADCAST if is_any else broadcast_of(address) or BROADCAST
 
 

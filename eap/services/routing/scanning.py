@@ -148,6 +148,8 @@ class _StationScan:
         return [
             SlaveEntry(
                 address,
+                # The name of the plant file goes first: a remote station may know only the order
+                # code.
                 names.get(address) or await self._slave_name(net_id, address),
                 _state(states[2 * place : 2 * place + 1]),
             )

@@ -208,6 +208,7 @@ class StationRouter:
             self._router.add_device(each, self._services.ports(each))
         self._queues = SerialQueues(self._finish)
         self._client = LocalClient(self)
+        # Requests of this process take the same path as those of peers.
         self.add_transport(LOCAL_TRANSPORT, self._client)
         self._below_waiters: dict[Endpoint, tuple[int, asyncio.Event]] = {}
         self._timer = RouterTimer(self._router.next_timeout, self._handle_timeout)

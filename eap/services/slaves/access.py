@@ -82,6 +82,7 @@ class ObjectStream:
         if task is None or task.cancelled():
             return
         if task.done():
+            # asyncio warns of an exception that is never retrieved.
             task.exception()  # the reader has it, or does not want it any more
         else:
             task.cancel()

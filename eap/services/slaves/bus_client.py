@@ -213,6 +213,7 @@ class MailboxLock:
     def abandon(self) -> None:
         """Close it in the middle, and have the slave end the transfer that was begun."""
         abort = ABORT_MESSAGES.get(self._kind)
+        # Slaves handle one transfer at a time (ETG.1000.6): an abandoned one would block the next.
         if self._is_open and not self._is_idle and abort is not None:
             with suppress(EngineGoneError):
                 self._link.send(lambda number: self._step(number, abort))

@@ -209,6 +209,7 @@ class FileHistory:
         """Return the new part of *data*; raise BusError if the repeated part has changed."""
         known = min(len(data), self._size - self._repeated)
         if known:
+            # The reader has these bytes already: the new transfer must bring the same.
             self._hash_again.update(data[:known])
             self._repeated += known
             if self._repeated == self._size and self._hash_again.digest() != self._hash.digest():
@@ -272,6 +273,7 @@ class LocalFile(FileStream):
                         raise
                 again = self._history.rewind()
                 if self.is_write:
+                    # In front of what waits: the slave gets the whole file in its order.
                     self.buffer[:0] = again
                 logger.info("%s: restart %d after: %s", self.name, restarts.count, restarts.reason)
                 await asyncio.sleep(PAUSE_S)

@@ -158,6 +158,7 @@ class RemoteSlave:
 
     async def write_unsized(self, index: int, subindex: int, octets: bytes) -> None:
         """Write an entry from four bytes of which as many count as the entry has."""
+        # ADS has no write without a length: the entry's present value tells it.
         size = len(await self.read_object(index, subindex))
         await self.write_object(index, subindex, octets[:size])
 
@@ -317,6 +318,7 @@ class RemoteFile(FileStream):
     async def _open(self) -> None:
         sizes = await self._slave.sizes()
         self.sizes.set(sizes.to_slave, sizes.to_master)
+        # A first look, before the slave is touched at all.
         self._check_open()  # a slave may forget its old file as soon as a new one is begun
         group = IndexGroup.FOE_OPEN_WRITE if self.is_write else IndexGroup.FOE_OPEN_READ
         opened = await self._request_block(group, self._password, _HANDLE_SIZE, self.name.encode())

@@ -187,6 +187,7 @@ class ListeningSocket(Generic[C]):
     def _accept_some(self, group: asyncio.TaskGroup) -> bool:
         """Accept waiting connections for one time slice; return False to pause."""
         end_ns = monotonic_ns() + (_LOCAL_ACCEPT_SLICE_NS if self._is_local else _ACCEPT_SLICE_NS)
+        # By time, not by number: what a connection costs depends on its protocol.
         while monotonic_ns() < end_ns:
             try:
                 sock, _ = self._socket.accept()
@@ -224,6 +225,7 @@ class ListeningSocket(Generic[C]):
             return
         if victim is not None:
             victim.close(CloseReason.EVICTED)
+        # The victim is told to close; the limit may be exceeded for as long as it takes.
         task = group.create_task(self._serve(connection, sock))
         task.add_done_callback(lambda _: self._forget(connection, sock))
 

@@ -141,6 +141,7 @@ class AmsWindow:
         self._octets += size
         if command in _READS and size >= AmsHeader.SIZE + _LENGTH.size:
             (requested,) = _LENGTH.unpack_from(packet, AmsHeader.SIZE)
+            # A client may ask for any length: it counts as a full window at most.
             self._octets += min(MAX_OCTETS, requested)
             if packet[_GROUP] in _ITEM_SIZES:
                 self.subscriptions.note_request(packet)
@@ -316,6 +317,8 @@ class AmsConnection(asyncio.BufferedProtocol):
     def eof_received(self) -> bool:
         """Note the end of the received data; the peer may still read answers (asyncio)."""
         self._is_half_closed = True
+        # True keeps the transport open: asyncio would close it otherwise, with answers still
+        # pending.
         self._close_when_done()
         return True
 

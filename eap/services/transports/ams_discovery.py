@@ -146,6 +146,7 @@ async def _decide(
 ) -> tuple[AdsError, str]:
     """Return the result for the sender, and a text for the log."""
     if refused := _why_denied(station.spec.users, request, is_this_host=is_this_host):
+        # Tools expect 0x704 after a wrong password.
         return AdsError.ACCESS, f"refused: {refused}"
     try:
         wanted = _read(request, sender)

@@ -353,6 +353,7 @@ class AmsUplink(ReconnectingLink):
             lambda: AmsConnection(str(self.peer), host, self, is_outgoing=True), sock=sock
         )
         try:
+            # Four checks in that time: the limit is exceeded by a quarter at most.
             while not (await asyncio.wait([self._closed], timeout=self._overdue_ns / 4e9))[0]:
                 late_ns = connection.late_since_ns
                 if late_ns is not None and monotonic_ns() - late_ns >= self._overdue_ns:

@@ -275,6 +275,7 @@ class MailboxIntake:
         if packet is not None:
             self._demultiplexer.receive(packet, sender, is_broadcast=is_group_frame)
             return None
+        # Several gateways get a multicast frame, and each would execute the request.
         if is_group_frame:
             return refusal_of(frame)
         return self._gateway.receive(bytes(frame), sender, self._sender.send_frame)
