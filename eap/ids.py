@@ -261,3 +261,23 @@ def is_host(text: str) -> bool:
     except ValueError:
         return False
     return not (address.is_multicast or address.is_unspecified or text == "255.255.255.255")
+
+
+class Endpoint(NamedTuple):
+    """Connection of a transport, or an address on a transport without connections.
+
+    Two connections never have the same name while a process runs, even from one address; where
+    there are none, *connection* is the sender's address, which answers go back to.
+    """
+
+    transport: str
+    connection: str
+
+    @property
+    def kind(self) -> str:
+        """Kind of the transport, a :class:`~eap.ams.spec.TransportKind`."""
+        return self.transport.partition(":")[0]
+
+    def __str__(self) -> str:
+        # A transport to a single address is named after it: print the address once.
+        return f"{self.connection} by {self.transport.removesuffix(f':{self.connection}')}"

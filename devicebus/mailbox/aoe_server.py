@@ -10,7 +10,6 @@ from collections.abc import Callable
 
 from devicebus.mailbox.protocol import MailboxSizes, raise_mailbox_error
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
 from eap.ads.notifications import AdsClient
 from eap.ads.objects import ObjectSpace
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
@@ -24,10 +23,10 @@ from eap.codec.ads import (
     device_name,
     encode_result,
 )
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, StateFlags, decode_packet, response_to
 from eap.codec.mailbox import MailboxError
 from eap.errors import CodecError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 

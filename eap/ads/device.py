@@ -5,23 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-from eap.ads.endpoint import AmsAnswer
 from eap.ads.notifications import AdsClient, NotificationTable
-from eap.ads.operation import (
+from eap.ads.request import (
     AdsRefusedError,
     Operation,
     OperationOutcome,
+    Outcomes,
     Read,
     ReadDeviceInfo,
     ReadState,
     ReadWrite,
     Write,
     WriteControl,
+    accept_request,
 )
-from eap.ads.request import Outcomes, accept_request
 from eap.ads.space import AdsSpace, DeviceDataSpace, States
 from eap.codec.ads import AdsDeviceInfo, AdsError
 from eap.codec.adsnotification import AddNotification
+from eap.codec.ams import AmsAnswer
 
 FIRST_CHANGE_NS = 100_000_000
 """AdsLib drops samples that come before its caller has seen the answer with their handle.  Where a

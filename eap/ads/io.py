@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.ads.space import BOOT, INIT, OP, PREOP, SAFEOP, AdsSpace, Source, fixed_size_source
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import encode_text

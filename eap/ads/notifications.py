@@ -15,8 +15,7 @@ from collections.abc import Callable
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.ads.space import Source
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
@@ -28,7 +27,7 @@ from eap.codec.adsnotification import (
     encode_notification,
 )
 from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 MAX_HANDLES = 1024
 """Notifications of one client; TwinCAT's limit as well."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.ads.space import AdsSpace, Source, fixed_size_source
 from eap.codec.ads import AdsError, IndexGroup
 from eap.od import info

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from functools import partial
 from typing import NoReturn, TypeAlias
 
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.codec.ads import AdsError, AdsState, AdsStates, AdsSystemState, IndexGroup
 
 Source: TypeAlias = Callable[[], bytes]

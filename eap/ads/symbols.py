@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterable
 from functools import cached_property, partial
 from typing import NamedTuple, Protocol
 
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.ads.space import AdsSpace, Source
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import (

@@ -13,13 +13,11 @@ from collections.abc import Collection, Sequence
 from ipaddress import IPv4Address, IPv4Network
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation, Read, ReadWrite, Write, WriteControl
-from eap.ads.sum import SUM_COMMANDS
+from eap.ads.request import SUM_COMMANDS, Operation, Read, ReadWrite, Write, WriteControl
 from eap.ams.spec import IP_TRANSPORTS, AccessRule, AccessService, ObjectRange, TransportKind
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
-from eap.ids import MacAddr, NetId
+from eap.ids import Endpoint, MacAddr, NetId
 
 _MAX_KNOWN = 4096
 """Cached pairs of a client and a target."""

@@ -9,10 +9,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome
 from eap.ads.request import (
+    AdsRefusedError,
     AdsRequest,
+    Operation,
+    OperationOutcome,
     encode_refusal,
     encode_sum,
     has_results,
@@ -26,6 +27,7 @@ from eap.ams.record import Outcome, Record, Trace, describe
 from eap.ams.spec import AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader
+from eap.ids import Endpoint
 
 _DENIED = OperationOutcome(AdsError.ACCESS_DENIED)
 _RESULT = 4

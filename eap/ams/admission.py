@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.error_reply import RoutingError
 from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import InFlight
@@ -19,7 +18,7 @@ from eap.ams.routes import Route, RouteTable
 from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
-from eap.ids import STATION_OCTETS, NetId
+from eap.ids import STATION_OCTETS, Endpoint, NetId
 
 
 class RouterLimits(NamedTuple):

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
 from eap.ams.record import Outcome, Record, Trace, describe
 from eap.ams.routes import Route
 from eap.ams.transport_table import Action, TransportTable
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
-
-_NO_RETURN = StateFlags.NO_RETURN.value  # plain numbers: enums and operators of flags are slow
-_NOTIFICATION = AmsCommand.NOTIFICATION.value
+from eap.codec.ams import AmsAnswer, AmsHeader, response_to
+from eap.ids import Endpoint
 
 
 class RoutingError(NamedTuple):
@@ -25,11 +22,6 @@ class RoutingError(NamedTuple):
     outcome: Outcome = Outcome.FAILED
     body: bytes = b""
     """Body of the reply, where that carries the error and not the AMS header."""
-
-
-def wants_answer(header: AmsHeader) -> bool:
-    """Return whether the sender of a request waits for an answer."""
-    return not (header.state_flags & _NO_RETURN or header.command == _NOTIFICATION)
 
 
 class ErrorReplier:
@@ -54,7 +46,7 @@ class ErrorReplier:
             hop = why.route.hop
             self._record.routes.of(why.route.key, at_ns).add_error(why.text)
         self._record.add(Trace(at_ns, why.outcome, endpoint, hop, header, why.error, took_ns, text))
-        if endpoint is None or not wants_answer(header):
+        if endpoint is None or not header.wants_answer:
             return []
         packet = response_to(header, AmsAnswer(why.body, 0 if why.body else why.error))
         traffic = self._record.connections.of(endpoint, at_ns)

@@ -7,10 +7,9 @@ a packet that runs in a circle.
 
 from __future__ import annotations
 
-from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
 from eap.ams.access_filter import AccessFilter, AuthorizedRequest, exchange_body
 from eap.ams.admission import Admission, RouterLimits
-from eap.ams.error_reply import ErrorReplier, RoutingError, wants_answer
+from eap.ams.error_reply import ErrorReplier, RoutingError
 from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import InFlight, InvokeIds, LoopDetector, Pending, is_marked
 from eap.ams.notification_forwarder import (
@@ -28,8 +27,8 @@ from eap.ams.subscription_restorer import SubscriptionRestorer
 from eap.ams.subscriptions import MAX_PER_CLIENT, MAX_TOTAL, Subscription
 from eap.ams.transport_table import Action, TransportTable
 from eap.codec.ads import AdsError
-from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import ADDRESSES, AmsAnswer, AmsCommand, AmsHeader, response_to
+from eap.ids import Endpoint, NetId
 
 _NOTIFICATION = AmsCommand.NOTIFICATION.value  # taken once: members of enums are slow
 _ANSWERED = Outcome.ANSWERED
@@ -157,7 +156,7 @@ class Forwarder:
         if is_tracked and not self.notification_forwarder.is_within_limits(header, data, endpoint):
             return self._refuse_subscriptions(header, authorized, endpoint, now_ns)
         onward = self._onward(header, endpoint, route)
-        if not wants_answer(header):
+        if not header.wants_answer:
             if authorized is not None:
                 self._access_filter.abandon(authorized)
             return self._forward_once(header, data, onward, endpoint, route, now_ns)
@@ -338,7 +337,7 @@ class Forwarder:
         handles = deleted_handles(header, data)
         grants = self.notification_forwarder.forget(own)
         actions: list[Action] = []
-        if wants_answer(header):
+        if header.wants_answer:
             results = [
                 AdsError.NONE if each in known else AdsError.NOTIFICATION_HANDLE for each in handles
             ]

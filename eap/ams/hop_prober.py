@@ -15,11 +15,10 @@ from collections.abc import Callable, Container, Iterator
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.routes import RouteTable
 from eap.codec.ads import AdsRange, AdsSystemState, IndexGroup
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 PROBE_PORT = 1
 """AMS port of this router for answers to probes."""

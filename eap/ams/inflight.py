@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Container, Iterator
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.access_filter import AuthorizedRequest
 from eap.ams.routes import Route
 from eap.codec.ams import AmsHeader
+from eap.ids import Endpoint
 
 _SERIAL_BITS = 22
 _SERIALS = 1 << _SERIAL_BITS

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from struct import Struct
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.admission import RouterLimits
 from eap.ams.inflight import InFlight, InvokeIds, Pending, is_marked
 from eap.ams.subscriptions import MAX_PER_CLIENT, Grant, Subscription, Subscriptions, divide
@@ -21,7 +20,7 @@ from eap.ams.transport_table import Action, Reply, TransportTable
 from eap.codec.ads import AdsError, AdsReadWrite, IndexGroup
 from eap.codec.adsnotification import AddNotification, decode_notification
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, StateFlags, encode_packet
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 _WRITE = Struct("<III")  # group, offset, length
 

@@ -11,7 +11,6 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
-from eap.ads.endpoint import Endpoint
 from eap.codec.ams import (
     AmsCommand,
     AmsHeader,
@@ -23,7 +22,7 @@ from eap.codec.ams import (
 )
 from eap.codec.wire import Buffer
 from eap.errors import MalformedError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 
 class OversizedPacket(NamedTuple):

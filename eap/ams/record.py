@@ -9,11 +9,10 @@ from typing import Generic, NamedTuple, TypeVar
 
 import msgspec
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.hop_prober import PROBE_PORT
 from eap.ams.routes import RouteKey
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 
 class Outcome(StrEnum):

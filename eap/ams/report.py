@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.hop_prober import HopProber
 from eap.ams.record import Traffic
 from eap.ams.routes import Route
@@ -21,7 +20,7 @@ from eap.ams.spec import AccessService, TransportKind
 from eap.codec.ads import AdsError
 from eap.codec.wire import WireStruct, net_id, u8, u16
 from eap.errors import MalformedError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 
 class RouteState(StrEnum):

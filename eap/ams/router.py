@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable
 from typing import TypeAlias
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
 from eap.ams.access_filter import AccessFilter
 from eap.ams.admission import RouterLimits
-from eap.ams.error_reply import ErrorReplier, RoutingError, wants_answer
+from eap.ams.error_reply import ErrorReplier, RoutingError
 from eap.ams.forwarder import Forwarder
 from eap.ams.hop_prober import MISSES, HopProber
 from eap.ams.reassembly import Reassembly
@@ -23,9 +22,9 @@ from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
 from eap.ams.transport_table import Action, Deliver, Reply, Transport, TransportTable
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError, MalformedError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 _RESPONSE = StateFlags.RESPONSE.value  # plain numbers: enums and operators of flags are slow
 _FRAGMENT = AmsCommand.FRAGMENT.value
@@ -356,11 +355,11 @@ class Router:
             return self._error_replier.reply_error(header, endpoint, through, now_ns)
         data, authorized = through
         body = data[AmsHeader.SIZE :]
-        if authorized is None and self._answer_now is not None and wants_answer(header):
+        if authorized is None and self._answer_now is not None and header.wants_answer:
             answer = self._answer_now(header, body, endpoint)
             if answer is not None:
                 return self._forwarder.answer_now(header, endpoint, *answer, now_ns)
-        if not wants_answer(header):
+        if not header.wants_answer:
             if authorized is not None:
                 self.access_filter.abandon(authorized)
             return [Deliver(_NO_TICKET, header, body, endpoint)]

@@ -15,8 +15,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 
-from eap.ads.endpoint import Endpoint
-from eap.ids import NetId, prefix_text
+from eap.ids import Endpoint, NetId, prefix_text
 
 MAX_LEARNED = 10_000
 """Limit of learned routes; further ones are ignored."""

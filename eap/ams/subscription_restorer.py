@@ -25,7 +25,6 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.admission import RouterLimits
 from eap.ams.error_reply import ErrorReplier, RoutingError
 from eap.ams.inflight import InFlight, InvokeIds, Pending
@@ -41,6 +40,7 @@ from eap.ams.subscriptions import Grant, Subscription, Subscriptions, key_of
 from eap.ams.transport_table import Action, TransportTable
 from eap.codec.ads import AdsError
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
+from eap.ids import Endpoint
 
 RETRY_NS = 500_000_000
 """Between two attempts for one pair of addresses."""

@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.access import host_of
 from eap.ams.routes import Route
 from eap.codec.adsnotification import (
@@ -25,7 +24,7 @@ from eap.codec.adsnotification import (
     encode_notification,
 )
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 MAX_PER_CLIENT = 1024
 """Subscriptions of one AMS address of one connection; TwinCAT's limit as well."""

@@ -7,9 +7,9 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import iter_fragments
 from eap.codec.ams import AmsHeader
+from eap.ids import Endpoint
 
 
 class Forward(NamedTuple):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 
-from eap.ads.endpoint import Endpoint
 from eap.cli.output import Column, Styled, TextTable, count, duration
 from eap.control.routes import (
     ConnectionRow,
@@ -17,6 +16,7 @@ from eap.control.routes import (
     RouterRow,
     interruption_text,
 )
+from eap.ids import Endpoint
 from eap.ops.routing import RouterList, TestedTarget
 
 _UNITS = ("", "k", "M", "G", "T", "P", "E")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum, IntFlag
+from typing import NamedTuple
 
 from eap.codec.wire import Buffer, WireStruct, net_id, u16, u32
 from eap.errors import MalformedError, TruncatedError
@@ -58,6 +59,12 @@ class StateFlags(IntFlag):
     BROADCAST = 0x8000
 
 
+# Plain numbers: members of enums and operators of flags are slow.
+_RESPONSE = StateFlags.RESPONSE.value
+_NO_RETURN = StateFlags.NO_RETURN.value
+_NOTIFICATION = AmsCommand.NOTIFICATION.value
+
+
 class AmsHeader(WireStruct, frozen=True):
     """Beckhoff ADS specification, AMS header: target, source and service.
 
@@ -75,6 +82,11 @@ class AmsHeader(WireStruct, frozen=True):
     length: u32 = 0
     error_code: u32 = 0
     invoke_id: u32 = 0
+
+    @property
+    def wants_answer(self) -> bool:
+        """True if the sender of this request waits for an answer."""
+        return not (self.state_flags & _NO_RETURN or self.command == _NOTIFICATION)
 
 
 def decode_packet(data: Buffer, offset: int = 0) -> tuple[AmsHeader, memoryview]:
@@ -107,6 +119,33 @@ def encode_packet(header: AmsHeader, body: Buffer) -> bytes:
         header.error_code,
         header.invoke_id,
     ).encode() + bytes(body)
+
+
+class AmsAnswer(NamedTuple):
+    """Answer of a service to a request."""
+
+    data: bytes = b""
+    error_code: int = 0
+    """Of the AMS header: the reason the request was not delivered."""
+    why: str = ""
+    """Reason for operators, where results inside *data* refuse something."""
+
+
+def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
+    """Return the packet with *answer* to the request with *header*."""
+    data = answer.data
+    back = AmsHeader(
+        header.source,
+        header.source_port,
+        header.target,
+        header.target_port,
+        header.command,
+        header.state_flags | _RESPONSE,
+        len(data),
+        answer.error_code,
+        header.invoke_id,
+    )
+    return back.encode() + data
 
 
 AMS_TCP_PORT = 48898

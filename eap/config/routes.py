@@ -8,7 +8,6 @@ from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.directory import ip_hop, read_address
 from eap.ams.routes import Origin, RouteTable
 from eap.ams.routes import Route as AmsRoute
@@ -23,6 +22,7 @@ from eap.ids import (
     STATION_OCTETS,
     Destination,
     DestinationKind,
+    Endpoint,
     InterfaceUri,
     MacAddr,
     NetId,

@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
+from eap.ids import Endpoint
 
 _S = 1_000_000_000
 

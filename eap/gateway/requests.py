@@ -19,11 +19,9 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
-from eap.ads.endpoint import AmsAnswer, response_to
-from eap.ads.operation import AdsRefusedError, Operation, Read, ReadWrite, Write
-from eap.ads.request import parse_request
+from eap.ads.request import AdsRefusedError, Operation, Read, ReadWrite, Write, parse_request
 from eap.codec.ads import IndexGroup
-from eap.codec.ams import AmsHeader, StateFlags, decode_packet
+from eap.codec.ams import AmsAnswer, AmsHeader, StateFlags, decode_packet, response_to
 from eap.codec.coe import (
     CoeHeader,
     CoeService,

@@ -18,7 +18,7 @@ from devicebus.errors import MailboxProtocolError, MailboxRefusedError
 from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.operation import Read, Write
+from eap.ads.request import Read, Write
 from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import EntryDescription, ObjectDescription

@@ -13,8 +13,14 @@ from typing import NamedTuple, Self, TypeVar
 import msgspec
 
 from devicebus.wire.alstatus import state_name
-from eap.ads.operation import Operation, OperationOutcome, ReadState, WriteControl
-from eap.ads.request import decode_outcome, encode_query
+from eap.ads.request import (
+    Operation,
+    OperationOutcome,
+    ReadState,
+    WriteControl,
+    decode_outcome,
+    encode_query,
+)
 from eap.ads.space import BOOT, INIT, OP, PREOP, SAFEOP, states_of
 from eap.codec.ads import AdsError, AdsStates
 from eap.control.device import StateAnswer, StateError

@@ -8,12 +8,11 @@ from shutil import copy
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation, Read, ReadWrite, Write
+from eap.ads.request import Operation, Read, ReadWrite, Write
 from eap.ams.access import AccessList
 from eap.ams.directory import Directory
 from eap.codec.ads import IndexGroup
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.runtime.plantfile import load_plant
 
 ROOT = Path(__file__).parents[2]

@@ -6,10 +6,9 @@ import struct
 
 import pytest
 
-from eap.ads.endpoint import Endpoint, response_to
 from eap.ads.notifications import AdsClient
-from eap.codec.ams import AmsCommand, decode_packet
-from eap.ids import NetId
+from eap.codec.ams import AmsCommand, decode_packet, response_to
+from eap.ids import Endpoint, NetId
 from tests.support.adsdevice import DictStore, Station, variable_device
 from tests.support.packets import ethernet
 from tests.support.tshark import dissect, write_pcap

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from eap.ads.device import AdsDevice
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, SlaveState
-from eap.ads.operation import AdsRefusedError, WriteControl
+from eap.ads.request import AdsRefusedError, WriteControl
 from eap.ads.space import OP, SAFEOP, SystemSpace, al_state_for, states_of
 from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes

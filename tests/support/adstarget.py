@@ -6,16 +6,15 @@ from contextlib import ExitStack
 from typing import Any
 
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import AdsClient
 from eap.ads.objects import ObjectSpace
-from eap.ads.operation import WriteControl
+from eap.ads.request import WriteControl
 from eap.ads.space import al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsStates, device_name
 from eap.control.protocol import ErrorCode
 from eap.control.routes import TracedPath
 from eap.errors import ControlError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 from tests.support.controlstub import ControlStub

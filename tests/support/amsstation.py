@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TypeAlias
 
-from eap.ads.endpoint import AmsAnswer, response_to
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsHeader
+from eap.codec.ams import AmsAnswer, AmsHeader, response_to
 from eap.ids import NetId
 
 Send: TypeAlias = Callable[[str, Iterable[bytes]], str | None]

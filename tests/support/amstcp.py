@@ -15,10 +15,9 @@ from collections.abc import Mapping
 from typing import Self
 
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import AdsClient
 from eap.codec.adsnotification import to_filetime
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 PORT = 48898
 _PREFIX = struct.Struct("<HI")

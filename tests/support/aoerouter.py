@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
 from eap.ams.admission import RouterLimits
 from eap.ams.hop_prober import HopProber
@@ -13,7 +12,7 @@ from eap.ams.router import AnswerNow, Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule
 from eap.ams.transport_table import Action, Deliver, Forward, Reply, Transport
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tests.support.ams import Ams, parse
 
 ROUTER = "5.1.1.1.1.1"

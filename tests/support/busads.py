@@ -8,12 +8,18 @@ from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite, Write
-from eap.ads.request import decode_outcome, encode_query
+from eap.ads.request import (
+    Operation,
+    OperationOutcome,
+    Read,
+    ReadWrite,
+    Write,
+    decode_outcome,
+    encode_query,
+)
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsHeader
+from eap.ids import Endpoint, NetId
 from eap.services.ads.bus_ads import BusService
 from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.engine_link import EngineLink

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.ads.endpoint import AmsAnswer
-from eap.ads.operation import Operation, OperationOutcome
-from eap.ads.request import encode_outcome, parse_request
+from eap.ads.request import Operation, OperationOutcome, encode_outcome, parse_request
 from eap.codec.ads import AdsError
+from eap.codec.ams import AmsAnswer
 from eap.services.slaves.remote_slave import RemoteSlave
 from tests.support import busads
 

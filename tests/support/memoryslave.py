@@ -12,9 +12,9 @@ from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.match import answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
-from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
+from eap.ids import Endpoint
 from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway.sessions import SessionCodec
 from eap.services.slaves.access import LocalSlave

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.directory import Directory
 from eap.ams.spec import (
     DirectoryPort,
@@ -13,8 +12,8 @@ from eap.ams.spec import (
     TransportKind,
 )
 from eap.ams.transport_table import Transport
-from eap.codec.ams import SYSTEM_PORT
-from eap.ids import InterfaceUri, NetId
+from eap.codec.ams import SYSTEM_PORT, AmsAnswer
+from eap.ids import Endpoint, InterfaceUri, NetId
 from eap.runtime.store import StationStore
 from eap.services.routing.route_rows import RouterView
 from eap.services.routing.service import LocalRequest

@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer
+from eap.ids import Endpoint, NetId
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
 from eap.services.transports.demultiplexer import Demultiplexer

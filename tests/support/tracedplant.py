@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.operation import ReadWrite
-from eap.ads.request import parse_request
+from eap.ads.request import ReadWrite, parse_request
 from eap.ams.access import AccessList
 from eap.ams.record import Record
 from eap.ams.report import HopQuestion, Location, encode_report
@@ -15,8 +13,8 @@ from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule
 from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError, IndexGroup, encode_result
-from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import SYSTEM_PORT, AmsAnswer, AmsCommand, AmsHeader
+from eap.ids import Endpoint, NetId
 from eap.services.routing.tracing import answer_hop_query
 
 Serve = Callable[[int, int, bytes], AmsAnswer]

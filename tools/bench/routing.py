@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from time import perf_counter_ns
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.transport_table import Forward, Transport
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet, encode_packet
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.settings import Settings
 

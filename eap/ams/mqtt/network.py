@@ -16,7 +16,6 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
-from eap.ads.endpoint import AmsAnswer, Endpoint, response_to
 from eap.ams.mqtt.messages import (
     ClientPorts,
     Info,
@@ -33,9 +32,9 @@ from eap.ams.mqtt.messages import (
 from eap.ams.routes import Origin, Route, RouteTable
 from eap.ams.spec import MqttSpec
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsHeader, StateFlags
+from eap.codec.ams import AmsAnswer, AmsHeader, StateFlags, response_to
 from eap.errors import CodecError
-from eap.ids import STATION_OCTETS, NetId
+from eap.ids import STATION_OCTETS, Endpoint, NetId
 
 MAX_PEERS = 2000
 """Routers that are kept; further ones are ignored."""

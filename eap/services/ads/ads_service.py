@@ -14,13 +14,21 @@ from time import monotonic_ns
 from typing import TypeAlias
 
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import AdsClient, NotificationTable
-from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome, WriteControl
-from eap.ads.request import Outcomes, accept_request, encode_outcome
+from eap.ads.request import (
+    AdsRefusedError,
+    Operation,
+    OperationOutcome,
+    Outcomes,
+    WriteControl,
+    accept_request,
+    encode_outcome,
+)
 from eap.ads.space import AdsSpace, al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsStates, device_name
+from eap.codec.ams import AmsAnswer
 from eap.errors import ControlError
+from eap.ids import Endpoint
 from eap.services.device.station_device import StationDevice
 from eap.services.routing.service import LocalRequest
 from eap.services.slaves.bus_client import BusDescription

@@ -19,9 +19,8 @@ from typing import NamedTuple, TypeAlias
 
 from devicebus.errors import MailboxTimeoutError, SoeError
 from devicebus.wire.sii import SiiProtocol
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import AdsClient
-from eap.ads.operation import (
+from eap.ads.request import (
     AdsRefusedError,
     Operation,
     OperationOutcome,
@@ -31,17 +30,18 @@ from eap.ads.operation import (
     ReadWrite,
     Write,
     WriteControl,
+    decode_outcome,
+    encode_query,
 )
-from eap.ads.request import decode_outcome, encode_query
 from eap.ads.space import DeviceDataSpace, al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoOffset, SoeOffset, device_name
-from eap.codec.ams import DEVICE_PORT, AmsHeader, decode_packet
+from eap.codec.ams import DEVICE_PORT, AmsAnswer, AmsHeader, decode_packet
 from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
 from eap.codec.mailbox import VoeHeader
 from eap.codec.soe import COMMAND_CLEAR, COMMAND_START, DataState, Element, Idn, SoeErrorCode
 from eap.errors import EapError, TruncatedError
 from eap.gateway.error_table import ads_result
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.ads.ads_service import answer_request, check_up
 from eap.services.ads.master_ads import MasterAds, Send, StateRequests

@@ -23,17 +23,10 @@ from devicebus.wire.datagram import (
     brd,
 )
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import Endpoint
 from eap.ads.io import MasterSpace, SlaveState
 from eap.ads.notifications import AdsClient, NotificationTable
 from eap.ads.objects import ObjectSpace
-from eap.ads.operation import (
-    AdsRefusedError,
-    Operation,
-    OperationOutcome,
-    ReadWrite,
-    WriteControl,
-)
+from eap.ads.request import AdsRefusedError, Operation, OperationOutcome, ReadWrite, WriteControl
 from eap.ads.space import INIT, al_state_for, states_of
 from eap.ams.access import group_and_offset
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
@@ -41,7 +34,7 @@ from eap.codec.adsnotification import AddNotification, to_filetime
 from eap.codec.ams import DEVICE_PORT
 from eap.errors import EapError, MalformedError, TruncatedError
 from eap.gateway.error_table import ads_result
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.od.model import OdState
 from eap.services.ads.ads_service import check_up, device_info
 from eap.services.device.master_values import MasterDictionaryProvider

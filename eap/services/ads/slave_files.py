@@ -18,7 +18,7 @@ from collections.abc import Awaitable, Collection
 from typing import TypeVar
 
 from eap.ads.notifications import AdsClient
-from eap.ads.operation import AdsRefusedError, Read, ReadWrite, Write
+from eap.ads.request import AdsRefusedError, Read, ReadWrite, Write
 from eap.codec.ads import AdsError, IndexGroup
 from eap.errors import EapError
 from eap.ids import NetId

@@ -19,11 +19,10 @@ from secrets import randbelow
 from time import monotonic_ns
 from typing import Any, Protocol
 
-from eap.ads.endpoint import AmsAnswer
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, NoSegmentSpace
 from eap.ads.notifications import AdsClient
 from eap.ads.objects import ObjectSpace
-from eap.ads.operation import (
+from eap.ads.request import (
     AdsRefusedError,
     Operation,
     OperationOutcome,
@@ -44,7 +43,7 @@ from eap.codec.ads import (
     IndexGroup,
     encode_result,
 )
-from eap.codec.ams import DEVICE_PORT, IO_PORT, SYSTEM_PORT, AmsCommand, AmsHeader
+from eap.codec.ams import DEVICE_PORT, IO_PORT, SYSTEM_PORT, AmsAnswer, AmsCommand, AmsHeader
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
 from eap.errors import ControlError, ImageError

@@ -19,9 +19,8 @@ from contextlib import contextmanager
 from time import monotonic_ns, time_ns
 from typing import NamedTuple, TypeAlias
 
-from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import NotificationTable
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.ads.space import AdsSpace, Source
 from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
@@ -29,7 +28,7 @@ from eap.codec.ads import AdsError
 from eap.codec.adsnotification import to_filetime
 from eap.codec.values import String
 from eap.errors import ImageError, TornReadError, WriterConflictError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.net.image_file import StationImage
 from eap.pd.image import Image, ImageSamples, extract_value
 from eap.pd.layout import VariableSlot

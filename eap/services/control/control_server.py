@@ -20,7 +20,7 @@ from functools import partial
 from typing import Any, SupportsIndex, TypeAlias
 
 from devicebus.errors import BusError
-from eap.ads.operation import Operation, Read, ReadWrite
+from eap.ads.request import Operation, Read, ReadWrite
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeHeader, SdoHeader
 from eap.codec.mailbox import MailboxType

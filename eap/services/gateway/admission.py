@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation, Read
+from eap.ads.request import Operation, Read
 from eap.ams.access import AccessList, Decision
 from eap.ams.access_filter import AuditedOperation, AuditEntry
 from eap.ams.spec import AccessService
@@ -23,7 +22,7 @@ from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import SoeHeader
 from eap.gateway.error_table import Cause, ads_result
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.od.abort import SdoAbortError
 from eap.services.gateway.sessions import GatewayReply
 

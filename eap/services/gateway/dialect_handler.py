@@ -11,8 +11,7 @@ from collections.abc import Awaitable, Callable
 from typing import TypeAlias
 
 from devicebus.errors import FoeError, MailboxRefusedError, SoeError
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation, ReadWrite
+from eap.ads.request import Operation, ReadWrite
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeHeader, SdoHeader
 from eap.codec.mailbox import MailboxType
@@ -32,6 +31,7 @@ from eap.gateway.dialect import (
 )
 from eap.gateway.error_table import Cause, cause_of_result
 from eap.gateway.requests import GatewayError, idn, sdo
+from eap.ids import Endpoint
 from eap.od.abort import SdoAbortError
 from eap.services.gateway.admission import GatewayAdmission, RuleTarget, denial_cause
 from eap.services.gateway.sessions import MasterSession, cause_of, text_of

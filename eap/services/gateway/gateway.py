@@ -20,8 +20,7 @@ from msgspec.structs import replace
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.wire.sii import SiiProtocol
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation
+from eap.ads.request import Operation
 from eap.ams.access import AccessList, host_of
 from eap.ams.spec import TransportKind
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
@@ -47,7 +46,7 @@ from eap.gateway.requests import (
     SlaveAddress,
     operation_of,
 )
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.gateway.admission import (
     MASTER_PORT,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxError, encode_plain_frame
 from eap.errors import MalformedError, TruncatedError
 from eap.gateway.requests import mailbox_error
+from eap.ids import Endpoint
 from eap.runtime.drop_counters import DropReason
 from eap.services.transports.mailbox_frames import refusal_of
 

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 from devicebus.errors import SoeError
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.codec.eoe import EoeType
@@ -23,6 +22,7 @@ from eap.codec.soe import SoeHeader, SoeOpcode, encode_fragments
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import MemoryShare
 from eap.gateway.requests import GatewayError
+from eap.ids import Endpoint
 from eap.services.gateway.sessions import SessionCodec
 from eap.services.gateway.transfer_codecs import FileCodec, ObjectCodec
 from eap.services.slaves.access import RemoteAccessError, SlaveAccess

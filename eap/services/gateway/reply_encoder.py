@@ -9,12 +9,12 @@ from typing import Any, TypeAlias
 import msgspec
 
 from devicebus.mailbox.protocol import next_counter
-from eap.ads.endpoint import Endpoint
 from eap.ams.access import host_of
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_plain_frame
 from eap.gateway import dialect
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker, Ticket
+from eap.ids import Endpoint
 from eap.services.gateway.sessions import GatewayReply, error_replies
 from eap.services.rate_limits import caused_by
 

@@ -17,8 +17,7 @@ from msgspec.structs import replace
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation
+from eap.ads.request import Operation
 from eap.ams.access import group_and_offset
 from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxError, MailboxType
@@ -26,6 +25,7 @@ from eap.errors import CodecError, EapError, TruncatedError
 from eap.gateway import error_table
 from eap.gateway.error_table import Cause, cause_of_result
 from eap.gateway.requests import GatewayError, error_reply, mailbox_error, operation_of
+from eap.ids import Endpoint
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 from eap.services.slaves.access import RemoteAccessError

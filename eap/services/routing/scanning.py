@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from devicebus.wire.alstatus import state_name
 from eap.ads.io import IoDeviceType
-from eap.ads.operation import OperationOutcome, Read, ReadDeviceInfo
+from eap.ads.request import OperationOutcome, Read, ReadDeviceInfo
 from eap.ams.directory import AmsAddress, Directory
 from eap.ams.routes import Route
 from eap.ams.spec import DirectoryPort, DirectoryStation

@@ -19,12 +19,11 @@ from itertools import count
 from time import monotonic_ns
 from typing import NamedTuple, Protocol, TypeAlias
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsHeader, StateFlags, decode_packet, encode_packet
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.ids import Endpoint, NetId
 from eap.services.tasks import TaskSet
 
 

@@ -20,7 +20,6 @@ import os
 from collections.abc import Callable, Collection, Hashable
 from time import monotonic_ns
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList, host_of
 from eap.ams.access_filter import AuditEntry
 from eap.ams.admission import RouterLimits
@@ -31,8 +30,8 @@ from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
 from eap.ams.transport_table import Action, Forward, Reply, Transport
-from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsHeader
+from eap.ids import Endpoint, NetId
 from eap.services.rate_limits import caused_by
 from eap.services.routing.service import (
     LOCAL_TRANSPORT,

@@ -16,14 +16,13 @@ from ipaddress import IPv4Address
 
 from msgspec.structs import replace
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.access import AccessList
 from eap.ams.routes import Origin, Route
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
-from eap.ids import STATION_OCTETS, Destination, DestinationKind, NetId, prefix_text
+from eap.ids import STATION_OCTETS, Destination, DestinationKind, Endpoint, NetId, prefix_text
 from eap.net.interface import own_addresses
 from eap.pd.spec import StationSpec
 from eap.runtime.store import StationFile

@@ -14,9 +14,17 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.operation import AdsRefusedError, Operation, OperationOutcome, ReadState, ReadWrite
-from eap.ads.request import decode_outcome, encode_outcome, encode_query, parse_request
+from eap.ads.request import (
+    AdsRefusedError,
+    Operation,
+    OperationOutcome,
+    ReadState,
+    ReadWrite,
+    decode_outcome,
+    encode_outcome,
+    encode_query,
+    parse_request,
+)
 from eap.ams.directory import AmsAddress, Directory
 from eap.ams.record import Outcome, reason_of
 from eap.ams.report import (
@@ -34,11 +42,11 @@ from eap.ams.report import (
 )
 from eap.ams.spec import TransportKind
 from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
-from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT, AmsCommand, AmsHeader
+from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT, AmsAnswer, AmsCommand, AmsHeader
 from eap.control.protocol import ErrorCode
 from eap.control.routes import TestResult
 from eap.errors import CodecError, ControlError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.routing.service import LocalRequest, Service
 from eap.services.routing.station_router import StationRouter
 

@@ -16,11 +16,17 @@ from typing import Protocol
 from devicebus.errors import FoeError, SoeError
 from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.endpoint import AmsAnswer, response_to
-from eap.ads.operation import Operation, Read, ReadState, ReadWrite, Write
-from eap.ads.request import decode_outcome, encode_query
+from eap.ads.request import (
+    Operation,
+    Read,
+    ReadState,
+    ReadWrite,
+    Write,
+    decode_outcome,
+    encode_query,
+)
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
+from eap.codec.ams import DEVICE_PORT, AmsAnswer, AmsCommand, AmsHeader, StateFlags, response_to
 from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
 from eap.codec.foe import DATA_OVERHEAD
 from eap.codec.foe import name_of as name_of_foe

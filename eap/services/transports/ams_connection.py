@@ -24,10 +24,10 @@ from typing import ClassVar, Protocol
 
 import msgspec
 
-from eap.ads.endpoint import AmsAnswer, response_to
 from eap.ams.reassembly import AmsStreamDecoder, OversizedPacket, RouterRequest, StreamItem
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import (
+    AmsAnswer,
     AmsCommand,
     AmsHeader,
     RouterCommand,
@@ -35,6 +35,7 @@ from eap.codec.ams import (
     encode_net_id,
     encode_opened_port,
     encode_with_prefix,
+    response_to,
 )
 from eap.errors import MalformedError
 from eap.ids import NetId

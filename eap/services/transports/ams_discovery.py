@@ -20,7 +20,6 @@ from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.access import Decision
 from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
 from eap.ams.routes import Origin, RouteTable
@@ -41,7 +40,7 @@ from eap.codec.amsdiscovery import (
     encode_version,
 )
 from eap.errors import CodecError, ControlError, EnvironmentalError
-from eap.ids import STATION_OCTETS, NetId, parse_host
+from eap.ids import STATION_OCTETS, Endpoint, NetId, parse_host
 from eap.net.host import read_password
 from eap.release import RELEASE
 from eap.runtime.drop_counters import DropReason

@@ -18,11 +18,10 @@ from threading import Thread
 from time import monotonic_ns
 from typing import NamedTuple
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AMS_TCP_PORT
-from eap.ids import NetId, parse_host
+from eap.ids import Endpoint, NetId, parse_host
 from eap.net.connections import OVERDUE_NS, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from time import monotonic_ns
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import Reassembly
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.routing.station_router import StationRouter
 
 

@@ -12,6 +12,7 @@ from eap.ids import (
     EAP_MULTICAST_MAC,
     Destination,
     DestinationKind,
+    Endpoint,
     InterfaceUri,
     MacAddr,
     NetId,
@@ -240,3 +241,8 @@ def test_invalid_address_in_record_is_refused_with_its_field(key, text, reason) 
     fields = {"interface": "loop://a", "net_id": "1.1.1.1.1.1"} | {key: text}
     with pytest.raises(msgspec.ValidationError, match=reason):
         msgspec.convert(fields, Bound, dec_hook=decode_value)
+
+
+def test_endpoint_text_has_connection_and_transport() -> None:
+    assert str(Endpoint("AMS/TCP", "10.0.0.1:3456 #7")) == "10.0.0.1:3456 #7 by AMS/TCP"
+    assert str(Endpoint("ams-tcp:10.0.0.1:48898", "10.0.0.1:48898")) == "10.0.0.1:48898 by ams-tcp"

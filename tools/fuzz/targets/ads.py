@@ -7,7 +7,6 @@ from itertools import cycle
 from struct import Struct
 
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import AdsClient
 from eap.ads.request import MAX_ANSWER
 from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
@@ -15,7 +14,7 @@ from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name
 from eap.codec.adsnotification import decode_notification
 from eap.codec.ams import AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tools.fuzz.messages import cut
 
 _TYPES = {"flags": "WORD", "name": "STRING(20)", "curve": "REAL[4]", "depth": "INT24"}

@@ -6,8 +6,7 @@ import asyncio
 from collections import deque
 from typing import Any
 
-from eap.ads.endpoint import AmsAnswer, response_to
-from eap.codec.ams import AmsHeader, AmsTcpHeader, encode_with_prefix
+from eap.codec.ams import AmsAnswer, AmsHeader, AmsTcpHeader, encode_with_prefix, response_to
 from eap.runtime.drop_counters import DropReason
 from eap.services.transports.ams_connection import MAX_REQUESTS, AmsConnection
 

@@ -17,11 +17,10 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.voe import VoeServer
 from devicebus.master.mailboxes import Unsolicited
-from eap.ads.endpoint import AmsAnswer
-from eap.ads.operation import Operation, OperationOutcome, Read, ReadWrite
-from eap.ads.request import accept_request
+from eap.ads.request import Operation, OperationOutcome, Read, ReadWrite, accept_request
 from eap.ams.access import AccessList
 from eap.ams.spec import AccessRule, AccessService
+from eap.codec.ams import AmsAnswer
 from eap.codec.mailbox import (
     MailboxHeader,
     MailboxType,

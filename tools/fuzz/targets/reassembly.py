@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import Reassembly
 from eap.codec.ams import AmsCommand, AmsHeader, decode_packet
 from eap.errors import CodecError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tools.fuzz.messages import cut
 
 _WAYS = tuple(Endpoint("fuzz", str(number)) for number in range(3))

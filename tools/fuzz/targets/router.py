@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.spec import AccessRule, ObjectRange
 from eap.ams.transport_table import Deliver, Forward, Reply, Transport
-from eap.codec.ams import AmsHeader, decode_packet
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsHeader, decode_packet
+from eap.ids import Endpoint, NetId
 from tools.fuzz.messages import cut
 
 _OWN = NetId.parse("5.1.1.1.1.1")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestTracker
 from eap.gateway.requests import error_reply, operation_of
+from eap.ids import Endpoint
 from tools.fuzz.messages import cut
 
 _WAYS = tuple(Endpoint("door", str(number)) for number in range(5))

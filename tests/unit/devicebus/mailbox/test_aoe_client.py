@@ -11,8 +11,7 @@ from devicebus.errors import BusError, MailboxProtocolError, MailboxSizeError
 from devicebus.mailbox import aoe_client
 from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.endpoint import AmsAnswer
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.ids import NetId
 from tests.support.examples import examples

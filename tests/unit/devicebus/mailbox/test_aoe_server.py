@@ -6,9 +6,8 @@ import pytest
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.aoe_server import AdsServer, AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.endpoint import AmsAnswer
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxError, decode_frame
 from eap.ids import NetId
 from eap.od import info

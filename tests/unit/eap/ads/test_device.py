@@ -7,15 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ads.device import FIRST_CHANGE_NS, AdsDevice
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import AdsClient
-from eap.ads.operation import Read, Write
-from eap.ads.request import MAX_ANSWER
+from eap.ads.request import MAX_ANSWER, Read, Write
 from eap.ads.space import AdsSpace
 from eap.codec.ads import AdsError, AdsState, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
-from eap.codec.ams import AmsCommand
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsCommand
+from eap.ids import Endpoint, NetId
 from tests.support.adsdevice import DictStore, Station, info, variable_device
 
 G = IndexGroup

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, NoSegmentSpace
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.codec.ads import IndexGroup
 from eap.ids import NetId
 from tests.support.adsdevice import FakeMaster

@@ -3,9 +3,8 @@ from __future__ import annotations
 import pytest
 
 from eap.ads import notifications as ads_notifications
-from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import FULL_PACKET, MAX_WATCHED, AdsClient, Notice, NotificationTable
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
     AddNotification,
@@ -16,7 +15,7 @@ from eap.codec.adsnotification import (
     to_filetime,
 )
 from eap.codec.ams import AmsHeader, decode_packet
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 MS = 1_000_000
 ME = AdsClient(Endpoint("tcp", "1"), NetId(b"client"), 30000)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, rule
 
 from eap.ads.notifications import AdsClient, NotificationTable
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
     AddNotification,

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.objects import ObjectSpace
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.codec.ads import AdsError, IndexGroup
 from eap.od import info
 from eap.od.dictionary import ObjectDictionary

@@ -6,22 +6,19 @@ import struct
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer
-from eap.ads.operation import (
+from eap.ads.request import (
     AdsRefusedError,
+    AdsRequest,
     DeleteNotification,
     Operation,
     OperationOutcome,
+    Outcomes,
     Read,
     ReadDeviceInfo,
     ReadState,
     ReadWrite,
     Write,
     WriteControl,
-)
-from eap.ads.request import (
-    AdsRequest,
-    Outcomes,
     accept_request,
     decode_outcome,
     encode_outcome,
@@ -34,7 +31,7 @@ from eap.ads.request import (
 )
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode
-from eap.codec.ams import AmsCommand, decode_packet
+from eap.codec.ams import AmsAnswer, AmsCommand, decode_packet
 from tests.support.vectors import load
 
 G = IndexGroup
@@ -245,3 +242,9 @@ def test_a_sum_read_without_a_count_has_no_results() -> None:
     assert has_results(sum_of(G.SUM_READ, READS))
     assert not has_results(sum_of(G.SUM_READ, READS)._replace(index_offset=0))
     assert not has_results(AdsRequest(AmsCommand.READ, (READS[0],)))
+
+
+def test_refusal_says_its_result() -> None:
+    assert str(AdsRefusedError(AdsError.SIZE)) == "SIZE"
+    assert str(AdsRefusedError(AdsError.SIZE, "too long")) == "SIZE: too long"
+    assert OperationOutcome() == (AdsError.NONE, b"", "")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.ads.space import (
     AdsSpace,
     DeviceDataSpace,

@@ -8,15 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ads.operation import (
+from eap.ads.request import (
+    MAX_ANSWER,
+    MAX_ITEMS,
     AdsRefusedError,
     DeleteNotification,
     OperationOutcome,
+    Outcomes,
     Read,
     ReadWrite,
     Write,
+    encode_refusal,
+    parse_request,
 )
-from eap.ads.request import MAX_ANSWER, MAX_ITEMS, Outcomes, encode_refusal, parse_request
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable, symbol_type
 from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup

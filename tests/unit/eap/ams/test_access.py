@@ -4,8 +4,7 @@ from ipaddress import IPv4Address
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import (
+from eap.ads.request import (
     DeleteNotification,
     Operation,
     Read,
@@ -20,7 +19,7 @@ from eap.ams.spec import AccessRule, AccessTarget, ObjectRange
 from eap.ams.spec import AccessService as Service
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 G = IndexGroup
 SLAVE = NetId.parse("5.1.1.1.3.1"), 1001

@@ -5,9 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.operation import Operation, Read, ReadWrite, Write
-from eap.ads.request import AdsRequest, encode_sum, parse_request
+from eap.ads.request import AdsRequest, Operation, Read, ReadWrite, Write, encode_sum, parse_request
 from eap.ams.access import Decision
 from eap.ams.access_filter import MAX_ENTRIES, AuditedOperation, AuditEntry, AuthorizedRequest
 from eap.ams.admission import RouterLimits
@@ -15,8 +13,8 @@ from eap.ams.record import Outcome
 from eap.ams.spec import AccessRule, AccessService, ObjectRange
 from eap.ams.transport_table import Deliver, Forward
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader
+from eap.ids import Endpoint, NetId
 from tests.support.ams import NOTIFICATION, READ, READ_WRITE, Ams
 from tests.support.aoerouter import CLIENT, DEVICE, FAR, FAR_DEVICE, LINK, Station, route
 

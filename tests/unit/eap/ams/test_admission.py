@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.admission import Admission, RouterLimits
 from eap.ams.error_reply import RoutingError
 from eap.ams.inflight import InFlight, Pending
@@ -11,7 +10,7 @@ from eap.ams.routes import Route, RouteTable
 from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 OWN, FAR, CLIENT = (NetId.parse(text) for text in ("5.1.1.1.1.1", "6.1.1.1.1.1", "7.1.1.1.1.1"))
 ASKED = AmsHeader(FAR, 1, CLIENT, 2, 2, invoke_id=9)

@@ -1,15 +1,12 @@
 from __future__ import annotations
 
-import pytest
-
-from eap.ads.endpoint import Endpoint
-from eap.ams.error_reply import ErrorReplier, RoutingError, wants_answer
+from eap.ams.error_reply import ErrorReplier, RoutingError
 from eap.ams.record import Outcome, Record
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport, TransportTable
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
-from eap.ids import NetId
+from eap.codec.ams import AmsHeader
+from eap.ids import Endpoint, NetId
 from tests.support.ams import Ams
 from tests.support.aoerouter import only_reply
 
@@ -39,19 +36,6 @@ def test_refusal_is_answered_counted_and_traced() -> None:
 def test_error_replier_sends_nothing_without_waiting_client() -> None:
     error_replier = ErrorReplier(TransportTable([Transport("tcp")]), Record())
     assert error_replier.reply_error(HEADER, None, WHY, 9) == []
-
-
-@pytest.mark.parametrize(
-    ("flags", "command", "wanted"),
-    [
-        (StateFlags.ADS, AmsCommand.READ, True),
-        (StateFlags.ADS | StateFlags.NO_RETURN, AmsCommand.READ, False),
-        (StateFlags.ADS, AmsCommand.NOTIFICATION, False),
-    ],
-)
-def test_some_packets_have_no_answer(flags: int, command: int, *, wanted: bool) -> None:
-    header = AmsHeader(NetId(bytes(6)), 0, NetId(bytes(6)), 0, command, flags)
-    assert wants_answer(header) is wanted
 
 
 def test_dropped_packets_are_traced() -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.admission import RouterLimits
 from eap.ams.inflight import is_marked
 from eap.ams.record import Outcome
 from eap.ams.routes import Route
 from eap.ams.transport_table import Forward
-from eap.codec.ams import StateFlags
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, StateFlags
+from eap.ids import Endpoint, NetId
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import (
     CLIENT,

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.hop_prober import PROBE_PORT, HopProber
 from eap.ams.record import Outcome
 from eap.ams.routes import RouteTable
 from eap.ams.transport_table import Forward
 from eap.codec.ams import SYSTEM_PORT, AmsCommand
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import (
     CLIENT,

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.inflight import MAX_PASSED, InFlight, InvokeIds, LoopDetector, Pending, is_marked
 from eap.ams.routes import Route
 from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 
 def test_ids_are_marked_and_differ() -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import struct
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.admission import RouterLimits
 from eap.ams.inflight import InvokeIds
 from eap.ams.record import Outcome
 from eap.ams.routes import Route
 from eap.ams.subscriptions import MAX_PER_CLIENT
 from eap.ams.transport_table import Forward
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tests.support.ams import (
     ADD_NOTIFICATION,
     DELETE_NOTIFICATION,

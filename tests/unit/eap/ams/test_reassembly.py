@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ads.endpoint import Endpoint
 from eap.ams import reassembly
 from eap.ams.reassembly import (
     FRAGMENT_TIMEOUT_NS,
@@ -31,7 +30,7 @@ from eap.codec.ams import (
     encode_with_prefix,
 )
 from eap.errors import MalformedError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tests.support.ams import Ams
 
 LIMIT = 100

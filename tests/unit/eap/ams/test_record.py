@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.record import (
     MAX_ENDPOINTS,
     MAX_EVENTS,
@@ -16,7 +15,7 @@ from eap.ams.record import (
     describe,
 )
 from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 
 def test_traffic_is_counted_by_endpoint() -> None:

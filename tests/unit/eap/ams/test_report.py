@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.record import Traffic
 from eap.ams.report import (
     MAX_REPORT,
@@ -25,7 +24,7 @@ from eap.ams.transport_table import Transport
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.errors import CodecError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, ROUTER, Station, route
 

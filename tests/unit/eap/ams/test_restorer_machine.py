@@ -7,7 +7,6 @@ from collections import deque
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.transport_table import Action, Forward, Reply
 from eap.codec.adsnotification import (
     AddNotification,
@@ -17,6 +16,7 @@ from eap.codec.adsnotification import (
     decode_notification,
     encode_notification,
 )
+from eap.ids import Endpoint
 from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, Station, route
 

@@ -2,13 +2,12 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.reassembly import iter_fragments
 from eap.ams.record import Outcome
 from eap.ams.routes import Origin
 from eap.ams.transport_table import Deliver, Reply, Transport
-from eap.codec.ams import AmsHeader, StateFlags, decode_packet
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsHeader, StateFlags, decode_packet
+from eap.ids import Endpoint, NetId
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams, parse
 from tests.support.aoerouter import (
     CLIENT,

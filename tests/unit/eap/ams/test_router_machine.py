@@ -6,12 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.admission import RouterLimits
 from eap.ams.reassembly import FragmentAssembler
 from eap.ams.transport_table import Action, Deliver, Forward, Reply
-from eap.codec.ams import decode_packet
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, decode_packet
+from eap.ids import Endpoint, NetId
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import (
     CLIENT,

@@ -4,9 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.routes import MAX_LEARNED, Origin, Route, RouteTable
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 
 A, B, C = (Endpoint("tcp", name) for name in "abc")
 

@@ -5,7 +5,6 @@ from itertools import count
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams import subscriptions as module
 from eap.ams.routes import Route
 from eap.ams.subscriptions import (
@@ -18,7 +17,7 @@ from eap.ams.subscriptions import (
 )
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.errors import TruncatedError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tests.support.ams import parse
 
 ONE, TWO, LINK = Endpoint("tcp", "1"), Endpoint("tcp", "2"), Endpoint("link", "6")

@@ -1,14 +1,12 @@
-"""None"""
-
 from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import FragmentAssembler
 from eap.ams.record import Outcome
 from eap.ams.transport_table import Forward, Reply, Transport, TransportTable
 from eap.codec.ams import decode_packet
+from eap.ids import Endpoint
 from tests.support.ams import Ams
 
 

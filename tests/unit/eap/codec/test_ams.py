@@ -1,5 +1,3 @@
-"""None"""
-
 from __future__ import annotations
 
 import pytest
@@ -7,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.codec.ams import (
+    AmsAnswer,
     AmsCommand,
     AmsHeader,
     AmsTcpHeader,
@@ -17,6 +16,7 @@ from eap.codec.ams import (
     encode_opened_port,
     encode_packet,
     encode_with_prefix,
+    response_to,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
 from eap.ids import NetId
@@ -106,3 +106,28 @@ def test_address_of_a_local_client() -> None:
     net_id = NetId.parse("1.2.3.4.5.6")
     assert encode_opened_port(net_id, 0x8001) == bytes.fromhex("0010 08000000 010203040506 0180")
     assert encode_net_id(net_id) == bytes.fromhex("0210 06000000 010203040506")
+
+
+REQUEST = AmsHeader(NetId(b"target"), 1001, NetId(b"source"), 33000, AmsCommand.READ, invoke_id=7)
+
+
+def test_response_keeps_command_and_invoke_id() -> None:
+    header, body = decode_packet(response_to(REQUEST, AmsAnswer(b"data", 6)))
+    assert (header.target, header.target_port) == (REQUEST.source, REQUEST.source_port)
+    assert (header.source, header.source_port) == (REQUEST.target, REQUEST.target_port)
+    assert header.state_flags == StateFlags.ADS | StateFlags.RESPONSE
+    assert (header.command, header.invoke_id, header.error_code) == (AmsCommand.READ, 7, 6)
+    assert bytes(body) == b"data"
+
+
+@pytest.mark.parametrize(
+    ("flags", "command", "wanted"),
+    [
+        (StateFlags.ADS, AmsCommand.READ, True),
+        (StateFlags.ADS | StateFlags.NO_RETURN, AmsCommand.READ, False),
+        (StateFlags.ADS, AmsCommand.NOTIFICATION, False),
+    ],
+)
+def test_some_packets_have_no_answer(flags: int, command: int, *, wanted: bool) -> None:
+    header = AmsHeader(NetId(bytes(6)), 0, NetId(bytes(6)), 0, command, flags)
+    assert header.wants_answer is wanted

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from eap.ads.endpoint import Endpoint
 from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestTracker, Ticket
+from eap.ids import Endpoint
 
 A, B, C = (Endpoint("udp", f"10.0.0.{number}:5") for number in (1, 2, 3))
 SECOND = 1_000_000_000

@@ -4,7 +4,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.ads.operation import ReadState
+from eap.ads.request import ReadState
 from eap.errors import ControlError
 from eap.ops.routing import AmsRefusedError, open_ams
 from tests.support.adstarget import TARGET, AdsTarget

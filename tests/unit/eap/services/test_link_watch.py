@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.transport_table import Transport
+from eap.ids import Endpoint
 from eap.services.sockets import LinkWatch
 from tests.support.eventually import eventually
 from tests.support.routing import RecordingSender, station, while_serving

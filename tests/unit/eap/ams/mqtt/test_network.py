@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.mqtt import network as mqtt_network
 from eap.ams.mqtt import network as mqtt_peers
 from eap.ams.mqtt.messages import FIRST_PORT, Info, encode_info
@@ -32,7 +31,7 @@ from eap.ams.mqtt.network import (
 )
 from eap.ams.routes import Origin, Route, RouteTable
 from eap.ams.spec import MqttSpec
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from tests.support.ams import NOTIFICATION, Ams, parse
 
 OWN, FAR, NEAR = (NetId.parse(each) for each in ("5.1.1.1.1.1", "6.1.1.1.1.1", "6.1.1.1.9.1"))

@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import struct
 
-from eap.ads.endpoint import AmsAnswer
-from eap.ads.operation import OperationOutcome
+from eap.ads.request import OperationOutcome
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import AmsCommand
+from eap.codec.ams import AmsAnswer, AmsCommand
 from eap.services.ads.ads_service import answer_request, begin_answer
 
 OK = bytes(4)

@@ -7,13 +7,12 @@ import struct
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.space import AdsSpace
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode
-from eap.codec.ams import AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader
+from eap.ids import Endpoint, NetId
 from eap.pd.device import DeviceState
 from eap.services.ads.ads_service import AdsService, device_info
 from eap.services.routing.service import LocalRequest

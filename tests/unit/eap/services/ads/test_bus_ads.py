@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from eap.ads.operation import (
+from eap.ads.request import (
     OperationOutcome,
     Read,
     ReadDeviceInfo,

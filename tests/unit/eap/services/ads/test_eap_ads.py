@@ -7,13 +7,12 @@ import struct
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.notifications import AdsClient
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
-from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
+from eap.codec.ams import DEVICE_PORT, AmsAnswer, AmsCommand, AmsHeader
 from eap.errors import EngineRefusedError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.od.profiles.eap1000 import Tx
 from eap.pd.device import DeviceState, FaultCode
 from eap.pd.words import StationWord

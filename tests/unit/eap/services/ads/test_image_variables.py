@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from eap.ads.operation import AdsRefusedError
+from eap.ads.request import AdsRefusedError
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adssymbol import SymbolFlag, decode_entry
 from eap.net.image_file import create_image, open_image

@@ -8,7 +8,7 @@ import pytest
 
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, brd
 from eap.ads.io import SlaveState
-from eap.ads.operation import AdsRefusedError, DeleteNotification, WriteControl
+from eap.ads.request import AdsRefusedError, DeleteNotification, WriteControl
 from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
 from eap.codec.ams import AmsCommand, decode_packet

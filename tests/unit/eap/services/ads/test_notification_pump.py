@@ -9,12 +9,11 @@ from time import monotonic_ns
 import pytest
 from msgspec.structs import replace
 
-from eap.ads.endpoint import Endpoint
 from eap.ads.notifications import AdsClient, NotificationTable
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification, to_filetime
 from eap.codec.ams import AmsCommand, decode_packet
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.net.image_file import create_image
 from eap.pd.image import ImageSamples, Inputs, Sampler
 from eap.pd.layout import plan_layout

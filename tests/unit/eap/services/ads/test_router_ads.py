@@ -8,13 +8,12 @@ import struct
 import pytest
 from msgspec.structs import replace
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
-from eap.codec.ams import AmsCommand, AmsHeader
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
-from eap.ids import InterfaceUri, NetId
+from eap.ids import Endpoint, InterfaceUri, NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortKind, PortSpec
 from eap.services.ads.ads_service import device_info

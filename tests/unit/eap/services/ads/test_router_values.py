@@ -7,12 +7,11 @@ from time import monotonic_ns
 import pytest
 from msgspec.structs import replace
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
 from eap.ams.transport_table import Transport
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.device.live_dictionaries import RouterDictionary
-from eap.ids import InterfaceUri, NetId
+from eap.ids import Endpoint, InterfaceUri, NetId
 from eap.net.image_file import create_image
 from eap.od.profiles.router9000 import RouterLive
 from eap.pd.layout import plan_layout

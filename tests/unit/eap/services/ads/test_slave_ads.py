@@ -6,7 +6,7 @@ import pytest
 
 from devicebus.mailbox import aoe_client
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.operation import Read, ReadState, ReadWrite, Write, WriteControl
+from eap.ads.request import Read, ReadState, ReadWrite, Write, WriteControl
 from eap.codec.ads import AdsError, AdsRange, AdsState, IndexGroup, SoeOffset
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand, AmsHeader

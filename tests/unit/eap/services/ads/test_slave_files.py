@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from eap.ads.operation import Read, ReadWrite, Write
+from eap.ads.request import Read, ReadWrite, Write
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import NetId
 from eap.runtime.engine_messages import ExchangeMailbox

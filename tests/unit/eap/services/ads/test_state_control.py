@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from eap.ads.operation import OperationOutcome, WriteControl
+from eap.ads.request import OperationOutcome, WriteControl
 from eap.codec.ads import AdsError, AdsState
 from eap.errors import EngineRefusedError
 from eap.pd.device import DeviceState

@@ -7,11 +7,10 @@ import struct
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
-from eap.codec.ams import AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader
+from eap.ids import Endpoint, NetId
 from eap.pd.device import DeviceState
 from eap.services.ads.ads_service import device_info
 from eap.services.ads.station_ads import SystemAds

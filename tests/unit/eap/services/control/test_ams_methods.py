@@ -6,12 +6,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.directory import Directory
 from eap.ams.routes import Route
 from eap.ams.spec import DirectoryStation
+from eap.codec.ams import AmsAnswer
 from eap.errors import ControlError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.control.route_methods import AmsMethods
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.tracing import RouteQuery

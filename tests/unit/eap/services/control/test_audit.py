@@ -7,15 +7,14 @@ from typing import Any
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation, ReadWrite, Write, WriteControl
+from eap.ads.request import Operation, ReadWrite, Write, WriteControl
 from eap.ams.access import Decision
 from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
 from eap.ams.directory import Directory
 from eap.ams.spec import AccessService, DirectoryPort, DirectoryStation
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
-from eap.ids import InterfaceUri, NetId
+from eap.ids import Endpoint, InterfaceUri, NetId
 from eap.services.control import audit as module
 from eap.services.control.audit import BURST, KEPT, Audit, AuditFile
 

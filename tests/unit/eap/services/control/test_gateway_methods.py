@@ -9,11 +9,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
 from eap.gateway.request_tracker import RequestTracker
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.services.control.bus_methods import GatewayMethods
 from eap.services.gateway.gateway import Settings

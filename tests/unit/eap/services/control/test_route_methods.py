@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route
 from eap.codec.staticroutes import StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.control.route_methods import RouteMethods
 from eap.services.routing.remote_routers import RemoteRouter
 from tests.support.routeviews import DIRECTORY, Left

@@ -20,13 +20,13 @@ from devicebus.errors import (
     NoMailboxError,
 )
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Read
+from eap.ads.request import Read
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError, EngineGoneError
 from eap.gateway.error_table import Cause
 from eap.gateway.requests import GatewayError
+from eap.ids import Endpoint
 from eap.runtime.engine_messages import SlaveDescription
 from eap.services.gateway import sessions as module
 from eap.services.gateway.gateway import check_slave

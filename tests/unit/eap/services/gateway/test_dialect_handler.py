@@ -16,8 +16,7 @@ from devicebus.errors import (
 )
 from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Operation, Read, ReadWrite, Write
+from eap.ads.request import Operation, Read, ReadWrite, Write
 from eap.ams.access import AccessList, service_of
 from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
@@ -35,7 +34,7 @@ from eap.gateway.dialect import (
 )
 from eap.gateway.error_table import Cause
 from eap.gateway.requests import GatewayError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, variable

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.ads.endpoint import Endpoint
+from eap.ids import Endpoint
 from eap.services.gateway.message_codecs import LISTENS_NS, MAX_LISTENERS, EoeListeners
 
 A, B = Endpoint("udp:e", "10.0.0.1:1"), Endpoint("udp:e", "10.0.0.2:1")

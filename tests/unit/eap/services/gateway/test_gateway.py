@@ -10,8 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from devicebus.master.mailboxes import Unsolicited
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Read
+from eap.ads.request import Read
 from eap.ams.access import AccessList
 from eap.ams.spec import AccessRule, AccessTarget
 from eap.codec.ads import IndexGroup
@@ -23,7 +22,7 @@ from eap.codec.mailbox import (
     encode_frame,
 )
 from eap.gateway.requests import AddressMap, RemoteAddress, SlaveAddress
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, array, variable
 from eap.runtime.engine_messages import UnsolicitedMessage

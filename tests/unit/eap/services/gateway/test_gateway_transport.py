@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import decode_frame
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.runtime.drop_counters import DropReason
 from eap.services.gateway.gateway import Settings
 from eap.services.gateway.gateway_transport import GatewayTransport

@@ -6,13 +6,13 @@ import asyncio
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import (
     MailboxHeader,
     encode_frame,
     encode_plain_frame,
 )
 from eap.gateway.request_tracker import ClientLimits
+from eap.ids import Endpoint
 from eap.services.gateway.gateway import Settings
 from tests.unit.eap.services.gateway.test_gateway import (
     ALSO_HERE,

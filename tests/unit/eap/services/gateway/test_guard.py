@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
-from eap.ads.operation import Read, Write
+from eap.ads.request import Read, Write
 from eap.ams.access import AccessList
 from eap.ams.access_filter import AuditEntry
 from eap.ams.spec import AccessRule, AccessService
@@ -13,7 +12,7 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
 from eap.gateway.requests import error_reply
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.gateway.admission import GatewayAdmission, RuleTarget, denial_cause, result_of
 from eap.services.gateway.sessions import GatewayReply
 

@@ -12,12 +12,10 @@ from devicebus.mailbox import soe_client
 from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_server import SoeParameter, SoeServer
-from eap.ads.endpoint import AmsAnswer
-from eap.ads.operation import Read, ReadWrite, Write
-from eap.ads.request import encode_query
+from eap.ads.request import Read, ReadWrite, Write, encode_query
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Display, Element, Idn, SoeAttribute, encode_list
 from eap.gateway.error_table import Cause

@@ -10,7 +10,7 @@ import pytest
 from devicebus.mailbox import coe_client
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.ads.operation import Write
+from eap.ads.request import Write
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.od.abort import AbortCode, SdoAbortError

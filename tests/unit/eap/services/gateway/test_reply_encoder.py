@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker
+from eap.ids import Endpoint
 from eap.services.gateway.reply_encoder import (
     ErrorLog,
     GatewayRequest,

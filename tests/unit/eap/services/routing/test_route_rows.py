@@ -6,13 +6,12 @@ from time import monotonic_ns, time
 import pytest
 from msgspec.structs import replace
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.record import Outcome, Trace, Traffic
 from eap.ams.report import ConnectionReport, RouteReport, RouteState
 from eap.ams.routes import Origin, Route
 from eap.codec.ams import AmsHeader
 from eap.control.routes import RoutesListParameters
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.routing.route_rows import (
     MAX_LOOPS,
     connection_row,

@@ -8,15 +8,14 @@ import msgspec
 import pytest
 
 from eap.ads.device import AdsDevice
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, SlaveState
 from eap.ads.notifications import AdsClient
 from eap.ams.directory import Directory
 from eap.ams.routes import Route
 from eap.ams.spec import DirectoryPort, DirectoryStation
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_name
-from eap.codec.ams import IO_PORT
-from eap.ids import InterfaceUri, NetId
+from eap.codec.ams import IO_PORT, AmsAnswer
+from eap.ids import Endpoint, InterfaceUri, NetId
 from eap.services.routing import scanning
 from eap.services.routing.scanning import scan, scan_targets
 from tests.support.eventually import elapse

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.codec.ads import AdsError
-from eap.codec.ams import decode_packet
+from eap.codec.ams import AmsAnswer, decode_packet
+from eap.ids import Endpoint
 from eap.services.routing import service as service_module
 from eap.services.routing.service import LocalRequest, SerialQueues
 from tests.support import aoe

@@ -7,10 +7,9 @@ from inspect import signature
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsCommand, AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader
+from eap.ids import Endpoint, NetId
 from eap.services.ads.ads_service import AdsService
 from eap.services.routing.service import LocalClient, Service, ServiceTable, TransportSender
 from eap.services.transports.ams_tcp import AmsClients

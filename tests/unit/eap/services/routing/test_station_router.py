@@ -7,14 +7,13 @@ from time import monotonic_ns
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.access import AccessList
 from eap.ams.admission import RouterLimits
 from eap.ams.routes import Route
 from eap.ams.spec import AccessRule
 from eap.ams.transport_table import Transport
-from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsHeader
+from eap.ids import Endpoint, NetId
 from eap.services.routing import station_router
 from eap.services.routing.station_router import RouterTimer, StationRouter
 from tests.support import aoe

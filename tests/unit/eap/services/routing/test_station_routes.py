@@ -8,11 +8,10 @@ import threading
 import pytest
 from msgspec.structs import replace
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Origin, Route, RouteTable
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.errors import ControlError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.runtime.store import StationFile, StationStore
 from eap.services.routing import station_routes
 from eap.services.routing.station_routes import (

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.record import Outcome, Trace, describe
 from eap.codec.ams import AmsHeader
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.routing.station_router import TraceLog
 
 HOP = Endpoint("udp:eap0", "10.0.0.2:34980")

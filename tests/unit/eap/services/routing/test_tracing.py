@@ -10,9 +10,7 @@ from typing import Any
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
-from eap.ads.operation import Operation, Read, ReadState, ReadWrite
-from eap.ads.request import decode_outcome, encode_query
+from eap.ads.request import Operation, Read, ReadState, ReadWrite, decode_outcome, encode_query
 from eap.ams.directory import AmsAddress
 from eap.ams.record import Outcome, Trace, describe
 from eap.ams.report import HopQuestion, decode_report
@@ -20,9 +18,9 @@ from eap.ams.routes import Route
 from eap.ams.spec import AccessRule
 from eap.ams.spec import AccessService as Service
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
-from eap.codec.ams import SYSTEM_PORT, AmsHeader
+from eap.codec.ams import SYSTEM_PORT, AmsAnswer, AmsHeader
 from eap.errors import ControlError
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.routing import tracing
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.tracing import (

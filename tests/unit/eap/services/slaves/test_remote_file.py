@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 
-from eap.ads.operation import Read, ReadWrite
+from eap.ads.request import Read, ReadWrite
 from eap.codec.ads import IndexGroup
 from eap.services.slaves.remote_slave import BLOCK, RemoteFile
 from tests.support import busads

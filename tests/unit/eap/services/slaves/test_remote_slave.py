@@ -6,10 +6,9 @@ import asyncio
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer
-from eap.ads.operation import Read, Write
+from eap.ads.request import Read, Write
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import AmsCommand, AmsHeader, decode_packet
+from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, decode_packet
 from eap.codec.coe import SdoInfoOpcode
 from eap.errors import CodecError
 from eap.ids import NetId

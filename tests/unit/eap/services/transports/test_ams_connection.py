@@ -14,8 +14,7 @@ from typing import Any, TypeAlias
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, response_to
-from eap.codec.ams import AmsHeader
+from eap.codec.ams import AmsAnswer, AmsHeader, response_to
 from eap.ids import NetId
 from eap.net.connections import CloseReason
 from eap.net.tcp import set_stream_options

@@ -9,10 +9,9 @@ from contextlib import asynccontextmanager, contextmanager
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.transports.ams_tcp import AmsUplinks
 from tests.support.eventually import eventually
 

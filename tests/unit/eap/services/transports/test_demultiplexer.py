@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.reassembly import iter_fragments
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
-from eap.ids import NetId
+from eap.ids import Endpoint, NetId
 from eap.services.transports.demultiplexer import Demultiplexer
 from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.routing import RecordingSender, demultiplexer, station

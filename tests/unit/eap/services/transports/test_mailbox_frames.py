@@ -11,13 +11,12 @@ from time import monotonic_ns
 
 import pytest
 
-from eap.ads.endpoint import Endpoint
 from eap.ams.hop_prober import PROBE_PORT
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsCommand
 from eap.codec.ethercat import EtherCatHeader
-from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
+from eap.ids import EAP_MULTICAST_MAC, Endpoint, MacAddr, NetId
 from eap.net.ipsocket import prepare_receiver
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel

@@ -7,10 +7,10 @@ import socket
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer
+from eap.ids import Endpoint, NetId
 from eap.net.connections import OWN_HOST
 from eap.runtime.drop_counters import DropReason
 from eap.services.gateway.gateway_transport import GatewayTransport

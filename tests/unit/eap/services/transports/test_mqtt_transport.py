@@ -7,12 +7,11 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from eap.ads.endpoint import AmsAnswer, Endpoint
 from eap.ams.routes import Origin, Route
 from eap.ams.spec import MqttSpec, RoutingSpec
 from eap.ams.transport_table import Transport
-from eap.codec.ams import AmsCommand
-from eap.ids import NetId
+from eap.codec.ams import AmsAnswer, AmsCommand
+from eap.ids import Endpoint, NetId
 from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.services.transports.mqtt_transport import MqttTransport, open_mqtt_transports
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
