@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from eap.cli.group import ExitCode
 from eap.cli.output import (
     Column,
     ItemLine,
@@ -37,7 +38,9 @@ from eap.cli.status_findings import (
     Severity,
     StatusFinding,
     StatusReport,
+    appliance_label,
     findings,
+    is_hung,
     is_special,
 )
 from eap.errors import ControlError
@@ -82,7 +85,9 @@ class StatusSample(NamedTuple):
 @plant_option
 @station_option
 @json_option("Print one object; docs/control.md explains its fields.")
+@click.pass_context
 def status(
+    ctx: click.Context,
     full: bool,
     watch: bool,
     interval_s: float,
@@ -93,11 +98,15 @@ def status(
     """Show the state of the running appliances: errors first, then a line for each station.
 
     Each error and warning has its place, cause, time and remedy.
+
+    Exits with 1 when an appliance does not answer.
     """
     view = _full if full else _screen
     if not watch:
         sample = _take_sample(plant, station)
         output.show(sample.document, lambda _: view(sample))
+        if sample.document.silent:
+            ctx.exit(ExitCode.FAILED)
         return
     try:
         for found in _samples(plant, station, interval_s):
@@ -138,11 +147,11 @@ def _take_sample(plant: str | None, station: str | None) -> StatusSample:
     """Return the merged answer of the chosen appliances, cut down to *station* if it is given."""
     from msgspec.structs import asdict, replace
 
-    from eap.ops.client import MergedStatus, connect
+    from eap.ops.client import MergedStatus, connect, request_each
 
     with ExitStack() as stack:
         clients = [stack.enter_context(client) for client in connect(plant, station)]
-        status = MergedStatus.of([client.request("status") for client in clients])
+        status = MergedStatus.of(*request_each(clients, "status"))
     if station:
         status = replace(
             status, stations=[row for row in status.stations if row["name"] == station]
@@ -267,7 +276,9 @@ class StatusScreen:
             dropped += sum(number for each in rx for number in each["discarded"].values())
             table.add_row(
                 row["name"],
-                Styled(row["state"], style=_STATE_STYLES.get(row["state"], "")),
+                Styled("no cycles", style=_BAD)
+                if is_hung(row)
+                else Styled(row["state"], style=_STATE_STYLES.get(row["state"], "")),
                 _links(row["ports"]),
                 self._figure(row, "tx", "sent"),
                 self._figure(row, "rx", "received"),
@@ -296,18 +307,10 @@ class StatusScreen:
         return f"{(total - total_before) / (seconds if seconds > 0 else self._seconds):.0f}"
 
 
-def appliance_label(document: StatusReport, appliance: ApplianceStatus) -> str:
-    """Return the plant of an appliance, with its stations where others run parts of that plant."""
-    plants = [each.plant for each in document.appliances]
-    plant: str = appliance.plant
-    if plants.count(plant) == 1:
-        return plant
-    return f"{plant} ({', '.join(appliance.stations)})"
-
-
 def summaries(document: StatusReport) -> list[Styled]:
     """Return a line for each plant: the number of errors and warnings, and its parts."""
-    plants = dict.fromkeys(appliance.plant for appliance in document.appliances)
+    plants = dict.fromkeys(each.plant for each in document.appliances)
+    plants |= dict.fromkeys(each.plant for each in document.silent)
     return [_summary(document, plant) for plant in plants]
 
 

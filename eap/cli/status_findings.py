@@ -22,7 +22,7 @@ from eap.cli.output import count, duration
 from eap.cli.output import times as times_of
 
 if TYPE_CHECKING:
-    from eap.ops.client import ApplianceStatus, MergedStatus
+    from eap.ops.client import ApplianceStatus, MergedStatus, SilentAppliance
 
 Row = Mapping[str, Any]
 
@@ -108,24 +108,47 @@ class StatusReport:
     processes: Row
     stations: list[Row]
     appliances: list[ApplianceStatus]
+    silent: list[SilentAppliance]
     findings: list[StatusFinding]
 
 
 def findings(status: MergedStatus, now_s: float) -> list[StatusFinding]:
     """Return all findings of *status*, errors first, then warnings."""
     found = [
+        StatusFinding(
+            Severity.ERROR,
+            f"{silent.plant} ({', '.join(silent.stations)})",
+            "services does not answer",
+            f"look at process {silent.services}, or restart the appliance",
+            plant=silent.plant,
+        )
+        for silent in status.silent
+    ]
+    found += [
         replace(each, plant=appliance.plant)
         for appliance in status.appliances
-        for each in _of_appliance(appliance)
+        for each in _of_appliance(appliance, appliance_label(status, appliance))
     ]
     for appliance in status.appliances:
-        plant = appliance.plant
+        plant, label = appliance.plant, appliance_label(status, appliance)
         stations = _stations_of(status, appliance)
-        found += [replace(each, plant=plant) for each in _of_engine(plant, stations, now_s)]
+        found += [replace(each, plant=plant) for each in _of_engine(label, stations, now_s)]
         for station in stations:
             found += [replace(each, plant=plant) for each in _of_station(station)]
     order = list(Severity)
     return sorted(found, key=lambda each: order.index(each.severity))
+
+
+def appliance_label(
+    status: MergedStatus | StatusReport, appliance: ApplianceStatus | SilentAppliance
+) -> str:
+    """Return the plant of an appliance, with its stations where others run parts of that plant."""
+    plants = [each.plant for each in status.appliances]
+    plants += [each.plant for each in status.silent]
+    plant = appliance.plant
+    if plants.count(plant) == 1:
+        return plant
+    return f"{plant} ({', '.join(appliance.stations)})"
 
 
 def _stations_of(status: MergedStatus, appliance: ApplianceStatus) -> list[Row]:
@@ -151,8 +174,7 @@ def _info(where: str, what: str) -> StatusFinding:
     return StatusFinding(Severity.INFO, where, what)
 
 
-def _of_appliance(appliance: ApplianceStatus) -> Iterator[StatusFinding]:
-    plant = appliance.plant
+def _of_appliance(appliance: ApplianceStatus, plant: str) -> Iterator[StatusFinding]:
     for row in appliance.findings:
         yield StatusFinding(**{**row, "severity": Severity(row["severity"])})
     processes = dict(appliance.processes)
@@ -213,17 +235,18 @@ def _of_listener(plant: str, listener: Row) -> Iterator[StatusFinding]:
         yield _info(where, f"connections: {what}")
 
 
-def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[StatusFinding]:
+def _of_engine(label: str, stations: Sequence[Row], now_s: float) -> Iterator[StatusFinding]:
     """Yield one finding for all stations that the engine runs no more."""
-    if hung := [station for station in stations if _is_hung(station)]:
+    if hung := [station for station in stations if is_hung(station)]:
         names = ", ".join(station["name"] for station in hung)
         of_all = "any station" if len(hung) == len(stations) > 1 else names
         since = now_s - max(station["cycle_age_us"] for station in hung) / 1e6
         what = f"runs no cycles of {of_all}"
-        yield _error(f"{plant} engine", what, "see the log of 'eapctl run'", since)
+        yield _error(f"{label} engine", what, "see the log of 'eapctl run'", since)
 
 
-def _is_hung(station: Row) -> bool:
+def is_hung(station: Row) -> bool:
+    """Return whether the engine has run no cycle of *station* for long."""
     # A long device cycle is no fault: the limit is ten cycles, and at least two seconds.
     silent_us: int = station.get("cycle_age_us") or 0
     cycle_us: int = station.get("cycle_us", 0)
@@ -240,7 +263,7 @@ def _of_station(station: Row) -> Iterator[StatusFinding]:
             advice = f"check cable and interface of {port['interface']}"
             yield _error(where, "link down", advice)
         # An engine that hangs exchanges no frames either: that is one finding, not one per bus.
-        elif port.get("link") == "down" and not _is_hung(station):
+        elif port.get("link") == "down" and not is_hung(station):
             yield _error(where, "no frame comes back", "check cable and interface of the bus")
     for frame in filter(is_special, station.get("frames", ())):
         if frame["address"] is None:

@@ -37,6 +37,13 @@ from eap.suggest import suggest
 
 TIMEOUT_S = 10.0
 """Time for one answer: services may be restarting."""
+STATUS_S = 3.0
+"""Time for the answers of several appliances, when one of them has answered."""
+_PING_S = 2.0
+"""Time after which a request without an answer is followed by a ping, and time for its answer."""
+_PINGED_S = 30.0
+"""Longest time for an answer with a ping: a change may occupy services longer than _PING_S."""
+_LISTED = 4
 _CONNECT_PAUSE_S = 0.02
 _EVENT = partial(msgspec.convert, type=ValuesEvent)
 
@@ -85,17 +92,39 @@ class ControlClient(Closeable):
             ControlError: the appliance refused, or does not answer.
             BusError: a bus or a slave refused or failed.
         """
+        self.send(within_s, method, **params)
+        if _PING_S < within_s < _PINGED_S and not self.has_data(_PING_S) and self._is_hung():
+            raise self._gone(TimeoutError("timed out"))
+        return self.receive()
+
+    def send(self, within_s: float, method: str, /, **params: Any) -> None:
+        """Send a request, whose result :meth:`receive` returns within *within_s*.
+
+        Raises:
+            ControlError: the appliance does not read it.
+        """
         self._last_id += 1
         self._socket.settimeout(within_s)
         try:
             self._socket.sendall(encode_request(self._last_id, method, params))
         except OSError as exc:
             raise self._gone(exc) from None
+
+    def receive(self) -> Any:
+        """Return the result of the request sent last; raises as :meth:`request_within`."""
         while True:
             reply = self._next_reply()
             # Events of an earlier subscription may precede the answer.
             if reply.subscription is None:
                 return _checked(reply).result
+
+    def has_data(self, timeout_s: float) -> bool:
+        """Wait for *timeout_s* at most; return whether an answer or its begin has come."""
+        return bool(select.select([self._socket], [], [], timeout_s)[0])
+
+    def gone(self, why: str) -> ControlError:
+        """Return the error that the appliance does not answer for the reason *why*."""
+        return self._gone(TimeoutError(why))
 
     def events(self, **params: Any) -> Iterator[ValuesEvent]:
         """Subscribe with *params* and yield each event until the appliance ends.
@@ -133,12 +162,24 @@ class ControlClient(Closeable):
             raise self._gone(None)
         return decode_reply(line)
 
+    def _is_hung(self) -> bool:
+        """Return whether services accept connections, but answer no request on another one."""
+        folder = self._folder
+        if folder is None or any(_starting(folder)):
+            return False
+        try:
+            with _connect_one(folder, self.info) as other:
+                other.request_within(_PING_S, "hello")
+        except ControlError as exc:
+            return exc.code == ErrorCode.UNAVAILABLE and not any(_starting(folder))
+        return False
+
     def _gone(self, cause: OSError | None) -> ControlError:
         why = str(cause) if cause else "it closed the connection"
         if self._folder is not None:
             why = "; ".join((why, *_starting(self._folder)))
         return ControlError(
-            f"appliance {self.info.plant} (process {self.info.supervisor}) does not answer: {why}",
+            f"appliance {_label(self.info)} does not answer: {why}",
             code=ErrorCode.UNAVAILABLE,
         )
 
@@ -185,6 +226,41 @@ def connect_those(wanted: Callable[[ApplianceInfo], bool]) -> list[ControlClient
             client.close()
         raise
     return clients
+
+
+def request_each(
+    clients: Sequence[ControlClient], method: str, /, **params: Any
+) -> tuple[list[Any], list[ApplianceInfo]]:
+    """Return the results of the appliances that answer, and those that do not.
+
+    The first answer ends the wait for the others after STATUS_S.
+
+    Raises:
+        ControlError: none answers, or one refuses.
+    """
+    silent: dict[ControlClient, ControlError] = {}
+    results: dict[ControlClient, Any] = {}
+    for client in clients:
+        try:
+            client.send(TIMEOUT_S, method, **params)
+        except ControlError as exc:
+            silent[client] = exc
+    start_s = monotonic()
+    for limit_s in (STATUS_S, TIMEOUT_S):
+        for client in clients:
+            if client in silent or client in results or (results and limit_s == TIMEOUT_S):
+                continue
+            if client.has_data(max(0.0, start_s + limit_s - monotonic())):
+                try:
+                    results[client] = client.receive()
+                except ControlError as exc:
+                    if exc.code != ErrorCode.UNAVAILABLE:
+                        raise
+                    silent[client] = exc
+    if not results:
+        raise next(iter(silent.values()), clients[0].gone("timed out"))
+    answered = [results[client] for client in clients if client in results]
+    return answered, [client.info for client in clients if client not in results]
 
 
 def connect_station(station: str, plant: str | None) -> ControlClient:
@@ -251,23 +327,33 @@ class ApplianceStatus(msgspec.Struct, frozen=True):
     listeners: list[dict[str, Any]] = []
 
 
+class SilentAppliance(msgspec.Struct, frozen=True):
+    """Appliance that does not answer: its plant, stations, and the process id of its services."""
+
+    plant: str
+    stations: list[str]
+    services: int
+
+
 class MergedStatus(msgspec.Struct, frozen=True):
     """Status of several appliances.
 
     Attributes:
         version: Of the format.
         processes: Those of the first appliance.
-        stations: Of all appliances, each with the name of its plant.
-        appliances: All appliances.
+        stations: Of all appliances that answer, each with the name of its plant.
+        appliances: All appliances that answer.
+        silent: Appliances that do not answer.
     """
 
     version: int
     processes: dict[str, Any]
     stations: list[dict[str, Any]]
     appliances: list[ApplianceStatus]
+    silent: list[SilentAppliance] = []
 
     @classmethod
-    def of(cls, answers: Sequence[dict[str, Any]]) -> Self:
+    def of(cls, answers: Sequence[dict[str, Any]], silent: Sequence[ApplianceInfo] = ()) -> Self:
         """Merge the answers of appliances to the method ``status``."""
         appliances = [
             msgspec.convert(
@@ -281,7 +367,13 @@ class MergedStatus(msgspec.Struct, frozen=True):
             for answer in answers
             for station in answer["stations"]
         ]
-        return cls(answers[0]["version"], answers[0]["processes"], stations, appliances)
+        return cls(
+            answers[0]["version"],
+            answers[0]["processes"],
+            stations,
+            appliances,
+            [SilentAppliance(info.plant, info.stations, info.services.pid) for info in silent],
+        )
 
 
 def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> ControlClient:
@@ -292,7 +384,7 @@ def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> ControlClient:
     except OSError as exc:
         connection.close()
         raise ControlError(
-            f"appliance {info.plant} (process {info.supervisor}) cannot be reached at"
+            f"appliance {_label(info)} cannot be reached at"
             f" {folder.control_socket}: {exc.strerror}",
             code=ErrorCode.UNAVAILABLE,
         ) from None
@@ -315,6 +407,13 @@ def _connect(connection: socket.socket, path: str) -> None:
             select.select([], [], [], _CONNECT_PAUSE_S)
         else:
             return
+
+
+def _label(info: ApplianceInfo) -> str:
+    """Return plant, stations and process: several appliances may run parts of one plant."""
+    more = len(info.stations) - _LISTED
+    stations = ", ".join(info.stations[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+    return f"{info.plant} ({stations}; process {info.supervisor})"
 
 
 def _starting(folder: ApplianceFolder) -> Iterator[str]:

@@ -99,19 +99,25 @@ def first_answer(
         ControlError: nothing runs, the names are unknown, or *query* failed in another way.
     """
     unknown: ControlError | None = None
+    silent: ControlError | None = None
     with ExitStack() as stack:
         for client in [stack.enter_context(each) for each in connect(plant, via)]:
             try:
                 answer = query(client)
             except ControlError as exc:
-                if exc.code != ErrorCode.UNKNOWN_NAME:
+                # Another appliance may know the name, or have a route to it.
+                if exc.code == ErrorCode.UNAVAILABLE:
+                    silent = silent or exc
+                elif exc.code == ErrorCode.UNKNOWN_NAME:
+                    unknown = unknown or exc
+                else:
                     raise
-                unknown = unknown or exc
             else:
                 yield client, answer
                 return
-    assert unknown is not None  # noqa: S101  connect() found at least one
-    raise unknown
+    error = silent or unknown
+    assert error is not None  # noqa: S101  connect() found at least one
+    raise error
 
 
 class AmsRefusedError(ControlError):

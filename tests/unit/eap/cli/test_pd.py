@@ -145,7 +145,7 @@ def test_watch_ends_with_the_appliance(appliance: Appliance, names: list[str]) -
         _, errors = process.communicate(timeout=20)
     assert process.returncode == 1
     assert errors.count("\n") == 1
-    assert "appliance line (process 1) does not answer" in errors
+    assert "appliance line (mixer, filler; process 1) does not answer" in errors
 
 
 def test_reader_that_leaves_early_ends_a_command_quietly(appliance: Appliance) -> None:

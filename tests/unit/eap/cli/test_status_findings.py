@@ -4,9 +4,11 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
+import msgspec
 import pytest
 
 from eap.cli.status_findings import Severity, StatusFinding, findings
+from eap.ops.client import SilentAppliance
 from tests.support.statusdocument import NOW_S, bus_port, document, frame, merged, rx, tx
 
 
@@ -332,3 +334,21 @@ def test_process_near_its_limit_of_descriptors_is_a_warning() -> None:
     assert found(status) == [("warning", text)]
     status["processes"]["services"]["descriptors"] = {"used": 54, "limit": 60}
     assert found(status) == []
+
+
+def test_findings_name_an_appliance_that_does_not_answer() -> None:
+    status = msgspec.structs.replace(
+        merged(document()), silent=[SilentAppliance("line", ["far", "near"], 77)]
+    )
+    first, *_ = findings(status, NOW_S)
+    assert (first.severity, first.plant) == (Severity.ERROR, "line")
+    assert first.text(NOW_S) == (
+        "line (far, near): services does not answer; look at process 77, or restart the appliance"
+    )
+
+
+def test_finding_of_a_hung_engine_names_the_stations_of_its_appliance() -> None:
+    status = document(cycle_age_us=5_000_000)
+    status["silent"] = [{"plant": "line", "stations": ["far"], "services": 77}]
+    wheres = [each.where for each in findings(merged(status), NOW_S)]
+    assert wheres[:2] == ["line (far)", "line (mixer) engine"]

@@ -6,12 +6,14 @@ import json
 import os
 import socket
 import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 
 from devicebus.errors import AlStatusError
 from eap.errors import ControlError
-from eap.ops.client import ApplianceStatus, ControlClient, MergedStatus, connect
+from eap.ops.client import ApplianceStatus, ControlClient, MergedStatus, connect, request_each
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
 
 pytestmark = pytest.mark.net
@@ -170,3 +172,87 @@ def test_status_of_several_becomes_one():
         ApplianceStatus("p", ["a"], {"engine": {}}, findings=[], audit=None, listeners=[]),
         ApplianceStatus("q", ["b"], {}, findings=[], audit=None, listeners=[]),
     ]
+
+
+def answer_one(listener: socket.socket, result: object) -> None:
+    """Answer the first request of the next client."""
+    connection, _ = listener.accept()
+    with connection, connection.makefile("rb") as lines:
+        asked = json.loads(lines.readline())
+        connection.sendall(json.dumps({"v": 1, "id": asked["id"], "result": result}).encode())
+        connection.sendall(b"\n")
+
+
+@pytest.fixture
+def two_appliances(root: None) -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Listeners of two appliances that run parts of one plant."""
+    with (
+        ApplianceFolder.claim("demo@a") as one,
+        ApplianceFolder.claim("demo@b+c") as other,
+        listen(one) as first,
+        listen(other) as second,
+    ):
+        one.write_info(info(stations=("a",)))
+        other.write_info(info(stations=("b", "c")))
+        yield first, second
+
+
+def test_request_each_returns_the_answers_and_names_the_silent_appliances(
+    two_appliances: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("eap.ops.client.STATUS_S", 0.3)
+    for answering, silent in (0, ["b", "c"]), (1, ["a"]):
+        thread = threading.Thread(target=answer_one, args=(two_appliances[answering], 7))
+        thread.start()
+        with ExitStack() as stack:
+            clients = [stack.enter_context(each) for each in connect()]
+            answers, others = request_each(clients, "status")
+            assert (answers, [each.stations for each in others]) == ([7], [silent])
+        thread.join()
+        two_appliances[1 - answering].accept()[0].close()
+
+
+def test_request_each_waits_longer_while_no_appliance_answers(
+    two_appliances: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("eap.ops.client.STATUS_S", 0.01)
+    monkeypatch.setattr("eap.ops.client.TIMEOUT_S", 0.05)
+    with ExitStack() as stack:
+        clients = [stack.enter_context(each) for each in connect()]
+        with pytest.raises(
+            ControlError, match=r"appliance demo \(a; process \d+\) does not answer"
+        ):
+            request_each(clients, "status")
+
+
+@pytest.mark.usefixtures("root")
+def test_request_to_hung_services_ends_after_a_ping(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("eap.ops.client._PING_S", 0.05)
+    with ApplianceFolder.claim("demo") as demo, listen(demo) as listener:
+        running = info()
+        running.engine = running.services = ProcessInfo(7)
+        demo.write_info(running)
+        (client,) = connect()
+        with (
+            client,
+            pytest.raises(
+                ControlError, match=r"demo \(a, b; process \d+\) does not answer: timed out$"
+            ),
+        ):
+            client.request("status")  # no accept: the connections wait at the listener
+        (client,) = connect()
+        for _ in range(2):
+            listener.accept()[0].close()
+
+        def answer_both() -> None:
+            slow = listener.accept()[0]
+            answer_one(listener, {})  # the ping
+            with slow, slow.makefile("rb") as lines:
+                lines.readline()
+                slow.sendall(b'{"v": 1, "id": 1, "result": 5}\n')
+
+        thread = threading.Thread(target=answer_both)
+        thread.start()
+        with client:
+            assert client.request("status") == 5
+        thread.join()
