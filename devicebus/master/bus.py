@@ -253,5 +253,6 @@ class BusState:
         self.slaves = {}
         self.changes.note()
         self.image = self.cycle = self.reference = None
+        # Without cycles nothing refills the budget: acyclic datagrams would stop for ever.
         self.link.stop_cycles()
         self.is_lost = self.needs_check = False

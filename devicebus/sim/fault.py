@@ -67,6 +67,7 @@ def _emergency(slave: SimulatedSlave, spec: FaultSpec, now_ns: int, on: bool) ->
     code = spec.code & 0xFFFF if on else 0
     drives = device.behaviour.drives if isinstance(device.behaviour, Axes) else ()
     if code and spec.axis < len(drives):
+        # The axis reports its error by itself, and clears it when it is reset.
         drives[spec.axis].fail(code)
     else:
         device.report_error(code, axis=spec.axis)
@@ -277,6 +278,7 @@ class FaultySegment:
         if change_wkc:
             spoil_working_counters(frame)
         entry = (now_ns + delay_ns, next(self._order), Outgoing(frame, out, origin))
+        # By time, then by number: frames with the same delay keep their order.
         heapq.heappush(self._returning, entry)
 
     def frames_to_send(self, now_ns: int) -> list[Outgoing]:

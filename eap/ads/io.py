@@ -72,6 +72,7 @@ class IoSpace(AdsSpace):
         if offset == _Offset.COUNT:
             return count.to_bytes(4, "little")
         if offset == _Offset.IDS_OR_NAME:
+            # The count is the first number of the list.
             return b"".join(number.to_bytes(2, "little") for number in (count, *self._devices))
         raise AdsRefusedError(AdsError.INDEX_OFFSET)
 
@@ -153,6 +154,7 @@ class MasterSpace(AdsSpace):
         reader = self._readers.get((group, offset))
         if reader is not None:
             octets = reader()
+            # Addresses and states have two bytes: none of them is cut.
             return octets[: min(length, len(octets)) // 2 * 2]
         if group != IndexGroup.SLAVE_STATES:
             raise AdsRefusedError(AdsError.INDEX_OFFSET)
@@ -161,6 +163,8 @@ class MasterSpace(AdsSpace):
     def write(self, group: int, offset: int, data: bytes) -> None:
         """Request a state, of the master by the offset, of a slave by the two bytes written."""
         if group == IndexGroup.MASTER_STATE:
+            # TwinCAT has the requested state of a master in the offset, that of a slave in the
+            # data.
             self._master.request_state(_al_state(offset))
         elif group == IndexGroup.SLAVE_STATES:
             if len(data) != 2:

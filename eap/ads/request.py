@@ -193,6 +193,7 @@ def _starts(count: int, size: int) -> Iterable[int]:
 
 
 def _results(outcomes: Iterable[OperationOutcome]) -> bytes:
+    # All results come first, then all data: clients find the data by the lengths of their request.
     return b"".join(encode_result(item.result) for item in outcomes)
 
 
@@ -225,6 +226,7 @@ def _join_handles(_: Sequence[Operation], outcomes: Sequence[OperationOutcome]) 
     )
 
 
+# AdsDef.h: 0xF083 answers with padded values, 0xF084 with their real lengths.
 SUM_COMMANDS: dict[int, SumCommand] = {
     IndexGroup.SUM_READ: SumCommand(AdsRange.SIZE, _split_reads, _join_reads, is_padded=True),
     IndexGroup.SUM_WRITE: SumCommand(AdsRange.SIZE, _split_writes, _join_results),

@@ -160,6 +160,7 @@ class AccessList:
         key = endpoint, source, target, port
         grants = self._known.get(key)
         if grants is None:
+            # Source NetIDs can be invented: the cache must not grow with them.
             if len(self._known) >= _MAX_KNOWN:
                 self._known.clear()
             grants = self._known[key] = self._find(endpoint, source, target, port)

@@ -142,6 +142,7 @@ class Admission:
         known = self._in_flight.get(header.invoke_id)
         if known is None or known.route is None:
             return None
+        # Two routers may give the same ID: only the same request with the same addresses is a loop.
         if known.onward != onward or known.header.command != header.command:
             return None
         text = f"it was forwarded from here already: routes to {header.target} run in a circle"
@@ -168,6 +169,7 @@ class Admission:
         self, header: AmsHeader, endpoint: Endpoint, route: Route
     ) -> RoutingError | None:
         back = self._table.find(header.source)
+        # A default route matches every source: it says nothing about this one.
         if back is not None and back[1] >= STATION_OCTETS and back[0].is_unidirectional:
             text = f"route {back[0].name} is unidirectional: requests from there are refused"
             return RoutingError(AdsError.ACCESS_DENIED, text, back[0])

@@ -58,6 +58,7 @@ class NotificationCleanup:
             ):
                 break
             handle = grant.handle.to_bytes(4, "little")
+            # As a request of this router: nothing goes back to the client, which may be gone.
             actions.append(self._ask(grant, AmsCommand.DELETE_NOTIFICATION, handle, now_ns))
             actions += self.release(grant, now_ns)
         return actions
@@ -75,6 +76,7 @@ class NotificationCleanup:
 
         Not while the answer with its handle may still arrive: datagrams overtake each other.
         """
+        # The sample of a notification may overtake the answer with its handle.
         if any(pending.handles for pending in self._in_flight.on(endpoint.transport, None)):
             return []
         head = AmsHeader(
@@ -226,6 +228,7 @@ class NotificationForwarder:
             if result:
                 continue
             grant = Grant(pending.onward, handle, route)
+            # The client closed its connection, or has its time-out: nothing may stay at the server.
             if endpoint is None:
                 granted.surplus.append(grant)
                 continue
@@ -300,6 +303,7 @@ class NotificationForwarder:
         mine = self._symbols.get(endpoint)
         if request is None or mine is None:
             return b""
+        # A handle may be watched by either of two groups; it is stored by one of them.
         group = IndexGroup.VALUE_BY_HANDLE if request.group in BY_HANDLE else request.group
         return mine.get((addresses, group, request.offset), b"")
 

@@ -234,6 +234,7 @@ class Router:
                     actions += self._forwarder.hop_lost(*probe.hop, text, now_ns)
                 if probe.is_gone:
                     self._gone.append(probe.hop)
+                # A route may name a transport that this station does not have.
                 if probe.hop.transport in self._transports.transports:
                     actions.append(self._transports.forward(probe.hop, probe.packet, _NO_TICKET))
         return actions
@@ -305,6 +306,7 @@ class Router:
                 else [Reply(endpoint, (acknowledgement,))]
             )
         whole, _ = decode_packet(packet)
+        # Fragments in fragments could be nested without end.
         if whole.command == _FRAGMENT:
             raise MalformedError("a fragment in fragments", layout="AmsHeader")
         return self._receive_whole(whole, packet, endpoint, now_ns, is_broadcast=is_broadcast)
@@ -315,6 +317,7 @@ class Router:
         if header.state_flags & _RESPONSE:
             return self._receive_answer(header, data, endpoint, now_ns)
         ports = self._devices.get(header.target)
+        # Every station of the segment got it: only its target answers, none forwards it.
         if ports is None and is_broadcast:
             return []
         self.record.connections.of(endpoint, now_ns).add_request(len(data), header.source)

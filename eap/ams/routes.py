@@ -112,6 +112,7 @@ class Route(msgspec.Struct, frozen=True):
 
 
 def _exchange(net_id: NetId, old: NetId, new: NetId, octets: int) -> NetId | None:
+    # The longest match first: a NetID of its own goes before that of its station.
     for level in (6, 5, 4):
         if level >= octets and net_id[:level] == old[:level]:
             return NetId(new[:level] + net_id[level:])

@@ -239,6 +239,7 @@ class SubscriptionRestorer:
         """Act on the answer to a request of a restoration."""
         step = pending.step
         assert isinstance(step, _Step)  # noqa: S101  for the type
+        # An answer came in time: the limit is the short one again.
         step.session.timeouts = 0
         return self._end_step(pending, step, header, body, now_ns)
 
@@ -255,6 +256,7 @@ class SubscriptionRestorer:
         self._outstanding -= 1
         step.session.outstanding -= 1
         error = header.error_code or int.from_bytes(body[:4], "little")
+        # An answer without a result counts as a general error, which may pass.
         if len(body) < 4 and not error:
             error = AdsError.GENERAL
         actions: list[Action] = []
@@ -330,6 +332,7 @@ class SubscriptionRestorer:
     def _begin(self, session: _Session, now_ns: int) -> list[Action]:
         """Request one subscription, or a group once one has been granted."""
         actions: list[Action] = []
+        # One request finds out whether the server is there again; the others follow by its answer.
         limit = 1 if session.is_trying else GROUP
         while session.waiting and session.outstanding < limit and self._is_below_limits():
             subscription = session.waiting.popleft()
@@ -422,6 +425,8 @@ class SubscriptionRestorer:
         subscription.is_queued = False
         subscription.interrupted_at_ns = subscription.refused_at_ns = None
         subscription.why = ""
+        # A check of a live subscription makes the server send its value again, which the client
+        # has.
         subscription.skips_repeat = not was_interrupted
         subscription.established_at_ns = subscription.received_at_ns = now_ns
         session.is_trying = False
@@ -452,6 +457,7 @@ class SubscriptionRestorer:
             passes = now_ns - since_ns < STARTUP_TIMEOUT_NS
         if not passes:
             return self._give_up(session, subscription, text, now_ns)
+        # In front: the order of the client's subscriptions is kept.
         session.waiting.appendleft(subscription)
         session.is_trying = True
         self._schedule(session, now_ns + max(RETRY_NS, len(self._sessions) * spacing_ns))

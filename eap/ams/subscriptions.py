@@ -143,6 +143,7 @@ class Subscription:
         That is a sample without bytes, as TwinCAT sends it; it is alone in its packet, because
         AdsLib skips what follows such a sample.
         """
+        # In the clock of the server, which may differ: its last stamp plus the time since.
         time = self.time + (now_ns - self.received_at_ns) // UNIT_NS if self.time else 0
         body = encode_notification([Stamp(time, (Sample(self.handle, b""),))])
         server, port, client, client_port = ADDRESSES.unpack(self.addresses)
@@ -191,6 +192,7 @@ class Subscriptions:
         endpoint = subscription.endpoint
         grant, subscription.grant = subscription.grant, None
         displaced = None if grant is None else self._by_grant.get(key_of(grant))
+        # One that another router restores is forgotten here: that router requests it again.
         if displaced is not None and displaced.request is None:
             self.remove(displaced)
         elif displaced is not None:

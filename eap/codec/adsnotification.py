@@ -97,6 +97,7 @@ def encode_notification(stamps: Iterable[Stamp]) -> bytes:
         for handle, data in stamp.samples:
             octets += _SampleHead(handle, len(data)).encode()
             octets += data
+    # The length counts the bytes behind it: the number of stamps (4 bytes) and the stamps.
     return _PacketHead(len(octets) + 4, count).encode() + octets
 
 

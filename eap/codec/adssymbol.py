@@ -76,6 +76,7 @@ class UploadInfo(WireStruct, frozen=True):
     def encode_for(self, length: int) -> bytes:
         """Return the newest version that fits into *length* bytes."""
         octets = self.encode()
+        # Clients tell the version that they know by the length that they read.
         if length >= _INFO_3_SIZE:
             return (octets + _InfoTail(0, CODE_PAGE).encode()).ljust(_INFO_3_SIZE, b"\0")
         return octets[:length]

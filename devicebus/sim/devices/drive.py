@@ -94,6 +94,7 @@ class DriveStateMachine:
 
     def control(self, word: int) -> None:
         """Execute a control word."""
+        # Only an edge resets: a bit that stays set must not clear the next fault at once.
         rising = word & ~self._control_word & FAULT_RESET_BIT
         self._control_word = word
         self.process(DriveCommand.FAULT_RESET if rising else command_of(word))
@@ -221,6 +222,7 @@ class Drive:
 
     def step(self, state: AlState, now_ns: int) -> None:
         """Follow the control word and the set points; out of OP the axis is switched off."""
+        # Out of OP no control word arrives: the drive must not go on by the last one.
         self._execute(self.entry(0x6040).value if state is AlState.OP else 0)
         elapsed = 0 if self._stepped_ns is None else now_ns - self._stepped_ns
         self._stepped_ns = now_ns
@@ -272,6 +274,7 @@ class Drive:
             return
         if mode == CYCLIC_POSITION:
             old, target = position.value, self.entry(0x607A).value
+            # 0xFFFFFFFF switches the supervision of the following error off.
             if abs(target - old) > self.entry(0x6065).value < NO_WINDOW:
                 self.fail(FOLLOWING_ERROR)
                 return
@@ -282,6 +285,7 @@ class Drive:
         elif mode == CYCLIC_VELOCITY:
             velocity.value = self.entry(0x60FF).value
             moved = position.value + velocity.value * elapsed_ns // _NS
+            # The position wraps, as a counter of 32 bits does.
             position.value = (moved + (1 << 31)) % (1 << 32) - (1 << 31)
 
     def _show(self) -> None:

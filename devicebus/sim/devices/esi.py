@@ -89,6 +89,7 @@ def objects(device: Element) -> Iterator[ObjectSpec]:
     for item in device.iterfind("Profile/Dictionary/Objects/Object"):
         index = number(text_at(item, "Index", "0"))
         bits = number(text_at(item, "BitSize", "0"))
+        # The standard objects are built from identity and PDOs of the file, so that both agree.
         if index in _STANDARD or not bits:
             continue
         kind = text_at(item, "Type", "")
@@ -108,6 +109,7 @@ def _sub_items(kind: Element | None, types: dict[str, Element]) -> Iterator[_Sub
         name = text_at(item, "Type", "")
         bits = number(text_at(item, "BitSize", "0"))
         access = _access(item)
+        # A SubItem without SubIdx is an array: its elements are the subindexes.
         if item.find("SubIdx") is None:
             yield from _elements(types.get(name), types, access)
             continue
@@ -135,6 +137,7 @@ def _elements(
 
 def _entries(item: Element, parts: list[_SubItem]) -> Iterator[EntrySpec]:
     infos = {text_at(each, "Name", ""): each.find("Info") for each in item.iterfind("Info/SubItem")}
+    # A subindex that a file has twice counts once: the last one.
     for part in {each.subindex: each for each in parts}.values():
         yield EntrySpec(
             subindex=part.subindex,
@@ -236,6 +239,7 @@ def _mailbox(device: Element) -> MailboxSpec | None:
     mailbox = device.find("Mailbox")
     if mailbox is None:
         return None
+    # The first two sync managers are the mailboxes.
     sizes = [number(each.get("DefaultSize", "128")) for each in device.findall("Sm")[:2]]
     return MailboxSpec(
         size=max(_MINIMUM_MAILBOX, min(sizes, default=128)),

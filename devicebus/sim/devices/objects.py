@@ -99,6 +99,8 @@ def _numbered(
 def _while_empty(index: int, sub: int, count: Entry) -> Callable[[bytes], None]:
     def check(octets: bytes) -> None:
         del octets
+        # 0x06010003: entries are writable only while subindex 0 is 0, so no half-written list is
+        # valid.
         if count.octets[0]:
             raise SdoAbortError(AbortCode.SUBINDEX_0_NOT_ZERO, index, sub)
 
@@ -124,6 +126,7 @@ def _check_mapping(
             entry = dictionary.entry(*place)
             if not entry.access & right:
                 raise SdoAbortError(AbortCode.NOT_MAPPABLE, index, sub, entry.name)
+            # What the device description itself maps is accepted, also with another length.
             if bits != entry.kind.bit_length and number not in own:
                 raise SdoAbortError(AbortCode.PARAMETER, index, sub,
                                     f"{bits} bits of {entry.kind.text}")  # fmt: skip
@@ -175,6 +178,7 @@ def object_ids_of(channels: Sequence[ChannelSpec], base: int) -> list[ObjectId]:
         if channel.object:
             found.append(ObjectId.parse(channel.object))
         else:
+            # Only entries without an object of their own take a number of the default range.
             free += 1
             found.append(ObjectId(base + 0x10 * ((free - 1) // 200), (free - 1) % 200 + 1))
     return found

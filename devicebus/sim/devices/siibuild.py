@@ -92,6 +92,7 @@ def plan_channels(
     first = len(channels)
     at = (at + 7) // 8 * 8
     channels.append(SiiSyncManager(at, output_size, 0x64, enable=int(output_size > 0), type=3))
+    # Three buffers, and room for what a master may map in addition.
     at = (at + 3 * max(output_size, MIN_ROOM) + 7) // 8 * 8
     channels.append(SiiSyncManager(at, input_size, 0x20, enable=int(input_size > 0), type=4))
     end = at + 3 * max(input_size, MIN_ROOM)
@@ -210,6 +211,7 @@ def _pdos(
     found = [item for item in dictionary if 0 <= item.index - base < PDOS]
     assign = dictionary[RX_ASSIGN if base == RX_PDO else TX_ASSIGN]
     assigned = [assign.entries[sub].value for sub in range(1, assign.max_subindex + 1)]
+    # Masters that read no CoE objects take the order of the EEPROM for that of the process data.
     found.sort(key=lambda item: _rank(assigned, item.index))
     title = "Outputs" if base == RX_PDO else "Inputs"
     return tuple(
@@ -217,6 +219,7 @@ def _pdos(
             SiiPdoHeader(
                 item.index,
                 item.max_subindex,
+                # 0xFF: the PDO exists, but no sync manager has it by default.
                 channel if item.index in assigned else _NOT_ASSIGNED,
                 name=strings.number(title if len(found) == 1 else f"{title} {item.index - base}"),
             ),

@@ -167,6 +167,7 @@ class Rx(IntEnum):
     PDO_LENGTH = 2
     PD_ID = 3
     VERSION = 4
+    # ID and length are never ignored: another PD's data would be taken for this one's.
     FLAGS = 5
     PUBLISHER = 6
     POLL_REQUEST_TXPD = 7
@@ -325,6 +326,7 @@ TX_PDO = ProfileObject(
     0x1A00, 0x1BFF, "TxPDO mapping {n}", _ARRAY, _MAPPED,
     "Variables of a sent PD in their order.", dynamic=True, mapping=True, section="publish",
 )  # fmt: skip
+# The 512 indexes of the standard are too few for 1,000 PDs.
 MORE_RX_PDO = RX_PDO._replace(
     first=0x2000, last=0x2DFF, name="Further RxPDO mapping {n}",
     description="As 0x1600, for ports that receive more than 512 different PDOs.",

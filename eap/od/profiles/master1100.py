@@ -165,6 +165,7 @@ DIAGNOSIS = ProfileObject(
     ),
     "How a slave is.",
 )  # fmt: skip
+# TwinCAT stops before the entries where masters and clients pad complete access differently.
 USUAL_EXTENT = {CONFIGURED.first: 37, DETECTED.first: 32, DIAGNOSIS.first: 17}
 """Last sub-index by first index of the range, as TwinCAT has it."""
 FIXED = (

@@ -227,6 +227,7 @@ class NotificationPump:
             self._symbols.refresh()
         except AdsRefusedError as exc:
             logger.debug("notifications delayed: %s", exc)
+            # There is no image just now, as while a new one is made: it is looked for again soon.
             return _POLL_NS
         image = self._symbols.image
         if self._samples is None:

@@ -69,6 +69,8 @@ class AuditFile:
         fd = self._open_locked()
         try:
             size = os.fstat(fd).st_size
+            # A process that was killed may have left a part of a line: it must not join the next
+            # one.
             if size and os.pread(fd, 1, size - 1) != b"\n":
                 lines = b"\n" + lines
             try:
@@ -121,6 +123,7 @@ class AuditFile:
         for older, newer in zip(reversed(names[1:]), reversed(names[:-1]), strict=True):
             if newer.exists():
                 newer.replace(older)
+        # The file itself is moved last: a failure before leaves it in its place.
         self.path.replace(names[0])
 
 
@@ -318,6 +321,7 @@ class Audit:
 
     def _skip(self, client: _Client) -> None:
         """Count a line that is left out."""
+        # Written early rather than forgotten, whatever the number of clients.
         if client not in self._skipped and len(self._skipped) >= _MAX_CLIENTS:
             self.write_skipped()
         self._skipped[client] = self._skipped.get(client, 0) + 1

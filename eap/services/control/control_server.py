@@ -429,8 +429,8 @@ class _Client:
             raise ControlError(reason, code=ErrorCode.BUSY)
         watch = self._methods.watch(params)
         self._last_subscription += 1
-        # The number is sent before the first event can follow.
         subscription = self._last_subscription
+        # Sent before its task starts: the client knows the number when the first event comes.
         await self.send(encode_result(number, Subscribed(subscription)))
         self.subscriptions[subscription] = group.create_task(self._events(subscription, watch))
 

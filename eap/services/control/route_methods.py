@@ -312,6 +312,7 @@ class RouteMethods:
         stations = self._directory.stations
         if wanted.net_id:
             return str(NetId.parse(wanted.net_id))
+        # A default route matches every NetID: it needs none of its own.
         if not wanted.octets:
             return str(_ANY)
         if wanted.name in stations:

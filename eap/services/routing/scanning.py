@@ -148,8 +148,7 @@ class _StationScan:
         return [
             SlaveEntry(
                 address,
-                # The name of the plant file goes first: a remote station may know only the order
-                # code.
+                # The name of the plant file goes first; it saves a request for each slave.
                 names.get(address) or await self._slave_name(net_id, address),
                 _state(states[2 * place : 2 * place + 1]),
             )

@@ -151,6 +151,7 @@ async def answer_hop_query(
     next_router = NetId.parse(report.next_net_id)
     timeout_s = _HOP_TIMEOUT_S + _TIMEOUT_PER_HOP_S * further
     outcome = await run_operation(station, next_router, SYSTEM_PORT, operation, timeout_s)
+    # The router further on does not answer: its predecessor's report says how far the path goes.
     if outcome.result:
         return replace(report, error=outcome.result)
     try:
@@ -164,6 +165,7 @@ def _last_failure(station: StationRouter, header: AmsHeader) -> str:
     oldest_ns = monotonic_ns() - _LAST_FAILURE_NS
     addresses = header.target, header.target_port, header.source
     for each in reversed(station.record.latest):
+        # The newest come first: the others are older still.
         if each.at_ns < oldest_ns:
             break
         found = each.header

@@ -324,7 +324,6 @@ class RemoteFile(FileStream):
     async def _open(self) -> None:
         sizes = await self._slave.sizes()
         self.sizes.set(sizes.to_slave, sizes.to_master)
-        # A first look, before the slave is touched at all.
         self._check_open()  # a slave may forget its old file as soon as a new one is begun
         group = IndexGroup.FOE_OPEN_WRITE if self.is_write else IndexGroup.FOE_OPEN_READ
         opened = await self._request_block(group, self._password, _HANDLE_SIZE, self.name.encode())
