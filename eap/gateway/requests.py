@@ -48,6 +48,11 @@ ALL_SLAVES = 0xFFFF
 VIRTUAL_BIT = 0x8000
 
 
+def address_text(address: int) -> str:
+    """Return a mailbox address as plant files write it: 1001, or 0x9001 with bit 15 set."""
+    return f"0x{address:04X}" if address & VIRTUAL_BIT else f"{address}"
+
+
 class MasterAddress(NamedTuple):
     """The dictionary of the master itself."""
 

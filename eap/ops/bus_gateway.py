@@ -20,7 +20,7 @@ from eap.codec.mailbox import MailboxError
 from eap.codec.soe import SoeErrorCode
 from eap.errors import ConfigError, EapError
 from eap.gateway.client import GatewayClient
-from eap.gateway.requests import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
+from eap.gateway.requests import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT, address_text
 from eap.gateway.slaves import NO_DICTIONARY, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.ops.bus_session import Begin, Slave, choose, no_mailbox
@@ -178,8 +178,12 @@ class GatewayBus:
             return ""
         described = self._description_of(slave)
         if described is None:
-            known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
-            return f"unknown slave {slave.station}; slaves known to the master: {known or 'none'}"
+            # The master's dictionary has no virtual addresses: the slave may be there all the same.
+            known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves) or "none"
+            return (
+                f"address {address_text(slave.station)} is not a slave of this bus ({known});"
+                " it may be a virtual address of the plant file"
+            )
         if not described.to_slave:
             return str(no_mailbox(_slave(described), state_name(_slave(described).status.state)))
         return ""

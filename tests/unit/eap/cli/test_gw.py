@@ -51,7 +51,7 @@ def test_mailbox_option_is_accepted_after_the_host(gateway, option, tmp_path) ->
     assert (refused.exit_code, "use --mailbox BYTES" in refused.output) == (1, True)
     asked = run(gateway, "foe", "get", "7", "f", str(tmp_path / "f"), *option)
     assert "UNSUPPORTED_PROTOCOL" in asked.output
-    assert "unknown slave 7; slaves known to the master: 1001 (drive)" in asked.output
+    assert "address 7 is not a slave of this bus (1001 (drive))" in asked.output
     assert run(gateway, "scan", "--mailbox").exit_code == 2
     assert run(gateway, "voe", "drive", "--vendor", "1", "--", "--tcp").exit_code == 2
 

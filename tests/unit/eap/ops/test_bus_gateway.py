@@ -28,6 +28,11 @@ pytestmark = pytest.mark.net
 MODE = Idn.parse("S-0-0032")
 
 
+NOT_A_SLAVE = (
+    "is not a slave of this bus (1001 (drive)); it may be a virtual address of the plant file"
+)
+
+
 @pytest.fixture
 def gateway():
     with FakeGateway() as running:
@@ -65,9 +70,7 @@ def test_virtual_addresses_are_passed_to_the_gateway(bus) -> None:
     assert slave.station == 0x9001
     with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL") as caught:
         bus.converse(slave, lambda _: coe_client.upload(0x2000, 0), "x")
-    assert caught.value.__notes__ == [
-        "unknown slave 36865; slaves known to the master: 1001 (drive)"
-    ]
+    assert caught.value.__notes__ == [f"address 0x9001 {NOT_A_SLAVE}"]
 
 
 def test_files_go_in_packets_that_fill_the_mailbox(bus, tmp_path) -> None:
@@ -149,9 +152,7 @@ def test_refusal_of_a_slave_that_the_master_does_not_know_has_a_hint(gateway, bu
     gateway.aborts_for = 1009  # as a gateway may, for want of a better error
     with pytest.raises(SdoAbortError) as caught:
         read_entry(bus, "1009", 0x1018, 1, kind=None, complete=False)
-    assert caught.value.__notes__ == [
-        "unknown slave 1009; slaves known to the master: 1001 (drive)"
-    ]
+    assert caught.value.__notes__ == [f"address 1009 {NOT_A_SLAVE}"]
 
 
 def test_slave_by_name_with_a_silent_master_has_a_remedy(silent_at_master):
