@@ -270,8 +270,10 @@ class Mailbox:
         try:
             message = yield from self._exchange(step, start_ns + step.timeout_ns)
         except EapError as exc:
-            error = exc
-            self._counters.fail(exc)
+            # The text of a lost frame names a register, and no slave.
+            is_lost = isinstance(exc, FrameLostError)
+            error = FrameLostError(f"slave {self.station}: {exc}") if is_lost else exc
+            self._counters.fail(error)
             if isinstance(exc, MailboxTimeoutError) and not step.listen:
                 self._queue.matcher(step.type).expire(step)
         _, now_ns = yield Sleep(0)
@@ -307,10 +309,7 @@ class Mailbox:
                 return reply
             _, now_ns = yield Sleep(pause_ns)
             if now_ns >= deadline_ns:
-                raise MailboxTimeoutError(
-                    f"slave {self.station}: no {step.type.name} reply within"
-                    f" {step.timeout_ns // 1_000_000} ms"
-                )
+                raise self._timeout(step, "")
             pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)
             is_full = yield from self._is_full(deadline_ns)
 
@@ -336,9 +335,13 @@ class Mailbox:
                     return reply
             _, now_ns = yield Sleep(MAX_PAUSE_NS)
             if now_ns >= deadline_ns:
-                raise MailboxTimeoutError(
-                    f"slave {self.station}: its mailbox is still full, the slave does not read it"
-                )
+                raise self._timeout(step, ": its mailbox is still full, the slave does not read it")
+
+    def _timeout(self, step: MailboxRequest, why: str) -> MailboxTimeoutError:
+        limit_ms = step.timeout_ns // 1_000_000
+        return MailboxTimeoutError(
+            f"slave {self.station}: no {step.type.name} reply within {limit_ms} ms{why}"
+        )
 
     def _write_message(self, message: bytes, deadline_ns: int) -> Procedure[WriteResult]:
         """Write a request; retry while no frame comes back."""

@@ -26,9 +26,9 @@ IDLE_S = 10.0
 """A conversation without a request for so long is ended: others may wait for it."""
 TURN_S = 30.0
 """Limit for the wait for a turn at a mailbox."""
-MARGIN_S = 10.0
+ENGINE_MARGIN_S = 10.0
 """Beyond the time-out of a mailbox message: those of other protocols may go first."""
-WAIT_UP_S = 5.0
+BUS_WAIT_UP_S = 5.0
 """Limit for the wait for a bus that is not up yet, or whose engine starts again."""
 TRANSFER_S = 5.0
 """Limit for datagrams."""

@@ -195,6 +195,7 @@ class BusPublisher:
             fault=bus.fault,
             stations=tuple(bus_slaves) or tuple(slave.station for slave in slaves),
             slaves=tuple(slaves),
+            is_silent=master.is_lost,
         )
         if self._send(message):
             self._sent, self._bus_slaves = revision, bus_slaves

@@ -267,7 +267,7 @@ _BY_EXCEPTION: dict[type[EapError], tuple[Cause, AdsError]] = {
     errors.MailboxProtocolError: (Cause.PROTOCOL, AdsError.GENERAL),
     errors.MailboxBusyError: (Cause.BUSY, AdsError.BUSY),
     errors.MailboxTimeoutError: (Cause.TIMEOUT, AdsError.TIMEOUT),
-    errors.FrameLostError: (Cause.TIMEOUT, AdsError.TIMEOUT),
+    errors.FrameLostError: (Cause.BUS_DOWN, AdsError.HOST_UNREACHABLE),
     errors.StateTimeoutError: (Cause.TIMEOUT, AdsError.TIMEOUT),
     errors.AlStatusError: (Cause.TIMEOUT, AdsError.STATE),
 }

@@ -43,7 +43,7 @@ T = TypeVar("T")
 REPORT_S = 0.1
 """Interval of calls of *meanwhile*."""
 
-_MARGIN_S = 10.0
+_SERVICES_MARGIN_S = 10.0
 """For services on its way back from a restart, beyond what it waits for itself."""
 _S = 1_000_000_000
 _PER_STEP = 60
@@ -109,7 +109,7 @@ class RunningBus:
 
     def forget(self) -> None:
         """Clear past faults of the running master."""
-        self._call(words.BUS_FORGET, words.WAIT_UP_S)
+        self._call(words.BUS_FORGET, words.BUS_WAIT_UP_S)
 
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name; raise BusError if that is not one."""
@@ -161,7 +161,7 @@ class RunningBus:
         return count_frames(self._describe())
 
     def _describe(self) -> BusReport:
-        return self._call(words.BUS_DESCRIBE, words.WAIT_UP_S, wait=True)
+        return self._call(words.BUS_DESCRIBE, words.BUS_WAIT_UP_S, wait=True)
 
     def _step(self, step: Step) -> StepReplies:
         if isinstance(step, Sleep):
@@ -202,7 +202,11 @@ class RunningBus:
         return opened.conversation
 
     def _exchange(self, number: int, request: MailboxRequest) -> bytes:
-        limit_s = (request.timeout_ns + request.delay_ns) / _S + words.MARGIN_S + _MARGIN_S
+        limit_s = (
+            (request.timeout_ns + request.delay_ns) / _S
+            + words.ENGINE_MARGIN_S
+            + _SERVICES_MARGIN_S
+        )
         answer = self._client.call(
             words.BUS_ASK,
             within_s=limit_s,
@@ -212,7 +216,9 @@ class RunningBus:
         return bytes.fromhex(answer.data)
 
     def _call(self, method: Method[ParametersT, AnswerT], limit_s: float, **params: Any) -> AnswerT:
-        return self._client.call(method, within_s=limit_s + _MARGIN_S, **self._where, **params)
+        return self._client.call(
+            method, within_s=limit_s + _SERVICES_MARGIN_S, **self._where, **params
+        )
 
 
 @contextmanager

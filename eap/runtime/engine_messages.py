@@ -251,6 +251,8 @@ class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):
     stations: tuple[int, ...]
     """All slaves in the order of the bus."""
     slaves: tuple[SlaveDescription, ...]
+    is_silent: bool = False
+    """Whether no frame comes back."""
 
 
 EngineMessage: TypeAlias = EngineReply | EngineStarted | UnsolicitedMessage | BusChange

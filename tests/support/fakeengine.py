@@ -138,6 +138,7 @@ class FakeBus:
                 SlaveDescription(**{name: getattr(each, name) for name in fields})
                 for each in report.slaves
             ),
+            is_silent=self.master.is_lost,
         )
 
 

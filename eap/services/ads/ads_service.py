@@ -168,7 +168,6 @@ def device_info(name: str, release: str) -> AdsDeviceInfo:
 
 
 def check_up(name: str, bus: BusDescription) -> None:
-    """Raise AdsRefusedError if a bus is not up."""
-    if not bus.is_up:
-        why = f"{name} is not up: {bus.fault or 'starting'}"
-        raise AdsRefusedError(AdsError.HOST_UNREACHABLE, why)
+    """Raise AdsRefusedError if no slave of a bus can be reached."""
+    if not bus.is_reachable:
+        raise AdsRefusedError(AdsError.HOST_UNREACHABLE, bus.describe_obstacle(name))

@@ -15,6 +15,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Container
 from functools import partial
 from itertools import count, islice
+from time import monotonic_ns
 from typing import NamedTuple, TypeAlias
 
 from devicebus.errors import MailboxTimeoutError, SoeError
@@ -359,8 +360,8 @@ def _device_info(slave: SlaveDescription) -> AdsDeviceInfo:
     return AdsDeviceInfo(high, middle, revision & 0xFFFF, device_name(slave.name))
 
 
-ANSWER_S = 4.0
-"""How long a request may take; routers give up after 4.5 s, clients after 5 s."""
+BUS_REQUEST_S = 4.0
+"""Limit for a request from its receipt: routers give up after 4.5 s, clients after 5 s."""
 _IN_HEADER = frozenset((AdsError.HOST_UNREACHABLE, AdsError.TARGET_PORT))
 """Errors of the way to a service, which belong into the AMS header."""
 _RESULT_SIZE = 4
@@ -402,14 +403,14 @@ class BusService:
         """Do the operations of a request; return its answer."""
         header = request.header
         client = AdsClient(request.endpoint, header.source, header.source_port)
-        end_s = asyncio.get_running_loop().time() + ANSWER_S
+        limit = _TimeLimit.of(request, f"{self._name}: ")
         try:
             perform = await self._performer(header.target_port, client)
         except AdsRefusedError as exc:
             return AmsAnswer(error_code=exc.result, why=exc.why)
         except EapError as exc:
             return AmsAnswer(error_code=ads_result(exc), why=str(exc))
-        perform_in_time = partial(_perform_until, end_s, perform)
+        perform_in_time = partial(_perform_within, limit, perform)
         answer = await answer_request(header.command, request.body, perform_in_time)
         result = int.from_bytes(answer.data[:_RESULT_SIZE], "little")
         # Routers put errors of the route into the AMS header, and clients look for them there.
@@ -428,7 +429,7 @@ class BusService:
         if ams_port == DEVICE_PORT:
             return lambda operation: self._master.perform(operation, client)
         slave = bus.slaves.get(ams_port)
-        if slave is None or not (bus.is_up and slave.to_slave):
+        if slave is None or not (bus.is_reachable and slave.to_slave):
             bus = await self._view.confirm()
             slave = bus.slaves.get(ams_port)
         if slave is None:
@@ -441,19 +442,56 @@ class BusService:
             # State and name are cached: a client can read them to see why the bus is down.
             if not isinstance(operation, ReadState | ReadDeviceInfo):
                 check_up(self._name, bus)
-            return await self._slaves.perform(found, client, operation)
+            try:
+                return await self._slaves.perform(found, client, operation)
+            except (AdsRefusedError, EapError) as exc:
+                # The texts of the engine name a slave by its address alone.
+                return _error_outcome(exc, f"{self._name}/{found.name}")
 
         return perform
 
 
-async def _perform_until(end_s: float, perform: Perform, operation: Operation) -> OperationOutcome:
+class _TimeLimit(NamedTuple):
+    """End of the time of a request, and the texts for an operation that does not fit into it."""
+
+    end_s: float
+    """Time of the running loop."""
+    not_begun: str
+    not_done: str
+
+    @classmethod
+    def of(cls, request: LocalRequest, where: str) -> _TimeLimit:
+        """Return the limit of a request, BUS_REQUEST_S behind its receipt."""
+        waited_s = (monotonic_ns() - request.queued_ns) / 1e9 if request.queued_ns else 0.0
+        end_s = asyncio.get_running_loop().time() + BUS_REQUEST_S - waited_s
+        target = request.header.target_port
+        not_done = f"{where}port {target}: not done within {BUS_REQUEST_S:g} s"
+        if not request.ahead:
+            return cls(end_s, not_done, not_done)
+        others = "1 other request" if request.ahead == 1 else f"{request.ahead} other requests"
+        wait = f"waited {waited_s:.1f} s behind {others} of this client"
+        not_begun = f"{where}{wait}: port {target} got no request; send fewer at a time"
+        return cls(end_s, not_begun, f"{not_done}: {wait}")
+
+
+async def _perform_within(
+    limit: _TimeLimit, perform: Perform, operation: Operation
+) -> OperationOutcome:
     """Do an operation, or return why it was not done; at the end of its time, that it was not."""
+    if asyncio.get_running_loop().time() >= limit.end_s:
+        return OperationOutcome(AdsError.TIMEOUT, why=limit.not_begun)
     try:
-        async with asyncio.timeout_at(end_s):
+        async with asyncio.timeout_at(limit.end_s):
             return await perform(operation)
     except TimeoutError:
-        return OperationOutcome(AdsError.TIMEOUT, why=f"not done within {ANSWER_S:g} s")
-    except AdsRefusedError as exc:
-        return OperationOutcome(exc.result, why=exc.why)
-    except EapError as exc:
-        return OperationOutcome(ads_result(exc), why=str(exc))
+        return OperationOutcome(AdsError.TIMEOUT, why=limit.not_done)
+    except (AdsRefusedError, EapError) as exc:
+        return _error_outcome(exc)
+
+
+def _error_outcome(error: AdsRefusedError | EapError, where: str = "") -> OperationOutcome:
+    if isinstance(error, AdsRefusedError):
+        result, why = error.result, error.why
+    else:
+        result, why = ads_result(error), str(error)
+    return OperationOutcome(result, why=f"{where}: {why}" if where and why else why)

@@ -27,14 +27,14 @@ from eap.services.slaves.file_stream import FileStream
 
 T = TypeVar("T")
 
-ANSWER_S = 3.0
+FILE_BLOCK_S = 3.0
 """How long one request may take."""
 IDLE_S = 30.0
 """A file without requests for so long is closed: other clients may wait for the slave."""
 ABANDONED_S = 2.0
 """A file without requests for so long gives way to the next one of its owner.
 
-Shorter than ANSWER_S, so that the next one has its turn at its first request; longer than the
+Shorter than FILE_BLOCK_S, so that the next one has its turn at its first request; longer than the
 pauses between the blocks of a transfer, since several programs may share one NetID.
 """
 MAX_OF_CLIENT = 8
@@ -241,7 +241,7 @@ class SlaveFiles:
 
 async def _in_time(work: Awaitable[T], what: str) -> T:
     try:
-        async with asyncio.timeout(ANSWER_S):
+        async with asyncio.timeout(FILE_BLOCK_S):
             return await work
     except TimeoutError:
         raise AdsRefusedError(AdsError.BUSY, f"{what}: not ready: repeat the request") from None

@@ -73,7 +73,7 @@ from eap.services.slaves.access import LocalSlave, SlaveAccess
 from eap.services.slaves.bus_client import BusClient
 from eap.services.tasks import TaskSet
 
-ANSWER_S = 0.9
+GATEWAY_ANSWER_S = 0.9
 """Limit for an answer, below the second after which usual clients give up."""
 STALL_S = 2.0
 """Wait of a slave for the client of a file after which that gives way to another client's."""
@@ -94,7 +94,7 @@ class Settings(NamedTuple):
 
     net_id: NetId
     """Of the bus port: targets of access rules."""
-    answer_s: float = ANSWER_S
+    answer_s: float = GATEWAY_ANSWER_S
     is_silent: bool = False
     """It sends no errors of its own, and answers only as slaves do."""
     max_size: int = 1486
@@ -382,12 +382,12 @@ class MailboxGateway:
         try:
             bus = await self._bus.view.current()
             slave = bus.slaves.get(station)
-            if not bus.is_up or slave is None or not slave.to_slave:
+            if not bus.is_reachable or slave is None or not slave.to_slave:
                 # Clients that have just seen a slave come to PREOP send their requests at once.
                 bus = await self._bus.view.confirm()
         except EngineGoneError:
             raise GatewayError(Cause.BUS_DOWN) from None
-        if not bus.is_up:
+        if not bus.is_reachable:
             raise GatewayError(Cause.BUS_DOWN)
         if (found := bus.slaves.get(station)) is None:
             raise GatewayError(Cause.NO_SLAVE)

@@ -37,6 +37,10 @@ class LocalRequest(NamedTuple):
     header: AmsHeader
     body: bytes
     endpoint: Endpoint
+    ahead: int = 0
+    """Requests of the same client to the same port that it waited for."""
+    queued_ns: int = 0
+    """Monotonic time of its receipt if it waited, else 0."""
 
 
 AnswerNow: TypeAlias = Callable[[AmsHeader, bytes], AmsAnswer | None]
@@ -201,7 +205,9 @@ class SerialQueues:
             self._finish(ticket, _FULL)
         else:
             self._octets += len(request.body)
-            queue.append(waiting)
+            # The client's time-out runs from the receipt, so that the wait is part of the time.
+            late = request._replace(ahead=1 + len(queue), queued_ns=monotonic_ns())
+            queue.append(waiting._replace(request=late))
 
     def forget(self, endpoint: Endpoint) -> None:
         """Drop requests from *endpoint* that wait for their turn; those that run continue."""

@@ -27,12 +27,13 @@ from devicebus.mailbox.conversation import (
     MailboxMessage,
     MailboxRequest,
 )
+from devicebus.master.findings import SlaveView, find_silence
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
-from eap.control.bus import BRING_S, MARGIN_S, TRANSFER_S, WAIT_UP_S
+from eap.control.bus import BRING_S, BUS_WAIT_UP_S, ENGINE_MARGIN_S, TRANSFER_S
 from eap.errors import EapError, EngineGoneError
 from eap.runtime.engine_messages import (
     BringSlaves,
@@ -50,7 +51,7 @@ from eap.runtime.engine_messages import (
 from eap.runtime.handover import PortName
 from eap.services.engine_link import EngineLink
 
-ANSWER_S = 1.0
+ENGINE_PING_S = 1.0
 
 
 class BusDescription(NamedTuple):
@@ -61,6 +62,20 @@ class BusDescription(NamedTuple):
     fault: str = "no report from the engine yet"
     slaves: Mapping[int, SlaveDescription] = MappingProxyType({})
     """By station address, in the order of the bus; while it is not up those that are expected."""
+    is_silent: bool = False
+    """Whether no frame comes back, so that nothing is known about any slave."""
+
+    @property
+    def is_reachable(self) -> bool:
+        """Whether frames reach its slaves and come back."""
+        return self.is_up and not self.is_silent
+
+    def describe_obstacle(self, name: str) -> str:
+        """Return why no slave of the bus *name* can be reached, as ``eapctl bus diag`` says it."""
+        if not self.is_up:
+            return f"{name} is not up: {self.fault or 'starting'}"
+        silence = find_silence([SlaveView(at, each.name) for at, each in self.slaves.items()])
+        return f"{name}: {silence.what}; {silence.advice}"
 
 
 class BusView:
@@ -106,10 +121,10 @@ class BusView:
         process image or from the slave itself, than has come here.
         """
         if self._is_complete:
-            await self._link.request(lambda number: Ping(id=number), ANSWER_S)
+            await self._link.request(lambda number: Ping(id=number), ENGINE_PING_S)
         else:
             await self._link.request(
-                lambda number: Republish(id=number, bus=self._number), ANSWER_S
+                lambda number: Republish(id=number, bus=self._number), ENGINE_PING_S
             )
         if not self._is_complete:
             raise EngineGoneError("no report from the engine about the bus")
@@ -122,7 +137,7 @@ class BusView:
         # Without the messages before, which another process has read, some slaves are not known.
         self._is_complete = all(station in known for station in change.stations)
         slaves = {station: known[station] for station in change.stations if self._is_complete}
-        self.latest = BusDescription(change.is_up, change.fault, slaves)
+        self.latest = BusDescription(change.is_up, change.fault, slaves, change.is_silent)
         for notify in self.on_change:
             notify()
 
@@ -206,7 +221,7 @@ class MailboxLock:
         """
         self._is_idle = False
         # The engine answers at the time-out of the slave itself; this limit is for a dead engine.
-        limit_s = (request.delay_ns + request.timeout_ns) / _NS_PER_S + MARGIN_S
+        limit_s = (request.delay_ns + request.timeout_ns) / _NS_PER_S + ENGINE_MARGIN_S
         reply = await self._link.request(lambda number: self._step(number, request), limit_s)
         return reply.message or MailboxMessage(self._kind, b"")
 
@@ -280,7 +295,7 @@ class BusClient:
         """Return the report of the bus once it is up.
 
         Raises:
-            BusError: it is not after WAIT_UP_S, with the reason.
+            BusError: it is not after BUS_WAIT_UP_S, with the reason.
             EngineGoneError: there is no engine all the while.
         """
         await self._wait_up()
@@ -291,7 +306,7 @@ class BusClient:
         if self.view.latest.is_up:
             return
         loop = asyncio.get_running_loop()
-        end_s = loop.time() + WAIT_UP_S
+        end_s = loop.time() + BUS_WAIT_UP_S
         while True:
             error: EapError
             try:
@@ -301,7 +316,7 @@ class BusClient:
             else:
                 if bus.is_up:
                     return
-                error = BusError(f"{self.name} is not up: {bus.fault or 'starting'}")
+                error = BusError(bus.describe_obstacle(self.name))
             if loop.time() >= end_s:
                 raise error
             await asyncio.sleep(_POLL_S)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+from time import monotonic_ns
 
 import pytest
 
@@ -27,13 +28,15 @@ from eap.codec.ads import (
     device_name,
 )
 from eap.codec.adsnotification import AddNotification, TransMode
-from eap.codec.ams import AmsCommand
+from eap.codec.ams import AmsCommand, AmsHeader
 from eap.codec.mailbox import MailboxType
+from eap.runtime.bus_status import report_findings
 from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.ads import bus_ads as service
 from eap.services.ads import slave_files
 from eap.services.device.master_values import MasterView
-from tests.support.busads import DRIVE, MASTER, play, until
+from eap.services.routing.service import LocalRequest
+from tests.support.busads import BUS, DRIVE, MASTER, TOOL, play, until
 
 VENDOR = Read(IndexGroup.SDO, 0x1018_0001, 4)
 VENDOR_ID = b"\x5a\x0e\0\0"
@@ -211,6 +214,44 @@ def test_bus_that_is_down_is_host_unreachable():
     play(scene)
 
 
+def test_bus_without_frames_is_host_unreachable_with_the_words_of_its_finding():
+    async def scene(client, engine):
+        await client.good(DRIVE, VENDOR)
+        bus = engine.buses[0]
+        bus.line.fault(kind="loss")
+        await until(lambda: _is_silent(client))
+        answer = await client.answer(DRIVE, AmsCommand.READ, AdsRange(*VENDOR).encode())
+        assert answer[:2] == (b"", AdsError.HOST_UNREACHABLE)
+        finding = report_findings(bus.report())[0]
+        assert answer.why == f"left/bus0: {finding.what}; {finding.advice}"
+
+    play(scene)
+
+
+async def _is_silent(client) -> bool:
+    return (await client.bus.view.confirm()).is_silent
+
+
+def test_request_that_waited_behind_others_has_the_rest_of_its_time(monkeypatch):
+    async def scene(client, engine):
+        header = AmsHeader(BUS, DRIVE, TOOL, 30000, AmsCommand.READ, length=12)
+        waited = LocalRequest(
+            header, AdsRange(*VENDOR).encode(), client.endpoint, 2, monotonic_ns()
+        )
+        assert (await client.service.answer(waited)).data[8:] == VENDOR_ID
+        monkeypatch.setattr(service, "BUS_REQUEST_S", 0.0)
+        engine.requests.clear()
+        late = await client.service.answer(waited)
+        assert late.data[:4] == b"\x19\7\0\0"
+        assert late.why == (
+            "left/bus0: waited 0.0 s behind 2 other requests of this client:"
+            " port 1001 got no request; send fewer at a time"
+        )
+        assert not engine.requests
+
+    play(scene)
+
+
 def test_engine_that_is_gone_is_host_unreachable():
     async def scene(client, engine):
         engine.holds = True
@@ -240,13 +281,13 @@ def test_sum_command_has_a_result_for_each_item():
 
 
 def test_operation_that_takes_too_long_is_answered_in_time(monkeypatch):
-    monkeypatch.setattr(service, "ANSWER_S", 0.05)
+    monkeypatch.setattr(service, "BUS_REQUEST_S", 0.05)
 
     async def scene(client, engine):
         engine.holds, engine.held_kind = True, ExchangeMailbox
         outcome = await client.do(DRIVE, sum_of(IndexGroup.SUM_READ, VENDOR, VENDOR))
         assert outcome.data[:8] == 2 * b"\x19\7\0\0"
-        assert client.why == "; ".join(2 * ["not done within 0.05 s"])
+        assert client.why == "; ".join(2 * ["left/bus0: port 1001: not done within 0.05 s"])
         engine.release()
         assert await client.good(DRIVE, VENDOR) == VENDOR_ID
 
@@ -270,13 +311,13 @@ def test_answer_longer_than_the_room_of_the_client_is_refused(length):
     async def scene(client, engine):
         outcome = await client.do(DRIVE, VENDOR._replace(length=length))
         assert outcome == OperationOutcome(AdsError.SIZE)
-        assert client.why == f"4 bytes, the client has room for {length}"
+        assert client.why == f"left/bus0/drive: 4 bytes, the client has room for {length}"
 
     play(scene)
 
 
 def test_request_of_any_content_is_answered(monkeypatch):
-    monkeypatch.setattr(slave_files, "ANSWER_S", 0.01)
+    monkeypatch.setattr(slave_files, "FILE_BLOCK_S", 0.01)
     monkeypatch.setattr(service, "COMMAND_ANSWER_S", 0.01)
     pick = random.Random(7)
     groups = [*IndexGroup, 0, 0x8000_0000]

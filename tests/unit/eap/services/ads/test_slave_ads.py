@@ -58,7 +58,7 @@ def test_slave_without_an_open_mailbox_is_answered_with_its_state():
         await until(is_there)
         outcome = await client.do(DRIVE, Read(IndexGroup.SDO, 0x1018_0001, 4))
         assert outcome.result == AdsError.STATE
-        assert client.why == "slave 1001 (drive) has no mailbox in INIT"
+        assert client.why == "left/bus0/drive: slave 1001 (drive) has no mailbox in INIT"
 
     play(scene)
 
@@ -73,7 +73,7 @@ def test_slave_that_does_not_answer_is_a_timeout():
             await until(is_gone)
             outcome = await client.do(OTHER_SLAVE, Read(IndexGroup.SDO, 0x1018_0001, 4))
             assert outcome.result == AdsError.TIMEOUT
-            assert client.why == "slave 1002 does not answer"
+            assert client.why == "left/bus0/other: slave 1002 does not answer"
 
     play(scene, "files")
 
@@ -234,7 +234,7 @@ def test_procedure_command_that_takes_long_is_busy_until_it_is_done(monkeypatch)
     async def scene(client, engine):
         command = Write(IndexGroup.SOE, place(COMMAND, is_command=1), b"")
         assert (await client.do(DRIVE, command)).result == AdsError.BUSY
-        assert client.why == "S-0-0099 is being executed: repeat the request"
+        assert client.why == "left/bus0/drive: S-0-0099 is being executed: repeat the request"
         value = await client.read(DRIVE, IndexGroup.SOE, place(MODE, Element.VALUE))
         assert value == b"\2\0\0\0"  # the drive can be talked to meanwhile
 

@@ -132,14 +132,14 @@ def test_file_handle_belongs_to_a_net_id_through_any_connection():
 
 
 def test_file_is_busy_while_the_slave_moves_another_one(monkeypatch):
-    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "FILE_BLOCK_S", 0.05)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         await client.ask(DISK, WRITE, handle, b"begun", 0)
         second = await client.do(DISK, ReadWrite(OPEN_READ, 0, 4, b"a.bin"))
         assert second.result == AdsError.BUSY
-        assert client.why == "another file goes to slave 1001 or comes from it"
+        assert client.why == "left/bus0/disk: another file goes to slave 1001 or comes from it"
         waiting = asyncio.ensure_future(client.open_file(DISK, OPEN_READ, b"a.bin"))
         await asyncio.sleep(0)
         await client.ask(DISK, CLOSE, handle)
@@ -204,7 +204,7 @@ def test_file_left_open_does_not_count_when_its_owner_opens_the_next_one(monkeyp
 
 def test_file_left_open_does_not_give_way_to_other_clients(monkeypatch):
     monkeypatch.setattr(slave_files, "ABANDONED_S", 0)
-    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "FILE_BLOCK_S", 0.05)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -218,7 +218,7 @@ def test_file_left_open_does_not_give_way_to_other_clients(monkeypatch):
 
 def test_file_in_use_does_not_give_way_to_the_next_one_of_its_owner(monkeypatch):
     monkeypatch.setattr(slave_files, "ABANDONED_S", 0.05)
-    monkeypatch.setattr(slave_files, "ANSWER_S", 0.1)
+    monkeypatch.setattr(slave_files, "FILE_BLOCK_S", 0.1)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -249,7 +249,7 @@ def test_file_that_is_given_up_keeps_its_content():
 
 
 def test_file_of_a_slow_slave_is_busy_until_it_goes_on(monkeypatch):
-    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "FILE_BLOCK_S", 0.05)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -259,7 +259,10 @@ def test_file_of_a_slow_slave_is_busy_until_it_goes_on(monkeypatch):
         for group, data in ((WRITE, b"more"), (CLOSE, b"")):
             late = await client.do(DISK, ReadWrite(group, handle, 0, data))
             assert late.result == AdsError.BUSY
-            assert client.why == "file 'a.bin' of slave 1001: not ready: repeat the request"
+            assert (
+                client.why
+                == "left/bus0/disk: file 'a.bin' of slave 1001: not ready: repeat the request"
+            )
         more = await client.do(DISK, ReadWrite(WRITE, handle, 0, b"more"))
         assert more.result == AdsError.STATE  # it was said that there is no more
         engine.release()
@@ -272,7 +275,7 @@ def test_file_of_a_slow_slave_is_busy_until_it_goes_on(monkeypatch):
 
 
 def test_file_that_is_opened_late_is_read_then(monkeypatch):
-    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "FILE_BLOCK_S", 0.05)
 
     async def scene(client, engine):
         hold_mailboxes(engine)

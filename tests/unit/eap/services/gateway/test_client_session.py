@@ -251,7 +251,7 @@ def test_session_last_step_of_a_download_may_take_longer(is_long: bool, cause: C
         (MailboxProtocolError("x"), Cause.PROTOCOL),
         (NoMailboxError("x"), Cause.NO_MAILBOX),
         (MailboxClosedError("x"), Cause.TIMEOUT),
-        (FrameLostError("x"), Cause.TIMEOUT),
+        (FrameLostError("x"), Cause.BUS_DOWN),
         (BusError("x"), Cause.TIMEOUT),
         (EngineGoneError("x"), Cause.BUS_DOWN),
         (GatewayError(Cause.CROWDED), Cause.CROWDED),

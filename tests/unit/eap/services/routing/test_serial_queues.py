@@ -152,3 +152,19 @@ def test_queue_close_cancels_running_requests():
         await settle()
 
     assert play(script) == []
+
+
+def test_queue_counts_the_requests_before_one_and_notes_its_receipt():
+    seen: list[LocalRequest] = []
+
+    async def script(queues, slow):
+        for ticket in range(1, 4):
+            queues.put(ticket, StubService(slow), request())
+        queues.put(4, StubService(lambda each: seen.append(each) or AmsAnswer()), request())
+        queues.put(5, StubService(lambda each: seen.append(each) or AmsAnswer()), request(port=1))
+        slow.access_filter.set()
+        await settle()
+
+    play(script)
+    assert [each.ahead for each in seen] == [0, 3]
+    assert [each.queued_ns > 0 for each in seen] == [False, True]

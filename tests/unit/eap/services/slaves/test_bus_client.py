@@ -226,7 +226,7 @@ def test_bus_that_is_not_up_is_waited_for(monkeypatch):
         engine.buses[0].is_up = False
         engine.say_hello()
         await settle()
-        monkeypatch.setattr(bus_client, "WAIT_UP_S", 0.1)
+        monkeypatch.setattr(bus_client, "BUS_WAIT_UP_S", 0.1)
         with pytest.raises(BusError, match="left/bus0 is not up: no frame comes back"):
             await client.converse(SENSOR, vendor(), 1)
         assert not (await client.describe()).is_up
@@ -242,7 +242,7 @@ def test_engine_that_is_gone(monkeypatch):
             await client.converse(SENSOR, vendor(), 1)
         with pytest.raises(EngineGoneError):
             await client.describe(0.05)
-        monkeypatch.setattr(bus_client, "WAIT_UP_S", 0.1)
+        monkeypatch.setattr(bus_client, "BUS_WAIT_UP_S", 0.1)
         with pytest.raises(EngineGoneError):
             await client.wait_up()
 
