@@ -67,8 +67,9 @@ def check_port_reference(
 def _check_frame(
     index: Index, report: FindingReport, station: StationSection, frame: FrameSection
 ) -> None:
-    report.add_breaches(frame.at, rules.check_modulo(frame.name, frame.divider, frame.modulo))
     pds = [pd for pd in station.publish if pd.frame == frame.name]
+    spec = frame.spec(frame.to, tuple(pd.spec() for pd in pds))
+    report.add_breaches(frame.at, rules.check_frame(spec, frame.modulo))
     known = {each.name for each in station.frames}
     # A PD with errors may be the one that belongs here.
     if not pds and not report.broken and all(pd.frame in known for pd in station.publish):
@@ -135,13 +136,7 @@ def _check_triggers(
     index: Index, report: FindingReport, station: StationSection, pd: PublishSection
 ) -> None:
     spec, frame = pd.spec(), index.frames.get((station.name, pd.frame))
-    report.add_breaches(pd.at, rules.check_modulo(pd.name, pd.divider, pd.modulo))
-    report.add_breaches(pd.at, rules.check_triggers(spec))
-    for key in ("timeout_ms", "inhibit_us"):
-        value = getattr(pd.on_change, key, 0)
-        if not 0 <= value <= 0xFFFF_FFFF:
-            expected = "0 (off) to 4294967295"
-            report.add(f"{pd.at}.on_change.{key}", f"{key} is {value}", expected)
+    report.add_breaches(pd.at, rules.check_pd(spec, pd.modulo))
     if pd.modulo is not None and not pd.divider:
         spec = replace(spec, trigger=replace(spec.trigger, modulo=0))  # reported above
     gate = None if frame is None else frame.spec(frame.to)
@@ -174,7 +169,6 @@ def check_polls(index: Index, report: FindingReport) -> None:
             _check_poll_frame(report, station, frame)
         for pd in station.publish:
             if pd.poll:
-                report.add_breaches(pd.at, rules.check_polled(pd.spec()))
                 _check_answer(index, report, station, pd)
         for subscription in station.subscribe:
             if subscription.poll:
@@ -185,7 +179,6 @@ def check_polls(index: Index, report: FindingReport) -> None:
 
 def _check_poll_frame(report: FindingReport, station: StationSection, frame: FrameSection) -> None:
     spec, line = frame.spec(frame.to), report.line_of(f"{frame.at}.to")
-    report.add_breaches(frame.at, rules.check_answers(spec))
     for pd in station.publish:
         if pd.frame == frame.name:
             report.add_breaches(pd.at, rules.check_frame_of(pd.spec(), spec, f"line {line}"))

@@ -356,19 +356,15 @@ def _breaches_of_frame(frame: TxFrameSpec, uri: InterfaceUri) -> Iterator[RuleVi
     destination = None if is_answer else Destination.parse(frame.destination)
     return chain(
         # A dictionary cannot tell "no modulo" from 0.
-        rules.check_modulo(frame.name, frame.divider, frame.modulo or None),
-        rules.check_answers(frame),
+        rules.check_frame(frame, frame.modulo or None),
         chain.from_iterable(rules.check_frame_of(pd, frame) for pd in frame.pds),
         rules.check_monitoring(frame, destination, uri),
     )
 
 
 def _breaches_of_pd(pd: TxPdSpec, frame: TxFrameSpec, cycle_us: int) -> Iterator[RuleViolation]:
-    trigger = pd.trigger
     return chain(
-        rules.check_polled(pd),
-        rules.check_triggers(pd),
-        rules.check_modulo(pd.name, trigger.divider, trigger.modulo or None),
+        rules.check_pd(pd, pd.trigger.modulo or None),
         rules.check_times(pd, frame, cycle_us),
     )
 

@@ -95,6 +95,23 @@ def check_phase(cycle_us: int, phase_us: int) -> Iterator[RuleViolation]:
         yield RuleViolation(FaultCode.CYCLE_TIME, "phase_us", message, f"less than {cycle_us}")
 
 
+def check_frame(frame: TxFrameSpec, modulo: int | None) -> Iterator[RuleViolation]:
+    """Yield the violations of the rules that *frame* has to meet by itself and with its PDs.
+
+    Plant file and dictionary both call this function: a new rule is called here.  *modulo* is None
+    if none is given.
+    """
+    yield from check_modulo(frame.name, frame.divider, modulo)
+    yield from check_answers(frame)
+
+
+def check_pd(pd: TxPdSpec, modulo: int | None) -> Iterator[RuleViolation]:
+    """Yield the violations of the rules that *pd* has to meet by itself, as :func:`check_frame`."""
+    yield from check_polled(pd)
+    yield from check_triggers(pd)
+    yield from check_modulo(pd.name, pd.trigger.divider, modulo)
+
+
 def check_modulo(name: str, divider: int | None, modulo: int | None) -> Iterator[RuleViolation]:
     """A modulo is one of its divider."""
     if modulo is None:
