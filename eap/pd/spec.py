@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from enum import StrEnum
 from functools import lru_cache, partial
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from eap.ids import InterfaceUri, NetId, decode_value, encode_value
+
+_U32 = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF_FFFF)]
 
 
 class Writer(StrEnum):
@@ -141,9 +143,9 @@ Source = EngineSource | ServicesSource
 class OnChangeSpec(SpecRecord, frozen=True):
     """Send when the data differs from the data sent last."""
 
-    timeout_ms: int = 0
+    timeout_ms: _U32 = 0
     """Send again though unchanged after this time; 0 never."""
-    inhibit_us: int = 0
+    inhibit_us: _U32 = 0
     """Shortest gap between two frames sent for a change; 0 none."""
 
 

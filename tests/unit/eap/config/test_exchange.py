@@ -64,7 +64,14 @@ def frame(text):
             "15: PD 'state' is sent on change and has a divider; o",
         ),
         ([pd("on_change: true")], "15: on_change is True; a mapping"),
-        ([pd("on_change: {timeout_ms: -1}")], "15: timeout_ms is -1; 0 (off) to 4294967295"),
+        (
+            [pd("on_change: {timeout_ms: -1}")],
+            "15: timeout_ms is -1; a whole number of milliseconds from 0 to 4294967295",
+        ),
+        (
+            [pd("on_change: {inhibit_us: 4294967296}")],
+            "15: inhibit_us is 4294967296; a whole number of microseconds from 0 to 4294967295",
+        ),
         (
             [pd("on_change: {timeout_ms: 1, inhibit_us: 1001}")],
             "15: PD 'state' is to be sent again before changes may be; timeout_ms of at least 2",
