@@ -315,7 +315,11 @@ class TxFrame:
 
     @property
     def is_plain(self) -> bool:
-        """True if the frame goes whole by its schedule and nothing holds it back."""
+        """True if the frame goes whole by its schedule and nothing holds it back.
+
+        Anything that decides for each cycle makes it false: :meth:`select` is never called for
+        plain frames.
+        """
         return (
             self.schedule is not None
             and not self.is_held

@@ -6,9 +6,12 @@ them.  Clients find everything by name through SDO information.
 
 To add a field of the plant file: its section (``eap.config.structs``) and its record
 (``eap.pd.spec``) get it, a row here names both, and docs/plant-file.md explains it; dictionaries,
-checks of entries, plans and docs/objects.md follow.  A TxFrame ends with the list of its PDs: a new
-entry takes the first sub-index of that list.  Stored objects are then those of another version
-(``eap.device.configuration.VERSION``), and are made anew from the stored specification.
+checks of entries, plans and docs/objects.md follow.  A TxFrame ends with the list of its PDs:
+sub-index 0, the highest sub-index, gives the length of the list, so that nothing can follow it.  A
+new entry takes the first sub-index of the list, and the list moves up by one.  A script that writes
+the list by number then writes another entry: CHANGELOG.md names it.  Stored objects are then those
+of another version (``eap.device.configuration.VERSION``), and are made anew from the stored
+specification.
 """
 
 from __future__ import annotations
