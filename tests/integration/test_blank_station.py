@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from eap.od.profiles.eap1000 import FrameSub
 from tests.support.appliance import Appliance, Plants, run_eapctl, troubles, wait_until
 
 pytestmark = pytest.mark.net
@@ -50,7 +51,7 @@ WRITES = [
     ("0xD000:5", "true"),
     ("0x8000:2", "2"),
     ("0x8000:5", "127.9.8.1"),
-    ("0x8000:10", "0xD000"),
+    (f"0x8000:{FrameSub.TXPD:X}", "0xD000"),
     ("0x8000:1", "true"),
     # What it receives.
     ("0x7000:4", "UINT"),

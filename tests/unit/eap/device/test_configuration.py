@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 
 from eap.device.configuration import (
+    VERSION,
     StoredError,
     adopt_configuration,
     compare,
@@ -16,7 +17,7 @@ from eap.device.configuration import (
 from eap.device.eap_dictionary import EapDictionary
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import RX_PD, TX_PD, FrameSub, Rx, Tx, Var
+from eap.od.profiles.eap1000 import RX_PD, TX_PD, TX_VARIABLE, FrameSub, Rx, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import OP, copy, mapping, receiver, sender, tx_pd, variable, write
 from tests.support.examples import examples
@@ -116,24 +117,30 @@ def test_unknown_entries_are_refused_and_change_nothing(udp, code, kept):
     assert read_configuration(udp) == before
 
 
+_STORED = {"version": VERSION, "profile": 1000, "objects": {}}
+
+
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"[]", "no stored configuration"),
-        (b'{"version": 1}', "no stored configuration"),
-        (b'{"version": 2, "profile": 1000, "objects": {}}', "version 2, this release knows 1"),
-        (b'{"version": 1, "profile": 9000, "objects": {}}', "profile 9000, this is 1000"),
-        (b'{"version": 1, "profile": 1000, "objects": {"x": {}}}', "no stored configuration"),
-        (b'{"version": 1, "profile": 1000, "objects": {"6000": {"5": "0"}}}', "no stored"),
-        (b'{"version": 1, "profile": 1000, "objects": {"5000": {"0": "00"}}}', "does not exist"),
-        (b'{"version": 1, "profile": 1000, "objects": {}, "more": 1}', "no stored configuration"),
+        ([], "no stored configuration"),
+        ({"version": VERSION}, "no stored configuration"),
+        (
+            _STORED | {"version": VERSION + 1},
+            f"version {VERSION + 1}, this release knows {VERSION}",
+        ),
+        (_STORED | {"profile": 9000}, "profile 9000, this is 1000"),
+        (_STORED | {"objects": {"x": {}}}, "no stored configuration"),
+        (_STORED | {"objects": {"6000": {"5": "0"}}}, "no stored"),
+        (_STORED | {"objects": {"5000": {"0": "00"}}}, "does not exist"),
+        (_STORED | {"more": 1}, "no stored configuration"),
     ],
 )
 def test_invalid_stored_configuration_is_refused_with_reason(udp, data, reason):
     sender(udp)
     before = dump_configuration(udp)
     with pytest.raises(StoredError, match=reason):
-        load_configuration(udp, msgspec.json.decode(data))
+        load_configuration(udp, data)
     assert dump_configuration(udp) == before
 
 
@@ -221,10 +228,10 @@ def test_a_variable_more_in_a_pd_empties_its_mapping_first(udp):
 def test_removed_objects_are_deleted_after_their_references(udp):
     sender(udp)
     assert _told(udp, udp.blank()) == [
-        ("removed", "TxFrame 0 (frame0)", "16", "", False),
+        ("removed", "TxFrame 0 (frame0)", str(FrameSub.TXPD.value), "", False),
         ("removed", "TxPDO mapping 0", "1", "", False),
-        ("removed", "TxPD 0 (txpd0)", "18", "", False),
-        ("removed", "Tx variable 0 (level)", "10", "", False),
+        ("removed", "TxPD 0 (txpd0)", str(TX_PD.fixed_count), "", False),
+        ("removed", "Tx variable 0 (level)", str(TX_VARIABLE.fixed_count), "", False),
     ]
 
 
@@ -233,7 +240,9 @@ def test_a_pd_more_in_a_frame_goes_to_the_end_of_its_list(udp):
     new = copy(udp)
     write(new, 0x8000, FrameSub.TXPD + 1, tx_pd(new, 0xD001, 0x1A00, 2))
     changes = [change for change in compare(udp, new) if change.index == 0x8000]
-    assert [(c.kind, c.subindex, c.new) for c in changes] == [("added", 17, "0xD001")]
+    assert [(c.kind, c.subindex, c.new) for c in changes] == [
+        ("added", FrameSub.TXPD + 1, "0xD001")
+    ]
 
 
 def test_pds_that_change_their_places_leave_the_frame_first(udp):

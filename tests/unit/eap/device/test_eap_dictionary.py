@@ -16,7 +16,16 @@ from eap.od import info, model
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, ObjectCode, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import MORE_TX_PDO, AddressMode, EapLive, FrameSub, Rx, Tx, Var
+from eap.od.profiles.eap1000 import (
+    MAX_ENTRIES,
+    MORE_TX_PDO,
+    AddressMode,
+    EapLive,
+    FrameSub,
+    Rx,
+    Tx,
+    Var,
+)
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import PortKind, PortSpec, VariableSpec
 from tests.support.downloads import (
@@ -70,10 +79,10 @@ def test_zero_empties_a_mapping_which_stays(udp):
 
 def test_a_list_grows_by_writing_behind_its_end_and_shrinks_by_its_count(udp):
     write(udp, 0x8000, FrameSub.TXPD + 2, 0xD002)
-    assert udp[0x8000].max_subindex == 18
+    assert udp[0x8000].max_subindex == FrameSub.TXPD + 2
     assert udp.upload(0x8000, FrameSub.TXPD, PREOP) == b"\0\0"
-    write(udp, 0x8000, 0, 16)
-    assert max(udp[0x8000].entries) == 16
+    write(udp, 0x8000, 0, FrameSub.TXPD)
+    assert max(udp[0x8000].entries) == FrameSub.TXPD
 
 
 @pytest.mark.parametrize(
@@ -473,10 +482,10 @@ def test_members_are_listed_in_order_of_their_indexes(udp):
 
 
 def test_a_longest_list_has_names_for_all_entries(udp):
-    item = udp.make_object(profile.TX_FRAME, 0x8000, last=254)
+    item = udp.make_object(profile.TX_FRAME, 0x8000, last=MAX_ENTRIES)
     assert item.entries[FrameSub.TXPD].name == "TxPD 0"
-    assert item.entries[254].name == "TxPD 238"
-    assert item.max_subindex == 254
+    assert item.entries[MAX_ENTRIES].name == f"TxPD {MAX_ENTRIES - FrameSub.TXPD}"
+    assert item.max_subindex == MAX_ENTRIES
 
 
 def test_growing_what_has_no_list_changes_nothing(udp):

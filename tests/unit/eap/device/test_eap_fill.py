@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import msgspec
 import pytest
 from hypothesis import given
 from msgspec.structs import replace
@@ -8,7 +11,17 @@ from eap.device.configuration import read_configuration
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill
 from eap.ids import InterfaceUri, NetId
-from eap.od.profiles.eap1000 import RX_PD, RX_VARIABLE, TX_FRAME, TX_PD, TX_VARIABLE, Tx, Var
+from eap.od.profiles.eap1000 import (
+    MAX_ENTRIES,
+    RX_PD,
+    RX_VARIABLE,
+    TX_FRAME,
+    TX_PD,
+    TX_VARIABLE,
+    FrameSub,
+    Tx,
+    Var,
+)
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import (
     PortKind,
@@ -22,6 +35,8 @@ from eap.pd.spec import (
 )
 from tests.support.examples import examples
 from tests.support.stations import BLANK, filled, stations
+
+FEATURES = Path(__file__).parents[4] / "docs" / "features.md"
 
 
 def _names(dictionary: EapDictionary, row) -> list[str]:
@@ -143,8 +158,27 @@ def test_specification_too_large_is_refused_with_its_object(variables, sent, ind
 
 
 def test_a_frame_lists_as_many_pds_as_its_object_has_entries():
-    pds = tuple(TxPdSpec(f"pd{number}", number, ("own",)) for number in range(240))
+    most = MAX_ENTRIES - FrameSub.TXPD + 1
+    assert f"a list of more than {most} PDs in a frame" in FEATURES.read_text(encoding="utf-8")
+    pds = tuple(TxPdSpec(f"pd{number}", number, ("own",)) for number in range(most + 1))
     frames = (TxFrameSpec("f", "eap0", "tcp://10.0.0.2", pds),)
     station = replace(BLANK, variables=(VariableSpec("own", "BIT1"),), frames=frames)
-    with pytest.raises(DeviceFault, match="240 entries, at most 239"):
+    with pytest.raises(DeviceFault, match=f"{most + 1} entries, at most {most}"):
         filled(station)
+
+
+def test_stations_strategy_varies_each_field_of_frames_and_pds():
+    """Properties see a new field only if ``tests/support/stations.py`` fills it."""
+    seen: dict[type, set[str]] = {TxFrameSpec: set(), TxPdSpec: set(), RxPdSpec: {"alternates"}}
+
+    @examples(800)
+    @given(stations())
+    def collect(station: StationSpec) -> None:
+        pds = [pd for frame in station.frames for pd in frame.pds]
+        for record in (*station.frames, *pds, *station.subscriptions):
+            fields = msgspec.structs.fields(record)
+            seen[type(record)] |= {f.name for f in fields if getattr(record, f.name) != f.default}
+
+    collect()
+    # A dictionary has no entry for alternates: they last only while a sender changes.
+    assert seen == {kind: set(kind.__struct_fields__) for kind in seen}

@@ -80,12 +80,21 @@ def _change(dictionary: EapDictionary, *writes: tuple[int, int, object]) -> EapD
         ([(0xD000, Tx.PDO_INDEX, 0)], (FaultCode.NO_PDO, 0xD000, Tx.PDO_INDEX)),
         ([(0xD000, Tx.PDO_INDEX, 0x1A09)], (FaultCode.MISSING_OBJECT, 0xD000, Tx.PDO_INDEX)),
         ([(0x1A00, 0, 0)], (FaultCode.EMPTY_PDO, 0x1A00, 0)),
-        ([(0x8000, 17, 0xD009)], (FaultCode.MISSING_OBJECT, 0x8000, 17)),
-        ([(0x8000, 17, 0xD000)], (FaultCode.PD_IN_TWO_FRAMES, 0x8000, 17)),
-        ([(0x8001, 16, 0xD000)], (FaultCode.PD_IN_TWO_FRAMES, 0x8001, 16)),
-        ([(0x8000, 16, 0)], (FaultCode.EMPTY_FRAME, 0x8000, 16)),
-        ([(0xD000, Tx.ENABLED, 0)], (FaultCode.EMPTY_FRAME, 0x8000, 16)),
-        ([(0x8000, 16, 0), (0x8000, 1, 0)], (FaultCode.PD_WITHOUT_FRAME, 0xD000, 0)),
+        (
+            [(0x8000, FrameSub.TXPD + 1, 0xD009)],
+            (FaultCode.MISSING_OBJECT, 0x8000, FrameSub.TXPD + 1),
+        ),
+        (
+            [(0x8000, FrameSub.TXPD + 1, 0xD000)],
+            (FaultCode.PD_IN_TWO_FRAMES, 0x8000, FrameSub.TXPD + 1),
+        ),
+        ([(0x8001, FrameSub.TXPD, 0xD000)], (FaultCode.PD_IN_TWO_FRAMES, 0x8001, FrameSub.TXPD)),
+        ([(0x8000, FrameSub.TXPD, 0)], (FaultCode.EMPTY_FRAME, 0x8000, FrameSub.TXPD)),
+        ([(0xD000, Tx.ENABLED, 0)], (FaultCode.EMPTY_FRAME, 0x8000, FrameSub.TXPD)),
+        (
+            [(0x8000, FrameSub.TXPD, 0), (0x8000, FrameSub.ENABLED, 0)],
+            (FaultCode.PD_WITHOUT_FRAME, 0xD000, 0),
+        ),
         ([(0x8000, 5, bytes(4))], (FaultCode.NO_DESTINATION, 0x8000, 5)),
         ([(0x8000, 2, AddressMode.MAC)], (FaultCode.NO_DESTINATION, 0x8000, 2)),
         (
@@ -176,9 +185,10 @@ def test_a_frame_that_is_too_long_is_a_fault_of_the_frame(udp):
         mapping(udp, 0x1A00 + number, (0x6000 + number, 255))
         tx_pd(udp, 0xD000 + number, 0x1A00 + number, number)
     frame(udp, 0x8000, 0xD000)
-    udp.grow(0x8000, 17)
-    udp[0x8000].entries[17].value = 0xD001
-    udp[0x8000].entries[0].value = 17
+    second = FrameSub.TXPD + 1
+    udp.grow(0x8000, second)
+    udp[0x8000].entries[second].value = 0xD001
+    udp[0x8000].entries[0].value = second
     assert _fault(udp) == (FaultCode.FRAME_TOO_LONG, 0x8000, FrameSub.FRAME_LENGTH)
 
 

@@ -200,7 +200,11 @@ def _downloads(draw: st.DrawFn) -> tuple[int, int, object]:
             st.tuples(st.just(0xE000), st.just(Rx.PDO_INDEX), _NUMBERS.map(0x1600.__add__)),
             st.tuples(st.just(0xE000), st.just(Rx.FLAGS), st.sampled_from([0x80, 0x85, 0])),
             st.tuples(st.just(0xE000), st.sampled_from(list(Rx)), st.integers(0, 20)),
-            st.tuples(st.just(0x8000), st.integers(16, 18), _NUMBERS.map(0xD000.__add__)),
+            st.tuples(
+                st.just(0x8000),
+                st.integers(FrameSub.TXPD, FrameSub.TXPD + 2),
+                _NUMBERS.map(0xD000.__add__),
+            ),
             st.tuples(st.just(0x8000), st.sampled_from(list(FrameSub)), st.integers(0, 5)),
             st.tuples(
                 st.sampled_from([0x6000, 0x7000, 0x8000, 0xD000, 0xE000]), st.just(0), st.just(0)

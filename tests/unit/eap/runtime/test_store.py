@@ -16,13 +16,13 @@ from msgspec.structs import replace
 
 from eap.ams.spec import HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.config.load import load
-from eap.device.configuration import load_configuration as load_objects
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import read_back
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.device import DeviceState
 from eap.pd.spec import RxAlternateSpec, SentVariableSpec
 from eap.runtime import store as module
+from eap.runtime.device_change import fill_all
 from eap.runtime.durable import seal
 from eap.runtime.store import (
     VERSION,
@@ -492,7 +492,7 @@ def test_state_folder_of_the_version_before_is_taken_over(tmp_path, monkeypatch,
         assert kept.base == digest_of(before)
         assert kept.previous.spec == before
         dictionary = EapDictionary(spec, "eap0")
-        load_objects(dictionary, kept.objects["eap0"])
+        fill_all({"eap0": dictionary}, kept.objects)
         assert read_back(spec, {"eap0": dictionary}) == spec
     assert [each.name for each in StationStore("kept", "mill").routes.read()] == ["plc"]
     routing = StationStore("kept", "saw").routing.read()
