@@ -7,11 +7,18 @@ a packet that runs in a circle.
 
 from __future__ import annotations
 
-from eap.ams.access_filter import AccessFilter, AuthorizedRequest, exchange_body
-from eap.ams.admission import Admission, RouterLimits
+from eap.ams.access import AccessFilter, AuthorizedRequest, exchange_body
 from eap.ams.error_reply import ErrorReplier, RoutingError
 from eap.ams.hop_prober import HopProber
-from eap.ams.inflight import InFlight, InvokeIds, LoopDetector, Pending, is_marked
+from eap.ams.inflight import (
+    Admission,
+    InFlight,
+    InvokeIds,
+    LoopDetector,
+    Pending,
+    RouterLimits,
+    is_marked,
+)
 from eap.ams.notification_forwarder import (
     TRACKED_COMMANDS,
     NotificationCleanup,

@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from struct import Struct
 from typing import NamedTuple
 
-from eap.ams.admission import RouterLimits
-from eap.ams.inflight import InFlight, InvokeIds, Pending, is_marked
+from eap.ams.inflight import InFlight, InvokeIds, Pending, RouterLimits, is_marked
 from eap.ams.subscriptions import MAX_PER_CLIENT, Grant, Subscription, Subscriptions, divide
 from eap.ams.transport_table import Action, Reply, TransportTable
 from eap.codec.ads import AdsError, AdsReadWrite, IndexGroup

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable
 from typing import TypeAlias
 
-from eap.ams.access import AccessList
-from eap.ams.access_filter import AccessFilter
-from eap.ams.admission import RouterLimits
+from eap.ams.access import AccessFilter, AccessList
 from eap.ams.error_reply import ErrorReplier, RoutingError
 from eap.ams.forwarder import Forwarder
 from eap.ams.hop_prober import MISSES, HopProber
+from eap.ams.inflight import RouterLimits
 from eap.ams.reassembly import Reassembly
 from eap.ams.record import Outcome, Record, Stats, Trace
 from eap.ams.report import ConnectionReport, Location, RouteReport, report_route

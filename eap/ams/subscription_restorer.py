@@ -25,9 +25,8 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
-from eap.ams.admission import RouterLimits
 from eap.ams.error_reply import ErrorReplier, RoutingError
-from eap.ams.inflight import InFlight, InvokeIds, Pending
+from eap.ams.inflight import InFlight, InvokeIds, Pending, RouterLimits
 from eap.ams.notification_forwarder import (
     BY_HANDLE,
     NotificationCleanup,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from eap.ams.access import AccessList
-from eap.ams.admission import RouterLimits
 from eap.ams.hop_prober import HopProber
+from eap.ams.inflight import RouterLimits
 from eap.ams.record import Outcome
 from eap.ams.router import AnswerNow, Router
 from eap.ams.routes import Route, RouteTable

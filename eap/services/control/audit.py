@@ -28,8 +28,7 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 
 from eap.ads.request import Operation, WriteControl
-from eap.ams.access import group_and_offset, host_of
-from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.access import AddRoute, AuditedOperation, AuditEntry, group_and_offset, host_of
 from eap.ams.directory import Directory
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import ObjectId

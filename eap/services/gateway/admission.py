@@ -12,8 +12,7 @@ from typing import NamedTuple
 import msgspec
 
 from eap.ads.request import Operation, Read
-from eap.ams.access import AccessList, Decision
-from eap.ams.access_filter import AuditedOperation, AuditEntry
+from eap.ams.access import AccessList, AuditedOperation, AuditEntry, Decision
 from eap.ams.spec import AccessService
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader

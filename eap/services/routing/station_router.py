@@ -20,10 +20,9 @@ import os
 from collections.abc import Callable, Collection, Hashable
 from time import monotonic_ns
 
-from eap.ams.access import AccessList, host_of
-from eap.ams.access_filter import AuditEntry
-from eap.ams.admission import RouterLimits
+from eap.ams.access import AccessList, AuditEntry, host_of
 from eap.ams.hop_prober import HopProber
+from eap.ams.inflight import RouterLimits
 from eap.ams.record import Outcome, Record, Stats, Trace, reason_of
 from eap.ams.report import ConnectionReport, Location, RouteReport
 from eap.ams.router import Router

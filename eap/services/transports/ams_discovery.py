@@ -20,8 +20,7 @@ from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
-from eap.ams.access import Decision
-from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.access import AddRoute, AuditedOperation, AuditEntry, Decision
 from eap.ams.routes import Origin, RouteTable
 from eap.ams.spec import AccessService, AmsUser, HopSpec, RouteSpec, TransportKind
 from eap.codec.ads import AdsError

@@ -6,9 +6,8 @@ import struct
 from collections.abc import Iterator
 
 from eap.ads.request import AdsRequest, Operation, Read, ReadWrite, Write, encode_sum, parse_request
-from eap.ams.access import Decision
-from eap.ams.access_filter import MAX_ENTRIES, AuditedOperation, AuditEntry, AuthorizedRequest
-from eap.ams.admission import RouterLimits
+from eap.ams.access import MAX_ENTRIES, AuditedOperation, AuditEntry, AuthorizedRequest, Decision
+from eap.ams.inflight import RouterLimits
 from eap.ams.record import Outcome
 from eap.ams.spec import AccessRule, AccessService, ObjectRange
 from eap.ams.transport_table import Deliver, Forward

@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.admission import Admission, RouterLimits
 from eap.ams.error_reply import RoutingError
-from eap.ams.inflight import InFlight, Pending
+from eap.ams.inflight import Admission, InFlight, Pending, RouterLimits
 from eap.ams.record import Outcome
 from eap.ams.routes import Route, RouteTable
 from eap.ams.transport_table import Transport

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.ams.admission import RouterLimits
-from eap.ams.inflight import is_marked
+from eap.ams.inflight import RouterLimits, is_marked
 from eap.ams.record import Outcome
 from eap.ams.routes import Route
 from eap.ams.transport_table import Forward

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from eap.ams.admission import RouterLimits
-from eap.ams.inflight import InvokeIds
+from eap.ams.inflight import InvokeIds, RouterLimits
 from eap.ams.record import Outcome
 from eap.ams.routes import Route
 from eap.ams.subscriptions import MAX_PER_CLIENT

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from eap.ams.admission import RouterLimits
+from eap.ams.inflight import RouterLimits
 from eap.ams.reassembly import FragmentAssembler
 from eap.ams.transport_table import Action, Deliver, Forward, Reply
 from eap.codec.ams import AmsAnswer, decode_packet

@@ -8,8 +8,7 @@ import struct
 import msgspec
 import pytest
 
-from eap.ams.admission import RouterLimits
-from eap.ams.inflight import InvokeIds
+from eap.ams.inflight import InvokeIds, RouterLimits
 from eap.ams.record import Outcome
 from eap.ams.subscription_restorer import (
     GROUP,

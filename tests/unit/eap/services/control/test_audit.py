@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from eap.ads.request import Operation, ReadWrite, Write, WriteControl
-from eap.ams.access import Decision
-from eap.ams.access_filter import AddRoute, AuditedOperation, AuditEntry
+from eap.ams.access import AddRoute, AuditedOperation, AuditEntry, Decision
 from eap.ams.directory import Directory
 from eap.ams.spec import AccessService, DirectoryPort, DirectoryStation
 from eap.codec.ads import IndexGroup

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.ams.access_filter import AuditEntry
+from eap.ams.access import AuditEntry
 from eap.ams.spec import AccessRule, AccessService, ObjectRange
 from tests.unit.eap.services.gateway.test_gateway import (
     COE,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.ads.request import Read, Write
-from eap.ams.access import AccessList
-from eap.ams.access_filter import AuditEntry
+from eap.ams.access import AccessList, AuditEntry
 from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType

@@ -8,7 +8,7 @@ from time import monotonic_ns
 import pytest
 
 from eap.ams.access import AccessList
-from eap.ams.admission import RouterLimits
+from eap.ams.inflight import RouterLimits
 from eap.ams.routes import Route
 from eap.ams.spec import AccessRule
 from eap.ams.transport_table import Transport
