@@ -89,6 +89,7 @@ def state(words: tuple[str, ...], bus: BusAddress, output: Renderer) -> None:
     from eap.cli.bus_view import state_view
     from eap.ops.bus_info import slave_states
 
+    # One argument may be either: a slave whose name is that of a state is addressed by its number.
     target = words[-1].upper() if words and words[-1].upper() in STATES else None
     rest = words[:-1] if target else words
     if len(rest) > 1:
@@ -425,6 +426,7 @@ def foe_get(
         done = get_file(session, slave, name, whole, password=password, report=report)
     text = _transfer_text(done, f"{done.name} → {done.file}")
     if is_stdout:
+        # On stderr: stdout holds the file.
         click.echo(text, err=True)
     else:
         output.show(done, lambda _: text)
@@ -492,6 +494,7 @@ def _progress(name: str, *, hidden: bool) -> Iterator[Callable[[int, int | None,
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
+    # The bar is drawn over itself; in a log it would be a line for each step.
     disable = hidden or not console.is_terminal
     with Progress(*columns, console=console, disable=disable) as bar:
         task = bar.add_task(name, total=None)

@@ -93,6 +93,7 @@ def diagnosis_view(
     shown = found.slaves
     if len(shown) > _MANY_SLAVES and not is_full:
         lasting = [row for row in found.findings if not row.is_over]
+        # A cause may concern all slaves behind a break; its first one stands for them.
         first = {each.address for row in lasting for each in row.slaves[:1]}
         shown = [row for row in shown if row.address in first or _has_errors(row)]
     if shown:
@@ -151,6 +152,7 @@ def _port_table(slaves: Iterable[DiagnosedSlave]) -> TextTable:
             table.add_row(*first)
         for port in row.ports:
             errors = (port.invalid_frames, port.physical, port.forwarded, port.lost_links)
+            # A closed port without errors is the usual end of a line.
             if not port.is_open and not any(errors):
                 continue
             numbers = (str(each or "") for each in errors)
@@ -296,6 +298,7 @@ def _plain(value: Any) -> str:
 
 def _value(value: Any, data: str) -> str:
     octets = bytes.fromhex(data)
+    # A block's value is its digits again; the grouped form is easier to read.
     if value is None or value == data:
         more = f" … ({len(octets)} bytes)" if len(octets) > _SHOWN_OCTETS else ""
         return f"[{octets[:_SHOWN_OCTETS].hex(' ')}{more}]"

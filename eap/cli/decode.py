@@ -56,6 +56,7 @@ def decode(ctx: click.Context, source: tuple[str, ...], output: Renderer) -> Non
 
 def _frames(source: str) -> Iterator[DecodedFrame]:
     try:
+        # Digits first: a file whose name is all digits needs ./ in front, as the help says.
         octets = bytes.fromhex(source.translate(_SEPARATORS).removeprefix("0x"))
     except ValueError:
         yield from _frames_of_file(source)
@@ -89,6 +90,7 @@ def _frames_of_octets(octets: bytes) -> Iterator[DecodedFrame]:
     elif packet.segment is None:
         yield _with_origin(decode_frame(packet.payload), packet)
     else:
+        # Several frames may be in one TCP segment, and its last one may end in the next.
         stream = bytearray(packet.payload)
         frames = list(cut_frames(stream))
         for data in [*frames, bytes(stream)] if stream else frames:

@@ -40,6 +40,7 @@ class CommandGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the subcommand that *args* start with; raise UsageError with a suggestion."""
+        # resilient_parsing is shell completion, which must not fail on half a word.
         if self.get_command(ctx, args[0]) is None and not ctx.resilient_parsing:
             names = self.list_commands(ctx)
             hint = suggest(args[0], names) or f"; known commands: {', '.join(names)}"
@@ -133,6 +134,7 @@ def describe(error: Exception) -> str:
         text = str(error) or type(error).__name__
     else:
         text = f"unexpected {type(error).__name__}: {error} ({DEBUG_VARIABLE}=1 shows where)"
+    # One line whatever the text holds: scripts read stderr by lines.
     return " ".join("; ".join((text, *_notes_of(error))).split())
 
 

@@ -46,6 +46,7 @@ def scan(via: str | None, plant: str | None, output: Renderer) -> None:
     stations = [station for answer in answers for station in answer.stations]
     merged = MergedScan(stations, [answer.via for answer in answers])
     output.show(merged, lambda _: map(scan_table, answers))
+    # Behind the table and on stderr, so that a pipe has the table alone.
     for line in fault_lines(stations):
         click.echo(line, err=True)
 

@@ -108,6 +108,7 @@ def read(
             output.show(read_entry(device, *entry, kind), value_line)
 
 
+# A negative VALUE such as -5 is no option.
 @od.command(context_settings={"ignore_unknown_options": True})
 @target_argument
 @click.argument("entry", required=False, metavar="[INDEX[:SUB]]")

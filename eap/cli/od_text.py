@@ -121,6 +121,7 @@ def _from_json(line: str) -> Download | None:
         row = msgspec.json.decode(line, type=_JsonEntry)
     except msgspec.MsgspecError as exc:
         raise ValueError(f"not an entry as 'od dump --json' prints it: {exc}") from None
+    # A dump has all entries; those that cannot be written are for its readers.
     if row.data is None or "w" not in row.access:
         return None
     return row.index, row.subindex, bytes.fromhex(row.data)
@@ -132,6 +133,7 @@ def _from_text(line: str) -> Download:
         raise ValueError(f"{line!r} is not INDEX:SUB = TYPE VALUE, such as 0xD000:07 = UDINT 10000")
     index, subindex = ObjectId.parse(match["entry"])
     rest = match["rest"] or ""
+    # A quoted text may hold a #, which begins a remark everywhere else.
     value = _quoted(rest) if rest.startswith('"') else _REMARK.sub("", rest).strip()
     if match["type"] == RAW:
         return index, subindex, bytes.fromhex(value)
@@ -151,6 +153,7 @@ def _literal(entry: Entry, data: str) -> str:
     octets = bytes.fromhex(data)
     kind = datatypes.parse(entry.type) if entry.type else None
     text = notation.show(kind, entry.name, octets) if kind else None
+    # Tried by reading it back: a float, or a text with padding, may have bytes that no literal has.
     if kind is None or text is None or not _is_exact(kind, text, octets):
         return f"{RAW} {data}"
     is_text = kind.text.startswith("STRING")

@@ -125,6 +125,7 @@ def repaint(parts: Iterable[RenderableType]) -> None:
     lines = text.rstrip("\n").split("\n")
     max_lines = console.height - 1  # one line stays free for the prompt of the shell
     if (hidden := len(lines) - max_lines) > 0:
+        # A line too many would scroll the screen, and the next repaint would leave its rest above.
         lines[max_lines - 1 :] = [f"… {hidden + 1} more lines"]
     write_text(_HOME + "".join(f"{line}{_CLEAR_LINE}\n" for line in lines) + _CLEAR_BELOW, end="")
 
@@ -144,6 +145,7 @@ def _render(console: Console, parts: Iterable[RenderableType]) -> str:
         for part in parts:
             console.print(part)
     text = capture.get()
+    # Rich pads cells to the width of their column; piped lines are compared and parsed.
     if console.is_terminal:
         return text
     return "\n".join(line.rstrip() for line in text.split("\n"))

@@ -104,6 +104,7 @@ def _phase(index: Index, station: StationSection, position: int, count: int) -> 
     cycle = index.cycle_us(station)
     # Short cycles have fewer groups, so that a group ends before the next one begins.
     groups = max(1, min(count, STAGGER_GROUPS, cycle // MIN_STAGGER_US))
+    # By turns: neighbours in the file are in different groups.
     return position % groups * (cycle // groups)
 
 
@@ -193,6 +194,7 @@ def _variable(name: str, variable: VariableSection, writer: Writer) -> VariableS
 
 
 def _source(source: Source, folder: Path) -> Source:
+    # Relative to the plant file, and not to the working directory of services.
     if isinstance(source, CsvSource):
         return msgspec.structs.replace(source, file=str((folder / source.file).resolve()))
     return source
@@ -332,6 +334,7 @@ def _received_destinations(
     for subscription in station.subscribe:
         if subscription.port == port.name:
             for sent in index.publishers(subscription):
+                # An answer is unicast to its requester: no group has to be joined for it.
                 if sent.frame.to == REQUESTER:
                     continue
                 uri = index.uris[sent.station.name, sent.port.name]
@@ -413,6 +416,7 @@ def _derived_routes(
     """
     written = {route.to for route in station.routes}
     for target in index.plant.stations:
+        # A route in the file replaces the derived one of the same station.
         if target is station or target.name in written:
             continue
         router = known[target.name][0][0]
@@ -481,6 +485,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     check_routes(index, report, path.parent)
     check_discovery(index, report)
     check_access(index, report, path.parent)
+    # Derived only from a plant without findings, so nothing below can fail.
     if findings := report.findings():
         return PlantResult(None, findings)
     plant = Plant(

@@ -110,6 +110,7 @@ def _port_address(text: str, uri: InterfaceUri, index: Index) -> Destination:
     address = f"{target.host}:{target.port}" if target.port else target.host
     if target.scheme == uri.scheme == "udp":
         return Destination.parse(address)
+    # By NetID: the file need not hold MAC addresses, the engine learns them from frames.
     if target.scheme == uri.scheme == "ethernet" and port.kind is PortKind.EAP:
         return Destination(DestinationKind.NET_ID, str(port.net_id))
     if uri.scheme in {"udp", "tcp"} and accepts_tcp(port, target):
@@ -155,6 +156,7 @@ def group_of(destination: Destination) -> str | None:
     if not destination.is_group or destination.host == IP_BROADCAST:
         return None
     if destination.kind is DestinationKind.MAC:
+        # Every Ethernet port receives these two without joining.
         usual = {str(EAP_MULTICAST_MAC), str(BROADCAST_MAC)}
         return None if destination.host in usual else destination.host
     return destination.host
@@ -266,6 +268,7 @@ def check_names(names: Iterable[tuple[str, str]], what: str, report: FindingRepo
     named = []
     for at, name in names:
         path = f"{at}.name" if f"{at}.name" in report.lines else at
+        # Duplicates are looked for among valid names only: one finding for each item.
         if is_name(name):
             named.append((name, (path, name)))
         else:

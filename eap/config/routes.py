@@ -246,6 +246,7 @@ def route_net_ids(index: Index, route: RouteSection, shared: set[str]) -> list[t
         return [(str(ANY_NET_ID), 0)]
     target = target_of(index, route)
     if target is None:
+        # Four octets by default: router and ports of a station usually share them.
         return [(str(NetId.parse(route.net_id)), route.octets or STATION_OCTETS)]
     # A virtual NetID replaces a prefix: it cannot stand for several NetIDs of one station.
     return net_ids_of(target, set() if route.virtual else shared)
@@ -341,6 +342,7 @@ def _hop(
     if uri.scheme == target.scheme == "ethernet":
         port, there = index.ports[own], index.ports[other]
         if is_wanted or (uri.host == target.host and port.vlan_id == there.vlan_id):
+            # The NetID stands for a MAC address that is learned from frames.
             address = MacAddr.parse(there.mac) if there.mac else there.net_id
             return HopSpec(TransportKind.ETHERNET, own[1], str(address)), 0
     return None
@@ -503,6 +505,7 @@ def follow_routes(
 def _follow(plant: _PlantRouters, station: StationSection, to: str) -> str:
     """Return the error of the route called *to*, empty if none is known."""
     for spec in plant.routing[station.name].routes:
+        # A default route (0 octets) leads to no target that could be followed.
         if spec.name == to and spec.octets:
             names = [station.name]
             net_id = NetId.parse(spec.net_id)

@@ -25,6 +25,8 @@ from eap.pd.spec import (
     Wake,
 )
 
+# Ranges of the wire fields (PD id, version) and of the dictionary's entries: a file that loads fits
+# both.
 U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
 Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
 Milliseconds = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
@@ -56,6 +58,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True):
 class VlanSection(Section, frozen=True):
     """The tag of an Ethernet port's frames."""
 
+    # 802.1Q reserves 4095; 0 would be a priority tag without a VLAN.
     id: Annotated[int, Meta(ge=1, le=4094)]
     priority: Annotated[int, Meta(ge=0, le=7)] = 0
 

@@ -102,6 +102,7 @@ def _check_source(
             report.add(path, message, one_of(known))
         return
     period = getattr(source, "period_ms", 1)
+    # msgspec checks no range here: the records of sources are shared with the engine.
     if period <= 0:
         report.add(f"{path}.period_ms", f"period_ms is {period:g}", "more than 0")
     try:
@@ -142,6 +143,7 @@ def _check_span(
     report: FindingReport,
 ) -> None:
     bounds = kind.scalar_range
+    # A counter wraps with its type and cannot leave its range.
     if bounds is None or isinstance(source, CounterSource):
         return
     if isinstance(source, RampSource):

@@ -85,6 +85,7 @@ def get_file(
             return foe_client.read(name, sink, sizes, password=password, progress=progress)
 
         transfer = _FileCopy(bus, slave, begin, f"FoE read of {name!r}", progress)
+        # Bytes that went to a pipe cannot be taken back: then a fault ends the transfer.
         restarts = transfer.run(rewind if target is not None and file.seekable() else None, report)
     report(progress.done, progress.done, restarts.count)
     seconds = time.monotonic() - start

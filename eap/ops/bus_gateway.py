@@ -110,6 +110,7 @@ class GatewayBus:
         conversation = begin(self._sizes(slave))
         try:
             result = self._client.converse(slave.station, conversation, meanwhile)
+        # No hint: only a refusal has a reason that the master may explain.
         except MailboxTimeoutError:
             raise
         except EapError as exc:
@@ -130,6 +131,7 @@ class GatewayBus:
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
         """Refuse: a gateway passes mailbox messages, and no datagrams."""
+        # A generator that was never started: closing it avoids a warning when it is collected.
         procedure.close()
         _refuse(name)
 
@@ -190,6 +192,7 @@ class GatewayBus:
 
     def _description_of(self, slave: Slave) -> MasterSlave | None:
         """Return the master's description of a slave, None without one."""
+        # With bit 15 set it is the same slave; only the address in the answer differs.
         station = slave.station & ~VIRTUAL_BIT
         return next((each for each in self._slaves or () if each.station == station), None)
 

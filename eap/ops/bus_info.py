@@ -269,6 +269,7 @@ def write_eeprom(bus: SlaveBus, slave: str, image: bytes) -> WrittenEeprom:
     Raises:
         SiiError: no slave would start with this image, or the EEPROM rejects it.
     """
+    # Before anything is written: a slave with a wrong checksum does not load its configuration.
     if not sii.is_intact(image):
         raise SiiError("wrong checksum in the image: the slave would not load it")
     sii.decode(image)
@@ -276,6 +277,7 @@ def write_eeprom(bus: SlaveBus, slave: str, image: bytes) -> WrittenEeprom:
     what = f"slave {unit.station}: its EEPROM"
     bus.run(eeprom.write_image(unit.station, image), what)
     there = bus.run(eeprom.read_image(unit.station), what)
+    # The image may have padding behind the last category, which is not read back.
     if not image.startswith(there):
         raise SiiError(f"{what} differs from the written image")
     bus.run(eeprom.reload(unit.station), what)
@@ -293,6 +295,7 @@ def _scanned(slave: Slave) -> ScannedSlave:
         revision=slave.revision,
         serial=slave.serial,
         alias=slave.alias,
+        # Bit 4 is the error bit of the AL status (ESC 0x0130).
         state=state_name(status.state | status.error << 4) if status.state else None,
         code=status.code,
         mailbox=None if protocols is None else [f"{str(each.name)[0]}oE" for each in protocols],

@@ -141,6 +141,7 @@ def read_entry(
 
     def conversation(sizes: MailboxSizes) -> Conversation[SdoValue]:
         del sizes
+        # Value and description in one conversation: no other client can come in between.
         octets = yield from coe_client.upload(index, subindex, complete=complete)
         known = kind
         if known is None and not complete:
@@ -228,6 +229,8 @@ def _dumped(bus: SlaveBus, unit: Slave, found: SlaveObject, subindex: int) -> Sd
     try:
         entry = bus.converse(unit, lambda _: coe_client.entry_description(index, subindex), name)
     except SdoAbortError as exc:
+        # Gaps between subindexes are usual, such as 9 to 32 of 0x8nnn (ETG.5001.3); no error of the
+        # slave.
         return None if cause_of(exc) is Cause.NOT_FOUND else replace(row, error=str(exc))
     except MailboxProtocolError as exc:  # one bad description is no reason to lose all others
         return replace(row, error=str(exc))
@@ -280,6 +283,7 @@ def _numbers() -> dict[int, DataType]:
 def _value_of(kind: DataType | None, octets: bytes, *, complete: bool) -> Any:
     """Return the value of *octets*; None if the type is unknown."""
     if kind is None:
+        # Without a type a number is a guess; blocks of these sizes are shown as bytes too (data).
         is_number = not complete and len(octets) in _PLAIN_SIZES
         return int.from_bytes(octets, "little") if is_number else None
     if kind.is_text:
@@ -353,6 +357,7 @@ def write_idn(bus: SlaveBus, slave: str, idn: Idn, text: str, *, drive: int) -> 
     unit = bus.find(slave)
 
     def conversation(sizes: MailboxSizes) -> Conversation[SoeValue]:
+        # The attribute tells size and form of the value; SoE data itself has no type.
         octets = yield from soe_client.read(idn, Element.ATTRIBUTE, drive=drive)
         with reading(f"attribute of {idn}"):
             attribute = SoeAttribute.decode(octets)

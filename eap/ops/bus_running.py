@@ -202,6 +202,7 @@ class RunningBus:
         return opened.conversation
 
     def _exchange(self, number: int, request: MailboxRequest) -> bytes:
+        # Longer than each of the waits below: the innermost one then reports the exact reason.
         limit_s = (
             (request.timeout_ns + request.delay_ns) / _S
             + words.ENGINE_MARGIN_S
@@ -235,6 +236,7 @@ def open_running(station: str, port: str, plant: str | None = None) -> Iterator[
 def _read_registers(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:
     """Read position and wiring of slaves; zeros for one that does not answer."""
     replies: list[DatagramReply] = []
+    # Two datagrams each: a request to the engine takes 256 at most.
     for start in range(0, len(stations), _PER_STEP):
         answers, _ = yield [
             access

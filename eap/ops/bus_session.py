@@ -127,6 +127,7 @@ class BusSession:
             self._bring_all(bus_slaves, target)
         finally:
             self._bus.cycle = None
+            # Cycles end with the command; a slave in OP then falls back by its watchdog.
             self._bus.link.stop_cycles()
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
@@ -172,6 +173,8 @@ class BusSession:
                     meanwhile()
                     report_ns = now_ns + REPORT_NS
         finally:
+            # After an exception too: a conversation that stays open would occupy the slave's
+            # mailbox.
             task.cancel()
         # The end of a conversation may have left a last message, such as an abort, to be sent.
         for frame in self._bus.link.frames_to_send(self._clock()):

@@ -104,6 +104,7 @@ class ControlClient(Closeable):
             ControlError: the appliance does not read it.
         """
         self._last_id += 1
+        # Each request has a limit of its own: a state change of slaves takes longer than a read.
         self._socket.settimeout(within_s)
         try:
             self._socket.sendall(encode_request(self._last_id, method, params))

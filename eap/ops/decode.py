@@ -134,6 +134,7 @@ def decode_frame(data: Buffer) -> DecodedFrame:
         found.error = str(exc)
     if end > len(data):
         there = len(data) - EtherCatHeader.SIZE
+        # Set last: that bytes are missing explains any error that decoding met at the end.
         found.error = (
             f"EtherCatHeader at offset 0: length {header.length}, but {there} bytes follow"
         )
@@ -324,6 +325,7 @@ class Stream:
             # SYN occupies a sequence number of its own: the data begins behind it.
             sequence = (sequence + 1) % _SEQUENCES
             self._next = sequence
+        # A retransmission may be longer than the segment that it repeats.
         if payload and len(payload) > len(self._waiting.get(sequence, b"")):
             self._waiting[sequence] = payload
         # A capture may start in the middle of a connection: its first segment is the start.
@@ -364,6 +366,7 @@ class Stream:
     def _distance(self, sequence: int) -> int:
         """Return the distance of *sequence* from the next expected one; sequence numbers wrap."""
         distance = (sequence - (self._next or 0)) % _SEQUENCES
+        # Half of the number space ahead counts as behind.
         return distance - _SEQUENCES if distance >= _SEQUENCES // 2 else distance
 
 
