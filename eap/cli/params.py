@@ -115,6 +115,7 @@ def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) ->
         cycle_us = float(text) * 1000
     except ValueError:
         cycle_us = 0.0
+    # Whole microseconds: the dictionary and the plant file have no fractions.
     if not MIN_CYCLE_US <= cycle_us <= MAX_CYCLE_US or cycle_us % 1:
         raise click.BadParameter(
             f"{text!r} is not a device cycle: expected 0.1 to 60000 milliseconds"
@@ -211,6 +212,7 @@ class BusCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the command line; raise UsageError that shows both forms if neither is there."""
+        # What follows -- is no option, even if it looks like one.
         words = args[: args.index("--")] if "--" in args else args
         by_interface = any(word.partition("=")[0] == "--interface" for word in words)
         ctx.meta[_INTERFACE] = by_interface
@@ -230,6 +232,7 @@ class BusCommand(click.Command):
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Return the parameters: without STATION/PORT if ``--interface`` is given."""
         params = super().get_params(ctx)
+        # click would take the first word, SLAVE, for an optional STATION/PORT that was left out.
         if ctx.meta.get(_INTERFACE):
             return [param for param in params if param.name != _PLACE]
         return params

@@ -80,6 +80,8 @@ def watch(
             if count is not None:
                 stream = islice(stream, count)
             if output.is_json:
+                # On stderr: each JSON line is a change, and the number would repeat in all of one
+                # event.
                 skipped = SkippedCycles(period_ms, partial(click.echo, err=True))
                 stack.callback(skipped.close)
                 stream = map(skipped.count, stream)

@@ -187,6 +187,7 @@ def _merge(streams: Sequence[Iterator[ValuesEvent]]) -> Iterator[ValuesEvent]:
             arrivals.put(exc)
 
     for stream in streams:
+        # Daemons: a thread that waits for an event must not keep the process alive after Ctrl-C.
         threading.Thread(target=forward, args=(stream,), daemon=True).start()
     while not isinstance(arrival := arrivals.get(), Exception):
         yield arrival

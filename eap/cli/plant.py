@@ -235,6 +235,7 @@ def apply(
 
     with running_plant(plant, stations) as (link, wanted):
         refusing = {each.station: each.refused for each in plan_all(link, wanted) if each.refused}
+        # Without --keep-going one refusal stops all: no station changes before all have agreed.
         is_on = keep_going or not refusing
         chosen = {name: spec for name, spec in wanted.items() if is_on and name not in refusing}
         # Receivers first: a receiver accepts a new layout beside the old one.
@@ -279,6 +280,8 @@ def _run_steps(
         for step in steps:
             taken.append(step)
             if not output.is_json:
+                # As they are done: a change of many stations takes a minute, and may be
+                # interrupted.
                 for line in _step_lines(step):
                     write_text(line)
     except ControlError as exc:
@@ -501,6 +504,7 @@ def _blank_plant(name: str, interface: str, net_id: str, cycle_us: int) -> Plant
     if result.plant is not None:
         return result.plant
     options = {INTERFACE_PATH: "--interface"} | dict.fromkeys(NET_ID_PATHS, "--net-id")
+    # A dict, since the router's NetID follows from the port's: both may report the same.
     lines = {
         f"{options.get(each.path, '--blank')}: {each.message}; expected {each.expected}": None
         for each in result.findings

@@ -52,6 +52,7 @@ def routes(ctx: click.Context, plant: str | None) -> None:
     """
     if ctx.invoked_subcommand is not None:
         if plant:
+            # The group has the option for the view alone; each command has one of its own.
             raise click.UsageError("--plant stands before its command: write it after the command")
         return
     if not is_terminal():
@@ -241,6 +242,7 @@ def test(
             # A default route has no NetID of its own to test.
             targeted = [route for route in row.routes if route.octets]
             chosen += [(row.station, name) for name in dict.fromkeys(r.net_id for r in targeted)]
+            # A client without a router, such as pyads, answers no requests; that is no failure.
             clients |= {(row.station, r.net_id) for r in row.routes if r.state == "client"}
     results = [
         TestedTarget.of(name, _test(name, target, timeout_ms, plant)) for name, target in chosen
@@ -411,6 +413,7 @@ def _password(user: str, file: Path | None) -> str:
         from eap.net.host import read_password_text
 
         return read_password_text(file)
+    # No option for the password itself: every user of the host can read command lines in /proc.
     return click.prompt("Password", hide_input=True, err=True) if user else ""
 
 

@@ -159,6 +159,7 @@ def _dead_hops(routes: Sequence[RouteRow]) -> Iterator[str]:
 def short(number: int) -> str:
     """Return a count in at most five characters."""
     value, unit = float(number), 0
+    # 9999.5 would be shown rounded, as 10000, which has five digits and a unit behind it.
     while value >= 9999.5 and unit < len(_UNITS) - 1:
         value, unit = value / 1000, unit + 1
     return (
@@ -243,6 +244,7 @@ def belongs(request: RequestRow, row: RouteRow | ConnectionRow) -> bool:
     """Return whether a request used a route or a connection."""
     if isinstance(row, ConnectionRow):
         return request.came_by == path_of(row)
+    # The pattern ends with * where fewer than six bytes of the NetID have to match.
     prefix = row.pattern.partition("*")[0]
     is_target = not row.octets or request.target.startswith(prefix)
     return is_target and (request.transport, request.address) == (row.transport, row.address)

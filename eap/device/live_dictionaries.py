@@ -95,6 +95,7 @@ class RouterDictionary(ObjectDictionary):
 
     def _route_indexes(self) -> range:
         first = router9000.ROUTE.first
+        # More routes than indexes: the rest is not in the dictionary, but the router uses it.
         return range(first, first + min(len(self._values.routes()), _MAX_ROUTES))
 
     def _make_route(self, index: int, route: object) -> OdObject:
@@ -226,6 +227,7 @@ class MasterDictionary(ObjectDictionary):
 
     def upload_complete(self, index: int, first: int, state: OdState) -> bytes:
         """Return a whole object as :class:`ObjectDictionary` does, padded if configured."""
+        # TwinCAT refuses this too, and clients of ETG.1510 are written against it.
         if index == _DETECT and not self._padded:
             raise SdoAbortError(AbortCode.PARAMETER, index, first, "no complete access, as TwinCAT")
         octets = super().upload_complete(index, first, state)
@@ -233,6 +235,7 @@ class MasterDictionary(ObjectDictionary):
 
     def _pad(self, item: OdObject, octets: bytes, first: int) -> bytes:
         """Insert a byte before each entry of an even size that begins at an odd offset."""
+        # Subindex 0 is padded to 16 bits already.
         start = 2 if first == 0 else 0
         padded = bytearray(octets[:start])
         for subindex, entry in item.entries.items():
@@ -250,6 +253,8 @@ class MasterDictionary(ObjectDictionary):
         for row in master1100.SLAVES:
             found.update(range(row.first, row.first + len(self._stations(row))))
         for row in master1100.LISTS:
+            # The first list exists on an empty bus too: clients read it without listing the
+            # objects.
             lists = max(1, -(-len(self._stations(row)) // master1100.PER_LIST))
             found.update(range(row.first, row.first + lists))
         return found
@@ -266,6 +271,7 @@ class MasterDictionary(ObjectDictionary):
         if number >= len(stations):
             raise SdoAbortError(AbortCode.NO_OBJECT, index, 0)
         station = stations[number]
+        # ETG.1510 has more entries than TwinCAT shows; some clients expect exactly TwinCAT's.
         extent = row.last_subindex if self._full else master1100.USUAL_EXTENT[row.first]
         read = {
             master1100.CONFIGURED.first: self._values.of_configured,

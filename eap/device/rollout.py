@@ -179,6 +179,7 @@ class _SentPds:
     def received_by(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, PdKey, PdLayout]]:
         """Yield sender, key and layout of each PD that *pd* of *station* receives."""
         for sender in self._senders.get(pd.pd_id, {}):
+            # A station changes its sending and its receiving side in one step.
             if sender == station:
                 continue
             sent = self._sent[sender]
@@ -202,6 +203,7 @@ class _Rollout:
         senders = {name for name in self._changed if self._sends_differently(name)}
         waiting = []
         for name in self._changed:
+            # Receivers first: a PD with a layout that no one accepts yet would be discarded.
             prepared = self._accept_layouts(name, self._current[name], self._later)
             if prepared == self._current[name]:
                 waiting.append(name)
@@ -280,6 +282,7 @@ class _Rollout:
         return self._senders_with_step(name, lambda old, new: old > new)
 
     def _senders_with_step(self, name: str, compare: Callable[[float, float], bool]) -> set[str]:
+        # No fixed step counts as infinitely rare: nothing can be lost then.
         old = {pd.name: pd.step or inf for pd in self._current[name].subscriptions}
         return {
             sender
@@ -361,6 +364,7 @@ def _names(form: PdLayout, layout: PdLayout) -> dict[tuple[str, str], str]:
 def _alternate(ours: dict[tuple[str, str], str], layout: PdLayout) -> RxAlternateSpec:
     """Return *layout* as an alternate with the local name of each variable, empty for none."""
     variables = (
+        # pop: a variable that is sent twice fills its local one only once.
         SentVariableSpec(ours.pop((each.name, each.type), ""), each.type)
         for each in layout.variables
     )

@@ -297,9 +297,11 @@ def _parts(found: ObjectInfo, first: int, octets: bytes) -> list[OdValue]:
         count = next((each for each in found.entries if each.subindex == 0), None)
         if count is not None:
             rows.append(_value(found.index, count, octets[:1]))
+        # In complete access subindex 0 is padded to 16 bits.
         octets = octets[2:]
     kinds = [each.kind for each in chosen if each.kind is not None]
     plan = datatypes.layout(kinds)
+    # Without all types no offset behind the first unknown one is certain.
     if len(kinds) != len(chosen) or plan.size != len(octets):
         return rows
     for entry, kind, bit_offset in zip(chosen, kinds, plan.bit_offsets, strict=True):
@@ -321,6 +323,8 @@ def load(device: OdDevice, entries: Iterable[Download]) -> LoadedEntries:
     written = unchanged = 0
     for index, group in groupby(sorted(entries, key=_order), key=lambda entry: entry[0]):
         chosen = list(group)
+        # Unchanged objects are left alone: writing one anew may be refused while others refer to
+        # it.
         if index == CONTROL or all(present.get(each[:2]) == each[2] for each in chosen):
             unchanged += len(chosen)
             continue
@@ -336,6 +340,7 @@ def load(device: OdDevice, entries: Iterable[Download]) -> LoadedEntries:
 def _order(entry: Download) -> tuple[int, int, int]:
     index, subindex, _ = entry
     rank = next((rank for indexes, rank in _RANKS if index in indexes), _LAST)
+    # Subindex 0 last: it is checked against the entries that are there.
     return rank, index, subindex or 0x100
 
 
@@ -343,6 +348,7 @@ def _steps(index: int, entries: list[Download]) -> list[Download]:
     """Return the downloads for one object; *entries* have subindex 0 last."""
     counts = entries[-1][1] == 0 and len(entries) > 1
     if counts and any(index in each for each in _MAPPINGS):
+        # As in slaves: a mapping can be written only while its subindex 0 is 0.
         return [(index, 0, bytes(1)), *entries]
     return entries
 

@@ -93,6 +93,7 @@ class Target(NamedTuple):
         running = [info for _, info in find_running()]
         chosen = [info for info in running if self.plant in {None, info.plant}]
         names = {name for info in chosen for name in info.stations}
+        # Without any appliance the error is that of the local way, which says how to start one.
         return not chosen or (not self.is_address and self.station in names)
 
     def __str__(self) -> str:
@@ -268,6 +269,7 @@ class AdsOd:
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
         """Return the device's description of an entry, or None."""
+        # All value information that there is; a device leaves out what it does not have.
         offset = index << 16 | int(~ValueInfo(0)) << 8 | subindex
         name = str(ObjectId(index, subindex))
         try:
@@ -312,6 +314,7 @@ class AdsOd:
         return object_info(index, found)
 
     def _read(self, group: int, offset: int, what: str) -> bytes:
+        # ADS has no way to ask for a length first: the device answers with as much as it has.
         return self._device.demand(Read(group, offset, _MAX_SIZE), what)
 
 

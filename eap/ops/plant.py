@@ -198,6 +198,7 @@ class PlantLink:
         )
         router = self.plan_routing(spec.name)
         notes, refused = answer.station + router.changes, answer.refused + router.refused
+        # Fixed when an appliance starts, so that applying a file cannot switch it off.
         if self._clients[spec.name].info.audit_required != self._audit_required:
             duty = "required" if self._audit_required else "optional"
             refused += [f"access: audit becomes {duty}: restart the appliance"]
@@ -258,6 +259,7 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
     names = {station.name for station in plant.stations}
     clients = connect_those(
         lambda info: (
+            # A blank appliance has no plant file, and the plant that it reports is its own name.
             info.plant == plant.name if info.plant_file else not names.isdisjoint(info.stations)
         )
     )
@@ -321,6 +323,7 @@ def plan_all(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[Station
 
 def steps_to(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[Step]:
     """Return the order of steps to the specifications *wanted*."""
+    # All stations and not only the wanted ones: the others may receive what changes.
     running = {name: link.export(name).spec for name in link.stations}
     return steps(running, {**running, **wanted})
 
@@ -339,6 +342,7 @@ def apply_steps(
     """
     running = [link.export(name) for name in link.stations]
     under_way = [each.cause for each in running if _is_under_way(each.spec)]
+    # Alternates show that an earlier change was interrupted: this one continues it.
     cause = max(under_way, default="") or new_cause()
     refused = set()
     for done in _walk(order, partial(link.apply, cause=cause), keep_going=keep_going):
@@ -368,12 +372,14 @@ def roll_back(
     routers = {name: routing for name in goal if (routing := link.export_routing(name)) is not None}
     routers = {name: each for name, each in routers.items() if each.previous is not None}
     causes = [each.cause for each in known.values()] + [each.cause for each in routers.values()]
+    # Causes are times with leading zeros, so the largest text is the latest change.
     last = max(causes, default="")
     part = {name: each for name, each in known.items() if each.cause == last}
     left = {n: each for n, each in part.items() if not each.undone and each.previous != goal[n]}
     routed = [name for name, each in routers.items() if each.cause == last]
     routed_left = [name for name in routed if not routers[name].undone]
     if not (left or routed_left or any(_is_under_way(each.spec) for each in part.values())):
+        # Nothing is left to undo: this rollback undoes the last one.
         left, routed_left = part, routed
     goal |= {name: each.previous for name, each in left.items() if each.previous is not None}
     back = _walk(steps(now, {**now, **goal}), link.rollback, keep_going=keep_going)
@@ -402,6 +408,7 @@ def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[StepOu
         yield StepOutcome(step.station, step.why, outcome)
         if not outcome.ok:
             refused.add(step.station)
+            # Stopped at once: the steps behind rely on those before them.
             if not keep_going:
                 return
 

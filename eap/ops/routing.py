@@ -79,6 +79,7 @@ def scan(plant: str | None = None, via: str | None = None) -> list[PlantScan]:
     answers: dict[str, PlantScan] = {}
     with ExitStack() as stack:
         for client in [stack.enter_context(each) for each in connect(plant, via)]:
+            # Several appliances may run parts of one plant; each knows the whole of it.
             if client.info.plant not in answers:
                 answers[client.info.plant] = client.call(SCAN, within_s=SCAN_S, via=via or "")
     return list(answers.values())
@@ -218,6 +219,8 @@ def request_state(
     if outcome.result == AdsError.ACCESS_DENIED:
         raise device.refusal(outcome.result, wanted)
     now = _now(device)
+    # A refused request is not waited for; the state is read once, as the device may be there
+    # already.
     deadline = clock() + (0 if outcome.result else STATE_S)
     while now != wanted and clock() < deadline:
         pause(_PAUSE_S)
@@ -339,6 +342,7 @@ def text_of_xml(octets: bytes) -> str:
     for mark, encoding in _MARKS:
         if octets.startswith(mark):
             return octets.decode(encoding)
+    # XML without mark and declaration is UTF-8 (XML 1.0).
     declared = _DECLARED.match(octets)
     try:
         return octets.decode(declared[1].decode() if declared else "utf-8")

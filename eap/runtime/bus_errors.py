@@ -52,6 +52,7 @@ def to_record(error: EapError) -> ErrorRecord:
 
 def to_error(record: ErrorRecord) -> BusException:
     """Return the exception of a record, with its text and its numbers; BusError if not known."""
+    # A class of another release is still a BusError with its text.
     kind = _CLASSES.get(record.kind, BusError)
     names = _FACTS.get(kind, ())
     if len(names) == 1:

@@ -73,6 +73,8 @@ def fill_all(
         DeviceFault: there is no room for all of it.
     """
     for name, dictionary in dictionaries.items():
+        # Stored objects keep the indexes that clients know; a new dictionary may number them
+        # otherwise.
         if name in objects:
             try:
                 load_configuration(dictionary, objects[name])
@@ -97,6 +99,7 @@ def make_plan(
     }
     try:
         fill_all(fresh, objects, dictionaries)
+        # As PreOp to SafeOp would: what cannot be read back must not be stored either.
         read_back(wanted, fresh)
     except DeviceFault as exc:
         return Plan(wanted, [], [], [str(exc)], {})

@@ -75,6 +75,7 @@ class DropCounters(Closeable):
     def __init__(self, path: Path, stations: Sequence[str]) -> None:
         size = 8 * len(_DROP_REASONS) * max(1, len(stations))
         try:
+            # Not truncated: the counters of a process that was restarted continue.
             with path.open("ab") as file:
                 os.posix_fallocate(file.fileno(), 0, size)  # no SIGBUS on a full disk
                 os.ftruncate(file.fileno(), size)
@@ -130,6 +131,8 @@ class DropCounterFeed:
     def publish(self) -> None:
         """Add the counts since the last call."""
         for name, total in self._source.items():
+            # Differences: the file holds counts of earlier processes, the driver those since its
+            # start.
             grown = total - self._seen.get(name, 0)
             if not grown:
                 continue

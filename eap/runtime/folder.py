@@ -261,6 +261,7 @@ class ApplianceFolder(Closeable):
         for entry in self.path.iterdir():
             if entry == self.bytecode:
                 shutil.rmtree(entry)
+            # The lock stays: a file removed under it would let another process lock its own.
             elif entry.name != "lock":
                 entry.unlink()
 
@@ -300,6 +301,8 @@ def _lock(path: Path) -> int:
     while True:
         fd = os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
+            # An OFD lock: a POSIX one would be dropped when this process closes any descriptor of
+            # the file.
             request = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
             fcntl.fcntl(fd, fcntl.F_OFD_SETLK, request)
         except BlockingIOError:

@@ -109,6 +109,7 @@ class InheritedRecord(SpecRecord, frozen=True):
     def from_descriptor(cls, fd: int) -> Self:
         """Read what ``to_descriptor`` wrote, and close *fd*."""
         with os.fdopen(fd, "rb") as file:
+            # The offset is shared with the parent, whose writing left it at the end.
             file.seek(0)
             return msgspec.json.decode(file.read(), type=cls, dec_hook=decode_value)
 
@@ -207,6 +208,7 @@ def pass_connection(
 
 def receive_connection(link: socket.socket) -> tuple[socket.socket, PassedConnection] | None:
     """Return the next connection that was passed, None if there is none now."""
+    # CLOEXEC at once: a process that is started in between must not inherit the connection.
     flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
     try:
         message, ancillary, _, _ = link.recvmsg(_MAX_MESSAGE, _DESCRIPTOR_SPACE, flags)

@@ -100,6 +100,7 @@ class RoutesApp(App[None]):
 
     def fetch(self) -> None:
         """Request the routes, unless a request is under way."""
+        # One request at a time: a station that does not answer must not pile up threads.
         if self._requested_at is None:
             self._requested_at = monotonic()
             self._look(self._match if self._view is View.ROUTES else "")
@@ -108,6 +109,7 @@ class RoutesApp(App[None]):
             self._snapshot = self._snapshot._replace(problem=problem)
             self._show()
 
+    # The control client blocks; in Textual's own thread a slow answer would freeze the keyboard.
     @work(thread=True)
     def _look(self, match: str) -> None:
         snapshot = self._client.fetch(match)
@@ -116,6 +118,7 @@ class RoutesApp(App[None]):
     def _take(self, snapshot: Snapshot) -> None:
         self._requested_at = None
         if snapshot.problem:
+            # The last rows stay on the screen, in another style, below the reason.
             snapshot = Snapshot(self._snapshot.routers, snapshot.problem)
         self._snapshot = snapshot
         self._show()
@@ -436,6 +439,7 @@ class RouteForm(ModalScreen[list[str]]):
 class Question(ModalScreen[bool]):
     """Yes or no; Enter alone is no."""
 
+    # Enter, pressed once too often, must not remove a route.
     AUTO_FOCUS = "#no"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("y", "answer(True)", "Yes"),
@@ -504,5 +508,6 @@ def values_of(row: RouteRow) -> dict[str, Any]:
         "timeout_ms": row.timeout_ms,
         "probed": row.probed,
         "unidirectional": row.unidirectional,
+        # The NetID may be edited too: the old route then goes with the same request.
         "replaces": row.net_id,
     }

@@ -323,6 +323,7 @@ class Grid(DataTable[Text]):
             ]
             for line in found
         ]  # fmt: skip
+        # Rebuilding moves cursor and scroll position; usually only cells have changed.
         if (fitted, [line.key for line in found]) != (self._fitted, before):
             self._fitted = fitted
             self._lay_out(cells, chosen)
@@ -339,6 +340,7 @@ class Grid(DataTable[Text]):
             heading = cut(column.heading, size, is_number=column.is_number)
             self.add_column(Text(heading, style="bold"), width=size + 1)
         self.add_rows(cells)
+        # By key and not by number: the cursor stays on its route when others come and go.
         keys = [line.key for line in self._lines]
         if chosen is not None and chosen.key in keys:
             at = keys.index(chosen.key)
