@@ -246,6 +246,7 @@ class GatewayGroup(LazyGroup):
                 others.append(word)
                 break
             is_help = word in ctx.help_option_names and len(others) < _FIRST_OF_COMMAND
+            # Help of a subcommand comes behind its name, and is left to it.
             is_own = is_help or word.partition("=")[0] in {_TCP, _MAILBOX}
             (first if is_own else others).append(word)
             if word == _MAILBOX:

@@ -193,6 +193,7 @@ def _answer_text(answer: TargetAnswer) -> str:
 
     if answer.text:
         return f"answers: {answer.text}" if answer.error else answer.text
+    # Devices of other vendors may have states that ADS does not name: shown as numbers.
     known = AdsState._value2member_map_.get(answer.ads_state)
     state = known.name if isinstance(known, AdsState) else answer.ads_state
     return f"answers: {state}, device state {answer.device_state}"

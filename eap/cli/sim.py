@@ -72,6 +72,7 @@ def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults:
         raise click.UsageError(
             "--second needs an ethernet:// interface and a bus file with ring: true"
         )
+    # Only on request: a background process that reads its terminal is stopped by SIGTTIN.
     command_fd = sys.stdin.fileno() if faults else None
     segment_process.run(loaded, interface, write_json, second=second, command_fd=command_fd)
 
@@ -91,6 +92,7 @@ def parse_fault(words: tuple[str, ...]) -> dict[str, Any]:
         key, equals, text = word.partition("=")
         if not key or not equals:
             raise click.UsageError(f"{word!r} is not key=value: a fault is written {_EXAMPLE}")
+        # Either form of the key: options have a hyphen, bus files an underscore.
         fault[key.replace("-", "_")] = parse_value(text)
     return fault
 
@@ -191,5 +193,6 @@ def set_value(
 def _send(bus: StationBus, command: dict[str, Any], plant: str | None) -> None:
     from eap.ops.client import connect_station
 
+    # By services, which hold the other end of the segment's command socket.
     with connect_station(bus.station, plant) as client:
         client.request("bus_fault", station=bus.station, port=bus.port, command=command)

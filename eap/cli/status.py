@@ -128,6 +128,7 @@ def _samples(
         try:
             sample = _take_sample(plant, station)
         except ControlError as exc:
+            # No rates over a gap: the appliance may be another one afterwards.
             before = None
             yield str(exc)
         else:
@@ -140,6 +141,7 @@ def _samples(
 
 
 def _pause(seconds: float) -> None:
+    # A signal handler runs during the wait, so that Ctrl-C ends it at once.
     Event().wait(seconds)
 
 
@@ -231,6 +233,7 @@ class StatusScreen:
 
         stations, findings = len(self._document.stations), len(self._findings)
         if console.is_terminal:
+            # Measured by rendering: a long finding takes several lines on a narrow screen.
             while findings > _LEAST_ROWS and (lines := excess(findings, _LEAST_ROWS)) > 0:
                 findings = max(_LEAST_ROWS, findings - lines)
             while stations > _LEAST_ROWS and (lines := excess(findings, stations)) > 0:
@@ -566,7 +569,9 @@ def _process_data(stations: Sequence[Row]) -> TextTable:
         if pd["tx"] or pd["rx"]:
             table.add_row("", Styled(station["name"], style="bold"))
         for row in pd["tx"]:
+            # An appliance of an older release has no last_reason.
             why = row.get("last_reason") or next(reversed(row["reason"]), "silent")
+            # SafeOp still sends (ETG.1005), so only PreOp shows its PDs as off.
             shown = _OFF if station["state"] == "PREOP" else REASONS.get(why, why)
             table.add_row("→", row["name"], _state(shown), str(row["sent"]))
         for row in pd["rx"]:

@@ -91,6 +91,7 @@ class StatusFinding:
 
     def text(self, now_s: float) -> str:
         """Return the finding as a sentence: what happened, since when; what to do."""
+        # The time belongs to the fault, and so stands before the details that follow it.
         fault, *details = self.what.split("; ")
         since = "" if self.since is None else f", since {_moment(self.since, now_s)}"
         parts = [f"{self.where}: {fault}{since}", *details, self.advice]
@@ -159,6 +160,7 @@ def _stations_of(status: MergedStatus, appliance: ApplianceStatus) -> list[Row]:
 
 def is_special(frame: Row) -> bool:
     """Return whether a frame has a monitored subscriber or a NetID as its destination."""
+    # A NetID has six numbers: five dots, which no IPv4 address has.
     return bool(frame["monitor_interval_ms"]) or frame["destination"].count(".") == _NET_ID_DOTS
 
 
@@ -339,6 +341,7 @@ def _of_silent(station: Row) -> Iterator[StatusFinding]:
     advice = "check its sender and the network path"
     yield from _grouped(station, stale, "stale: nothing received within the timeout", advice)
     waiting = [row for row in station["pd"]["rx"] if row["state"] == "waiting"]
+    # Losses are counted only at a fixed step: without one, silence may be as configured.
     cyclic = [row for row in waiting if row["lost"] is not None]
     yield from _grouped(station, cyclic, "nothing received yet", advice, _warning)
     if rest := [row["name"] for row in waiting if row["lost"] is None]:
@@ -353,6 +356,7 @@ def _grouped(
         for row in rows:
             yield finding(f"{name} ← {row['name']}", what, advice, row.get("last_good"))
         return
+    # The earliest of them: the fault began with the first PD that stopped.
     times = [row["last_good"] for row in rows if row.get("last_good")]
     of_all = f"{len(rows)} of {len(station['pd']['rx'])} received PDs"
     where = f"{name} ← {rows[0]['name']} and others ({of_all})"
@@ -379,6 +383,7 @@ def _of_sources(station: Row) -> Iterator[StatusFinding]:
     for row in station["pd"]["rx"]:
         if source := row.get("wrong_source"):
             what = f"{source['address']} sends with this publisher ID: dropped"
+            # By text: one wrong sender concerns many PDs, and is one finding.
             wrong.setdefault(what, []).append(row | {"ago_us": source["age_us"]})
         if source := row.get("other_source"):
             both = " and ".join(sorted((row["source"], source["address"])))

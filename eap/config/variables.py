@@ -260,6 +260,7 @@ def find_loops(links: Sequence[Ends]) -> list[list[int]]:
     while left:
         loop = _walk_back(before, left)
         if loop:
+            # From its first link in the file, so that the same loop has the same text each time.
             first = loop.index(min(loop))
             loops.append(loop[first:] + loop[:first])
     return loops
@@ -288,6 +289,7 @@ def _predecessors(links: Sequence[Ends]) -> list[list[int]]:
         [
             position
             for position in writers[link.source.variable]
+            # By bits: a link may fill one bit of a variable and another one read the next.
             if links[position].target.overlaps(link.source)
         ]
         for link in links
@@ -408,6 +410,7 @@ def _fits_scaled(
     link: LinkSection, source: DataType, target: DataType, shown: str, report: FindingReport
 ) -> bool:
     key = "scale" if link.scale is not None else "offset"
+    # It would make a constant, which a default does better.
     if link.scale == 0:
         report.add(f"{link.at}.scale", "scale is 0", "another number")
         return False

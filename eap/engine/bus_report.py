@@ -63,6 +63,7 @@ def link_presets(slaves: Collection[BusSlave]) -> dict[int, int]:
     presets: dict[int, int] = {}
     for slave in slaves:
         node = slave.found.node
+        # A link is between two slaves: each of them has a port that is expected to be connected.
         ends = [(slave.found.position, node.entry_port)]
         if node.parent is not None:
             ends.append((node.parent, node.parent_port))
@@ -174,9 +175,11 @@ class BusPublisher:
         """Send the changes, if there are any."""
         bus, master = self._bus, self._bus.master
         revision = bus.revision
+        # Nothing has changed, which is the case in nearly every call.
         if revision == self._sent:
             return
         bus.faults.handle_events(master)  # a change that they bring is counted already
+        # The mapping is replaced by each scan: its identity tells a new set of slaves.
         bus_slaves = master.slaves
         if bus_slaves is self._bus_slaves:
             presets = self._presets

@@ -299,6 +299,7 @@ class BusRequestHandler:
     def _send(self, message: EngineMessage) -> bool:
         """Send a message; return False and drop it if there is no room."""
         try:
+            # The socket does not block: the cycles never wait for services to read.
             self._sock.send(msgspec.msgpack.encode(message))
         except OSError:
             self.dropped += not isinstance(message, BusChange)  # that one is built anew
@@ -342,6 +343,7 @@ def _check_datagram(wanted: DatagramRequest) -> DatagramRequest:
             f"datagram to 0x{adp:X}:0x{ado:X} with {size} bytes, expected addresses of 16"
             f" bits and 1 to {MAX_DATA} bytes"
         )
+    # Bounded: a datagram that is lost for good would occupy the bus with its retries.
     tries = min(max(wanted.tries, AS_SET), MAX_TRIES)
     return wanted if tries == wanted.tries else replace(wanted, tries=tries)
 

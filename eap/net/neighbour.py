@@ -63,6 +63,7 @@ class NeighbourState(IntEnum):
 _EVIDENCE = {
     NeighbourState.REACHABLE: ProbeResult.SEEN,
     NeighbourState.FAILED: ProbeResult.ABSENT,
+    # Never checked by the kernel: such an entry stays as it is when its host is gone.
     NeighbourState.NOARP: ProbeResult.BLIND,
     NeighbourState.PERMANENT: ProbeResult.BLIND,
 }
@@ -188,6 +189,7 @@ class NeighbourTable:
             while True:
                 data, sender = self._sock.recvfrom(_ANSWER_SIZE)
                 length, kind, _, sequence, _ = _HEADER.unpack_from(data)
+                # Port 0 is the kernel: any process of this host may send to a netlink socket.
                 if sender[0] == 0 and sequence == self._sequence:  # not of an earlier question
                     return data[_HEADER.size : length] if kind == answer else None
         except OSError:

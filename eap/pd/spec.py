@@ -435,6 +435,7 @@ def encode_in_steps(record: msgspec.Struct) -> bytes:
     for name in record.__struct_fields__:
         value = getattr(record, name)
         if isinstance(value, tuple):
+            # Without the brackets of each piece: together they are one JSON array.
             pieces = (_encode(piece)[1:-1] for piece in _pieces(value))
             octets = b"[" + b",".join(pieces) + b"]"
         else:

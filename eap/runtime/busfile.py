@@ -56,6 +56,7 @@ def load(path: Path) -> BusResult:
     if spec is None or report.findings():
         return BusResult(None, report.findings())
     slaves = range(len(spec.slaves))
+    # Whether the key is there, not its value: a file that leaves it open accepts any revision.
     revised = frozenset(n for n in slaves if f"slaves[{n}].revision" in report.lines)
     bus = BusFile(spec, {}, revised)
     for number, slave in enumerate(spec.slaves):
@@ -100,6 +101,7 @@ def _line(spec: BusSpec) -> tuple[int, ...]:
     numbers = {slave.name: number for number, slave in enumerate(spec.slaves)}
     for number, slave in enumerate(spec.slaves[1:], 1):
         parent = numbers[slave.after] if slave.after else number - 1
+        # Port 0 is the one that leads to the master.
         links[number, 0] = parent, slave.port
         links[parent, slave.port] = number, 0
     return trace_path(links, (0, 0)).order

@@ -145,6 +145,7 @@ class StationFile(Generic[T]):
         except ConfigError as exc:
             aside = self.path.with_suffix(".damaged")
             self._warn(f"cannot be used: {exc}; it is kept as {aside.name}, the plant file runs")
+            # Kept, not deleted: a person may still read from it what was configured.
             put_aside(self.path, aside)
             return None
 
@@ -258,6 +259,7 @@ class StationStore:
 
 def new_cause() -> str:
     """Return a name for a change; those of later changes sort behind it."""
+    # Wall-clock time, since it has to grow over restarts of the host too.
     return f"{time.time_ns():020d}"
 
 
@@ -315,6 +317,7 @@ def _effective(plant: str, spec: StationSpec, state: DeviceState, cause: str) ->
     if stored is None:
         return Effective(spec, state)
     base = digest_of(spec)
+    # The plant file is the one that was configured: the stored state of the station goes on.
     if stored.base == base:
         return Effective(stored.spec, stored.state)
     updated = _with_plant_file(stored, Stored(base=base, spec=spec, state=state, cause=cause))

@@ -227,10 +227,12 @@ class Supervisor:
         self._restart_ns.pop(child, None)
         handover, descriptors = self._given[child]
         if isinstance(handover, Handover):
+            # At each start and not once: the station may have been reconfigured since.
             handover = with_stored_configuration(handover)
         try:
             child.start(handover, descriptors, self._clock())
         except OSError as exc:
+            # A start that failed half way leaves its pipes open.
             child.close()
             if not child.watch.has_run:
                 raise EnvironmentalError(f"{child.name} cannot be started: {exc}") from None
@@ -290,6 +292,7 @@ class Supervisor:
             took_ms = (self._clock() - child.started_ns) // 1_000_000
             logger.warning("%s runs again (process %d, %d ms)", child.name, child.pid, took_ms)
         if not self._announced and all(child.is_ready for child in self._children):
+            # Once: restarts later are no news for a script that waits for the start.
             self._announced = True
             line = msgspec.json.encode({"ready": True, "stations": self._info.stations})
             try:
@@ -303,6 +306,7 @@ class Supervisor:
         # A process that has never run would fail again: the appliance ends with its exit code.
         if not child.watch.has_run and not child.watch.is_stuck:
             if code < 0:
+                # A signal leaves no line of the process itself, unlike an exit code.
                 logger.error("%s was %s while starting", child.name, describe_end(code))
             self._exit_code = 2 if code == 2 else 1
             return
@@ -363,6 +367,8 @@ class Supervisor:
                 for child in running:
                     logger.warning("%s does not end after SIGTERM: killing it", child.name)
                     child.send_signal(signal.SIGKILL)
+                # SIGKILL takes effect when the process leaves the kernel: waited for, and sent
+                # again if need be.
                 deadline_ns = now_ns + GRACE_NS
             poll = select.poll()
             for child in running:
