@@ -49,8 +49,9 @@ from eap.od.info import ListType, ValueInfo
 
 MAX_SIZE = 1 << 24
 """Default limit for the size of an uploaded object, in bytes."""
+# A slave that sends more never ends a transfer.
 MAX_SHORT = 1_000
-"""Limit for segments of less than seven bytes: a slave that sends more never ends a transfer."""
+"""Limit for segments of less than seven bytes."""
 
 
 class UploadStart(NamedTuple):

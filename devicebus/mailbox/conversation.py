@@ -106,6 +106,8 @@ def reading(what: str) -> Iterator[None]:
 
 # Short: a slave that accepts no messages must not delay other clients by this one.
 _ABORT_TIMEOUT_NS = 50_000_000
+# Other protocols have no transfers that stay open. A slave without a transfer ignores the message,
+# so it is safe to send it whenever the slave's state is unknown.
 ABORT_MESSAGES = {
     MailboxType.COE: MailboxRequest(
         MailboxType.COE,
@@ -120,8 +122,4 @@ ABORT_MESSAGES = {
         expects_reply=False,
     ),
 }
-"""Messages that end an abandoned transfer, by protocol.
-
-Other protocols have no transfers that stay open.  A slave without a transfer ignores the message,
-so it is safe to send it whenever the slave's state is unknown.
-"""
+"""Messages that end an abandoned transfer, by protocol."""

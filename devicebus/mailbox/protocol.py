@@ -11,8 +11,9 @@ from eap.errors import MalformedError, TruncatedError
 
 T = TypeVar("T")
 
+# So many bytes hold the headers of every protocol but AoE.
 MINIMUM_SIZE = 16
-"""Smallest mailbox in bytes: it holds the headers of every protocol but AoE."""
+"""Smallest mailbox in bytes."""
 
 
 class MailboxSizes:

@@ -102,12 +102,10 @@ def synchronize(
 def find_delays(
     nodes: Mapping[int, TopologyNode], latched: Mapping[int, Latched]
 ) -> dict[int, int]:
-    """Return the delay to each slave with a clock, by position; 0 for the first.
-
-    A slave without a clock is treated as part of the cable.
-    """
+    """Return the delay to each slave with a clock, by position; 0 for the first."""
     delays: dict[int, int] = {}
     for position in sorted(latched):
+        # A slave without a clock is treated as part of the cable.
         parent, port = _clocked_parent(position, nodes, latched)
         if parent is None:
             delays[position] = 0

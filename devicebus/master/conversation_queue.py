@@ -210,10 +210,7 @@ class ConversationQueue:
         return self._queues.setdefault(kind, ProtocolQueue(kind))
 
     def next_job(self, now_ns: int) -> QueuedConversation | None:
-        """Return the conversation to continue now, or None.
-
-        A conversation that only listens has priority: no other can match its message.
-        """
+        """Return the conversation to continue now, or None."""
         ready = []
         for queue in self._queues.values():
             queue.advance()
@@ -221,6 +218,7 @@ class ConversationQueue:
                 ready.append(queue.active)
         if not ready:
             return None
+        # A conversation that only listens has priority: no other can match its message.
         job = next((each for each in ready if each.step.listen), ready[0])
         # Moved to the end: protocols alternate message by message.
         self._queues[job.step.type] = self._queues.pop(job.step.type)

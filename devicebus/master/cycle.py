@@ -18,8 +18,9 @@ from devicebus.master.image import BusImage, DatagramGroup, SlaveLayout
 from devicebus.master.link import Exchange, Link
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, logical
 
+# More cycles in flight would only delay the later ones, and acyclic frames too.
 MAX_UNDER_WAY = 2
-"""Limit for cycles in flight: more would only delay the later ones, and acyclic frames too."""
+"""Limit for cycles in flight."""
 
 
 class Participation(Enum):

@@ -12,10 +12,12 @@ BUSY_TIMEOUT_NS = 20_000_000
 POLL_NS = 100_000
 TRIES = 4
 """Attempts of a command that the EEPROM does not acknowledge."""
+# The EEPROM stores a word in up to 10 ms and does not answer meanwhile.
 RETRY_NS = 4_000_000
-"""Pause between attempts: the EEPROM stores a word in up to 10 ms and does not answer meanwhile."""
+"""Pause between attempts."""
+# Many EEPROMs declare no size.
 MIN_LIMIT = 4096
-"""Accepted size in bytes whatever the EEPROM declares: many declare none."""
+"""Accepted size in bytes whatever the EEPROM declares."""
 MAX_SIZE = 0x20000
 """Address range of 16 bit word addresses in bytes."""
 

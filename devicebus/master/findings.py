@@ -19,8 +19,9 @@ from devicebus.master.diagnosis import BusDiagnosis, Fault, PortErrors
 from eap.errors import EapError
 
 NO_ANSWER = "it does not answer"
+# Error counters are read each second.
 SAME_TIME_NS = 2_000_000_000
-"""Faults that ended within this time have one cause: error counters are read each second."""
+"""Faults that ended within this time have one cause."""
 RECENT_NS = 2_500_000_000
 """Errors of a port counted within this time are still going on."""
 # Limit for naming slaves one by one.
@@ -130,10 +131,7 @@ def _port_findings(
     faults: Sequence[Fault],
     history: History | None,
 ) -> Iterator[BusFinding]:
-    """Yield the first port with new errors, and the first port of each past period.
-
-    Both ends of a cable count its errors: only the first end is named.
-    """
+    """Yield the first port with new errors, and the first port of each past period."""
     ports = history.ports if history is not None else {}
     timed = [(fault, ports.get((fault.station, fault.port))) for fault in faults]
     if history is not None:
@@ -143,6 +141,7 @@ def _port_findings(
     for fault, times in timed:
         is_over = history is not None and _is_over(times)
         moment = times.until_ns if times is not None and is_over else None if is_over else 0
+        # Both ends of a cable count its errors: only the first end is named.
         cable = frozenset((fault.station, fault.neighbour or 0))
         if cable in cables or any(_same_time(moment, each) for each in moments):
             continue

@@ -33,13 +33,14 @@ from devicebus.wire.datagram import (
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.wire import Buffer
 
+# 200 slaves take less than 1 ms, the rest is reserve for this machine.
 FLOOR_NS = 2_000_000
-"""Minimum time-out: 200 slaves take less than 1 ms, the rest is reserve for this machine."""
+"""Minimum time-out."""
 CEILING_NS = 1_000_000_000
 """Default for the maximum time-out."""
+# Late frames show a slow bus, and a silent bus must be detected soon.
 BACKOFF_LIMIT_NS = 100_000_000
-"""Time-out before the first measurement, and limit of the back-off: late frames show a slow bus,
-and a silent bus must be detected soon."""
+"""Time-out before the first measurement, and limit of the back-off."""
 
 
 class RoundTrip:
@@ -108,18 +109,21 @@ RETRIES = 4
 LINGER_NS = 1_000_000_000
 """Time after the time-out in which a frame is late; after it the frame is lost."""
 INDEXES = 256
+# Some slaves and masters support no more datagrams in a frame.
 MAX_DATAGRAMS = 15
-"""Datagrams in a frame; some slaves and masters support no more."""
+"""Datagrams in a frame."""
 MAX_BODY = 1498
 """Bytes of a frame without its header: the capacity of an Ethernet frame."""
 MAX_DATA = MAX_BODY - OVERHEAD
 """Bytes of one datagram."""
+# A short datagram takes as much time as so many bytes.
 MIN_COST = 64
-"""Minimum cost of a datagram in the budget: a short one takes as much time as so many bytes."""
+"""Minimum cost of a datagram in the budget."""
 MAX_PIGGYBACK = 256
 """Bytes of acyclic datagrams in a cyclic frame: 20 µs at 100 Mbit/s."""
+# More frames would only wait in buffers.
 MAX_ACYCLIC_FRAMES = 8
-"""Limit for acyclic frames in flight; more would only wait in buffers."""
+"""Limit for acyclic frames in flight."""
 
 Done: TypeAlias = Callable[[list[DatagramReply] | FrameLostError, int], None]
 

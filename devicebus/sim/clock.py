@@ -124,16 +124,14 @@ class Clock:
         self._last_write_ns = None
 
     def activate(self, now_ns: int) -> None:
-        """Start or stop SYNC0 and SYNC1 by the activation register.
-
-        A start time in the past starts nothing, as in a controller.
-        """
+        """Start or stop SYNC0 and SYNC1 by the activation register."""
         self._sync0_seen = self._sync1_seen = 0
         self._start_ns = None
         self._memory[Register.DC_ACTIVATION_STATUS] = 0
         if not self._has(_SYNC_OUT | _SYNC0) or not self._get(Register.DC_SYNC0_CYCLE, 4):
             return
         start = self._get(Register.DC_START_TIME, 8)
+        # A start time in the past starts nothing, as in a controller.
         if start < self.system_time(now_ns):
             self._memory[Register.DC_ACTIVATION_STATUS] = _START_IS_PAST
         else:

@@ -88,9 +88,9 @@ def dl_status(joined: frozenset[int]) -> int:
 
 POLL_NS = 1_000_000
 """Period of the timers of slaves, MAX_POLLED slaves at once."""
+# With 200 slaves each timer is checked every 4 ms; all at once would use half of a processor.
 MAX_POLLED = 64
-"""Limit per period: with 200 slaves each timer is checked every 4 ms; all at once would use half
-of a processor."""
+"""Limit per period."""
 CATCH_UP_NS = 20_000_000
 """Time in which a late caller passes the frames that wait."""
 
@@ -204,11 +204,9 @@ class SimulatedSegment:
             slave.handle_timeout(now_ns)
 
     def postpone_timeouts(self, now_ns: int) -> None:
-        """Process frames that waited while the caller did not run before any timer.
-
-        A watchdog must not expire because the simulation's process was late to pass outputs that
-        had arrived in time.
-        """
+        """Process frames that waited while the caller did not run before any timer."""
+        # A watchdog must not expire because the simulation's process was late to pass outputs that
+        # had arrived in time.
         self._poll_at_ns = now_ns + CATCH_UP_NS
 
     def _run_slaves(self, side: SegmentEnd, now_ns: int) -> None:

@@ -145,8 +145,9 @@ def _scalar(kind: DataType) -> tuple[AdsType, str, int]:
 
 
 _INDEX_BITS = 24
+# Clients take texts without it for texts in the code page of TwinCAT.
 _UTF_8 = (("TcEncoding", "UTF-8"),)
-"""Attribute of texts; clients take those without for texts in the code page of TwinCAT."""
+"""Attribute of texts."""
 _ALIGNMENT = 8
 """Bytes: no value of a client's lies across what its processor reads at once."""
 

@@ -67,8 +67,9 @@ LOOKUPS = frozenset(
 """Groups whose ReadWrite changes only the client's own handles."""
 
 
+# A tuple: a union would be built at each call.
 _ADDRESSED = (Read, Write, ReadWrite, AddNotification)
-"""Operations with group and offset.  A tuple: a union would be built at each call."""
+"""Operations with group and offset."""
 
 
 def service_of(operation: Operation) -> AccessService:

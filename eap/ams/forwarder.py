@@ -123,14 +123,12 @@ class Forwarder:
         return self._end_unwanted(header, samples, endpoint)
 
     def _is_refused_for_good(self, found: Route | RoutingError) -> bool:
-        """Return whether samples for a client that is not connected here can never reach it.
-
-        A client that does not listen gets samples by its own connection only, and that has ended.
-        """
+        """Return whether samples for a client that is not connected here can never reach it."""
         if isinstance(found, Route):
             return False
         if found.error == AdsError.TARGET_MACHINE:
             return True
+        # A client that does not listen gets samples by its own connection only, and that has ended.
         obstacle = None if found.route is None else self.admission.find_obstacle(found.route)
         return obstacle is not None and obstacle.state is RouteState.CLIENT
 

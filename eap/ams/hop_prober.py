@@ -24,13 +24,14 @@ PROBE_PORT = 1
 """AMS port of this router for answers to probes."""
 MISSES = 2
 """Probes without an answer after which a hop is dead."""
+# A router that was cut off for as long subscribes again when it is back.
 GONE_NS = 60_000_000_000
-"""Time after which a dead hop counts as gone: its notifications are ended.  A router that was cut
-off for as long subscribes again when it is back."""
+"""Time after which a dead hop counts as gone: its notifications are ended."""
 _BUSY = 5
 """A hop that answers requests is probed only in every fifth interval, for its round trip."""
+# With many hops each is probed less often.
 _SPACING_NS = 10_000_000
-"""Smallest mean gap between two probes: many hops are probed less often."""
+"""Smallest mean gap between two probes."""
 
 
 _STATE = AdsRange(IndexGroup.SYSTEM_STATE, 0, AdsSystemState.SIZE).encode()

@@ -26,8 +26,9 @@ from eap.ids import STATION_OCTETS, Endpoint, NetId
 
 _SERIAL_BITS = 22
 _SERIALS = 1 << _SERIAL_BITS
+# Neighbouring serials get upper bits that have nothing in common.
 _FACTOR = 2654435761
-"""Knuth's multiplier: neighbours get upper bits that have nothing in common."""
+"""Knuth's multiplier."""
 
 
 class InvokeIds:
@@ -60,8 +61,9 @@ def _mark(serial: int) -> int:
     return (serial * _FACTOR >> 12 & 0x3FF) or 1
 
 
+# A packet that runs in a circle returns long before so many others.
 MAX_PASSED = 1024
-"""Packets that are kept; one that runs in a circle returns long before so many others."""
+"""Packets that are kept."""
 
 
 class LoopDetector:
@@ -203,10 +205,8 @@ class InFlight:
         return pending
 
     def abandon(self, endpoint: Endpoint) -> list[Pending]:
-        """Return the requests of *endpoint*, whose answers no client waits for any more.
-
-        They stay until their time is up: a packet that runs in a circle is still known.
-        """
+        """Return the requests of *endpoint*, whose answers no client waits for any more."""
+        # The requests stay until their time is up: a packet that runs in a circle is still known.
         left = list(self._by_endpoint.get(endpoint, {}).values())
         for pending in left:
             self._detach(pending)

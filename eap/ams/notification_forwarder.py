@@ -71,10 +71,7 @@ class NotificationCleanup:
         return [self._ask(grant, AmsCommand.WRITE, body, now_ns)]
 
     def end_unwanted(self, header: AmsHeader, handle: int, endpoint: Endpoint) -> list[Action]:
-        """Return the request that ends a notification without a client here, at its server.
-
-        Not while the answer with its handle may still arrive: datagrams overtake each other.
-        """
+        """Return the request that ends a notification without a client here, at its server."""
         # The sample of a notification may overtake the answer with its handle.
         if any(pending.handles for pending in self._in_flight.on(endpoint.transport, None)):
             return []

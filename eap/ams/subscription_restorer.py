@@ -43,8 +43,9 @@ from eap.ids import Endpoint
 
 RETRY_NS = 500_000_000
 """Between two attempts for one pair of addresses."""
+# With many pairs of addresses each is tried less often.
 SPACING_NS = 10_000_000
-"""Between two requests at all, on the average: many pairs are tried less often."""
+"""Between two requests at all, on the average."""
 _LOOKUP_SPACING_NS = 1_000_000
 """Likewise, between two route lookups that fail, which cost no packet."""
 GROUP = 32

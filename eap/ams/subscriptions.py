@@ -28,9 +28,10 @@ from eap.ids import Endpoint, NetId
 
 MAX_PER_CLIENT = 1024
 """Subscriptions of one AMS address of one connection; TwinCAT's limit as well."""
+# A host, which may be another router with all its clients, has at most as many as it leaves: one
+# takes a half, two take three quarters, and some remain for others.
 MAX_TOTAL = 16_384
-"""Of one router.  A host, which may be another router with all its clients, has at most as many as
-it leaves: one takes a half, two take three quarters, and some remain for others."""
+"""Of one router."""
 _FIRST_OWN_HANDLE = 0xC000_0000
 _ON_CHANGE = frozenset((TransMode.SERVER_ON_CHANGE, TransMode.SERVER_ON_CHANGE_2))
 _SHORTEST_QUIET_NS = 2_000_000_000
@@ -138,13 +139,11 @@ class Subscription:
         )  # fmt: skip
 
     def encode_end(self, now_ns: int) -> bytes:
-        """Return the packet that signals the end of the subscription to the client.
-
-        That is a sample without bytes, as TwinCAT sends it; it is alone in its packet, because
-        AdsLib skips what follows such a sample.
-        """
+        """Return the packet that signals the end of the subscription to the client."""
         # In the clock of the server, which may differ: its last stamp plus the time since.
         time = self.time + (now_ns - self.received_at_ns) // UNIT_NS if self.time else 0
+        # The end is a sample without bytes, as TwinCAT sends it, alone in its packet, because
+        # AdsLib skips what follows such a sample.
         body = encode_notification([Stamp(time, (Sample(self.handle, b""),))])
         server, port, client, client_port = ADDRESSES.unpack(self.addresses)
         header = AmsHeader(NetId(client), client_port, NetId(server), port, AmsCommand.NOTIFICATION)

@@ -16,8 +16,9 @@ from eap.errors import MalformedError, TruncatedError
 CODE_PAGE = 1252
 _ENCODING = f"cp{CODE_PAGE}"
 """TwinCAT's, for names, types and comments."""
+# Clients accept 256 bytes with the NUL.
 MAX_TEXT = 255
-"""Bytes of a name, type or comment: clients accept 256 with the NUL."""
+"""Bytes of a name, type or comment."""
 
 
 class AdsType(IntEnum):

@@ -13,8 +13,9 @@ from eap.ids import MacAddr
 ETHERTYPE_ARP = 0x0806
 REQUEST = 1
 REPLY = 2
+# An answer to this address enters no table under a wrong one.
 NO_ADDRESS = IPv4Address(0)
-"""The sender of a probe: an answer to it enters no table under a wrong address."""
+"""The sender of a probe."""
 NO_MAC = MacAddr(bytes(6))
 
 _LAYOUT = struct.Struct("!HHBBH6s4s6s4s")

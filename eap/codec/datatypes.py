@@ -15,8 +15,9 @@ from eap.suggest import suggest
 
 __all__ = ["MAX_SIZE", "DataType", "PdoLayout", "Plain", "Value", "layout", "parse"]
 
+# A PD's length is 16 bits wide.
 MAX_SIZE = 0xFFFF
-"""Bytes of the largest variable: a PD's length is 16 bits wide."""
+"""Bytes of the largest variable."""
 
 
 def _integer(name: str, code: int, bits: int, *, signed: bool = False) -> DataType:

@@ -116,10 +116,7 @@ class IpSettings(msgspec.Struct, frozen=True):
     name: str | None = None
 
     def encode(self) -> bytes:
-        """Return the body of a message; raise CodecError if the name is longer than 32 bytes.
-
-        Addresses lie the other way round than IP has them: as 32-bit numbers.
-        """
+        """Return the body of a message; raise CodecError if the name is longer than 32 bytes."""
         flags = 0
         octets = b""
         parts = (
@@ -138,10 +135,7 @@ class IpSettings(msgspec.Struct, frozen=True):
 
     @classmethod
     def decode(cls, body: Buffer) -> Self:
-        """Read the body of a message; raise TruncatedError if it lacks what it says to hold.
-
-        The name may be shorter than its field: some masters cut it.
-        """
+        """Read the body of a message; raise TruncatedError if it lacks what it says to hold."""
         flags = _Flags.decode(body).flags
         view = memoryview(body)[_Flags.SIZE :]
 

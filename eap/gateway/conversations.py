@@ -379,11 +379,9 @@ class GatewayConversations:
         return True
 
     def _numbered(self, address: int, frame: bytes) -> bytes:
-        """Return a frame with the next counter of its address.
-
-        Each address has its own: gateways that pass the counter on to the slave (IgH) would
-        otherwise send a slave the same one twice now and then, which it takes for a repeat.
-        """
+        """Return a frame with the next counter of its address."""
+        # Each address has its own: gateways that pass the counter on to the slave (IgH) would
+        # otherwise send a slave the same one twice now and then, which it takes for a repeat.
         counter = self._counters[address] = next_counter(self._counters.get(address, 0))
         numbered = bytearray(frame)
         numbered[_COUNTER_OCTET] |= counter << _COUNTER_SHIFT

@@ -51,11 +51,9 @@ def complete(spec: SlaveSpec, resources: Mapping[str, bytes]) -> SlaveSpec:
 
 
 def _padding(channels: Iterable[ChannelSpec]) -> Iterator[ChannelSpec]:
-    """Yield the padding of the last byte of each PDO.
-
-    Real devices with an application pad their PDOs, and SOEM expects too small a working counter of
-    slaves that share a byte.  Devices from an ESI file have the padding of the file.
-    """
+    """Yield the padding of the last byte of each PDO."""
+    # Real devices with an application pad their PDOs, and SOEM expects too small a working counter
+    # of slaves that share a byte. Devices from an ESI file have the padding of the file.
     ends: dict[int, int] = {}
     for channel in channels:
         bits = channel.bits or datatypes.parse(channel.type).bit_length

@@ -35,8 +35,9 @@ from eap.od.profiles.table import (
     single,
 )
 
+# The vendor's description of its own EAP device says 5002.
 PROFILE = 5001
-"""Of modular devices; the vendor's description of its own EAP device says 5002."""
+"""Of modular devices."""
 MODULE_PROFILE = 1000
 
 
@@ -273,8 +274,9 @@ class Waking(IntEnum):
 
 NAME = "STRING(255)"
 TEXT = "STRING(1000)"
+# 255 is reserved for the object's structure.
 MAX_ENTRIES = 254
-"""Highest sub-index of a list: 255 is reserved for the object's structure."""
+"""Highest sub-index of a list."""
 WHOLE = 0xFF
 """Bit length in a mapping entry of a variable too long for the eight bits there."""
 

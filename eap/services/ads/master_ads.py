@@ -41,8 +41,9 @@ from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.slaves.bus_client import BusClient, BusView
 from eap.services.tasks import TaskSet
 
+# States change slowly.
 POLL_S = 0.05
-"""Shortest time between two looks of notifications at the bus: states change slowly."""
+"""Shortest time between two looks of notifications at the bus."""
 _ERROR = 0x10
 _NO_LINK = 0x01
 _ALL = 0

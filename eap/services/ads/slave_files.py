@@ -29,14 +29,13 @@ T = TypeVar("T")
 
 FILE_BLOCK_S = 3.0
 """How long one request may take."""
+# Other clients may wait for the slave.
 IDLE_S = 30.0
-"""A file without requests for so long is closed: other clients may wait for the slave."""
+"""A file without requests for so long is closed."""
+# Shorter than FILE_BLOCK_S, so that the next one has its turn at its first request; longer than the
+# pauses between the blocks of a transfer, since several programs may share one NetID.
 ABANDONED_S = 2.0
-"""A file without requests for so long gives way to the next one of its owner.
-
-Shorter than FILE_BLOCK_S, so that the next one has its turn at its first request; longer than the
-pauses between the blocks of a transfer, since several programs may share one NetID.
-"""
+"""A file without requests for so long gives way to the next one of its owner."""
 MAX_OF_CLIENT = 8
 """Files that a NetID may have open."""
 MAX_OPEN = 64

@@ -40,12 +40,10 @@ KEPT = 4
 """Older files."""
 # O_NOFOLLOW: a link in the folder must not redirect the audit.
 _FLAGS = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+# All clients of the process wait meanwhile, so after one wait in vain there is none until the lock
+# was had again: another process may be stopped while it holds it.
 LOCK_S = 0.2
-"""Longest wait for the lock, which others hold as long as it takes to write a few lines.
-
-All clients of the process wait meanwhile, so after one wait in vain there is none until the lock
-was had again: another process may be stopped while it holds it.
-"""
+"""Longest wait for the lock, which others hold as long as it takes to write a few lines."""
 
 
 class AuditFile:
@@ -136,8 +134,9 @@ BURST, PER_S = 500, 50
 """Lines that a client may cause at once, and in each second for long."""
 TRANSPORT_RATE = Rate(5000, 500)
 """Likewise, of all clients of a transport."""
+# The addresses of new clients can be invented.
 NEW_RATE = Rate(500, 50)
-"""Likewise, of all its clients that were never seen: their addresses can be invented."""
+"""Likewise, of all its clients that were never seen."""
 CONTROL = "control"
 """Stands for a transport in lines about clients of the control socket."""
 TOO_MANY = f"the audit is required, and records at most {PER_S} changes a second of one client"

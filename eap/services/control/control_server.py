@@ -194,10 +194,8 @@ class ControlServer:
         self._listening: ListeningSocket[ControlConnection] | None = None
 
     async def serve(self, listener: socket.socket, listeners: Listeners) -> None:
-        """Accept clients until cancelled; *listener* stays open.
-
-        Shares are counted by process: there is one host, and one user mostly.
-        """
+        """Accept clients until cancelled; *listener* stays open."""
+        # Shares are counted by process: there is one host, and one user mostly.
         if self._listening is None:
             self._listening = ListeningSocket(listener, "control", self, listeners, LIMITS)
         await self._listening.serve()

@@ -25,8 +25,9 @@ from eap.runtime.handover import PortName
 from eap.services.tasks import TaskSet
 
 VERSION = 1
+# The kernel counts in ticks of 10 ms.
 MIN_SAMPLE_NS = 200_000_000
-"""Two questions closer than this get the same figures: the kernel counts in ticks of 10 ms."""
+"""Two questions closer than this get the same figures."""
 
 SNAPSHOT_PAUSES = 100
 """A tenth of a second: an engine without real-time priority is interrupted for that long."""

@@ -19,8 +19,9 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 PORTS = 4
 LOOPS = Register.DL_CONTROL + 1
 """Register with the loop control of the four ports, two bits each."""
+# Every step takes a cycle.
 _EACH, _AT_ONCE = 4, 15
-"""Registers of a slave, and slaves that are read at a time: every step takes a cycle."""
+"""Registers of a slave, and slaves that are read at a time."""
 
 
 class SlaveRegisters(NamedTuple):

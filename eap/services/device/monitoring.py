@@ -36,8 +36,9 @@ from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
 
 logger = logging.getLogger(__name__)
 
+# Hosts tell about one a second, whatever is sent.
 REFUSAL_NS = 3_000_000_000
-"""How long a refusal holds while frames go on: hosts tell about one a second, whatever is sent."""
+"""How long a refusal holds while frames go on."""
 _CALLS_PER_TURN = 8
 
 
@@ -69,10 +70,8 @@ class UdpSubscriberProbe:
             self._is_enabled = True
 
     def collect(self, now_ns: int) -> None:
-        """Take what ICMP told, for :meth:`refused_targets`.
-
-        While errors wait, whoever waits for frames at these sockets is woken again and again.
-        """
+        """Take what ICMP told, for :meth:`refused_targets`."""
+        # While errors wait, whoever waits for frames at these sockets is woken again and again.
         for sock in self.sockets if self._is_enabled else ():
             for _ in range(_CALLS_PER_TURN):
                 errors = read_errors(sock)

@@ -232,11 +232,9 @@ class StationKeeper:
         await self._save_back()
 
     async def resend(self) -> None:
-        """Send the engine the configuration again, which it may have missed.
-
-        It may have read what was kept just before that changed, and services may have been killed
-        between the two.
-        """
+        """Send the engine the configuration again, which it may have missed."""
+        # The engine may have read the stored configuration just before it changed, and services may
+        # have been killed between the two.
         try:
             await self._engine.configure(self.spec.name, self.spec)
             await self._engine.set_state(self.spec.name, self.state)

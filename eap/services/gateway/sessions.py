@@ -32,8 +32,9 @@ from eap.services.slaves.access import RemoteAccessError
 
 IDLE_S = 5.0
 """Limit for the pause between two steps of a transfer."""
+# The slave gets all of the download then.
 WRITES = 5
-"""Answer times that the last step of a download may take: the slave gets all of it then."""
+"""Answer times that the last step of a download may take."""
 MAX_SESSIONS = 512
 _GRACE_S = 0.03
 """For the bus, which answers at the deadline itself."""
@@ -153,12 +154,10 @@ class ClientSession:
         return replies
 
     def _is_repeated(self, body: bytes) -> bool:
-        """Return whether a request repeats the last step, whose reply was lost.
-
-        After BUSY it is none: that is how a client asks whether the slave has time now.
-        """
+        """Return whether a request repeats the last step, whose reply was lost."""
         if body != self._request or self._replies is None or not self.codec.is_step(body):
             return False
+        # After BUSY it is no repetition: by it a client asks whether the slave has time now.
         is_busy = (
             self._kind is MailboxType.FOE
             and self._replies[-1:]

@@ -87,15 +87,13 @@ class RouterTimer:
         self._timer = self._loop.call_at(at_s, self._expire)
 
     def set_soon(self) -> None:
-        """Set the timer to a moment from now, because something may be due earlier than before.
-
-        This is cheap: the exact due time is looked up then, and not for each packet.
-        """
+        """Set the timer to a moment from now, because something may be due earlier than before."""
         if self._is_soon or self._loop is None:
             return
         self._is_soon = True
         if self._timer is not None:
             self._timer.cancel()
+        # The exact due time is looked up then, and not for each packet, which would cost more.
         self._timer = self._loop.call_later(_MOMENT_S, self._expire)
 
     def _expire(self) -> None:

@@ -51,13 +51,15 @@ from eap.services.routing.service import LocalRequest, Service
 from eap.services.routing.station_router import StationRouter
 
 HERE = Endpoint(TransportKind.LOCAL, "trace")
+# Routers before the target time out earlier.
 TARGET_TIMEOUT_S = 5.0
-"""For the target itself; routers before it time out earlier."""
+"""For the target itself."""
 SUSPECT_TIMEOUT_S = 2.0
 """For a target behind a router that did not answer."""
 _HOP_TIMEOUT_S = 1.0
+# The router nearest to the start waits longest.
 _TIMEOUT_PER_HOP_S = 0.25
-"""For each router that forwards a query: the router nearest to the start waits longest."""
+"""For each router that forwards a query."""
 _ON_THE_WAY = frozenset(
     (
         AdsError.TARGET_MACHINE,
@@ -74,8 +76,9 @@ _NO_ANSWER = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsE
 _LAST_FAILURE_NS = 10_000_000_000
 """Age of a failure that may be that of the request of a trace."""
 _REPLIED = frozenset((Outcome.ANSWERED, Outcome.FAILED, Outcome.DENIED))
+# ReadState is answered from the memory of its master.
 NO_SLAVE = "its master answers: the slave does not answer"
-"""Result for a slave without an AL state: ReadState is answered from the memory of its master."""
+"""Result for a slave without an AL state."""
 
 
 class Hop(NamedTuple):

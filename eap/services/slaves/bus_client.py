@@ -105,21 +105,17 @@ class BusView:
         return self._is_complete and self._link.is_alive
 
     async def current(self) -> BusDescription:
-        """Return the description, as a rule without waiting; raise EngineGoneError.
-
-        A request goes to the engine only if it has sent nothing for a second, or nothing about
-        this bus: a dead engine says nothing, and must not leave an old state here for long.
-        """
+        """Return the description, as a rule without waiting; raise EngineGoneError."""
+        # A request goes to the engine only if it has sent nothing for a second, or nothing about
+        # this bus: a dead engine says nothing, and must not leave an old state here for long.
         if self.is_current:
             return self.latest
         return await self.confirm()
 
     async def confirm(self) -> BusDescription:
-        """Return the description as the engine has it now; raise EngineGoneError.
-
-        For a request that would be refused because of it: its client may know more, from the
-        process image or from the slave itself, than has come here.
-        """
+        """Return the description as the engine has it now; raise EngineGoneError."""
+        # For a request that the cached description would refuse: its client may know more, from the
+        # process image or from the slave itself, than has come here.
         if self._is_complete:
             await self._link.request(lambda number: Ping(id=number), ENGINE_PING_S)
         else:

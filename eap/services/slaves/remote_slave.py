@@ -37,10 +37,12 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.services.slaves.access import ObjectStream, RemoteAccessError
 from eap.services.slaves.file_stream import AHEAD, FileStream
 
+# By datagrams, one that is lost costs the whole block.
 BLOCK = 16 << 10
-"""Octets of the longest block; where there are only datagrams, one that is lost costs all of it."""
+"""Octets of the longest block."""
+# Routers give up after 4.5 s.
 STEP_S = 5.0
-"""How long the answer to a block may take: routers give up after 4.5 s."""
+"""How long the answer to a block may take."""
 PAUSE_S = 0.02
 """Pause before a station that is busy gets the request again."""
 _HANDLE_SIZE = 4
@@ -218,12 +220,10 @@ class RemoteSlave:
         await self.perform(Write(IndexGroup.VOE, 0, message))
 
     async def exchange_ads(self, header: AmsHeader, data: bytes) -> bytes:
-        """Return the AMS packet that answers an AoE request; nothing if it wants no answer.
-
-        The packet's target is not looked at: the slave is the one that this access leads to.
-        """
+        """Return the AMS packet that answers an AoE request; nothing if it wants no answer."""
         if header.command not in _FORWARDED:
             raise RemoteAccessError(AdsError.SERVICE)
+        # The packet's target is not looked at: the slave is the one that this access leads to.
         answer = await self._request(self._port, header.command, data, timeout_s=self._answer_s)
         if header.state_flags & StateFlags.NO_RETURN:
             return b""

@@ -28,8 +28,9 @@ from eap.net.connections import (
 from eap.net.realtime import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
 from eap.services.rate_limits import caused_by
 
+# Short, because established clients wait meanwhile.
 _ACCEPT_SLICE_NS, _LOCAL_ACCEPT_SLICE_NS = 5_000_000, 20_000_000
-"""Time slice for accepting connections: short, because established clients wait meanwhile."""
+"""Time slice for accepting connections."""
 _PAUSE_S = 1.0
 """Pause after an error of the listener; new connections wait in its backlog."""
 _CREDENTIALS = struct.Struct("3i")

@@ -164,18 +164,18 @@ def _is_granted(answer: bytes) -> bool:
     return answer[_ERROR] == answer[_RESULT] == _NO_ERROR
 
 
+# No value here is a quarter as long.
 LONGEST_PACKET = 256 << 10
-"""Limit of the bytes of an AMS packet; no value here is a quarter as long."""
+"""Limit of the bytes of an AMS packet."""
 LONGEST_ANSWER = 4 << 20
 """Likewise on a connection that this side opened: the symbols of a large controller."""
+# The pending requests keep a client below, unless it does not keep up with its notifications.
 MAX_UNSENT = 8 << 20
-"""Limit of the bytes that a peer has not read.  The pending requests keep a client below, unless it
-does not keep up with its notifications.
-"""
+"""Limit of the bytes that a peer has not read."""
+# The default of asyncio allocates and frees 256 KB for each packet, which takes longer than
+# everything else.
 _RECEIVED = memoryview(bytearray(64 << 10))
-"""Receive buffer of all connections.  The default of asyncio allocates and frees 256 KB for each
-packet, which takes longer than everything else.
-"""
+"""Receive buffer of all connections."""
 _PER_TURN = 8
 """Packets of one connection in a row, while few connections have more."""
 _FEW = 4

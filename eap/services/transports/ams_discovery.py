@@ -48,13 +48,14 @@ from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.tasks import TaskSet
 
+# Requests beyond these rates get no answer, so that guessing passwords takes time.
 RATES = SourceRates(
     source=Rate(10, 1.0),
     known=Rate(50, 5.0),
     new=Rate(10, 1.0),
     local=Rate(50, 10.0),
 )
-"""Requests that are decided; others get no answer, so that guessing passwords takes time."""
+"""Requests that are decided."""
 MAX_SOURCES = 1024
 _SHOWN = 80
 

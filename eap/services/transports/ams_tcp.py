@@ -146,9 +146,6 @@ class AmsTransport:
 async def resolve(host: str) -> str:
     """Return the IPv4 address of a host name or address, without blocking the loop.
 
-    A thread of its own looks the name up.  The executor of asyncio would delay the end of the
-    process until its threads have ended, even if the name server does not answer.
-
     Raises:
         OSError: there is no such name, or no name server answers.
     """
@@ -178,6 +175,8 @@ async def resolve(host: str) -> str:
         with suppress(RuntimeError):  # the loop has ended meanwhile
             loop.call_soon_threadsafe(complete, result)
 
+    # A thread of its own looks the name up. The executor of asyncio would delay the end of the
+    # process until its threads have ended, even if the name server does not answer.
     Thread(target=look_up, name=f"resolve {host}", daemon=True).start()
     return await found
 
@@ -370,11 +369,9 @@ class AmsUplink(ReconnectingLink):
 
 
 def source_for(host: str, sources: Collection[str]) -> str | None:
-    """Return the station's source address towards *host*, None for any.
-
-    Routers identify peers by their addresses; stations that share a host and its network each use
-    their own.
-    """
+    """Return the station's source address towards *host*, None for any."""
+    # Routers identify peers by their addresses; stations that share a host and its network each use
+    # their own.
     for source in sources:
         if host.startswith("127.") and source.startswith("127."):
             return source

@@ -44,8 +44,9 @@ SPIN_LIMIT_NS = 60_000
 """Time limit of one busy-poll for the next frame."""
 MAX_SPIN_FRAMES = 32
 """Limit of the frames in one busy-poll, because other tasks wait for the loop."""
+# A quick sender may have been interrupted.
 MAX_FRUITLESS = 2
-"""Fruitless polls in a row before backing off: a quick sender may have been interrupted."""
+"""Fruitless polls in a row before backing off."""
 MAX_BACKOFF = 1024
 """Most frames without busy-polling after many fruitless polls."""
 
