@@ -246,7 +246,7 @@ MAX_ITEMS = 10_000
 """Of a sum command; Beckhoff advises 500.  Others wait while a request is taken apart."""
 _HEAD_SIZE = 8
 """Bytes of a result and of what stands beside it in the answer of a sum command."""
-# A sum command may have thousands of reasons.
+# A sum command may fail thousands of times over.
 _REASONS = 3
 """Reasons kept for one request."""
 

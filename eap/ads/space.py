@@ -103,11 +103,9 @@ def states_of(al_state: int) -> AdsStates:
 
 
 def al_state_for(ads_state: int) -> int:
-    """Return the AL state that a WriteControl to *ads_state* requests; refuse with VALUE.
-
-    The device state beside it says nothing: clients send back the one that they read before.
-    """
+    """Return the AL state that a WriteControl to *ads_state* requests; refuse with VALUE."""
     try:
+        # The device state beside it says nothing: clients send back the one that they read before.
         return _REQUESTED[ads_state]
     except KeyError:
         raise AdsRefusedError(AdsError.VALUE) from None

@@ -414,6 +414,7 @@ def _expected(code: str, bits: int) -> str:
 
 
 def _code(attribute: SoeAttribute) -> str:
+    # A display of FLOAT with 1 or 2 bytes cannot be a float: it is read as a number.
     if attribute.display == Display.FLOAT and attribute.length in _FLOAT:
         return f"<{_FLOAT[attribute.length]}"
     codes = _SIGNED if attribute.display == Display.SIGNED else _UNSIGNED

@@ -58,6 +58,7 @@ def object_list(dictionary: ObjectDictionary, list_type: int) -> bytes:
             AbortCode.PARAMETER, 0, 0, f"object list type {list_type}, expected 0 to 5"
         ) from None
     if kind is ListType.COUNTS:
+        # List type 0: the counts of the five lists, in their order.
         numbers = [len(_indexes(dictionary, each)) for each in ListType if each]
     else:
         numbers = _indexes(dictionary, kind)

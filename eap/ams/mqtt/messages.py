@@ -99,6 +99,7 @@ def decode_payload(payload: bytes) -> Payload:
     start = AmsTcpHeader.SIZE
     if len(payload) >= start + AmsHeader.SIZE:
         prefix = AmsTcpHeader.decode(payload)
+        # A prefix is 0 and the length of the rest; a bare packet begins with a NetID instead.
         if prefix.reserved == 0 and prefix.length == len(payload) - start:
             return Payload(payload[start:], is_prefixed=True)
     if len(payload) < AmsHeader.SIZE:

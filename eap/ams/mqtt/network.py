@@ -300,6 +300,7 @@ class MqttNetwork:
         return [
             *self._report_missing(),
             Subscribe(self._topics.filters),
+            # After the subscription: where brokers retain nothing, other routers answer it at once.
             self._publish_info(now_ns),
         ]
 
@@ -360,6 +361,7 @@ class MqttNetwork:
         if now_ns >= self._refresh_at_ns:
             self._refresh_at_ns = now_ns + REFRESH_NS
             actions += self._forget(max(self._connected_at_ns, now_ns - EXPIRY_NS), now_ns)
+            # A repeated subscription makes the broker send again what it retains.
             actions.append(Subscribe((self._topics.all_info,)))
             if self._spec.no_retain:
                 self._publish_at_ns = now_ns
@@ -448,6 +450,7 @@ class MqttNetwork:
         return self.will()._replace(payload=encode_info(self._info))
 
     def _schedule_info(self, now_ns: int) -> list[Action]:
+        # One info a second at most, however many routers connect at once.
         self._publish_at_ns = max(now_ns, self._published_at_ns + _ANNOUNCE_GAP_NS)
         return [self._publish_info(now_ns)] if now_ns >= self._publish_at_ns else []
 

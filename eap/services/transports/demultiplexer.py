@@ -101,6 +101,7 @@ class Demultiplexer:
         header, body = decode_packet(data)
         if header.command != AmsCommand.FRAGMENT:
             return data
+        # Own fragments want no acknowledgement.
         if header.state_flags & StateFlags.RESPONSE:
             return None
         station, transport = self._behind[0]
@@ -108,6 +109,7 @@ class Demultiplexer:
         packet, acknowledgement = self._fragments.receive(
             endpoint, header, bytes(body), monotonic_ns()
         )
+        # The target is only known from the whole packet: any station may acknowledge its fragments.
         if acknowledgement is not None:
             station.send_notification(endpoint, acknowledgement)
         return packet
