@@ -57,7 +57,7 @@ check: setup  ## format, lint, types, import contracts, tree
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python tools/check_tree.py
 
-structure: setup  ## count modules, code lines, names, tests, and modules that a request passes
+structure: setup  ## count modules, code lines, names, tests, and modules that a request passes (up to a minute)
 	@sh tools/isolated.sh $(BIN)/python -m tools.structure --paths $(ARGS)
 
 bench: .venv/.stamp-bench  ## measure speed and memory (as root for everything; takes minutes)

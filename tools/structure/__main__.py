@@ -2,7 +2,8 @@
 
 ROOT is any checkout of the project, also an older one (``git worktree add``); two or more are shown
 side by side.  ``--paths`` also runs the demo plant of each and counts the modules that a request
-passes.  ``-v`` lists the names behind the numbers.
+passes, which takes up to a minute; stop another demo first, because it has the addresses.
+``-v`` lists the names behind the numbers.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import sys
 from pathlib import Path
 
 from tools.structure.counts import Row, count
-from tools.structure.paths import trace_paths
+from tools.structure.paths import PlantError, trace_paths
 
 
 def main(arguments: list[str]) -> int:
@@ -20,10 +21,17 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.structure", description=__doc__)
     parser.add_argument("root", nargs="*", type=Path, default=[Path(__file__).parents[2]])
     parser.add_argument("-v", "--verbose", action="store_true", help="list the names, too")
-    parser.add_argument("--paths", action="store_true", help="run the demo plant, too")
+    parser.add_argument(
+        "--paths",
+        action="store_true",
+        help="run the demo plant, too: up to a minute; stop another demo first",
+    )
     options = parser.parse_args(arguments)
     roots = [root.resolve() for root in options.root]
-    columns = [[*count(root), *(trace_paths(root) if options.paths else [])] for root in roots]
+    try:
+        columns = [[*count(root), *(trace_paths(root) if options.paths else [])] for root in roots]
+    except PlantError as exc:
+        parser.error(str(exc))
     for rows in zip(*columns, strict=True):
         print(format_rows(rows))
         if options.verbose:

@@ -135,9 +135,19 @@ def find_passed(
     return sorted(name for name in names if name.partition(".")[0] in PACKAGES)
 
 
+class PlantError(Exception):
+    """The demo plant does not run."""
+
+
 @contextmanager
 def _run(root: Path, folder: str) -> Iterator[_Plant]:
-    """Run the demo plant until the block ends, with the bus in OP at its begin."""
+    """Run the demo plant until the block ends, with the bus in OP at its begin.
+
+    Raises:
+        PlantError: A demo plant runs already, or this one ended; with what it wrote.
+    """
+    if _is_taken():
+        raise PlantError(f"{_ADDRESS}:48898 is in use: stop the demo plant that runs already")
     Path(folder, "trace").mkdir()
     plant = _Plant(root, Path(folder))
     command = [sys.executable, "-m", "eap", "run", str(root / "config" / "demo.yaml")]
@@ -147,7 +157,9 @@ def _run(root: Path, folder: str) -> Iterator[_Plant]:
             command, cwd=root, env=plant.environment, stdout=output, stderr=output
         )
     try:
-        _wait(_answers)
+        _wait(lambda: process.poll() is not None or _answers())
+        if process.poll() is not None:
+            raise PlantError(f"the demo plant ended with {process.returncode}:\n{log.read_text()}")
         plant.find_processes(process.pid)
         yield plant
     except TimeoutError as exc:
@@ -156,6 +168,14 @@ def _run(root: Path, folder: str) -> Iterator[_Plant]:
     finally:
         process.terminate()
         process.wait()
+
+
+def _is_taken() -> bool:
+    try:
+        socket.create_connection((_ADDRESS, 48898), timeout=5).close()
+    except OSError:
+        return False
+    return True
 
 
 def _answers() -> bool:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
 
-from tools.structure.paths import Calls, find_passed, read_calls
+import pytest
+
+from tools.structure import paths
+from tools.structure.paths import Calls, PlantError, find_passed, read_calls, trace_paths
 
 TRACER = Path(__file__).parents[3] / "tools" / "structure" / "tracer"
 
@@ -51,3 +55,20 @@ def test_tracer_counts_calls_but_none_of_imports(tmp_path: Path) -> None:
     )
     (trace,) = tmp_path.glob("*.json")
     assert read_calls(trace) == {("eap.py", "run"): 2}
+
+
+@pytest.mark.net
+def test_paths_beside_a_running_plant_ends_at_once_with_a_remedy(monkeypatch) -> None:
+    monkeypatch.setattr(paths, "_ADDRESS", "127.0.77.1")
+    with (
+        socket.create_server(("127.0.77.1", 48898)),
+        pytest.raises(PlantError, match="in use: stop the demo plant that runs already"),
+    ):
+        trace_paths(Path())
+
+
+@pytest.mark.net
+def test_paths_of_a_plant_that_does_not_start_shows_its_error(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(paths, "_ADDRESS", "127.0.77.1")
+    with pytest.raises(PlantError, match=r"ended with \d+:\n.*demo\.yaml"):
+        trace_paths(tmp_path)
