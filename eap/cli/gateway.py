@@ -29,7 +29,7 @@ from eap.cli.params import (
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from eap.control.bus import GatewayRow
+    from eap.control.bus import GatewayRow, MailboxFigures
     from eap.ops.bus_objects import SdoDumpEntry
 
 
@@ -185,13 +185,13 @@ def gateway_view(row: GatewayRow) -> Iterator[TextTable | str]:
                 Column("Requests", is_number=True),
                 Column("Replies", rank=1, is_number=True),
                 Column("Errors", is_number=True),
-                Column("Mean", is_number=True),
-                Column("Slowest", rank=2, is_number=True),
+                Column("Mean reply", is_number=True),
+                Column("Slowest reply", rank=2, is_number=True),
                 Column("Last error", wraps=True),
             ),
             (
                 (
-                    each.address or "master",
+                    _slave_text(each),
                     each.protocol,
                     each.requests,
                     each.replies,
@@ -203,6 +203,13 @@ def gateway_view(row: GatewayRow) -> Iterator[TextTable | str]:
                 for each in row.slaves
             ),
         )
+
+
+def _slave_text(row: MailboxFigures) -> str:
+    from eap.gateway.requests import address_text
+
+    name = f" ({row.name})" if row.name else ""
+    return f"{address_text(row.address)}{name}" if row.address else "master"
 
 
 def _table(columns: Iterable[Column | str], rows: Iterable[tuple[object, ...]]) -> TextTable:

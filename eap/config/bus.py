@@ -200,7 +200,10 @@ def resolve_gateway_address(
     if other_port is port and number != MASTER_PORT:
         # On the same bus no router is needed between gateway and slave.
         return GatewayAddress(address, station=number)
-    return GatewayAddress(address, net_id=str(other_port.net_id), port=number)
+    slaves = index.slaves(other, other_port.name)
+    found = [each.name for each in slaves if each.station == number] or names[2:]
+    name = "/".join([*names[:2], *found])
+    return GatewayAddress(address, net_id=str(other_port.net_id), port=number, name=name)
 
 
 def _member(

@@ -290,6 +290,8 @@ class MailboxFigures(Document, frozen=True, kw_only=True):
     last_error: str
     mean_us: float | None
     slowest_us: float
+    name: str = ""
+    """Of a remote slave in the plant."""
 
 
 class GatewayRow(Document, frozen=True, kw_only=True):

@@ -351,6 +351,8 @@ class GatewayAddress(SpecRecord, frozen=True):
     port: int = 0
     members: tuple[int, ...] = ()
     """Of a group: station addresses, or virtual ones that are no groups."""
+    name: str = ""
+    """Of the slave or bus at *net_id* in the plant, such as ``mixer/bus0/drive``."""
 
 
 class GatewaySpec(SpecRecord, frozen=True):

@@ -353,7 +353,12 @@ def gateway_row(owner: PortName, gateway: MailboxGateway, served: list[str]) -> 
             )
             for endpoint, counts in gateway.tracker.table().items()
         ],
-        slaves=msgspec.convert(gateway.statistics.report(), list[records.MailboxFigures]),
+        slaves=[
+            msgspec.convert(
+                {**row, "name": settings.names.get(row["address"], "")}, records.MailboxFigures
+            )
+            for row in gateway.statistics.report()
+        ],
     )
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from time import monotonic_ns
+from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
 
 from msgspec.structs import replace
@@ -58,7 +59,7 @@ from eap.services.gateway.admission import (
 )
 from eap.services.gateway.dialect_handler import DialectHandler, DialectTarget
 from eap.services.gateway.message_codecs import EoeListeners, codec_for
-from eap.services.gateway.reply_encoder import GatewayRequest, ReplyEncoder, Send
+from eap.services.gateway.reply_encoder import ErrorLog, GatewayRequest, ReplyEncoder, Send
 from eap.services.gateway.sessions import (
     ClientSession,
     GatewayReply,
@@ -102,6 +103,8 @@ class Settings(NamedTuple):
     limits: ClientLimits = ClientLimits()
     name: str = ""
     """Of the bus port, for log lines."""
+    names: Mapping[int, str] = MappingProxyType({})
+    """Names of remote slaves by virtual address."""
 
 
 class MailboxGateway:
@@ -137,7 +140,8 @@ class MailboxGateway:
     ) -> None:
         self.tracker = RequestTracker(settings.limits)
         self.memory, self.file_memory = MemoryBudget(), MemoryBudget()
-        self._encoder = ReplyEncoder(self.tracker, settings.name, is_silent=settings.is_silent)
+        log = ErrorLog(settings.name, settings.names, settings.answer_s)
+        self._encoder = ReplyEncoder(self.tracker, log, is_silent=settings.is_silent)
         self.statistics = self._encoder.statistics
         self.admission = GatewayAdmission(access)
         self.settings = settings

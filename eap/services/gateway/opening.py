@@ -64,6 +64,7 @@ def open_gateways(
             is_silent=spec.silent,
             limits=ClientLimits(spec.in_flight, spec.rate, spec.clients),
             name=clients[bus.owner].name,
+            names={each.address: each.name for each in spec.addresses if each.name},
         )
         gateway = MailboxGateway(
             clients[bus.owner],

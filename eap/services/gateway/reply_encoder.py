@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import msgspec
@@ -14,6 +14,7 @@ from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_p
 from eap.gateway import dialect
 from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker, Ticket
+from eap.gateway.requests import address_text
 from eap.ids import Endpoint
 from eap.services.gateway.sessions import GatewayReply, error_replies
 from eap.services.rate_limits import caused_by
@@ -120,10 +121,20 @@ class GatewayStatistics:
 
 
 class ErrorLog:
-    """The lines of one gateway; *name* is that of the bus port."""
+    """The lines of one gateway.
 
-    def __init__(self, name: str) -> None:
+    Args:
+        name: Of the bus port.
+        names: Of remote slaves, by virtual address.
+        answer_s: Limit for an answer.
+    """
+
+    def __init__(
+        self, name: str, names: Mapping[int, str] | None = None, answer_s: float = 0.0
+    ) -> None:
         self._name = name
+        self._names = names or {}
+        self._answer_ms = round(answer_s * 1000)
 
     def write(self, endpoint: Endpoint, address: int, kind: MailboxType, reason: Cause) -> None:
         """Log that a request was refused."""
@@ -131,9 +142,12 @@ class ErrorLog:
             return
         host = host_of(endpoint)
         cause = self._name, endpoint.transport, host, address, kind, reason
+        name = self._names.get(address, "")
+        limit = f" (answer_ms {self._answer_ms})" if reason is Cause.TIMEOUT else ""
         logger.warning(
-            "gateway %s: %s of %s (%s) to address %d refused: %s",
-            self._name, kind.name, endpoint.connection, endpoint.transport, address, reason.text,
+            "gateway %s: %s of %s (%s) to address %s%s refused: %s%s",
+            self._name, kind.name, endpoint.connection, endpoint.transport, address_text(address),
+            f" ({name})" if name else "", reason.text, limit,
             extra=caused_by(cause, f"{self._name} {endpoint.transport} {host}"),
         )  # fmt: skip
 
@@ -159,17 +173,17 @@ class ReplyEncoder:
 
     Args:
         tracker: Counts errors of clients.
-        name: Of the bus port, for log lines.
+        log: Lines of refusals.
         is_silent: Whether errors of the gateway itself are kept back.
 
     Attributes:
         statistics: Requests and answers by slave and protocol.
     """
 
-    def __init__(self, tracker: RequestTracker, name: str, *, is_silent: bool) -> None:
+    def __init__(self, tracker: RequestTracker, log: ErrorLog, *, is_silent: bool) -> None:
         self.statistics = GatewayStatistics()
         self._tracker = tracker
-        self._log = ErrorLog(name)
+        self._log = log
         self._is_silent = is_silent
         self._counters = bytearray(_ADDRESSES)
 

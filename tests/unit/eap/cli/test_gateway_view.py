@@ -31,6 +31,11 @@ ROW = {
             "errors": {"no_slave": 2}, "last_error": "there is no such slave", "mean_us": None,
             "slowest_us": 0.0,
         },
+        {
+            "address": 0x9001, "protocol": "COE", "requests": 1, "replies": 0,
+            "errors": {"timeout": 1}, "last_error": "it did not answer in time", "mean_us": None,
+            "slowest_us": 0.0, "name": "press/bus0/1001",
+        },
     ],
 }  # fmt: skip
 
@@ -54,6 +59,7 @@ def test_gateway_view_shows_clients_and_requests():
     )
     assert any("master" in each and "1.2 ms" in each for each in lines)
     assert "there is no such slave" in text
+    assert "0x9001 (press/bus0/1001)" in text
 
 
 def test_gateway_view_of_many_clients_shows_the_latest_and_those_with_transfers():

@@ -15,7 +15,7 @@ def test_gateway_specification_has_all_keys(load_plant):
     assert first.gateway.answer_ms == 50
     assert first.gateway.addresses == (
         GatewayAddress(0x9000, station=1001),
-        GatewayAddress(9, net_id="127.0.9.2.3.1", port=1001),
+        GatewayAddress(9, net_id="127.0.9.2.3.1", port=1001, name="right/bus0/valves"),
         GatewayAddress(0xA, members=(9,)),
     )
     assert (first.gateway.port, second.gateway.port) == (0, 34981)
@@ -26,7 +26,7 @@ def test_gateway_specification_has_all_keys(load_plant):
 def test_a_master_is_a_bus_port_without_a_slave(load_plant):
     loaded = load_plant(with_gateway("{addresses: {9: left/bus0}}"))
     (found,) = loaded.plant.stations[0].ports[1].gateway.addresses
-    assert found == GatewayAddress(9, net_id="127.0.9.1.3.1", port=0xFFFF)
+    assert found == GatewayAddress(9, net_id="127.0.9.1.3.1", port=0xFFFF, name="left/bus0")
 
 
 PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'

@@ -34,7 +34,7 @@ def request_(sent):
 def encoder(*, is_silent: bool = False) -> tuple[ReplyEncoder, RequestTracker]:
     tracker = RequestTracker()
     tracker.admit(HERE, b"request", 0)
-    return ReplyEncoder(tracker, "mill/bus0", is_silent=is_silent), tracker
+    return ReplyEncoder(tracker, ErrorLog("mill/bus0"), is_silent=is_silent), tracker
 
 
 def test_reply_encoder_counts_the_messages_of_each_slave(request_, sent):
@@ -101,6 +101,16 @@ def test_refusal_log_names_client_address_and_cause(caplog):
     assert line == (
         "gateway mill/bus0: COE of 10.0.0.8:1 (udp:eap0) to address 1001 refused: access refused:"
         " the plant file has no rule that allows it"
+    )
+
+
+def test_refusal_log_names_a_remote_slave_as_the_plant_does(caplog):
+    log = ErrorLog("mill/bus0", {0x9001: "press/bus0/drive"}, 0.9)
+    log.write(NEAR, 0x9001, MailboxType.COE, Cause.TIMEOUT)
+    (line,) = caplog.messages
+    assert line == (
+        "gateway mill/bus0: COE of 10.0.0.8:1 (udp:eap0) to address 0x9001 (press/bus0/drive)"
+        " refused: it did not answer in time (answer_ms 900)"
     )
 
 
