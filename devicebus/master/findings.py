@@ -28,6 +28,8 @@ RECENT_NS = 2_500_000_000
 _LISTED = 3
 _SLAVE = re.compile(r"^slave \d+(?: \([^)]*\))?:? ")
 _NO_FRAME = "no frame came back"
+UNANSWERED_NS = 60_000_000_000
+"""A mailbox request without a reply is a present fault for so long."""
 
 
 class SlaveView(NamedTuple):
@@ -43,6 +45,17 @@ class SlaveView(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.name} ({self.station})"
+
+
+class MailboxTimeouts(NamedTuple):
+    """Mailbox requests to a slave without a reply."""
+
+    slave: SlaveView
+    number: int
+    late: int
+    """Replies that came after their request had timed out."""
+    last_ns: int
+    """Age of the last time-out."""
 
 
 class FaultPeriod(NamedTuple):
@@ -79,6 +92,8 @@ class History(NamedTuple):
     """Age of the present period without frames in ns, if there is one."""
     ports: Mapping[tuple[int, int], FaultPeriod] = MappingProxyType({})
     """Periods in which errors were counted, by station address and port."""
+    mailboxes: tuple[MailboxTimeouts, ...] = ()
+    """Slaves with mailbox requests without a reply."""
 
 
 def find_causes(
@@ -110,7 +125,42 @@ def find_causes(
     if diagnosis is not None:
         found += _port_findings(slaves, diagnosis, faults, history)
     past = _past(slaves, history) if history is not None else []
-    return [*(each for each in found if not each.is_over), *_merged(past, found)]
+    missed = find_unanswered(history.mailboxes) if history is not None else []
+    present = [each for each in (*found, *missed) if not each.is_over]
+    return [*present, *_merged(past, found), *(each for each in missed if each.is_over)]
+
+
+def find_unanswered(mailboxes: Sequence[MailboxTimeouts]) -> list[BusFinding]:
+    """Return findings about mailbox requests without a reply: present ones, then past ones.
+
+    A finding is present for UNANSWERED_NS after the last time-out.
+    """
+    found = []
+    for is_over in (False, True):
+        group = [each for each in mailboxes if (each.last_ns > UNANSWERED_NS) == is_over]
+        # One finding for many slaves: their number must not hide other faults.
+        parts = [group] if len(group) > _LISTED else [[each] for each in group]
+        found += [_unanswered(part, is_over=is_over) for part in parts if part]
+    return found
+
+
+def _unanswered(group: Sequence[MailboxTimeouts], *, is_over: bool) -> BusFinding:
+    number, late = sum(each.number for each in group), sum(each.late for each in group)
+    last_ns = min(each.last_ns for each in group)
+    slaves = [each.slave for each in group]
+    what = f"{_listed([str(each) for each in slaves])}: "
+    what += f"{number} mailbox request{'s' * (number != 1)} without reply in time"
+    if late:
+        what += f", {late} late repl{'ies' if late > 1 else 'y'}"
+    if not is_over:
+        what += f", last {last_ns // 1_000_000_000} s ago"
+    return BusFinding(
+        what=what,
+        advice="" if is_over else "check the application of the slave",
+        slaves=_stations(slaves),
+        is_over=is_over,
+        until_ns=last_ns,
+    )
 
 
 def find_silence(slaves: Sequence[SlaveView], since_ns: int | None = None) -> BusFinding:

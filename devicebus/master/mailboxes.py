@@ -68,6 +68,10 @@ class MailboxStats(msgspec.Struct, frozen=True, kw_only=True):
     sent: int
     received: int
     timeouts: int
+    unanswered: int
+    """Requests without a reply since the last reset: time-outs without those of listening."""
+    unanswered_ns: int | None
+    """Time of the last of them."""
     errors: int
     """Requests that ended in another error than a time-out."""
     last_error: str
@@ -102,6 +106,8 @@ class RequestCounters:
         "sent",
         "timeouts",
         "total_ns",
+        "unanswered",
+        "unanswered_ns",
         "unsolicited",
     )  # fmt: skip
 
@@ -110,6 +116,18 @@ class RequestCounters:
         self.late = self.unsolicited = self.malformed = 0
         self.answered = self.last_ns = self.max_ns = self.total_ns = 0
         self.last_error = ""
+        self.unanswered = 0
+        self.unanswered_ns: int | None = None
+
+    def forget_unanswered(self) -> None:
+        """Reset the requests without a reply, and the late replies."""
+        self.unanswered = self.late = 0
+        self.unanswered_ns = None
+
+    def miss(self, now_ns: int) -> None:
+        """Count a request without a reply."""
+        self.unanswered += 1
+        self.unanswered_ns = now_ns
 
     def answer(self, latency_ns: int) -> None:
         """Count an answered request."""
@@ -132,6 +150,8 @@ class RequestCounters:
             sent=self.sent,
             received=self.received,
             timeouts=self.timeouts,
+            unanswered=self.unanswered,
+            unanswered_ns=self.unanswered_ns,
             errors=self.errors,
             last_error=self.last_error,
             repeats=repeats,
@@ -217,6 +237,10 @@ class Mailbox:
             self._work.cancel()
         self._queue.fail_all("the slave's mailbox was closed, for it is set up anew")
 
+    def forget_unanswered(self) -> None:
+        """Reset the requests without a reply, and the late replies."""
+        self._counters.forget_unanswered()
+
     def stats(self) -> MailboxStats:
         """Return a snapshot of the counters."""
         return self._counters.stats(
@@ -276,6 +300,8 @@ class Mailbox:
             self._counters.fail(error)
             if isinstance(exc, MailboxTimeoutError) and not step.listen:
                 self._queue.matcher(step.type).expire(step)
+                _, now_ns = yield Sleep(0)
+                self._counters.miss(now_ns)
         _, now_ns = yield Sleep(0)
         if error is None:
             self._counters.answer(now_ns - start_ns)

@@ -204,6 +204,12 @@ class Master:
             },
         )
 
+    def forget_unanswered(self) -> None:
+        """Reset the mailbox requests without a reply, and the late replies, of all slaves."""
+        for slave in self._bus.slaves.values():
+            if slave.mailbox is not None:
+                slave.mailbox.forget_unanswered()
+
     def _stop(self) -> None:
         running, self._running = self._running, None
         if running is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from msgspec import UNSET
@@ -128,13 +128,19 @@ def _ago(at_s: float, now_s: float) -> str:
 
 
 def _has_errors(slave: DiagnosedSlave) -> bool:
-    return any(
+    return bool(slave.mailbox_timeouts) or any(
         port.invalid_frames or port.physical or port.forwarded or port.lost_links
         for port in slave.ports
     )
 
 
-def _port_table(slaves: Iterable[DiagnosedSlave]) -> TextTable:
+def _port_table(slaves: Sequence[DiagnosedSlave]) -> TextTable:
+    # Two more columns only with content: the table has to fit on 80 columns.
+    has_timeouts = any(row.mailbox_timeouts or row.mailbox_late for row in slaves)
+    mailbox = (
+        Column("Mailbox\ntimeouts", is_number=True),
+        Column("Late\nreplies", rank=4, is_number=True),
+    )
     table = TextTable(
         "Slave",
         Column("Name", rank=2),
@@ -145,19 +151,22 @@ def _port_table(slaves: Iterable[DiagnosedSlave]) -> TextTable:
         Column("RX", is_number=True),
         Column("Forwarded", rank=1, is_number=True),
         Column("Lost link", is_number=True),
+        *(mailbox if has_timeouts else ()),
     )
     for row in slaves:
         first = (str(row.address), row.name, _state(row.state if row.answers else None))
         if not row.ports:
             table.add_row(*first)
+        counts = (str(row.mailbox_timeouts or ""), str(row.mailbox_late or ""))
         for port in row.ports:
             errors = (port.invalid_frames, port.physical, port.forwarded, port.lost_links)
             # A closed port without errors is the usual end of a line.
             if not port.is_open and not any(errors):
                 continue
             numbers = (str(each or "") for each in errors)
-            table.add_row(*first, str(port.port), "yes" if port.is_open else "no", *numbers)
-            first = ("", "", Styled())
+            location = (*first, str(port.port), "yes" if port.is_open else "no")
+            table.add_row(*location, *numbers, *(counts if has_timeouts else ()))
+            first, counts = ("", "", Styled()), ("", "")
     return table
 
 

@@ -312,7 +312,12 @@ def _of_bus(where: str, bus: Row) -> Iterator[StatusFinding]:
     elif not bus["is_up"]:
         yield _warning(where, "starting up")
     for each in bus.get("findings", []):
-        yield _error(where, each["what"], each["advice"] or advice, each["since"])
+        if each["is_over"]:
+            yield _info(where, f"{each['what']}; 'eapctl bus diag {where} --reset' clears this")
+        elif each["until"] is not None:  # it happened a short time ago, and may again
+            yield _warning(where, each["what"], each["advice"] or advice)
+        else:
+            yield _error(where, each["what"], each["advice"] or advice, each["since"])
     for key, noun, text in _BUS_COUNTERS:
         if number := bus.get(key):
             yield _info(where, f"{count(number, noun)} {text}")

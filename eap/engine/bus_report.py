@@ -108,11 +108,16 @@ def _report(
     bus: EngineBus, slave: BusSlave, presets: Mapping[int, int], now_ns: int
 ) -> SlaveReport:
     last = bus.faults.last(slave.station)
+    stats = slave.mailbox.stats() if slave.mailbox is not None else None
+    missed_ns = None if stats is None else stats.unanswered_ns
     return SlaveReport(
         **asdict(describe_slave(bus, slave, presets)),
         past_fault=last.text if last.until_ns is not None else "",
         since_ns=now_ns - last.since_ns if last.text else None,
         until_ns=None if last.until_ns is None else now_ns - last.until_ns,
+        mailbox_timeouts=0 if stats is None else stats.unanswered,
+        mailbox_timeout_ns=None if missed_ns is None else now_ns - missed_ns,
+        mailbox_late=0 if stats is None else stats.late,
         port_errors=tuple(
             PortErrorReport(port, now_ns - seen.since_ns, now_ns - seen.until_ns)
             for port, seen in bus.master.port_errors.of(slave.station).items()

@@ -224,8 +224,9 @@ class EngineBus:
         self._guarded(self._send, now_ns)
 
     def forget_past(self) -> None:
-        """Forget faults that are over, and when errors of ports were counted."""
+        """Forget faults that are over, times of port errors, and mailbox time-outs."""
         self.faults.forget_past()
+        self.master.forget_unanswered()
         self.master.port_errors.clear()
 
     def prepare_mapping(

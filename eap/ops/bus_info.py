@@ -90,6 +90,8 @@ class DiagnosedSlave(msgspec.Struct, frozen=True):
     reason: str
     answers: bool
     ports: tuple[PortErrors, ...]
+    mailbox_timeouts: int = 0
+    mailbox_late: int = 0
 
 
 class Diagnosis(msgspec.Struct, frozen=True):
@@ -179,6 +181,7 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
     """
     known = bus.known()
     names = {each.station: each.name for each in known}
+    units = {each.station: each for each in known}
     wanted = {choose(known, slave).station} if slave is not None else {*names}
     found = bus.run(_diagnose(list(names)), "diagnosis")
     views = [_view(each, there) for each, there in zip(known, found.slaves, strict=True)]
@@ -203,6 +206,8 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
                 reason=each.text if each.code else "",
                 answers=each.answers,
                 ports=each.ports,
+                mailbox_timeouts=units[each.station].mailbox_timeouts,
+                mailbox_late=units[each.station].mailbox_late,
             )
             for each in found.slaves
             if each.station in wanted

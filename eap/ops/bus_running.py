@@ -99,6 +99,8 @@ class RunningBus:
                 fault=report.fault,
                 target=report.target,
                 since_ns=report.since_ns if report.fault else None,
+                mailbox_timeouts=report.mailbox_timeouts,
+                mailbox_late=report.mailbox_late,
             )
             for report in reports
         ]

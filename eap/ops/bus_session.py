@@ -274,6 +274,10 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """AL state where the master of a running station keeps it."""
     since_ns: int | None = None
     """Age of *fault* in nanoseconds, if it is known."""
+    mailbox_timeouts: int = 0
+    """Mailbox requests without a reply, as the master of a running station counts them."""
+    mailbox_late: int = 0
+    """Replies that came after their request had timed out."""
 
 
 class SlaveBus(Protocol):

@@ -12,9 +12,11 @@ from devicebus.master.findings import (
     BusFinding,
     FaultPeriod,
     History,
+    MailboxTimeouts,
     SlaveView,
     find_causes,
     find_silence,
+    find_unanswered,
 )
 from devicebus.master.link import LinkStats
 from devicebus.wire.alstatus import state_name
@@ -69,11 +71,11 @@ def count_frames(source: BusReport | LinkStats) -> FrameCounts:
 
 
 def report_findings(report: BusReport) -> list[BusFinding]:
-    """Return the causes of the present faults of a bus."""
+    """Return the causes of the present faults of a bus, and its mailbox time-outs."""
     views = [_view(slave) for slave in report.slaves]
     if is_silent(report):
         return [find_silence(views, report.silent_since_ns)]
-    return find_causes(views)
+    return [*find_causes(views), *find_unanswered(_mailboxes(report))]
 
 
 def is_silent(report: BusReport) -> bool:
@@ -95,7 +97,20 @@ def history_of(report: BusReport) -> History:
         for each in slave.port_errors:
             ports[slave.station, each.port] = FaultPeriod(each.since_ns, each.until_ns)
     since_ns = report.silent_since_ns if is_silent(report) else None
-    return History(tuple(over), silence, since_ns, ports)
+    return History(tuple(over), silence, since_ns, ports, _mailboxes(report))
+
+
+def _mailboxes(report: BusReport) -> tuple[MailboxTimeouts, ...]:
+    return tuple(
+        MailboxTimeouts(
+            SlaveView(each.station, each.name),
+            each.mailbox_timeouts,
+            each.mailbox_late,
+            each.mailbox_timeout_ns,
+        )
+        for each in report.slaves
+        if each.mailbox_timeout_ns is not None
+    )
 
 
 def finding_row(finding: BusFinding, names: Mapping[int, str], now_s: float) -> FindingRow:

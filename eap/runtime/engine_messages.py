@@ -172,6 +172,12 @@ class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
     """Nanoseconds since *fault* or *past_fault* began."""
     until_ns: int | None = None
     """Nanoseconds since *past_fault* was over."""
+    mailbox_timeouts: int = 0
+    """Requests without a reply since its mailbox was opened, or since ForgetFaults."""
+    mailbox_timeout_ns: int | None = None
+    """Nanoseconds since the last of them."""
+    mailbox_late: int = 0
+    """Replies that came after their request had timed out."""
     port_errors: tuple[PortErrorReport, ...] = ()
     """Ports whose errors were counted while the master read them."""
 

@@ -7,6 +7,7 @@ from devicebus.master.diagnosis import BusDiagnosis, Fault, PortErrors, SlaveDia
 from devicebus.master.findings import (
     FaultPeriod,
     History,
+    MailboxTimeouts,
     SlaveView,
     find_causes,
     find_silence,
@@ -193,3 +194,34 @@ def test_join_errors_has_a_line_for_each_cause():
         "  a (1001), b (1002): AL status: working counter 0, expected 1",
         "  c (1003): does not answer",
     ]
+
+
+ALL_MISSED = "4 slaves from a (1001) to d (1004): 8 mailbox requests without reply in time"
+
+
+def missed(*, number: int = 1, late: int = 0, ago_s: int = 20, count: int = 1) -> History:
+    """Mailbox requests without a reply of the first slaves."""
+    slaves = [SlaveView(at, name) for at, name in NAMES.items()][:count]
+    each = [MailboxTimeouts(slave, number, late, ago_s * SECOND) for slave in slaves]
+    return History(mailboxes=tuple(each))
+
+
+@pytest.mark.parametrize(
+    ("history", "what", "is_over"),
+    [
+        (missed(), "a (1001): 1 mailbox request without reply in time, last 20 s ago", False),
+        (
+            missed(number=3, late=2),
+            "a (1001): 3 mailbox requests without reply in time, 2 late replies, last 20 s ago",
+            False,
+        ),
+        (missed(ago_s=61), "a (1001): 1 mailbox request without reply in time", True),
+        (missed(number=2, count=4), f"{ALL_MISSED}, last 20 s ago", False),
+    ],
+)
+def test_mailbox_timeouts_are_a_finding_that_becomes_past(
+    history: History, what: str, is_over: bool
+) -> None:
+    (finding,) = find_causes(line(), None, history)
+    assert (finding.what, finding.is_over, finding.since_ns) == (what, is_over, None)
+    assert finding.until_ns == history.mailboxes[0].last_ns

@@ -408,3 +408,12 @@ def test_mailbox_counters_have_latencies_and_errors():
     assert (stats.latency_ns, stats.mean_latency_ns, stats.max_latency_ns) == (20, 20, 30)
     assert (stats.timeouts, stats.errors, stats.last_error) == (1, 1, "odd")
     assert (stats.repeats, stats.duplicates, stats.gaps) == (1, 2, 3)
+    assert (stats.unanswered, stats.unanswered_ns) == (0, None)  # of what it listened for
+    counters.miss(50)
+    counters.miss(70)
+    counters.late = 1
+    stats = counters.stats(repeats=0, duplicates=0, gaps=0)
+    assert (stats.unanswered, stats.unanswered_ns, stats.late) == (2, 70, 1)
+    counters.forget_unanswered()
+    stats = counters.stats(repeats=0, duplicates=0, gaps=0)
+    assert (stats.unanswered, stats.unanswered_ns, stats.late, stats.timeouts) == (0, None, 0, 1)

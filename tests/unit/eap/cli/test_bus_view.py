@@ -194,3 +194,20 @@ def test_idns():
         "  data state 0x0007 (executing)",
     ]
     assert "Targets" in shown(*idn_table([NamedIdn("S-0-0024", 24, "Targets")]))
+
+
+def test_diagnosis_has_columns_of_mailbox_timeouts_where_there_are_any() -> None:
+    row = {"address": 1001, "name": "a", "state": "OP", "code": 0, "reason": "", "answers": True,
+           "ports": [port(0)]}  # fmt: skip
+    frames = dict.fromkeys(
+        ("sent", "received", "late", "lost", "retried", "timeout_us", "round_trip_us"), 0
+    )
+
+    def table(**counters: int) -> str:
+        found = {"frames": frames, "findings": [], "starts_at": None, "slaves": [row | counters]}
+        return shown(*diagnosis_view(record(Diagnosis, **found), 0.0))
+
+    assert "timeouts" not in table()
+    text = table(mailbox_timeouts=3, mailbox_late=2)
+    assert "timeouts" in text
+    assert any(line.split()[-2:] == ["3", "2"] for line in text.splitlines())

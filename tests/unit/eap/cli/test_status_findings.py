@@ -352,3 +352,13 @@ def test_finding_of_a_hung_engine_names_the_stations_of_its_appliance() -> None:
     status["silent"] = [{"plant": "line", "stations": ["far"], "services": 77}]
     wheres = [each.where for each in findings(merged(status), NOW_S)]
     assert wheres[:2] == ["line (far)", "line (mixer) engine"]
+
+
+def test_finding_with_its_last_time_is_a_warning_and_a_remark_when_it_is_over() -> None:
+    row = {"what": "drive (1001): 1 late", "advice": "do", "since": None, "until": NOW_S - 20}
+    warned = bus_port(lost=0, findings=[row | {"is_over": False}])
+    assert texts(ports=[warned])[0] == "warning mixer/bus0: drive (1001): 1 late; do"
+    past = bus_port(lost=0, findings=[row | {"is_over": True}])
+    assert texts(ports=[past])[0] == (
+        "info mixer/bus0: drive (1001): 1 late; 'eapctl bus diag mixer/bus0 --reset' clears this"
+    )

@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import pytest
 
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master.findings import History
 from devicebus.wire.alstatus import AlState
+from eap.codec.mailbox import MailboxType
 from eap.engine.bus_report import report_bus
 from eap.runtime.bus_status import history_of, report_findings
 from eap.runtime.engine_messages import SlaveReport
@@ -170,3 +172,25 @@ def test_report_silent_bus_blames_no_slave_and_has_no_states(tmp_path):
     assert present == []
     assert history.silence is not None
     assert 900 * MS < history.silence.until_ns < 2_000 * MS
+
+
+def test_report_counts_mailbox_requests_without_reply_until_they_are_reset(tmp_path):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    rig.fault(kind="mailbox", slave="io")
+
+    def read():
+        yield MailboxRequest(MailboxType.COE, bytes(10), timeout_ns=50 * MS)
+
+    task = rig.bus.master.converse(1002, read(), rig.now_ns)
+    rig.bus.keep(task, rig.now_ns)
+    rig.run(200 * MS)
+    assert task.is_done
+    slave = report_bus(rig.bus, rig.now_ns).slaves[1]
+    assert slave.mailbox_timeouts == 1
+    assert slave.mailbox_timeout_ns > 100 * MS
+    present, history = findings(rig)
+    assert present == ["io (1002): 1 mailbox request without reply in time, last 0 s ago"]
+    assert len(history.mailboxes) == 1
+    rig.bus.forget_past()
+    assert findings(rig) == ([], History())
