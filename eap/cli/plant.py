@@ -280,7 +280,7 @@ def _run_steps(
         for step in steps:
             taken.append(step)
             if not output.is_json:
-                # As they are done: a change of many stations takes a minute, and may be
+                # As they are done: a change of many stations takes a while, and may be
                 # interrupted.
                 for line in _step_lines(step):
                     write_text(line)

@@ -131,7 +131,6 @@ class GatewayBus:
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
         """Refuse: a gateway passes mailbox messages, and no datagrams."""
-        # A generator that was never started: closing it avoids a warning when it is collected.
         procedure.close()
         _refuse(name)
 

@@ -72,7 +72,7 @@ class RxSubscription:
         """Return the reason to drop such a PD from the address *source*, None to accept it."""
         if self.source and source != self.source:
             return PdDropReason.WRONG_SOURCE
-        # Before the version is compared: an alternate has another one by its nature.
+        # Before the version is compared: an alternate may have another one.
         if (version, length) in self.alternates:
             return None
         # VarState tells the two apart (bit 0 version, bit 1 length); the version is named first.
@@ -279,7 +279,7 @@ def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | PdDropReas
         end = PD_FRAME_START + ethercat.length
         frame = data[: min(end, size)]
         count = PdFrameHeader.decode(frame, PD_FRAME_START).count
-        # Checked before the loop: a forged count of 65535 would cost a cycle its time.
+        # Not left to the loop, which would report a truncated frame instead of a wrong count.
         if FIRST_PD + count * PdHeader.SIZE > end:
             return PdDropReason.COUNT_TOO_LARGE
         pds = []

@@ -55,8 +55,8 @@ class Restarts:
 
         One that could not even begin, since the slave is not back yet, is tried until RETURN_S.
         """
-        # A mailbox timeout before any data may be the slave's refusal; after data it is the bus's
-        # fault.
+        # A mailbox timeout before any data may come from the slave; after data the bus is the
+        # likelier cause.
         is_under_way = self._progress.done > 0
         is_of_bus = isinstance(error, _OF_THE_BUS)
         if not is_of_bus and not (is_under_way and isinstance(error, MailboxTimeoutError)):
