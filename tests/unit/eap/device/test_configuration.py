@@ -252,9 +252,9 @@ def test_pds_that_change_their_places_leave_the_frame_first(udp):
     write(new, 0x8000, FrameSub.TXPD, 0xD001)
     write(new, 0x8000, FrameSub.TXPD + 1, 0xD000)
     assert [(c.subindex, c.new, c.interim) for c in compare(udp, new)] == [
-        (0, "15", True),
-        (16, "0xD001", False),
-        (17, "0xD000", False),
+        (0, str(FrameSub.TXPD - 1), True),
+        (FrameSub.TXPD, "0xD001", False),
+        (FrameSub.TXPD + 1, "0xD000", False),
     ]
 
 

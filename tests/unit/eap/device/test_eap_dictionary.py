@@ -120,7 +120,7 @@ def test_a_list_grows_by_writing_behind_its_end_and_shrinks_by_its_count(udp):
         (AbortCode.VALUE, (0x6001, Var.TYPE_NAME, "WORT")),
         (AbortCode.VALUE, (0xD000, Tx.PDO_INDEX, 0x1600)),
         (AbortCode.VALUE, (0x8000, FrameSub.TXPD, 0xE000)),
-        (AbortCode.VALUE, (0x8000, 0, 14)),
+        (AbortCode.VALUE, (0x8000, 0, FrameSub.TXPD - 2)),
         (AbortCode.VALUE, (0xE000, Rx.FLAGS, 0x82)),
         (AbortCode.VALUE, (0xF200, 1, 1)),
         (AbortCode.VALUE, (0xF811, 1, "10.0.0.1")),
@@ -140,7 +140,8 @@ def test_entries_of_a_mapping_in_force_are_refused_until_it_is_empty(udp):
 
 def test_referred_objects_stay(udp):
     sender(udp)
-    assert "0x8000:10 refers" in _refused(udp, AbortCode.PARAMETER, 0xD000, 0, 0)
+    refused = _refused(udp, AbortCode.PARAMETER, 0xD000, 0, 0)
+    assert f"0x8000:{FrameSub.TXPD:02X} refers" in refused
     assert "0x1A00:01 refers" in _refused(udp, AbortCode.MAPPED, 0x6000, 0, 0)
     receiver(udp)
     write(udp, 0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)
