@@ -13,9 +13,10 @@ from devicebus.mailbox.conversation import (
     RESPONSE_TIMEOUT_NS,
     Conversation,
     MailboxRequest,
+    answers,
+    is_aoe_fragment,
     reading,
 )
-from devicebus.mailbox.match import answers, is_aoe_fragment
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ams import AmsHeader, decode_packet, encode_packet

@@ -1,7 +1,7 @@
 """CoE as conversations: SDO transfers, SDO information and PDOs of a slave (ETG.1000.6).
 
-An answer is identified by index and subindex, a segment by its toggle bit (:mod:`match`).  An SDO
-abort of the slave is raised as SdoAbortError.  After an invalid answer the slave gets an abort and
+An answer is identified by index and subindex, a segment by its toggle bit.  An SDO abort of the
+slave is raised as SdoAbortError.  After an invalid answer the slave gets an abort and
 MailboxProtocolError is raised.
 """
 
@@ -12,8 +12,13 @@ from collections.abc import Callable
 from typing import NamedTuple, NoReturn
 
 from devicebus.errors import MailboxProtocolError
-from devicebus.mailbox.conversation import Conversation, MailboxRequest, Progress, reading
-from devicebus.mailbox.match import INFO_START
+from devicebus.mailbox.conversation import (
+    INFO_START,
+    Conversation,
+    MailboxRequest,
+    Progress,
+    reading,
+)
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.coe import (
     EXPEDITED_SIZE,
@@ -116,7 +121,7 @@ def continue_upload(
     while len(content) < size:
         request = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
         body = yield from sdo.exchange_segment(request)
-        with reading(f"segment of {sdo}"):
+        with reading("segment of", sdo):
             segment, data = decode_segment(body)
         content += data
         if len(content) > size:
@@ -194,7 +199,7 @@ class _Sdo:
         """Send the first message of a transfer; return head and data of the answer."""
         request = encode_message(CoeService.SDO_REQUEST, body)
         data = (yield MailboxRequest(MailboxType.COE, request)).data
-        with reading(f"answer to {self}"):
+        with reading("answer to", self):
             head = SdoHeader.decode(data, CoeHeader.SIZE)
         # Either side may abort; the abort of a slave comes as an SDO request (CoE service 2) too.
         if head.specifier == SdoResponse.ABORT:
@@ -205,7 +210,7 @@ class _Sdo:
         """Send a segment or a segment request; return the answer without its CoE header."""
         request = encode_message(CoeService.SDO_REQUEST, body)
         data = (yield MailboxRequest(MailboxType.COE, request)).data
-        with reading(f"segment of {self}"):
+        with reading("segment of", self):
             head = SdoSegmentHeader.decode(data, CoeHeader.SIZE)
             if head.specifier == SdoResponse.ABORT:
                 code = SdoHeader.decode(data, CoeHeader.SIZE).value

@@ -1,4 +1,4 @@
-"""Rules that the servers of all mailbox protocols share: sizes, errors, counters (ETG.1000.4)."""
+"""Rules that the servers of all mailbox protocols share: sizes and errors (ETG.1000.4)."""
 
 from __future__ import annotations
 
@@ -76,41 +76,3 @@ def decode_or_error(decode: Callable[[bytes], T], data: bytes) -> T:
         raise_mailbox_error(MailboxError.SIZE_TOO_SHORT, str(exc))
     except MalformedError as exc:
         raise_mailbox_error(MailboxError.SERVICE_NOT_SUPPORTED, str(exc))
-
-
-def next_counter(counter: int) -> int:
-    """Return the counter that follows *counter*: 1 to 7, then 1 again; 0 disables the check."""
-    return counter % 7 + 1
-
-
-class CounterCheck:
-    """Check of one sender's counters: repeated and missing messages.
-
-    Attributes:
-        repeated: Number of messages with the counter of the message before.
-        gaps: Number of gaps in the sequence.
-    """
-
-    __slots__ = ("_last", "gaps", "repeated")
-
-    def __init__(self) -> None:
-        self.repeated = 0
-        self.gaps = 0
-        self._last = 0
-
-    def restart(self) -> None:
-        """Accept any counter next; the counts stay."""
-        self._last = 0
-
-    def is_new(self, counter: int) -> bool:
-        """Count a message; return false for a repetition of the message before."""
-        last, self._last = self._last, counter
-        # Counter 0 is always accepted: its sender does not count.
-        if not counter or not last:
-            return True
-        if counter == last:
-            self.repeated += 1
-            return False
-        if counter != next_counter(last):
-            self.gaps += 1
-        return True

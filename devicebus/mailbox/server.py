@@ -12,13 +12,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from devicebus.errors import MailboxRefusedError
-from devicebus.mailbox.protocol import (
-    CounterCheck,
-    MailboxSizes,
-    ProtocolServer,
-    next_counter,
-    raise_mailbox_error,
-)
+from devicebus.mailbox.conversation import CounterCheck, next_counter
+from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer, raise_mailbox_error
 from eap.codec.mailbox import (
     MailboxError,
     MailboxErrorReply,

@@ -14,8 +14,7 @@ from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation, MailboxRequest
 from devicebus.master.bring import bring, wait_for
 from devicebus.master.bus import BusSlave, BusState
-from devicebus.master.mailboxes import Mailbox
-from devicebus.master.mailboxport import MailboxArea
+from devicebus.master.mailboxes import Mailbox, MailboxArea
 from devicebus.master.procedure import Procedure, Sleep, read
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import Register, SyncManager

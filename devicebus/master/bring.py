@@ -11,8 +11,7 @@ from devicebus.master.clocks import start_sync0, synchronize
 from devicebus.master.cycle import Participation
 from devicebus.master.esm import acknowledge, change_state, path
 from devicebus.master.image import MAX_FMMUS, SlaveLayout
-from devicebus.master.mailboxes import Mailbox
-from devicebus.master.mailboxport import MailboxArea, configure
+from devicebus.master.mailboxes import Mailbox, MailboxArea, configure
 from devicebus.master.pdo import channels_from_sii, read_channels, write_configuration
 from devicebus.master.procedure import Procedure, Sleep, Task, write
 from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState

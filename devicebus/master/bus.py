@@ -12,8 +12,7 @@ from devicebus.master.clocks import Sync0, drift_datagram
 from devicebus.master.cycle import Cycle, Participation
 from devicebus.master.image import BusImage
 from devicebus.master.link import CEILING_NS, RETRIES, Link
-from devicebus.master.mailboxes import Mailbox, Unsolicited
-from devicebus.master.mailboxport import MailboxArea
+from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
 from devicebus.master.pdo import PdoConfiguration, ProcessDataChannel
 from devicebus.master.procedure import Runner, Task
 from devicebus.master.scan import FIRST_STATION, ExpectedSlave, FoundSlave

@@ -17,8 +17,13 @@ from collections.abc import Hashable, Iterator
 from typing import Any
 
 from devicebus.errors import MailboxClosedError
-from devicebus.mailbox.conversation import Conversation, MailboxRequest
-from devicebus.mailbox.match import answers, has_more, is_aoe_fragment
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxRequest,
+    answers,
+    has_more,
+    is_aoe_fragment,
+)
 from devicebus.master.procedure import Task
 from eap.codec.ams import AmsHeader, StateFlags
 from eap.codec.coe import CoeHeader, CoeService

@@ -27,7 +27,7 @@ from devicebus.master.bus import (
 )
 from devicebus.master.cycle import Participation
 from devicebus.master.diagnosis import COUNTERS, port_counters
-from devicebus.master.mailboxport import STATUS
+from devicebus.master.mailboxes import STATUS
 from devicebus.master.procedure import Procedure, Sleep, Task
 from devicebus.master.scan import (
     assign_stations,

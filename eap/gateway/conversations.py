@@ -15,9 +15,14 @@ from __future__ import annotations
 from collections import deque
 
 from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox.conversation import ABORT_MESSAGES, MailboxMessage, MailboxRequest
-from devicebus.mailbox.match import answers, has_more
-from devicebus.mailbox.protocol import next_counter
+from devicebus.mailbox.conversation import (
+    ABORT_MESSAGES,
+    MailboxMessage,
+    MailboxRequest,
+    answers,
+    has_more,
+    next_counter,
+)
 from eap.codec.mailbox import (
     MailboxError,
     MailboxErrorReply,

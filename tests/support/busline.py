@@ -10,8 +10,7 @@ import devicebus.drive
 from devicebus.mailbox.server import MailboxServer
 from devicebus.master.esm import change_state
 from devicebus.master.link import Link
-from devicebus.master.mailboxes import Mailbox
-from devicebus.master.mailboxport import MailboxArea, configure
+from devicebus.master.mailboxes import Mailbox, MailboxArea, configure
 from devicebus.master.procedure import Procedure, Runner, Sleep, Step, StepReplies, Task
 from devicebus.master.scan import scan
 from devicebus.sim.devices.build import build_segment

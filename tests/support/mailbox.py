@@ -15,9 +15,15 @@ import pytest
 
 from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.mailbox.match import answers
-from devicebus.mailbox.protocol import CounterCheck, MailboxSizes, ProtocolServer, next_counter
+from devicebus.mailbox.conversation import (
+    Conversation,
+    CounterCheck,
+    MailboxMessage,
+    MailboxRequest,
+    answers,
+    next_counter,
+)
+from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from devicebus.mailbox.server import MailboxServer
 from eap.codec.mailbox import (
     MailboxErrorReply,

@@ -9,8 +9,7 @@ from typing import Any, TypeVar, cast
 
 from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.mailbox.match import answers
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare

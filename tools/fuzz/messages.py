@@ -7,8 +7,7 @@ from typing import TypeVar
 
 from devicebus.drive import drive
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
-from devicebus.mailbox.match import answers
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, answers
 from eap.codec.mailbox import MailboxType
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from devicebus.mailbox.protocol import next_counter
+from devicebus.mailbox.conversation import next_counter
 from eap.ams.access import host_of
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_plain_frame
 from eap.gateway import dialect

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns
 from typing import NamedTuple, Protocol, TypeAlias
 
-from devicebus.mailbox.protocol import next_counter
+from devicebus.mailbox.conversation import next_counter
 from eap.ams.hop_prober import PROBE_PORT
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
 from eap.codec.ethercat import EtherCatHeader, FrameType

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devicebus.mailbox.match import answers, has_more
+from devicebus.mailbox.conversation import answers, has_more
 from eap.codec.ams import AmsHeader, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.ids import NetId

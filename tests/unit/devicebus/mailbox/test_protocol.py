@@ -5,13 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devicebus.errors import MailboxRefusedError
-from devicebus.mailbox.protocol import (
-    MINIMUM_SIZE,
-    CounterCheck,
-    MailboxSizes,
-    next_counter,
-    raise_mailbox_error,
-)
+from devicebus.mailbox.conversation import CounterCheck, next_counter
+from devicebus.mailbox.protocol import MINIMUM_SIZE, MailboxSizes, raise_mailbox_error
 from eap.codec.mailbox import MailboxError
 
 

@@ -14,7 +14,7 @@ from devicebus.master.bring import (
 )
 from devicebus.master.bus import MasterSettings
 from devicebus.master.image import plan_image
-from devicebus.master.mailboxport import MailboxArea
+from devicebus.master.mailboxes import MailboxArea
 from devicebus.master.master import Master
 from devicebus.master.pdo import PdoConfiguration
 from devicebus.master.scan import assign_stations

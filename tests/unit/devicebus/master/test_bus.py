@@ -8,7 +8,7 @@ from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master import bus
 from devicebus.master.bus import MAX_EVENTS, BusLost, BusSlave, BusState, MasterSettings
 from devicebus.master.cycle import Participation
-from devicebus.master.mailboxport import MailboxArea
+from devicebus.master.mailboxes import MailboxArea
 from devicebus.master.scan import scan
 from devicebus.master.startup import set_up_cycle
 from devicebus.wire.datagram import frmw

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError, FrameLostError, WorkingCounterError
-from devicebus.master.mailboxport import MailboxArea, MailboxPort, WriteResult, configure
+from devicebus.master.mailboxes import MailboxArea, MailboxPort, WriteResult, configure
 from devicebus.master.scan import assign_stations
 from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest
 from devicebus.wire.register import Register, SyncManager
