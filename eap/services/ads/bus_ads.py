@@ -403,7 +403,7 @@ class BusService:
         """Do the operations of a request; return its answer."""
         header = request.header
         client = AdsClient(request.endpoint, header.source, header.source_port)
-        limit = _TimeLimit.of(request, f"{self._name}: ")
+        limit = _TimeLimit.of(request, self._name)
         try:
             perform = await self._performer(header.target_port, client)
         except AdsRefusedError as exc:
@@ -454,24 +454,29 @@ class BusService:
 class _TimeLimit(NamedTuple):
     """End of the time of a request, and the texts for an operation that does not fit into it."""
 
+    request: LocalRequest
+    bus: str
     end_s: float
     """Time of the running loop."""
-    not_begun: str
-    not_done: str
+    waited_s: float
+    """Behind other requests."""
 
     @classmethod
-    def of(cls, request: LocalRequest, where: str) -> _TimeLimit:
+    def of(cls, request: LocalRequest, bus: str) -> _TimeLimit:
         """Return the limit of a request, BUS_REQUEST_S behind its receipt."""
         waited_s = (monotonic_ns() - request.queued_ns) / 1e9 if request.queued_ns else 0.0
         end_s = asyncio.get_running_loop().time() + BUS_REQUEST_S - waited_s
-        target = request.header.target_port
-        not_done = f"{where}port {target}: not done within {BUS_REQUEST_S:g} s"
-        if not request.ahead:
-            return cls(end_s, not_done, not_done)
-        others = "1 other request" if request.ahead == 1 else f"{request.ahead} other requests"
-        wait = f"waited {waited_s:.1f} s behind {others} of this client"
-        not_begun = f"{where}{wait}: port {target} got no request; send fewer at a time"
-        return cls(end_s, not_begun, f"{not_done}: {wait}")
+        return cls(request, bus, end_s, waited_s)
+
+    def explain(self, *, is_begun: bool) -> str:
+        """Return why an operation was not done."""
+        port, ahead = self.request.header.target_port, self.request.ahead
+        others = "1 other request" if ahead == 1 else f"{ahead} other requests"
+        wait = f"waited {self.waited_s:.1f} s behind {others} of this client"
+        if is_begun or not ahead:
+            late = f"{self.bus}: port {port}: not done within {BUS_REQUEST_S:g} s"
+            return f"{late}: {wait}" if ahead else late
+        return f"{self.bus}: {wait}: port {port} got no request; send fewer at a time"
 
 
 async def _perform_within(
@@ -479,12 +484,12 @@ async def _perform_within(
 ) -> OperationOutcome:
     """Do an operation, or return why it was not done; at the end of its time, that it was not."""
     if asyncio.get_running_loop().time() >= limit.end_s:
-        return OperationOutcome(AdsError.TIMEOUT, why=limit.not_begun)
+        return OperationOutcome(AdsError.TIMEOUT, why=limit.explain(is_begun=False))
     try:
         async with asyncio.timeout_at(limit.end_s):
             return await perform(operation)
     except TimeoutError:
-        return OperationOutcome(AdsError.TIMEOUT, why=limit.not_done)
+        return OperationOutcome(AdsError.TIMEOUT, why=limit.explain(is_begun=True))
     except (AdsRefusedError, EapError) as exc:
         return _error_outcome(exc)
 
