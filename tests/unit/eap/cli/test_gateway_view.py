@@ -24,12 +24,12 @@ ROW = {
     "slaves": [
         {
             "address": 0, "protocol": "COE", "requests": 5, "replies": 5, "errors": {},
-            "last_error": "", "mean_us": 1200.0, "slowest_us": 3000.0,
+            "last_error": "", "mean_us": 1200.0, "slowest_us": 3000.0, "name": "",
         },
         {
             "address": 1009, "protocol": "SOE", "requests": 2, "replies": 0,
             "errors": {"no_slave": 2}, "last_error": "there is no such slave", "mean_us": None,
-            "slowest_us": 0.0,
+            "slowest_us": 0.0, "name": "",
         },
         {
             "address": 0x9001, "protocol": "COE", "requests": 1, "replies": 0,
