@@ -17,7 +17,7 @@ from devicebus.master.link import MAX_DATA
 from devicebus.master.pdo import ProcessDataChannel
 from devicebus.wire.register import FMMU_READ, FMMU_WRITE, Fmmu, SyncManager
 from eap.codec import datatypes
-from eap.codec.values import DataType, Value
+from eap.codec.datatypes import DataType, Value
 
 BASE = 0x0001_0000
 """First logical address."""

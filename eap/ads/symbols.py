@@ -31,7 +31,7 @@ from eap.codec.adssymbol import (
     encode_entry,
     encode_text,
 )
-from eap.codec.values import Array, Block, Boolean, DataType, Integer, Real, String
+from eap.codec.datatypes import Array, Block, Boolean, DataType, Integer, Real, String
 
 _INTEGERS = {
     (True, 1): (AdsType.INT8, "SINT"),

@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from eap.codec import datatypes
-from eap.codec.values import DataType
+from eap.codec.datatypes import DataType
 from eap.config.structs import (
     FrameSection,
     FromSection,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from eap.codec import datatypes
-from eap.codec.values import DataType
+from eap.codec.datatypes import DataType
 from eap.config.exchange import is_unresolved
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index

@@ -15,7 +15,7 @@ import msgspec
 
 from eap.closeable import Closeable
 from eap.codec import datatypes
-from eap.codec.values import DataType
+from eap.codec.datatypes import DataType
 from eap.control.protocol import (
     MAX_LINE,
     SUBSCRIBE,

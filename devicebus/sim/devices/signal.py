@@ -11,7 +11,7 @@ from zlib import crc32
 from devicebus.sim.devices.objects import INPUTS, OUTPUTS, object_ids_of
 from devicebus.sim.spec import ChannelSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
-from eap.codec.values import DataType
+from eap.codec.datatypes import DataType
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Entry
 

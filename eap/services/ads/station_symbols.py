@@ -26,7 +26,7 @@ from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import to_filetime
-from eap.codec.values import String
+from eap.codec.datatypes import String
 from eap.errors import ImageError, TornReadError, WriterConflictError
 from eap.ids import Endpoint, NetId
 from eap.net.image_file import StationImage

@@ -219,18 +219,18 @@ class ControlServer:
             lambda: asyncio.StreamReaderProtocol(reader, loop=loop), sock
         )
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
-        bus = BusConnection(self._buses)
         try:
             peer = peer_of(sock)
             record = self._record and partial(self._record, peer)
             announce = self._announce and partial(self._announce, peer)
-            client = _Client(self._methods, bus, writer, self._slow_reader_s, record, announce)
+            client = _Client(
+                self._methods, self._buses, writer, self._slow_reader_s, record, announce
+            )
             connection.subscriptions = client.subscriptions
             await client.run(reader)
         except* (OSError, TimeoutError) as group:
             logger.debug("control client disconnected: %s", group.exceptions[0])
         finally:
-            bus.close()
             # Not close(): it would wait for a client that does not read.
             transport.abort()
 
@@ -316,7 +316,7 @@ class _Client:
     def __init__(
         self,
         methods: Methods,
-        bus: BusConnection,
+        buses: Buses,
         writer: asyncio.StreamWriter,
         slow_reader_s: float,
         record: Callable[[str, dict[str, Any]], None] | None,
@@ -325,7 +325,9 @@ class _Client:
         self._methods = methods
         self._announce = announce
         self._record = record
-        self._bus = bus
+        self._buses = buses
+        # Few clients use buses; the others need no state for them.
+        self._bus: BusConnection | None = None
         self._writer = writer
         self._slow_reader_s = slow_reader_s
         self.subscriptions: dict[int, asyncio.Task[None]] = {}
@@ -338,11 +340,16 @@ class _Client:
             await self._writer.drain()
 
     async def run(self, reader: _Reader) -> None:
-        async with asyncio.TaskGroup() as group:
-            while line := await self._next_line(reader):
-                await self._answer(line, reader, group)
-            for task in self.subscriptions.values():
-                task.cancel()
+        """Answer requests until the client leaves; then release its buses."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                while line := await self._next_line(reader):
+                    await self._answer(line, reader, group)
+                for task in self.subscriptions.values():
+                    task.cancel()
+        finally:
+            if self._bus is not None:
+                self._bus.close()
 
     async def _next_line(self, reader: asyncio.StreamReader) -> bytes:
         """Return the next line, empty at the end or when the client sends no lines."""
@@ -392,13 +399,13 @@ class _Client:
 
     async def _call_audited(self, request: Request) -> Any:
         """Have a change written down when it is known how it came out, before it is answered."""
-        change = None if self._record is None else change_of(request, self._bus.opened)
+        change = None if self._record is None else change_of(request, self._opened)
         if change is None or self._record is None:
             return await self._call(request)
         station, fields = change
         conversation = None
         if request.method == "bus_ask":
-            conversation = self._bus.opened(request.params["conversation"])
+            conversation = self._opened(request.params["conversation"])
         if self._announce is not None and (why := self._announce(station, fields)):
             raise ControlError(why, code=ErrorCode.REFUSED)
         error: str | None = None  # as long as nobody knows
@@ -412,10 +419,15 @@ class _Client:
             self._record(station, fields | {"error": error})
         return result
 
+    def _opened(self, number: int) -> BusOpenParameters | None:
+        return None if self._bus is None else self._bus.opened(number)
+
     async def _call(self, request: Request) -> Any:
         if request.method == "unsubscribe":
             return self._unsubscribe(request.params)
         if request.method in BUS_METHODS:
+            if self._bus is None:
+                self._bus = BusConnection(self._buses)
             return await self._bus.call(request.method, request.params)
         return await self._methods.call(request.method, request.params)
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from eap.codec import datatypes
-from eap.codec.values import DataType
+from eap.codec.datatypes import DataType
 from eap.errors import ImageError
 from eap.net.image_file import StationImage
 from eap.od.profiles import eap1000 as profile

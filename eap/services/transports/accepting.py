@@ -170,7 +170,8 @@ class ListeningSocket(Generic[C]):
         self._is_local = sock.family == socket.AF_UNIX
         reserve = descriptor_reserve()
         # Half of the reserve is for the operator of this host.
-        self._reserve = reserve // 2 if self._is_local else reserve
+        # Counted once: the limit stays while the process runs.
+        self._spare = spare_descriptors(0, reserve // 2 if self._is_local else reserve)
 
     async def serve(self) -> None:
         """Accept and serve until cancelled; then close all connections."""
@@ -215,7 +216,7 @@ class ListeningSocket(Generic[C]):
 
     def _admit(self, connection: C, sock: socket.socket, group: asyncio.TaskGroup) -> None:
         # Each connection needs one descriptor, and the process needs some for files and the audit.
-        spare = spare_descriptors(sock.fileno(), self._reserve)
+        spare = self._spare - sock.fileno()
         refusal, victim = self._table.admit(
             self._listener, connection, monotonic_ns(), spare_descriptors=spare
         )

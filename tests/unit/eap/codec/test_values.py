@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec.datatypes import parse
-from eap.codec.values import DataType
+from eap.codec.datatypes import DataType, parse
 from eap.errors import TruncatedError
 
 INTEGERS = [

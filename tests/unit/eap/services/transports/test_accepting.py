@@ -175,8 +175,8 @@ def test_listener_without_descriptors_closes_an_unused_connection(monkeypatch):
 
 
 def test_few_descriptors_are_kept_for_the_control_socket(monkeypatch, tmp_path):
-    monkeypatch.setattr(accepting, "spare_descriptors", lambda newest, reserve: 10 - reserve)
-    monkeypatch.setattr(accepting, "descriptor_reserve", lambda: 15)
+    monkeypatch.setattr(accepting, "spare_descriptors", lambda _, reserve: 1500 - reserve)
+    monkeypatch.setattr(accepting, "descriptor_reserve", lambda: 2000)
 
     def refused(connect, echo, listeners):
         assert connect().recv(1) == b""
