@@ -87,4 +87,5 @@ def _send_first_message(protocols: SiiProtocol, state: AlState | None) -> Conver
         note = soe.encode_message(soe.SoeOpcode.NOTIFICATION, 0)
         yield MailboxRequest(MailboxType.SOE, note, expects_reply=False)
     else:
+        # Any slave takes it: one without VoE answers with a mailbox error, which is discarded.
         yield MailboxRequest(MailboxType.VOE, VoeHeader(0, 0).encode(), expects_reply=False)

@@ -12,6 +12,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 
+from eap.codec.mailbox import MailboxType
 from eap.codec.wire import Buffer, Scalar, WireStruct, bit, bits2, u8, u16, u32
 from eap.errors import CodecError, TruncatedError
 
@@ -150,7 +151,7 @@ class SiiCategory(IntEnum):
 
 
 class SiiProtocol(IntFlag):
-    """Mailbox protocols of word 0x1C."""
+    """Mailbox protocols of word 0x1C; each has the name of its :class:`MailboxType`."""
 
     AOE = 0x01
     EOE = 0x02
@@ -158,6 +159,16 @@ class SiiProtocol(IntFlag):
     FOE = 0x08
     SOE = 0x10
     VOE = 0x20
+
+    @classmethod
+    def of(cls, kind: MailboxType) -> SiiProtocol:
+        """Return the bit of a mailbox type, none for a type that an EEPROM cannot name."""
+        return cls.__members__.get(kind.name, cls(0))
+
+    @property
+    def title(self) -> str:
+        """The protocol of one bit as people write it, ``CoE``."""
+        return MailboxType[str(self.name)].title
 
 
 class CategoryHeader(WireStruct, frozen=True):

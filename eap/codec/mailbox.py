@@ -28,6 +28,22 @@ class MailboxType(IntEnum):
 
     __hash__ = int.__hash__  # that of enums is slow
 
+    @property
+    def title(self) -> str:
+        """The protocol as people write it, ``CoE``."""
+        return _TITLES[self]
+
+
+_TITLES = {
+    MailboxType.ERR: "error",
+    MailboxType.AOE: "AoE",
+    MailboxType.EOE: "EoE",
+    MailboxType.COE: "CoE",
+    MailboxType.FOE: "FoE",
+    MailboxType.SOE: "SoE",
+    MailboxType.VOE: "VoE",
+}
+
 
 class MailboxHeader(WireStruct, frozen=True):
     """ETG.1000.4: the six bytes in front of every mailbox message.

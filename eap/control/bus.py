@@ -40,6 +40,7 @@ _MAX_MS = 60_000
 
 Station = Annotated[int, Meta(ge=0, le=0xFFFF)]
 Protocol = Literal["aoe", "eoe", "coe", "foe", "soe", "voe"]
+"""Names of :class:`MailboxType` in lower case; :func:`kind_of` relies on that."""
 State = Literal["INIT", "PREOP", "BOOT", "SAFEOP", "OP"]
 Duration = Annotated[int, Meta(ge=0, le=_MAX_MS)]
 DatagramRow = tuple[int, int, int, str, int]

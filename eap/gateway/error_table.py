@@ -14,6 +14,9 @@ Sources of the columns:
     dialect: failures of the high-nibble dialect, whose numbers are in :mod:`eap.gateway.dialect`.
 No standard relates the columns to each other, and ETG.8200 leaves open what a gateway answers that
 gets no answer itself; the rows are a choice of this project (docs/gateway.md, "Errors").
+
+A protocol has a column if it has codes for most of these causes.  The codes of one with few are
+listed in ``received`` only, and the gateway reports its own causes by the mailbox error.
 """
 
 from __future__ import annotations

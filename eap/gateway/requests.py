@@ -9,8 +9,8 @@ an ADS client would do the same (ETG.1020).
 
 An error is answered in the protocol of the request, since a tool understands those best: an SDO is
 aborted, an IDN refused, a file transfer ended with a text, also for a master or slave that does not
-support the protocol.  A mailbox error answers protocols without an error of their own (VoE, EoE),
-and messages that are no request.
+support the protocol.  A mailbox error answers protocols without an error for the
+causes of a gateway (VoE, EoE), and messages that are no request.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ def _scanned(slave: Slave) -> ScannedSlave:
         # Bit 4 is the error bit of the AL status (ESC 0x0130).
         state=state_name(status.state | status.error << 4) if status.state else None,
         code=status.code,
-        mailbox=None if protocols is None else [f"{str(each.name)[0]}oE" for each in protocols],
+        mailbox=None if protocols is None else [each.title for each in protocols],
         parent=slave.parent,
         ports=slave.ports,
         fault=slave.fault,

@@ -24,16 +24,6 @@ from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
 from eap.ids import MacAddr
 
-PROTOCOLS = {
-    MailboxType.ERR: "error",
-    MailboxType.AOE: "AoE",
-    MailboxType.EOE: "EoE",
-    MailboxType.COE: "CoE",
-    MailboxType.FOE: "FoE",
-    MailboxType.SOE: "SoE",
-    MailboxType.VOE: "VoE",
-}
-
 
 class DecodedPd(Struct, frozen=True):
     """PD of a frame of type 4; *quality* in units of 100 us."""
@@ -201,7 +191,7 @@ def _read_mailbox(frame: memoryview, found: DecodedFrame) -> None:
         channel=header.channel,
         priority=header.priority,
         type=int(header.type),
-        protocol=PROTOCOLS[header.type],
+        protocol=header.type.title,
         counter=header.counter,
     )
     _, data = mailbox.decode_frame(frame)

@@ -11,6 +11,7 @@ from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
+from devicebus.wire.sii import SiiProtocol
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
 from eap.ids import Endpoint
@@ -74,7 +75,7 @@ def memory_slave(
     mailbox = MemoryMailbox(open_line(kind, server, sizes))
     slave = SlaveDescription(
         station=1001, name="s", vendor=1, product=2, revision=3, serial=4, alias=0, state=8,
-        target=8, to_slave=sizes.to_slave, to_master=sizes.to_master, protocols=0x3F,
+        target=8, to_slave=sizes.to_slave, to_master=sizes.to_master, protocols=sum(SiiProtocol),
     )  # fmt: skip
     return LocalSlave(cast("BusClient", mailbox), slave, CLIENT), mailbox
 

@@ -174,8 +174,10 @@ class SlaveAds:
                 return await access.read_info(
                     SdoInfoOpcode.OBJECT_REQUEST, ObjectRequest(index).encode()
                 )
-        request = EntryRequest(index, low & 0xFF, low >> 8).encode()
-        return await access.read_info(SdoInfoOpcode.ENTRY_REQUEST, request)
+            case IndexGroup.ENTRY_DESCRIPTION:
+                request = EntryRequest(index, low & 0xFF, low >> 8).encode()
+                return await access.read_info(SdoInfoOpcode.ENTRY_REQUEST, request)
+        raise AdsRefusedError(AdsError.INDEX_GROUP)
 
     async def _write(self, target: SlaveTarget, group: int, offset: int, data: bytes) -> None:
         """Write an entry, an object or an element, or execute a procedure command."""
@@ -309,8 +311,7 @@ def _protocol(slave: SlaveDescription, group: int) -> SiiProtocol:
     if not slave.protocols & (protocol | SiiProtocol.AOE):
         if protocol is SiiProtocol.AOE:
             raise AdsRefusedError(AdsError.INDEX_GROUP)
-        name = str(protocol.name).replace("OE", "oE")
-        why = f"slave {slave.station} does not speak {name}"
+        why = f"slave {slave.station} does not speak {protocol.title}"
         raise AdsRefusedError(AdsError.SERVICE, why)
     # A slave that is missing on the bus: an exchange would only run into its time-out.
     if not slave.state:

@@ -32,6 +32,10 @@ MASTER_PORT = 0xFFFF
 _SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
 """Services of CoE whose messages may be aborts."""
 _SOE_ERROR = 0x10
+_FOE_ERRORS: dict[int, AdsError] = {
+    FoeOpcode.BUSY: AdsError.BUSY,
+    FoeOpcode.ERROR: AdsError.GENERAL,
+}
 
 
 class RuleTarget(NamedTuple):
@@ -156,18 +160,36 @@ def result_of(replies: Sequence[GatewayReply]) -> int | None:
 
 def error_in(kind: MailboxType, body: bytes) -> int:
     """Return the error that a slave answered with, as one of ADS; 0 for none."""
-    match kind:
-        case MailboxType.ERR:
-            return AdsError.SERVICE
-        case MailboxType.COE if len(body) >= CoeHeader.SIZE + SdoHeader.SIZE:
-            head = SdoHeader.decode(body, CoeHeader.SIZE)
-            # An abort may come with the service of a request or of a response.
-            if body[1] >> 4 in _SDO and head.specifier == SdoRequest.ABORT:
-                return ads_result(SdoAbortError(head.value, head.index, head.subindex))
-        case MailboxType.SOE if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR:
-            return AdsError.GENERAL
-        case MailboxType.FOE if body[:1] == bytes((FoeOpcode.BUSY,)):
-            return AdsError.BUSY
-        case MailboxType.FOE if body[:1] == bytes((FoeOpcode.ERROR,)):
-            return AdsError.GENERAL
-    return 0
+    find = _ERRORS.get(kind)
+    return find(body) if find is not None else 0
+
+
+def _of_error_reply(_: bytes) -> int:
+    return AdsError.SERVICE
+
+
+def _of_coe(body: bytes) -> int:
+    if len(body) < CoeHeader.SIZE + SdoHeader.SIZE:
+        return 0
+    head = SdoHeader.decode(body, CoeHeader.SIZE)
+    # An abort may come with the service of a request or of a response.
+    if body[1] >> 4 not in _SDO or head.specifier != SdoRequest.ABORT:
+        return 0
+    return ads_result(SdoAbortError(head.value, head.index, head.subindex))
+
+
+def _of_soe(body: bytes) -> int:
+    return AdsError.GENERAL if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR else 0
+
+
+def _of_foe(body: bytes) -> int:
+    return _FOE_ERRORS.get(body[0], 0) if body else 0
+
+
+_ERRORS: dict[MailboxType, Callable[[bytes], int]] = {
+    MailboxType.ERR: _of_error_reply,
+    MailboxType.COE: _of_coe,
+    MailboxType.SOE: _of_soe,
+    MailboxType.FOE: _of_foe,
+}
+"""Protocols whose slaves can refuse; the audit records a change by any other as done."""

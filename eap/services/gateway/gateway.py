@@ -463,7 +463,7 @@ def check_slave(kind: MailboxType, body: bytes, slave: SlaveDescription) -> None
     """Raise GatewayError if a request cannot be sent to the slave at all."""
     if not slave.to_slave:
         raise GatewayError(cause_of(no_mailbox(slave)))
-    if not slave.protocols & SiiProtocol[kind.name]:
+    if not slave.protocols & SiiProtocol.of(kind):
         raise GatewayError(Cause.NO_PROTOCOL)
     if len(body) + MailboxHeader.SIZE > slave.to_slave:
         raise GatewayError(Cause.TOO_LONG)

@@ -17,6 +17,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.voe import VoeServer
 from devicebus.master.mailboxes import Unsolicited
+from devicebus.wire.sii import SiiProtocol
 from eap.ads.request import Operation, OperationOutcome, Read, ReadWrite, accept_request
 from eap.ams.access import AccessList
 from eap.ams.spec import AccessRule, AccessService
@@ -115,7 +116,8 @@ class _Link:
     async def current(self) -> BusDescription:
         slave = SlaveDescription(
             station=_STATION, name="", vendor=0, product=0, revision=0, serial=0, alias=0, state=8,
-            target=8, to_slave=_SIZES.to_slave, to_master=_SIZES.to_master, protocols=0x2C,
+            target=8, to_slave=_SIZES.to_slave, to_master=_SIZES.to_master,
+            protocols=SiiProtocol.COE | SiiProtocol.FOE | SiiProtocol.VOE,
         )  # fmt: skip
         return BusDescription(True, "", {_STATION: slave})
 

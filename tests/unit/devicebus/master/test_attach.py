@@ -43,7 +43,10 @@ def line(tmp_path):
 
 @pytest.mark.parametrize("name", REQUESTS)
 def test_every_session_is_answered(line, name):
-    """Whatever the counter of the last message of the session before was."""
+    """The counter of the last message of the session before does not matter.
+
+    A request of this test has the same answer each time, so that a lost or a stale one is seen.
+    """
     answers = []
     for number in range(9):
         with line.session() as bus:

@@ -18,8 +18,10 @@ from devicebus.wire.sii import (
     SiiPdo,
     SiiPdoEntry,
     SiiPdoHeader,
+    SiiProtocol,
     SiiSyncManager,
 )
+from eap.codec.mailbox import MailboxType
 from eap.errors import CodecError, TruncatedError
 
 
@@ -145,3 +147,11 @@ def test_garbage_never_escapes(noise):
 def test_string_that_does_not_fit(text):
     with pytest.raises(CodecError, match="StringCount"):
         sii.encode(Sii(fixed=SiiFixed(), strings=(text,)))
+
+
+def test_protocols_have_the_names_and_titles_of_mailbox_types():
+    bits = {kind: SiiProtocol.of(kind) for kind in MailboxType}
+    assert bits.pop(MailboxType.ERR) == SiiProtocol(0)
+    assert sorted(bits.values()) == sorted(SiiProtocol)
+    assert all(bit.title == kind.title for kind, bit in bits.items())
+    assert SiiProtocol.COE.title == "CoE"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 
 from devicebus.errors import BusError
@@ -11,6 +13,7 @@ from eap.codec.mailbox import MailboxType
 from eap.control.bus import (
     BUS_TRANSFER,
     BusAskParameters,
+    Protocol,
     datagram_row,
     kind_of,
     protocol_of,
@@ -69,3 +72,7 @@ def test_kind_of_an_unknown_protocol_is_refused():
         BUS_TRANSFER.decode({"replies": [1]})
     with pytest.raises(ControlError, match="timeout_ms"):
         parameters({"conversation": 1, "request": "", "timeout_ms": 10**9}, BusAskParameters)
+
+
+def test_protocols_are_the_mailbox_types_without_errors():
+    assert {kind_of(name) for name in get_args(Protocol)} == {*MailboxType} - {MailboxType.ERR}

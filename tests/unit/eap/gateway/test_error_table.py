@@ -101,4 +101,6 @@ def test_error_table_receives_each_code_as_one_cause():
     ]
     assert len(received) == len(set(received))
     kinds = {kind for kind, _ in received}
-    assert kinds == {AdsError, AbortCode, SoeErrorCode, FoeErrorCode, MailboxError}
+    assert kinds == {AdsError, AbortCode, SoeErrorCode, FoeErrorCode, MailboxError}, (
+        "codes of a new protocol: add them here and to _refusal of error_table"
+    )

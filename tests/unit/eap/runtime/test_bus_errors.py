@@ -37,3 +37,15 @@ def test_others_become_errors_of_the_bus():
     assert to_record(ConfigError("no number")) == ErrorRecord("BusError", "no number")
     for kind in ("EapError", "annotations", "os", ""):
         assert type(to_error(ErrorRecord(kind, "text"))) is errors.BusError
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [each for each in vars(errors).values() if isinstance(each, type)],
+    ids=lambda k: k.__name__,
+)
+def test_every_bus_error_has_its_numbers_in_the_table(kind):
+    if issubclass(kind, errors.BusError):
+        assert type(to_error(ErrorRecord(kind.__name__, "text"))) is kind, (
+            f"{kind.__name__}: add its numbers to _FACTS of eap/runtime/bus_errors.py"
+        )

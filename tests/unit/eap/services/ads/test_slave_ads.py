@@ -6,6 +6,7 @@ import pytest
 
 from devicebus.mailbox import aoe_client
 from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.wire.sii import SiiProtocol
 from eap.ads.request import Read, ReadState, ReadWrite, Write, WriteControl
 from eap.codec.ads import AdsError, AdsRange, AdsState, IndexGroup, SoeOffset
 from eap.codec.adsnotification import AddNotification, TransMode
@@ -46,6 +47,15 @@ def test_slave_without_the_protocol_of_a_group_is_an_error(group):
         assert (await client.do(MUTE, Read(0x1234, 0, 4))).result == AdsError.INDEX_GROUP
 
     play(scene, "aoe")
+
+
+def test_group_without_a_service_is_not_sent_as_another_one(monkeypatch):
+    monkeypatch.setitem(bus_ads._PROTOCOLS, 0x1234, SiiProtocol.COE)
+
+    async def scene(client, engine):
+        assert (await client.do(DRIVE, Read(0x1234, 0, 4))).result == AdsError.INDEX_GROUP
+
+    play(scene)
 
 
 def test_slave_without_an_open_mailbox_is_answered_with_its_state():
