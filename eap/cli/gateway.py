@@ -25,12 +25,14 @@ from eap.cli.params import (
     open_session,
     plant_option,
 )
+from eap.errors import ControlError
 
 if TYPE_CHECKING:
     from rich.tree import Tree
 
     from eap.control.bus import GatewayRow, MailboxFigures
     from eap.ops.bus_objects import SdoDumpEntry
+    from eap.ops.client import ControlClient
 
 
 _JSON = json_option("Print one object per gateway; docs/control.md explains its fields.")
@@ -82,8 +84,10 @@ def status(target: str, plant: str | None, output: Renderer) -> None:
 
     Without STATION, of all running stations.
     """
-    rows = _call("status", target, plant) if target else _all_rows(plant)
+    rows, silent = (_call("status", target, plant), []) if target else _all_rows(plant)
     output.show_rows(rows, _status_view)
+    if silent:
+        raise silent[0]
 
 
 def _call(
@@ -104,29 +108,33 @@ def _call(
         return client.call(method, station=station, port=port)
 
 
-def _all_rows(plant: str | None) -> list[GatewayRow]:
-    """Return the gateways of all stations of the running appliances."""
+def _all_rows(plant: str | None) -> tuple[list[GatewayRow], list[ControlError]]:
+    """Return the gateways of all stations, and the errors of appliances that do not answer."""
     from contextlib import ExitStack
 
     from eap.control.bus import GATEWAY_STATUS
     from eap.control.protocol import ErrorCode
-    from eap.errors import ControlError
-    from eap.ops.client import connect
+    from eap.ops.client import call_each, connect
 
-    rows: list[GatewayRow] = []
+    def rows_of(client: ControlClient) -> list[GatewayRow]:
+        rows: list[GatewayRow] = []
+        for station in client.info.stations:
+            try:
+                found: list[GatewayRow] = client.call(GATEWAY_STATUS, station=station)
+            except ControlError as exc:
+                if exc.code != ErrorCode.UNKNOWN_NAME:  # the station has no bus port
+                    raise
+            else:
+                rows += found
+        return rows
+
     with ExitStack() as stack:
-        for client in [stack.enter_context(each) for each in connect(plant)]:
-            for station in client.info.stations:
-                try:
-                    found = client.call(GATEWAY_STATUS, station=station)
-                except ControlError as exc:
-                    if exc.code != ErrorCode.UNKNOWN_NAME:  # the station has no bus port
-                        raise
-                else:
-                    rows += found
-    if not rows:
+        clients = [stack.enter_context(each) for each in connect(plant)]
+        answers, silent = call_each(clients, rows_of)
+    rows = [row for answer in answers for row in answer]
+    if not rows and not silent:
         raise ControlError("no running station has a mailbox gateway: none has a bus port")
-    return rows
+    return rows, silent
 
 
 def _state_lines(rows: Iterable[GatewayRow]) -> Iterator[str]:

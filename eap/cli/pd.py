@@ -21,6 +21,7 @@ from eap.cli.params import (
 
 if TYPE_CHECKING:
     from eap.cli.pd_view import ListedPd
+    from eap.ops.client import ControlClient
 
 
 @click.group(cls=CommandGroup)
@@ -36,16 +37,22 @@ def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
     """List every PD with ID, version, port and address, and every variable with type and writer."""
     from eap.cli.pd_view import listed_pds, pd_table
     from eap.control.protocol import PD_LIST, VARIABLES
-    from eap.ops.client import connect
+    from eap.ops.client import call_each, connect
 
-    rows: list[ListedPd] = []
+    def rows_of(client: ControlClient) -> list[ListedPd]:
+        rows: list[ListedPd] = []
+        for name in [station] if station else client.info.stations:
+            pds = client.call(PD_LIST, station=name)
+            variables = client.call(VARIABLES, station=name)
+            rows += listed_pds(name, pds, variables)
+        return rows
+
     with ExitStack() as stack:
-        for client in map(stack.enter_context, connect(plant, station)):
-            for name in [station] if station else client.info.stations:
-                pds = client.call(PD_LIST, station=name)
-                variables = client.call(VARIABLES, station=name)
-                rows += listed_pds(name, pds, variables)
-    output.show_rows(rows, pd_table)
+        clients = [stack.enter_context(each) for each in connect(plant, station)]
+        found, silent = call_each(clients, rows_of)
+    output.show_rows([row for rows in found for row in rows], pd_table)
+    if silent:
+        raise silent[0]
 
 
 @pd.command()

@@ -11,7 +11,7 @@ import click
 from eap.cli.group import ExitCode, LazyGroup
 from eap.cli.output import Renderer, write_text
 from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
-from eap.errors import EnvironmentalError
+from eap.errors import ControlError, EnvironmentalError
 
 if TYPE_CHECKING:
     from eap.control.routes import ImportRow, NeighbourRow, TestResult
@@ -94,8 +94,12 @@ def list_all(station: str | None, match: str, plant: str | None, output: Rendere
     from eap.cli.routes_view import routes_view
     from eap.ops.routing import RouterList, list_routes
 
-    found = list_routes(plant, station, match, requests=50 if output.is_json else 0)
+    silent: list[ControlError] = []
+    requests = 50 if output.is_json else 0
+    found = list_routes(plant, station, match, requests=requests, silent=silent)
     output.show(RouterList([row for each in found for row in each.stations]), routes_view)
+    if silent:
+        raise silent[0]
 
 
 @click.command(short_help="Add a persistent route.")

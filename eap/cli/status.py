@@ -423,7 +423,10 @@ def full_view(document: StatusReport, now_s: float) -> Iterator[RenderableType]:
         yield finding_grid(faults, now_s)
     for appliance in document.appliances:
         yield ""
-        yield _processes_table(appliance, appliance_label(document, appliance))
+        if (label := appliance_label(document, appliance)) != appliance.plant:
+            # Above the table: a heading with all stations would widen its first column.
+            yield Styled(label, style="bold")
+        yield _processes_table(appliance)
         if listeners := appliance.listeners:
             yield ""
             yield _listeners(listeners)
@@ -442,9 +445,9 @@ def full_view(document: StatusReport, now_s: float) -> Iterator[RenderableType]:
         yield from (Styled(each.text(now_s)) for each in remarks)
 
 
-def _processes_table(appliance: ApplianceStatus, label: str) -> TextTable:
+def _processes_table(appliance: ApplianceStatus) -> TextTable:
     table = TextTable(
-        f"Process of {label}",
+        f"Process of {appliance.plant}",
         Column("PID", rank=1, is_number=True),
         Column("CPU", is_number=True),
         Column("Memory", is_number=True),

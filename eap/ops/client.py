@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from math import isfinite
 from time import monotonic
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import msgspec
 
@@ -34,6 +34,8 @@ from eap.errors import ControlError
 from eap.runtime.bus_errors import ErrorRecord, to_error
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, describe_roots, find_running
 from eap.suggest import suggest
+
+T = TypeVar("T")
 
 TIMEOUT_S = 10.0
 """Time for one answer: services may be restarting."""
@@ -262,6 +264,28 @@ def request_each(
         raise next(iter(silent.values()), clients[0].gone("timed out"))
     answered = [results[client] for client in clients if client in results]
     return answered, [client.info for client in clients if client not in results]
+
+
+def call_each(
+    clients: Iterable[ControlClient], call: Callable[[ControlClient], T]
+) -> tuple[list[T], list[ControlError]]:
+    """Return what *call* returns of the appliances that answer, and the errors of the others.
+
+    Raises:
+        ControlError: none answers, or one refuses.
+    """
+    found: list[T] = []
+    silent: list[ControlError] = []
+    for client in clients:
+        try:
+            found.append(call(client))
+        except ControlError as exc:
+            if exc.code != ErrorCode.UNAVAILABLE:
+                raise
+            silent.append(exc)
+    if silent and not found:
+        raise silent[0]
+    return found, silent
 
 
 def connect_station(station: str, plant: str | None) -> ControlClient:

@@ -37,7 +37,7 @@ from eap.control.routes import (
 )
 from eap.errors import CodecError, ControlError
 from eap.gateway.error_table import cause_of_result
-from eap.ops.client import ControlClient, connect
+from eap.ops.client import ControlClient, call_each, connect
 
 T = TypeVar("T")
 
@@ -291,6 +291,7 @@ def list_routes(
     *,
     requests: int = 0,
     most: int | None = None,
+    silent: list[ControlError] | None = None,
 ) -> list[PlantRoutes]:
     """Return all routes of the running stations, or of *station*, that *match*.
 
@@ -300,19 +301,24 @@ def list_routes(
         match: Substring of name, NetID, transport, address, origin or state of a route.
         requests: Number of the latest requests to return of each station.
         most: Routes of one station; None for as many as there are.
+        silent: Gets the errors of appliances that do not answer, if others do.
 
     Raises:
         ControlError: there is no such appliance or station, or it does not answer.
     """
-    clients = connect(plant, station)
-    try:
-        return [
-            PlantRoutes(each.info.plant, _fetch_routes(each, station or "", match, requests, most))
-            for each in clients
-        ]
-    finally:
-        for each in clients:
-            each.close()
+    with ExitStack() as stack:
+        clients = [stack.enter_context(each) for each in connect(plant, station)]
+        found, errors = call_each(
+            clients,
+            lambda each: PlantRoutes(
+                each.info.plant, _fetch_routes(each, station or "", match, requests, most)
+            ),
+        )
+    if silent is not None:
+        silent += errors
+    elif errors:
+        raise errors[0]
+    return found
 
 
 def _fetch_routes(

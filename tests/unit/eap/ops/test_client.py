@@ -13,7 +13,14 @@ import pytest
 
 from devicebus.errors import AlStatusError
 from eap.errors import ControlError
-from eap.ops.client import ApplianceStatus, ControlClient, MergedStatus, connect, request_each
+from eap.ops.client import (
+    ApplianceStatus,
+    ControlClient,
+    MergedStatus,
+    call_each,
+    connect,
+    request_each,
+)
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
 
 pytestmark = pytest.mark.net
@@ -256,3 +263,19 @@ def test_request_to_hung_services_ends_after_a_ping(monkeypatch: pytest.MonkeyPa
         with client:
             assert client.request("status") == 5
         thread.join()
+
+
+def test_call_each_returns_the_answers_and_the_errors_of_silent_appliances() -> None:
+    def call(number: int) -> int:
+        if number < 0:
+            raise ControlError(f"{number} does not answer", code="unavailable")
+        if number == 0:
+            raise ControlError("no such name", code="unknown_name")
+        return number
+
+    found, silent = call_each([-1, 2, -3, 4], call)
+    assert (found, list(map(str, silent))) == ([2, 4], ["-1 does not answer", "-3 does not answer"])
+    with pytest.raises(ControlError, match="-1 does not answer"):
+        call_each([-1], call)
+    with pytest.raises(ControlError, match="no such name"):
+        call_each([1, 0], call)
