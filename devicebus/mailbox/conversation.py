@@ -5,9 +5,10 @@
         more = yield MailboxRequest(MailboxType.COE, request, listen=True)  # nothing is sent
         return first.data + more.data
 
-The driver (:mod:`devicebus.drive`, or a master's mailbox) sends the request, waits, and resumes the
-generator with the reply.  It throws MailboxTimeoutError when no reply comes and MailboxRefusedError
-when the slave answers with a mailbox error, and closes the generator to cancel it.
+The driver (:func:`drive`, :func:`drive_async`, or a master's mailbox) sends the request, waits, and
+resumes the generator with the reply.  It throws MailboxTimeoutError when no reply comes and
+MailboxRefusedError when the slave answers with a mailbox error, and closes the generator to cancel
+it.
 
 :func:`answers` matches a slave's replies to requests, by their content alone (ETG.1000.6).  The
 mailbox counter cannot match them: a reply carries the slave's own sequence.  A reply that is too
@@ -15,19 +16,23 @@ short to identify matches any request of its protocol, so that the conversation 
 instead of a time-out.  A conversation that listens for fragments passes a shortened request: it
 holds only the fields that fragments repeat.
 
+BusError raised by *exchange* of a driver is thrown into the generator, which may handle it: a SoE
+procedure command is cleared after a failure, a scan skips a slave that does not answer.  Any other
+error, as of a lost engine or a cancelled task, closes the generator and goes to the caller.
+
 The records travel as they are, in MessagePack, between the processes that share a master.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Awaitable, Callable, Generator, Iterator
 from contextlib import contextmanager
 from typing import TypeAlias, TypeVar
 
 import msgspec
 
-from devicebus.errors import MailboxProtocolError
+from devicebus.errors import BusError, MailboxProtocolError
 from eap.codec import foe
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 from eap.codec.coe import (
@@ -368,3 +373,48 @@ def is_aoe_fragment(reply: bytes) -> bool:
     """Return true if *reply* is an AoE fragment, and not the acknowledgement of one."""
     flags = int.from_bytes(reply[18:20], "little")
     return reply[16:18] == _FRAGMENT and not flags & StateFlags.RESPONSE
+
+
+RequestT = TypeVar("RequestT")
+ReplyT = TypeVar("ReplyT")
+
+
+def drive(
+    conversation: Generator[RequestT, ReplyT, T], exchange: Callable[[RequestT], ReplyT]
+) -> T:
+    """Run a conversation to its end, one exchange after the other; return its result."""
+    try:
+        request = next(conversation)
+        while True:
+            try:
+                reply = exchange(request)
+            except BusError as exc:
+                request = conversation.throw(exc)
+            else:
+                request = conversation.send(reply)
+    except StopIteration as end:
+        result: T = end.value
+        return result
+    finally:
+        # Also after an error of *exchange*, so that a transfer under way is released at once.
+        conversation.close()
+
+
+async def drive_async(
+    conversation: Generator[RequestT, ReplyT, T], exchange: Callable[[RequestT], Awaitable[ReplyT]]
+) -> T:
+    """Run a conversation to its end as :func:`drive` does, waiting for each exchange."""
+    try:
+        request = next(conversation)
+        while True:
+            try:
+                reply = await exchange(request)
+            except BusError as exc:
+                request = conversation.throw(exc)
+            else:
+                request = conversation.send(reply)
+    except StopIteration as end:
+        result: T = end.value
+        return result
+    finally:
+        conversation.close()

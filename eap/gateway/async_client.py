@@ -10,13 +10,13 @@ from time import monotonic_ns
 from types import TracebackType
 from typing import Self, TypeVar, cast
 
-from devicebus.drive import drive_async
 from devicebus.mailbox import coe_client, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import (
     Conversation,
     MailboxMessage,
     MailboxRequest,
     Progress,
+    drive_async,
 )
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_client import IdnDescription

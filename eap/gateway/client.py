@@ -21,7 +21,6 @@ from functools import partial
 from time import monotonic_ns
 from typing import TypeVar
 
-from devicebus.drive import drive
 from devicebus.errors import BusError
 from devicebus.mailbox import coe_client, foe_client, soe_client, voe
 from devicebus.mailbox.conversation import (
@@ -29,6 +28,7 @@ from devicebus.mailbox.conversation import (
     MailboxMessage,
     MailboxRequest,
     Progress,
+    drive,
 )
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_client import IdnDescription

@@ -14,9 +14,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from devicebus.drive import drive
 from devicebus.errors import FrameLostError
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, drive
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.findings import History
 from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-import devicebus.drive
+from devicebus.mailbox.conversation import drive as run_conversation
 from devicebus.mailbox.server import MailboxServer
 from devicebus.master.esm import change_state
 from devicebus.master.link import Link
@@ -151,7 +151,7 @@ def drive(
         now_ns += TRIP_NS
         return StepReplies([respond(access) for access in step], now_ns)
 
-    return devicebus.drive.drive(procedure, exchange)
+    return run_conversation(procedure, exchange)
 
 
 def slave(name: str, kind: str = "digital", **options) -> SlaveSpec:

@@ -13,7 +13,6 @@ from typing import TypeVar
 
 import pytest
 
-from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox.conversation import (
     Conversation,
@@ -21,6 +20,7 @@ from devicebus.mailbox.conversation import (
     MailboxMessage,
     MailboxRequest,
     answers,
+    drive,
     next_counter,
 )
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer

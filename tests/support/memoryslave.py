@@ -7,9 +7,14 @@ from collections import deque
 from collections.abc import Hashable
 from typing import Any, TypeVar, cast
 
-from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, answers
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+    answers,
+    drive_async,
+)
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from devicebus.wire.sii import SiiProtocol
 from eap.codec.mailbox import MailboxType

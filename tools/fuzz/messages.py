@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
-from devicebus.drive import drive
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, answers
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+    answers,
+    drive,
+)
 from eap.codec.mailbox import MailboxType
 
 T = TypeVar("T")

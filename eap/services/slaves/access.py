@@ -12,9 +12,8 @@ from collections.abc import Coroutine, Hashable
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
-from devicebus.drive import drive_async
 from devicebus.mailbox import aoe_client, coe_client, soe_client, voe
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, drive_async
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet

@@ -19,13 +19,13 @@ from time import monotonic_ns
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
-from devicebus.drive import drive_async
 from devicebus.errors import BusError, MailboxBusyError
 from devicebus.mailbox.conversation import (
     ABORT_MESSAGES,
     Conversation,
     MailboxMessage,
     MailboxRequest,
+    drive_async,
 )
 from devicebus.master.findings import SlaveView, find_silence
 from devicebus.master.mailboxes import Unsolicited

@@ -14,10 +14,15 @@ from collections.abc import Awaitable, Callable, Hashable
 from hashlib import sha256
 from time import monotonic
 
-from devicebus.drive import drive_async
 from devicebus.errors import BusError
 from devicebus.mailbox import foe_client
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, Progress
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+    Progress,
+    drive_async,
+)
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import DATA_OVERHEAD, FoeOpcode
 from eap.errors import EapError

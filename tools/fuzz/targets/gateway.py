@@ -8,10 +8,9 @@ from collections.abc import Callable, Hashable, Iterator
 from itertools import cycle
 from typing import TypeVar, cast
 
-from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.coe_server import CoeServer
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, drive_async
 from devicebus.mailbox.foe_server import FoeServer, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer

@@ -7,10 +7,9 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from devicebus.drive import drive
 from devicebus.errors import BusError
 from devicebus.mailbox import coe_client, eoe, foe_client, soe_client, voe
-from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest, drive
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
 from eap.codec.soe import Idn

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 
-from devicebus.drive import drive
 from devicebus.errors import BusError
+from devicebus.mailbox.conversation import drive
 from devicebus.master import eeprom
 from devicebus.master.image import SlaveProcessData, plan_image
 from devicebus.master.pdo import channels_from_sii

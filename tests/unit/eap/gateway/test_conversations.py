@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox import coe_client, foe_client, soe_client, voe
-from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
+from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest, drive
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
 from eap.codec.soe import Idn

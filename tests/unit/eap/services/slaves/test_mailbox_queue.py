@@ -8,9 +8,8 @@ from contextlib import suppress
 import pytest
 from msgspec.structs import replace
 
-from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import MailboxRequest
+from devicebus.mailbox.conversation import MailboxRequest, drive_async
 from eap.codec.mailbox import MailboxType
 from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.engine_link import EngineLink

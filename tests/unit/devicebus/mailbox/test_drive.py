@@ -5,8 +5,8 @@ from collections.abc import Callable, Generator
 
 import pytest
 
-from devicebus.drive import drive, drive_async
 from devicebus.errors import BusError, MailboxTimeoutError
+from devicebus.mailbox.conversation import drive, drive_async
 from eap.errors import EngineGoneError
 
 
