@@ -140,7 +140,9 @@ def check_top_level(files: list[PurePosixPath]) -> Iterator[Violation]:
     """Yield what stands at the top and does not belong there, each entry once."""
     for entry in sorted({name.parts[0] for name in files} - TOP_LEVEL):
         first = next(name for name in files if name.parts[0] == entry)
-        yield Violation(first, 1, f"{entry!r} at the top level", "a known one")
+        yield Violation(
+            first, 1, f"{entry!r} at the top level", "a known one (untracked: remove it)"
+        )
 
 
 def check_unit_tests(files: list[PurePosixPath]) -> Iterator[Violation]:

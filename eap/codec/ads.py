@@ -114,7 +114,8 @@ class IndexGroup(IntEnum):
 
     Those of a slave are of ETG.1020, AoE; those of symbols and sums of AdsDef.h; those of a master
     and of the I/O server as Beckhoff documents them for TwinCAT; FoE, SoE and VoE as in Ads.h of
-    its SDK.
+    its SDK.  An own group takes a number that none of these sources uses, near its relatives, and
+    says "own format".
     """
 
     ADDRESS = 0x0001

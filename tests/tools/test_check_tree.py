@@ -39,14 +39,16 @@ def test_every_finding_is_one_line_and_the_status_is_1(tmp_path, capsys):
     assert main([str(tmp_path)]) == 1
 
     assert capsys.readouterr().out.splitlines() == [
-        "notes.txt:1: 'notes.txt' at the top level, expected a known one",
+        "notes.txt:1: 'notes.txt' at the top level, expected a known one (untracked: remove it)",
         "tests/unit/eap/helper.py:1: no test file, expected helpers of tests in tests/support",
     ]
 
 
 def test_a_foreign_directory_is_reported_once(tmp_path):
     grow(tmp_path, "vendor/a.txt", "vendor/b.txt")
-    assert found(tmp_path) == ["vendor/a.txt:1: 'vendor' at the top level, expected a known one"]
+    assert found(tmp_path) == [
+        "vendor/a.txt:1: 'vendor' at the top level, expected a known one (untracked: remove it)"
+    ]
 
 
 def test_missing_file_named_in_page_is_reported(tmp_path):
