@@ -3,7 +3,8 @@
 Rules: the top level holds only what ``docs/architecture.md`` allows; modules stay under 700 lines;
 ``tests/unit`` and ``tests/tools`` hold test files, in folders named after what they test;
 nothing that is true of one machine only is committed; unfinished work names its issue; tasks have
-an owner that keeps and reports them; the files and modules that pages name exist.
+an owner that keeps and reports them; docstrings name the thing; the files and modules that pages
+name exist.
 
     python tools/check_tree.py [ROOT]
 
@@ -66,6 +67,7 @@ LINK = re.compile(r"\]\(([^)\s:#]*)(?:#([\w-]+))?\)")
 HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 PAGES = ("CONTRIBUTING.md", "README.md")
 """Pages beside those in ``docs/``."""
+QUESTION = re.compile(r'^\s*r?"""(?:What|Who(?:ever|m|se)?|How|Whether|Where|When|Why)\b')
 LOOSE_TASK = re.compile(r"(?<!group)\.create_task\(|\bensure_future\(")
 TASKS = ("services", "tasks.py")
 """The module that may start tasks, whatever package services is in."""
@@ -169,6 +171,8 @@ def check_text(name: PurePosixPath, text: str) -> Iterator[Violation]:
     for number, line in enumerate(lines, 1):
         if is_bound and LOOSE_TASK.search(line):
             yield Violation(name, number, "a task without an owner", "a TaskGroup or a TaskSet")
+        if name.suffix == ".py" and QUESTION.search(line):
+            yield Violation(name, number, "a docstring that asks", "the thing's name, or a verb")
         for pattern, what, expected in FORBIDDEN:
             if match := pattern.search(line):
                 yield Violation(name, number, f"{what} ({match[0]})", expected)

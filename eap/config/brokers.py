@@ -24,7 +24,7 @@ class Broker(NamedTuple):
     host: str
     port: int
     needs_tls: bool
-    """Whether the URL requires TLS, with or without a ``tls`` section."""
+    """True if the URL requires TLS, with or without a ``tls`` section."""
 
 
 def parse_url(text: str) -> Broker:

@@ -449,7 +449,7 @@ class Plant(msgspec.Struct, frozen=True):
     directory: tuple[DirectoryStation, ...] = ()
     """Names of the stations, ports and slaves of the plant."""
     audit_required: bool = False
-    """Whether changes that cannot be recorded are refused."""
+    """True if changes that cannot be recorded are refused."""
 
 
 class PlantResult(msgspec.Struct, frozen=True):

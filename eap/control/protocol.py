@@ -62,7 +62,7 @@ class Request(msgspec.Struct, frozen=True):
 
 
 class Failure(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Why a request was not done."""
+    """Error of a request that was not done."""
 
     code: str
     message: str

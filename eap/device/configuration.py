@@ -200,7 +200,7 @@ class EntryChange(msgspec.Struct, frozen=True):
     data: bytes
     """Data of the download."""
     interim: bool = False
-    """Whether the write is an interim step, such as clearing an entry that is set later."""
+    """True if the write is an interim step, such as clearing an entry that is set later."""
 
 
 def compare(old: EapDictionary, new: EapDictionary) -> list[EntryChange]:

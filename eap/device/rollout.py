@@ -55,7 +55,7 @@ class PdLayout(NamedTuple):
     size: int
     variables: tuple[PdVariable, ...]
     any_version: bool = False
-    """Whether a receiver accepts any other version, too."""
+    """True if a receiver accepts any other version, too."""
 
 
 def lay_out(version: int, variables: Iterable[tuple[str, str]]) -> PdLayout:

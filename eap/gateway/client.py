@@ -64,8 +64,8 @@ class GatewayClient(Closeable):
             virtual addresses.
 
     Raises:
-        EnvironmentalError: the host has no address, or no way leads there.
-        BusError: nobody takes the connection.
+        EnvironmentalError: the host has no address, or no route leads there.
+        BusError: the host accepts no connection.
     """
 
     def __init__(

@@ -61,14 +61,14 @@ class PendingRequest:
         self.tries = tries
         self.first_ns = 0
         self.deadline_ns: int | None = due_ns
-        """When to send it, or to give up; None while it may not be sent beside another."""
+        """Time to send it, or to give up; None while it may not be sent beside another."""
         self.is_single = False
-        """Whether it has to be the only one in flight at its address."""
+        """True if it has to be the only one in flight at its address."""
         self._outcome: MailboxMessage | BusError
 
     @property
     def is_in_flight(self) -> bool:
-        """Whether a reply to it is expected by now."""
+        """True if a reply to it is expected by now."""
         return self.sends > 0 and self.deadline_ns is not None and not self.is_done
 
     def result(self) -> MailboxMessage:

@@ -244,7 +244,7 @@ class Cause(Enum):
         self.ads = row.ads
         self.dialect = row.dialect
         self.is_from_slave = row.is_from_slave
-        """Whether the slave refused; otherwise it was not reached, or did not answer."""
+        """True if the slave refused; otherwise it was not reached, or did not answer."""
 
 
 _ELEMENT_DIGITS = {

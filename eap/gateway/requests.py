@@ -116,7 +116,7 @@ class AddressMap:
 
 _COMPLETE = 0x100
 _RAW = ReadWrite(IndexGroup.VOE, 0, 0, b"")
-"""What cannot be looked into."""
+"""Operation whose content is unknown to the gateway."""
 # Members of enums are slow to reach.
 _SDO_GROUP = IndexGroup.SDO
 _INFORMATION, _REQUEST = CoeService.SDO_INFORMATION, CoeService.SDO_REQUEST
@@ -232,7 +232,7 @@ _BY_KIND: dict[MailboxType, Callable[[bytes], Operation | None]] = {
 
 _NOT_BEGUN = Busy(0, 100)
 _SUBINDEX = 5
-"""Where it stands in an SDO request, CoE header included."""
+"""Offset in an SDO request, CoE header included."""
 
 _TEMPORARY = frozenset((Cause.BUSY, Cause.TOO_FAST))
 

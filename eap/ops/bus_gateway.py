@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 _MASTER_SIZE = 1480
 _HINT_S = 0.3
-"""How long the master may take for each answer that only explains an error."""
+"""Time limit of the master for each answer that only explains an error."""
 
 
 class GatewayBus:

@@ -404,7 +404,7 @@ class SubscriptionTable:
                 own_cycle_ns=own_cycle_ns,
                 polled=bool(slot.poll_request),
             )
-            # Only PDs that are judged alike can share; with any publisher nothing is known.
+            # Only PDs with the same checks can share; with any publisher nothing is known.
             history: object = first_word or (
                 (
                     slot.publisher,

@@ -134,7 +134,7 @@ class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
     to_master: int = 0
     """Bytes of the mailboxes, 0 while none is open."""
     mailbox_fault: ErrorRecord | None = None
-    """Why none is open: a NoMailboxError, or a MailboxClosedError that will pass."""
+    """Reason that none is open: a NoMailboxError, or a MailboxClosedError that will pass."""
     protocols: int = 0
     """As in its EEPROM."""
     order: str = ""
@@ -188,7 +188,7 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     is_up: bool
     """True after it has been brought up, in any state of its slaves."""
     fault: str = ""
-    """Why not."""
+    """Reason if not."""
     slaves: tuple[SlaveReport, ...] = ()
     silent_since_ns: int | None = None
     """Nanoseconds since frames stopped coming back, the last time."""
@@ -258,7 +258,7 @@ class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):
     """All slaves in the order of the bus."""
     slaves: tuple[SlaveDescription, ...]
     is_silent: bool = False
-    """Whether no frame comes back."""
+    """True if no frame comes back."""
 
 
 EngineMessage: TypeAlias = EngineReply | EngineStarted | UnsolicitedMessage | BusChange

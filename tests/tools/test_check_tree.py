@@ -185,6 +185,18 @@ def test_task_without_an_owner_is_reported(path, line, is_fine):
     )
 
 
+@pytest.mark.parametrize(
+    ("word", "is_fine"),
+    [("What the bus tells.", False), ("Whoever asks.", False), ("How long.", False),
+     ("True if the bus is up.", True), ("Whole objects of a slave.", True)],
+)  # fmt: skip
+def test_docstring_that_begins_with_a_question_word_is_reported(word, is_fine):
+    line = '    r"' + f'""{word}"""'
+    assert [each.what for each in check_text(PurePosixPath("eap/net/a.py"), line)] == (
+        [] if is_fine else ["a docstring that asks"]
+    )
+
+
 def test_binary_files_are_not_read_as_text(tmp_path):
     grow(tmp_path, "tests/vectors/a.pcap", text="\0 /wor" + "k/x")
     assert found(tmp_path) == []

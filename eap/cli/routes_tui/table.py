@@ -291,7 +291,7 @@ STYLES = {
     "bold": "bold",
     "": "",
 }
-"""How texts are coloured, by what they say."""
+"""Colours of texts, by their content."""
 
 
 class Grid(DataTable[Text]):

@@ -54,11 +54,11 @@ from eap.services.slaves.bus_client import BusClient
 from eap.services.tasks import TaskSet
 
 COMMAND_ANSWER_S = 3.0
-"""How long one request waits for a procedure command to end."""
+"""Time that one request waits for a procedure command to end."""
 EXECUTION_S = 60.0
-"""How long a procedure command may take."""
+"""Time limit of a procedure command."""
 KEEP_S = 30.0
-"""How long the result of a procedure command is kept for a repeated request."""
+"""Time to keep the result of a procedure command for a repeated request."""
 MAX_COMMANDS = 64
 """Procedure commands that go on or are kept at a time, of all drives."""
 _POLL_S = 0.02

@@ -28,7 +28,7 @@ from eap.services.slaves.file_stream import FileStream
 T = TypeVar("T")
 
 FILE_BLOCK_S = 3.0
-"""How long one request may take."""
+"""Time limit of one request."""
 # Other clients may wait for the slave.
 IDLE_S = 30.0
 """A file without requests for so long is closed."""

@@ -154,16 +154,16 @@ Send: TypeAlias = Callable[[Endpoint, bytes], object]
 """Sends a packet to a client, and does not wait for that."""
 
 _POLL_NS = 200_000_000
-"""How often at least services says that it wants samples."""
+"""Longest period of the requests for samples."""
 _SAMPLE_LEASE_NS = 1_000_000_000
-"""How long the engine goes on for services that are gone."""
+"""Time that the engine goes on sampling for a dead services process."""
 _CYCLE_TIME_NS = 200_000
-"""How long after its time a cycle has mostly ended."""
+"""Usual delay from the start of a cycle to its end."""
 _SHORT_PAUSE_NS = 1_000_000
 _MAX_VALUES = 500
 """Values after which others of this process have a turn."""
 _ENGINE_PAUSE_NS = 10_000_000
-"""How soon to look again while the engine does not run."""
+"""Pause before the next look while the engine does not run."""
 
 logger = logging.getLogger(__name__)
 

@@ -166,7 +166,7 @@ class Lost(NamedTuple):
     until: float | None
     """Unix time at which the last one was lost."""
     error: str
-    """Why nothing can be written now; empty if it can."""
+    """Reason that no line can be written now; empty if it can."""
 
 
 class Audit:

@@ -131,11 +131,11 @@ def appliance_status(
     """Return the whole answer.
 
     Args:
-        info: What the supervisor tells.
+        info: Report of the supervisor.
         images: Snapshots of all stations.
-        discarded: What each process turned away, by station.
+        discarded: Frames and requests that each process dropped, by station.
         meter: Of the processes.
-        buses: What the engine says of its buses, of none if it does not answer.
+        buses: Report of the engine on its buses; empty if it does not answer.
         listeners: Figures of the listeners of services.
     """
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)

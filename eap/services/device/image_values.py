@@ -1,7 +1,6 @@
 """Live entries of a station's dictionaries, from its process image.
 
-Nothing is kept here: each value is looked up when somebody reads it, in the image that is the
-newest then.
+This module stores nothing: a read looks the value up in the newest image.
 """
 
 from __future__ import annotations

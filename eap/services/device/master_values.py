@@ -51,7 +51,7 @@ FRESH_S = 0.1
 LINKS_FRESH_S = 1.1
 """Age up to which registers are shown in the configuration, which has only links of them."""
 FACTS_ANSWER_S = 0.3
-"""How long a client of the dictionary waits for the objects of a slave."""
+"""Time that a client of the dictionary waits for the objects of a slave."""
 _DEVICE_TYPE, _HISTORY = 0x1000, 0x10F3
 _OF_REGISTERS = range(0x8000, 0xB000)
 _OF_CONFIGURED = range(CONFIGURED.first, CONFIGURED.last + 1)

@@ -1,7 +1,7 @@
-"""Subscriber monitoring in services: who is asked, what is heard, and the words that tell it.
+"""Subscriber monitoring in services: the monitored targets, their answers and their texts.
 
-It follows the images: which frames are monitored, and where they go at the moment, is looked up
-there again and again, so that a station may be configured anew and a frame sent elsewhere.
+It follows the images: it reads the monitored frames and their present targets there again and
+again, so a station may be reconfigured and a frame may get another target.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ logger = logging.getLogger(__name__)
 
 # Hosts tell about one a second, whatever is sent.
 REFUSAL_NS = 3_000_000_000
-"""How long a refusal holds while frames go on."""
+"""Time that a refusal stays valid while frames go on."""
 _CALLS_PER_TURN = 8
 
 
 class UdpSubscriberProbe:
-    """What ICMP says of the frames of one UDP port, and what the kernel knows of their targets.
+    """ICMP errors for the frames of one UDP port, and the kernel's knowledge of their targets.
 
     *sockets* are those of the port, the engine's included: which of them gets an error is up to the
     kernel.  Nothing is sent.
@@ -70,8 +70,8 @@ class UdpSubscriberProbe:
             self._is_enabled = True
 
     def collect(self, now_ns: int) -> None:
-        """Take what ICMP told, for :meth:`refused_targets`."""
-        # While errors wait, whoever waits for frames at these sockets is woken again and again.
+        """Read the ICMP errors, for :meth:`refused_targets`."""
+        # Pending errors wake the reader of frames at these sockets again and again.
         for sock in self.sockets if self._is_enabled else ():
             for _ in range(_CALLS_PER_TURN):
                 errors = read_errors(sock)
@@ -157,7 +157,7 @@ def key_of(target: Destination) -> tuple[str, int]:
 
 
 POLL_NS = 200_000_000
-"""How often at least it is looked whether frames go elsewhere; answers wait as long at most."""
+"""Longest period of the look for changed targets; answers wait at most as long."""
 
 
 class ImageHolder(Protocol):

@@ -1,8 +1,8 @@
 """The EAP device of a station as services serve it: its dictionaries, states and changes.
 
-Rule 1: what changes anything is a job; jobs are done one after the other and to their ends.
-Rule 2: there is one way into force, whoever asks: a whole specification, through the keeper.
-Rule 3: in any state but PreOp the dictionaries say what runs.
+Rule 1: each change is a job; jobs run one after the other and to their ends.
+Rule 2: a change takes effect only as a whole specification, through the keeper.
+Rule 3: in any state but PreOp the dictionaries show the running specification.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ logger = logging.getLogger(__name__)
 
 
 class Unsaved(NamedTuple):
-    """Why a configuration is not kept, and since when, as Unix time."""
+    """Reason that a configuration is not stored, and its start as Unix time."""
 
     reason: str
     since: float

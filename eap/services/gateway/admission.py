@@ -51,8 +51,8 @@ class RequestDecision(msgspec.Struct, frozen=True):
     Attributes:
         station: Mailbox address that is counted.
         target: Its name in access rules.
-        operation: None for what needs no verdict: a step of what was judged when it began, and a
-            read where everything may be read.
+        operation: None for a request that needs no decision: a step of a transfer that was
+            decided at its start, or a read where everything may be read.
         decision: Likewise.
     """
 
@@ -63,12 +63,12 @@ class RequestDecision(msgspec.Struct, frozen=True):
 
     @property
     def is_allowed(self) -> bool:
-        """Whether it may be done."""
+        """True if it may be done."""
         return self.decision is None or self.decision.is_allowed
 
 
 class GatewayAdmission:
-    """Judges requests.
+    """Access decisions on gateway requests.
 
     Args:
         access: Returns the rules that are in force.

@@ -22,8 +22,8 @@ class GatewayTransport:
     """One socket or listener, and the gateway behind it.
 
     Args:
-        gateways: Gateways of the stations there, and by what name each knows the door; a frame does
-            not say which one it is for, so the first is asked.
+        gateways: Gateways of the stations there, and the transport's name at each; a frame does
+            not name its station, so the first gateway handles it.
     """
 
     def __init__(self, gateways: Sequence[tuple[MailboxGateway, str]]) -> None:
@@ -35,7 +35,7 @@ class GatewayTransport:
 
     @property
     def has_gateway(self) -> bool:
-        """Whether there is any gateway behind."""
+        """True if there is any gateway behind."""
         return self._gateway is not None
 
     def receive(

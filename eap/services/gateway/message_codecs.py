@@ -61,7 +61,7 @@ class MessageCodec:
 
     @property
     def is_running(self) -> bool:
-        """Whether fragments are to come."""
+        """True if fragments are to come."""
         return False
 
     def is_step(self, body: bytes) -> bool:
@@ -88,7 +88,7 @@ class ElementCodec(MessageCodec):
 
     @property
     def is_running(self) -> bool:
-        """Whether fragments of a write are to come."""
+        """True if fragments of a write are to come."""
         return bool(self._written)
 
     def completes_write(self, body: bytes) -> bool:
@@ -156,7 +156,7 @@ class AdsCodec(MessageCodec):
 
     @property
     def is_running(self) -> bool:
-        """Whether fragments of a request are to come."""
+        """True if fragments of a request are to come."""
         return self._assembler.octets > 0
 
     def reset(self) -> None:

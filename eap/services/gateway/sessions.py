@@ -63,7 +63,7 @@ class SessionCodec(Protocol):
 
     @property
     def is_running(self) -> bool:
-        """Whether a transfer is active, so that more requests belong to it."""
+        """True if a transfer is active, so that more requests belong to it."""
 
     async def answer(self, body: bytes) -> list[bytes]:
         """Return the answers to a message.
@@ -108,7 +108,7 @@ class ClientSession:
 
     @property
     def is_running(self) -> bool:
-        """Whether a transfer is active."""
+        """True if a transfer is active."""
         return self.codec.is_running
 
     async def handle(self, body: bytes, *, is_step: bool) -> list[GatewayReply]:
@@ -234,7 +234,7 @@ class KeyedSession(Protocol):
 
     @property
     def is_running(self) -> bool:
-        """Whether a transfer is active."""
+        """True if a transfer is active."""
 
     def close(self) -> None:
         """Abort the active transfer."""

@@ -85,7 +85,7 @@ class ObjectCodec:
 
     @property
     def is_running(self) -> bool:
-        """Whether a segmented SDO is active."""
+        """True if a segmented SDO is active."""
         return self._transfer is not None or self._stream is not None
 
     def is_step(self, body: bytes) -> bool:
@@ -263,7 +263,7 @@ class FileCodec:
 
     @property
     def is_running(self) -> bool:
-        """Whether a file is open, or is to be opened when the slave has time."""
+        """True if a file is open, or is to be opened when the slave has time."""
         return self._file is not None
 
     @property
@@ -274,7 +274,7 @@ class FileCodec:
 
     @property
     def waits_for_lock(self) -> bool:
-        """Whether this file waits for those of other clients."""
+        """True if this file waits for those of other clients."""
         return self._file is not None and not self._file.has_lock
 
     def is_step(self, body: bytes) -> bool:

@@ -58,16 +58,16 @@ class BusDescription(NamedTuple):
     """A bus without counters and times, which only an explicit request brings."""
 
     is_up: bool = False
-    """Whether it has been brought up, wherever its slaves are now."""
+    """True if it has been brought up, wherever its slaves are now."""
     fault: str = "no report from the engine yet"
     slaves: Mapping[int, SlaveDescription] = MappingProxyType({})
     """By station address, in the order of the bus; while it is not up those that are expected."""
     is_silent: bool = False
-    """Whether no frame comes back, so that nothing is known about any slave."""
+    """True if no frame comes back, so that nothing is known about any slave."""
 
     @property
     def is_reachable(self) -> bool:
-        """Whether frames reach its slaves and come back."""
+        """True if frames reach its slaves and come back."""
         return self.is_up and not self.is_silent
 
     def describe_obstacle(self, name: str) -> str:
@@ -101,7 +101,7 @@ class BusView:
 
     @property
     def is_current(self) -> bool:
-        """Whether :meth:`current` returns without waiting."""
+        """True if :meth:`current` returns without waiting."""
         return self._is_complete and self._link.is_alive
 
     async def current(self) -> BusDescription:

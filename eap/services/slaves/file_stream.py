@@ -86,7 +86,7 @@ class FileStream(ABC):
 
     @property
     def has_ended(self) -> bool:
-        """Whether the transfer has completed or failed."""
+        """True if the transfer has completed or failed."""
         return self.is_complete or self._error is not None
 
     async def wait_open(self) -> None:

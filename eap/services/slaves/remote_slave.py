@@ -42,7 +42,7 @@ BLOCK = 16 << 10
 """Octets of the longest block."""
 # Routers give up after 4.5 s.
 STEP_S = 5.0
-"""How long the answer to a block may take."""
+"""Time limit of the answer to a block."""
 PAUSE_S = 0.02
 """Pause before a station that is busy gets the request again."""
 _HANDLE_SIZE = 4

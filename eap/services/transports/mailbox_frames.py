@@ -176,7 +176,7 @@ class FrameHandler(Protocol):
 
     @property
     def has_gateway(self) -> bool:
-        """Whether there is a gateway."""
+        """True if there is a gateway."""
 
     def receive(
         self, frame: bytes, connection: str, send: Callable[[str, bytes], object]
