@@ -183,7 +183,10 @@ class Publisher:
             self._sending.clear()
 
     def forget(self) -> None:
-        """Reset to the state at a start: on-change PDs are due at once, and no event is pending."""
+        """Reset the triggers: on-change PDs are due at once, and no event is pending.
+
+        The station calls it when it begins to send again (PreOp to SafeOp); a new publisher is so.
+        """
         for frame in self.frames:
             for pd in frame.pds:
                 pd.trigger.forget()

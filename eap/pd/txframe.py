@@ -318,7 +318,8 @@ class TxFrame:
         """True if the frame goes whole by its schedule and nothing holds it back.
 
         Anything that decides for each cycle makes it false: :meth:`select` is never called for
-        plain frames.
+        plain frames.  Where its value changes, ``Publisher._group_frames`` has to run between two
+        cycles.
         """
         return (
             self.schedule is not None
