@@ -160,6 +160,7 @@ def encode_value(value: object) -> str:
     """Return the text of an address in a record (msgspec's ``enc_hook``)."""
     if isinstance(value, NetId | InterfaceUri):
         return str(value)
+    # msgspec's sign that a hook does not know the type.
     raise NotImplementedError(f"{type(value).__name__} in a record")
 
 

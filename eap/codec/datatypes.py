@@ -64,6 +64,8 @@ class DataType(msgspec.Struct, frozen=True):
             raise self._no_room(buffer, offset)
         buffer[offset : offset + self.size] = octets
 
+    # The next two and parse_text are abstract; a msgspec.Struct has a metaclass that ABC refuses.
+
     def decode(self, buffer: Buffer, offset: int) -> Value:
         """Return the value at *offset* of a buffer that is known to be long enough."""
         raise NotImplementedError
