@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Iterator
 from contextlib import contextmanager
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 
@@ -45,7 +45,7 @@ from eap.codec.coe import (
     SdoResponse,
     encode_abort,
 )
-from eap.codec.eoe import EoeHeader
+from eap.codec.eoe import EoeHeader, EoeType
 from eap.codec.foe import FoeHeader, FoeOpcode
 from eap.codec.mailbox import MailboxType, VoeHeader
 from eap.codec.soe import SoeHeader, SoeOpcode
@@ -332,47 +332,95 @@ def _answers_voe(request: bytes, reply: bytes) -> bool:
     return reply.startswith(request[: VoeHeader.SIZE])
 
 
-_ANSWERS: dict[MailboxType, Callable[[bytes, bytes], bool]] = {
-    MailboxType.AOE: _answers_aoe,
-    MailboxType.EOE: _answers_eoe,
-    MailboxType.COE: _answers_coe,
-    MailboxType.FOE: _answers_foe,
-    MailboxType.SOE: _answers_soe,
-    MailboxType.VOE: _answers_voe,
-}
-# Minimum length of a request that can be answered.
-_SHORTEST = {
-    MailboxType.EOE: 1,
-    MailboxType.COE: CoeHeader.SIZE,
-    MailboxType.FOE: FoeHeader.SIZE,
-    MailboxType.SOE: 1,
+def is_aoe_fragment(reply: bytes) -> bool:
+    """Return true if *reply* is an AoE fragment, and not the acknowledgement of one."""
+    flags = int.from_bytes(reply[18:20], "little")
+    return reply[16:18] == _FRAGMENT and not flags & StateFlags.RESPONSE
+
+
+def _has_more_info(reply: bytes) -> bool:
+    is_info = len(reply) >= INFO_START and _service(reply) == CoeService.SDO_INFORMATION
+    return is_info and reply[4:6] != b"\0\0"
+
+
+def _has_more_elements(reply: bytes) -> bool:
+    return len(reply) >= SoeHeader.SIZE and bool(reply[0] & 0x08)
+
+
+def _never(*_: bytes) -> bool:
+    return False
+
+
+class ReplyRules(NamedTuple):
+    """Rules of one protocol for a master and a gateway.
+
+    Attributes:
+        answers: Returns whether a reply answers a request.
+        shortest: Bytes of the shortest request that has an answer.
+        has_more: Returns whether fragments may follow a reply.
+        is_unsolicited: Returns whether slaves send a message without a request; it may raise
+            CodecError.
+    """
+
+    answers: Callable[[bytes, bytes], bool]
+    shortest: int
+    has_more: Callable[[bytes], bool]
+    is_unsolicited: Callable[[bytes], bool]
+
+
+_COE_UNSOLICITED = frozenset(
+    (CoeService.EMERGENCY, CoeService.TX_PDO, CoeService.TX_PDO_REMOTE_REQUEST)
+)
+_SOE_UNSOLICITED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
+_RULES: dict[MailboxType, ReplyRules] = {
+    MailboxType.ERR: ReplyRules(_never, 0, _never, _never),
+    MailboxType.AOE: ReplyRules(
+        _answers_aoe,
+        0,
+        is_aoe_fragment,  # AoE does not mark its last fragment
+        lambda data: (
+            not AmsHeader.decode(data).state_flags & StateFlags.RESPONSE
+            and not is_aoe_fragment(data)
+        ),
+    ),
+    MailboxType.EOE: ReplyRules(
+        _answers_eoe, 1, _never, lambda data: EoeHeader.decode(data).type == EoeType.FRAGMENT
+    ),
+    MailboxType.COE: ReplyRules(
+        _answers_coe,
+        CoeHeader.SIZE,
+        _has_more_info,
+        lambda data: CoeHeader.decode(data).service in _COE_UNSOLICITED,
+    ),
+    MailboxType.FOE: ReplyRules(_answers_foe, FoeHeader.SIZE, _never, _never),
+    MailboxType.SOE: ReplyRules(
+        _answers_soe,
+        1,
+        _has_more_elements,
+        lambda data: SoeHeader.decode(data).opcode in _SOE_UNSOLICITED,
+    ),
+    # A VoE message says nothing of its kind.
+    MailboxType.VOE: ReplyRules(_answers_voe, 0, _never, lambda _: True),
 }
 
 
 def answers(kind: MailboxType, request: bytes, reply: bytes) -> bool:
     """Return true if *reply* answers *request*, both of one protocol, without mailbox header."""
-    if len(request) < _SHORTEST.get(kind, 0):
-        return False
-    return kind in _ANSWERS and _ANSWERS[kind](request, reply)
+    rules = _RULES[kind]
+    return len(request) >= rules.shortest and rules.answers(request, reply)
 
 
 def has_more(kind: MailboxType, reply: bytes) -> bool:
-    """Return true if fragments may follow *reply*; AoE does not mark its last fragment."""
-    match kind:
-        case MailboxType.COE:
-            is_info = len(reply) >= INFO_START and _service(reply) == CoeService.SDO_INFORMATION
-            return is_info and reply[4:6] != b"\0\0"
-        case MailboxType.SOE:
-            return len(reply) >= SoeHeader.SIZE and bool(reply[0] & 0x08)
-        case MailboxType.AOE:
-            return is_aoe_fragment(reply)
-    return False
+    """Return true if fragments may follow *reply*."""
+    return _RULES[kind].has_more(reply)
 
 
-def is_aoe_fragment(reply: bytes) -> bool:
-    """Return true if *reply* is an AoE fragment, and not the acknowledgement of one."""
-    flags = int.from_bytes(reply[18:20], "little")
-    return reply[16:18] == _FRAGMENT and not flags & StateFlags.RESPONSE
+def is_unsolicited(kind: MailboxType, data: bytes) -> bool:
+    """Return true for a message that slaves send unsolicited; any other without request is late."""
+    try:
+        return _RULES[kind].is_unsolicited(data)
+    except CodecError:
+        return False
 
 
 RequestT = TypeVar("RequestT")

@@ -22,20 +22,11 @@ from devicebus.mailbox.conversation import (
     MailboxRequest,
     answers,
     has_more,
-    is_aoe_fragment,
+    is_unsolicited,
 )
 from devicebus.master.procedure import Task
-from eap.codec.ams import AmsHeader, StateFlags
-from eap.codec.coe import CoeHeader, CoeService
-from eap.codec.eoe import EoeHeader, EoeType
 from eap.codec.mailbox import MailboxHeader, MailboxType
-from eap.codec.soe import SoeHeader, SoeOpcode
-from eap.errors import CodecError
 
-_COE_UNSOLICITED = frozenset(
-    (CoeService.EMERGENCY, CoeService.TX_PDO, CoeService.TX_PDO_REMOTE_REQUEST)
-)
-_SOE_UNSOLICITED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
 # Masters send address 0; the gateways of KickCAT and libethercat mark their requests on the bus by
 # bit 15 as well.
 _TAG = 0x8000
@@ -123,24 +114,6 @@ class ReplyMatcher:
 
 def _fits(header: MailboxHeader, data: bytes, step: MailboxRequest) -> bool:
     return header.type == step.type and answers(step.type, step.request, data)
-
-
-def is_unsolicited(kind: MailboxType, data: bytes) -> bool:
-    """Return true for a message that slaves send unsolicited; any other without request is late."""
-    try:
-        match kind:
-            case MailboxType.COE:
-                return CoeHeader.decode(data).service in _COE_UNSOLICITED
-            case MailboxType.SOE:
-                return SoeHeader.decode(data).opcode in _SOE_UNSOLICITED
-            case MailboxType.EOE:
-                return EoeHeader.decode(data).type == EoeType.FRAGMENT
-            case MailboxType.AOE:
-                is_response = AmsHeader.decode(data).state_flags & StateFlags.RESPONSE
-                return not is_response and not is_aoe_fragment(data)
-    except CodecError:
-        return False
-    return kind is MailboxType.VOE
 
 
 class QueuedConversation:

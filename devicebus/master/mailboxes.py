@@ -29,14 +29,11 @@ from devicebus.mailbox.conversation import (
     CounterCheck,
     MailboxMessage,
     MailboxRequest,
+    is_unsolicited,
     next_counter,
 )
 from devicebus.mailbox.protocol import MINIMUM_SIZE, MailboxSizes
-from devicebus.master.conversation_queue import (
-    ConversationQueue,
-    QueuedConversation,
-    is_unsolicited,
-)
+from devicebus.master.conversation_queue import ConversationQueue, QueuedConversation
 from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure, Runner, Sleep, Task, read, write
 from devicebus.wire.datagram import fprd, fpwr

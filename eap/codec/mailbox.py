@@ -31,18 +31,7 @@ class MailboxType(IntEnum):
     @property
     def title(self) -> str:
         """The protocol as people write it, ``CoE``."""
-        return _TITLES[self]
-
-
-_TITLES = {
-    MailboxType.ERR: "error",
-    MailboxType.AOE: "AoE",
-    MailboxType.EOE: "EoE",
-    MailboxType.COE: "CoE",
-    MailboxType.FOE: "FoE",
-    MailboxType.SOE: "SoE",
-    MailboxType.VOE: "VoE",
-}
+        return "error" if self is MailboxType.ERR else self.name.replace("O", "o")
 
 
 class MailboxHeader(WireStruct, frozen=True):

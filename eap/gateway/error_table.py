@@ -273,8 +273,16 @@ _BY_EXCEPTION: dict[type[EapError], tuple[Cause, AdsError]] = {
     errors.FrameLostError: (Cause.BUS_DOWN, AdsError.HOST_UNREACHABLE),
     errors.StateTimeoutError: (Cause.TIMEOUT, AdsError.TIMEOUT),
     errors.AlStatusError: (Cause.TIMEOUT, AdsError.STATE),
+    errors.WorkingCounterError: (Cause.TIMEOUT, AdsError.GENERAL),
+    errors.IdentityError: (Cause.TIMEOUT, AdsError.GENERAL),
+    errors.SiiError: (Cause.TIMEOUT, AdsError.GENERAL),
+    errors.EoeError: (Cause.GENERAL, AdsError.GENERAL),
+    errors.BusError: (Cause.TIMEOUT, AdsError.GENERAL),
 }
-"""Cause at a gateway, and result of the ADS service of slaves, which distinguishes more."""
+"""Cause at a gateway, and result of the ADS service of slaves, which distinguishes more.
+
+It has every error of the device bus but those of :func:`_refusal`.
+"""
 
 
 def cause_of_result(result: int) -> Cause:

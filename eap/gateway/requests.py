@@ -1,4 +1,4 @@
-"""Mailbox requests of gateway clients: destination, operation for access rules, and error answer.
+"""Mailbox requests of gateway clients: destination, operation for access rules, errors.
 
 ETG.8200 has station addresses and 0 for the master.  Its implementations add: bit 15 marks an
 address as that of a slave, 0xFFFF addresses all of them, and virtual addresses of the plant file
@@ -20,7 +20,7 @@ from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 from eap.ads.request import AdsRefusedError, Operation, Read, ReadWrite, Write, parse_request
-from eap.codec.ads import IndexGroup
+from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsAnswer, AmsHeader, StateFlags, decode_packet, response_to
 from eap.codec.coe import (
     CoeHeader,
@@ -40,8 +40,9 @@ from eap.codec.mailbox import MailboxErrorReply, MailboxType
 from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.codec.soe import encode_message as encode_soe
 from eap.errors import CodecError, EapError
-from eap.gateway.error_table import Cause
+from eap.gateway.error_table import Cause, ads_result
 from eap.ids import NetId
+from eap.od.abort import SdoAbortError
 
 MASTER_ADDRESS = 0
 ALL_SLAVES = 0xFFFF
@@ -121,14 +122,20 @@ _RAW = ReadWrite(IndexGroup.VOE, 0, 0, b"")
 _SDO_GROUP = IndexGroup.SDO
 _INFORMATION, _REQUEST = CoeService.SDO_INFORMATION, CoeService.SDO_REQUEST
 _UPLOAD, _DOWNLOAD = SdoRequest.UPLOAD, SdoRequest.DOWNLOAD
+_SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
+"""Services of CoE whose messages may be aborts."""
+_SOE_ERROR = 0x10
+_FOE_ERRORS: dict[int, AdsError] = {
+    FoeOpcode.BUSY: AdsError.BUSY,
+    FoeOpcode.ERROR: AdsError.GENERAL,
+}
 _EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
 
 
 @lru_cache(1024)  # clients ask for the same again and again
 def operation_of(kind: MailboxType, body: bytes) -> Operation | None:
     """Return the operation of a request; None for a step of a transfer, decided at its start."""
-    find = _BY_KIND.get(kind)
-    return find(body) if find is not None else _RAW
+    return _PROTOCOLS[kind].operation(body)
 
 
 def sdo(index: int, subindex: int, *, complete: bool, data: bytes | None = None) -> Operation:
@@ -221,13 +228,8 @@ def _of_aoe(body: bytes) -> Operation:
     return operations[0] if len(operations) == 1 and not is_answer else _RAW
 
 
-_BY_KIND: dict[MailboxType, Callable[[bytes], Operation | None]] = {
-    MailboxType.COE: _of_coe,
-    MailboxType.SOE: _of_soe,
-    MailboxType.FOE: _of_foe,
-    MailboxType.EOE: _of_eoe,
-    MailboxType.AOE: _of_aoe,
-}
+def _of_other(_: bytes) -> Operation:
+    return _RAW
 
 
 _NOT_BEGUN = Busy(0, 100)
@@ -261,10 +263,7 @@ def error_reply(kind: MailboxType, request: bytes, cause: Cause, text: str = "")
         cause: Why it is refused.
         text: More than *cause* says, where the protocol has room for words.
     """
-    error_replier = _ERROR_ENCODERS.get(kind)
-    if error_replier is None:
-        return mailbox_error(cause.mailbox)
-    body = error_replier(request, cause, text or cause.text)
+    body = _PROTOCOLS[kind].error(request, cause, text or cause.text)
     return mailbox_error(cause.mailbox) if body is None else ErrorReply(kind, body)
 
 
@@ -323,9 +322,63 @@ def _aoe_error(request: bytes, cause: Cause, text: str) -> bytes | None:
     return response_to(header, AmsAnswer(error_code=cause.ads))
 
 
-_ERROR_ENCODERS = {
-    MailboxType.AOE: _aoe_error,
-    MailboxType.COE: _coe_error,
-    MailboxType.FOE: _foe_error,
-    MailboxType.SOE: _soe_error,
+def _no_error(*_: object) -> None:
+    """Leave the error to the mailbox: the protocol has none for the causes of a gateway."""
+
+
+def error_in(kind: MailboxType, body: bytes) -> int:
+    """Return the error that a slave answered with, as one of ADS; 0 for none."""
+    return _PROTOCOLS[kind].result(body)
+
+
+def _result_of_error_reply(_: bytes) -> int:
+    return AdsError.SERVICE
+
+
+def _result_of_coe(body: bytes) -> int:
+    if len(body) < CoeHeader.SIZE + SdoHeader.SIZE:
+        return 0
+    head = SdoHeader.decode(body, CoeHeader.SIZE)
+    # An abort may come with the service of a request or of a response.
+    if body[1] >> 4 not in _SDO or head.specifier != SdoRequest.ABORT:
+        return 0
+    return ads_result(SdoAbortError(head.value, head.index, head.subindex))
+
+
+def _result_of_soe(body: bytes) -> int:
+    return AdsError.GENERAL if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR else 0
+
+
+def _result_of_foe(body: bytes) -> int:
+    return _FOE_ERRORS.get(body[0], 0) if body else 0
+
+
+def _done(_: bytes) -> int:
+    return 0
+
+
+class ProtocolRules(NamedTuple):
+    """Requests and answers of one protocol, as access rules and the audit see them.
+
+    Attributes:
+        operation: Returns the operation of a request, None for a step of a transfer.
+        error: Returns an error of the gateway in the protocol, None where only a mailbox error
+            will do.
+        result: Returns the error in the answer of a slave as one of ADS, 0 for none.  A protocol
+            without errors of its own has none: a change is recorded as done.
+    """
+
+    operation: Callable[[bytes], Operation | None]
+    error: Callable[[bytes, Cause, str], bytes | None]
+    result: Callable[[bytes], int]
+
+
+_PROTOCOLS: dict[MailboxType, ProtocolRules] = {
+    MailboxType.ERR: ProtocolRules(_of_other, _no_error, _result_of_error_reply),
+    MailboxType.AOE: ProtocolRules(_of_aoe, _aoe_error, _done),
+    MailboxType.EOE: ProtocolRules(_of_eoe, _no_error, _done),
+    MailboxType.COE: ProtocolRules(_of_coe, _coe_error, _result_of_coe),
+    MailboxType.FOE: ProtocolRules(_of_foe, _foe_error, _result_of_foe),
+    MailboxType.SOE: ProtocolRules(_of_soe, _soe_error, _result_of_soe),
+    MailboxType.VOE: ProtocolRules(_of_other, _no_error, _done),
 }

@@ -11,7 +11,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import NoReturn, TypeVar
 
-from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError, SoeError
+from devicebus.errors import (
+    BusError,
+    FoeError,
+    MailboxRefusedError,
+    MailboxTimeoutError,
+    SoeError,
+)
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState, state_name
@@ -20,6 +26,7 @@ from eap.codec.mailbox import MailboxError
 from eap.codec.soe import SoeErrorCode
 from eap.errors import ConfigError, EapError
 from eap.gateway.client import GatewayClient
+from eap.gateway.error_table import Cause
 from eap.gateway.requests import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT, address_text
 from eap.gateway.slaves import NO_DICTIONARY, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
@@ -31,6 +38,11 @@ T = TypeVar("T")
 _MASTER_SIZE = 1480
 _HINT_S = 0.3
 """Time limit of the master for each answer that only explains an error."""
+_NO_ANSWER = (Cause.TIMEOUT, Cause.BUS_DOWN, Cause.UNREACHABLE)
+_NO_ANSWER_HINT = (
+    "if the slave did not answer, 'eapctl gateway status' and 'eapctl trace' at the gateway's"
+    " station show the cause"
+)
 
 
 class GatewayBus:
@@ -118,7 +130,7 @@ class GatewayBus:
             if _is_too_long(exc) and self._can_learn_size(slave):
                 return self.converse(slave, begin, name, meanwhile)
             # A gateway may refuse for a slave that is not there as slaves do for their objects.
-            if slave.station not in self._reached and (hint := self._hint(slave)):
+            if slave.station not in self._reached and (hint := self._hint(slave, exc)):
                 exc.add_note(hint)
             raise
         self._reached.add(slave.station)
@@ -169,24 +181,25 @@ class GatewayBus:
             self.scan()
         return self._description_of(slave) is not None
 
-    def _hint(self, slave: Slave) -> str:
-        """Return the master's reason why a slave's mailbox is unreachable."""
+    def _hint(self, slave: Slave, error: EapError) -> str:
+        """Return why the mailbox of a slave is unreachable, or where that is shown."""
         self._reached.add(slave.station)  # once is enough
-        if self._slaves is None:
+        if _may_mean(error, *_NO_ANSWER):
+            return _NO_ANSWER_HINT
+        is_missing = _may_mean(error, Cause.NO_SLAVE)
+        if self._slaves is None and (is_missing or _may_mean(error, Cause.NO_MAILBOX)):
             with suppress(BusError), self._client.waiting_once(_HINT_S):
                 self.scan()
-        if self._slaves is None:
-            return ""
         described = self._description_of(slave)
-        if described is None:
+        if described is not None and not described.to_slave:
+            return str(no_mailbox(_slave(described), state_name(_slave(described).status.state)))
+        if described is None and self._slaves is not None and is_missing:
             # The master's dictionary has no virtual addresses: the slave may be there all the same.
             known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves) or "none"
             return (
                 f"address {address_text(slave.station)} is not a slave of this bus ({known});"
                 " it may be a virtual address of the plant file"
             )
-        if not described.to_slave:
-            return str(no_mailbox(_slave(described), state_name(_slave(described).status.state)))
         return ""
 
     def _description_of(self, slave: Slave) -> MasterSlave | None:
@@ -198,6 +211,20 @@ class GatewayBus:
 
 def _unknown(station: int, name: str) -> MasterSlave:
     return MasterSlave(station, name, 0, 0, 0, 0, 0, 0, 0)
+
+
+def _may_mean(error: EapError, *causes: Cause) -> bool:
+    """Return whether a gateway of this project reports one of *causes* by *error*."""
+    match error:
+        case SdoAbortError():
+            return error.code in {each.sdo for each in causes}
+        case SoeError():
+            return error.code in {each.soe for each in causes}
+        case FoeError():
+            return error.code in {each.foe for each in causes}
+        case MailboxRefusedError():
+            return error.detail in {each.mailbox for each in causes}
+    return False
 
 
 def _is_too_long(error: EapError) -> bool:

@@ -91,7 +91,11 @@ class Appliance:
         self.process.communicate()
 
     def command(self, *words: str) -> str:
-        """Return what ``eapctl`` prints about this appliance."""
+        """Return the stdout of ``eapctl`` with *words*, which sees no other appliance.
+
+        Any exit code but 0 fails the test, with stderr as the reason: where a failure is expected,
+        use :func:`run_eapctl`.
+        """
         done = run_eapctl(self.runtime, *words)
         assert done.returncode == 0, done.stderr
         return done.stdout

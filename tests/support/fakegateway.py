@@ -84,7 +84,8 @@ class FakeGateway:
         has_master: Whether address 0 has a dictionary; otherwise it refuses what is asked.
         is_master_silent: Whether address 0 never answers, as with KickCAT.
         addresses: Of the messages that came.
-        aborts_for: An address for which SDO requests are aborted, though nobody has it.
+        aborts_for: An address for which requests are refused, though nobody has it.
+        aborts_with: Cause of these refusals.
         heard: The messages that came, without headers.
     """
 
@@ -97,6 +98,7 @@ class FakeGateway:
         self.addresses: list[int] = []
         self._sizes = sizes
         self.aborts_for: int | None = None
+        self.aborts_with = Cause.NO_SLAVE
         slave = ObjectDictionary(
             [
                 variable(0x1008, "N", "STRING(500)", RW, "x" * 300),
@@ -146,7 +148,7 @@ class FakeGateway:
         if header.address == 0 and self.is_master_silent:
             return []
         if header.address == self.aborts_for:
-            refusal = error_reply(header.type, bytes(body), Cause.NO_SLAVE)
+            refusal = error_reply(header.type, bytes(body), self.aborts_with)
             return [_frame(MailboxHeader(0, header.address, type=refusal.type), refusal.body)]
         if header.address and len(body) + MailboxHeader.SIZE > self._sizes.to_slave:
             refusal = error_reply(header.type, bytes(body), Cause.TOO_LONG)

@@ -194,15 +194,8 @@ def _general(spec: SlaveSpec, ports: Iterable[int]) -> SiiGeneral:
 def _protocols(mailbox: MailboxSpec | None) -> int:
     if mailbox is None:
         return 0
-    chosen = (
-        (mailbox.coe, SiiProtocol.COE),
-        (mailbox.foe, SiiProtocol.FOE),
-        (mailbox.soe, SiiProtocol.SOE),
-        (mailbox.eoe, SiiProtocol.EOE),
-        (mailbox.voe, SiiProtocol.VOE),
-        (mailbox.aoe, SiiProtocol.AOE),
-    )
-    return sum(bit for wanted, bit in chosen if wanted)
+    # A field of MailboxSpec has the name of its bit.
+    return sum(bit for bit in SiiProtocol if getattr(mailbox, str(bit.name).lower()))
 
 
 def _pdos(

@@ -47,7 +47,7 @@ from eap.control.protocol import (
     request_id,
 )
 from eap.errors import ControlError, EapError, ImageError
-from eap.gateway.requests import operation_of
+from eap.gateway.requests import error_in, operation_of
 from eap.net.connections import Activity, ListenerLimits
 from eap.od.abort import SdoAbortError
 from eap.runtime.bus_errors import to_record
@@ -114,8 +114,6 @@ def error_in_result(result: Any, conversation: BusOpenParameters | None = None) 
         conversation: How the conversation was opened that it is an answer of, if it is one.
     """
     if conversation is not None and isinstance(result, MailboxData):
-        from eap.services.gateway.admission import error_in  # plants without buses have none
-
         kind, answer = kind_of(conversation.protocol), bytes.fromhex(result.data)
         code = error_in(kind, answer)
         if code and kind is MailboxType.COE:

@@ -16,26 +16,15 @@ from eap.ams.access import AccessList, AuditedOperation, AuditEntry, Decision
 from eap.ams.spec import AccessService
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
-from eap.codec.coe import CoeHeader, CoeService, SdoHeader, SdoRequest
-from eap.codec.foe import FoeOpcode
-from eap.codec.mailbox import MailboxType
-from eap.codec.soe import SoeHeader
-from eap.gateway.error_table import Cause, ads_result
+from eap.gateway.error_table import Cause
+from eap.gateway.requests import error_in
 from eap.ids import Endpoint, NetId
-from eap.od.abort import SdoAbortError
 from eap.services.gateway.sessions import GatewayReply
 
 NO_SOURCE = NetId(bytes(6))
 """Source NetID of clients, which have none here."""
 MASTER_PORT = 0xFFFF
 """AMS port by which rules name the master itself."""
-_SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
-"""Services of CoE whose messages may be aborts."""
-_SOE_ERROR = 0x10
-_FOE_ERRORS: dict[int, AdsError] = {
-    FoeOpcode.BUSY: AdsError.BUSY,
-    FoeOpcode.ERROR: AdsError.GENERAL,
-}
 
 
 class RuleTarget(NamedTuple):
@@ -156,40 +145,3 @@ def result_of(replies: Sequence[GatewayReply]) -> int | None:
         return None
     reply = replies[-1]
     return error_in(reply.type, reply.body) if reply.reason is None else reply.reason.value.ads
-
-
-def error_in(kind: MailboxType, body: bytes) -> int:
-    """Return the error that a slave answered with, as one of ADS; 0 for none."""
-    find = _ERRORS.get(kind)
-    return find(body) if find is not None else 0
-
-
-def _of_error_reply(_: bytes) -> int:
-    return AdsError.SERVICE
-
-
-def _of_coe(body: bytes) -> int:
-    if len(body) < CoeHeader.SIZE + SdoHeader.SIZE:
-        return 0
-    head = SdoHeader.decode(body, CoeHeader.SIZE)
-    # An abort may come with the service of a request or of a response.
-    if body[1] >> 4 not in _SDO or head.specifier != SdoRequest.ABORT:
-        return 0
-    return ads_result(SdoAbortError(head.value, head.index, head.subindex))
-
-
-def _of_soe(body: bytes) -> int:
-    return AdsError.GENERAL if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR else 0
-
-
-def _of_foe(body: bytes) -> int:
-    return _FOE_ERRORS.get(body[0], 0) if body else 0
-
-
-_ERRORS: dict[MailboxType, Callable[[bytes], int]] = {
-    MailboxType.ERR: _of_error_reply,
-    MailboxType.COE: _of_coe,
-    MailboxType.SOE: _of_soe,
-    MailboxType.FOE: _of_foe,
-}
-"""Protocols whose slaves can refuse; the audit records a change by any other as done."""

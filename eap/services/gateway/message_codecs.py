@@ -249,14 +249,6 @@ class EoeListeners:
             of_slave.pop(endpoint, None)
 
 
-_MESSAGES: dict[MailboxType, type[ElementCodec | VendorCodec | AdsCodec | EthernetCodec]] = {
-    MailboxType.SOE: ElementCodec,
-    MailboxType.VOE: VendorCodec,
-    MailboxType.AOE: AdsCodec,
-    MailboxType.EOE: EthernetCodec,
-}
-
-
 def codec_for(
     kind: MailboxType,
     access: SlaveAccess,
@@ -266,8 +258,18 @@ def codec_for(
     wait_s: float,
 ) -> SessionCodec:
     """Return the server's side of a protocol for one client; *wait_s* as FileCodec has it."""
-    if kind is MailboxType.COE:
-        return ObjectCodec(access, sizes, memory)
-    if kind is MailboxType.FOE:
-        return FileCodec(access, sizes, memory, wait_s)
-    return _MESSAGES[kind](access, sizes, memory)
+    match kind:
+        case MailboxType.COE:
+            return ObjectCodec(access, sizes, memory)
+        case MailboxType.FOE:
+            return FileCodec(access, sizes, memory, wait_s)
+        case MailboxType.SOE:
+            return ElementCodec(access, sizes, memory)
+        case MailboxType.VOE:
+            return VendorCodec(access, sizes, memory)
+        case MailboxType.AOE:
+            return AdsCodec(access, sizes, memory)
+        case MailboxType.EOE:
+            return EthernetCodec(access, sizes, memory)
+        case MailboxType.ERR:
+            raise GatewayError(Cause.NO_PROTOCOL)

@@ -1,4 +1,4 @@
-"""Answers of a gateway as frames, with their statistics and the log lines of refusals."""
+"""Answers of a gateway as frames, with their statistics and the log lines of errors."""
 
 from __future__ import annotations
 
@@ -36,6 +36,8 @@ _LOGGED = frozenset(
     )
 )
 """Reasons that an operator may want to act on; the others are between client and slave."""
+_REFUSALS = frozenset((Cause.DENIED, Cause.NOT_RECORDED, Cause.CROWDED, Cause.TOO_FAST))
+"""Those by which the gateway itself decides; otherwise the request was tried, and failed."""
 
 logger = logging.getLogger(__name__)
 
@@ -134,20 +136,30 @@ class ErrorLog:
     ) -> None:
         self._name = name
         self._names = names or {}
-        self._answer_ms = round(answer_s * 1000)
+        self.answer_ms = round(answer_s * 1000)
 
-    def write(self, endpoint: Endpoint, address: int, kind: MailboxType, reason: Cause) -> None:
-        """Log that a request was refused."""
+    def write(
+        self,
+        endpoint: Endpoint,
+        address: int,
+        kind: MailboxType,
+        reason: Cause,
+        *,
+        is_overdue: bool = False,
+    ) -> None:
+        """Log that a request was refused or failed; *is_overdue* as GatewayReply has it."""
         if reason not in _LOGGED:
             return
         host = host_of(endpoint)
         cause = self._name, endpoint.transport, host, address, kind, reason
         name = self._names.get(address, "")
-        limit = f" (answer_ms {self._answer_ms})" if reason is Cause.TIMEOUT else ""
+        is_own_limit = is_overdue and reason is Cause.TIMEOUT
+        limit = f" (answer_ms {self.answer_ms})" if is_own_limit else ""
         logger.warning(
-            "gateway %s: %s of %s (%s) to address %s%s refused: %s%s",
+            "gateway %s: %s of %s (%s) to address %s%s %s: %s%s",
             self._name, kind.name, endpoint.connection, endpoint.transport, address_text(address),
-            f" ({name})" if name else "", reason.text, limit,
+            f" ({name})" if name else "", "refused" if reason in _REFUSALS else "failed",
+            reason.text, limit,
             extra=caused_by(cause, f"{self._name} {endpoint.transport} {host}"),
         )  # fmt: skip
 
@@ -199,7 +211,8 @@ class ReplyEncoder:
         reasons = [each.reason for each in replies]
         kind = request.header.type
         self.statistics.count(station, kind, reasons, took_ns)
-        self._count_errors(request, kind, reasons)
+        is_overdue = any(each.is_overdue for each in replies)
+        self._count_errors(request, kind, reasons, is_overdue=is_overdue)
         if replies and replies[0].is_repeat:
             self._count_repeat(request.endpoint)
         # Released before the answer goes out: the client may send the same bytes anew at once.
@@ -221,7 +234,8 @@ class ReplyEncoder:
         """Answer a request of the high-nibble dialect; *reason* is why *body* is an error."""
         address = request.header.address
         self.statistics.count(address, kind, [reason], took_ns)
-        self._count_errors(request, kind, [reason])
+        is_overdue = took_ns >= self._log.answer_ms * 1_000_000
+        self._count_errors(request, kind, [reason], is_overdue=is_overdue)
         request.release()
         if not (self._is_silent and reason is not None):
             request.send(encode_frame(dialect.encode_header(kind, address), body))
@@ -244,7 +258,12 @@ class ReplyEncoder:
             counts.repeated += 1
 
     def _count_errors(
-        self, request: GatewayRequest, kind: MailboxType, reasons: Iterable[Cause | None]
+        self,
+        request: GatewayRequest,
+        kind: MailboxType,
+        reasons: Iterable[Cause | None],
+        *,
+        is_overdue: bool,
     ) -> None:
         """Count and log errors of the gateway itself."""
         for reason in reasons:
@@ -255,4 +274,5 @@ class ReplyEncoder:
         counts = self._tracker.counts_of(request.endpoint)
         if counts is not None:
             counts.errors += 1
-        self._log.write(request.endpoint, request.header.address, kind, reason)
+        address = request.header.address
+        self._log.write(request.endpoint, address, kind, reason, is_overdue=is_overdue)

@@ -50,6 +50,8 @@ class GatewayReply(msgspec.Struct, frozen=True):
     """Of the gateway's own refusal; None for an answer of the slave."""
     is_repeat: bool = False
     """True for the answer to a repeated step of a transfer, the same as to the step itself."""
+    is_overdue: bool = False
+    """True if the gateway's own limit has passed, and not one of the slave or of a router."""
 
 
 class SessionCodec(Protocol):
@@ -125,7 +127,7 @@ class ClientSession:
                 async with asyncio.timeout_at(now_s + self._answer_s):
                     await self._lock.acquire()
             except TimeoutError:
-                return self._error_replies(body, Cause.TIMEOUT)
+                return _overdue(self._error_replies(body, Cause.TIMEOUT))
         else:
             await self._lock.acquire()  # without waiting, and without the price of a time-out
         try:
@@ -171,7 +173,7 @@ class ClientSession:
                 answers = await self.codec.answer(body)
         except TimeoutError:
             self.close()
-            return self._error_replies(body, Cause.TIMEOUT)
+            return _overdue(self._error_replies(body, Cause.TIMEOUT))
         # The session goes on: a mailbox error of the slave ends one request, not the client.
         except MailboxRefusedError as exc:
             self.codec.reset()
@@ -181,7 +183,10 @@ class ClientSession:
             return self._error_replies(body, Cause.TOO_SHORT if is_cut else Cause.SERVICE)
         except EapError as exc:
             self.close()
-            return self._error_replies(body, cause_of(exc), text_of(exc))
+            replies = self._error_replies(body, cause_of(exc), text_of(exc))
+            # The router has the same limit for a remote slave, and answers at it.
+            is_overdue = asyncio.get_running_loop().time() >= deadline_s
+            return _overdue(replies) if is_overdue else replies
         except BaseException:
             self.close()
             raise
@@ -201,6 +206,10 @@ def error_replies(
 ) -> list[GatewayReply]:
     """Return the error that answers a request."""
     return [GatewayReply(*error_reply(kind, body, reason, text), reason=reason)]
+
+
+def _overdue(replies: list[GatewayReply]) -> list[GatewayReply]:
+    return [replace(each, is_overdue=True) for each in replies]
 
 
 def cause_of(error: EapError) -> Cause:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import MailboxRequest
+from devicebus.mailbox.conversation import MailboxRequest, is_unsolicited
 from devicebus.master.conversation_queue import (
     ConversationQueue,
     QueuedConversation,
     ReplyMatcher,
-    is_unsolicited,
 )
 from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxHeader, MailboxType

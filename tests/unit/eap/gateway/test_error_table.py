@@ -10,8 +10,10 @@ from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxError
 from eap.codec.soe import SoeErrorCode
 from eap.errors import EngineGoneError
+from eap.gateway import error_table
 from eap.gateway.error_table import Cause, ads_result, cause_of, cause_of_result
 from eap.od.abort import AbortCode, SdoAbortError
+from eap.runtime.bus_errors import ErrorRecord, to_error
 
 
 @pytest.mark.parametrize(
@@ -104,3 +106,17 @@ def test_error_table_receives_each_code_as_one_cause():
     assert kinds == {AdsError, AbortCode, SoeErrorCode, FoeErrorCode, MailboxError}, (
         "codes of a new protocol: add them here and to _refusal of error_table"
     )
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [each for each in vars(errors).values() if isinstance(each, type)],
+    ids=lambda kind: kind.__name__,
+)
+def test_error_table_has_each_error_of_the_bus(kind):
+    if issubclass(kind, errors.BusError):
+        error = to_error(ErrorRecord(kind.__name__, "text"))
+        assert error_table._refusal(error) or kind in error_table._BY_EXCEPTION, (
+            f"{kind.__name__}: a refusal with a code of its own belongs into _refusal of"
+            " eap/gateway/error_table.py, any other error into _BY_EXCEPTION"
+        )

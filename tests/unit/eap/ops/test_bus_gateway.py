@@ -15,6 +15,7 @@ from eap.codec import datatypes
 from eap.codec.soe import Idn
 from eap.errors import ConfigError
 from eap.gateway.client import GatewayClient
+from eap.gateway.error_table import Cause
 from eap.od.abort import SdoAbortError
 from eap.ops import bus_gateway
 from eap.ops.bus_foe import exchange, put_file
@@ -70,7 +71,7 @@ def test_virtual_addresses_are_passed_to_the_gateway(bus) -> None:
     assert slave.station == 0x9001
     with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL") as caught:
         bus.converse(slave, lambda _: coe_client.upload(0x2000, 0), "x")
-    assert caught.value.__notes__ == [f"address 0x9001 {NOT_A_SLAVE}"]
+    assert not hasattr(caught.value, "__notes__")
 
 
 def test_files_go_in_packets_that_fill_the_mailbox(bus, tmp_path) -> None:
@@ -153,6 +154,27 @@ def test_refusal_of_a_slave_that_the_master_does_not_know_has_a_hint(gateway, bu
     with pytest.raises(SdoAbortError) as caught:
         read_entry(bus, "1009", 0x1018, 1, kind=None, complete=False)
     assert caught.value.__notes__ == [f"address 1009 {NOT_A_SLAVE}"]
+
+
+@pytest.mark.parametrize(
+    ("cause", "hint"),
+    [
+        (Cause.TIMEOUT, "gateway status"),
+        (Cause.UNREACHABLE, "eapctl trace"),
+        (Cause.DENIED, ""),
+        (Cause.NO_MAILBOX, ""),
+        (Cause.LENGTH, ""),
+    ],
+)
+def test_refusal_for_another_reason_has_no_hint_about_the_address(
+    gateway, bus, cause, hint
+) -> None:
+    gateway.aborts_for, gateway.aborts_with = 0x9001, cause
+    with pytest.raises(SdoAbortError) as caught:
+        read_entry(bus, "0x9001", 0x1018, 1, kind=None, complete=False)
+    notes = getattr(caught.value, "__notes__", [])
+    assert not any("virtual" in note for note in notes)
+    assert [hint in note for note in notes] == ([True] if hint else [])
 
 
 def test_slave_by_name_with_a_silent_master_has_a_remedy(silent_at_master):

@@ -166,7 +166,7 @@ def test_session_answers_in_time_for_a_station_that_does_not(kind: MailboxType, 
 
     async def scene(handle: Ask, session: ClientSession) -> None:
         (reply,) = await session.handle(bytes.fromhex(body), is_step=False)
-        assert reply.reason is Cause.TIMEOUT
+        assert (reply.reason, reply.is_overdue) == (Cause.TIMEOUT, True)
         assert not session.is_running
 
     play(kind, station, scene, answer_s=0.05)

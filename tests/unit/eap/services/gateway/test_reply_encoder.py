@@ -106,12 +106,15 @@ def test_refusal_log_names_client_address_and_cause(caplog):
 
 def test_refusal_log_names_a_remote_slave_as_the_plant_does(caplog):
     log = ErrorLog("mill/bus0", {0x9001: "press/bus0/drive"}, 0.9)
-    log.write(NEAR, 0x9001, MailboxType.COE, Cause.TIMEOUT)
-    (line,) = caplog.messages
-    assert line == (
-        "gateway mill/bus0: COE of 10.0.0.8:1 (udp:eap0) to address 0x9001 (press/bus0/drive)"
-        " refused: it did not answer in time (answer_ms 900)"
-    )
+    log.write(NEAR, 0x9001, MailboxType.COE, Cause.TIMEOUT, is_overdue=True)
+    log.write(NEAR, 1001, MailboxType.COE, Cause.TIMEOUT)
+    log.write(NEAR, 1002, MailboxType.COE, Cause.BUS_DOWN, is_overdue=True)
+    start = "gateway mill/bus0: COE of 10.0.0.8:1 (udp:eap0) to address"
+    assert caplog.messages == [
+        f"{start} 0x9001 (press/bus0/drive) failed: it did not answer in time (answer_ms 900)",
+        f"{start} 1001 failed: it did not answer in time",
+        f"{start} 1002 failed: the bus is down",
+    ]
 
 
 def test_error_log_repeats_of_one_client_have_the_same_cause(caplog):
