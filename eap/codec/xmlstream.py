@@ -175,6 +175,10 @@ class XmlReader:
         """The root without its children, as soon as its tag has been read."""
         return self._builder.root
 
+    def above(self, path: str) -> XmlElement | None:
+        """Return the last element at *path*, above those that are wanted, without children."""
+        return self._builder.above.get(path)
+
     def feed(self, data: bytes | str) -> list[XmlElement]:
         """Take the next part of the file; return the wanted elements that end in it."""
         self._received += len(data)
@@ -244,14 +248,15 @@ class _Builder:
         limits: XmlLimits,
     ) -> None:
         self.root: XmlElement | None = None
+        self.above: dict[str, XmlElement] = {}
         self.expat: object = None
         self._roots = roots
         self._ignored = ignored
         self._limits = limits
         self._takes_root = "*" in wanted
         self._wanted = wanted
-        # Elements above those that are wanted: only through them leads a way to one.
-        self._above = {path[:end] for path in wanted for end in _slashes(path)}
+        # Only inside these is there anything that is wanted.
+        self._leading = {path[:end] for path in wanted for end in _slashes(path)}
         self._path: list[str] = []
         self._open: list[XmlElement] = []
         self._texts: list[list[str]] = []
@@ -300,7 +305,8 @@ class _Builder:
         if path in self._wanted or (self._takes_root and not self._path):
             self._count = 0
             self._push(element)
-        elif path in self._above:
+        elif path in self._leading:
+            self.above[path] = element
             self._path.append(element.tag)
         else:
             self._skipped = 1

@@ -60,6 +60,10 @@ def test_reader_returns_each_element_in_the_part_that_ends_it() -> None:
     assert not reader.root.children
     assert [each.tag for each in reader.feed(FILE[FILE.index("<Other>") :])] == ["Device"]
     assert reader.close() == []
+    devices = reader.above("Info/Devices")
+    assert devices is not None
+    assert devices.line == 4
+    assert reader.above(DEVICES) is None
 
 
 def test_tree_is_searched_by_path() -> None:
