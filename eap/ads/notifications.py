@@ -11,7 +11,7 @@ bytes, as TwinCAT does, in a packet of its own, because AdsLib skips what follow
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
@@ -141,31 +141,53 @@ class _Outbox:
         return data
 
 
+def handle_numbers(first: int) -> Iterator[int]:
+    """Yield handles from *first* on, and from 1 again behind the last one."""
+    handle = first
+    while True:
+        yield handle
+        handle = handle % 0xFFFF_FFFF + 1
+
+
 class NotificationTable:
-    """The notifications of one device.
+    """The notifications of one device, or of one value where several tables share *handles*.
 
     Args:
         first_handle: Another one at each start keeps a router that missed the start from taking a
             handle for one that it knows.
         first_change_ns: Time between a request for changes and its first sample.
+        handles: By default those from *first_handle* on.
 
     Attributes:
         on_add: Called whenever there is one more.
     """
 
-    def __init__(self, first_handle: int = 1, first_change_ns: int = 1) -> None:
+    def __init__(
+        self,
+        first_handle: int = 1,
+        first_change_ns: int = 1,
+        *,
+        handles: Iterator[int] | None = None,
+    ) -> None:
         self._first_change_ns = first_change_ns
         self.on_add: Callable[[], None] | None = None
         self._notifications: dict[int, _Notification] = {}
         self._clients: dict[AdsClient, _Outbox] = {}
         self._due: list[tuple[int, int]] = []
-        self._next_handle = first_handle
+        self._handles = handle_numbers(first_handle) if handles is None else handles
         self._samples = 0
         self._packets = 0
         self._ended = 0
 
     def __len__(self) -> int:
         return len(self._notifications)
+
+    def __contains__(self, handle: int) -> bool:
+        return handle in self._notifications
+
+    def shortest_cycle_ns(self) -> int:
+        """Return the shortest cycle of a notification, 0 without any."""
+        return min((each.cycle_ns for each in self._notifications.values()), default=0)
 
     def add(self, client: AdsClient, request: AddNotification, source: Source, now_ns: int) -> int:
         """Return the handle of a new notification; its first sample is due later.
@@ -252,11 +274,7 @@ class NotificationTable:
 
     def _take_handle(self) -> int:
         # 256 clients with 1024 handles leave most of 32 bits free.
-        while self._next_handle in self._notifications:
-            self._next_handle = self._next_handle % 0xFFFF_FFFF + 1
-        handle = self._next_handle
-        self._next_handle = handle % 0xFFFF_FFFF + 1
-        return handle
+        return next(handle for handle in self._handles if handle not in self._notifications)
 
     def _take_due(self, now_ns: int) -> list[_Notification]:
         due = []

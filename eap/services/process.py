@@ -406,14 +406,18 @@ class Services:
         providers: Mapping[PortName, MasterDictionaryProvider],
     ) -> Buses:
         handover = self._handover
-        segments = {}
+        segments: dict[PortName, SegmentLink] = {}
+        if not handover.buses:
+            return Buses(handover.stations, clients, segments)
+        # Imported here: a plant without buses does not need them.
+        from eap.services.ads.bus_ads import BusService
+        from eap.services.ads.slave_notifications import SamplingBudget
+
+        budget = SamplingBudget()
         for bus in handover.buses:
             if bus.command_fd != NO_DESCRIPTOR:
                 segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
                 self._resources.callback(segments[bus.owner].close)
-            # Imported here: a plant without buses does not need it.
-            from eap.services.ads.bus_ads import BusService
-
             net_id = handover.port(bus.owner).net_id
             router = devices.routers[bus.owner.station]
             service = BusService(
@@ -422,6 +426,7 @@ class Services:
                 RELEASE,
                 router.send_notification,
                 providers[bus.owner],
+                budget,
             )
             router.add_service(net_id, service)
         return Buses(handover.stations, clients, segments)

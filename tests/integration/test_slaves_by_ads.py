@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -167,3 +168,108 @@ def test_file_does_not_keep_others_waiting(plant: Appliance) -> None:
         writer.kill()
         writer.wait()
         writer.stdout.close()
+
+
+WINDOW = SDO, 0x6065 << 16
+"""0x6065:00 of the drive, which nothing but a client changes."""
+
+
+class Watch:
+    """Notifications of one connection of pyads on values of a slave."""
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+        self._handles: list[tuple[int, int]] = []
+
+    def add(self, group: int, offset: int, mode: int, cycle_s: float) -> list[int]:
+        """Return the list to which each notification adds its value."""
+        told: list[int] = []
+
+        def receive(notification: Any, _: Any) -> None:
+            told.append(self._connection.parse_notification(notification, pyads.PLCTYPE_UDINT)[2])
+
+        attributes = pyads.NotificationAttrib(4, mode, max_delay=0, cycle_time=cycle_s)
+        self._handles.append(
+            self._connection.add_device_notification((group, offset), attributes, receive)
+        )
+        return told
+
+    def close(self) -> None:
+        # AdsLib crashes when it closes a port that still has notifications.
+        while self._handles:
+            self._connection.del_device_notification(*self._handles.pop())
+
+
+@contextmanager
+def watching(target: tuple[str, int], via: str) -> Iterator[tuple[Slave, Watch]]:
+    with pyads.Connection(*target, via) as connection:
+        watch = Watch(connection)
+        try:
+            yield Slave(connection), watch
+        finally:
+            watch.close()
+
+
+@pytest.mark.parametrize("via", [MILL, SAW])
+def test_objects_of_slaves_are_watched_by_several_clients(plant: Appliance, via: str) -> None:
+    with watching(DRIVE, via) as (drive, here), watching(DRIVE, via) as (_, there):
+        drive.write(*WINDOW, (1000).to_bytes(4, "little"))
+        changes = [each.add(*WINDOW, pyads.ADSTRANS_SERVERONCHA, 0.02) for each in (here, there)]
+        cyclic = here.add(*WINDOW, pyads.ADSTRANS_SERVERCYCLE, 0.05)
+        vendor = there.add(SDO, 0x1018_0001, pyads.ADSTRANS_SERVERCYCLE, 0.05)
+        wait_until(lambda: all(told == [1000] for told in changes))
+        drive.write(*WINDOW, (2345).to_bytes(4, "little"))
+        wait_until(lambda: all(told == [1000, 2345] for told in changes))
+        wait_until(lambda: len(cyclic) > 5 and cyclic[-1] == 2345 and len(vendor) > 5)
+        assert set(vendor) == {3674}
+        with pytest.raises(pyads.ADSError) as refused:
+            here.add(SDO, 0x5555 << 16, pyads.ADSTRANS_SERVERCYCLE, 0.05)
+        assert refused.value.err_code == 0x70C
+
+
+NODE_MODULES = os.environ.get("EAP_NODE_MODULES", "")
+"""Folder with the npm package ads-client, which is not part of the project."""
+SUBSCRIBER = """
+const { Client } = require("ads-client");
+const [netId, port, address] = process.argv.slice(1);
+const client = new Client({
+  targetAmsNetId: netId, targetAdsPort: Number(port), localAmsNetId: "192.168.5.5.1.1",
+  localAdsPort: 40001, routerAddress: address, rawClient: true, autoReconnect: false,
+});
+(async () => {
+  await client.connect();
+  const told = [];
+  const subscription = await client.subscribeRaw(0xF302, 0x60650000, 4, (data) => {
+    told.push(data.value.readUInt32LE(0));
+    console.log(JSON.stringify(told));
+  }, 50);
+  process.stdin.on("data", async () => {
+    await subscription.unsubscribe();
+    await client.disconnect();
+    process.exit(0);
+  });
+})().catch((error) => { console.error(error); process.exit(1); });
+"""
+
+
+@pytest.mark.skipif(
+    not shutil.which("node") or not (Path(NODE_MODULES) / "ads-client").is_dir(),
+    reason="needs node, and EAP_NODE_MODULES with ads-client: npm install ads-client",
+)
+@pytest.mark.parametrize("via", [MILL, SAW])
+def test_ads_client_watches_objects_of_slaves(plant: Appliance, via: str) -> None:
+    with slave(DRIVE, MILL) as drive:
+        drive.write(*WINDOW, (500).to_bytes(4, "little"))
+        words = ["node", "-e", SUBSCRIBER, "--", DRIVE[0], str(DRIVE[1]), via]
+        with subprocess.Popen(
+            words,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "NODE_PATH": NODE_MODULES},
+        ) as node:
+            assert node.stdout.readline() == "[500]\n"
+            drive.write(*WINDOW, (501).to_bytes(4, "little"))
+            assert node.stdout.readline() == "[500,501]\n"
+            node.communicate("end\n")
+        assert node.returncode == 0

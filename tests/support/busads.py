@@ -21,6 +21,7 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsAnswer, AmsHeader
 from eap.ids import Endpoint, NetId
 from eap.services.ads.bus_ads import BusService
+from eap.services.ads.slave_notifications import SamplingBudget
 from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.engine_link import EngineLink
 from eap.services.routing.service import LocalRequest
@@ -158,7 +159,12 @@ def play(
         told: list[tuple[Endpoint, bytes]] = []
         provider = MasterDictionaryProvider(bus, "1.2.3")
         service = BusService(
-            bus, BUS, "1.2.3", lambda endpoint, packet: told.append((endpoint, packet)), provider
+            bus,
+            BUS,
+            "1.2.3",
+            lambda endpoint, packet: told.append((endpoint, packet)),
+            provider,
+            SamplingBudget(),
         )
         try:
             async with asyncio.timeout(20):

@@ -36,6 +36,7 @@ from eap.ads.request import (
 )
 from eap.ads.space import DeviceDataSpace, al_state_for, states_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoOffset, SoeOffset, device_name
+from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import DEVICE_PORT, AmsAnswer, AmsHeader, decode_packet
 from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
 from eap.codec.mailbox import VoeHeader
@@ -47,6 +48,7 @@ from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.ads.ads_service import answer_request, check_up
 from eap.services.ads.master_ads import MasterAds, Send, StateRequests
 from eap.services.ads.slave_files import SlaveFiles
+from eap.services.ads.slave_notifications import SamplingBudget, SlaveNotifications
 from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.routing.service import LocalRequest
 from eap.services.slaves.access import LocalSlave
@@ -75,6 +77,8 @@ _PROTOCOLS: dict[int, SiiProtocol] = {
     IndexGroup.SOE: SiiProtocol.SOE,
     IndexGroup.VOE: SiiProtocol.VOE,
 } | dict.fromkeys(SlaveFiles.groups, SiiProtocol.FOE)
+_UNWATCHED = frozenset((SiiProtocol.FOE, SiiProtocol.VOE))
+"""Protocols of messages and files, which have no values."""
 
 
 class SlaveTarget(NamedTuple):
@@ -92,10 +96,21 @@ class SlaveAds:
         bus: With these slaves.
         net_id: Of the bus port.
         states: Takes requests for states.
+        send: Sends a notification to a client.
+        budget: Limits of notifications.
     """
 
-    def __init__(self, bus: BusClient, net_id: NetId, states: StateRequests) -> None:
+    def __init__(
+        self,
+        bus: BusClient,
+        net_id: NetId,
+        states: StateRequests,
+        send: Send,
+        budget: SamplingBudget,
+    ) -> None:
         self._bus = bus
+        self._sampler = AdsClient(Endpoint("", ""), net_id, DEVICE_PORT)
+        self._notifications = SlaveNotifications(net_id, self._sample, send, budget)
         self._states = states
         self._files = SlaveFiles()
         self._commands = ProcedureCommands()
@@ -122,10 +137,35 @@ class SlaveAds:
                 if protocol is SiiProtocol.AOE:
                     return await self._forwarder.perform(target, operation)
                 data = await self._exchange(protocol, target, operation)
+            case AddNotification(group):
+                if _PROTOCOLS.get(group) in _UNWATCHED:
+                    why = f"no notifications on index group 0x{group:X}: it has no values"
+                    raise AdsRefusedError(AdsError.SERVICE, why)
+                handle = await self._notifications.add(slave.station, client, operation)
+                data = handle.to_bytes(4, "little")
             case _:
-                why = "slaves have no notifications by ADS: poll their objects"
-                raise AdsRefusedError(AdsError.SERVICE, why)
+                data = b""
+                self._notifications.delete(slave.station, client, operation.handle)
         return OperationOutcome(data=data)
+
+    def client_gone(self, endpoint: Endpoint) -> None:
+        """End the notifications of a connection that is closed."""
+        self._notifications.client_gone(endpoint)
+
+    async def _sample(self, station: int, place: Read) -> bytes:
+        """Read a value for notifications; raise AdsRefusedError or the errors of a SlaveAccess."""
+        bus = await self._bus.view.current()
+        check_up(self._bus.name, bus)
+        slave = bus.slaves.get(station)
+        if slave is None:
+            raise AdsRefusedError(AdsError.HOST_UNREACHABLE, f"no slave {station} on the bus")
+        outcome = await self.perform(slave, self._sampler, place)
+        if outcome.result:
+            # A slave that answers by AoE may have results of its own.
+            is_known = outcome.result in AdsError._value2member_map_
+            result = AdsError(outcome.result) if is_known else AdsError.GENERAL
+            raise AdsRefusedError(result, outcome.why)
+        return outcome.data
 
     async def _exchange(
         self, protocol: SiiProtocol, target: SlaveTarget, operation: Read | Write | ReadWrite
@@ -380,6 +420,7 @@ class BusService:
         release: Of this software, such as ``0.1.0``.
         send: Sends a notification to a client.
         provider: The dictionary of the master.
+        budget: Limits of notifications on values of slaves, shared by all buses.
 
     Attributes:
         ports: AMS ports that it answers for; a port without a slave is refused here.
@@ -392,13 +433,14 @@ class BusService:
         release: str,
         send: Send,
         provider: MasterDictionaryProvider,
+        budget: SamplingBudget,
     ) -> None:
         self.ports: Container[int] = range(1, DEVICE_PORT + 1)
         self._name = bus.name
         self._view = bus.view
         states = StateRequests(bus)
         self._master = MasterAds(bus, net_id, release, send, provider, states)
-        self._slaves = SlaveAds(bus, net_id, states)
+        self._slaves = SlaveAds(bus, net_id, states, send, budget)
 
     async def answer(self, request: LocalRequest) -> AmsAnswer:
         """Do the operations of a request; return its answer."""
@@ -420,6 +462,7 @@ class BusService:
     def client_gone(self, endpoint: Endpoint) -> None:
         """Remove the notifications of a closed connection; files stay open for another one."""
         self._master.client_gone(endpoint)
+        self._slaves.client_gone(endpoint)
 
     async def _performer(self, ams_port: int, client: AdsClient) -> Perform:
         """Return the function that does operations for a port; raise AdsRefusedError for no port.

@@ -9,7 +9,6 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import SiiProtocol
 from eap.ads.request import Read, ReadState, ReadWrite, Write, WriteControl
 from eap.codec.ads import AdsError, AdsRange, AdsState, IndexGroup, SoeOffset
-from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.codec.coe import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
@@ -86,15 +85,6 @@ def test_slave_that_does_not_answer_is_a_timeout():
             assert client.why == "left/bus0/other: slave 1002 does not answer"
 
     play(scene, "files")
-
-
-def test_slave_refuses_notifications():
-    async def scene(client, engine):
-        asked = AddNotification(IndexGroup.SDO, 0x1018_0001, 4, TransMode.SERVER_CYCLE, 0, 0)
-        assert (await client.do(DRIVE, asked)).result == AdsError.SERVICE
-        assert "no notifications" in client.why
-
-    play(scene)
 
 
 def test_slave_with_aoe_gets_groups_of_other_protocols():
