@@ -12,8 +12,9 @@ from __future__ import annotations
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation, MailboxRequest
-from devicebus.master.bring import bring, wait_for
+from devicebus.master.bring import bring
 from devicebus.master.bus import BusSlave, BusState
+from devicebus.master.configuration import wait_for
 from devicebus.master.mailboxes import Mailbox, MailboxArea
 from devicebus.master.procedure import Procedure, Sleep, read
 from devicebus.wire.alstatus import AlState, state_name

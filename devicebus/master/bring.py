@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 from devicebus.errors import BusError, SiiError
-from devicebus.mailbox.conversation import Conversation
 from devicebus.master.bus import BusSlave, BusState
-from devicebus.master.clocks import start_sync0, synchronize
+from devicebus.master.clocks import synchronize
+from devicebus.master.configuration import (
+    prepare_registers,
+    prepare_safeop,
+    run_writes,
+    state_timeout_ns,
+    transition_of,
+)
 from devicebus.master.cycle import Participation
 from devicebus.master.esm import acknowledge, change_state, path
 from devicebus.master.image import MAX_FMMUS, SlaveLayout
-from devicebus.master.mailboxes import Mailbox, MailboxArea, configure
-from devicebus.master.pdo import channels_from_sii, read_channels, write_configuration
-from devicebus.master.procedure import Procedure, Sleep, Task, write
+from devicebus.master.mailboxes import MailboxArea, configure
+from devicebus.master.procedure import Procedure, Sleep, write
 from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
 from devicebus.wire.register import Fmmu, Register, SyncManager
-from devicebus.wire.sii import SiiFixed, SiiProtocol
+from devicebus.wire.sii import SiiFixed
+from eap.od.slave_config import Transition
 
 MAX_SYNC_MANAGERS = 16
-# The register counts (n + 2) periods of 40 ns.
-WATCHDOG_DIVIDER = 2498
-"""Watchdog divider for steps of 100 µs."""
-_STEPS_PER_MS = 10
-MAX_WATCHDOG_MS = 0xFFFF // _STEPS_PER_MS
 
 
 def standard_mailbox(fixed: SiiFixed) -> MailboxArea:
@@ -66,36 +65,13 @@ def set_process_data(layout: SlaveLayout) -> Procedure[None]:
         yield from write(layout.station, Register.FMMU, octets, "FMMUs")
 
 
-def set_watchdog(station: int, timeout_ms: int) -> Procedure[None]:
-    """Set the process data watchdog: without outputs for so long a slave leaves OP; 0 disables it.
-
-    Raises:
-        ValueError: the time does not fit the register.
-        WorkingCounterError: the slave does not answer.
-    """
-    if not 0 <= timeout_ms <= MAX_WATCHDOG_MS:
-        raise ValueError(f"watchdog of {timeout_ms} ms, expected 0 to {MAX_WATCHDOG_MS}")
-    divider = WATCHDOG_DIVIDER.to_bytes(2, "little")
-    steps = (timeout_ms * _STEPS_PER_MS).to_bytes(2, "little")
-    yield from write(station, Register.WATCHDOG_DIVIDER, divider, "watchdog divider")
-    yield from write(station, Register.WATCHDOG_PROCESS_DATA, steps, "watchdog")
-
-
-T = TypeVar("T")
-
-# A message of a conversation takes about a cycle.  Checks every 100 µs resumed the procedures of
-# 200 slaves 770,000 times during one start-up.
-_FIRST_PAUSE_NS = 100_000
-# Pause between two checks of a task; it doubles from the first to this.
-_MAX_PAUSE_NS = 2_000_000
-
-
 def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
     """Bring a slave to *target*, step by step.
 
     Raises:
         AlStatusError, StateTimeoutError: the slave refuses, or takes too long.
         SiiError: its EEPROM cannot be read, so its configuration is unknown.
+        BusError: it refuses a part of its configuration.
         WorkingCounterError: the slave does not answer.
     """
     if slave.found.fault:
@@ -105,7 +81,9 @@ def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
         bus.close_mailbox(slave)
     for step in path(current, target):
         yield from _prepare(bus, slave, current, step)
-        yield from change_state(slave.station, step)
+        limit_ns = state_timeout_ns(slave.config, current, step)
+        yield from change_state(slave.station, step, timeout_ns=limit_ns)
+        slave.is_configured = False
         before, slave.state, current = current, step, step
         if step is AlState.INIT:
             bus.close_mailbox(slave)  # only now: a slave that refused INIT keeps its mailbox
@@ -121,16 +99,6 @@ def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
     slave.state = target
 
 
-def read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Read the PDO mapping of a slave in PREOP."""
-    sii = slave.found.sii
-    if slave.mailbox is not None and sii.fixed.protocols & SiiProtocol.COE:
-        reading = read_channels(sii)
-        slave.channels = yield from _ask(bus, slave.mailbox, reading, "reading PDOs")
-    else:
-        slave.channels = channels_from_sii(sii)
-
-
 def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedure[None]:
     """Set the clocks of all slaves, or *only* of the given stations."""
     _, now_ns = yield Sleep(0)
@@ -139,24 +107,18 @@ def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedur
     bus.distribute_time(states[0].station if states else None)
 
 
-def wait_for(task: Task[T]) -> Procedure[T]:
-    """Wait within a procedure for another task; return its result."""
-    pause_ns = _FIRST_PAUSE_NS
-    while not task.is_done:
-        yield Sleep(pause_ns)
-        pause_ns = min(2 * pause_ns, _MAX_PAUSE_NS)
-    return task.result()
-
-
 def _prepare(bus: BusState, slave: BusSlave, current: AlState, step: AlState) -> Procedure[None]:
     """Write the registers that the slave checks on its way to *step*."""
     if current in WITH_PROCESS_DATA and step not in WITH_PROCESS_DATA:
         # Before the request: cycles with and without this slave are valid until it has left.
         bus.set_participation(slave, Participation.UNCERTAIN)
+    transition = transition_of(current, step)
     if current is AlState.INIT:
         yield from _prepare_mailbox(bus, slave, step)
-    elif current is AlState.PREOP and step is AlState.SAFEOP:
+    elif transition is Transition.PS:
         yield from _prepare_process_data(bus, slave)
+    elif transition is not None and slave.mailbox is not None:
+        yield from run_writes(bus, slave, transition)
 
 
 def _prepare_mailbox(bus: BusState, slave: BusSlave, step: AlState) -> Procedure[None]:
@@ -180,34 +142,20 @@ def _end_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
 
 
 def _begin_preop(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Open the mailbox and write the PDO configuration."""
+    """Open the mailbox and send the start-up writes of IP."""
     area = standard_mailbox(slave.found.sii.fixed)
-    if not area.is_there:
-        return
-    bus.open_mailbox(slave, area)
-    configuration = bus.settings.pdo_configurations.get(slave.station)
-    mailbox = slave.mailbox
-    if configuration is not None and mailbox is not None:
-        yield from _ask(
-            bus, mailbox, write_configuration(configuration, mailbox.sizes), "setting PDOs"
-        )
-
-
-def _ask(bus: BusState, mailbox: Mailbox, conversation: Conversation[T], name: str) -> Procedure[T]:
-    _, now_ns = yield Sleep(0)
-    task = mailbox.converse(conversation, now_ns, name=name, requester=bus)
-    return (yield from wait_for(task))
+    if area.is_there:
+        bus.open_mailbox(slave, area)
+    # In PREOP, because INIT has no mailbox.
+    yield from run_writes(bus, slave, Transition.IP)
 
 
 def _prepare_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
+    yield from prepare_safeop(bus, slave)
     layout = bus.image.layout.slaves.get(slave.station) if bus.image is not None else None
     if layout is None:
         return
-    if bus.settings.watchdog_ms is not None:
-        yield from set_watchdog(slave.station, bus.settings.watchdog_ms)
-    sync0 = bus.settings.sync0.get(slave.station)
-    if sync0 is not None and bus.reference is not None:
-        yield from start_sync0(slave.station, sync0)
+    yield from prepare_registers(bus, slave)
     # Between the write of the first FMMU and SAFEOP the slave counts partly or fully.
     bus.set_participation(slave, Participation.UNCERTAIN)
     yield from set_process_data(layout)

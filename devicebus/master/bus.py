@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import msgspec
 
-from devicebus.master.clocks import Sync0, drift_datagram
+from devicebus.master.clocks import drift_datagram
 from devicebus.master.cycle import Cycle, Participation
 from devicebus.master.image import BusImage
 from devicebus.master.link import CEILING_NS, RETRIES, Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
-from devicebus.master.pdo import PdoConfiguration, ProcessDataChannel
+from devicebus.master.pdo import ProcessDataChannel
 from devicebus.master.procedure import Runner, Task
 from devicebus.master.scan import FIRST_STATION, ExpectedSlave, FoundSlave
 from devicebus.wire.alstatus import AlState
+from eap.od.slave_config import SlaveConfig
 
 
 class SlaveLost(msgspec.Struct, frozen=True):
@@ -74,9 +75,10 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of a master."""
 
     expected: Sequence[ExpectedSlave] = ()
-    """Expected slaves in the order of the segment; empty disables the comparison."""
-    pdo_configurations: Mapping[int, PdoConfiguration] = {}
-    """PDO configuration by station address; other slaves keep their defaults."""
+    """Expected slaves in the order of the segment, with their configurations.
+
+    Empty disables the comparison, and slaves keep their defaults.
+    """
     first_station: int = FIRST_STATION
     frame_timeout_ns: int = CEILING_NS
     """Limit for the time-out of a frame, which follows the round trip."""
@@ -87,9 +89,9 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     watchdog_ms: int | None = None
     """Process data watchdog of the slaves; None keeps their defaults."""
     clocks: bool = False
-    """Set and synchronize distributed clocks; required by SYNC0."""
-    sync0: Mapping[int, Sync0] = {}
-    """SYNC0 by station address."""
+    """Set and synchronize distributed clocks, also if no slave is configured for SYNC0."""
+    cycle_ns: int = 1_000_000
+    """Time between two cycles, for SYNC0 and SYNC1 that follow it."""
     epoch_offset_ns: int = 0
     """Offset from the master's time to DC system time (nanoseconds since 2000-01-01)."""
     allow_lrw: bool = True
@@ -120,6 +122,8 @@ class BusSlave:
         revision: Count of changes of the bus at its last change.
         state: AL state at the last read; None after the slave was lost, until the next read.
         target: Requested state.
+        config: Its configuration.
+        is_configured: True if its PDOs and start-up writes of PS are done since it entered PREOP.
         is_set_up: True while its sync managers and FMMUs are configured for process data.
         channels: Sync managers of its process data.
         mailbox: Open mailbox; None in states without one.
@@ -129,7 +133,13 @@ class BusSlave:
         retry_ns: Earliest time of the next attempt.
     """
 
-    def __init__(self, found: FoundSlave, name: str, changes: ChangeCount | None = None) -> None:
+    def __init__(
+        self,
+        found: FoundSlave,
+        name: str,
+        changes: ChangeCount | None = None,
+        config: SlaveConfig | None = None,
+    ) -> None:
         self._changes = changes or ChangeCount()
         self.revision = 0
         self.found = found
@@ -137,6 +147,8 @@ class BusSlave:
         self.station = found.station
         self.state: AlState | None = None
         self.target = AlState.INIT
+        self.config = config or SlaveConfig()
+        self.is_configured = False
         self.is_set_up = False
         self.channels: tuple[ProcessDataChannel, ...] = ()
         self.mailbox: Mailbox | None = None
@@ -174,7 +186,7 @@ class BusSlave:
         """Mark the slave as lost: it does not answer, or another device is in its place."""
         self.is_lost = True
         self.state = None
-        self.is_set_up = False
+        self.is_configured = self.is_set_up = False
 
 
 class BusState:
@@ -205,6 +217,14 @@ class BusState:
         self.is_lost = False
         self.needs_check = False
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
+
+    @property
+    def uses_clocks(self) -> bool:
+        """True if distributed clocks are set and synchronized."""
+        return self.settings.clocks or any(
+            each.config.sync is not None and each.config.sync.activate >> 8
+            for each in self.settings.expected
+        )
 
     def emit(self, event: Event) -> None:
         """Queue an event."""

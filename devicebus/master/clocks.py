@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import msgspec
-
 from devicebus.master.procedure import Procedure, not_answered, read, write
 from devicebus.master.scan import FoundSlave, TopologyNode
 from devicebus.wire.datagram import DatagramRequest, bwr, fprd, frmw
 from devicebus.wire.register import Register
+from eap.od.slave_config import SyncSignals
 
 _U32 = 0xFFFF_FFFF
 _U64 = (1 << 64) - 1
@@ -25,16 +24,6 @@ _DRIFT_FRAMES = 20
 _DRIFT_PER_FRAME = 15
 SYNC_LEAD_NS = 100_000_000
 """Lead time of the first SYNC0 pulse, within which its registers must be written."""
-# Cyclic operation and SYNC0, in the activation register.
-_CYCLIC_OUT = 0x03
-
-
-class Sync0(msgspec.Struct, frozen=True):
-    """SYNC0 of a slave; times in nanoseconds."""
-
-    cycle_ns: int
-    shift_ns: int = 0
-    """Shift from the start of the common cycle."""
 
 
 class Latched(NamedTuple):
@@ -126,22 +115,33 @@ def drift_datagram(reference: int) -> DatagramRequest:
     return frmw(reference, Register.DC_SYSTEM_TIME, 8)
 
 
-def start_sync0(station: int, sync0: Sync0) -> Procedure[int]:
-    """Start SYNC0 in a slave whose clock is set; return the time of the first pulse.
+def start_sync(station: int, signals: SyncSignals) -> Procedure[int]:
+    """Start SYNC0 and SYNC1 in a slave whose clock is set; return the time of the first pulse.
 
     Raises WorkingCounterError if the slave does not answer.
     """
-    # The sync unit is stopped while its start time and cycle change.
-    yield from write(station, Register.DC_ACTIVATION, b"\0", "DC activation")
-    yield from write(station, Register.DC_CYCLIC_UNIT, b"\0", "DC cyclic unit")
+    # The sync unit is stopped while its start time and cycles change.
+    yield from stop_sync(station, signals.activate)
     octets = yield from read(station, Register.DC_SYSTEM_TIME, 8, "DC system time")
     earliest = int.from_bytes(octets, "little") + SYNC_LEAD_NS
-    start = -(-earliest // sync0.cycle_ns) * sync0.cycle_ns + sync0.shift_ns
+    # A multiple of the cycle: slaves with one cycle and shift pulse together, whenever they start.
+    start = -(-earliest // signals.cycle0_ns) * signals.cycle0_ns + signals.shift0_ns
     yield from write(station, Register.DC_START_TIME, start.to_bytes(8, "little"), "SYNC0 start")
-    cycle = sync0.cycle_ns.to_bytes(4, "little")
-    yield from write(station, Register.DC_SYNC0_CYCLE, cycle, "SYNC0 cycle")
-    yield from write(station, Register.DC_ACTIVATION, bytes((_CYCLIC_OUT,)), "DC activation")
+    cycles = signals.cycle0_ns.to_bytes(4, "little") + signals.cycle1_ns.to_bytes(4, "little")
+    yield from write(station, Register.DC_SYNC0_CYCLE, cycles, "SYNC cycles")
+    activation = bytes((signals.activate >> 8,))
+    yield from write(station, Register.DC_ACTIVATION, activation, "DC activation")
     return start
+
+
+def stop_sync(station: int, activate: int) -> Procedure[None]:
+    """Stop SYNC0 and SYNC1; the low byte of *activate* (AssignActivate) stays in effect.
+
+    Raises WorkingCounterError if the slave does not answer.
+    """
+    yield from write(station, Register.DC_ACTIVATION, b"\0", "DC activation")
+    owner = bytes((activate & 0xFF,))
+    yield from write(station, Register.DC_CYCLIC_UNIT, owner, "DC cyclic unit")
 
 
 def read_difference(station: int) -> Procedure[int]:

@@ -7,18 +7,21 @@ the mapping.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from types import MappingProxyType
 from typing import NamedTuple
 
 import msgspec
 
-from devicebus.errors import MailboxProtocolError
+from devicebus.errors import BusError, MailboxProtocolError
 from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import Sii, SiiPdo, SiiSyncManager
 from eap.ids import ObjectId
 from eap.od.abort import SdoAbortError
+from eap.od.slave_config import SlaveConfig
 
 ASSIGNMENT = 0x1C10
 """Assignment object of sync manager 0; those of the others follow."""
@@ -63,34 +66,46 @@ class ProcessDataChannel(NamedTuple):
         return (bits + 7) // 8 if self.pdos else self.fixed_size
 
 
-class PdoConfiguration(msgspec.Struct, frozen=True, kw_only=True):
-    """PDO assignment and mapping to write to a slave."""
+def channels_from_sii(
+    sii: Sii, assignment: Mapping[int, Sequence[int]] = MappingProxyType({})
+) -> tuple[ProcessDataChannel, ...]:
+    """Return the process data sync managers with their PDOs.
 
-    assignment: Mapping[int, Sequence[int]] = {}
-    """Assigned PDOs by sync manager."""
-    mapping: Mapping[int, Sequence[tuple[int, int, int]]] = {}
-    """Index, subindex and bit length of each entry, by PDO."""
+    Those are the PDOs that *assignment* gives a sync manager, else those that the EEPROM assigns.
 
-
-def channels_from_sii(sii: Sii) -> tuple[ProcessDataChannel, ...]:
-    """Return the process data sync managers with the PDOs that the EEPROM assigns."""
+    Raises BusError for a PDO that the EEPROM does not have.
+    """
     return tuple(
         ProcessDataChannel(
             number,
             manager.start,
             manager.control,
             is_output,
-            tuple(
-                _pdo(sii, pdo)
-                for pdo in (sii.rx_pdos if is_output else sii.tx_pdos)
-                # PDOs of other values (0xFF) are not assigned by default.
-                if pdo.header.sync_manager == number
-            ),
-            manager.length if manager.enable & 1 else 0,
+            tuple(_pdos_of(sii, number, assignment.get(number), is_output=is_output)),
+            manager.length if manager.enable & 1 and number not in assignment else 0,
         )
         for number, manager in enumerate(sii.sync_managers)
         if (is_output := _is_output(manager)) is not None
     )
+
+
+def _pdos_of(
+    sii: Sii, number: int, assigned: Sequence[int] | None, *, is_output: bool
+) -> Iterator[Pdo]:
+    known = sii.rx_pdos if is_output else sii.tx_pdos
+    if assigned is None:
+        # PDOs of other values (0xFF) are not assigned by default.
+        yield from (_pdo(sii, each) for each in known if each.header.sync_manager == number)
+        return
+    by_index = {each.header.index: each for each in known}
+    for index in assigned:
+        if index not in by_index:
+            has = ", ".join(f"0x{each:04X}" for each in by_index) or "none"
+            raise BusError(
+                f"PDO 0x{index:04X} cannot be assigned to sync manager {number}: the EEPROM has"
+                f" {has}"
+            )
+        yield _pdo(sii, by_index[index])
 
 
 def read_channels(sii: Sii) -> Conversation[tuple[ProcessDataChannel, ...]]:
@@ -128,16 +143,27 @@ def read_channels(sii: Sii) -> Conversation[tuple[ProcessDataChannel, ...]]:
     return tuple(channels)
 
 
-def write_configuration(choice: PdoConfiguration, sizes: MailboxSizes) -> Conversation[None]:
+def write_configuration(config: SlaveConfig, sizes: MailboxSizes) -> Conversation[None]:
     """Write PDO mapping and assignment to a slave in PREOP.
+
+    A list that the slave does not let write is no error if it is the wanted one.
 
     Raises:
         SdoAbortError: the slave refuses a value.
     """
-    for pdo, entries in choice.mapping.items():
-        numbers = [index << 16 | subindex << 8 | bits for index, subindex, bits in entries]
+    # Without assigned PDOs first: a slave refuses to change the mapping of an assigned one.
+    remapped = [
+        manager
+        for manager, pdos in config.assignment.items()
+        if any(pdo in config.mapping for pdo in pdos)
+    ]
+    for manager in remapped:
+        with suppress(SdoAbortError):  # a fixed assignment is checked below
+            yield from coe_client.download(ASSIGNMENT + manager, 0, b"\0", sizes)
+    for pdo, entries in config.mapping.items():
+        numbers = [each.index << 16 | each.subindex << 8 | each.bit_length for each in entries]
         yield from _write_list(pdo, numbers, 4, sizes)
-    for manager, pdos in choice.assignment.items():
+    for manager, pdos in config.assignment.items():
         yield from _write_list(ASSIGNMENT + manager, pdos, 2, sizes)
 
 
@@ -215,7 +241,12 @@ def _write_list(
 ) -> Conversation[None]:
     # Subindex 0 is cleared first: entries of a mapping or assignment are writable only then, and
     # the new count makes them valid.
-    yield from coe_client.download(index, 0, b"\0", sizes)
+    try:
+        yield from coe_client.download(index, 0, b"\0", sizes)
+    except SdoAbortError:
+        if (yield from _read_list(index, size)) != list(numbers):
+            raise
+        return  # fixed, and as wanted
     for subindex, number in enumerate(numbers, 1):
         yield from coe_client.download(index, subindex, number.to_bytes(size, "little"), sizes)
     yield from coe_client.download(index, 0, bytes((len(numbers),)), sizes)

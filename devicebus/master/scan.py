@@ -21,6 +21,7 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 from devicebus.wire.sii import Sii, SiiFixed
 from eap.codec.wire import WireStruct, u8, u16, u32
 from eap.errors import EapError
+from eap.od.slave_config import SlaveConfig
 
 _ORDER = (3, 1, 2)
 
@@ -270,6 +271,7 @@ class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
     serial: int | None = None
     alias: int | None = None
     """Alias; a slave with one other than 0 may have any position (:func:`match_aliases`)."""
+    config: SlaveConfig = SlaveConfig()
 
 
 def fits(expected: ExpectedSlave, identity: Identity) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from devicebus.errors import BusError, StateTimeoutError
-from devicebus.master.bring import bring, read_process_data, set_clocks
+from devicebus.master.bring import bring, set_clocks
 from devicebus.master.bus import BusSlave, BusState
+from devicebus.master.configuration import prepare_safeop, run_writes, transition_of
 from devicebus.master.cycle import Cycle
 from devicebus.master.esm import POLL_NS, TIMEOUT_NS
 from devicebus.master.findings import join_errors
@@ -56,6 +57,9 @@ def shut_down(bus: BusState) -> Procedure[None]:
         StateTimeoutError: a slave stays in another state.
         FrameLostError: no frame comes back.
     """
+    slaves = [slave for slave in bus.slaves.values() if slave.mailbox is not None]
+    # Best effort: a slave that refuses a write, or does not answer, goes to INIT all the same.
+    yield from together([_run_last_writes(bus, slave) for slave in slaves])
     bus.reset()
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
     _, now_ns = yield Sleep(0)
@@ -67,6 +71,13 @@ def shut_down(bus: BusState) -> Procedure[None]:
             return
         _, now_ns = yield Sleep(POLL_NS)
     raise StateTimeoutError("some slaves are not in INIT within 5 s")
+
+
+def _run_last_writes(bus: BusState, slave: BusSlave) -> Procedure[None]:
+    """Send the start-up writes of the transition from the slave's state to INIT."""
+    transition = transition_of(slave.state or AlState.INIT, AlState.INIT)
+    if transition is not None:
+        yield from run_writes(bus, slave, transition)
 
 
 def set_up_cycle(bus: BusState) -> None:
@@ -100,7 +111,12 @@ def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusS
     if moved:
         yield from assign_stations(moved)
     return [
-        BusSlave(slave._replace(station=station), expected[number].name, bus.changes)
+        BusSlave(
+            slave._replace(station=station),
+            expected[number].name,
+            bus.changes,
+            expected[number].config,
+        )
         for slave, station, number in zip(found, stations, order, strict=True)
     ]
 
@@ -111,7 +127,7 @@ def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState)
     for slave, _ in starting.errors:
         slave.channels = _channels_by_eeprom(slave)
     # Clocks are set before SAFEOP, where slaves with SYNC0 check them.
-    if bus.settings.clocks:
+    if bus.uses_clocks:
         yield from set_clocks(bus)
     set_up_cycle(bus)
     yield from starting.run_all(lambda slave: bring(bus, slave, AlState.SAFEOP))
@@ -120,8 +136,8 @@ def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState)
 
 
 def _read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
-    """Read the process data of a slave, and check that it fits a frame."""
-    yield from read_process_data(bus, slave)
+    """Configure and read the process data of a slave, and check that it fits a frame."""
+    yield from prepare_safeop(bus, slave)
     plan_image([_process_data_of(slave)])
 
 

@@ -256,7 +256,7 @@ def _bring_back(bus: BusState, slave: BusSlave, *, stays: bool) -> Procedure[int
             )
         yield from bring(bus, slave, AlState.INIT)
         slave.is_lost = False
-        if bus.settings.clocks:
+        if bus.uses_clocks:
             yield from set_clocks(bus, only=frozenset((slave.station,)))
     yield from bring(bus, slave, slave.target)
     _, now_ns = yield Sleep(0)

@@ -105,7 +105,8 @@ class OpMode(msgspec.Struct, frozen=True, kw_only=True):
         """Return the signals for a bus cycle; None if the mode uses none."""
         if not self.activate >> 8:
             return None
-        cycle0 = self.cycle0_ns or _scaled(cycle_ns, self.factor0)
+        # A factor of 0 would be a single pulse: such modes follow the bus.
+        cycle0 = self.cycle0_ns or _scaled(cycle_ns, self.factor0) or cycle_ns
         base = cycle0 if self.factor1 >= 0 else cycle_ns
         cycle1 = self.cycle1_ns or _scaled(base, self.factor1)
         return SyncSignals(

@@ -23,8 +23,9 @@ from devicebus.errors import BusError, NoMailboxError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.attach import attach
-from devicebus.master.bring import bring, read_process_data
+from devicebus.master.bring import bring
 from devicebus.master.bus import BusSlave, BusState, MasterSettings
+from devicebus.master.configuration import read_process_data
 from devicebus.master.findings import History, join_errors
 from devicebus.master.procedure import Procedure, Task, together
 from devicebus.master.scan import FoundSlave, scan

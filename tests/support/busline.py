@@ -12,7 +12,7 @@ from devicebus.master.esm import change_state
 from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, configure
 from devicebus.master.procedure import Procedure, Runner, Sleep, Step, StepReplies, Task
-from devicebus.master.scan import scan
+from devicebus.master.scan import ExpectedSlave, scan
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.segment import POLL_NS, SegmentEnd, SimulatedSegment
 from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec
@@ -24,6 +24,7 @@ from devicebus.wire.datagram import (
     encode_frame,
     iter_datagrams,
 )
+from eap.od.slave_config import SlaveConfig
 
 US = 1_000
 MS = 1_000_000
@@ -162,6 +163,17 @@ def slave(name: str, kind: str = "digital", **options) -> SlaveSpec:
             "outputs": (ChannelSpec(name="out"),),
         } | options
     return SlaveSpec(name=name, kind=DeviceKind(kind), **({"product": 7} | options))
+
+
+def expect(spec: SlaveSpec, **config) -> ExpectedSlave:
+    """The slave that a master expects, with its configuration."""
+    return ExpectedSlave(
+        name=spec.name,
+        vendor=spec.vendor,
+        product=spec.product,
+        alias=spec.alias or None,
+        config=SlaveConfig(**config),
+    )
 
 
 def segment(*slaves: SlaveSpec) -> SimulatedSegment:

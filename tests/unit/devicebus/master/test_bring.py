@@ -8,20 +8,18 @@ from devicebus.master.bring import (
     bring,
     clear,
     set_process_data,
-    set_watchdog,
     standard_mailbox,
-    wait_for,
 )
 from devicebus.master.bus import MasterSettings
+from devicebus.master.configuration import set_watchdog, wait_for
 from devicebus.master.image import plan_image
 from devicebus.master.mailboxes import MailboxArea
 from devicebus.master.master import Master
-from devicebus.master.pdo import PdoConfiguration
 from devicebus.master.scan import assign_stations
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Fmmu, Register, SyncManager
 from devicebus.wire.sii import SiiFixed
-from tests.support.busline import Bench, Line, Paced, run, segment, slave
+from tests.support.busline import Bench, Line, Paced, expect, run, segment, slave
 from tests.unit.devicebus.master.test_image import shape
 
 FIXED = SiiFixed(
@@ -103,8 +101,8 @@ def test_mailboxes_open_and_close_with_the_states():
 
 
 def test_bring_writes_the_pdo_configuration_before_reading():
-    choice = PdoConfiguration(assignment={2: (), 3: (0x1A00,)})
-    line = Paced(Master(MasterSettings(pdo_configurations={1001: choice})), segment(slave("a")))
+    expected = [expect(slave("a"), assignment={2: (), 3: (0x1A00,)})]
+    line = Paced(Master(MasterSettings(expected=expected)), segment(slave("a")))
     line.wait(line.core.bring_up(line.now_ns))
     assert [each.name for each in line.core.image.layout.variables] == ["in"]
     assert line.segment.slaves[0].state is AlState.OP

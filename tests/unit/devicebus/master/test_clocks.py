@@ -5,17 +5,18 @@ import pytest
 from devicebus.errors import WorkingCounterError
 from devicebus.master.clocks import (
     Latched,
-    Sync0,
     drift_datagram,
     find_delays,
     read_difference,
-    start_sync0,
+    start_sync,
+    stop_sync,
     synchronize,
 )
 from devicebus.master.scan import TopologyNode, scan
 from devicebus.sim.segment import CABLE_NS, FORWARD_NS
 from devicebus.sim.spec import ClockSpec
 from devicebus.wire.register import Register
+from eap.od.slave_config import SyncSignals
 from tests.support.busline import MS, Bench, Line, run, segment, slave
 
 HOP = CABLE_NS + FORWARD_NS
@@ -131,16 +132,35 @@ def test_differences_have_a_sign():
     assert run(line, read_difference(1001)) == 5
 
 
+SIGNALS = SyncSignals(activate=0x0300, cycle0_ns=MS, shift0_ns=250_000)
+
+
 def test_sync0_starts_at_a_whole_cycle_plus_shift():
     line, found = line_of(clocked("a"))
     run(line, synchronize(found, TIME))
-    start = run(line, start_sync0(1001, Sync0(MS, 250_000)))
+    start = run(line, start_sync(1001, SIGNALS))
     assert start % MS == 250_000
     shown = times(line)["a"]
     assert shown + 90 * MS < start < shown + 102 * MS
     clock = line.segment.slaves[0].esc.clock
     assert clock.sync0_is_active
     assert clock.take_sync0(line.now_ns + 110 * MS) >= 8
+    assert not clock.sync1_is_active
+
+
+def test_sync1_follows_sync0_by_its_register():
+    line, found = line_of(clocked("a"))
+    run(line, synchronize(found, TIME))
+    both = SyncSignals(activate=0x0730, cycle0_ns=MS, cycle1_ns=MS + 20_000)
+    run(line, start_sync(1001, both))
+    esc = line.segment.slaves[0].esc
+    assert esc.memory[Register.DC_CYCLIC_UNIT] == 0x30
+    assert esc.clock.sync1_is_active
+    # Every second SYNC0 pulse has a SYNC1.
+    later = line.now_ns + 110 * MS
+    assert esc.clock.take_sync0(later) in {2 * esc.clock.take_sync1(later) - n for n in (0, 1)}
+    run(line, stop_sync(1001, 0))
+    assert not esc.clock.sync0_is_active
 
 
 def test_clocks_lost_slave_is_named():

@@ -7,7 +7,6 @@ from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.pdo import (
     Pdo,
-    PdoConfiguration,
     PdoEntry,
     ProcessDataChannel,
     channels_from_sii,
@@ -26,6 +25,7 @@ from devicebus.wire.sii import (
 from eap.codec.coe import CoeService, SdoResponse, encode_initiate, encode_message
 from eap.codec.mailbox import MailboxType
 from eap.od.abort import SdoAbortError
+from eap.od.slave_config import MappedObject, SlaveConfig
 from tests.support.busline import Bench, Line, open_mailbox, segment, slave
 
 MANAGERS = (
@@ -92,19 +92,19 @@ def test_read_channels_falls_back_to_the_eeprom():
 def test_write_configuration_clears_counts_first():
     line = Line(Bench(), segment(slave("a")))
     box = open_mailbox(line)
-    empty = PdoConfiguration(assignment={2: (), 3: (0x1A00,)})
+    empty = SlaveConfig(assignment={2: (), 3: (0x1A00,)})
     line.wait(box.converse(write_configuration(empty, box.sizes), line.now_ns))
     dictionary = line.segment.slaves[0].device.dictionary
     assert dictionary.entry(0x1C12, 0).value == 0
     assert dictionary.entry(0x1C13, 1).value == 0x1A00
-    wrong = PdoConfiguration(mapping={0x1600: ((0x7000, 1, 8),)})
+    wrong = SlaveConfig(mapping={0x1600: (MappedObject(0x7000, 1, 8),)})
     with pytest.raises(SdoAbortError, match="0x1600:0"):
         line.wait(box.converse(write_configuration(wrong, box.sizes), line.now_ns))
 
 
 def test_write_configuration_encodes_index_subindex_and_bits():
     writing = write_configuration(
-        PdoConfiguration(mapping={0x1600: ((0x7010, 2, 16),)}), MailboxSizes()
+        SlaveConfig(mapping={0x1600: (MappedObject(0x7010, 2, 16),)}), MailboxSizes()
     )
     first = next(writing)
     assert first.request[3:6] == b"\x00\x16\x00"

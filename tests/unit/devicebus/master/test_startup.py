@@ -13,13 +13,13 @@ from devicebus.errors import (
     StateTimeoutError,
 )
 from devicebus.master.bus import MasterSettings
-from devicebus.master.clocks import Sync0
 from devicebus.master.master import Master
 from devicebus.master.scan import ExpectedSlave
 from devicebus.sim.spec import ClockSpec, MailboxSpec
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState
-from tests.support.busline import MS, Paced, Slow, segment, slave
+from eap.od.slave_config import OpMode
+from tests.support.busline import MS, Paced, Slow, expect, segment, slave
 
 
 def line_of(*slaves, **settings):
@@ -201,8 +201,10 @@ def test_slaves_that_need_sync0_reach_op_with_their_clocks_together():
     line = line_of(
         clocked("a"),
         clocked("bb"),
-        clocks=True,
-        sync0={1001: Sync0(MS), 1002: Sync0(MS, 1000)},
+        expected=[
+            expect(clocked("a"), sync=OpMode()),
+            expect(clocked("bb"), sync=OpMode(cycle0_ns=MS, shift0_ns=1000)),
+        ],
         epoch_offset_ns=10**17,
     )
     line.wait(line.core.bring_up(line.now_ns))
