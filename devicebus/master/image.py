@@ -266,7 +266,7 @@ class BusImage:
         kind = data_type_of(variable)
         if kind is None and not isinstance(value, bytes):
             raise ValueError(f"{value!r} for {name!r}, expected bytes")
-        self.write_octets(variable, kind.encode(value) if kind else bytes(value))  # type: ignore[arg-type]
+        self.write_octets(variable, kind.encode(value) if kind else bytes(value))
 
     def read_octets(self, variable: ProcessVariable) -> bytes:
         """Return the bits of an entry, shifted to bit 0 of the first byte."""

@@ -31,7 +31,7 @@ from eap.codec.adssymbol import (
     encode_entry,
     encode_text,
 )
-from eap.codec.datatypes import Array, Block, Boolean, DataType, Integer, Real, String
+from eap.codec.datatypes import Array, Boolean, DataType, Integer, Real, String
 
 _INTEGERS = {
     (True, 1): (AdsType.INT8, "SINT"),
@@ -58,10 +58,10 @@ class SymbolType(NamedTuple):
 
     def describe(self) -> list[DataTypeEntry]:
         """Return the data type entries of this type and of its elements."""
-        if isinstance(self.kind, Array):
-            (of,) = symbol_type(self.kind.element).describe()
-        elif isinstance(self.kind, Block):
+        if _is_bytes(self.kind):
             of = DataTypeEntry("BYTE", AdsType.UINT8, 1)
+        elif isinstance(self.kind, Array):
+            (of,) = symbol_type(self.kind.element).describe()
         else:
             return [DataTypeEntry(self.name, self.id, self.size)]
         return [of, DataTypeEntry(self.name, self.id, self.size, of.name, self.size // of.size)]
@@ -118,13 +118,18 @@ def symbol_type(kind: DataType) -> SymbolType:
     """Return how clients know *kind*."""
     if isinstance(kind, String):
         return SymbolType(kind, AdsType.STRING, f"STRING({kind.size})", kind.size + 1)
-    if isinstance(kind, Block):
+    if _is_bytes(kind):
         return SymbolType(kind, AdsType.UINT8, f"ARRAY [0..{kind.size - 1}] OF BYTE", kind.size)
     element = _element(kind)
     type_id, name, size = _scalar(element)
     if isinstance(kind, Array):
         name = f"ARRAY [0..{kind.count - 1}] OF {name}"
     return SymbolType(kind, type_id, name, size * kind.count)
+
+
+def _is_bytes(kind: DataType) -> bool:
+    """Return whether clients know *kind* as bytes: it is neither a text nor made of numbers."""
+    return not isinstance(kind, String) and not isinstance(_element(kind), Boolean | Integer | Real)
 
 
 def _element(kind: DataType) -> DataType:

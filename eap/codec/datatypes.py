@@ -1,334 +1,69 @@
-"""Base data types of process variables (ETG.1020): names, values, and layout in a PD.
+"""Data types of process variables by their texts (ETG.1020, IEC 61131-3), and their layout in a PD.
 
 Names are those of ESI files and IEC 61131-3; the shorter and the CANopen names are read as well.
-
-Everything is little-endian.  A type does not know the offset of its variable; the caller of
-``read`` and ``write`` passes it.  :func:`parse` finds a type by its name.
+:func:`parse` returns the type for a text, which is complete: a struct's has all its members, so
+that a type passes between processes and files as its text.  :mod:`eap.codec.structures` describes
+the texts of structs and enumerations.
 """
 
 from __future__ import annotations
 
 import re
-import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
-from operator import index
-from typing import Any, NamedTuple, TypeAlias
+from types import MappingProxyType
+from typing import NamedTuple, NoReturn
 
 import msgspec
 
-from eap.codec.wire import Buffer
-from eap.errors import TruncatedError
+from eap.codec.arrays import MAX_SIZE, Array, Dimension, check_size, make_array
+from eap.codec.basetypes import (
+    Block,
+    Boolean,
+    DataType,
+    Integer,
+    Plain,
+    Real,
+    String,
+    Value,
+    WideChar,
+    WideString,
+)
+from eap.codec.enumerations import MAX_MEMBERS, make_enumeration
+from eap.codec.structures import MAX_DEPTH, Member, make_structure
+from eap.codec.times import TIMES
 from eap.suggest import suggest
 
-Value: TypeAlias = bool | int | float | str | bytes | tuple[int, ...] | tuple[float, ...]
-"""Value that ``read`` returns; ``write`` takes the same, and any sequence for an array."""
-Plain: TypeAlias = bool | int | float | str | list[int] | list[float]
-"""A value as YAML and JSON carry it: a raw block is a string of hexadecimal digits."""
-
-
-_SHOWN = 60
-"""Characters of a refused value in a message."""
-
-
-class DataType(msgspec.Struct, frozen=True):
-    """One type, complete with its length; made by ``datatypes.parse``."""
-
-    text: str
-    """Canonical name, which ``datatypes.parse`` reads again."""
-    code: int
-    """Index of the base type in the object dictionary (ETG.1020)."""
-    bit_length: int
-    size: int
-    """Bytes in the process image."""
-    is_bits: bool = False
-    """True if it is packed bit by bit on the wire; in the image it has a byte of its own."""
-    count: int = 1
-    """Elements of an array, else 1."""
-
-    @property
-    def is_text(self) -> bool:
-        """True if it is text, of which only as many bytes count as are not NUL at the end."""
-        return self.code == 0x09
-
-    def read(self, buffer: Buffer, offset: int) -> Value:
-        """Return the value at *offset*; raise TruncatedError if the buffer ends before it."""
-        if offset < 0 or offset + self.size > len(buffer):
-            raise self._no_room(buffer, offset)
-        return self.decode(buffer, offset)
-
-    def write(self, buffer: bytearray | memoryview, offset: int, value: Any) -> None:
-        """Put *value* at *offset*, or raise ValueError with the reason and write nothing."""
-        octets = self.encode(value)
-        if offset < 0 or offset + self.size > len(buffer):
-            raise self._no_room(buffer, offset)
-        buffer[offset : offset + self.size] = octets
-
-    # The next two and parse_text are abstract; a msgspec.Struct has a metaclass that ABC refuses.
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Return the value at *offset* of a buffer that is known to be long enough."""
-        raise NotImplementedError
-
-    def encode(self, value: Any) -> bytes:
-        """Return the bytes of *value*; raise ValueError naming type and range if it is none."""
-        raise NotImplementedError
-
-    @property
-    def zero(self) -> Value:
-        """The value of all bytes zero."""
-        return self.decode(bytes(self.size), 0)
-
-    @property
-    def scalar_range(self) -> tuple[int, int] | tuple[float, float] | None:
-        """Smallest and largest value of a single number (ints or floats), None for all others."""
-        return None
-
-    def parse_text(self, text: str) -> Value:
-        """Read a value as typed on a command line; raise ValueError if it is none."""
-        raise NotImplementedError
-
-    def from_plain(self, plain: object) -> Value:
-        """Read a value as a plant file or JSON holds it; raise ValueError if it is none."""
-        return self.decode(self.encode(plain), 0)
-
-    def to_plain(self, value: Value) -> Plain:
-        """Return *value* as JSON can carry it."""
-        if isinstance(value, bytes):
-            return value.hex()
-        return list(value) if isinstance(value, tuple) else value
-
-    def _no_room(self, buffer: Buffer, offset: int) -> TruncatedError:
-        return TruncatedError(
-            f"needs {self.size} bytes of a buffer of {len(buffer)}",
-            layout=self.text,
-            offset=offset,
-        )
-
-    def _refuse(self, value: object, expected: str) -> ValueError:
-        shown = repr(value)
-        if len(shown) > _SHOWN:
-            shown = f"{shown[:_SHOWN]}…"
-        return ValueError(f"{shown} is not a value of {self.text}: expected {expected}")
-
-
-class Integer(DataType, frozen=True):
-    """A whole number of 1 to 8 bytes, or of 1 to 8 bits in a byte of its own."""
-
-    signed: bool = False
-
-    @property
-    def scalar_range(self) -> tuple[int, int]:
-        """Smallest and largest number."""
-        if self.signed:
-            half = 1 << self.bit_length - 1
-            return -half, half - 1
-        return 0, (1 << self.bit_length) - 1
-
-    def encode(self, value: Any) -> bytes:
-        """Return the bytes of any whole number in range."""
-        low, high = self.scalar_range
-        try:
-            number = index(value)
-        except TypeError:
-            raise self._refuse(value, f"a whole number from {low} to {high}") from None
-        if not low <= number <= high:
-            raise self._refuse(value, f"a whole number from {low} to {high}")
-        return number.to_bytes(self.size, "little", signed=self.signed)
-
-    def parse_text(self, text: str) -> Value:
-        """Read decimal, or hexadecimal, octal and binary behind 0x, 0o and 0b."""
-        try:
-            number = int(text, 10 if text.strip().lstrip("+-").isdecimal() else 0)
-        except ValueError:
-            low, high = self.scalar_range
-            raise self._refuse(text, f"a whole number from {low} to {high}") from None
-        self.encode(number)
-        return number
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read all bytes as one number; a bit field ignores the bits beyond it."""
-        number = int.from_bytes(buffer[offset : offset + self.size], "little", signed=self.signed)
-        return number & (1 << self.bit_length) - 1 if self.is_bits else number
-
-
-_TRUTH = {"true": True, "1": True, "on": True, "false": False, "0": False, "off": False}
-
-
-class Boolean(DataType, frozen=True):
-    """One bit; any byte but zero reads as true."""
-
-    @property
-    def scalar_range(self) -> tuple[int, int]:
-        """0 and 1."""
-        return 0, 1
-
-    def encode(self, value: Any) -> bytes:
-        """Return the byte of True, False, 1 or 0."""
-        if not isinstance(value, int) or value not in (0, 1):
-            raise self._refuse(value, "true or false")
-        return bytes((value,))
-
-    def parse_text(self, text: str) -> Value:
-        """Read true or false, on or off, 1 or 0."""
-        truth = _TRUTH.get(text.strip().lower())
-        if truth is None:
-            raise self._refuse(text, "true or false")
-        return truth
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read any byte but zero as true."""
-        return buffer[offset] != 0
-
-
-_FLOAT = {4: struct.Struct("<f"), 8: struct.Struct("<d")}
-_LARGEST = {
-    size: _FLOAT[size].unpack(bits)[0]
-    for size, bits in ((4, bytes.fromhex("ffff7f7f")), (8, bytes.fromhex("ffffffffffffef7f")))
-}
-
-
-class Real(DataType, frozen=True):
-    """An IEEE 754 number of 4 or 8 bytes; infinities and NaN are values."""
-
-    @property
-    def scalar_range(self) -> tuple[float, float]:
-        """Smallest and largest finite number."""
-        return -_LARGEST[self.size], _LARGEST[self.size]
-
-    def encode(self, value: Any) -> bytes:
-        """Return the bytes of any number that is not too large."""
-        try:
-            return _FLOAT[self.size].pack(value)
-        except (struct.error, OverflowError):
-            low, high = self.scalar_range
-            raise self._refuse(value, f"a number from {low} to {high}") from None
-
-    def parse_text(self, text: str) -> Value:
-        """Read a decimal number, also with an exponent, ``inf`` or ``nan``."""
-        try:
-            number = float(text)
-        except ValueError:
-            raise self._refuse(text, "a number such as -1.5e3") from None
-        self.encode(number)
-        return number
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read the number, infinities and NaN included."""
-        number: float = _FLOAT[self.size].unpack_from(buffer, offset)[0]
-        return number
-
-
-class String(DataType, frozen=True):
-    """Text in a fixed number of bytes: UTF-8, padded with zeros, which end it on reading.
-
-    Bytes that are no UTF-8 read as U+FFFD: a peer's text never fails to be shown.
-    """
-
-    def encode(self, value: Any) -> bytes:
-        """Return the padded bytes of a text that fits and has no NUL; take bytes as they are."""
-        if isinstance(value, bytes) and len(value) == self.size:
-            return value
-        if not isinstance(value, str):
-            raise self._refuse(value, "a text")
-        try:
-            octets = value.encode()
-        except UnicodeEncodeError:
-            raise self._refuse(value, "a text without lone surrogates") from None
-        if 0 in octets:
-            raise self._refuse(value, "a text without NUL, which would end it")
-        if len(octets) > self.size:
-            raise self._refuse(value, f"at most {self.size} bytes, this text has {len(octets)}")
-        return octets.ljust(self.size, b"\0")
-
-    def parse_text(self, text: str) -> Value:
-        """Take the text as it is."""
-        self.encode(text)
-        return text
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read the text up to the first NUL."""
-        octets, _, _ = bytes(buffer[offset : offset + self.size]).partition(b"\0")
-        return octets.decode(errors="replace")
-
-
-class Block(DataType, frozen=True):
-    """Raw bytes of a fixed number."""
-
-    def encode(self, value: Any) -> bytes:
-        """Return the bytes, which must be exactly as many as the block has."""
-        if not isinstance(value, bytes | bytearray | memoryview):
-            raise self._refuse(value, f"{self.size} bytes")
-        if len(value) != self.size:
-            raise self._refuse(bytes(value), f"{self.size} bytes, these are {len(value)}")
-        return bytes(value)
-
-    def parse_text(self, text: str) -> Value:
-        """Read hexadecimal digits, spaces between bytes allowed."""
-        try:
-            octets = bytes.fromhex(text)
-        except ValueError:
-            raise self._refuse(text, f"{self.size} bytes in hexadecimal") from None
-        return self.encode(octets)
-
-    def from_plain(self, plain: object) -> Value:
-        """Read hexadecimal digits."""
-        if not isinstance(plain, str):
-            raise self._refuse(plain, f"{self.size} bytes in hexadecimal")
-        return self.parse_text(plain)
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Return a copy of the bytes."""
-        return bytes(buffer[offset : offset + self.size])
-
-
-class Array(DataType, frozen=True, kw_only=True):
-    """A fixed number of equal numbers; its value is a tuple."""
-
-    element: DataType
-
-    def encode(self, value: Any) -> bytes:
-        """Return the bytes of a sequence of exactly as many numbers; errors name the element."""
-        if not isinstance(value, Sequence) or isinstance(value, str | bytes | bytearray):
-            raise self._refuse(value, f"{self.count} values")
-        if len(value) != self.count:
-            raise self._refuse(value, f"{self.count} values, these are {len(value)}")
-        octets = bytearray()
-        for position, item in enumerate(value):
-            try:
-                octets += self.element.encode(item)
-            except ValueError as exc:
-                raise ValueError(f"element {position} of {self.text}: {exc}") from None
-        return bytes(octets)
-
-    def parse_text(self, text: str) -> Value:
-        """Read the elements between commas; brackets around them are allowed."""
-        items = text.strip().removeprefix("[").removesuffix("]").split(",")
-        if len(items) != self.count:
-            raise self._refuse(text, f"{self.count} values between commas, these are {len(items)}")
-        numbers: list[Any] = [self.element.parse_text(item) for item in items]
-        return tuple(numbers)
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read all elements."""
-        end, step = offset + self.size, self.element.size
-        numbers: list[Any] = [self.element.decode(buffer, at) for at in range(offset, end, step)]
-        return tuple(numbers)
-
-
-# A PD's length is 16 bits wide.
-MAX_SIZE = 0xFFFF
-"""Bytes of the largest variable."""
+# Users of types import all of them from here.
+__all__ = [
+    "MAX_SIZE",
+    "Array",
+    "Block",
+    "Boolean",
+    "DataType",
+    "Integer",
+    "PdoLayout",
+    "Plain",
+    "Real",
+    "String",
+    "Value",
+    "layout",
+    "parse",
+    "parse_with",
+]
 
 
 def _integer(name: str, code: int, bits: int, *, signed: bool = False) -> DataType:
     return Integer(name, code, bits, (bits + 7) // 8, signed=signed)
 
 
-_NUMBERS: dict[str, DataType] = {
+_BYTE_BOOL = Boolean("BOOL8", 0x01, 8, 1)
+"""BOOL of controllers: within arrays and structs every BOOL is one."""
+_BASE: dict[str, DataType] = {
     kind.text: kind
     for kind in (
         Boolean("BOOL", 0x01, 1, 1, is_bits=True),
+        _BYTE_BOOL,
         _integer("SINT", 0x02, 8, signed=True),
         _integer("INT", 0x03, 16, signed=True),
         _integer("DINT", 0x04, 32, signed=True),
@@ -350,6 +85,10 @@ _NUMBERS: dict[str, DataType] = {
         _integer("BYTE", 0x1E, 8),
         _integer("WORD", 0x1F, 16),
         _integer("DWORD", 0x20, 32),
+        # Numbers of types that ETG.1020 does not list are those of the number they are.
+        _integer("LWORD", 0x1B, 64),
+        WideChar("WCHAR", 0x06, 16, 2),
+        *TIMES,
         *(Integer(f"BIT{n}", 0x2F + n, n, 1, is_bits=True) for n in range(1, 9)),
     )
 }
@@ -365,6 +104,10 @@ _ALIASES = {
     "REAL64": "LREAL",
     "VISIBLE_STRING": "STRING",
     "OCTET_STRING": "BLOCK",
+    "TIME_OF_DAY": "TOD",
+    "LTIME_OF_DAY": "LTOD",
+    "DATE_AND_TIME": "DT",
+    "LDATE_AND_TIME": "LDT",
     **{
         f"{prefix}{width}": _BY_WIDTH[family].get(width, f"{family}{width}")
         for family, prefixes in (
@@ -379,12 +122,16 @@ _ALIASES = {
 _OF_OTHER_LANGUAGES = {"FLOAT": "REAL", "DOUBLE": "LREAL"}
 """Names that no standard of the field has; the right name is suggested."""
 
+# ETG.1020: VISIBLE_STRING, OCTET_STRING and UNICODE_STRING.
 _SIZED: dict[str, Callable[[int], DataType]] = {
     "STRING": lambda size: String(f"STRING({size})", 0x09, size * 8, size),
     "BLOCK": lambda size: Block(f"BLOCK({size})", 0x0A, size * 8, size),
+    "WSTRING": lambda count: WideString(f"WSTRING({count})", 0x0B, 16 * count + 16, 2 * count + 2),
 }
-_FORM = re.compile(r"([A-Z_][A-Z_0-9]*)\s*(?:\(\s*(\d+)\s*\))?\s*(?:\[\s*(\d+)\s*\])?", re.ASCII)
-_IEC_ARRAY = re.compile(r"ARRAY\s*\[\s*(\d+)\s*\.\.\s*(\d+)\s*\]\s*OF\s+(\S.*)", re.ASCII)
+_SUCH_AS = "(such as UINT, REAL[4] or STRING(16))"
+_MAX_TEXT = 1 << 18
+"""Characters of the longest text of a type."""
+_MAX_DIMENSIONS = 8
 
 
 @lru_cache(maxsize=4096)
@@ -392,61 +139,239 @@ def parse(text: str) -> DataType:
     """Return the type that *text* names: ``UINT``, ``REAL[4]``, ``STRING(16)``, ``BLOCK(600)``.
 
     Upper and lower case are the same, as in IEC 61131-3, and so are the IEC, CANopen and short
-    names (``UINT``, ``UNSIGNED16``, ``U16``).  ``ARRAY [0..3] OF REAL`` is read as ``REAL[4]``.
+    names (``UINT``, ``UNSIGNED16``, ``U16``).  ``ARRAY [0..3, 1..2] OF REAL`` is read as
+    ``REAL[4,1..2]``, ``DINT (-10..10)`` is a subrange; structs, enumerations and aliases are read
+    with their definition.
 
     Raises:
         ValueError: there is no such type; the message says which one comes near.
     """
-    form = text.strip().upper()
-    if bounds := _IEC_ARRAY.fullmatch(form):
-        form = f"{bounds[3]}[{max(0, int(bounds[2]) - int(bounds[1]) + 1)}]"
-    match = _FORM.fullmatch(form)
-    if not match:
-        raise ValueError(f"{text!r} is not a data type (such as UINT, REAL[4] or STRING(16))")
-    name = _ALIASES.get(match[1], match[1])
-    kind = _scalar(text, name, match[2])
-    return kind if match[3] is None else _array(text, kind, int(match[3]))
+    return parse_with(text, MappingProxyType({}))
 
 
-def _scalar(text: str, name: str, length: str | None) -> DataType:
-    if name in _NUMBERS:
-        if length is not None:
-            raise ValueError(f"{text!r}: {name} has a fixed length, arrays are {name}[{length}]")
-        return _NUMBERS[name]
-    if name not in _SIZED:
-        known = [*_NUMBERS, *_SIZED, *_ALIASES]
-        meant = _OF_OTHER_LANGUAGES.get(name)
-        hint = (
-            f", did you mean {meant}?"
-            if meant
-            else suggest(name, known) or " (such as UINT, REAL[4] or STRING(16))"
+def parse_with(text: str, definitions: Mapping[str, DataType]) -> DataType:
+    """Return the type that *text* names; it may refer to *definitions*, by name in upper case.
+
+    Raises:
+        ValueError: as of :func:`parse`.
+    """
+    return _Parser(text, definitions).whole()
+
+
+# A name ends before the dots of a range, a number before its second dot.
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*)*", re.ASCII)
+_NUMBER = re.compile(r"-?[0-9]{1,20}(?![0-9])", re.ASCII)
+_SPACE = re.compile(r"\s*")
+
+
+class _Parser:
+    """Position in the text of a type."""
+
+    def __init__(self, text: str, definitions: Mapping[str, DataType]) -> None:
+        if len(text) > _MAX_TEXT:
+            raise ValueError(f"a data type of {len(text)} characters: at most {_MAX_TEXT}")
+        self._text = text
+        self._at = 0
+        self._definitions = definitions
+        self._own: dict[str, DataType] = {}
+        """Definitions that the text has had so far, by name."""
+
+    def whole(self) -> DataType:
+        """Return the type of the whole text."""
+        kind = self._type(0)
+        self._skip()
+        if self._at < len(self._text):
+            self._fail()
+        return kind
+
+    def _type(self, depth: int) -> DataType:
+        """Read a type; *depth* is 0 for one that is no part of another."""
+        self._check_depth(depth)
+        name = self._name()
+        if name.upper() == "ARRAY":
+            return self._iec_array(depth)
+        kind = self._single(name, depth)
+        while self._take("["):
+            depth += 1
+            self._check_depth(depth)
+            kind = make_array(self._text[:60], _within(kind), self._dimensions())
+        return kind
+
+    def _check_depth(self, depth: int) -> None:
+        if depth > MAX_DEPTH:
+            raise ValueError(f"{self._shown} is nested too deeply: at most {MAX_DEPTH} levels")
+
+    def _iec_array(self, depth: int) -> DataType:
+        self._expect("[")
+        dimensions = self._dimensions()
+        if self._name().upper() != "OF":
+            self._fail()
+        return make_array(self._text[:60], _within(self._type(depth + 1)), dimensions)
+
+    def _single(self, name: str, depth: int) -> DataType:
+        if self._take("<"):
+            return self._definition(name, depth)
+        kind = self._own.get(name) or self._definitions.get(name.upper())
+        if kind is None:
+            upper = name.upper()
+            kind = self._base(name, _ALIASES.get(upper, upper))
+        if isinstance(kind, Integer) and self._take("("):
+            return self._subrange(kind)
+        return kind if depth == 0 else _within(kind)
+
+    def _base(self, name: str, base: str) -> DataType:
+        if base in _SIZED:
+            length = self._length(base)
+            kind = _SIZED[base](length)
+            if not length:
+                check_size(self._text[:60], 0)
+            check_size(self._text[:60], kind.size)
+            return kind
+        if base in _BASE:
+            return _BASE[base]
+        if not self._is_word:
+            self._fail()
+        known = [*_BASE, *_SIZED, *_ALIASES, *(each.name for each in self._definitions.values())]
+        meant = _OF_OTHER_LANGUAGES.get(base)
+        hint = f", did you mean {meant}?" if meant else suggest(base, known) or f" {_SUCH_AS}"
+        raise ValueError(f"{name[:60]!r} is not a data type{hint}")
+
+    def _length(self, name: str) -> int:
+        close = ")" if self._take("(") else ""
+        if not close:
+            unit = "characters" if name == "WSTRING" else "bytes"
+            raise ValueError(f"{self._shown} lacks its length in {unit}, such as {name}(16)")
+        length = self._number()
+        self._expect(close)
+        return length
+
+    def _subrange(self, kind: Integer) -> DataType:
+        low = self._number()
+        if not self._take(".."):
+            if self._take(")") and kind.text in _BASE:
+                raise ValueError(
+                    f"{self._shown}: {kind.text} has a fixed length, arrays are {kind.text}[{low}]"
+                )
+            self._fail()
+        high = self._number()
+        self._expect(")")
+        whole = kind.scalar_range
+        if type(kind) is not Integer or not whole[0] <= low <= high <= whole[1]:
+            bounds = f": expected a range within {whole[0]}..{whole[1]}" if whole else ""
+            raise ValueError(f"{self._shown}: {low}..{high} is no range of {kind.name}{bounds}")
+        return msgspec.structs.replace(
+            kind,
+            text=f"{kind.wire}({low}..{high})",
+            name="",
+            alias_of=None,
+            bounds=(low, high),
+            range_of=kind.wire,
         )
-        raise ValueError(f"{text!r} is not a data type{hint}")
-    if length is None:
-        raise ValueError(f"{text!r} lacks its length in bytes, such as {name}(16)")
-    _check_size(text, int(length))
-    return _SIZED[name](int(length))
+
+    def _dimensions(self) -> list[Dimension]:
+        found: list[Dimension] = []
+        while not found or self._take(","):
+            low, high = 0, self._number()
+            count = high
+            if self._take(".."):
+                low, high = high, self._number()
+                count = high - low + 1
+            if count < 1:
+                check_size(self._text[:60], 0)
+            found.append(Dimension(low, count))
+        self._expect("]")
+        if len(found) > _MAX_DIMENSIONS:
+            raise ValueError(
+                f"{self._shown} has {len(found)} dimensions: at most {_MAX_DIMENSIONS}"
+            )
+        return found
+
+    def _definition(self, name: str, depth: int) -> DataType:
+        """Read what stands behind ``NAME<``."""
+        self._skip()
+        if name.upper() in _BASE or name.upper() in _SIZED:
+            raise ValueError(f"{self._shown} gives {name} another meaning: expected another name")
+        if _NUMBER.match(self._text, self._at):
+            kind = self._structure(name, depth)
+        else:
+            base = self._type(depth + 1)
+            kind = self._enumeration(name, base) if self._take(":") else base.named(name)
+        self._expect(">")
+        self._own[name] = kind
+        return kind
+
+    def _structure(self, name: str, depth: int) -> DataType:
+        size = self._number()
+        self._expect("/")
+        align = self._number()
+        self._expect(":")
+        members: list[Member] = []
+        while not members or self._take(","):
+            member = self._name()
+            self._expect("@")
+            bit_offset = 8 * self._number()
+            if self._take("."):
+                bit_offset += self._number()
+            members.append(Member(member, self._type(depth + 1), bit_offset))
+            if len(members) > MAX_MEMBERS:
+                raise ValueError(f"{name} has more than {MAX_MEMBERS} members")
+        return make_structure(name, members, size, align)
+
+    def _enumeration(self, name: str, base: DataType) -> DataType:
+        numbers: dict[str, int] = {}
+        while not numbers or self._take(","):
+            each = self._name()
+            self._expect("=")
+            if each in numbers:
+                raise ValueError(f"{name} has two values {each}")
+            numbers[each] = self._number()
+        return make_enumeration(name, base, numbers)
+
+    @property
+    def _shown(self) -> str:
+        return repr(self._text if len(self._text) <= 60 else f"{self._text[:60]}…")
+
+    @property
+    def _is_word(self) -> bool:
+        """True if nothing but a type's name and its length can have been meant."""
+        return self._text[self._at :].strip()[:1] in {"", "(", "[", ",", ">"}
+
+    def _name(self) -> str:
+        return self._match(_NAME)
+
+    def _number(self) -> int:
+        return int(self._match(_NUMBER))
+
+    def _match(self, pattern: re.Pattern[str]) -> str:
+        self._skip()
+        match = pattern.match(self._text, self._at)
+        if match is None:
+            self._fail()
+        self._at = match.end()
+        return match[0]
+
+    def _take(self, sign: str) -> bool:
+        self._skip()
+        if not self._text.startswith(sign, self._at):
+            return False
+        self._at += len(sign)
+        return True
+
+    def _expect(self, sign: str) -> None:
+        if not self._take(sign):
+            self._fail()
+
+    def _skip(self) -> None:
+        match = _SPACE.match(self._text, self._at)
+        self._at = match.end() if match else self._at
+
+    def _fail(self) -> NoReturn:
+        raise ValueError(f"{self._shown} is not a data type {_SUCH_AS}")
 
 
-def _array(text: str, element: DataType, count: int) -> DataType:
-    if element.is_bits:
-        raise ValueError(f"{text!r}: arrays of bits are not supported, use variables or BYTE")
-    if element.scalar_range is None:
-        raise ValueError(f"{text!r}: only numbers form arrays, use one variable for each")
-    _check_size(text, element.size * count)
-    return Array(
-        f"{element.text}[{count}]",
-        element.code,
-        element.bit_length * count,
-        element.size * count,
-        count=count,
-        element=element,
-    )
-
-
-def _check_size(text: str, size: int) -> None:
-    if not 0 < size <= MAX_SIZE:
-        raise ValueError(f"{text!r} has {size} bytes, expected 1 to {MAX_SIZE}")
+def _within(kind: DataType) -> DataType:
+    """Return *kind* as it is within an array, a struct or a definition: a BOOL has a byte there."""
+    return _BYTE_BOOL if isinstance(kind, Boolean) and kind.is_bits else kind
 
 
 class PdoLayout(NamedTuple):

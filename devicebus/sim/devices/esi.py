@@ -183,7 +183,7 @@ def _value(info: Element | None, kind_name: str) -> Value | None:
         kind.encode(plain)
     except ValueError:
         return None
-    return None if isinstance(plain, list) else plain
+    return None if isinstance(plain, list | dict) else plain
 
 
 _MAX_ENTRY_BITS = 255

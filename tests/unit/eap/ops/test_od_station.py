@@ -87,7 +87,7 @@ def test_refusal_of_another_kind(station, answers):
 
 def test_type_of_a_later_release(station, answers):
     row = {"index": 1, "name": "", "label": "", "code": "VAR", "max_subindex": 0}
-    entry = {"subindex": 0, "name": "New", "type": "DATE", "access": "r", "unit": "", "bits": 16,
+    entry = {"subindex": 0, "name": "New", "type": "FUTURE", "access": "r", "unit": "", "bits": 16,
              "rights": 7, "default": "", "minimum": None, "maximum": None}  # fmt: skip
     answers["od_describe"] = lambda _: row | {"entries": [entry]}
     assert station.entry(1, 0).kind is None
