@@ -95,8 +95,8 @@ class ControlClient(Closeable):
             BusError: a bus or a slave refused or failed.
         """
         self.send(within_s, method, **params)
-        if _PING_S < within_s < _PINGED_S and not self.has_data(_PING_S) and self._is_hung():
-            raise self._gone(TimeoutError("timed out"))
+        if _PING_S < within_s < _PINGED_S and not self.has_data(_PING_S) and self.is_hung():
+            raise self.hung()
         return self.receive()
 
     def send(self, within_s: float, method: str, /, **params: Any) -> None:
@@ -125,9 +125,30 @@ class ControlClient(Closeable):
         """Wait for *timeout_s* at most; return whether an answer or its begin has come."""
         return bool(select.select([self._socket], [], [], timeout_s)[0])
 
+    def fileno(self) -> int:
+        """Return the descriptor of the connection, for select."""
+        return self._socket.fileno()
+
     def gone(self, why: str) -> ControlError:
         """Return the error that the appliance does not answer for the reason *why*."""
         return self._gone(TimeoutError(why))
+
+    def hung(self) -> ControlError:
+        """Return the error that services accept connections and answer none."""
+        pid = self.info.services.pid
+        return self.gone(f"services hangs; look at process {pid}, or restart the appliance")
+
+    def is_hung(self) -> bool:
+        """Return whether services accept connections, but answer no request on another one."""
+        folder = self._folder
+        if folder is None or any(_starting(folder)):
+            return False
+        try:
+            with _connect_one(folder, self.info) as other:
+                other.request_within(_PING_S, "hello")
+        except ControlError as exc:
+            return exc.code == ErrorCode.UNAVAILABLE and not any(_starting(folder))
+        return False
 
     def events(self, **params: Any) -> Iterator[ValuesEvent]:
         """Subscribe with *params* and yield each event until the appliance ends.
@@ -164,18 +185,6 @@ class ControlClient(Closeable):
         if not line:
             raise self._gone(None)
         return decode_reply(line)
-
-    def _is_hung(self) -> bool:
-        """Return whether services accept connections, but answer no request on another one."""
-        folder = self._folder
-        if folder is None or any(_starting(folder)):
-            return False
-        try:
-            with _connect_one(folder, self.info) as other:
-                other.request_within(_PING_S, "hello")
-        except ControlError as exc:
-            return exc.code == ErrorCode.UNAVAILABLE and not any(_starting(folder))
-        return False
 
     def _gone(self, cause: OSError | None) -> ControlError:
         why = str(cause) if cause else "it closed the connection"
@@ -241,29 +250,69 @@ def request_each(
     Raises:
         ControlError: none answers, or one refuses.
     """
-    silent: dict[ControlClient, ControlError] = {}
-    results: dict[ControlClient, Any] = {}
-    for client in clients:
-        try:
-            client.send(TIMEOUT_S, method, **params)
-        except ControlError as exc:
-            silent[client] = exc
     start_s = monotonic()
-    for limit_s in (STATUS_S, TIMEOUT_S):
+    answers = _Answers(clients, method, params)
+    answers.wait(start_s + _PING_S, start_s + _PING_S)
+    if not answers.results and (hung := answers.find_hung()) is not None:
+        raise hung
+    answers.wait(start_s + STATUS_S, start_s + TIMEOUT_S)
+    if not answers.results:
+        raise next(iter(answers.errors), clients[0].gone("timed out"))
+    ordered = [answers.results[client] for client in clients if client in answers.results]
+    return ordered, [client.info for client in clients if client not in answers.results]
+
+
+class _Answers:
+    """Answers of several appliances to one request, which is sent at once.
+
+    Attributes:
+        results: Of those that have answered.
+        errors: Of those that cannot answer.
+    """
+
+    def __init__(
+        self, clients: Sequence[ControlClient], method: str, params: dict[str, Any]
+    ) -> None:
+        self.results: dict[ControlClient, Any] = {}
+        self.errors: list[ControlError] = []
+        self._waiting: list[ControlClient] = []
         for client in clients:
-            if client in silent or client in results or (results and limit_s == TIMEOUT_S):
-                continue
-            if client.has_data(max(0.0, start_s + limit_s - monotonic())):
-                try:
-                    results[client] = client.receive()
-                except ControlError as exc:
-                    if exc.code != ErrorCode.UNAVAILABLE:
-                        raise
-                    silent[client] = exc
-    if not results:
-        raise next(iter(silent.values()), clients[0].gone("timed out"))
-    answered = [results[client] for client in clients if client in results]
-    return answered, [client.info for client in clients if client not in results]
+            try:
+                client.send(TIMEOUT_S, method, **params)
+            except ControlError as exc:
+                self.errors.append(exc)
+            else:
+                self._waiting.append(client)
+
+    def wait(self, until_s: float, first_until_s: float) -> None:
+        """Wait for the missing answers until *until_s*, for the first until *first_until_s*.
+
+        Raises:
+            ControlError: an appliance refuses.
+        """
+        while self._waiting:
+            end_s = until_s if self.results else first_until_s
+            left_s = max(0.0, end_s - monotonic())
+            ready, _, _ = select.select(self._waiting, [], [], left_s)
+            if not ready:
+                return
+            for client in ready:
+                self._waiting.remove(client)
+                self._receive(client)
+
+    def find_hung(self) -> ControlError | None:
+        """Return the error of the first of the missing appliances if all of them hang."""
+        if self._waiting and all(client.is_hung() for client in self._waiting):
+            return self._waiting[0].hung()
+        return None
+
+    def _receive(self, client: ControlClient) -> None:
+        try:
+            self.results[client] = client.receive()
+        except ControlError as exc:
+            if exc.code != ErrorCode.UNAVAILABLE:
+                raise
+            self.errors.append(exc)
 
 
 def call_each(

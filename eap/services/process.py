@@ -60,7 +60,11 @@ from eap.services.device.station_device import StationDevice
 from eap.services.device.station_keeper import EngineClient, StationEngine, StationKeeper
 from eap.services.engine_link import EngineLink
 from eap.services.rate_limits import LimitedLogHandler, caused_by
-from eap.services.routing.route_rows import RouterView, interruption_findings
+from eap.services.routing.route_rows import (
+    RouterView,
+    interruption_findings,
+    route_findings,
+)
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes, access_of, make_router
 from eap.services.routing.station_routing import StationRouting
@@ -347,6 +351,7 @@ class Services:
             ) | {
                 "audit": audit.report(),
                 "findings": [
+                    *route_findings(devices.routers.values()),
                     *interruption_findings(devices.routers.values(), time()),
                     *(row for each in devices.by_station.values() for row in each.findings()),
                 ],

@@ -5,12 +5,13 @@ Only figures that routers keep anyway are read here; 10,000 routes are sent in p
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 from time import monotonic_ns, time
 from typing import Any
 
 from eap.ams.record import Outcome, Trace, reason_of
-from eap.ams.report import ConnectionReport, RouteReport
+from eap.ams.report import ConnectionReport, RouteReport, RouteState
 from eap.ams.routes import Origin, Route
 from eap.ams.subscription_restorer import Interruption
 from eap.codec.ams import ADDRESSES, AmsCommand
@@ -31,6 +32,8 @@ from eap.services.routing.station_routes import StationRoutes
 MAX_LOOPS = 5
 """Limit of the reported loops; each is shown with its latest packet."""
 MAX_WARNINGS = 100
+MAX_NAMED = 3
+"""Stations that a finding names."""
 _S = 1_000_000_000
 _ORIGINS: dict[Origin, OriginName] = {
     Origin.STATIC: "static",
@@ -118,6 +121,46 @@ def interruption_findings(routers: Iterable[StationRouter], now_s: float) -> lis
                 }
             )
     return found
+
+
+def route_findings(routers: Iterable[StationRouter]) -> list[dict[str, Any]]:
+    """Return the configured next hops that are down as findings of ``status``.
+
+    A hop that several stations cannot reach for the same reason is one finding.
+    """
+    by_cause: dict[tuple[str, str], list[tuple[str, Route]]] = {}
+    for router in routers:
+        # One report for each hop: there may be 10,000 routes by one.
+        hops = {
+            each.hop: each
+            for each in router.table
+            if each.origin is not Origin.LEARNED and not each.is_client
+        }
+        for route in hops.values():
+            report = router.report(route)
+            if report.state is RouteState.DOWN:
+                where = f"{report.next_name} ({route.hop.connection})"
+                by_cause.setdefault((where, report.why), []).append((router.name, route))
+    return [
+        {
+            "severity": "warning",
+            "where": _listed([name for name, _ in found]),
+            "what": f"route to {hop} is down: {why}",
+            "advice": f"'eapctl routes test {_words(*found[0])}' tests it",
+            "since": None,
+        }
+        for (hop, why), found in by_cause.items()
+    ]
+
+
+def _words(station: str, route: Route) -> str:
+    """Return the arguments of a test of *route*; a default route has no target of its own."""
+    return shlex.join([station, route.name] if route.octets else [station])
+
+
+def _listed(names: list[str]) -> str:
+    rest = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow:

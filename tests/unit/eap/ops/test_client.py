@@ -207,6 +207,7 @@ def two_appliances(root: None) -> Iterator[tuple[socket.socket, socket.socket]]:
 def test_request_each_returns_the_answers_and_names_the_silent_appliances(
     two_appliances: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("eap.ops.client._PING_S", 0.1)
     monkeypatch.setattr("eap.ops.client.STATUS_S", 0.3)
     for answering, silent in (0, ["b", "c"]), (1, ["a"]):
         thread = threading.Thread(target=answer_one, args=(two_appliances[answering], 7))
@@ -219,10 +220,24 @@ def test_request_each_returns_the_answers_and_names_the_silent_appliances(
         two_appliances[1 - answering].accept()[0].close()
 
 
+@pytest.mark.usefixtures("root")
+def test_request_each_to_the_only_appliance_names_its_hung_services(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("eap.ops.client._PING_S", 0.05)
+    with ApplianceFolder.claim("demo") as demo, listen(demo):
+        running = info()
+        running.engine, running.services = ProcessInfo(6), ProcessInfo(7)
+        demo.write_info(running)
+        (client,) = connect()
+        with client, pytest.raises(ControlError, match="services hangs; look at process 7, or"):
+            request_each([client], "status")
+
+
 def test_request_each_waits_longer_while_no_appliance_answers(
     two_appliances: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("eap.ops.client.STATUS_S", 0.01)
+    monkeypatch.setattr("eap.ops.client._PING_S", 0.01)
     monkeypatch.setattr("eap.ops.client.TIMEOUT_S", 0.05)
     with ExitStack() as stack:
         clients = [stack.enter_context(each) for each in connect()]
@@ -243,7 +258,8 @@ def test_request_to_hung_services_ends_after_a_ping(monkeypatch: pytest.MonkeyPa
         with (
             client,
             pytest.raises(
-                ControlError, match=r"demo \(a, b; process \d+\) does not answer: timed out$"
+                ControlError,
+                match=r"demo \(a, b; process \d+\) does not answer: services hangs; look .* 7, or",
             ),
         ):
             client.request("status")  # no accept: the connections wait at the listener

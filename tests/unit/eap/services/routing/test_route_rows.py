@@ -16,6 +16,7 @@ from eap.services.routing.route_rows import (
     MAX_LOOPS,
     connection_row,
     request_row,
+    route_findings,
     route_row,
 )
 from tests.support.ams import Ams
@@ -65,6 +66,20 @@ def test_routes_filter_matches_all_shown_texts(match: str, names: list[str]) -> 
     assert [each.name for each in found.routes] == names
     assert found.total == len(names)
     assert [each.name for each in row(left, match=match, first=1, count=1).routes] == names[1:]
+
+
+def test_route_findings_name_each_configured_hop_that_is_down() -> None:
+    left, other = Left(), Left()
+    assert route_findings([left.router, other.router]) == []
+    for each in (left, other):
+        each.router.hop_down("udp:eap0", "127.0.9.2:34980", "it does not answer")
+        gone = Endpoint("ams-tcp:10.0.0.9", "10.0.0.9")
+        each.router.add_route(Route(NetId.parse("9.9.9.9.1.1"), "met", gone, Origin.LEARNED))
+    (found,) = route_findings([left.router, other.router])
+    assert found["severity"] == "warning"
+    assert found["where"] == "left, left"
+    assert found["what"] == "route to right (127.0.9.2:34980) is down: it does not answer"
+    assert found["advice"] == "'eapctl routes test left right' tests it"
 
 
 def test_warnings_and_loops_are_listed() -> None:
