@@ -44,13 +44,13 @@ class ErrorReplier:
         hop = None
         if why.route is not None:
             hop = why.route.hop
-            self._record.routes.of(why.route.key, at_ns).add_error(why.text)
+            self._record.routes.of(why.route.key, at_ns).add_error(why.text, at_ns)
         self._record.add(Trace(at_ns, why.outcome, endpoint, hop, header, why.error, took_ns, text))
         if endpoint is None or not header.wants_answer:
             return []
         packet = response_to(header, AmsAnswer(why.body, 0 if why.body else why.error))
         traffic = self._record.connections.of(endpoint, at_ns)
-        traffic.add_error(why.text)
+        traffic.add_error(why.text, at_ns)
         traffic.add_answer(len(packet), took_ns)
         return [self._transports.reply(endpoint, packet)]
 

@@ -458,11 +458,11 @@ class Forwarder:
                 error = AdsError.words_of(error_code)
                 why = f"{error} from {self._table.describe_hop(route)} or from behind it"
                 text = f"{describe(pending.header, endpoint)}: {why}"
-                traffic.add_error(why)
+                traffic.add_error(why, now_ns)
             traffic.add_answer(len(packet), took_ns)
         connection = self._record.connections.of(endpoint, now_ns)
         if error_code:
-            connection.add_error(text)
+            connection.add_error(text, now_ns)
         connection.add_answer(len(packet), took_ns)
         self._record.add(
             Trace(now_ns, _ANSWERED, endpoint, hop, pending.header, error_code, took_ns, text)

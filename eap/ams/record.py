@@ -72,6 +72,7 @@ class Traffic(msgspec.Struct):
         answer_bytes: Bytes of the answers.
         round_trip_ns: Of the latest answer.
         last_error: In words.
+        last_error_ns: When it was.
         sources: First NetIDs that sent requests.
         is_answered: Whether the latest of the requests that are over was answered.
     """
@@ -86,6 +87,7 @@ class Traffic(msgspec.Struct):
     last_error: str = ""
     sources: tuple[NetId, ...] = ()
     is_answered: bool = False
+    last_error_ns: int | None = None
 
     def add_request(self, octets: int, source: NetId | None = None) -> None:
         """Count a request."""
@@ -101,10 +103,10 @@ class Traffic(msgspec.Struct):
         self.round_trip_ns = took_ns
         self.is_answered = True
 
-    def add_error(self, text: str) -> None:
+    def add_error(self, text: str, now_ns: int) -> None:
         """Count a request that did not get to its target."""
         self.errors += 1
-        self.last_error = text
+        self.last_error, self.last_error_ns = text, now_ns
         self.is_answered = False
 
 

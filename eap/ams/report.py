@@ -197,12 +197,16 @@ MAX_REPORT = 4096
 
 
 class HopQuestion(WireStruct, frozen=True):
-    """Query for the route to an address, at the router that is *further* hops away."""
+    """Query for the route to an address, at the router that is *further* hops away.
+
+    *wants_faults* is 1 for the faults of a slave, too, which take longer: the time of the answer is
+    not that of the path then.
+    """
 
     target: net_id
     port: u16
     further: u8 = 0
-    reserved: u8 = 0
+    wants_faults: u8 = 0
 
 
 class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -226,6 +230,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         interrupted_s: For how many seconds; None for none.
         last_failure: Reason of the latest failed request of the sender to the target, if that is
             here.
+        faults: Present faults of the target, if it is a slave here, and of its bus; on request.
         error: Of ADS, why the next router did not answer; 0 for none.
     """
 
@@ -245,6 +250,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     interrupted: int = 0
     interrupted_s: int | None = None
     last_failure: str = ""
+    faults: tuple[str, ...] = ()
 
 
 def report_of(
@@ -295,6 +301,6 @@ def decode_report(data: bytes) -> HopReport:
 def _require_printable(report: HopReport) -> None:
     """Raise ValueError for a text that would do something to a terminal."""
     texts = (report.station, report.route, report.next_name, report.transport, report.address)
-    for text in (*texts, report.why, report.last_failure):
+    for text in (*texts, report.why, report.last_failure, *report.faults):
         if not text.isprintable():
             raise ValueError(f"{text!r} cannot be printed")

@@ -167,6 +167,13 @@ def trace_view(found: TracedPath) -> Iterator[TextTable | Styled | str]:
         answer = found.answer
         table.add_row("", "target", "", duration(answer.took_us), "", _answer_text(answer))
     yield table
+    yield from _remarks(found)
+    if found.why:
+        yield Styled(f"not reached: {found.why}", style="bold red")
+
+
+def _remarks(found: TracedPath) -> Iterator[Styled | str]:
+    """Yield what limits requests on the path, and the faults behind it that *why* lacks."""
     for hop in found.hops:
         refused = [service for service, allowed in hop.may.items() if allowed is False]
         if refused:
@@ -176,8 +183,9 @@ def trace_view(found: TracedPath) -> Iterator[TextTable | Styled | str]:
             many = count(hop.interrupted, "subscription")
             text = f"{hop.station}: {many} interrupted for {hop.interrupted_s} s"
             yield Styled(text, style="bold red")
-    if found.why:
-        yield Styled(f"not reached: {found.why}", style="bold red")
+    faults = (fault for hop in found.hops for fault in hop.faults if fault not in found.why)
+    for fault in faults:
+        yield Styled(fault, style="yellow")
 
 
 def _next_hop(hop: HopRow) -> str:

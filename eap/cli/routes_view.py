@@ -137,10 +137,10 @@ def _remarks(station: RouterRow) -> Iterator[str]:
     yield from _dead_hops(station.routes)
     for row in station.routes:
         if row.last_error:
-            yield f"{row.name}, last error: {row.last_error}"
+            yield f"{row.name}, {last_error(row)}"
     for connection in station.connections:
         if connection.last_error:
-            yield f"{path_of(connection)}, last error: {connection.last_error}"
+            yield f"{path_of(connection)}, {last_error(connection)}"
 
 
 def _dead_hops(routes: Sequence[RouteRow]) -> Iterator[str]:
@@ -182,6 +182,12 @@ def transport_of(row: EndpointRow) -> str:
 def path_of(row: EndpointRow) -> str:
     """Return address and transport."""
     return str(Endpoint(row.transport, row.address))
+
+
+def last_error(row: EndpointRow) -> str:
+    """Return the latest error with its age."""
+    ago = "" if row.last_error_s is None else f", {age(row.last_error_s)} ago"
+    return f"last error{ago}: {row.last_error}"
 
 
 def round_trip(us: int | None) -> str:

@@ -140,6 +140,7 @@ class EndpointRow(Document, frozen=True, kw_only=True):
         octets_out: Bytes sent.
         octets_in: Bytes received.
         last_error: Latest error in words, empty without one.
+        last_error_s: Its age; None without one.
     """
 
     transport: str
@@ -150,6 +151,7 @@ class EndpointRow(Document, frozen=True, kw_only=True):
     octets_out: int = 0
     octets_in: int = 0
     last_error: str = ""
+    last_error_s: int | None = None
 
 
 class RouteRow(EndpointRow, frozen=True, kw_only=True):
@@ -441,7 +443,8 @@ class HopRow(Document, frozen=True, kw_only=True):
     """One router on the path to a target.
 
     *spent_us* is the part of *took_us* behind the previous router.  *interrupted* is None if an
-    older router does not report it.
+    older router does not report it.  *faults* are those of a slave behind the last router, and of
+    its bus.
     """
 
     station: str
@@ -457,6 +460,7 @@ class HopRow(Document, frozen=True, kw_only=True):
     may: dict[str, bool | None]
     took_us: int
     spent_us: int
+    faults: list[str] = field(default_factory=list)
 
 
 class TargetAnswer(Document, frozen=True):
@@ -517,6 +521,7 @@ def hop_row(report: HopReport, took_us: int, spent_us: int, *, is_opaque: bool) 
         may={str(service): allowed for service, allowed in report.may.items()},
         took_us=took_us,
         spent_us=spent_us,
+        faults=list(report.faults),
     )
 
 

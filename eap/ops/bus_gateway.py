@@ -186,20 +186,23 @@ class GatewayBus:
         self._reached.add(slave.station)  # once is enough
         if _may_mean(error, *_NO_ANSWER):
             return _NO_ANSWER_HINT
-        is_missing = _may_mean(error, Cause.NO_SLAVE)
-        if self._slaves is None and (is_missing or _may_mean(error, Cause.NO_MAILBOX)):
+        # Other gateways have no mailbox for a slave that is not there.
+        if not _may_mean(error, Cause.NO_SLAVE, Cause.NO_MAILBOX):
+            return ""
+        if self._slaves is None:
             with suppress(BusError), self._client.waiting_once(_HINT_S):
                 self.scan()
+        if self._slaves is None:
+            return ""
         described = self._description_of(slave)
-        if described is not None and not described.to_slave:
-            return str(no_mailbox(_slave(described), state_name(_slave(described).status.state)))
-        if described is None and self._slaves is not None and is_missing:
-            # The master's dictionary has no virtual addresses: the slave may be there all the same.
+        if described is None:
             known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves) or "none"
-            return (
-                f"address {address_text(slave.station)} is not a slave of this bus ({known});"
-                " it may be a virtual address of the plant file"
-            )
+            hint = f"address {address_text(slave.station)} is not a slave of this bus ({known})"
+            # The master's dictionary has no virtual addresses: the slave may be there all the same.
+            is_missing = _may_mean(error, Cause.NO_SLAVE)
+            return hint + ("; it may be a virtual address of the plant file" if is_missing else "")
+        if not described.to_slave:
+            return str(no_mailbox(_slave(described), state_name(_slave(described).status.state)))
         return ""
 
     def _description_of(self, slave: Slave) -> MasterSlave | None:

@@ -434,6 +434,7 @@ class Services:
                 budget,
             )
             router.add_service(net_id, service)
+            router.add_fault_finder(net_id, clients[bus.owner].find_faults)
         return Buses(handover.stations, clients, segments)
 
 

@@ -44,6 +44,7 @@ class Station:
         self.line = line
         self.serve = serve
         self.is_ours = True
+        self.faults: dict[tuple[NetId, int], tuple[str, ...]] = {}
         self.router = Router(
             self.net_id,
             RouteTable([*routes]),
@@ -53,6 +54,9 @@ class Station:
         )
         self.router.add_device(self.net_id, {300, SYSTEM_PORT})
         self.router.add_device(NetId.parse(f"5.1.1.{number}.3.1"), {0xFFFF, 1001})
+
+    async def find_faults(self, net_id: NetId, port: int) -> tuple[str, ...]:
+        return self.faults.get((net_id, port), ())
 
     @property
     def record(self) -> Record:

@@ -272,7 +272,7 @@ def detail(line: Line | None) -> list[tuple[str, str]]:
         texts = [(routes_view.path_of(row), "bold"), (clients, "")]
     texts.append((routes_view.figures(row), ""))
     if row.last_error:
-        texts.append((f"last error: {row.last_error}", "down"))
+        texts.append((routes_view.last_error(row), "down"))
     own = row.net_id if isinstance(row, RouteRow) else row.address
     texts += [(text, "down") for text in line.router.routes.warnings if own in text]
     requests = [each for each in line.router.routes.requests if routes_view.belongs(each, row)]

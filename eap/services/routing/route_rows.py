@@ -189,6 +189,7 @@ def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow
         octets_out=traffic.request_bytes,
         octets_in=traffic.answer_bytes,
         last_error=traffic.last_error,
+        last_error_s=_age_s(traffic.last_error_ns, now_ns),
     )
 
 
@@ -207,7 +208,12 @@ def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
         octets_out=traffic.answer_bytes,
         octets_in=traffic.request_bytes,
         last_error=traffic.last_error,
+        last_error_s=_age_s(traffic.last_error_ns, now_ns),
     )
+
+
+def _age_s(at_ns: int | None, now_ns: int) -> int | None:
+    return None if at_ns is None else (now_ns - at_ns) // _S
 
 
 def request_row(trace: Trace, now_ns: int) -> RequestRow:

@@ -17,8 +17,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import Callable, Collection, Hashable
+from collections.abc import Awaitable, Callable, Collection, Hashable, Sequence
 from time import monotonic_ns
+from typing import TypeAlias
 
 from eap.ams.access import AccessList, AuditEntry, host_of
 from eap.ams.hop_prober import HopProber
@@ -152,6 +153,12 @@ def _cause(trace: Trace, host: str) -> tuple[Hashable, ...]:
     return trace.outcome, what, host, trace.error_code, reason
 
 
+FaultFinder: TypeAlias = Callable[[int], Awaitable[Sequence[str]]]
+MAX_FAULTS = 4
+MAX_FAULT = 300
+"""Characters of each in the report of a trace, which is bounded."""
+
+
 class StationRouter:
     """Router of the AMS packets of one station.
 
@@ -200,6 +207,7 @@ class StationRouter:
         )
         self._senders: dict[str, TransportSender] = {}
         self._services = ServiceTable((net_id, *net_ids))
+        self._fault_finders: dict[NetId, FaultFinder] = {}
         for each in self._services.net_ids:
             self._router.add_device(each, self._services.ports(each))
         self._queues = SerialQueues(self._finish)
@@ -279,6 +287,16 @@ class StationRouter:
             KeyError: the station has no such NetID.
         """
         self._services.add(net_id, service)
+
+    def add_fault_finder(self, net_id: NetId, find: FaultFinder) -> None:
+        """Have *find* return the faults of the device at each AMS port of *net_id*, for traces."""
+        self._fault_finders[net_id] = find
+
+    async def find_faults(self, net_id: NetId, port: int) -> tuple[str, ...]:
+        """Return the present faults of an own device in words."""
+        find = self._fault_finders.get(net_id)
+        found = () if find is None else await find(port)
+        return tuple(each[:MAX_FAULT] for each in found[:MAX_FAULTS])
 
     def add_route(self, route: Route) -> bool:
         """Add *route* to the table; return whether it was accepted."""

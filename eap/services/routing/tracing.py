@@ -145,11 +145,14 @@ async def answer_hop_query(
     report = report_of(station.name, station.net_id, query.target, location, monotonic_ns())
     if report.is_here:
         report = replace(report, last_failure=_last_failure(station, header))
+        if query.wants_faults:
+            faults = await station.find_faults(query.target, query.port)
+            report = replace(report, faults=faults)
     if not query.further or report.is_here or report.why or not report.next_net_id:
         return report
     # Bounded, because each router on a loop would forward the query once more.
     further = min(query.further, MAX_FURTHER) - 1
-    onward = HopQuestion(NetId.parse(report.target), query.port, further)
+    onward = HopQuestion(NetId.parse(report.target), query.port, further, query.wants_faults)
     operation = ReadWrite(IndexGroup.ROUTE_QUERY, 0, MAX_REPORT, onward.encode())
     next_router = NetId.parse(report.next_net_id)
     timeout_s = _HOP_TIMEOUT_S + _TIMEOUT_PER_HOP_S * further
@@ -193,22 +196,27 @@ async def trace(
     answer = await run_operation(station, target, port, ReadState(), timeout_s)
     took_ns = clock() - began_ns
     where = last.report.station + ("" if last.report.is_here else " or behind it")
+    is_reached = answer.result not in _ON_THE_WAY
     # Every other error comes from the target, so the path to it is complete.
-    if answer.result not in _ON_THE_WAY:
-        found = TraceResult(tuple(hops), answer, took_ns, "")
-        is_missing = is_slave_missing(port, found.states)
-        return found._replace(why=f"{where}: {NO_SLAVE}") if is_missing else found
-    if why:
+    if why and not is_reached:
         return TraceResult(tuple(hops), None, 0, why)
+    found = TraceResult(tuple(hops), answer, took_ns, "")
+    is_slave = port not in {DEVICE_PORT, SYSTEM_PORT}
     reason = ""
-    if last.report.is_here:
-        # Queried again: only the router that answered with the error knows its reason.
-        query = HopQuestion(target, port, len(hops) - 1)
+    faults: tuple[str, ...] = ()
+    if last.report.is_here and (is_slave or not is_reached):
+        # Queried again: only now it knows the reason of an error; its time counts no more.
+        query = HopQuestion(target, port, len(hops) - 1, wants_faults=int(is_slave))
         again = await answer_hop_query(station, query, HERE, station.net_id)
-        reason = again.last_failure
+        reason, faults = again.last_failure, again.faults
+        report = replace(last.report, faults=faults)
+        found = found._replace(hops=(*hops[:-1], last._replace(report=report)))
+    if is_slave_missing(port, found.states):
+        return found._replace(why="; ".join((f"{where}: {NO_SLAVE}", *faults)))
+    if is_reached:
+        return found
     code = f" (0x{answer.result:x})" if reason and "0x" not in reason else ""
-    why = f"{where}: {reason or AdsError.words_of(answer.result)}{code}"
-    return TraceResult(tuple(hops), answer, took_ns, why)
+    return found._replace(why=f"{where}: {reason or AdsError.words_of(answer.result)}{code}")
 
 
 def is_slave_missing(port: int, states: AdsStates | None) -> bool:

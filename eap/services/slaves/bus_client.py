@@ -35,6 +35,7 @@ from devicebus.wire.datagram import DatagramReply, DatagramRequest
 from eap.codec.mailbox import MailboxType
 from eap.control.bus import BRING_S, BUS_WAIT_UP_S, ENGINE_MARGIN_S, TRANSFER_S
 from eap.errors import EapError, EngineGoneError
+from eap.runtime.bus_status import report_findings
 from eap.runtime.engine_messages import (
     BringSlaves,
     BusChange,
@@ -243,6 +244,8 @@ class MailboxLock:
 T = TypeVar("T")
 
 DESCRIBE_S = 1.0
+FAULTS_S = 0.5
+"""Less than a router waits for the report of another one."""
 _POLL_S = 0.05
 _NS_PER_S = 1_000_000_000
 
@@ -286,6 +289,20 @@ class BusClient:
         if reply.report is None:
             raise BusError(f"{self.name}: no report from the engine")
         return reply.report
+
+    async def find_faults(self, station: int) -> list[str]:
+        """Return the present faults of a slave and of its bus, as ``eapctl bus diag`` says them."""
+        try:
+            report = await self.describe(FAULTS_S)
+        except EapError as exc:
+            return [f"{self.name}: {exc}"]
+        if not report.is_up:
+            return [self.view.latest.describe_obstacle(self.name)]
+        return [
+            f"{self.name}: {'; '.join(filter(None, (each.what, each.advice)))}"
+            for each in report_findings(report)
+            if station in each.slaves and not each.is_over
+        ]
 
     async def wait_up(self) -> BusReport:
         """Return the report of the bus once it is up.

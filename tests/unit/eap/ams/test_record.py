@@ -23,8 +23,10 @@ def test_traffic_is_counted_by_endpoint() -> None:
     endpoint = Endpoint("tcp", "1")
     table.of(endpoint, 7).add_request(44)
     table.of(endpoint, 8).add_answer(40, 1500)
-    table.of(endpoint, 8).add_error("gone")
-    assert table.snapshot() == {endpoint: Traffic(7, 1, 1, 1, 44, 40, 1500, "gone")}
+    table.of(endpoint, 8).add_error("gone", 8)
+    assert table.snapshot() == {
+        endpoint: Traffic(7, 1, 1, 1, 44, 40, 1500, "gone", last_error_ns=8)
+    }
     table.of(endpoint, 9).add_request(1)
     table.forget(endpoint)
     assert table.snapshot() == {}
@@ -58,7 +60,7 @@ def test_traffic_of_one_endpoint() -> None:
     after = table.get(endpoint)
     assert after is not None
     assert after.is_answered
-    table.of(endpoint, 9).add_error("gone")
+    table.of(endpoint, 9).add_error("gone", 8)
     assert not table.of(endpoint, 9).is_answered
 
 

@@ -44,6 +44,15 @@ def test_tables_of_routes_and_connections() -> None:
     ]  # fmt: skip
 
 
+def test_routes_list_names_the_age_of_the_last_error() -> None:
+    (press,) = (each for each in FakeRoutes().stations["island-01"].routes if each.name == "press")
+    station = msgspec.structs.replace(
+        FakeRoutes().stations["island-02"],
+        routes=[msgspec.structs.replace(press, last_error="refused", last_error_s=300)],
+    )
+    assert "press, last error, 5 min ago: refused" in shown(*view_of(RouterList([station])))
+
+
 def test_stations_that_are_well_have_no_remarks() -> None:
     quiet = FakeRoutes().stations["island-02"]
     assert "Warnings" not in shown(*view_of(RouterList([quiet])))

@@ -60,6 +60,14 @@ def test_trace_prints_a_complete_path() -> None:
     assert " ".join(rules) == "island-03: its access rules refuse write, raw"
 
 
+def test_trace_prints_faults_of_a_slave_once() -> None:
+    fault = "island-03/bus0: drive (1001): 2 mailbox requests without reply in time"
+    found = FOUND | {"hops": [FIRST, LAST | {"faults": [fault]}]}
+    assert " ".join(lines(found)[-1]) == fault
+    failed = lines(found | {"why": f"island-03: the slave does not answer; {fault}"})
+    assert sum("mailbox" in line for line in failed) == 1
+
+
 def test_trace_of_a_path_that_ends_before_its_target_fails() -> None:
     hops = [FIRST | {"route": "", "why": "no route"}]
     found = FOUND | {"hops": hops, "answer": None, "why": "island-01: no route", "name": ""}

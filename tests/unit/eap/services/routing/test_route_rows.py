@@ -24,7 +24,7 @@ from tests.support.routeviews import Left
 
 FAR = NetId.parse("127.0.9.2.1.1")
 HOP = Endpoint("udp:eap0", "127.0.9.2:34980")
-TRAFFIC = Traffic(5 * 10**9, 3, 2, 1, 90, 80, 1_500_000, "lost", (FAR,))
+TRAFFIC = Traffic(5 * 10**9, 3, 2, 1, 90, 80, 1_500_000, "lost", (FAR,), last_error_ns=6 * 10**9)
 HEADER = AmsHeader(FAR, 851, NetId.parse("5.1.1.1.1.1"), 30000, 2)
 
 
@@ -127,6 +127,7 @@ def test_route_row_has_all_fields() -> None:
     assert (found.unidirectional, found.probed) == (True, False)
     assert (found.requests, found.answers, found.errors) == (3, 2, 1)
     assert (found.octets_out, found.octets_in, found.last_error) == (90, 80, "lost")
+    assert route_row(report, 9 * 10**9, is_derived=False).last_error_s == 3
     late = route_row(report._replace(round_trip_ns=1_999), 99 * 10**9, is_derived=True)
     assert (late.rtt_us, late.expires_s, late.origin) == (1, 0, "derived")
 
@@ -135,7 +136,9 @@ def test_connection_row_has_all_fields() -> None:
     found = connection_row(ConnectionReport(HOP, TRAFFIC), 8 * 10**9)
     assert (found.transport, found.address, found.since_s, found.net_ids) == (*HOP, 3, [str(FAR)])
     assert (found.octets_in, found.octets_out, found.took_us) == (90, 80, 1500)
-    new = replace(TRAFFIC, answers=0)
+    assert found.last_error_s == 2
+    new = replace(TRAFFIC, answers=0, last_error="", last_error_ns=None)
+    assert connection_row(ConnectionReport(HOP, new), 8 * 10**9).last_error_s is None
     assert connection_row(ConnectionReport(HOP, new), 8 * 10**9).took_us is None
 
 

@@ -96,6 +96,24 @@ def test_trace_of_a_missing_slave_fails_although_its_master_answers() -> None:
     assert not follow(first, NetId.parse("5.1.1.2.3.1"), 0xFFFF).why  # the master itself
 
 
+def test_trace_reports_the_faults_of_the_slave_and_of_its_bus() -> None:
+    line = Line()
+    first = line.add(1, to(2))
+    last = line.add(2, to(1), serve=lambda *_: AmsAnswer(bytes(8)))
+    target = NetId.parse("5.1.1.2.3.1")
+    last.faults[target, 1001] = ("bus0: no frame comes back; check the cable",)
+    dead = follow(first, target)
+    assert dead.why == (
+        "island-02: its master answers: the slave does not answer;"
+        " bus0: no frame comes back; check the cable"
+    )
+    last.serve = run_state
+    alive = follow(first, target)
+    assert not alive.why
+    assert [each.report.faults for each in alive.hops] == [(), last.faults[target, 1001]]
+    assert [each.report.faults for each in follow(first, target, 0xFFFF).hops] == [(), ()]
+
+
 def test_trace_carries_the_reason_that_the_last_router_logged() -> None:
     line = Line()
     first = line.add(1, to(2))

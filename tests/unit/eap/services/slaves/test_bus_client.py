@@ -234,6 +234,21 @@ def test_bus_that_is_not_up_is_waited_for(monkeypatch):
     play(scene)
 
 
+def test_faults_of_a_slave_and_of_its_bus():
+    async def scene(client, engine):
+        assert await client.find_faults(SENSOR) == []
+        engine.buses[0].is_up = False
+        engine.say_hello()
+        await settle()
+        (fault,) = await client.find_faults(SENSOR)
+        assert fault.startswith("left/bus0 is not up: no frame comes back")
+        engine.holds = True
+        (fault,) = await client.find_faults(SENSOR)
+        assert fault.startswith("left/bus0: ")
+
+    play(scene)
+
+
 def test_engine_that_is_gone(monkeypatch):
     async def scene(client, engine):
         await client.wait_up()
