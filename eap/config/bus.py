@@ -11,6 +11,7 @@ from eap.codec.ethercat import EAP_PORT
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import ExpectedBus, Index
 from eap.config.routes import SectionError
+from eap.config.slaves import check_cycles, override
 from eap.config.structs import Plain, PlantFile, PortSection, StationSection
 from eap.ids import InterfaceUri, is_host
 from eap.pd.spec import GatewayAddress, GatewaySpec, PortKind
@@ -64,9 +65,25 @@ def describe_buses(
             description = known[file]
         if description is not None and not _has_names(path, port, description, report):
             description = None
+        if description is not None:
+            description = _configure(plant, station, port, description, report)
         # The first of two ports of one name counts, as everywhere in the index.
         found.setdefault((station.name, port.name), description)
     return found
+
+
+def _configure(
+    plant: PlantFile,
+    station: StationSection,
+    port: PortSection,
+    description: ExpectedBus,
+    report: FindingReport,
+) -> ExpectedBus:
+    """Return the bus with the configuration that the plant file has for its slaves."""
+    slaves = override(description.slaves, port.slaves, report, f"{port.at}.slaves")
+    cycle_us = station.cycle_us or plant.defaults.cycle_us
+    check_cycles({slave.name: slave for slave in slaves}, cycle_us, report, port.at)
+    return ExpectedBus(slaves)
 
 
 def bus_file(port: PortSection, folder: Path) -> tuple[str, Path | None]:

@@ -342,19 +342,30 @@ class _Converter:
             return self.value(node, structs[0] if is_struct else inspect.StrType(), path, key)
         lists = [each for each in kinds if isinstance(each, inspect.VarTupleType)]
         return (
-            self._flag_or_items(node, lists[0], path, key)
+            self._list_or_other(node, lists[0], kinds, path, key)
             if lists
             else self._plain(node, path, key)
         )
 
-    def _flag_or_items(
-        self, node: Node, kind: inspect.VarTupleType, path: str, key: str
-    ) -> bool | tuple[Any, ...]:
-        if isinstance(node.value, bool):
-            return node.value
-        if not isinstance(node.value, list):
-            raise self._unexpected(node, path, key, "true, false or a list")
-        return self._items(node, kind.item_type, path, key)
+    def _list_or_other(
+        self,
+        node: Node,
+        listed: inspect.VarTupleType,
+        kinds: list[inspect.Type],
+        path: str,
+        key: str,
+    ) -> Any:
+        """Read *node* as a list, or as the other one of two *kinds*."""
+        if isinstance(node.value, list):
+            return self._items(node, listed.item_type, path, key)
+        (other,) = (each for each in kinds if each is not listed)
+        match other, node.value:
+            case (inspect.BoolType(), bool()) | (inspect.DictType(), dict()):
+                return self.value(node, other, path, key)
+            case (inspect.StrType(), value) if not isinstance(value, dict | None):
+                return self.value(node, other, path, key)
+        words = {inspect.BoolType: "true, false", inspect.DictType: "a mapping"}
+        raise self._unexpected(node, path, key, f"{words.get(type(other), 'a text')} or a list")
 
     def _tagged(self, node: Node, structs: list[inspect.StructType], path: str, key: str) -> Any:
         tags = {str(each.tag): each for each in structs}

@@ -29,6 +29,7 @@ from eap.config.structs import (
     SubscribeSection,
 )
 from eap.ids import InterfaceUri, ObjectId
+from eap.od.slave_config import OpMode, SlaveConfig
 from eap.pd.spec import BusEntrySpec, BusSlaveSpec, PortKind
 
 FIRST_STATION = 1001
@@ -47,6 +48,30 @@ class DescribedPdoEntry(msgspec.Struct, frozen=True):
     index: int
     subindex: int
     bit_length: int
+    manager: int = 0
+    """Sync manager of the PDO that maps it."""
+
+
+class DescribedPdo(msgspec.Struct, frozen=True, kw_only=True):
+    """PDO that a slave has, assigned by default or not."""
+
+    index: int
+    name: str = ""
+    is_output: bool
+    manager: int
+    """Sync manager that it is assigned to, or may be."""
+    assigned: bool = True
+    mandatory: bool = False
+    fixed: bool = False
+    """True if its entries cannot be changed."""
+    excludes: tuple[int, ...] = ()
+    """PDOs that cannot be assigned together with it."""
+    entries: tuple[DescribedPdoEntry, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Index and name."""
+        return f"0x{self.index:04X}" + (f" ({self.name})" if self.name else "")
 
 
 class DescribedSlave(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,6 +86,17 @@ class DescribedSlave(msgspec.Struct, frozen=True, kw_only=True):
     outputs: tuple[DescribedPdoEntry, ...] = ()
     """In the order of the PDOs."""
     inputs: tuple[DescribedPdoEntry, ...] = ()
+    config: SlaveConfig = SlaveConfig()
+    pdos: tuple[DescribedPdo, ...] = ()
+    """All PDOs, by which *config* may replace *outputs* and *inputs*."""
+    objects: tuple[DescribedPdoEntry, ...] = ()
+    """Known entries of its dictionary."""
+    op_modes: tuple[OpMode, ...] = ()
+    managers: Mapping[int, bool] = {}
+    """Sync managers of process data; true for outputs."""
+    has_coe: bool = True
+    has_soe: bool = True
+    has_clock: bool = True
 
 
 class ExpectedBus(msgspec.Struct, frozen=True):
@@ -113,6 +149,7 @@ def name_bus(port: str, description: ExpectedBus) -> NamedBus:
                 alias=slave.alias,
                 outputs=outputs,
                 inputs=inputs,
+                config=slave.config,
             )
         )
     return NamedBus(tuple(slaves), variables)
@@ -120,7 +157,8 @@ def name_bus(port: str, description: ExpectedBus) -> NamedBus:
 
 def _name(entry: DescribedPdoEntry, prefix: str, name: str) -> BusEntrySpec:
     variable = f"{prefix}.{name}" if entry.type else ""
-    return BusEntrySpec(variable, entry.index, entry.subindex, entry.bit_length)
+    place = entry.index, entry.subindex, entry.bit_length
+    return BusEntrySpec(variable, *place, entry.manager)
 
 
 def _variables(

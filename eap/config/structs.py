@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from eap.ids import NetId
+from eap.od.slave_config import RevisionRule, StateTimeouts, Watchdogs
 from eap.pd.spec import (
     BusTarget,
     OnChangeSpec,
@@ -28,6 +29,7 @@ from eap.pd.spec import (
 # Ranges of the wire fields (PD id, version) and of the dictionary's entries: a file that loads fits
 # both.
 U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
+U32 = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
 Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
 Milliseconds = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
 DeviceCycle = Annotated[int, Meta(ge=100, le=60_000_000)]
@@ -86,6 +88,48 @@ class GatewaySection(Section, frozen=True):
     SHORT: ClassVar[str] = "enabled"
 
 
+class StartupSection(Section, frozen=True):
+    """A start-up write of a slave: an SDO or an IDN, with a value or data."""
+
+    transition: str | tuple[str, ...] = "PS"
+    sdo: str = ""
+    idn: str = ""
+    drive: Annotated[int, Meta(ge=0, le=7)] = 0
+    value: Plain | None = None
+    type: str = ""
+    data: str = ""
+    complete: bool = False
+    comment: str = ""
+
+
+class SyncSection(Section, frozen=True):
+    """SYNC0 or SYNC1 of a slave; without a cycle it follows the bus."""
+
+    cycle_us: Annotated[int, Meta(ge=1, le=4_000_000)] | None = None
+    shift_us: Annotated[float, Meta(ge=-4_000_000, le=4_000_000)] = 0.0
+
+
+class SlaveSection(Section, frozen=True):
+    """Configuration of a slave by its master; a key that is left out changes nothing."""
+
+    optional: bool | None = None
+    group: str | None = None
+    revision: U32 | None = None
+    revision_rule: RevisionRule | None = None
+    serial: U32 | None = None
+    alias: U16 | None = None
+    identification: str | None = None
+    pdos: tuple[str, ...] | dict[str, tuple[str, ...]] | None = None
+    mapping: dict[str, tuple[str, ...]] | None = None
+    startup: tuple[StartupSection, ...] = ()
+    dc: str | None = None
+    sync0: SyncSection | None = None
+    sync1: SyncSection | None = None
+    activate: U16 | None = None
+    watchdog: Watchdogs | None = None
+    timeouts: StateTimeouts | None = None
+
+
 class PortSection(Section, frozen=True):
     """A port; the NetID of an EAP port is the publisher ID of its frames.
 
@@ -111,6 +155,7 @@ class PortSection(Section, frozen=True):
     frame_timeout_us: FrameTimeout = 1_000_000
     frame_retries: FrameRetries = 4
     gateway: GatewaySection = GatewaySection()
+    slaves: dict[str, SlaveSection] = {}
 
     @property
     def vlan_id(self) -> int:
@@ -135,6 +180,7 @@ class PortSection(Section, frozen=True):
         "frame_timeout_us",
         "frame_retries",
         "gateway",
+        "slaves",
     )
 
 

@@ -149,6 +149,7 @@ def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> 
             revision=slave.revision,
             serial=slave.serial,
             alias=slave.alias,
+            config=slave.config,
         )
         for slave in spec.slaves
     ]
@@ -158,6 +159,7 @@ def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> 
         frame_retries=spec.frame_retries,
         acyclic_octets=max(_MIN_BUDGET, _BUDGET_PER_US * cycle_us),
         clocks=spec.clocks,
+        cycle_ns=1000 * cycle_us,
         epoch_offset_ns=epoch_offset_ns,
     )
 

@@ -9,9 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
+Milliseconds = Annotated[int, Meta(ge=0, le=600_000)]
+WatchdogMs = Annotated[int, Meta(ge=0, le=6553)]
+"""A register of 16 bits counts steps of 100 µs."""
 US = 1000
 """Nanoseconds of a microsecond."""
 
@@ -124,9 +129,9 @@ def _scaled(cycle_ns: int, factor: int) -> int:
 class Watchdogs(msgspec.Struct, frozen=True, kw_only=True):
     """Watchdogs of a slave's controller; 0 switches one off."""
 
-    process_data_ms: int | None = None
+    process_data_ms: WatchdogMs | None = None
     """Without outputs for so long the slave leaves OP."""
-    pdi_ms: int | None = None
+    pdi_ms: WatchdogMs | None = None
     """Without an access of its application for so long it is reported."""
     enabled: bool | None = None
     """Trigger of the process data watchdog by the sync managers of outputs (control bit 6)."""
@@ -138,11 +143,11 @@ class StateTimeouts(msgspec.Struct, frozen=True, kw_only=True):
     None is that of the master.
     """
 
-    preop_ms: int | None = None
-    safeop_op_ms: int | None = None
-    back_to_init_ms: int | None = None
-    back_to_safeop_ms: int | None = None
-    response_ms: int | None = None
+    preop_ms: Milliseconds | None = None
+    safeop_op_ms: Milliseconds | None = None
+    back_to_init_ms: Milliseconds | None = None
+    back_to_safeop_ms: Milliseconds | None = None
+    response_ms: Milliseconds | None = None
     """Of an answer to a start-up write."""
 
 
@@ -197,6 +202,8 @@ _WORDS: Mapping[RevisionRule, str] = MappingProxyType(
 
 ALIAS_REGISTER = 0x0012
 """Register with the alias of the EEPROM (ESI: StationAliasSupported)."""
+BY_SERIAL = 0
+"""In place of a register: the serial number in the EEPROM."""
 ID_REGISTER = 0x0134
 """Register with the identification that a slave shows on request (ESI: IdentificationReg134)."""
 
@@ -222,4 +229,4 @@ class SlaveConfig(msgspec.Struct, frozen=True, kw_only=True):
     """Hot-connect group, whose slaves are connected together."""
     revision_rule: RevisionRule = RevisionRule.EXACT
     identification: int = ALIAS_REGISTER
-    """Register that holds the value by which the slave is told from equal ones."""
+    """Register, or BY_SERIAL, that holds the value by which the slave is told from equal ones."""

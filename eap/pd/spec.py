@@ -15,6 +15,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 
 from eap.ids import InterfaceUri, NetId, decode_value, encode_value
+from eap.od.slave_config import SlaveConfig
 
 _U32 = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF_FFFF)]
 
@@ -278,6 +279,8 @@ class BusEntrySpec(SpecRecord, frozen=True):
     index: int
     subindex: int
     bit_length: int
+    manager: int = 0
+    """Sync manager that transfers it."""
 
 
 class BusSlaveSpec(SpecRecord, frozen=True):
@@ -293,6 +296,7 @@ class BusSlaveSpec(SpecRecord, frozen=True):
     alias: int | None = None
     outputs: tuple[BusEntrySpec, ...] = ()
     inputs: tuple[BusEntrySpec, ...] = ()
+    config: SlaveConfig = SlaveConfig()
 
 
 class BusTarget(StrEnum):

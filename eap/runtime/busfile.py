@@ -17,21 +17,37 @@ from devicebus.sim.fault import FaultySegment
 from devicebus.sim.segment import SegmentEnd, trace_path
 from devicebus.sim.spec import BusSpec, SlaveSpec
 from devicebus.wire import sii
+from devicebus.wire.sii import Sii, SiiProtocol
 from eap.config.document import convert_to, read
 from eap.config.finding import FindingReport, PlantFinding, one_of
-from eap.config.index import DescribedPdoEntry, DescribedSlave, ExpectedBus
+from eap.config.index import DescribedPdo, DescribedPdoEntry, DescribedSlave, ExpectedBus
+from eap.config.slaves import configure
+from eap.config.structs import SlaveSection
 from eap.errors import ConfigError
 from eap.od.dictionary import ObjectDictionary
+from eap.od.model import ObjectCode
 from eap.suggest import suggest
 
 MAX_RESOURCE = 16 << 20
 """Bytes of the largest file that a bus file may refer to."""
 
 
+class BusFileSlave(SlaveSpec, frozen=True, kw_only=True):
+    """Slave of a bus file: what the simulator plays, and what a master configures."""
+
+    master: SlaveSection = SlaveSection()
+
+
+class BusFileSpec(BusSpec, frozen=True, kw_only=True):
+    """Content of a bus file."""
+
+    slaves: tuple[BusFileSlave, ...]
+
+
 class BusFile(msgspec.Struct, frozen=True):
     """A bus file that can be built, with the files it refers to by the names it uses."""
 
-    spec: BusSpec
+    spec: BusFileSpec
     resources: dict[str, bytes]
     revised: frozenset[int] = frozenset()
     """Numbers of the slaves whose revision the file gives."""
@@ -52,7 +68,7 @@ def load(path: Path) -> BusResult:
     """Read and check the bus file at *path*; never raises for what the file holds."""
     report = FindingReport(str(path))
     root = read(path, report)
-    spec = None if root is None else convert_to(BusSpec, root, report, "bus")
+    spec = None if root is None else convert_to(BusFileSpec, root, report, "bus")
     if spec is None or report.findings():
         return BusResult(None, report.findings())
     slaves = range(len(spec.slaves))
@@ -66,6 +82,8 @@ def load(path: Path) -> BusResult:
         _check_wiring(spec, number, report, at)
         if not report.findings():
             _check_slave(slave, bus, report, at)
+        if not report.findings():
+            configure(_describe(bus, number), slave.master, report)
     if not spec.slaves:
         report.add("slaves", "the bus has no slaves", "at least one slave")
     if not report.findings():
@@ -92,7 +110,13 @@ def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
     if result.bus is None:
         return result.findings
     bus = result.bus
-    return ExpectedBus(tuple(_describe(bus, number) for number in _line(bus.spec)))
+    report = FindingReport(str(path))  # of findings that are known to be absent
+    return ExpectedBus(
+        tuple(
+            configure(_describe(bus, number), bus.spec.slaves[number].master, report)
+            for number in _line(bus.spec)
+        )
+    )
 
 
 def _line(spec: BusSpec) -> tuple[int, ...]:
@@ -111,13 +135,13 @@ def _describe(bus: BusFile, number: int) -> DescribedSlave:
     spec = bus.spec.slaves[number]
     slave = build_slave(spec, bus.resources)
     image = sii.decode(slave.esc.image)
-    channels = channels_from_sii(image)
+    dictionary = slave.device.dictionary
+    pdos = _describe_pdos(image, dictionary)
     outputs, inputs = (
         tuple(
-            _describe_entry(entry, slave.device.dictionary)
-            for channel in channels
-            if channel.is_output is is_output
-            for pdo in channel.pdos
+            entry
+            for pdo in pdos
+            if pdo.assigned and pdo.is_output is is_output
             for entry in pdo.entries
         )
         for is_output in (True, False)
@@ -131,15 +155,70 @@ def _describe(bus: BusFile, number: int) -> DescribedSlave:
         alias=image.fixed.alias or None,
         outputs=outputs,
         inputs=inputs,
+        pdos=tuple(pdos),
+        objects=tuple(_describe_objects(dictionary)),
+        managers={each.number: each.is_output for each in channels_from_sii(image)},
+        has_coe=bool(image.fixed.protocols & SiiProtocol.COE),
+        has_soe=bool(image.fixed.protocols & SiiProtocol.SOE),
+        has_clock=spec.clock is not None,
     )
 
 
-def _describe_entry(entry: PdoEntry, dictionary: ObjectDictionary) -> DescribedPdoEntry:
+def _describe_pdos(image: Sii, dictionary: ObjectDictionary) -> list[DescribedPdo]:
+    """Return the PDOs of an EEPROM in the order of their sync managers."""
+    sides: dict[bool, list[int]] = {True: [], False: []}
+    for channel in channels_from_sii(image):
+        sides[channel.is_output].append(channel.number)
+    found = []
+    for is_output, pdos in ((True, image.rx_pdos), (False, image.tx_pdos)):
+        managers = sides[is_output]
+        for pdo in pdos if managers else ():
+            # One that is not assigned by default (0xFF) goes to the first of its direction.
+            assigned = pdo.header.sync_manager in managers
+            manager = pdo.header.sync_manager if assigned else managers[0]
+            entries = [
+                _describe_entry(
+                    PdoEntry(each.index, each.subindex, each.bit_length), dictionary, manager
+                )
+                for each in pdo.entries
+            ]
+            found.append(
+                DescribedPdo(
+                    index=pdo.header.index,
+                    name=image.string(pdo.header.name),
+                    is_output=is_output,
+                    manager=manager,
+                    assigned=assigned,
+                    entries=tuple(entries),
+                )
+            )
+    return sorted(found, key=lambda each: each.manager)
+
+
+def _describe_entry(
+    entry: PdoEntry, dictionary: ObjectDictionary, manager: int
+) -> DescribedPdoEntry:
     place = entry.index, entry.subindex, entry.bit_length
     if not entry.index:
-        return DescribedPdoEntry("", "", *place)
+        return DescribedPdoEntry("", "", *place, manager)
     known = dictionary.entry(entry.index, entry.subindex)
-    return DescribedPdoEntry(known.name, known.kind.text, *place)
+    return DescribedPdoEntry(known.name, known.kind.text, *place, manager)
+
+
+_FIRST_APPLICATION_OBJECT = 0x2000
+
+
+def _describe_objects(dictionary: ObjectDictionary) -> Iterator[DescribedPdoEntry]:
+    """Yield the entries of the application, without the counts of records."""
+    for item in dictionary:
+        if item.index < _FIRST_APPLICATION_OBJECT:
+            continue
+        for subindex, entry in item.entries.items():
+            if subindex or item.code is ObjectCode.VAR:
+                kind = entry.kind
+                yield DescribedPdoEntry(
+                    entry.name, kind.text, item.index, subindex, kind.bit_length
+                )
 
 
 def _files(slave: SlaveSpec) -> Iterator[str]:

@@ -10,6 +10,7 @@ from devicebus.master.pdo import channels_from_sii
 from devicebus.master.scan import scan
 from eap.config.index import DescribedPdoEntry
 from eap.errors import ConfigError
+from eap.od.slave_config import SdoWrite, SlaveConfig
 from eap.runtime import busfile
 from tests.support.busline import Bench, Line, run
 
@@ -76,6 +77,29 @@ def test_finding(tmp_path, old, new, finding):
     assert any(each.startswith(finding) for each in found), found
 
 
+def test_master_keys_configure_the_slave(tmp_path):
+    keys = """
+    outputs: [{name: o}]
+    master:
+      optional: true
+      startup: [{sdo: "0x6000:1", data: "0100"}]
+      pdos: {3: []}
+"""
+    coupler, analogue = described(tmp_path, GOOD.replace("    inputs", f"{keys}    inputs"))
+    assert coupler.config == SlaveConfig()
+    assert analogue.config.optional
+    assert analogue.config.writes == (SdoWrite(index=0x6000, subindex=1, data=b"\1\0"),)
+    assert analogue.inputs == ()
+    assert [each.name for each in analogue.outputs] == ["o", ""]
+
+
+def test_finding_about_a_master_key_has_its_line(tmp_path):
+    wrong = GOOD.replace("    inputs", "    master:\n      pdos: [0x1A09]\n    inputs")
+    (finding,) = busfile.load(write(tmp_path, wrong)).findings
+    text = "bus.yaml:7: b has no PDO '0x1A09'; expected one of 0x1A00 (Inputs)"
+    assert str(finding).endswith(text)
+
+
 def test_port_that_is_taken(tmp_path):
     text = GOOD.replace("faults:", "  - {name: c, kind: coupler, after: a}\nfaults:")
     (finding,) = busfile.load(write(tmp_path, text)).findings
@@ -103,7 +127,7 @@ def test_bus_description_equals_master_scan(tmp_path):
     assert (coupler.name, coupler.vendor, coupler.product) == ("a", 0x0E5A, 1)
     assert (coupler.inputs, coupler.outputs) == ((), ())
     assert analogue.product == 3
-    assert analogue.inputs == (DescribedPdoEntry("level", "INT", 0x6000, 1, 16),)
+    assert analogue.inputs == (DescribedPdoEntry("level", "INT", 0x6000, 1, 16, 3),)
 
 
 def test_description_of_bits_has_their_padding(tmp_path):
