@@ -170,6 +170,7 @@ class EoeServer:
         settings: Initial IP settings.
         accept: Checks new settings; any result but OK refuses them.
         receive_frame: Called with each Ethernet frame from the master; returns frames to send back.
+        announce: Called after new settings; returns frames to send.
     """
 
     def __init__(
@@ -179,6 +180,7 @@ class EoeServer:
         settings: IpSettings | None = None,
         accept: Callable[[IpSettings], EoeResult] | None = None,
         receive_frame: Callable[[bytes], list[bytes]] | None = None,
+        announce: Callable[[], list[bytes]] | None = None,
     ) -> None:
         self.settings = settings or IpSettings()
         self.assembler = FrameAssembler()
@@ -187,6 +189,7 @@ class EoeServer:
         self._sizes = sizes
         self._accept = accept
         self._receive_frame = receive_frame
+        self._announce = announce
         self._pending: deque[bytes] = deque()
         self._frame_number = 0
 
@@ -225,9 +228,12 @@ class EoeServer:
         frame = self.assembler.receive(data)
         if frame is None or self._receive_frame is None:
             return
-        for answer in self._receive_frame(frame):
+        self._send_frames(self._receive_frame(frame))
+
+    def _send_frames(self, frames: list[bytes]) -> None:
+        for frame in frames:
             try:
-                self.send_frame(answer)
+                self.send_frame(frame)
             except CodecError:
                 self.dropped += 1
 
@@ -250,4 +256,6 @@ class EoeServer:
             parts = msgspec.structs.asdict(new).items()
             given = {name: value for name, value in parts if value is not None}
             self.settings = msgspec.structs.replace(self.settings, **given)
+            if self._announce is not None:
+                self._send_frames(self._announce())
         return result

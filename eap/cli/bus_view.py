@@ -28,6 +28,7 @@ from eap.ops.bus_objects import (
 )
 from eap.ops.od import OdObjectRow
 from eap.runtime.bus_status import FindingRow
+from eap.runtime.engine_messages import EoeReport
 
 _SHOWN_OCTETS = 32
 _MANY_SLAVES = 16
@@ -108,8 +109,33 @@ def diagnosis_view(
         f" {frames.retried} repeated\nround trip {duration(frames.round_trip_us)},"
         f" timeout {duration(frames.timeout_us)}"
     )
+    if found.eoe is not None:
+        yield ""
+        yield eoe_table(found.eoe)
     for row in found.findings:
         yield Styled(finding_line(row, now_s), style="dim" if row.is_over else "red")
+
+
+def eoe_table(report: EoeReport) -> TextTable:
+    """Return the ports of the Ethernet switch of a bus: the host, and the slaves with EoE."""
+    table = TextTable(
+        "EoE port",
+        Column("Address", wraps=True),
+        Column("In", is_number=True),
+        Column("Out", is_number=True),
+        Column("Dropped", is_number=True),
+        Column("Invalid", rank=1, is_number=True),
+        Column("Failed", rank=1, is_number=True),
+    )
+    host = "not open" if report.fault else report.address or "open"
+    figures = (report.received, report.sent, report.dropped)
+    table.add_row(report.interface, host, *map(str, figures), "", "")
+    for row in report.slaves:
+        address = row.ip or " ".join(row.addresses)
+        numbers = (row.received, row.sent, row.dropped, row.invalid, row.failed)
+        shown = address if row.is_connected else "no mailbox"
+        table.add_row(f"{row.station} {row.name}", shown, *map(str, numbers))
+    return table
 
 
 def finding_line(row: FindingRow, now_s: float) -> str:

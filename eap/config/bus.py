@@ -206,14 +206,14 @@ def resolve_gateway_address(
         return GatewayAddress(address, members=members)
     names = str(target).split("/")
     if len(names) == 1:
-        return GatewayAddress(address, station=_slave(index, station, port, target))
+        return GatewayAddress(address, station=find_slave(index, station, port, target))
     other = index.stations.get(names[0])
     other_port = index.ports.get((names[0], names[1]))
     if other is None or other_port is None or other_port.kind is not PortKind.BUS or len(names) > 3:
         buses = [f"{at}/{name}" for (at, name), each in index.ports.items() if _is_bus(each)]
         hint = suggest("/".join(names[:2]), buses)
         raise SectionError("", f"there is no bus port for {target!r}{hint}", TARGET)
-    number = _slave(index, other, other_port, names[2]) if len(names) == 3 else MASTER_PORT
+    number = find_slave(index, other, other_port, names[2]) if len(names) == 3 else MASTER_PORT
     if other_port is port and number != MASTER_PORT:
         # On the same bus no router is needed between gateway and slave.
         return GatewayAddress(address, station=number)
@@ -238,11 +238,15 @@ def _member(
             if isinstance(known[number], list):
                 raise SectionError("", f"0x{number:04X} is a group itself", _MEMBER)
             return number
-    return _slave(index, station, port, member)
+    return find_slave(index, station, port, member)
 
 
-def _slave(index: Index, station: StationSection, port: PortSection, slave: object) -> int:
-    """Return the station address of a slave, given by that address or by its name."""
+def find_slave(index: Index, station: StationSection, port: PortSection, slave: object) -> int:
+    """Return the station address of a slave, given by that address or by its name.
+
+    Raises:
+        SectionError: the bus has no such slave.
+    """
     slaves = index.slaves(station, port.name)
     for each in slaves:
         if slave in {each.name, each.station} or str(slave) == str(each.station):

@@ -35,6 +35,7 @@ from eap.config.brokers import (
 )
 from eap.config.bus import DescribeBus, bus_file, check_gateways, describe_buses, gateway_spec
 from eap.config.document import convert, read, read_net_id
+from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index, SentPd
@@ -320,6 +321,7 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
             port.frame_retries,
         ),
         gateway=gateway_spec(index, station, port),
+        eoe=eoe_spec(port),
     )
 
 
@@ -477,6 +479,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     index = Index(plant_file, describe_buses(plant_file, path.parent, describe_bus, report))
     check_ports(index, report)
     check_gateways(index, report)
+    check_eoe(index, report)
     check_variables(index, report, path.parent)
     check_publish(index, report)
     check_subscribe(index, report)

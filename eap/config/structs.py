@@ -130,6 +130,34 @@ class SlaveSection(Section, frozen=True):
     timeouts: StateTimeouts | None = None
 
 
+class EoeKind(StrEnum):
+    """Treatment of Ethernet frames of slaves."""
+
+    TAP = "tap"
+    """They go to a TAP interface of the host, and to other slaves."""
+
+
+class EoeSlaveSection(Section, frozen=True):
+    """A slave that is connected by EoE, with its IP settings."""
+
+    ip: str = ""
+    gateway: str = ""
+    dns: str = ""
+    name: str = ""
+    mac: str = ""
+
+
+class EoeSection(Section, frozen=True):
+    """EoE of a bus port; the short form is ``kind``."""
+
+    kind: EoeKind = EoeKind.TAP
+    interface: str = ""
+    address: str = ""
+    slaves: dict[str, EoeSlaveSection] = {}
+
+    SHORT: ClassVar[str] = "kind"
+
+
 class PortSection(Section, frozen=True):
     """A port; the NetID of an EAP port is the publisher ID of its frames.
 
@@ -156,6 +184,7 @@ class PortSection(Section, frozen=True):
     frame_retries: FrameRetries = 4
     gateway: GatewaySection = GatewaySection()
     slaves: dict[str, SlaveSection] = {}
+    eoe: EoeSection | None = None
 
     @property
     def vlan_id(self) -> int:
@@ -181,6 +210,7 @@ class PortSection(Section, frozen=True):
         "frame_retries",
         "gateway",
         "slaves",
+        "eoe",
     )
 
 

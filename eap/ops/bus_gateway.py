@@ -157,6 +157,10 @@ class GatewayBus:
     def forget(self) -> None:
         """Do nothing: a gateway has no such service."""
 
+    def eoe_report(self) -> None:
+        """Return None: a gateway reports no Ethernet frames."""
+        return
+
     def frame_counts(self) -> FrameCounts:
         """Refuse likewise."""
         _refuse("counters of frames")

@@ -22,7 +22,8 @@ from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from devicebus.wire.sii import SiiProtocol
 from eap.ops.bus_session import Slave, SlaveBus, choose
-from eap.runtime.bus_status import FindingRow, FrameCounts, finding_row
+from eap.runtime.bus_status import FindingRow, FrameCounts, find_eoe_faults, finding_row
+from eap.runtime.engine_messages import EoeReport
 
 _TRIES = 3
 _PAUSE_NS = 100_000_000
@@ -101,6 +102,7 @@ class Diagnosis(msgspec.Struct, frozen=True):
     findings: list[FindingRow]
     starts_at: ErrorOrigin | None
     slaves: list[DiagnosedSlave]
+    eoe: EoeReport | None = None
 
 
 class CounterReset(msgspec.Struct, frozen=True):
@@ -189,10 +191,11 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
     if found.is_silent:
         causes = [find_silence(views, history.silent_since_ns if history is not None else None)]
     else:
-        causes = find_causes(views, found, history)
+        causes = [*find_causes(views, found, history), *find_eoe_faults(bus.eoe_report())]
     fault = found.first_fault
     return Diagnosis(
         frames=bus.frame_counts(),
+        eoe=bus.eoe_report(),
         findings=[finding_row(each, names, now_s) for each in causes],
         starts_at=None
         if fault is None

@@ -35,7 +35,7 @@ from eap.runtime.bus_status import (
     is_silent,
     report_findings,
 )
-from eap.runtime.engine_messages import BusReport, SlaveReport, no_mailbox
+from eap.runtime.engine_messages import BusReport, EoeReport, SlaveReport, no_mailbox
 
 T = TypeVar("T")
 
@@ -156,6 +156,10 @@ class RunningBus:
         """Run a procedure to its end and return its result, or raise its error."""
         del name
         return drive(procedure, self._step)
+
+    def eoe_report(self) -> EoeReport | None:
+        """Return the state of the Ethernet switch as of the last :meth:`known`; None without."""
+        return self._report.eoe
 
     def frame_counts(self) -> FrameCounts:
         """Return the frames of the master since the engine started."""

@@ -36,6 +36,7 @@ from eap.errors import EapError
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
 from eap.runtime.bus_status import FrameCounts, count_frames
+from eap.runtime.engine_messages import EoeReport
 
 T = TypeVar("T")
 
@@ -138,6 +139,10 @@ class BusSession:
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the frames of this session."""
         return count_frames(self._bus.link.stats())
+
+    def eoe_report(self) -> None:
+        """Return None: this master carries no Ethernet frames."""
+        return
 
     def known(self) -> Sequence[Slave]:
         """Return the slaves of the last scan, or scan."""
@@ -310,6 +315,9 @@ class SlaveBus(Protocol):
 
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the master's frames."""
+
+    def eoe_report(self) -> EoeReport | None:
+        """Return the state of the Ethernet switch; None without one."""
 
     def known(self) -> Sequence[Slave]:
         """Return all slaves in the order of the line, without a new scan if they are known."""

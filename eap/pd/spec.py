@@ -381,6 +381,31 @@ class GatewaySpec(SpecRecord, frozen=True):
     clients: int = 256
 
 
+class EoeSlaveSpec(SpecRecord, frozen=True):
+    """A slave that is connected by EoE; settings that are empty are not written."""
+
+    slave: str
+    """Name, or station address."""
+    ip: str = ""
+    """IPv4 address with the length of its network, such as ``192.168.7.10/24``."""
+    gateway: str = ""
+    dns: str = ""
+    name: str = ""
+    """Host name."""
+    mac: str = ""
+    """Empty for one that is made of the station address."""
+
+
+class EoeSpec(SpecRecord, frozen=True):
+    """TAP interface of this host by which the slaves of a bus are reached (EoE)."""
+
+    interface: str
+    address: str = ""
+    """IPv4 address of the interface with the length of its network; empty to leave it alone."""
+    slaves: tuple[EoeSlaveSpec, ...] = ()
+    """Empty connects every slave that has EoE."""
+
+
 class PortSpec(SpecRecord, frozen=True):
     """One port of a station."""
 
@@ -405,8 +430,9 @@ class PortSpec(SpecRecord, frozen=True):
     ams: bool = True
     """True if AMS/TCP and UDP 48899 are served at the port's IP address, if it has one."""
     bus: BusPortSpec | None = None
-    """Bus ports only, as the next one."""
+    """Bus ports only, as those that follow."""
     gateway: GatewaySpec | None = None
+    eoe: EoeSpec | None = None
 
 
 class StationSpec(SpecRecord, frozen=True):

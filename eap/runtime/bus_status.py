@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -20,7 +20,7 @@ from devicebus.master.findings import (
 )
 from devicebus.master.link import LinkStats
 from devicebus.wire.alstatus import state_name
-from eap.runtime.engine_messages import BusReport, SlaveReport
+from eap.runtime.engine_messages import BusReport, EoeReport, SlaveReport
 
 
 class NamedSlave(msgspec.Struct, frozen=True):
@@ -75,7 +75,23 @@ def report_findings(report: BusReport) -> list[BusFinding]:
     views = [_view(slave) for slave in report.slaves]
     if is_silent(report):
         return [find_silence(views, report.silent_since_ns)]
-    return [*find_causes(views), *find_unanswered(_mailboxes(report))]
+    return [
+        *find_causes(views),
+        *find_unanswered(_mailboxes(report)),
+        *find_eoe_faults(report.eoe),
+    ]
+
+
+def find_eoe_faults(report: EoeReport | None) -> Iterator[BusFinding]:
+    """Yield what keeps Ethernet frames from the host or from slaves."""
+    if report is None:
+        return
+    if report.fault:
+        yield BusFinding(what=f"EoE: {report.fault}")
+    for each in report.slaves:
+        if each.fault:
+            what = f"slave {each.station} ({each.name}): EoE: {each.fault}"
+            yield BusFinding(what=what, slaves=(each.station,))
 
 
 def is_silent(report: BusReport) -> bool:
@@ -170,6 +186,7 @@ def bus_document(report: BusReport | None, now_s: float) -> dict[str, Any]:
             "trip_us": report.trip_ns // 1000,
             "max_trip_us": report.max_trip_ns // 1000,
             "frames": count_frames(report),
+            **({} if report.eoe is None else {"eoe": report.eoe}),
         }
     }
 

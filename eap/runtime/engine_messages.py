@@ -182,6 +182,47 @@ class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
     """Ports whose errors were counted while the master read them."""
 
 
+class EoePortReport(msgspec.Struct, frozen=True, kw_only=True):
+    """A slave at the Ethernet switch of its master; frames since services started."""
+
+    station: int
+    name: str
+    is_connected: bool
+    """True while its mailbox is open."""
+    ip: str
+    """Address that it has accepted, empty if none was written."""
+    fault: str
+    """Reason that its IP settings were not written."""
+    received: int
+    """Came from the slave."""
+    sent: int
+    """Went to the slave."""
+    dropped: int
+    """Not sent, because too many waited, or the slave was not connected."""
+    invalid: int
+    """Came from the slave with fragments missing, or a wrong length."""
+    failed: int
+    """Sent, but not taken by the slave."""
+    last_error: str
+    addresses: tuple[str, ...]
+    """MAC addresses behind it."""
+
+
+class EoeReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Ethernet switch of a master, with the TAP interface of the host as one port."""
+
+    interface: str
+    address: str
+    fault: str
+    """Reason that the interface is not open."""
+    received: int
+    """Frames that came from the host."""
+    sent: int
+    """Frames that went to the host."""
+    dropped: int
+    slaves: tuple[EoePortReport, ...]
+
+
 class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Description of a bus; counters since the engine started, times in nanoseconds."""
 
@@ -220,6 +261,8 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Malformed messages of services, for all buses of the engine together."""
     dropped: int = 0
     """Replies that services did not take, for all buses of the engine together."""
+    eoe: EoeReport | None = None
+    """Added by services, where the plant file has a TAP interface for the bus."""
 
 
 class EngineReply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="answer"):

@@ -76,6 +76,7 @@ from eap.services.transports.accepting import Listeners
 if TYPE_CHECKING:
     from eap.services.device.master_values import MasterDictionaryProvider
     from eap.services.gateway.gateway import MailboxGateway
+    from eap.services.slaves.eoe_bridge import EoeBridge
     from eap.services.transports.mqtt_transport import MqttTransport
 
 
@@ -250,6 +251,7 @@ class Services:
             self._resources,
         )
         transports = open_transports(network, self._link)
+        bridges = self._bridges(clients)
         brokers = self._brokers(devices.routers)
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(clients, devices, providers)
@@ -259,7 +261,7 @@ class Services:
         on_sockets: list[Callable[[], Awaitable[None]]] = [
             partial(server.serve, self._listener, self._listeners),
             self._listeners.serve,
-            *(each.serve for each in (*transports, *brokers)),
+            *(each.serve for each in (*transports, *brokers, *bridges)),
             watch.run,
         ]
         async with asyncio.TaskGroup() as group:
@@ -324,6 +326,18 @@ class Services:
         from eap.services.transports.mqtt_transport import open_mqtt_transports
 
         return open_mqtt_transports(routing, routers, self._counters)
+
+    def _bridges(self, clients: Mapping[PortName, BusClient]) -> list[EoeBridge]:
+        found = []
+        for owner, client in clients.items():
+            if (spec := self._handover.port(owner).eoe) is not None:
+                # Imported here: few plants use EoE.
+                from eap.services.slaves.eoe_bridge import EoeBridge
+
+                bridge = EoeBridge(client, spec)
+                client.report_eoe = bridge.report
+                found.append(bridge)
+        return found
 
     def _methods(
         self,

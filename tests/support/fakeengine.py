@@ -15,6 +15,7 @@ import msgspec
 
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.master.bus import MasterSettings
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master, why_closed
 from devicebus.master.procedure import Procedure
 from devicebus.sim.fault import execute_command
@@ -207,6 +208,9 @@ class FakeEngine:
     def publish(self) -> None:
         """Send what has changed on the buses."""
         for number, bus in enumerate(self.buses):
+            for event in iter(bus.master.next_event, None):
+                if isinstance(event, Unsolicited):
+                    self._send(UnsolicitedMessage(number, event))
             change = bus.change(number)
             if change != self._published.get(number):
                 self._published[number] = change

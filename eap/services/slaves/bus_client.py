@@ -19,6 +19,8 @@ from time import monotonic_ns
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
+from msgspec.structs import replace
+
 from devicebus.errors import BusError, MailboxBusyError
 from devicebus.mailbox.conversation import (
     ABORT_MESSAGES,
@@ -41,6 +43,7 @@ from eap.runtime.engine_messages import (
     BusChange,
     BusReport,
     DescribeBus,
+    EoeReport,
     ExchangeDatagrams,
     ExchangeMailbox,
     ForgetFaults,
@@ -262,12 +265,14 @@ class BusClient:
         port: As given.
         name: ``STATION/PORT``.
         view: Its cached description.
+        report_eoe: Reports the Ethernet switch of the bus, None without one.
     """
 
     def __init__(self, link: EngineLink, number: int, port: PortName) -> None:
         self.port = port
         self.name = f"{port.station}/{port.port}"
         self.view = BusView(link, number)
+        self.report_eoe: Callable[[], EoeReport] | None = None
         self._link = link
         self._number = number
         self._queues = MailboxQueues()
@@ -288,7 +293,9 @@ class BusClient:
         )
         if reply.report is None:
             raise BusError(f"{self.name}: no report from the engine")
-        return reply.report
+        if self.report_eoe is None:
+            return reply.report
+        return replace(reply.report, eoe=self.report_eoe())
 
     async def find_faults(self, station: int) -> list[str]:
         """Return the present faults of a slave and of its bus, as ``eapctl bus diag`` says them."""

@@ -112,6 +112,29 @@ def test_diagnosis_shows_ports_frames_and_findings():
     assert any("no answer" in line for line in lines)
 
 
+def test_diagnosis_shows_the_ports_of_ethernet():
+    port = {"station": 1001, "name": "drive", "is_connected": True, "ip": "10.0.0.2", "fault": "",
+            "received": 7, "sent": 8, "dropped": 9, "invalid": 1, "failed": 2, "last_error": "",
+            "addresses": ["02:01:05:30:03:e9"]}  # fmt: skip
+    slaves = [port, port | {"ip": ""}, port | {"is_connected": False}]
+    eoe = {"interface": "eoe0", "address": "", "fault": "", "received": 3, "sent": 4, "dropped": 5,
+           "slaves": slaves}  # fmt: skip
+    found = {"slaves": [], "frames": FRAMES, "findings": [], "starts_at": None, "eoe": eoe}
+
+    def rows(document):
+        text = shown(*diagnosis_view(msgspec.convert(document, Diagnosis), NOW_S))
+        return [line.split() for line in text.splitlines()][-4:]
+
+    assert rows(found) == [
+        ["eoe0", "open", "3", "4", "5"],
+        ["1001", "drive", "10.0.0.2", "7", "8", "9", "1", "2"],
+        ["1001", "drive", "02:01:05:30:03:e9", "7", "8", "9", "1", "2"],
+        ["1001", "drive", "no", "mailbox", "7", "8", "9", "1", "2"],
+    ]
+    dead = found | {"eoe": eoe | {"fault": "not permitted"}}
+    assert rows(dead)[0] == ["eoe0", "not", "open", "3", "4", "5"]
+
+
 def test_diagnosis_of_many_slaves_omits_those_without_errors():
     rows = [diagnosed(1001 + number) for number in range(100)]
     rows[49] = diagnosed(1050, ports=[port(0, lost_links=1)])
