@@ -188,7 +188,10 @@ class MqttLink(ReconnectingLink):
             finally:
                 room.release()
 
-        while True:
+        own = asyncio.current_task()
+        # asyncio.wait_for of Python 3.11 forgets a cancellation that comes together with the answer
+        # of the broker: this task would wait for ever, or start another one in a group that ends.
+        while own is not None and not own.cancelling():
             message = await self._outbox.get()
             self._octets -= _size(message)
             if isinstance(message, Subscribe):

@@ -8,7 +8,7 @@ import socket
 import sys
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager, suppress
 
 import pytest
 from aiomqtt import Message
@@ -261,6 +261,39 @@ def test_mqtt_overrun_is_reported():
         peer = Peer()
         await peer.link._read(Client())
         assert (peer.overruns, peer.heard) == (2, [("hall/1/ams", b"x", False)])
+
+    play(story)
+
+
+def test_mqtt_writer_ends_with_a_connection_that_breaks_as_the_broker_confirms():
+    """asyncio.wait_for returns the result if it comes together with the cancellation."""
+
+    class Client:
+        inbox = mqttclient.Inbox(1)
+
+        def __init__(self) -> None:
+            self.is_asked = asyncio.Event()
+
+        async def subscribe_all(self, filters):
+            self.is_asked.set()
+            with suppress(asyncio.CancelledError):
+                await asyncio.Event().wait()
+            return []
+
+        async def publish(self, *args, **more):
+            raise AssertionError("sent by a connection that is lost")
+
+        @property
+        async def messages(self):
+            await self.is_asked.wait()
+            raise mqttclient.MqttError("the cable is cut")
+            yield
+
+    async def story():
+        peer = Peer()
+        with pytest.raises(mqttclient.MqttError, match="the cable"):
+            async with asyncio.timeout(20):
+                await peer.link._serve(Client())
 
     play(story)
 
