@@ -314,7 +314,9 @@ class _SlaveSampler:
             self._wake.clear()
             if (wait_ns := value.next_ns - monotonic_ns()) > 0:
                 try:
-                    await asyncio.wait_for(self._wake.wait(), wait_ns / _NS_PER_S)
+                    # asyncio.wait_for of Python 3.11 may forget a cancellation.
+                    async with asyncio.timeout(wait_ns / _NS_PER_S):
+                        await self._wake.wait()
                 except TimeoutError:
                     pass
                 else:

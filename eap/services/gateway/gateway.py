@@ -414,10 +414,9 @@ class MailboxGateway:
 
     def _end_stalls(self, key: SessionKey) -> None:
         """Close files of other clients whose slave waits for them."""
-        limit_s = asyncio.get_running_loop().time() - STALL_S
         for other, session in self._slaves.of_slave(key.address, key.kind):
             codec = session.codec
-            if isinstance(codec, FileCodec) and codec.stalled_since_s < limit_s:
+            if isinstance(codec, FileCodec) and codec.stalled_s > STALL_S:
                 logger.info(
                     "gateway %s: file of slave %d closed: %s paused for %g s while %s waits",
                     self.settings.name, key.address, other.endpoint.connection, STALL_S,

@@ -13,7 +13,6 @@ server handles one file at a time).
 from __future__ import annotations
 
 import asyncio
-import math
 
 from devicebus.errors import FoeError
 from devicebus.mailbox.coe_server import (
@@ -267,10 +266,10 @@ class FileCodec:
         return self._file is not None
 
     @property
-    def stalled_since_s(self) -> float:
-        """Time since which the slave waits for this client; infinite while it need not."""
-        since_s = self._file.stalled_since_s if self._file is not None else None
-        return math.inf if since_s is None else since_s
+    def stalled_s(self) -> float:
+        """Time that the slave has waited for this client, see StallMeter."""
+        now_s = asyncio.get_running_loop().time()
+        return 0.0 if self._file is None else self._file.stalls.total_s(now_s)
 
     @property
     def waits_for_lock(self) -> bool:

@@ -32,6 +32,8 @@ from eap.services.tasks import TaskSet
 
 AHEAD = 64 << 10
 """Octets that are read before the reader wants them, unless it says otherwise."""
+SHORT_PAUSE_S = 0.5
+"""A shorter wait for a packet of the client is no stall."""
 MAX_UNSENT = 64 << 10
 """Octets that are taken from the writer before they have gone on."""
 MAX_KEPT = 16 << 20
@@ -42,6 +44,35 @@ _CHANGED = "the slave's file has changed while the bus was interrupted"
 _ACK = bytes((FoeOpcode.ACK,))
 
 logger = logging.getLogger(__name__)
+
+
+class StallMeter:
+    """Time that a slave has waited for the client of a file, less the time that it worked since.
+
+    A client that brings each packet just in time does not hold the slave for ever.
+    """
+
+    def __init__(self) -> None:
+        self._total_s = 0.0
+        self._at_s = 0.0
+        self._is_waiting = False
+
+    def begin(self, now_s: float) -> None:
+        """Note that the slave begins to wait."""
+        self._total_s, self._at_s, self._is_waiting = self.total_s(now_s), now_s, True
+
+    def end(self, now_s: float) -> None:
+        """Note that it goes on."""
+        pause_s = now_s - self._at_s
+        # To a distant client each packet takes a round trip: that is no stall.
+        change_s = pause_s if pause_s >= SHORT_PAUSE_S else -pause_s
+        self._total_s = max(0.0, self._total_s + change_s)
+        self._at_s, self._is_waiting = now_s, False
+
+    def total_s(self, now_s: float) -> float:
+        """Return the time at *now_s*, with the present pause."""
+        passed_s = now_s - self._at_s
+        return max(0.0, self._total_s + (passed_s if self._is_waiting else -passed_s))
 
 
 class FileStream(ABC):
@@ -64,8 +95,7 @@ class FileStream(ABC):
         is_open: Whether the slave has opened it.
         is_finished: Whether nothing more will be written to it.
         is_complete: Whether all of it was moved.
-        stalled_since_s: Time of the loop since which the slave waits for the reader or writer; None
-            while it need not.
+        stalls: Time that the slave has waited for the reader or writer, by the clock of the loop.
     """
 
     def __init__(self, name: str, sizes: MailboxSizes, *, is_write: bool, ahead: int) -> None:
@@ -76,7 +106,7 @@ class FileStream(ABC):
         self.name = name
         self.buffer = bytearray()
         """Octets read that are not fetched yet, or written that have not gone on."""
-        self.stalled_since_s: float | None = None
+        self.stalls = StallMeter()
         self._ahead = ahead
         self._wanted = 0
         self._error: EapError | None = None
@@ -161,11 +191,12 @@ class FileStream(ABC):
     async def _wait_stalled(self, is_so: Callable[[], bool]) -> None:
         """Wait for the reader or writer."""
         if not is_so():
-            self.stalled_since_s = asyncio.get_running_loop().time()
+            loop = asyncio.get_running_loop()
+            self.stalls.begin(loop.time())
             try:
                 await self._wait(is_so)
             finally:
-                self.stalled_since_s = None
+                self.stalls.end(loop.time())
 
     async def _wait_until(self, is_so: Callable[[], bool]) -> None:
         """Wait for a condition or the end of the transfer; raise the error that ended it."""

@@ -14,7 +14,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
 from eap.services.slaves import file_stream
-from eap.services.slaves.file_stream import AHEAD, FileHistory, LocalFile
+from eap.services.slaves.file_stream import AHEAD, FileHistory, LocalFile, StallMeter
 
 SIZES = MailboxSizes(1024, 1024)
 LONG = bytes(range(256)) * 1024
@@ -45,6 +45,27 @@ class FakeTurn:
 
     def close(self) -> None:
         self.end = self.end or "closed"
+
+
+def test_stall_meter_adds_up_pauses_that_no_work_pays_off() -> None:
+    meter = StallMeter()
+    now_s = 100.0
+    for _ in range(3):
+        assert meter.total_s(now_s) < 2
+        meter.begin(now_s)
+        assert meter.total_s(now_s + 0.8) > meter.total_s(now_s)
+        meter.end(now_s + 0.8)
+        now_s += 0.81  # the slave takes the packet in 10 ms
+    assert meter.total_s(now_s) > 2
+    assert meter.total_s(now_s + 5) == 0
+
+
+def test_stall_meter_takes_the_round_trips_of_a_client_for_work() -> None:
+    meter = StallMeter()
+    for number in range(1000):
+        meter.begin(number / 10)
+        meter.end(number / 10 + 0.09)
+    assert meter.total_s(100) == 0
 
 
 def play(scene, turn, *, is_write=False, name="a.bin"):
