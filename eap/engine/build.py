@@ -19,9 +19,9 @@ from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.engine_bus import EngineBus
 from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
 from eap.net.busport import BusPort
-from eap.net.connections import CloseReason
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import create_image
+from eap.net.limits import CloseReason
 from eap.net.loopback import LoopbackLines
 from eap.net.mmsg import ReceiveBatch
 from eap.net.realtime import descriptor_reserve, spare_descriptors

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from eap.codec.ethercat import EAP_PORT, EtherCatHeader, FrameType
 from eap.ids import Destination
-from eap.net.connections import OWN_HOST, Activity
+from eap.net.limits import OWN_HOST, Activity
 from eap.net.mmsg import count_error
 from eap.pd.link import FrameHandler, OutFrame
 

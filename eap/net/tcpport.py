@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from eap.ids import Destination, DestinationKind
-from eap.net.connections import CloseReason, ConnectionTable, ListenerLimits
+from eap.net.limits import CloseReason, ConnectionTable, ListenerLimits
 from eap.net.tcp import CONNECTION, TcpReceiver, TcpSender
 from eap.pd.link import FrameChannel, FrameHandler, OutFrame
 

@@ -189,7 +189,7 @@ class PassedConnection(SpecRecord, frozen=True):
 
     owners: tuple[PortName, ...]
     host: str
-    """Address of the peer, as the policy counts it (eap.net.connections)."""
+    """Address of the peer, as the policy counts it (eap.net.limits)."""
 
 
 def pass_connection(

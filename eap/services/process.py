@@ -59,7 +59,7 @@ from eap.services.device.sources import SourcePlayer
 from eap.services.device.station_device import StationDevice
 from eap.services.device.station_keeper import EngineClient, StationEngine, StationKeeper
 from eap.services.engine_link import EngineLink
-from eap.services.rate_limits import LimitedLogHandler, caused_by
+from eap.services.limited_log import LimitedLogHandler, caused_by
 from eap.services.routing.route_rows import (
     RouterView,
     interruption_findings,

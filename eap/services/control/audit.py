@@ -32,7 +32,7 @@ from eap.ams.access import AddRoute, AuditedOperation, AuditEntry, group_and_off
 from eap.ams.directory import Directory
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import ObjectId
-from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates
+from eap.net.limits import Rate, SourceRateLimiter, SourceRates
 
 MAX_BYTES = 8 << 20
 """Of the file before it is put aside."""

@@ -48,7 +48,7 @@ from eap.control.protocol import (
 )
 from eap.errors import ControlError, EapError, ImageError
 from eap.gateway.requests import error_in, operation_of
-from eap.net.connections import Activity, ListenerLimits
+from eap.net.limits import Activity, ListenerLimits
 from eap.od.abort import SdoAbortError
 from eap.runtime.bus_errors import to_record
 from eap.services.control.audit import operation_fields

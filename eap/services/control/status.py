@@ -12,8 +12,8 @@ from typing import Any
 
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.connections import ListenerStats
 from eap.net.interface import interface_of, link_is_up
+from eap.net.limits import ListenerStats
 from eap.pd.image import Image
 from eap.pd.report import station_status
 from eap.pd.spec import PortKind

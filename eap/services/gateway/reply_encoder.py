@@ -17,7 +17,7 @@ from eap.gateway.request_tracker import RequestTracker, Ticket
 from eap.gateway.requests import address_text
 from eap.ids import Endpoint
 from eap.services.gateway.sessions import GatewayReply, error_replies
-from eap.services.rate_limits import caused_by
+from eap.services.limited_log import caused_by
 
 Send: TypeAlias = Callable[[bytes], None]
 """Sends a frame back to the client of a request, now or later."""

@@ -32,7 +32,7 @@ from eap.ams.subscription_restorer import Interruption
 from eap.ams.transport_table import Action, Forward, Reply, Transport
 from eap.codec.ams import AmsAnswer, AmsHeader
 from eap.ids import Endpoint, NetId
-from eap.services.rate_limits import caused_by
+from eap.services.limited_log import caused_by
 from eap.services.routing.service import (
     LOCAL_TRANSPORT,
     LocalClient,

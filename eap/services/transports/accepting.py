@@ -1,6 +1,6 @@
 """Listeners of this process: they accept connections, admit, serve and close them.
 
-The policy is :mod:`eap.net.connections`.  All listeners of the process share one table, because
+The policy is :mod:`eap.net.limits`.  All listeners of the process share one table, because
 they share the descriptors of the process.
 """
 
@@ -15,7 +15,7 @@ from itertools import count
 from time import monotonic_ns
 from typing import Generic, Protocol, TypeVar
 
-from eap.net.connections import (
+from eap.net.limits import (
     OVERDUE_NS,
     Activity,
     CloseReason,
@@ -26,7 +26,7 @@ from eap.net.connections import (
     host_of,
 )
 from eap.net.realtime import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
-from eap.services.rate_limits import caused_by
+from eap.services.limited_log import caused_by
 
 # Short, because established clients wait meanwhile.
 _ACCEPT_SLICE_NS, _LOCAL_ACCEPT_SLICE_NS = 5_000_000, 20_000_000

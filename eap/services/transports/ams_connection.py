@@ -39,7 +39,7 @@ from eap.codec.ams import (
 )
 from eap.errors import MalformedError
 from eap.ids import NetId
-from eap.net.connections import Activity, CloseReason
+from eap.net.limits import Activity, CloseReason
 from eap.runtime.drop_counters import DropReason
 
 MAX_REQUESTS = 64
@@ -243,7 +243,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         is_outgoing: Whether this side opened it.
         assign_address: Returns NetID and port for a client on a host that requests an AMS address;
             without it a request for one ends the connection.
-        host: Host that the policy counts it for (:mod:`eap.net.connections`).
+        host: Host that the policy counts it for (:mod:`eap.net.limits`).
 
     Attributes:
         name: As above.

@@ -41,9 +41,10 @@ from eap.codec.amsdiscovery import (
 from eap.errors import CodecError, ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, Endpoint, NetId, parse_host
 from eap.net.host import read_password
+from eap.net.limits import Rate, SourceRateLimiter, SourceRates
 from eap.release import RELEASE
 from eap.runtime.drop_counters import DropReason
-from eap.services.rate_limits import Rate, SourceRateLimiter, SourceRates, caused_by
+from eap.services.limited_log import caused_by
 from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.tasks import TaskSet

@@ -22,7 +22,7 @@ from eap.ams.spec import TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AMS_TCP_PORT
 from eap.ids import Endpoint, NetId, parse_host
-from eap.net.connections import OVERDUE_NS, CloseReason, ListenerLimits
+from eap.net.limits import OVERDUE_NS, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.drop_counters import DropReason

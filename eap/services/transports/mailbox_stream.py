@@ -22,7 +22,7 @@ from typing import TypeAlias
 from eap.codec.ams import StateFlags
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxHeader
-from eap.net.connections import OWN_HOST, Activity, CloseReason, ListenerLimits
+from eap.net.limits import OWN_HOST, Activity, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.drop_counters import DropReason

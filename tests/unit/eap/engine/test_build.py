@@ -16,10 +16,10 @@ from devicebus.wire.register import Register
 from eap.codec.ethercat import EtherCatHeader
 from eap.engine.build import REST_NS, EngineBuses, EnginePlant
 from eap.engine.rebuild import EngineStation
-from eap.net import connections, tcpport
+from eap.net import limits, tcpport
 from eap.net.busport import SegmentSocket
-from eap.net.connections import ListenerLimits
 from eap.net.image_file import ImageFile, open_image
+from eap.net.limits import ListenerLimits
 from eap.pd.report import station_status
 from eap.pd.spec import Wake
 from eap.pd.station import Station
@@ -146,7 +146,7 @@ def test_frames_of_a_passed_connection_reach_the_port_behind_it(start, shared):
 @pytest.mark.net
 def test_host_over_its_share_loses_its_silent_connection_to_a_port(start, shared, monkeypatch):
     monkeypatch.setattr(tcpport, "LIMITS", ListenerLimits(total=2, reserved=0, per_host=1))
-    monkeypatch.setattr(connections, "FRESH_NS", 0)
+    monkeypatch.setattr(limits, "FRESH_NS", 0)
     stations = [left(), right(eap_port(2, tcp=True))]
     running = start(stations, shared(*stations))
     owners = (PortName("right", "eap0"),)

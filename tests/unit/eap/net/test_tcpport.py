@@ -9,8 +9,8 @@ import pytest
 
 from eap.ids import InterfaceUri
 from eap.net import tcpport
-from eap.net.connections import CloseReason, ListenerLimits
 from eap.net.ipsocket import open_tcp_listener
+from eap.net.limits import CloseReason, ListenerLimits
 from eap.net.loopback import LoopbackLines
 from eap.net.tcp import TcpReceiver
 from eap.net.tcpport import TcpPort

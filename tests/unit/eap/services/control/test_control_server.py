@@ -12,7 +12,7 @@ import pytest
 from eap.control.protocol import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.errors import ControlError, TornReadError
 from eap.ids import InterfaceUri, NetId
-from eap.net.connections import Activity, CloseReason, ListenerLimits
+from eap.net.limits import Activity, CloseReason, ListenerLimits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.services.control import control_server

@@ -12,8 +12,8 @@ import msgspec
 import pytest
 
 from eap.ids import InterfaceUri, NetId
-from eap.net.connections import ListenerStats
 from eap.net.image_file import create_image
+from eap.net.limits import ListenerStats
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec
 from eap.pd.words import StationWord

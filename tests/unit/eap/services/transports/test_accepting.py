@@ -11,7 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.net.connections import CloseReason, ListenerLimits
+from eap.net.limits import CloseReason, ListenerLimits
 from eap.services.transports import accepting
 from eap.services.transports.accepting import (
     Listeners,

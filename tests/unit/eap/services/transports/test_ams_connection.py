@@ -16,7 +16,7 @@ import pytest
 
 from eap.codec.ams import AmsAnswer, AmsHeader, response_to
 from eap.ids import NetId
-from eap.net.connections import CloseReason
+from eap.net.limits import CloseReason
 from eap.net.tcp import set_stream_options
 from eap.runtime.drop_counters import DropReason
 from eap.services.transports import ams_connection

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from eap.net.connections import ListenerLimits
+from eap.net.limits import ListenerLimits
 from eap.runtime.drop_counters import DropReason
 from eap.services.transports import accepting
 from eap.services.transports import ams_tcp as ams_door

@@ -11,7 +11,7 @@ from eap.ams.routes import Route
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsAnswer
 from eap.ids import Endpoint, NetId
-from eap.net.connections import OWN_HOST
+from eap.net.limits import OWN_HOST
 from eap.runtime.drop_counters import DropReason
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import mailbox_stream

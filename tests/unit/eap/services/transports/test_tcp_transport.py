@@ -11,8 +11,8 @@ import pytest
 
 from eap.ams.transport_table import Transport
 from eap.codec.ethercat import EtherCatHeader
-from eap.net import connections
-from eap.net.connections import OWN_HOST, Activity, ListenerLimits
+from eap.net import limits
+from eap.net.limits import OWN_HOST, Activity, ListenerLimits
 from eap.runtime.drop_counters import DropReason
 from eap.runtime.handover import PortName, receive_connection
 from eap.services.gateway.gateway_transport import GatewayTransport
@@ -146,7 +146,7 @@ def test_a_fault_ends_one_connection_only(monkeypatch, caplog):
 
 def test_connection_with_a_frame_goes_before_silent_ones(monkeypatch):
     monkeypatch.setattr(tcp_door, "LIMITS", ListenerLimits(total=2, reserved=0))
-    monkeypatch.setattr(connections, "FRESH_NS", 0)
+    monkeypatch.setattr(limits, "FRESH_NS", 0)
     monkeypatch.setattr(accepting, "host_of", lambda peer, own: "10.0.0.1")
     question = aoe.frame(aoe.packet(TARGET, 4, b""))
 

@@ -1,7 +1,8 @@
-"""Connection policy of all listeners of a process: admission, eviction and time-outs.
+"""Limits of peers: connections of all listeners of a process, and rates of what peers cause.
 
 A core without I/O.  A driver registers each listener, asks for admission of each connection that it
-accepted, and closes what the policy names.
+accepted, and closes what the policy names.  Requests without a connection, log lines and audit
+lines have a rate for each source and for all of them together.
 
 Rule 1: a listener has a fixed number of places.  Some are reserved for programs of this host, and
 one other host has at most its share.
@@ -21,7 +22,7 @@ Rule 4: a peer that leaves a frame unfinished, or takes no answers, is overdue a
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterable
 from enum import IntEnum, StrEnum
 from ipaddress import IPv4Address
@@ -282,3 +283,83 @@ def _is_in_use(connection: Connection, now_ns: int) -> bool:
 def host_of(peer: str, own: str) -> str:
     """Return the host of a peer with address *peer* that reached *own*, an address of ours."""
     return OWN_HOST if peer == own or IPv4Address(peer).is_loopback else peer
+
+
+class RateLimiter:
+    """Token bucket: *burst* at once, refilled with *per_s* a second."""
+
+    def __init__(self, burst: int, per_s: float, now_s: float) -> None:
+        self._burst = burst
+        self._per_s = per_s
+        self._left = float(burst)
+        self._at_s = now_s
+
+    def take(self, now_s: float) -> bool:
+        """Take one token; return whether there was one."""
+        passed_s = max(0.0, now_s - self._at_s)
+        self._at_s = now_s
+        self._left = min(self._burst, self._left + passed_s * self._per_s)
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class Rate(NamedTuple):
+    """Rate limit: *burst* at once, and *per_s* a second in the long run."""
+
+    burst: int
+    per_s: float
+
+
+class SourceRates(NamedTuple):
+    """Rates of a :class:`SourceRateLimiter`."""
+
+    source: Rate
+    """Limit of each source."""
+    known: Rate
+    """Limit of all sources together that are known."""
+    new: Rate
+    """Limit of all new sources together: datagrams can come from any number of addresses."""
+    local: Rate
+    """Limit of this host, which other sources do not use up."""
+
+
+class SourceRateLimiter:
+    """Rate limits by source address, and for all sources together.
+
+    A source that uses up its own rate, or the common rate of known sources, leaves the rates of
+    new sources and of this host as they are.
+
+    Args:
+        rates: The limits.
+        max_sources: Number of known sources; the one silent for longest is forgotten.
+        now_s: Current time, in seconds.
+    """
+
+    def __init__(self, rates: SourceRates, max_sources: int, now_s: float) -> None:
+        self._rate = rates.source
+        self._max_sources = max_sources
+        self._known = RateLimiter(*rates.known, now_s)
+        self._new = RateLimiter(*rates.new, now_s)
+        self._local = RateLimiter(*rates.local, now_s)
+        self._sources: OrderedDict[str, RateLimiter] = OrderedDict()
+
+    def take_local(self, now_s: float) -> bool:
+        """Take a token of this host; return whether there was one."""
+        return self._local.take(now_s)
+
+    def take(self, source: str, now_s: float) -> bool:
+        """Take a token for *source*; return whether its own limit and the common one allow it."""
+        own = self._sources.get(source)
+        if own is not None:
+            # In order of use, so that the first entry is the one silent for longest.
+            self._sources.move_to_end(source)
+            return own.take(now_s) and self._known.take(now_s)
+        # Before an entry is made: a flood from invented addresses must not evict known sources.
+        if not self._new.take(now_s):
+            return False
+        if len(self._sources) >= self._max_sources:
+            self._sources.popitem(last=False)
+        own = self._sources[source] = RateLimiter(*self._rate, now_s)
+        return own.take(now_s)

@@ -1,4 +1,4 @@
-"""Rate limits for the actions of peers: requests, log lines and audit lines.
+"""Log handler with limits for the lines that peers can cause.
 
 A log line that a peer can cause is written with ``extra=caused_by(cause, source)``.  The handler
 writes the first line of a cause at once, counts those that follow, and writes one line with their
@@ -13,88 +13,9 @@ import logging
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from time import monotonic
-from typing import Any, NamedTuple, TextIO
+from typing import Any, TextIO
 
-
-class RateLimiter:
-    """Token bucket: *burst* at once, refilled with *per_s* a second."""
-
-    def __init__(self, burst: int, per_s: float, now_s: float) -> None:
-        self._burst = burst
-        self._per_s = per_s
-        self._left = float(burst)
-        self._at_s = now_s
-
-    def take(self, now_s: float) -> bool:
-        """Take one token; return whether there was one."""
-        passed_s = max(0.0, now_s - self._at_s)
-        self._at_s = now_s
-        self._left = min(self._burst, self._left + passed_s * self._per_s)
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
-
-
-class Rate(NamedTuple):
-    """Rate limit: *burst* at once, and *per_s* a second in the long run."""
-
-    burst: int
-    per_s: float
-
-
-class SourceRates(NamedTuple):
-    """Rates of a :class:`SourceRateLimiter`."""
-
-    source: Rate
-    """Limit of each source."""
-    known: Rate
-    """Limit of all sources together that are known."""
-    new: Rate
-    """Limit of all new sources together: datagrams can come from any number of addresses."""
-    local: Rate
-    """Limit of this host, which other sources do not use up."""
-
-
-class SourceRateLimiter:
-    """Rate limits by source address, and for all sources together.
-
-    A source that uses up its own rate, or the common rate of known sources, leaves the rates of
-    new sources and of this host as they are.
-
-    Args:
-        rates: The limits.
-        max_sources: Number of known sources; the one silent for longest is forgotten.
-        now_s: Current time, in seconds.
-    """
-
-    def __init__(self, rates: SourceRates, max_sources: int, now_s: float) -> None:
-        self._rate = rates.source
-        self._max_sources = max_sources
-        self._known = RateLimiter(*rates.known, now_s)
-        self._new = RateLimiter(*rates.new, now_s)
-        self._local = RateLimiter(*rates.local, now_s)
-        self._sources: OrderedDict[str, RateLimiter] = OrderedDict()
-
-    def take_local(self, now_s: float) -> bool:
-        """Take a token of this host; return whether there was one."""
-        return self._local.take(now_s)
-
-    def take(self, source: str, now_s: float) -> bool:
-        """Take a token for *source*; return whether its own limit and the common one allow it."""
-        own = self._sources.get(source)
-        if own is not None:
-            # In order of use, so that the first entry is the one silent for longest.
-            self._sources.move_to_end(source)
-            return own.take(now_s) and self._known.take(now_s)
-        # Before an entry is made: a flood from invented addresses must not evict known sources.
-        if not self._new.take(now_s):
-            return False
-        if len(self._sources) >= self._max_sources:
-            self._sources.popitem(last=False)
-        own = self._sources[source] = RateLimiter(*self._rate, now_s)
-        return own.take(now_s)
-
+from eap.net.limits import Rate, SourceRateLimiter, SourceRates
 
 PERIOD_S = 60.0
 """Time for which lines of one cause are counted before their number is written."""

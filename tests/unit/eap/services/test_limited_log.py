@@ -1,4 +1,4 @@
-"""Rate limits, and the log handler that uses them."""
+"""Log handler with limits."""
 
 from __future__ import annotations
 
@@ -9,44 +9,8 @@ from contextlib import suppress
 
 import pytest
 
-from eap.services import rate_limits
-from eap.services.rate_limits import (
-    MAX_CAUSES,
-    PERIOD_S,
-    RATES,
-    LimitedLogHandler,
-    Rate,
-    RateLimiter,
-    SourceRateLimiter,
-    SourceRates,
-    caused_by,
-)
-
-
-def takes(allowance: RateLimiter, now_s: float) -> int:
-    count = 0
-    while allowance.take(now_s):
-        count += 1
-    return count
-
-
-def test_rate_limiter_allows_a_burst_and_refills() -> None:
-    allowance = RateLimiter(10, 2.0, 100.0)
-    assert takes(allowance, 100.0) == 10
-    assert takes(allowance, 100.4) == 0
-    assert takes(allowance, 102.0) == 4
-    assert takes(allowance, 90.0) == 0, "a clock that goes back gives nothing"
-    assert takes(allowance, 1000.0) == 10
-
-
-def test_source_rate_limiter_forgets_the_source_silent_for_longest() -> None:
-    one, many = Rate(1, 0.0), Rate(100, 0.0)
-    limiter = SourceRateLimiter(SourceRates(one, many, many, one), 2, 0.0)
-    assert [limiter.take(each, 0.0) for each in "aba"] == [True, True, False]
-    assert limiter.take("c", 0.0), "in the place of b"
-    assert [limiter.take(each, 0.0) for each in "ac"] == [False, False]
-    assert limiter.take("b", 0.0), "which is new again"
-    assert [limiter.take_local(0.0) for _ in range(2)] == [True, False]
+from eap.services import limited_log
+from eap.services.limited_log import MAX_CAUSES, PERIOD_S, RATES, LimitedLogHandler, caused_by
 
 
 class Log:
@@ -122,7 +86,7 @@ def test_log_many_sources_are_limited_together() -> None:
 def test_log_causes_are_bounded_and_a_forgotten_one_is_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(rate_limits, "MAX_CAUSES", 2)
+    monkeypatch.setattr(limited_log, "MAX_CAUSES", 2)
     log = Log()
     for cause in "abbc":
         log.write(cause, cause)
@@ -141,7 +105,7 @@ def test_log_end_of_the_process_writes_what_was_counted() -> None:
 
 
 def test_log_serve_writes_what_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rate_limits, "_FLUSH_S", 0.001)
+    monkeypatch.setattr(limited_log, "_FLUSH_S", 0.001)
     log = Log()
     log.write("a", "a")
     log.write("a", "a")
