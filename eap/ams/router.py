@@ -16,7 +16,7 @@ from eap.ams.hop_prober import MISSES, HopProber
 from eap.ams.inflight import RouterLimits
 from eap.ams.reassembly import Reassembly
 from eap.ams.record import Outcome, Record, Stats, Trace
-from eap.ams.report import ConnectionReport, Location, RouteReport, report_route
+from eap.ams.report import ConnectionReport, Location, Obstacle, RouteReport, report_route
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
 from eap.ams.transport_table import Action, Deliver, Reply, Transport, TransportTable
@@ -252,10 +252,14 @@ class Router:
         """Take the oldest trace of what was not simply answered."""
         return self.record.next_event()
 
+    def find_obstacle(self, route: Route) -> Obstacle | None:
+        """Return why nothing can go by *route* now; None if something can."""
+        return self._forwarder.admission.find_obstacle(route)
+
     def report(self, route: Route) -> RouteReport:
         """Return the report of one of the routes."""
         traffic = self.record.routes.get(route.key)
-        obstacle = self._forwarder.admission.find_obstacle(route)
+        obstacle = self.find_obstacle(route)
         name = self._table.next_name(route)
         return report_route(route, obstacle, traffic, self._hop_prober, next_name=name)
 

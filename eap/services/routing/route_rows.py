@@ -130,17 +130,17 @@ def route_findings(routers: Iterable[StationRouter]) -> list[dict[str, Any]]:
     """
     by_cause: dict[tuple[str, str], list[tuple[str, Route]]] = {}
     for router in routers:
-        # One report for each hop: there may be 10,000 routes by one.
+        # No reports here: there may be 10,000 routes, each with a hop of its own.
         hops = {
             each.hop: each
             for each in router.table
             if each.origin is not Origin.LEARNED and not each.is_client
         }
         for route in hops.values():
-            report = router.report(route)
-            if report.state is RouteState.DOWN:
-                where = f"{report.next_name} ({route.hop.connection})"
-                by_cause.setdefault((where, report.why), []).append((router.name, route))
+            obstacle = router.find_obstacle(route)
+            if obstacle is not None and obstacle.state is RouteState.DOWN:
+                where = f"{router.table.next_name(route)} ({route.hop.connection})"
+                by_cause.setdefault((where, obstacle.why), []).append((router.name, route))
     return [
         {
             "severity": "warning",

@@ -25,7 +25,7 @@ from eap.ams.access import AccessList, AuditEntry, host_of
 from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import RouterLimits
 from eap.ams.record import Outcome, Record, Stats, Trace, reason_of
-from eap.ams.report import ConnectionReport, Location, RouteReport
+from eap.ams.report import ConnectionReport, Location, Obstacle, RouteReport
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
@@ -226,6 +226,10 @@ class StationRouter:
     def record(self) -> Record:
         """Traffic by connection and hop, and the latest traces."""
         return self._router.record
+
+    def find_obstacle(self, route: Route) -> Obstacle | None:
+        """Return why nothing can go by *route* now; None if something can."""
+        return self._router.find_obstacle(route)
 
     def report(self, route: Route) -> RouteReport:
         """Return the state and the traffic of one of the routes."""
