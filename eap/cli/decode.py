@@ -68,12 +68,14 @@ def _frames(source: str) -> Iterator[DecodedFrame]:
 
 def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
     from eap.errors import CodecError
-    from eap.ops.decode import decode_frame, iter_capture
+    from eap.ops.decode import CycleOrders, decode_frame, iter_capture
 
+    orders = CycleOrders()
     try:
         for captured in iter_capture(Path(name)):
             frame = decode_frame(captured.data)
             frame.packet, frame.time = captured.number, captured.at_ns / 1e9
+            orders.enter(frame)
             yield _with_origin(frame, captured.packet)
     except (OSError, CodecError) as exc:
         if isinstance(exc, OSError) and exc.errno in {errno.ENOENT, errno.ENAMETOOLONG}:
@@ -131,8 +133,15 @@ def _headline(frame: DecodedFrame) -> str:
     name = _NAMES.get(frame.type, "undocumented")
     parts.append(f"type {frame.type} ({name}), {frame.length} bytes")
     if frame.publisher:
-        parts.append(f"publisher {frame.publisher}, cycle {frame.cycle}")
+        parts.append(f"publisher {frame.publisher}, cycle {_cycle(frame)}")
     return "  ".join(parts)
+
+
+def _cycle(frame: DecodedFrame) -> str:
+    cycle = frame.cycle or 0
+    if not frame.cycle_order:
+        return str(cycle)
+    return f"{cycle} (byte-swapped: {int.from_bytes(cycle.to_bytes(2, 'little'))})"
 
 
 def _parts(frame: DecodedFrame) -> Iterator[str]:

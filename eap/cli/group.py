@@ -170,6 +170,7 @@ _COMMANDS = {
     "bus": ("bus:bus", "Scan, diagnose and access the slaves of a bus."),
     "check": ("plant:check", "Check a plant file and report all errors."),
     "decode": ("decode:decode", "Decode a frame, or the frames of a capture."),
+    "discover": ("discover:discover", "Find the process data on a network, and who takes it."),
     "gateway": ("gateway:gateway", "Start, stop and show the mailbox gateways of a station."),
     "gw": ("gateway:gw", "Access a master and its slaves through any mailbox gateway."),
     "new": ("plant:new", "Write a plant file to start from."),

@@ -6,6 +6,7 @@ Layout from the public dissector of Wireshark and two open receivers; names foll
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.wire import Buffer, WireStruct, net_id, u8, u16
@@ -100,6 +101,67 @@ def iter_pds(data: Buffer) -> Iterator[tuple[PdHeader, memoryview]]:
         yield pd, payload
         # The next PD follows without alignment, also behind an odd length.
         offset += pd.length
+
+
+class FollowedFrame(NamedTuple):
+    """A frame of process data whose PDs were followed by their own lengths.
+
+    *length* is that of the EtherCAT header, *needed* what its PDs take.  Each PD comes with the
+    view of its data that is there: a frame that is cut ends with a short view, or before its last
+    PD.
+    """
+
+    header: PdFrameHeader
+    length: int
+    needed: int
+    pds: list[tuple[PdHeader, memoryview]]
+    is_cut: bool
+
+    @property
+    def has_wrong_length(self) -> bool:
+        """True if the PDs are all there, but not where the EtherCAT header says."""
+        return not self.is_cut and self.needed != self.length
+
+
+def follow_pds(data: Buffer) -> FollowedFrame:
+    """Return the PDs of a frame, whatever its EtherCAT header's Length says.
+
+    For tools that watch a network: some senders write a wrong Length (4 always), and a capture may
+    hold the begin of a frame only.  Bytes behind the last PD count as padding where Length covers
+    them.
+
+    Raises:
+        TruncatedError: the frame ends before its PD frame header does.
+        MalformedError: the frame is of another type, or a PD reaches past Length and past its end.
+    """
+    ethercat = EtherCatHeader.decode(data)
+    if ethercat.type != FrameType.PROCESS_DATA:
+        raise MalformedError(f"frame type {ethercat.type}, expected 4", layout="EtherCatHeader")
+    header = PdFrameHeader.decode(data, PD_FRAME_START)
+    view = memoryview(data)
+    size, offset = len(view), FIRST_PD
+    pds = []
+    for _ in range(header.count):
+        # Checked first: a count of 65535 must not run on in a short frame.
+        if offset + PdHeader.SIZE > size:
+            offset += PdHeader.SIZE
+            break
+        pd = PdHeader.decode(view, offset)
+        start = offset + PdHeader.SIZE
+        offset = start + pd.length
+        pds.append((pd, view[start : min(offset, size)]))
+    is_cut = offset > size
+    announced = PD_FRAME_START + ethercat.length
+    if is_cut and announced <= size:
+        raise MalformedError(
+            f"{header.count} PDs reach past the {size} bytes of the frame",
+            layout="PdFrameHeader",
+            offset=PD_FRAME_START,
+        )
+    needed = offset - PD_FRAME_START
+    if not is_cut and needed < ethercat.length and announced <= size:
+        needed = ethercat.length  # what later versions may add behind the last PD
+    return FollowedFrame(header, ethercat.length, needed, pds, is_cut)
 
 
 def encode_frame(header: PdFrameHeader, pds: list[tuple[PdHeader, bytes]]) -> bytes:

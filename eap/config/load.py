@@ -297,6 +297,7 @@ def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
         tcp=port.tcp,
         wake=port.wake,
         eap_sm=port.eap_sm,
+        length=port.length,
         profile=port.profile,
         ams=port.ams,
     )

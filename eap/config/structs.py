@@ -16,6 +16,7 @@ from eap.ids import NetId
 from eap.od.slave_config import RevisionRule, StateTimeouts, Watchdogs
 from eap.pd.spec import (
     BusTarget,
+    LengthCheck,
     OnChangeSpec,
     PortKind,
     Source,
@@ -174,6 +175,7 @@ class PortSection(Section, frozen=True):
     tcp: bool = False
     wake: Wake = Wake.CYCLE
     eap_sm: bool = False
+    length: LengthCheck = LengthCheck.STRICT
     profile: U16 = 0
     ams: bool = True
     mac: str = ""
@@ -198,6 +200,7 @@ class PortSection(Section, frozen=True):
         "tcp",
         "wake",
         "eap_sm",
+        "length",
         "profile",
         "ams",
         "mac",

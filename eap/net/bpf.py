@@ -16,7 +16,7 @@ from ipaddress import IPv4Address
 from typing import TypeAlias
 
 from eap.codec.arp import ETHERTYPE_ARP
-from eap.codec.ethercat import ETHERTYPE, FrameType
+from eap.codec.ethercat import EAP_PORT, ETHERTYPE, FrameType
 from eap.errors import EnvironmentalError
 
 SO_ATTACH_FILTER = 26
@@ -37,12 +37,17 @@ SERVICES_TYPES = (FrameType.AMS, FrameType.RAW_IO, FrameType.MAILBOX)
 
 _LOAD_WORD, _LOAD_HALF, _LOAD_BYTE, _LOAD_SIZE = 0x20, 0x28, 0x30, 0x80
 _SHIFT_RIGHT, _RETURN = 0x74, 0x06
-_EQUAL, _GREATER, _NOT_LESS = 0x15, 0x25, 0x35
+_EQUAL, _GREATER, _NOT_LESS, _ANY_BIT = 0x15, 0x25, 0x35, 0x45
+# The length of an IPv4 header goes to the index register, and loads behind it add that register.
+_LOAD_HEADER_LENGTH, _LOAD_HALF_BEHIND = 0xB1, 0x48
 # Loads at negative offsets read what the kernel knows of a packet, not its bytes.
 _PACKET_TYPE = 0xFFFFF000 + 4  # SKF_AD_OFF + SKF_AD_PKTTYPE
 _ALL = 0x40000
 _UDP_HEADER = 8
 _ETHERNET_HEADER = 14
+_VLAN, _VLAN_TAG = 0x8100, 4
+_IPV4 = 0x0800
+_FRAGMENT_OFFSET = 0x1FFF
 _ARP_SENDER = _ETHERNET_HEADER + 14
 _ARP_TARGET = _ETHERNET_HEADER + 24
 MAX_ADDRESSES = 1000
@@ -121,6 +126,39 @@ def type1_filter() -> list[Instruction]:
         (_RETURN, 0, 0, _ALL),
         (_RETURN, 0, 0, 0),
     ]
+
+
+def capture_filter() -> list[Instruction]:
+    """Keep EtherCAT frames to anyone, and UDP over IPv4 from or to port 34980, tagged or not.
+
+    Of a datagram in fragments the first one is kept: the others have no port numbers.
+    """
+    program: list[Instruction] = []
+    # The kernel has taken out the tag of a received packet; one that this host sends still has it.
+    for tag in (0, _VLAN_TAG):
+        start = _ETHERNET_HEADER + tag
+        part: list[Instruction] = [
+            (_LOAD_HALF, 0, 0, start - 2),
+            (_EQUAL, 0, 1, ETHERTYPE),
+            (_RETURN, 0, 0, _ALL),
+            (_EQUAL, 0, 10, _IPV4),
+            (_LOAD_BYTE, 0, 0, start + 9),
+            (_EQUAL, 0, 8, socket.IPPROTO_UDP),
+            (_LOAD_HALF, 0, 0, start + 6),
+            (_ANY_BIT, 6, 0, _FRAGMENT_OFFSET),
+            (_LOAD_HEADER_LENGTH, 0, 0, start),
+            (_LOAD_HALF_BEHIND, 0, 0, start),
+            (_EQUAL, 2, 0, EAP_PORT),
+            (_LOAD_HALF_BEHIND, 0, 0, start + 2),
+            (_EQUAL, 0, 1, EAP_PORT),
+            (_RETURN, 0, 0, _ALL),
+            (_RETURN, 0, 0, 0),
+        ]
+        program += part
+        if not tag:
+            # Behind the first part: only a tagged packet goes on.
+            program[-1:] = [(_LOAD_HALF, 0, 0, 12), (_EQUAL, 1, 0, _VLAN), (_RETURN, 0, 0, 0)]
+    return program
 
 
 def arp_filter(addresses: Iterable[IPv4Address]) -> list[Instruction]:

@@ -96,6 +96,33 @@ def open_arp(interface: str) -> socket.socket:
     return _open(interface, bpf.arp_filter(()))
 
 
+def open_capture(interface: str, program: Sequence[bpf.Instruction]) -> socket.socket:
+    """Open *interface* to see what *program* picks out of all that it receives and sends.
+
+    The loopback interface shows each packet once, as received.
+
+    Raises:
+        EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
+    """
+    check_interface(interface)
+    sock = _closed_socket(interface)
+    try:
+        bpf.attach(sock, program)
+        sock.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
+        prepare_receiver(sock)
+        sock.bind((interface, 0))  # receives nothing yet: tells the kind of the interface
+        is_loopback = sock.getsockname()[3] == ARPHRD_LOOPBACK
+        _bind_ethernet(sock, interface, _ETH_P_ALL, ignore_outgoing=is_loopback)
+        # Frames between others are seen too: at a mirror port, and groups that nobody here joined.
+        index = socket.if_nametoindex(interface)
+        membership = struct.pack("iHH8s", index, PACKET_MR_PROMISC, 0, b"")
+        sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
+    except (OSError, EnvironmentalError) as error:
+        sock.close()
+        raise _explain(interface, error) from None
+    return sock
+
+
 def _open(interface: str, program: Sequence[bpf.Instruction]) -> socket.socket:
     sock = _closed_socket(interface)
     try:
@@ -119,7 +146,13 @@ def _closed_socket(interface: str) -> socket.socket:
 
 def _join(sock: socket.socket, interface: str, protocol: int) -> None:
     # Without it the socket also receives the frames that this host sends.
-    sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
+    _bind_ethernet(sock, interface, protocol, ignore_outgoing=True)
+
+
+def _bind_ethernet(
+    sock: socket.socket, interface: str, protocol: int, *, ignore_outgoing: bool
+) -> None:
+    sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, int(ignore_outgoing))
     sock.bind((interface, protocol))
     if sock.getsockname()[3] not in (_ARPHRD_ETHER, ARPHRD_LOOPBACK):
         raise EnvironmentalError(f"interface {interface} is not an Ethernet interface")

@@ -19,10 +19,11 @@ from devicebus.wire.datagram import iter_datagrams
 from eap.codec import ams, mailbox
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE, EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxError, MailboxErrorReply, MailboxHeader, MailboxType
-from eap.codec.pd import PD_FRAME_START, PdFrameHeader, iter_pds
+from eap.codec.pd import PD_FRAME_START, PdFrameHeader, PdHeader, follow_pds, iter_pds
 from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
 from eap.ids import MacAddr
+from eap.pd.rhythm import CycleOrder, CycleWatch
 
 
 class DecodedPd(Struct, frozen=True):
@@ -88,12 +89,17 @@ class DecodedFrame(Struct, kw_only=True):
     Each type has fields of its own: ``publisher``, ``cycle`` and ``pds`` type 4, ``datagrams``
     type 1, ``ams`` type 2, ``mailbox`` type 5, raw ``data`` all others.  Bytes are strings of
     hexadecimal digits.  *error* is None if all is well.
+
+    *needed_length* is there if the PDs are whole, but not where *length* says; *cycle_order* is
+    ``swapped`` if earlier frames of the publisher show that it swaps the bytes of its counter.
     """
 
     type: int | None = None
     length: int | None = None
     publisher: str | UnsetType | None = UNSET
     cycle: int | UnsetType | None = UNSET
+    cycle_order: str | UnsetType = UNSET
+    needed_length: int | UnsetType = UNSET
     pds: list[DecodedPd] | UnsetType = UNSET
     datagrams: list[DecodedDatagram] | UnsetType = UNSET
     ams: DecodedAms | UnsetType | None = UNSET
@@ -118,6 +124,8 @@ def decode_frame(data: Buffer) -> DecodedFrame:
         return found
     found.type, found.length = header.type, header.length
     end = EtherCatHeader.SIZE + header.length
+    if header.type == FrameType.PROCESS_DATA and _read_by_pds(data, found):
+        return found
     try:
         _READERS.get(header.type, _read_raw)(memoryview(data)[:end], found)
     except CodecError as exc:
@@ -131,13 +139,35 @@ def decode_frame(data: Buffer) -> DecodedFrame:
     return found
 
 
+def _read_by_pds(data: Buffer, found: DecodedFrame) -> bool:
+    """Read a frame whose Length is wrong by the lengths of its PDs; return False for all others."""
+    try:
+        frame = follow_pds(data)
+    except CodecError:
+        return False
+    if not frame.has_wrong_length:
+        return False
+    found.publisher, found.cycle = str(frame.header.publisher), frame.header.cycle
+    found.pds = [_decoded_pd(pd, content) for pd, content in frame.pds]
+    found.needed_length = frame.needed
+    found.error = (
+        f"EtherCatHeader at offset 0: wrong length {frame.length}: its PDs take {frame.needed} "
+        "bytes; ports with length: lenient take the frame"
+    )
+    return True
+
+
+def _decoded_pd(pd: PdHeader, data: memoryview) -> DecodedPd:
+    return DecodedPd(pd.pd_id, pd.version, pd.length, pd.quality, data.hex())
+
+
 def _read_process_data(frame: memoryview, found: DecodedFrame) -> None:
     found.publisher = found.cycle = None
     found.pds = pds = []
     header = PdFrameHeader.decode(frame, PD_FRAME_START)
     found.publisher, found.cycle = str(header.publisher), header.cycle
     for pd, data in iter_pds(frame):
-        pds.append(DecodedPd(pd.pd_id, pd.version, pd.length, pd.quality, data.hex()))
+        pds.append(_decoded_pd(pd, data))
 
 
 def _read_datagrams(frame: memoryview, found: DecodedFrame) -> None:
@@ -224,6 +254,7 @@ _IPV4 = 0x0800
 _TCP, _UDP = 6, 17
 _SYN = 0x02
 _SEQUENCES = 1 << 32
+_MOST_PUBLISHERS = 4096
 _MOST_WAITING = 64
 """Segments of a TCP stream kept for a missing one before it counts as lost."""
 
@@ -358,6 +389,24 @@ class Stream:
         distance = (sequence - (self._next or 0)) % _SEQUENCES
         # Half of the number space ahead counts as behind.
         return distance - _SEQUENCES if distance >= _SEQUENCES // 2 else distance
+
+
+class CycleOrders:
+    """Order of the bytes of the cycle counters of all publishers in a capture."""
+
+    def __init__(self) -> None:
+        self._watches: dict[str, CycleWatch] = {}
+
+    def enter(self, frame: DecodedFrame) -> None:
+        """Note the counter of *frame*, and mark the frame if its publisher swaps the bytes."""
+        if not frame.publisher or not isinstance(frame.cycle, int):
+            return
+        if frame.publisher not in self._watches and len(self._watches) >= _MOST_PUBLISHERS:
+            self._watches.clear()
+        watch = self._watches.setdefault(frame.publisher, CycleWatch())
+        watch.enter(frame.cycle)
+        if watch.order is CycleOrder.SWAPPED:
+            frame.cycle_order = CycleOrder.SWAPPED.value
 
 
 class CapturedFrame(NamedTuple):

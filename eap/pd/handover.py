@@ -32,8 +32,8 @@ from eap.pd.words import (
     TxWord,
 )
 
-_IN_FRAMES = {"net_id", "eap_sm"}
-"""Fields of a port that only change the content of its frames."""
+_IN_FRAMES = {"net_id", "eap_sm", "length"}
+"""Fields of a port that only concern the content of its frames."""
 _WHOLE = {"bus", "gateway"}
 """Fields that are too much for a line."""
 _OWN_WORDS = {

@@ -216,6 +216,7 @@ def _rx(image: Image, slot: RxSlot, now_ns: int, wall_ns: int | None) -> dict[st
         "reordered": words[first + RxWord.REORDERED],
         "late": words[first + RxWord.LATE],
         "timeouts": words[first + RxWord.TIMEOUTS],
+        "repeated": words[first + RxWord.REPEATED],
         "discarded": _discarded(image, slot.words + RxWord.DISCARDED),
         "quality": quality(image, slot) if received else None,
         "cycle_index": words[first + RxWord.LAST_CYCLE] & 0xFFFF if received else None,

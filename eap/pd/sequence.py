@@ -6,7 +6,10 @@ is exact, and a frame of a hundred PDs costs one tracker, not a hundred.
 Rule 2: an older counter is a reordered frame and not taken, since newer data is here already; what
 was counted as lost because of it is not lost any more.  The third in a row that fills no gap is a
 sender that restarted its counter, and is taken.
-Rule 3: the same counter again counts as duplicated and is taken: some terminals never count.
+Rule 3: the same counter again counts as duplicated and is taken: some terminals never count.  With
+another toggle bit it is a new frame all the same; with the same one, from a sender that was seen to
+toggle, it also counts as repeated.  A toggle bit alone proves nothing: behind a lost frame it is
+that of the frame before, and a sender that toggles over several frames shows each receiver some.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ _DUPLICATED = RxWord.DUPLICATED - TRACKER_START
 _REORDERED = RxWord.REORDERED - TRACKER_START
 _LATE = RxWord.LATE - TRACKER_START
 _TIMEOUTS = RxWord.TIMEOUTS - TRACKER_START
+_REPEATED = RxWord.REPEATED - TRACKER_START
 _LOST = RxWord.LOST - TRACKER_START
 _STATE = RxWord.STATE - TRACKER_START
 _LAST_CYCLE = RxWord.LAST_CYCLE - TRACKER_START
@@ -75,6 +79,9 @@ class SequenceTracker:
         "_sender_cycle_ns",
         "_step",
         "_timing",
+        "_toggle",
+        "_toggle_cycle",
+        "_toggles",
         "_usual_gap",
         "_usual_ns",
         "_words",
@@ -95,6 +102,8 @@ class SequenceTracker:
         # A quarter of the 16 bits: within that time a step of the counter has one meaning only.
         self._wrap_ns = timing.sender_cycle_ns << 14 or 1 << 62
         self._words = words[first_word + TRACKER_START : first_word + RxWord.SIZE]
+        self._toggle = self._toggle_cycle = -1
+        self._toggles = False
         if not self._words[_RECEIVED]:
             self.forget_sender()
 
@@ -146,6 +155,19 @@ class SequenceTracker:
         """Start a tracker of the same history in the block at *first_word*."""
         words[first_word + TRACKER_START : first_word + RxWord.SIZE] = self._words
         return SequenceTracker(words, first_word, self._timing)
+
+    def enter_toggle(self, toggle: int, cycle: int) -> None:
+        """Note the toggle bit of the frame that was just entered with this cycle counter."""
+        if not self.has_taken(cycle):
+            return
+        is_same = toggle == self._toggle
+        if cycle == self._toggle_cycle:
+            if not is_same:
+                self._words[_DUPLICATED] -= 1  # counted by arrived(), which knows the counter only
+            elif self._toggles:
+                self._words[_REPEATED] += 1
+        self._toggles = self._toggles or (self._toggle >= 0 and not is_same)
+        self._toggle, self._toggle_cycle = toggle, cycle
 
     def arrived(self, cycle: int, at_ns: int, own_cycle: int) -> bool:
         """Enter a frame; return whether its data is to be taken.

@@ -406,6 +406,15 @@ class EoeSpec(SpecRecord, frozen=True):
     """Empty connects every slave that has EoE."""
 
 
+class LengthCheck(StrEnum):
+    """Treatment of frames whose EtherCAT header has a wrong Length."""
+
+    STRICT = "strict"
+    """They are dropped."""
+    LENIENT = "lenient"
+    """They are taken if all their PDs are there, and counted."""
+
+
 class PortSpec(SpecRecord, frozen=True):
     """One port of a station."""
 
@@ -425,6 +434,7 @@ class PortSpec(SpecRecord, frozen=True):
     wake: Wake = Wake.CYCLE
     eap_sm: bool = False
     """True if the frames sent carry the device's state in the EAP SM octet."""
+    length: LengthCheck = LengthCheck.STRICT
     profile: int = 0
     """Device profile that the port's dictionary names in 0x1000; 0 is that of modular devices."""
     ams: bool = True

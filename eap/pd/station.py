@@ -23,7 +23,7 @@ from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, StateChannel
 from eap.pd.links import Generators, Links
 from eap.pd.poll import outgoing_polls, requests_at
 from eap.pd.publisher import FrameRow, PollResponder, Publisher
-from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
+from eap.pd.spec import EngineSource, LengthCheck, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
 
@@ -108,7 +108,10 @@ class Station:
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
         own = [(pd, slot) for pd, slot in rows if pd.port == port]
-        return Subscriber(self.image, own, self.cycle_ns, self._requests[port], self._polls)
+        lenient = any(p.name == port and p.length is LengthCheck.LENIENT for p in self.spec.ports)
+        return Subscriber(
+            self.image, own, self.cycle_ns, self._requests[port], self._polls, lenient=lenient
+        )
 
     def connect(self, port: str, channel: FrameChannel) -> None:
         """Send the frames of *port* through *channel*, and drain it.

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from eap.codec.ethercat import EtherCatHeader
-from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
+from eap.codec.pd import CYCLE_OFFSET, EAP_SM_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
 from eap.pd.address import SourceWatch
 from eap.pd.image import Image
@@ -23,15 +23,17 @@ from eap.pd.spec import RxPdSpec
 from eap.pd.subscription import (
     AcceptedPd,
     DroppedPd,
+    FrameHead,
     FramePlan,
     RxSubscription,
     SubstituteValue,
     walk,
+    walk_by_pds,
 )
 from eap.pd.words import PD_DROP_INDEX, PdDropReason, RxState, RxWord, StationWord
 
-_KEY = struct.Struct("<10s4x6s").unpack_from
-"""EtherCAT header, publisher and count, and the header of the first PD: the key of a layout.
+_KEY = struct.Struct("<10s3x7s").unpack_from
+"""EtherCAT header, publisher and count; EAP SM and the header of the first PD: key of a layout.
 
 With one PD in the frame nothing else has to be compared.
 """
@@ -60,6 +62,7 @@ class Subscriber:
         own_cycle_ns: The station's device cycle.
         requests: Table for the requests of others.
         polls: The station's own polls, by the TxPD that sends them.
+        lenient: Whether frames with a wrong Length are taken.
     """
 
     def __init__(
@@ -69,8 +72,12 @@ class Subscriber:
         own_cycle_ns: int,
         requests: PollRequests,
         polls: Mapping[str, OutgoingPoll] = MappingProxyType({}),
+        *,
+        lenient: bool = False,
     ) -> None:
-        self._table = SubscriptionTable(image, subscriptions, own_cycle_ns, requests, polls)
+        self._table = SubscriptionTable(
+            image, subscriptions, own_cycle_ns, requests, polls, lenient=lenient
+        )
         self._open_from_ns = _NEVER
         self._closed_reason = PdDropReason.SUPPRESSED
         self._next_timeout_ns = _NEVER
@@ -142,6 +149,7 @@ class Subscriber:
             table.refuse(plan, at_ns)
             table.enter_answers(plan, cycle, at_ns)
             table.note_requests(plan, cycle, data, origin)
+            plan.enter_toggle(cycle)
         if outside:
             words[_SEQUENCE] += 1
 
@@ -208,8 +216,11 @@ class SubscriptionTable:
         own_cycle_ns: int,
         requests: PollRequests,
         polls: Mapping[str, OutgoingPoll],
+        *,
+        lenient: bool = False,
     ) -> None:
         self._requests = requests
+        self._lenient = lenient
         self.memory = image.memory
         self.words = image.words
         self.subscriptions = [
@@ -237,6 +248,8 @@ class SubscriptionTable:
         # tables.
         for plans in list(before._plans.values()):
             for plan in list(plans):
+                if plan.has_wrong_length and not self._lenient:
+                    continue  # learning it would count a dropped frame that never came
                 self.learn(plan.example(), plan.end, plan.watch.source or b"", 0)
 
     def release(self) -> None:
@@ -262,9 +275,13 @@ class SubscriptionTable:
     def learn(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
         """Make the plan of a layout not seen before from *source*, None without PDs."""
         pds = walk(data, size)
+        is_wrong = isinstance(pds, PdDropReason)
         if isinstance(pds, PdDropReason):
-            self.discard(pds, 1)
-            return None
+            reason = pds
+            pds = walk_by_pds(data, size) if self._lenient else []
+            if not pds:
+                self.discard(reason, 1)
+                return None
         if not pds:
             return None  # nothing to take: what is kept is bounded by the PDs of all layouts
         publisher = bytes(data[PD_FRAME_START : PD_FRAME_START + 6])
@@ -277,11 +294,17 @@ class SubscriptionTable:
             else:
                 chosen += [(subscription, header, offset) for subscription in match]
         taking = [subscription for subscription, _, _ in chosen]
+        head = FrameHead(publisher, EtherCatHeader.decode(data).length, data[EAP_SM_OFFSET])
+        end = PD_FRAME_START + head.length
+        if is_wrong:
+            end = pds[-1][1] + PdHeader.SIZE + pds[-1][0].length
+            refused.append(_wrong_length(taking))
         if self._part_trackers(set(taking)):
             # Plans hold trackers, so those made before the split are no longer valid.
             self._forget_plans()
         plan = FramePlan(
-            PD_FRAME_START + EtherCatHeader.decode(data).length,
+            head,
+            end,
             [(bytes(data[offset : offset + 6]), header.length) for header, offset in pds],
             [_take(subscription, header, offset) for subscription, header, offset in chosen],
             refused,
@@ -291,7 +314,6 @@ class SubscriptionTable:
             ],
             answers=[(s.tracker, s.answer) for s in taking if s.answer is not None],
             any_publisher={s.tracker for s in taking if not s.slot.publisher},
-            publisher=publisher,
         )
         if self._pds_planned > _PDS_PLANNED:
             self._forget_plans()
@@ -452,6 +474,14 @@ def _take(subscription: RxSubscription, header: PdHeader, offset: int) -> Accept
     alternate = subscription.alternates.get((header.version, header.length))
     size = PdHeader.SIZE + slot.size
     return AcceptedPd(subscription.tracker, slot.words, offset, slot.offset, size, alternate)
+
+
+def _wrong_length(taking: Iterable[RxSubscription]) -> DroppedPd:
+    """Count a frame with a wrong Length, and the PDs that are taken from it."""
+    index = PD_DROP_INDEX[PdDropReason.WRONG_LENGTH]
+    words = dict.fromkeys(each.slot.words for each in taking)
+    counters = [StationWord.DISCARDED + index, *(each + RxWord.DISCARDED + index for each in words)]
+    return DroppedPd(tuple(counters))
 
 
 def _drop_all(reasons: list[tuple[RxSubscription, PdDropReason]]) -> DroppedPd:

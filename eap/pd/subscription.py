@@ -12,13 +12,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 from eap.codec import datatypes
 from eap.codec.ethercat import EtherCatHeader, FrameType
-from eap.codec.pd import FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
-from eap.errors import TruncatedError
+from eap.codec.pd import FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader, follow_pds
+from eap.errors import CodecError, TruncatedError
 from eap.ids import NetId
 from eap.pd.address import SourceWatch, source_octets
 from eap.pd.copyplan import CopyPlan
 from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxSlot
+from eap.pd.link import TOGGLE_BIT
 from eap.pd.poll import OutgoingPoll, PollAnswer
 from eap.pd.sequence import SequenceTracker
 from eap.pd.spec import RxPdSpec, Substitute
@@ -149,17 +150,27 @@ class DroppedPd(NamedTuple):
     """First words of the RxPDs whose publisher has another address."""
 
 
+class FrameHead(NamedTuple):
+    """Fields of a frame's headers that its layout does not follow from."""
+
+    publisher: bytes
+    length: int
+    """Of the EtherCAT header."""
+    eap_sm: int = 0
+
+
 class FramePlan:
     """The plan of one layout.
 
     Attributes:
         headers: Reads all PD headers but their quality from a frame, at offset FIRST_PD.
         expected: Result of *headers* for which this plan applies.
-        end: Bytes of the frame by its Length.
+        end: Bytes of the frame by its Length; where that is wrong, by its PDs.
+        head: Fields of its headers.
         is_single: Whether there is one PD in it.
         parts: For each tracker that the frame concerns, the copies to make if it agrees.
         accepted_words: First words of the RxPDs that take one of its PDs.
-        has_more: Whether there is anything of the next four.
+        has_more: Whether there is anything of the next four, or an EAP SM byte.
         alternates: PDs that are laid out otherwise: tracker, offset in the frame, copy to make.
         refused: The PDs that no subscription accepts.
         requests: RxPDs that request PDs of this station, with their trackers.
@@ -177,6 +188,7 @@ class FramePlan:
         "end",
         "expected",
         "has_more",
+        "head",
         "headers",
         "is_single",
         "parts",
@@ -188,6 +200,7 @@ class FramePlan:
 
     def __init__(
         self,
+        head: FrameHead,
         end: int,
         pds: Iterable[tuple[bytes, int]],
         taken: Iterable[AcceptedPd],
@@ -197,7 +210,6 @@ class FramePlan:
         requests: Iterable[tuple[SequenceTracker, str]] = (),
         answers: Iterable[tuple[SequenceTracker, PollAnswer]] = (),
         any_publisher: Iterable[SequenceTracker] = (),
-        publisher: bytes = b"",
     ) -> None:
         """Build the plan from (header without quality, data length) of each PD and their fate."""
         pds = tuple(pds)
@@ -217,10 +229,23 @@ class FramePlan:
         self.refused = tuple(refused)
         self.requests = tuple(requests)
         self.answers = tuple(answers)
-        self.has_more = bool(self.alternates or self.refused or self.requests or self.answers)
+        self.head = head
+        more = (self.alternates, self.refused, self.requests, self.answers, head.eap_sm)
+        self.has_more = any(more)
         self.any_publisher = tuple(any_publisher)
-        self.publisher = int.from_bytes(publisher)
+        self.publisher = int.from_bytes(head.publisher)
         self.watch = watch
+
+    @property
+    def has_wrong_length(self) -> bool:
+        """True if the Length of the EtherCAT header does not cover the PDs, or too much."""
+        return self.end != PD_FRAME_START + self.head.length
+
+    def enter_toggle(self, cycle: int) -> None:
+        """Note the toggle bit of a frame of *cycle*; senders that leave EAP SM 0 have none."""
+        if self.head.eap_sm:
+            for tracker, _ in self.parts:
+                tracker.enter_toggle(self.head.eap_sm & TOGGLE_BIT, cycle)
 
     def copy_alternates(self, data: memoryview, cycle: int, memory: memoryview) -> None:
         """Copy PDs with another layout from the frame *data* of *cycle*, if they were accepted."""
@@ -230,9 +255,10 @@ class FramePlan:
 
     def example(self) -> memoryview:
         """Return a frame of this layout, without data."""
-        frame = bytearray(EtherCatHeader(self.end - PD_FRAME_START).encode())
-        publisher = NetId(self.publisher.to_bytes(6))
-        frame += PdFrameHeader(publisher, len(self.expected), 0).encode()
+        publisher, length, eap_sm = self.head
+        frame = bytearray(EtherCatHeader(length).encode())
+        count = len(self.expected)
+        frame += PdFrameHeader(NetId(publisher), count, 0, eap_sm=eap_sm).encode()
         for header in self.expected:
             frame += header + bytes(2)
             frame += bytes(PdHeader.decode(header + bytes(2)).length)
@@ -292,3 +318,20 @@ def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | PdDropReas
         return PdDropReason.TRUNCATED
     # Bytes behind the last PD and behind Length are ignored: padding, and what later versions add.
     return pds if offset <= end <= size else PdDropReason.TRUNCATED
+
+
+def walk_by_pds(data: memoryview, size: int) -> list[tuple[PdHeader, int]]:
+    """Return what :func:`walk` returns for a frame whose Length is wrong; nothing if PDs are cut.
+
+    Some senders write a Length that has nothing to do with the frame (4 always).
+    """
+    try:
+        frame = follow_pds(data[:size])
+    except CodecError:
+        return []
+    pds = []
+    offset = FIRST_PD
+    for header, _ in frame.pds:
+        pds.append((header, offset))
+        offset += PdHeader.SIZE + header.length
+    return [] if frame.is_cut else pds

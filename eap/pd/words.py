@@ -32,6 +32,8 @@ class PdDropReason(StrEnum):
     """The data was taken, but its frame has no address to answer."""
     WRONG_SOURCE = auto()
     """The frame came from another address than the publisher's."""
+    WRONG_LENGTH = auto()
+    """The data was taken, but the Length of the frame is not that of its PDs."""
 
 
 class Reason(StrEnum):
@@ -166,23 +168,25 @@ class RxWord(IntEnum):
     LATE = RECEIVED + 3
     LOST = RECEIVED + 4
     TIMEOUTS = RECEIVED + 5
-    STATE = RECEIVED + 6
+    REPEATED = RECEIVED + 6
+    """Duplicated PDs of a sender that toggles, with the toggle bit of the one before."""
+    STATE = RECEIVED + 7
     """RxState as a number."""
-    LAST_CYCLE = RECEIVED + 7
+    LAST_CYCLE = RECEIVED + 8
     """Cycle counter of the last frame taken (CycleIndex), not wrapped; -1 before the first."""
-    ARRIVED_AT_NS = RECEIVED + 8
-    ARRIVED_IN_CYCLE = RECEIVED + 9
+    ARRIVED_AT_NS = RECEIVED + 9
+    ARRIVED_IN_CYCLE = RECEIVED + 10
     """Own cycle whose input image it refreshed; the quality counts from it."""
-    BEHIND = RECEIVED + 10
+    BEHIND = RECEIVED + 11
     """Frames in a row that came with an older counter and filled no hole."""
-    HOLES = RECEIVED + 11
+    HOLES = RECEIVED + 12
     """Bit n: of the PDs counted as lost, the one n + 1 steps before HOLES_BELOW may still come."""
-    HOLES_BELOW = RECEIVED + 12
-    SENDER = RECEIVED + 13
+    HOLES_BELOW = RECEIVED + 13
+    SENDER = RECEIVED + 14
     """With any publisher: the NetID that the tracker follows, as a number."""
-    JITTER_MAX_US = RECEIVED + 14
+    JITTER_MAX_US = RECEIVED + 15
     """This and JITTER: deviation from the sender's rhythm; of answers the time they took."""
-    JITTER = RECEIVED + 15
+    JITTER = RECEIVED + 16
     SIZE = JITTER + HISTOGRAM_BINS
 
 

@@ -99,7 +99,14 @@ def give(
 class Receiver:
     """A subscriber in Op and the image that it fills."""
 
-    def __init__(self, *pds: RxPdSpec, variables: Sequence[VariableSpec], cycle_us: int = 1000):
+    def __init__(
+        self,
+        *pds: RxPdSpec,
+        variables: Sequence[VariableSpec],
+        cycle_us: int = 1000,
+        lenient: bool = False,
+    ):
+        self.lenient = lenient
         self.spec = station(cycle_us=cycle_us, variables=tuple(variables), subscriptions=tuple(pds))
         self.image = image_of(self.spec)
         self.start(0)
@@ -108,7 +115,11 @@ class Receiver:
         """Start as an engine does, also once more on the same image."""
         pairs = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
         self.subscriber = Subscriber(
-            self.image, list(pairs), self.spec.cycle_us * 1000, PollRequests(())
+            self.image,
+            list(pairs),
+            self.spec.cycle_us * 1000,
+            PollRequests(()),
+            lenient=self.lenient,
         )
         self.subscriber.open(now_ns)
 

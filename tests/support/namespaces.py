@@ -44,11 +44,11 @@ class Namespace:
     def socket(self, *kind: int) -> socket.socket:
         """Return a socket of this test that belongs to the namespace."""
         with Path("/proc/self/ns/net").open() as home, Path(f"/run/netns/{self.name}").open() as ns:
-            _enter(ns.fileno())
+            enter_network(ns.fileno())
             try:
                 return socket.socket(*kind)
             finally:
-                _enter(home.fileno())
+                enter_network(home.fileno())
 
     def mac(self) -> str:
         """Return the address of ``line0``."""
@@ -118,10 +118,11 @@ def row(count: int) -> Iterator[list[Namespace]]:
 def enter(inside: Namespace) -> None:
     """Take the calling thread into a namespace, for good."""
     with Path(f"/run/netns/{inside.name}").open() as ns:
-        _enter(ns.fileno())
+        enter_network(ns.fileno())
 
 
-def _enter(descriptor: int) -> None:
+def enter_network(descriptor: int) -> None:
+    """Take the calling thread into the network that *descriptor* is open on."""
     if _library.setns(descriptor, _CLONE_NEWNET):
         raise OSError(ctypes.get_errno(), "setns")
 

@@ -13,6 +13,7 @@ from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import (
     REQUESTER,
     CounterSource,
+    LengthCheck,
     LinkSpec,
     OnChangeSpec,
     PortKind,
@@ -209,6 +210,7 @@ def _port(draw: st.DrawFn, port: PortSpec) -> PortSpec:
         tcp=is_udp and draw(st.booleans()),
         wake=draw(st.sampled_from(Wake)),
         eap_sm=draw(st.booleans()),
+        length=draw(st.sampled_from(LengthCheck)),
         profile=draw(st.sampled_from((0, 5002))),
     )
 

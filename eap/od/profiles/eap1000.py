@@ -71,12 +71,14 @@ class EapLive(StrEnum):
     RX_REORDERED = auto()
     RX_LATE = auto()
     RX_TIMEOUTS = auto()
+    RX_REPEATED = auto()
     RX_JITTER_MAX = auto()
     RX_DISCARDED_VERSION = auto()
     RX_DISCARDED_LENGTH = auto()
     RX_DISCARDED_SUPPRESSED = auto()
     RX_DISCARDED_STALE = auto()
     RX_DISCARDED_WRONG_SOURCE = auto()
+    RX_DISCARDED_WRONG_LENGTH = auto()
     STATION_CYCLE = auto()
     STATION_OVERRUNS = auto()
     STATION_RESTARTS = auto()
@@ -90,6 +92,7 @@ class EapLive(StrEnum):
     STATION_DISCARDED_WRONG_TYPE = auto()
     STATION_DISCARDED_TOO_MANY_REQUESTS = auto()
     STATION_DISCARDED_NO_SENDER = auto()
+    STATION_DISCARDED_WRONG_LENGTH = auto()
 
 
 class Derived(StrEnum):
@@ -224,6 +227,7 @@ class PortSub(IntEnum):
     BROADCAST = 8
     WAKE = 9
     EAP_SM = 10
+    LENGTH = 11
 
 
 class AddressMode(IntEnum):
@@ -270,6 +274,13 @@ class Waking(IntEnum):
 
     CYCLE = 0
     ARRIVAL = 1
+
+
+class LengthChecked(IntEnum):
+    """Treatment of frames with a wrong Length."""
+
+    STRICT = 0
+    LENIENT = 1
 
 
 NAME = "STRING(255)"
@@ -522,6 +533,10 @@ RX_DIAGNOSIS = ProfileObject(
              "Had waited since before the start."),
         live(12, "Wrong source", "ULINT", EapLive.RX_DISCARDED_WRONG_SOURCE,
              "Discarded for it: came from another address."),
+        live(13, "Wrong frame length", "ULINT", EapLive.RX_DISCARDED_WRONG_LENGTH,
+             "Taken, though the frame's Length was wrong."),
+        live(14, "Repeated", "ULINT", EapLive.RX_REPEATED,
+             "Came twice, and so said the toggle bit."),
     ),
     "What became of the RxPD of the same number.",
 )  # fmt: skip
@@ -582,7 +597,9 @@ DEVICE = (
            live(12, "Too many requests", "ULINT", EapLive.STATION_DISCARDED_TOO_MANY_REQUESTS,
                  "Requests left without an answer."),
            live(13, "No sender", "ULINT", EapLive.STATION_DISCARDED_NO_SENDER,
-                 "Requests without an address to answer.")),
+                 "Requests without an address to answer."),
+           live(14, "Wrong frame length", "ULINT", EapLive.STATION_DISCARDED_WRONG_LENGTH,
+                 "Frames taken, though their Length was wrong.")),
     single(0xF200, "EAP control", "Requests to the device.",
            ProfileEntry(1, "Requested state", "UINT", RW,
                         "2 PreOp, 4 SafeOp, 8 Op; the status says what came of it.",
@@ -623,6 +640,9 @@ DEVICE = (
                    words=Waking),
            setting(PortSub.EAP_SM, "EAP SM", "BOOL",
                    "Whether the frames it sends carry the device's state.", key="eap_sm"),
+           setting(PortSub.LENGTH, "Length", "USINT",
+                   "Frames whose Length is wrong are 0 dropped, 1 taken.", maximum=1,
+                   key="length", words=LengthChecked),
            section="ports"),
     single(0xF811, "Multicast groups", "Groups to listen to besides the EAP default.",
            config(1, "Group {n}", "STRING(17)", "MAC address on Ethernet, IPv4 on UDP; empty "

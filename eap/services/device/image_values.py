@@ -202,6 +202,7 @@ _OF_RX: dict[str, Callable[[Image, RxSlot], int]] = {
     EapLive.RX_REORDERED: _tracked(RxWord.REORDERED),
     EapLive.RX_LATE: _tracked(RxWord.LATE),
     EapLive.RX_TIMEOUTS: _tracked(RxWord.TIMEOUTS),
+    EapLive.RX_REPEATED: _tracked(RxWord.REPEATED),
     EapLive.RX_JITTER_MAX: _tracked(RxWord.JITTER_MAX_US),
 } | {
     key: _discarded(reason)

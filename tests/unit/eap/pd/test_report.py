@@ -121,6 +121,7 @@ def test_report_of_waiting_subscription_has_nulls():
         "reordered": 0,
         "late": 0,
         "timeouts": 0,
+        "repeated": 0,
         "discarded": {},
         "quality": None,
         "cycle_index": None,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from eap.codec.ethercat import EtherCatHeader
-from eap.codec.pd import PdFrameHeader
+from eap.codec.pd import EAP_SM_OFFSET, PdFrameHeader
 from eap.ids import NetId
 from eap.pd.poll import REQUESTERS_PER_CYCLE, PollRequests
 from eap.pd.report import quality, station_status
@@ -68,6 +68,80 @@ def test_subscriber_counts_dropped_pds_by_reason(frame, reason, per_subscription
         assert r.discarded("r") == ({reason: count} if per_subscription else {})
     assert r.word("r", RxWord.RECEIVED) == 0
     assert r.image.read("x") == 0
+
+
+LENIENT_PDS = [(7, b"ab", 3), (8, b"cd", 0), (9, b"e", 0)]
+
+
+@pytest.mark.parametrize("length", [0, 4, 13, 2047])
+def test_lenient_port_takes_and_counts_frames_with_a_wrong_length(length):
+    pd = RxPdSpec("r", "eap0", 7, ("x",), PEER, version=3, step=1, sender_cycle_us=1000)
+    r = Receiver(pd, variables=received("x:UINT"), lenient=True)
+    for cycle in (1, 2, 3):  # learned, then recognized
+        right = octets(LENIENT_PDS, cycle=cycle)
+        r.give(EtherCatHeader(length).encode() + right[2:], cycle * MS)
+    assert r.image.read("x") == int.from_bytes(b"ab", "little")
+    assert (r.word("r", RxWord.RECEIVED), r.word("r", RxWord.LOST)) == (3, 0)
+    assert r.discarded("r") == {"wrong_length": 3}
+    assert r.discarded() == {"wrong_length": 3, "unknown_id": 6}
+
+
+def test_lenient_port_drops_what_is_cut_and_counts_no_right_frame():
+    pd = RxPdSpec("r", "eap0", 7, ("x",), PEER, version=3)
+    r = Receiver(pd, variables=received("x:UINT"), lenient=True)
+    right = octets(LENIENT_PDS)
+    for size in range(len(right)):
+        r.give(EtherCatHeader(4).encode() + right[2:size], MS)
+    assert set(r.discarded()) == {"truncated"}
+    assert r.word("r", RxWord.RECEIVED) == 0
+    r.give(right + b"padding", MS)
+    assert r.word("r", RxWord.RECEIVED) == 1
+    assert "wrong_length" not in r.discarded()
+
+
+def test_layouts_with_a_wrong_length_are_learned_again_by_a_lenient_port_only():
+    pd = RxPdSpec("r", "eap0", 7, ("x",), PEER, version=3)
+    before = Receiver(pd, variables=received("x:UINT"), lenient=True)
+    frame = EtherCatHeader(4).encode() + octets(LENIENT_PDS)[2:]
+    before.give(frame, MS)
+    for lenient in (True, False):
+        after = Receiver(pd, variables=received("x:UINT"), lenient=lenient)
+        after.subscriber.learn_from(before.subscriber)
+        assert after.discarded() == {}
+        after.give(frame, MS)
+        assert after.word("r", RxWord.RECEIVED) == int(lenient)
+
+
+def toggled(cycle: int, state: int) -> bytes:
+    frame = bytearray(octets([(7, b"ab", 3)], cycle=cycle))
+    frame[EAP_SM_OFFSET] = state
+    return bytes(frame)
+
+
+def test_toggle_bit_tells_repeated_frames_from_new_ones():
+    r = receiver(step=0)
+    sent = [(1, 0x28), (2, 0x08), (3, 0x28), (3, 0x28), (3, 0x08), (3, 0x08), (5, 0x08)]
+    for number, (cycle, state) in enumerate(sent):
+        r.give(toggled(cycle, state), number * MS)
+    # The fourth and the sixth repeat the one before; the fifth is new though its counter is not.
+    assert r.word("r", RxWord.REPEATED) == 2
+    assert r.word("r", RxWord.DUPLICATED) == 2
+    assert r.word("r", RxWord.RECEIVED) == len(sent)
+
+
+@pytest.mark.parametrize("state", [0, 0x08, 0x28])
+def test_sender_that_never_toggles_repeats_nothing(state):
+    r = receiver(step=0)
+    for number in range(6):
+        r.give(toggled(number // 2, state), number * MS)
+    assert (r.word("r", RxWord.REPEATED), r.word("r", RxWord.DUPLICATED)) == (0, 3)
+
+
+def test_counter_that_stands_still_is_no_duplicate_while_the_bit_toggles():
+    r = receiver(step=0)
+    for number in range(6):
+        r.give(toggled(0, 0x08 | number % 2 << 5), number * MS)
+    assert (r.word("r", RxWord.REPEATED), r.word("r", RxWord.DUPLICATED)) == (0, 0)
 
 
 def test_subscriber_reads_no_pd_behind_end_of_frame():

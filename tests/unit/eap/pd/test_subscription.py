@@ -11,6 +11,7 @@ from eap.pd.spec import RxPdSpec, Substitute, TxFrameSpec, TxPdSpec, VariableSpe
 from eap.pd.subscription import (
     AcceptedPd,
     DroppedPd,
+    FrameHead,
     FramePlan,
     RxSubscription,
     SubstituteValue,
@@ -101,6 +102,7 @@ def test_substitute_replaces_data_only(substitute, values):
     assert bytes(r.image.memory[slot.offset : slot.offset + 8]) == header
 
 
+PEER_ID = bytes([5, 23, 91, 23, 1, 1])
 WATCH = SourceWatch(memoryview(b""), b"", frozenset())
 TIMING = Timing(step=1, sender_cycle_ns=0, own_cycle_ns=1)
 
@@ -113,6 +115,7 @@ def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
     one = tracker()
     pds = [(b"\x01\0\0\0\x02\0", 2), (b"\x02\0\0\0\x04\0", 4), (b"\x03\0\0\0\x01\0", 1)]
     plan = FramePlan(
+        FrameHead(PEER_ID, 98),
         100,
         pds,
         [
@@ -131,13 +134,13 @@ def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
 def test_each_tracker_has_its_own_copies():
     one, other = tracker(), tracker()
     plan = FramePlan(
+        FrameHead(PEER_ID, 98),
         100,
         [(b"\x01\0\0\0\0\0", 0), (b"\x02\0\0\0\0\0", 0)],
         [AcceptedPd(one, 3, 14, 200, 8), AcceptedPd(other, 4, 22, 208, 8)],
         [DroppedPd((1,))],
         watch=WATCH,
         any_publisher=[other],
-        publisher=bytes([5, 23, 91, 23, 1, 1]),
     )
     assert [part for part, _ in plan.parts] == [one, other]
     assert plan.accepted_words == (3, 4)
@@ -148,6 +151,7 @@ def test_each_tracker_has_its_own_copies():
 def test_headers_are_compared_without_their_quality():
     frame = octets([(1, b"ab", 7, 500), (2, b"", 3, 0)], publisher=PEER)
     plan = FramePlan(
+        FrameHead(PEER_ID, len(frame) - 2),
         len(frame),
         [(b"\x01\0\x07\0\x02\0", 2), (b"\x02\0\x03\0\0\0", 0)],
         [],

@@ -10,7 +10,7 @@ from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import Derived, EapLive
 from eap.od.profiles.table import CONFIG, OWN_TYPE, UNITS
 from eap.pd.device import DeviceState
-from eap.pd.spec import Substitute, Wake, Writer
+from eap.pd.spec import LengthCheck, Substitute, Wake, Writer
 
 ENTRIES = [(row, entry) for row in profile.ALL for entry in row.entries]
 
@@ -122,6 +122,7 @@ def test_numbers_stand_for_the_words_of_specifications():
     assert {each.name for each in profile.WrittenBy} == {each.name for each in Writer}
     assert {each.name for each in profile.Substituted} == {each.name for each in Substitute}
     assert {each.name for each in profile.Waking} == {each.name for each in Wake}
+    assert {each.name for each in profile.LengthChecked} == {each.name for each in LengthCheck}
     assert (
         profile.row_of(0xF100)
         .row(1)

@@ -1,0 +1,196 @@
+"""``eapctl discover``: the process data on a network, live or from a capture."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from eap.cli.group import ExitCode
+from eap.cli.output import Renderer, count, repaint, write_view
+from eap.cli.params import PLANT_FILE, examples, json_option
+
+if TYPE_CHECKING:
+    from eap.ops.discover import DiscoveredPd, Discovery
+    from eap.ops.takers import Taker
+
+_USUAL_S = 5.0
+"""Length of a capture whose result goes to a file, a pipe or a plant file."""
+_REDRAW_S = 1.0
+
+
+@click.command(
+    epilog=examples(
+        "eapctl discover eth0",
+        "eapctl discover eth0 --for 10 --write found.yaml",
+        "eapctl discover --pcap line.pcapng --plant plant.yaml --json",
+    ),
+)
+@click.argument("interface", required=False)
+@click.option(
+    "--pcap",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Read a pcap or pcapng file instead of an interface.",
+)
+@click.option(
+    "--for",
+    "for_s",
+    type=click.FloatRange(0.1, 86_400),
+    metavar="S",
+    help="Seconds to watch [default: on a terminal until Ctrl-C, else 5]",
+)
+@click.option(
+    "--plant",
+    "plants",
+    type=PLANT_FILE,
+    multiple=True,
+    metavar="FILE",
+    help="Compare with the subscriptions of a plant file, besides those of running stations.",
+)
+@click.option(
+    "--write",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="PLANT",
+    help="Write a plant file with a subscription for each PD.",
+)
+@click.option("--force", is_flag=True, help="Overwrite an existing file.")
+@json_option("Print one object per PD.")
+@click.pass_context
+def discover(
+    ctx: click.Context,
+    interface: str | None,
+    pcap: Path | None,
+    for_s: float | None,
+    plants: tuple[Path, ...],
+    target: Path | None,
+    force: bool,
+    output: Renderer,
+) -> None:
+    """Find all process data on a network: who publishes which PD, how often, and who takes it.
+
+    INTERFACE is a network interface, such as eth0; lo shows the stations of this host.  Watching
+    needs CAP_NET_RAW, changes nothing, and works beside running stations.
+
+    Exits with 1 when nothing was found, with 2 when the interface or file cannot be read.
+    """
+    from eap.ops.discover import Discovery, discovered
+
+    _check_usage(interface, pcap, for_s)
+    if target is not None and target.exists() and not force:
+        raise click.UsageError(f"{target} exists: --force overwrites it")
+    takers = _takers(plants)
+    discovery = Discovery()
+    fault = None
+    if pcap is not None:
+        fault = _read(discovery, pcap)
+    elif interface is not None:
+        is_live = sys.stdout.isatty() and not output.is_json
+        if for_s is None and (not is_live or target is not None):
+            for_s = _USUAL_S
+        _watch(discovery, interface, for_s, takers if is_live else None)
+    rows = discovered(discovery, takers)
+    _show(rows, discovery, output)
+    if target is not None and rows:
+        _write(target, rows, pcap or interface)
+    if fault is not None:
+        raise click.UsageError(fault)
+    if not rows:
+        ctx.exit(ExitCode.FAILED)
+
+
+def _check_usage(interface: str | None, pcap: Path | None, for_s: float | None) -> None:
+    if interface is not None and pcap is not None:
+        raise click.UsageError("INTERFACE and --pcap are two sources: omit one")
+    if interface is None and for_s is not None:
+        raise click.UsageError("--for goes with INTERFACE")
+    if interface is None and pcap is None:
+        raise click.UsageError("nothing to look at: give INTERFACE or --pcap FILE")
+
+
+def _takers(plants: tuple[Path, ...]) -> list[Taker]:
+    """Return the subscriptions of running stations and of plant files."""
+    from eap.ops.takers import running_stations, takers_of
+
+    stations, errors = running_stations()
+    for error in errors:
+        click.echo(str(error), err=True)
+    for path in plants:
+        from eap.ops.plant import load_or_raise  # yaml
+
+        stations += load_or_raise(path).stations
+    return takers_of(stations)
+
+
+def _read(discovery: Discovery, path: Path) -> str | None:
+    """Read a capture; return its fault, where what came before it counts all the same."""
+    from eap.errors import CodecError
+
+    try:
+        discovery.read(path)
+    except (OSError, CodecError) as exc:
+        if not discovery.observer.frames:
+            raise click.UsageError(str(exc)) from None
+        return str(exc)
+    return None
+
+
+def _watch(
+    discovery: Discovery, interface: str, for_s: float | None, takers: list[Taker] | None
+) -> None:
+    """Watch an interface until the time is over or a signal comes; redraw with *takers*."""
+    from eap.cli.discover_view import live_view
+    from eap.ops.discover import discovered
+
+    drawn_ns = None
+    with _ended_by_signal():
+        try:
+            for _ in discovery.watch(interface, for_s):
+                if takers is None:
+                    continue
+                if drawn_ns is None or discovery.now_ns - drawn_ns >= _REDRAW_S * 1e9:
+                    drawn_ns = discovery.now_ns
+                    repaint(live_view(discovered(discovery, takers), discovery, interface))
+        except KeyboardInterrupt:
+            pass
+    if takers is not None:
+        repaint(())
+
+
+@contextmanager
+def _ended_by_signal() -> Iterator[None]:
+    """End the block as Ctrl-C does when SIGTERM comes: the result is printed then."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _show(rows: list[DiscoveredPd], discovery: Discovery, output: Renderer) -> None:
+    from eap.cli.discover_view import discovery_view, notes
+
+    if output.is_json:
+        output.show_rows(rows, lambda _: "")
+        for line in discovery.losses.lines():
+            click.echo(line, err=True)
+        return
+    if rows:
+        write_view(discovery_view(rows))
+    for line in notes(rows, discovery):
+        click.echo(line, err=True)
+
+
+def _write(target: Path, rows: list[DiscoveredPd], source: Path | str | None) -> None:
+    from eap.ops.discovered_plant import discovered_plant
+
+    interface = source if isinstance(source, str) else ""
+    text, taken = discovered_plant(target.stem, rows, interface)
+    target.write_text(text, encoding="utf-8")
+    click.echo(f"{target}: {count(taken, 'subscription')} written", err=True)

@@ -1,0 +1,307 @@
+"""Discovery of process data on a network: frames of an interface or of a capture, as rows.
+
+The observer (``eap.pd.observer``) sees frames only; here they come from a driver or from a file,
+and each PD that it finds is compared with the subscriptions of plants.
+"""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from functools import lru_cache
+from ipaddress import IPv4Address
+from pathlib import Path
+from time import monotonic
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from eap.codec.ethercat import EAP_PORT
+from eap.net.capture import FrameCapture
+from eap.ops.decode import Packet, iter_capture, unwrap
+from eap.ops.takers import Taker
+from eap.pd.appearance import guess
+from eap.pd.observer import MAX_PDS, FramePath, ObservedPd, Observer
+from eap.pd.rhythm import CycleOrder
+from eap.pd.words import PdDropReason, Reason
+
+_UDP_START = 42
+"""Offset of a datagram's payload behind Ethernet, IPv4 without options, and UDP."""
+_ETHERCAT, _PLAIN_IPV4 = b"\x88\xa4", b"\x08\x00\x45"
+_FRAGMENT = 0x3FFF
+"""More fragments follow, or an offset."""
+_MAX_PATHS = 4096
+_TICK_S = 0.2
+
+
+class RefusedBy(Struct, frozen=True):
+    """Subscription of the same PD ID that drops the PD, and why."""
+
+    entry: str
+    reason: str
+
+
+class DiscoveredPd(Struct, frozen=True, kw_only=True):
+    """``eapctl discover``: one PD on the network.
+
+    Attributes:
+        publisher: NetID in its frames.
+        pd_id: PD id.
+        version: Version of its layout.
+        length: Bytes of data.
+        rate_hz: Arrivals a second, None of a single one.
+        jitter_us: 99th percentile of the deviation from the rhythm, None without one.
+        destination: MAC or IPv4 address that it goes to, with a UDP port other than 34980.
+        taken_by: Subscriptions that take it, ``STATION/PD``; None if there is none.
+        transport: ``ethernet``, ``udp`` or ``tcp``.
+        destination_kind: ``unicast``, ``multicast`` or ``broadcast``.
+        vlan_id: Of a tagged frame.
+        sources: Addresses that it came from.
+        received: Arrivals.
+        age_ms: Time since the last one.
+        jitter_max_us: Largest deviation.
+        trigger: Guess: cycle, change, change_timeout, event or poll; None while too few arrived.
+        period_ms: Of a cyclic PD.
+        timeout_ms: Of ``change_timeout``: unchanged data comes again after it.
+        sender_cycle_us: Device cycle of the sender, None if unknown.
+        step: Sender cycles between two arrivals, None if there is no fixed number.
+        missed: Arrivals that the cycle counter shows to be missing, among the latest ones.
+        repeated: Arrivals with cycle counter and toggle bit of the one before.
+        cycle_order: ``little``, ``swapped``, ``constant`` or ``unknown``.
+        header_length: Length of the EtherCAT header where that is wrong.
+        quality: Of the last arrival, in units of 100 us.
+        refused_by: Subscriptions of the same PD ID that drop it.
+        looks_like: Guess of its content.
+    """
+
+    publisher: str
+    pd_id: int
+    version: int
+    length: int
+    rate_hz: float | None
+    jitter_us: int | None
+    destination: str
+    taken_by: str | None
+    transport: str = ""
+    destination_kind: str = ""
+    vlan_id: int | None = None
+    sources: list[str] = []
+    received: int = 0
+    age_ms: int | None = None
+    jitter_max_us: int | None = None
+    trigger: str | None = None
+    period_ms: float | None = None
+    timeout_ms: int | None = None
+    sender_cycle_us: int | None = None
+    step: int | None = None
+    missed: int = 0
+    repeated: int = 0
+    cycle_order: str = CycleOrder.UNKNOWN.value
+    header_length: int | None = None
+    quality: int | None = None
+    refused_by: list[RefusedBy] = []
+    looks_like: list[str] = []
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Publisher and PD ID."""
+        return self.publisher, self.pd_id
+
+
+class CaptureLosses(NamedTuple):
+    """Packets and frames that the capture did not see, or could not read."""
+
+    dropped: int | None
+    """Packets that the kernel dropped; None where that is not known."""
+    cut: int
+    """Frames of which only the begin was there."""
+    malformed: int
+    not_kept: int
+    """PDs beyond the limit of the observer."""
+
+    def lines(self) -> Iterator[str]:
+        """Yield a line for each kind of loss."""
+        if self.dropped:
+            yield f"capture: {self.dropped} packets lost by the kernel; rates and gaps are wrong"
+        if self.cut:
+            yield f"capture: {self.cut} frames with their begin only: in fragments, or cut"
+        if self.malformed:
+            yield f"capture: {self.malformed} frames malformed: their PDs reach past their end"
+        if self.not_kept:
+            yield f"capture: {self.not_kept} PDs not kept: more than {MAX_PDS} at a time"
+
+
+class Discovery:
+    """Observer with its source of frames.
+
+    Attributes:
+        observer: The PDs seen so far.
+        now_ns: Time of the latest packet or look, on the clock of the capture.
+    """
+
+    def __init__(self) -> None:
+        self.observer = Observer()
+        self.now_ns = 0
+        self._paths: dict[tuple[bytes, int], FramePath] = {}
+        self._dropped: int | None = None
+
+    @property
+    def losses(self) -> CaptureLosses:
+        """Losses so far."""
+        seen = self.observer
+        return CaptureLosses(self._dropped, seen.cut, seen.malformed, seen.not_kept)
+
+    def watch(self, interface: str, for_s: float | None) -> Iterator[None]:
+        """Capture at *interface* for *for_s* seconds, or without end; yield now and then.
+
+        Raises:
+            EnvironmentalError: the interface cannot be opened.
+        """
+        end_s = None if for_s is None else monotonic() + for_s
+        with closing(FrameCapture(interface)) as capture:
+            poll = select.poll()
+            poll.register(capture.fileno(), select.POLLIN)
+            while True:
+                left_s = _TICK_S if end_s is None else min(_TICK_S, end_s - monotonic())
+                if left_s <= 0:
+                    return
+                look_s = monotonic() + left_s
+                while (wait_s := look_s - monotonic()) > 0:
+                    if poll.poll(wait_s * 1000):
+                        capture.drain(self.receive_packet)
+                self.now_ns = round(monotonic() * 1e9)
+                self._dropped = capture.dropped
+                yield
+
+    def read(self, path: Path) -> None:
+        """Take all frames of a pcap or pcapng file.
+
+        Raises:
+            OSError: the file cannot be read.
+            MalformedError: it is no capture of Ethernet, or is damaged; the frames before count.
+        """
+        for frame in iter_capture(path):
+            self.now_ns = frame.at_ns
+            self.observer.receive_frame(frame.data, frame.at_ns, frame_path(frame.packet))
+
+    def receive_packet(self, octets: memoryview, at_ns: int, tci: int) -> None:
+        """Take one packet of a capture; *tci* is the VLAN tag that the kernel took out, or 0."""
+        # The bytes that a packet's path depends on; other forms (a tag in the packet, options,
+        # fragments) are rare and taken apart each time.
+        kind = octets[12:14]
+        if kind == _ETHERCAT:
+            head, start, end = bytes(octets[:14]), 14, None
+        elif octets[12:15] == _PLAIN_IPV4 and not int.from_bytes(octets[20:22]) & _FRAGMENT:
+            head, start = bytes(octets[:14]) + bytes(octets[26:38]), _UDP_START
+            end = 14 + int.from_bytes(octets[16:18])
+        else:
+            self._receive_unusual(octets, at_ns, tci)
+            return
+        path = self._paths.get((head, tci))
+        if path is None:
+            packet = unwrap(bytes(octets))
+            if packet is None:
+                return
+            path = _tagged(frame_path(packet), tci)
+            if len(self._paths) >= _MAX_PATHS:
+                self._paths.clear()
+            self._paths[head, tci] = path
+        self.observer.receive_frame(octets[start:end], at_ns, path)
+
+    def _receive_unusual(self, octets: memoryview, at_ns: int, tci: int) -> None:
+        packet = unwrap(bytes(octets))
+        if packet is not None:
+            self.observer.receive_frame(packet.payload, at_ns, _tagged(frame_path(packet), tci))
+
+
+def _tagged(path: FramePath, tci: int) -> FramePath:
+    """Return *path* with the VLAN of a tag that the kernel took out."""
+    return path._replace(vlan_id=tci & 0xFFF) if tci and path.vlan_id is None else path
+
+
+def frame_path(packet: Packet) -> FramePath:
+    """Return the path of a packet, with port numbers only where they are not the usual one."""
+    if packet.transport == "ethernet":
+        return FramePath(packet.transport, packet.source, packet.destination, packet.vlan_id)
+    source, destination = (
+        host if int(port) == EAP_PORT else f"{host}:{port}"
+        for host, _, port in (each.partition(":") for each in (packet.source, packet.destination))
+    )
+    return FramePath(packet.transport, source, destination, packet.vlan_id)
+
+
+def discovered(discovery: Discovery, takers: Iterable[Taker]) -> list[DiscoveredPd]:
+    """Return a row for each PD, by publisher and ID."""
+    by_id: dict[int, list[Taker]] = {}
+    for taker in takers:
+        by_id.setdefault(taker.subscription.pd_id, []).append(taker)
+    rows = [
+        _row(each, by_id.get(each.key.pd_id, ()), discovery.now_ns)
+        for each in discovery.observer.pds.values()
+    ]
+    return sorted(rows, key=lambda row: (_order(row.publisher), row.pd_id, row.destination))
+
+
+def _order(net_id: str) -> tuple[int, ...]:
+    return tuple(map(int, net_id.split(".")))
+
+
+def _row(pd: ObservedPd, takers: Sequence[Taker], now_ns: int) -> DiscoveredPd:
+    key, found = pd.key, pd.measure()
+    taking, refusing = [], []
+    for each in takers:
+        reason = each.refusal(key)
+        if reason is None and each.is_reached(key):
+            taking.append(each.name)
+        elif reason is None:
+            refusing.append(RefusedBy(each.name, NOT_REACHED))
+        elif reason is not PdDropReason.WRONG_PUBLISHER or each.is_reached(key):
+            refusing.append(RefusedBy(each.name, reason.value))
+    return DiscoveredPd(
+        publisher=str(pd.publisher),
+        pd_id=key.pd_id,
+        version=key.version,
+        length=key.length,
+        rate_hz=None if found.rate_hz is None else round(found.rate_hz, 3),
+        jitter_us=found.jitter_us,
+        destination=key.destination,
+        taken_by=", ".join(taking) or None,
+        transport=key.transport,
+        destination_kind=destination_kind(key.transport, key.destination),
+        vlan_id=key.vlan_id,
+        sources=list(pd.sources),
+        received=pd.rhythm.received,
+        age_ms=max(0, now_ns - pd.rhythm.last_ns) // 1_000_000,
+        jitter_max_us=found.jitter_max_us,
+        trigger=found.trigger and found.trigger.value,
+        period_ms=found.period_us / 1000 if found.period_us else None,
+        timeout_ms=found.timeout_ms if found.trigger is Reason.CHANGE_TIMEOUT else None,
+        sender_cycle_us=found.sender_cycle_us or None,
+        step=found.step or None,
+        missed=found.missed,
+        repeated=pd.repeated,
+        cycle_order=pd.cycle.order.value,
+        header_length=pd.wrong_length,
+        quality=pd.quality,
+        refused_by=[] if taking else refusing,
+        looks_like=[str(part) for part in guess(pd.samples)],
+    )
+
+
+NOT_REACHED = "other_destination"
+"""Reason of a subscription whose port does not get frames to the PD's destination."""
+
+
+@lru_cache(maxsize=1024)
+def destination_kind(transport: str, destination: str) -> str:
+    """Return ``unicast``, ``multicast`` or ``broadcast``."""
+    if transport == "ethernet":
+        if destination == "ff:ff:ff:ff:ff:ff":
+            return "broadcast"
+        return "multicast" if int(destination[:2], 16) & 1 else "unicast"
+    host = destination.partition(":")[0]
+    if IPv4Address(host).is_multicast:
+        return "multicast"
+    # Without a netmask a host number of 255 is taken for the directed broadcast.
+    return "broadcast" if host.endswith(".255") else "unicast"

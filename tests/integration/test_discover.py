@@ -1,0 +1,193 @@
+"""``eapctl discover`` beside the solar line: 54 PDs, and the written plant receives all of them."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import dpkt
+import pytest
+
+from eap.codec.ethercat import FrameType
+from eap.net import interface
+from eap.net.capture import FrameCapture
+from eap.ops.decode import iter_capture
+from tests.support.appliance import Appliance, Plants, run_eapctl, troubles, wait_until
+from tests.support.namespaces import Namespace, enter, enter_network, namespace
+from tests.support.pages import ROOT, Shell, commands, shell
+
+pytestmark = [pytest.mark.net, pytest.mark.root]
+
+SOLAR_LINE = ROOT / "config/solar-line.yaml"
+CAPTURED = 54 * 100
+"""Packets of the capture: a second of the line."""
+
+
+@pytest.fixture(scope="module")
+def line_network() -> Iterator[Namespace]:
+    with namespace() as inside:
+        yield inside
+
+
+@pytest.fixture(scope="module")
+def line(module_farm: Plants, line_network: Namespace) -> Appliance:
+    return module_farm.run(SOLAR_LINE, prefix=line_network.prefix)
+
+
+def forget_kernel_socket() -> None:
+    """Close the socket that questions about interfaces go to: it belongs to another network."""
+    interface._kernel().close()
+    interface._kernel.cache_clear()
+
+
+@contextmanager
+def inside(network: Namespace) -> Iterator[None]:
+    """Take the test into *network* for the length of a block."""
+    with Path("/proc/thread-self/ns/net").open() as home:
+        enter(network)
+        forget_kernel_socket()
+        try:
+            yield
+        finally:
+            enter_network(home.fileno())
+            forget_kernel_socket()
+
+
+def record(path: Path) -> None:
+    """Write a second of what passes lo into a pcap file."""
+    with closing(FrameCapture("lo")) as capture, path.open("wb") as file:
+        writer = dpkt.pcap.Writer(file, snaplen=65535, nano=True)
+        seen = 0
+
+        def write(octets: memoryview, at_ns: int, tci: int) -> None:
+            nonlocal seen
+            seen += 1
+            writer.writepkt_time(bytes(octets), at_ns / 1e9)
+
+        while seen < CAPTURED:
+            capture.drain(write)
+            time.sleep(0.001)
+        assert capture.dropped == 0
+
+
+@pytest.fixture(scope="module")
+def capture(line: Appliance, line_network: Namespace, module_farm: Plants) -> Path:
+    path = module_farm.folder / "line.pcap"
+    with inside(line_network):
+        record(path)
+    return path
+
+
+def discover(runtime: Path, *words: object) -> list[dict[str, Any]]:
+    result = run_eapctl(runtime, "discover", *map(str, words), "--json")
+    assert result.returncode == 0, result.stderr
+    return [json.loads(row) for row in result.stdout.splitlines()]
+
+
+def test_all_pds_are_found_beside_the_running_line(
+    line: Appliance, line_network: Namespace
+) -> None:
+    with inside(line_network):
+        rows = discover(line.runtime, "lo", "--for", 1.5)
+    assert len(rows) == 54
+    assert {row["trigger"] for row in rows} == {"cycle"}
+    assert {row["period_ms"] for row in rows} == {10}
+    subscriptions = {
+        f"{station['name']}/{rx['name']}"
+        for station in line.status()["stations"]
+        for rx in station["pd"]["rx"]
+    }
+    assert {row["taken_by"] for row in rows} == subscriptions
+
+
+def test_all_pds_are_found_in_a_capture(capture: Path, tmp_path: Path) -> None:
+    rows = discover(tmp_path, "--pcap", capture, "--plant", SOLAR_LINE)
+    assert len(rows) == 54
+    assert all(row["taken_by"] for row in rows)
+
+
+def send_again(network: Namespace, path: Path) -> dict[str, int]:
+    """Send the captured frames to their destinations at their own pace, from another host."""
+    sent: dict[str, int] = {}
+    with network.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        start_s = first_s = None
+        for frame in iter_capture(path):
+            if frame.data[1] >> 4 != FrameType.PROCESS_DATA:
+                continue  # probes of routes
+            at_s = frame.at_ns / 1e9
+            if start_s is None or first_s is None:
+                start_s, first_s = time.monotonic(), at_s
+            time.sleep(max(0.0, start_s + at_s - first_s - time.monotonic()))
+            host, _, port = frame.packet.destination.partition(":")
+            sock.sendto(frame.data, (host, int(port)))
+            sent[host] = sent.get(host, 0) + 1
+    return sent
+
+
+def pd_list(appliance: Appliance) -> list[dict[str, Any]]:
+    rows = map(json.loads, appliance.command("pd", "list", "--json").splitlines())
+    return [row for row in rows if row["direction"] == "rx"]
+
+
+def test_written_plant_receives_all_pds_and_loses_none(capture: Path, farm: Plants) -> None:
+    """In a network of its own, where it has the addresses of the line's stations."""
+    target = farm.folder / "found.yaml"
+    rows = discover(farm.folder, "--pcap", capture, "--write", target)
+    # A busy host leaves cycles out: then the capture has gaps already, which are no loss here.
+    gaps = {(row["publisher"], row["pd_id"]): row["missed"] for row in rows}
+    with namespace() as other:
+        appliance = farm.run(target, prefix=other.prefix)
+        sent = sum(send_again(other, capture).values())
+        assert sent > CAPTURED * 0.9
+
+        def received() -> int:
+            return sum(rx["received"] for rx in appliance.status()["stations"][0]["pd"]["rx"])
+
+        wait_until(lambda: received() >= sent)
+        station = appliance.status()["stations"][0]
+        assert len(station["pd"]["rx"]) == 54
+        for rx, row in zip(station["pd"]["rx"], pd_list(appliance), strict=True):
+            assert troubles(rx) == (gaps[row["publisher"], row["id"]], 0, 0)
+        assert received() == sent
+        assert station["discarded"] == {}
+        assert {rx["state"] for rx in station["pd"]["rx"]} == {"running"}
+        appliance.stop()
+
+
+PAGE = (ROOT / "docs" / "discover.md").read_text()
+BLOCK = re.compile(r"```console\n(.*?)```", re.DOTALL)
+
+
+def outline(text: str) -> str:
+    """Reduce an output to what is the same in every run."""
+    text = re.sub(r"\d+(\.\d+)? (µs|ms)\b", "TIME", text)
+    text = re.sub(r"\b\d+(\.\d+)? to \d+(\.\d+)?", "RANGE", text)
+    text = re.sub(
+        r'"(rate_hz|jitter_us|jitter_max_us|received|age_ms|missed)":[\d.]+', r'"\1":N', text
+    )
+    text = re.sub(r"[\d.]+ +TIME", "HZ TIME", text)
+    text = re.sub(r"a counter, \d+ more each time", "a counter", text)
+    text = re.sub(r"─+", "─", text)
+    return "\n".join(" ".join(row.split()) for row in text.splitlines())
+
+
+def test_examples_of_the_page_print_what_it_shows() -> None:
+    with namespace() as network, shell(COLUMNS="100") as reader:
+        (reader.folder / "config").symlink_to(ROOT / "config")
+        with inside(network):
+            shown = list(replayed(reader))
+    assert len(shown) >= 7
+    for command, expected, printed in shown:
+        assert outline(printed) == outline(expected), command
+
+
+def replayed(reader: Shell) -> Iterator[tuple[str, str, str]]:
+    for block in BLOCK.findall(PAGE):
+        for command, expected in commands(block):
+            yield command, expected, reader.run(command)
