@@ -127,8 +127,11 @@ def test_dead_hop_is_answered_for_at_once_and_comes_back(chain: Chain) -> None:
         assert client.ask(TARGET, aoe.READ_STATE, b"")[0] == UNREACHABLE
         assert time.monotonic() - began < 0.5 * slowness()
         assert client.net_id(f"{WEST}.2.1") == f"{WEST}.2.1"
+        (warning,) = west.status()["findings"]
+        assert warning["what"].startswith(f"route to middle ({MIDDLE}:34980) is down: ")
         chain.run()
         wait_until(lambda: is_reached(client))
+        wait_until(lambda: not west.status()["findings"])
     wait_until(lambda: f"({MIDDLE}:34980 by {chain.scheme}:eap0)" in west.log())
     assert "0x1b" in west.log()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 
@@ -58,6 +59,12 @@ def routes_are_known() -> bool:
     )
 
 
+def slaves_answer(reader: Shell) -> bool:
+    stations = json.loads(reader.run("eapctl status --json"))["stations"]
+    buses = [port["bus"] for each in stations for port in each["ports"] if "bus" in port]
+    return all(slave["state"] for bus in buses for slave in bus["slaves"])
+
+
 def replay(reader: Shell) -> Iterator[tuple[str, str, str]]:
     """Yield what is done, what the page says comes of it, and what does."""
     keys = iter(KEYS)
@@ -72,6 +79,7 @@ def replay(reader: Shell) -> Iterator[tuple[str, str, str]]:
                 yield command, expected, reader.run(command)
                 if command.endswith(" &"):
                     wait_until(routes_are_known)
+                    wait_until(lambda: slaves_answer(reader))
 
 
 def test_routes_page_commands_and_screens_match(reader: Shell) -> None:

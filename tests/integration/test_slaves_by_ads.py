@@ -132,6 +132,11 @@ def test_silent_slave_is_answered_before_clients_give_up(plant: Appliance) -> No
                 sensor.u32(SDO, 0x1018_0001)
             assert (refused.value.err_code, time.monotonic() - start < 4.5) == (0x719, True)
             assert coupler.u32(SDO, 0x1018_0001) == 3674
+        traced = json.loads(plant.command("trace", "saw/bus0/sensor", "--json"))
+        (fault,) = traced["hops"][-1]["faults"]
+        assert fault.startswith("saw/bus0: sensor (")
+        assert "without reply in time" in fault
+        assert (traced["ok"], traced["why"]) == (True, "")
     finally:
         plant.command("sim", "fault", "saw/bus0", "mailbox", "slave=sensor", "--end")
 
