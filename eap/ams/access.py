@@ -40,12 +40,13 @@ from eap.ams.spec import IP_TRANSPORTS, AccessRule, AccessService, ObjectRange, 
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import AmsCommand, AmsHeader
+from eap.codec.eoe import READS as EOE_READS
 from eap.ids import Endpoint, MacAddr, NetId
 
 _MAX_KNOWN = 4096
 """Cached pairs of a client and a target."""
 
-_RAW = frozenset((IndexGroup.RAW_COMMAND, IndexGroup.VOE, *SUM_COMMANDS))
+_RAW = frozenset((IndexGroup.RAW_COMMAND, IndexGroup.VOE, IndexGroup.EOE, *SUM_COMMANDS))
 """Sum commands: one inside another, which is not parsed."""
 _FILES = frozenset((IndexGroup.FOE_OPEN_WRITE, IndexGroup.FOE_WRITE))
 _STATES = frozenset((IndexGroup.MASTER_STATE, IndexGroup.SLAVE_STATES))
@@ -79,11 +80,13 @@ def service_of(operation: Operation) -> AccessService:
     if not isinstance(operation, (Write, ReadWrite)):
         return AccessService.READ
     group = operation.group
+    is_exchange = isinstance(operation, ReadWrite)
     if group in _RAW:
-        return AccessService.RAW
+        is_read = group == IndexGroup.EOE and is_exchange and operation.offset in EOE_READS
+        return AccessService.READ if is_read else AccessService.RAW
     if group in _FILES:
         return AccessService.FILES
-    if group in (LOOKUPS if isinstance(operation, ReadWrite) else _OWN_HANDLES):
+    if group in (LOOKUPS if is_exchange else _OWN_HANDLES):
         return AccessService.READ
     return AccessService.CONTROL if group in _STATES else AccessService.WRITE
 

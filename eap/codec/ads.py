@@ -177,6 +177,10 @@ class IndexGroup(IntEnum):
     """Offset: see :class:`SoeOffset`."""
     VOE = 0xF430
     """Written: a message with its VoE header."""
+    EOE = 0xF440
+    """Own format: a Write has an Ethernet frame for the slave, a Read returns those that it has
+    sent, each behind its length as 16 bits (offset: any number that the client chooses); a
+    ReadWrite has the body of a request for settings (offset: its type) and returns the answer."""
     ROUTE_QUERY = 0x4541_5001
     """Own format: of the system service, where it forwards requests to, see ``HopQuestion``."""
 

@@ -34,6 +34,19 @@ class EoeType(IntEnum):
     GET_FILTER_RESPONSE = 9
 
 
+REQUESTS = frozenset(
+    (
+        EoeType.SET_IP_REQUEST,
+        EoeType.SET_FILTER_REQUEST,
+        EoeType.GET_IP_REQUEST,
+        EoeType.GET_FILTER_REQUEST,
+    )
+)
+"""Messages that are answered; Ethernet frames are not."""
+READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
+"""Those that change nothing."""
+
+
 class EoeResult(IntEnum):
     """ETG.1000.6, EoE result codes; a peer may send others, which stay plain integers."""
 
@@ -191,3 +204,23 @@ def decode_message(data: Buffer) -> tuple[EoeHeader, int, memoryview]:
 def encode_message(kind: EoeType, body: Buffer = b"", *, result: int = 0, port: int = 0) -> bytes:
     """Return the data of a mailbox message that is no fragment."""
     return EoeHeader(kind, port).encode() + ResultWord(result).encode() + body
+
+
+COUNT_SIZE = 2
+
+
+def encode_counted(frame: bytes) -> bytes:
+    """Return an Ethernet frame behind its length, as ADS carries several of them (own format)."""
+    return len(frame).to_bytes(COUNT_SIZE, "little") + frame
+
+
+def split_counted(data: bytes) -> list[bytes]:
+    """Return the frames that :func:`encode_counted` made; an incomplete one is left out."""
+    found = []
+    at = 0
+    while at + COUNT_SIZE <= len(data):
+        start = at + COUNT_SIZE
+        at = start + int.from_bytes(data[at:start], "little")
+        if start < at <= len(data):
+            found.append(data[start:at])
+    return found

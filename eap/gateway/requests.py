@@ -33,7 +33,7 @@ from eap.codec.coe import (
     encode_abort,
 )
 from eap.codec.coe import encode_message as encode_coe
-from eap.codec.eoe import EoeType
+from eap.codec.eoe import READS as EOE_READS
 from eap.codec.foe import Busy, FoeOpcode
 from eap.codec.foe import encode_message as encode_foe
 from eap.codec.mailbox import MailboxErrorReply, MailboxType
@@ -129,7 +129,6 @@ _FOE_ERRORS: dict[int, AdsError] = {
     FoeOpcode.BUSY: AdsError.BUSY,
     FoeOpcode.ERROR: AdsError.GENERAL,
 }
-_EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
 
 
 @lru_cache(1024)  # clients ask for the same again and again
@@ -212,7 +211,7 @@ def _of_foe(body: bytes) -> Operation | None:
 
 
 def _of_eoe(body: bytes) -> Operation:
-    is_read = bool(body) and body[0] & 0x0F in _EOE_READS
+    is_read = bool(body) and body[0] & 0x0F in EOE_READS
     return Read(IndexGroup.OBJECT_LIST, 0, 0) if is_read else _RAW
 
 

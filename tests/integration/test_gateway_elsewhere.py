@@ -9,16 +9,23 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from ipaddress import IPv4Address
 from pathlib import Path
 
 import pytest
+from scapy.layers.inet import ICMP, IP
+from scapy.layers.l2 import Ether
 
 from devicebus.errors import FoeError
+from devicebus.mailbox.eoe import FrameAssembler, iter_fragments
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.codec.eoe import EoeType, IpSettings
+from eap.codec.eoe import encode_message as encode_eoe
 from eap.codec.foe import FoeErrorCode
 from eap.gateway.client import GatewayClient
+from eap.ids import MacAddr
 from tests.support.appliance import Appliance, Plants, plants, wait_until
-from tests.support.gatewaywire import AOE, COE, EOE, ERR, FOE, VENDOR, Wire, wire
+from tests.support.gatewaywire import AOE, COE, EOE, ERR, FOE, VENDOR, Wire, frame, wire
 
 pytestmark = pytest.mark.net
 
@@ -213,8 +220,29 @@ def test_ams_packets(udp: Wire) -> None:
     assert struct.unpack("<IIH", ask(MASTER, 6, 0, 2)) == (0, 2, 2)
 
 
-def test_ethernet_frames_are_refused(udp: Wire) -> None:
-    assert udp.talk(EOE, VIRTUAL, bytes(64)) == (ERR, bytes.fromhex("0100 0200"))
+def test_host_behind_a_remote_slave_answers_ping(udp: Wire) -> None:
+    mac, own = "02:00:00:00:00:02", "02:00:00:00:00:01"
+    settings = IpSettings(MacAddr.parse(mac), IPv4Address("10.0.0.2"), IPv4Address("255.255.255.0"))
+    request = encode_eoe(EoeType.SET_IP_REQUEST, settings.encode())
+    assert udp.talk(EOE, VIRTUAL, request) == (EOE, bytes.fromhex("0300 0000"))
+    # Longer than the mailbox of the slave: client and slave have other fragments.
+    ping = Ether(src=own, dst=mac) / IP(src="10.0.0.1", dst="10.0.0.2") / ICMP() / bytes(1400)
+    for piece in iter_fragments(bytes(ping), 0, 512):
+        udp.send(frame(EOE, VIRTUAL, piece))
+    assembler, answer = FrameAssembler(), None
+    while answer is None or ICMP not in answer:
+        received = udp.receive(20.0)
+        assert (received[4:6], received[7] & 0x0F) == (struct.pack("<H", VIRTUAL), EOE)
+        whole = assembler.receive(received[8:])
+        answer = None if whole is None else Ether(whole)
+    assert (answer[IP].src, answer[ICMP].type, len(answer[ICMP].payload)) == ("10.0.0.2", 0, 1400)
+    kind, body = udp.talk(EOE, VIRTUAL, encode_eoe(EoeType.GET_IP_REQUEST))
+    assert (kind, IpSettings.decode(body[4:]).ip) == (EOE, IPv4Address("10.0.0.2"))
+    udp.rest()
+
+
+def test_remote_slave_without_ethernet_refuses_it(udp: Wire) -> None:
+    assert udp.talk(EOE, 0x9003, bytes.fromhex("0600 0000")) == (ERR, bytes.fromhex("0100 0200"))
 
 
 def test_the_command_line(mill: Appliance, press: Appliance, tmp_path: Path) -> None:

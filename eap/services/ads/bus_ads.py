@@ -47,6 +47,7 @@ from eap.ids import Endpoint, NetId
 from eap.runtime.engine_messages import SlaveDescription, no_mailbox
 from eap.services.ads.ads_service import answer_request, check_up
 from eap.services.ads.master_ads import MasterAds, Send, StateRequests
+from eap.services.ads.slave_ethernet import SlaveEthernet
 from eap.services.ads.slave_files import SlaveFiles
 from eap.services.ads.slave_notifications import SamplingBudget, SlaveNotifications
 from eap.services.device.master_values import MasterDictionaryProvider
@@ -76,8 +77,9 @@ _PROTOCOLS: dict[int, SiiProtocol] = {
     IndexGroup.ENTRY_DESCRIPTION: SiiProtocol.COE,
     IndexGroup.SOE: SiiProtocol.SOE,
     IndexGroup.VOE: SiiProtocol.VOE,
+    IndexGroup.EOE: SiiProtocol.EOE,
 } | dict.fromkeys(SlaveFiles.groups, SiiProtocol.FOE)
-_UNWATCHED = frozenset((SiiProtocol.FOE, SiiProtocol.VOE))
+_UNWATCHED = frozenset((SiiProtocol.FOE, SiiProtocol.VOE, SiiProtocol.EOE))
 """Protocols of messages and files, which have no values."""
 
 
@@ -113,6 +115,7 @@ class SlaveAds:
         self._notifications = SlaveNotifications(net_id, self._sample, send, budget)
         self._states = states
         self._files = SlaveFiles()
+        self._ethernet = SlaveEthernet(bus)
         self._commands = ProcedureCommands()
         self._forwarder = AoeForwarder(net_id)
 
@@ -174,6 +177,10 @@ class SlaveAds:
         match protocol:
             case SiiProtocol.FOE:
                 found = await self._files.perform(
+                    target.access, target.slave.station, target.client, operation
+                )
+            case SiiProtocol.EOE:
+                found = await self._ethernet.perform(
                     target.access, target.slave.station, target.client, operation
                 )
             case SiiProtocol.VOE:

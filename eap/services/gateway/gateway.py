@@ -58,7 +58,8 @@ from eap.services.gateway.admission import (
     result_of,
 )
 from eap.services.gateway.dialect_handler import DialectHandler, DialectTarget
-from eap.services.gateway.message_codecs import EoeListeners, codec_for
+from eap.services.gateway.message_codecs import EoeListener, EoeListeners, codec_for
+from eap.services.gateway.remote_ethernet import RemoteEthernet
 from eap.services.gateway.reply_encoder import ErrorLog, GatewayRequest, ReplyEncoder, Send
 from eap.services.gateway.sessions import (
     ClientSession,
@@ -72,6 +73,7 @@ from eap.services.gateway.sessions import (
 from eap.services.gateway.transfer_codecs import FileCodec
 from eap.services.slaves.access import LocalSlave, SlaveAccess
 from eap.services.slaves.bus_client import BusClient
+from eap.services.slaves.remote_slave import RemoteSlave
 from eap.services.tasks import TaskSet
 
 GATEWAY_ANSWER_S = 0.9
@@ -79,7 +81,7 @@ GATEWAY_ANSWER_S = 0.9
 STALL_S = 2.0
 """Wait of a slave for the client of a file after which that gives way to another client's."""
 
-OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
+OpenRemote: TypeAlias = Callable[[RemoteAddress], RemoteSlave]
 """Returns access to a slave, or the master, of another station."""
 
 _REJECTIONS = {RequestAdmission.CROWDED: Cause.CROWDED, RequestAdmission.TOO_FAST: Cause.TOO_FAST}
@@ -158,6 +160,7 @@ class MailboxGateway:
         self._tasks = TaskSet(f"gateway {settings.name}")
         self._count = 0
         self._listeners = EoeListeners()
+        self._ethernet = RemoteEthernet(settings.name, settings.max_size, self._send_fragment)
         bus.listen(self._forward_unsolicited)
 
     def start(self) -> None:
@@ -209,6 +212,7 @@ class MailboxGateway:
         """Remove a client, and abort its transfers."""
         self.tracker.forget(endpoint)
         self._listeners.forget(endpoint)
+        self._ethernet.forget(endpoint)
         self._slaves.close_of(endpoint)
         self._masters.close_of(endpoint)
 
@@ -220,6 +224,7 @@ class MailboxGateway:
     async def close(self) -> None:
         """Abort all requests and transfers."""
         await self._tasks.close()
+        await self._ethernet.close()
         for endpoint in self.tracker.table():
             self.tracker.forget(endpoint)
             self._listeners.forget(endpoint)
@@ -309,7 +314,10 @@ class MailboxGateway:
                 return await self._forward_to_slave(request, key, is_step=is_step)
             case RemoteAddress():
                 sizes = MailboxSizes.of_data(self.settings.max_size)
-                begin = partial(self._begin, key, self._open_remote(destination), sizes)
+                slave = self._open_remote(destination)
+                if kind is MailboxType.EOE:
+                    self._ethernet.add(station, slave, endpoint, request.send)
+                begin = partial(self._begin, key, slave, sizes)
                 return await self._slaves.get(key, begin).handle(body, is_step=is_step)
             case GroupAddress():  # a group within a group
                 raise GatewayError(Cause.NO_SLAVE)
@@ -429,7 +437,10 @@ class MailboxGateway:
         if message.type != MailboxType.EOE:
             return
         for listener in self._listeners.of_slave(message.station, monotonic_ns()):
-            self._encoder.send(listener.send, listener.address, MailboxType.EOE, message.data)
+            self._send_fragment(listener, message.data)
+
+    def _send_fragment(self, listener: EoeListener, fragment: bytes) -> None:
+        self._encoder.send(listener.send, listener.address, MailboxType.EOE, fragment)
 
     async def _serve_dialect(self, request: GatewayRequest, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()

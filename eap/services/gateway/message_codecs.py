@@ -15,8 +15,9 @@ from typing import NamedTuple
 from devicebus.errors import SoeError
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
+from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
-from eap.codec.eoe import EoeType
+from eap.codec.eoe import REQUESTS as EOE_REQUESTS
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import SoeHeader, SoeOpcode, encode_fragments
 from eap.gateway.error_table import Cause
@@ -34,15 +35,8 @@ MAX_LISTENERS = 8
 """Of one slave."""
 MAX_WRITTEN = 0x10004
 """Octets of the longest list of SoE that is written in fragments."""
-_EOE_REQUESTS = frozenset(
-    (
-        EoeType.SET_IP_REQUEST,
-        EoeType.SET_FILTER_REQUEST,
-        EoeType.GET_IP_REQUEST,
-        EoeType.GET_FILTER_REQUEST,
-    )
-)
-"""Messages of EoE that are answered; Ethernet frames are not."""
+_UNKNOWN_GROUP = frozenset((AdsError.INDEX_GROUP, AdsError.SERVICE))
+"""Results of a station without EoE in its ADS services."""
 
 
 class MessageCodec:
@@ -191,13 +185,15 @@ class EthernetCodec(MessageCodec):
     async def answer(self, body: bytes) -> list[bytes]:
         """Return the answer to a setting; an Ethernet frame has none."""
         # What is too short to say what it is gets the slave's mailbox error.
-        expects_reply = not body or body[0] & 0x0F in _EOE_REQUESTS
+        expects_reply = not body or body[0] & 0x0F in EOE_REQUESTS
         try:
             message = await self._access.exchange(
                 MailboxType.EOE, body, expects_reply=expects_reply
             )
-        except RemoteAccessError:
-            raise GatewayError(Cause.NO_PROTOCOL) from None
+        except RemoteAccessError as exc:
+            if exc.result in _UNKNOWN_GROUP:
+                raise GatewayError(Cause.NO_PROTOCOL) from None
+            raise
         return [message.data] if expects_reply else []
 
 

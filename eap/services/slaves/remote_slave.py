@@ -15,6 +15,7 @@ from typing import Protocol
 
 from devicebus.errors import FoeError, SoeError
 from devicebus.mailbox.conversation import MailboxMessage
+from devicebus.mailbox.eoe import FrameAssembler
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.ads.request import (
     Operation,
@@ -28,6 +29,7 @@ from eap.ads.request import (
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, AmsAnswer, AmsCommand, AmsHeader, StateFlags, response_to
 from eap.codec.coe import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
+from eap.codec.eoe import EoeHeader, EoeType, ResultWord, split_counted
 from eap.codec.foe import DATA_OVERHEAD
 from eap.codec.foe import name_of as name_of_foe
 from eap.codec.mailbox import MailboxType
@@ -47,6 +49,8 @@ PAUSE_S = 0.02
 """Pause before a station that is busy gets the request again."""
 _HANDLE_SIZE = 4
 _ABORT = b"\1"
+LONGEST_SETTINGS = 1 << 10
+"""Bytes of the longest answer about Ethernet settings."""
 LONGEST_ANSWER = 0x20002
 """Octets of the longest answer: a list of all indexes there can be."""
 SHORT_WRITE = 1 << 10
@@ -98,6 +102,7 @@ class RemoteSlave:
         self._request = request
         self._port = port
         self._answer_s = answer_s
+        self._assembler = FrameAssembler()
 
     async def sizes(self) -> MailboxSizes:
         """Return the sizes of the slave's mailboxes, from the dictionary of its master (ETG.1510).
@@ -232,8 +237,34 @@ class RemoteSlave:
     async def exchange(
         self, kind: MailboxType, request: bytes, *, expects_reply: bool = True
     ) -> MailboxMessage:
-        """Refuse: ADS has no service that passes mailbox messages."""
-        raise RemoteAccessError(AdsError.SERVICE)
+        """Pass a message of EoE, in an own format of ADS; refuse those of other protocols.
+
+        Raises:
+            CodecError: the message is cut.
+        """
+        del expects_reply  # its type says that
+        if kind is not MailboxType.EOE:
+            raise RemoteAccessError(AdsError.SERVICE)
+        header = EoeHeader.decode(request)
+        if header.type is not EoeType.FRAGMENT:
+            body = request[EoeHeader.SIZE + ResultWord.SIZE :]
+            answer = await self.perform(
+                ReadWrite(IndexGroup.EOE, header.type, LONGEST_SETTINGS, body)
+            )
+            return MailboxMessage(kind, answer)
+        # Whole frames: the slave's mailbox may be smaller than the fragments of the client.
+        frame = self._assembler.receive(request)
+        if frame is not None:
+            await self.perform(Write(IndexGroup.EOE, 0, frame))
+        return MailboxMessage(kind, b"")
+
+    async def read_frames(self, reader: int) -> list[bytes]:
+        """Return the Ethernet frames that the slave has sent since the last call.
+
+        Args:
+            reader: Number of the caller at the other station.
+        """
+        return split_counted(await self.perform(Read(IndexGroup.EOE, reader, BLOCK)))
 
     async def perform(
         self, operation: Operation, *, port: int | None = None, timeout_s: float | None = None

@@ -129,7 +129,10 @@ def test_session_restarts_with_an_initiate_request() -> None:
 @pytest.mark.parametrize(
     ("kind", "body", "result", "cause"),
     [
-        (EOE, "00 00 0000 61", 0, Cause.NO_PROTOCOL),
+        (EOE, "06000000", AdsError.SERVICE, Cause.NO_PROTOCOL),
+        (EOE, "06000000", AdsError.INDEX_GROUP, Cause.NO_PROTOCOL),
+        (EOE, "06000000", AdsError.HOST_UNREACHABLE, Cause.UNREACHABLE),
+        (EOE, "00", 0, Cause.TOO_SHORT),
         (COE, UPLOAD, AdsError.HOST_UNREACHABLE, Cause.UNREACHABLE),
         (COE, UPLOAD, AdsError.TARGET_PORT, Cause.NO_SLAVE),
         (COE, "00", 0, Cause.TOO_SHORT),

@@ -10,12 +10,14 @@ import pytest
 from devicebus.errors import SoeError
 from devicebus.mailbox import soe_client
 from devicebus.mailbox.aoe_server import AoeServer
+from devicebus.mailbox.eoe import iter_fragments as iter_ethernet
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_server import SoeParameter, SoeServer
 from eap.ads.request import Read, ReadWrite, Write, encode_query
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.codec.eoe import EoeType
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Display, Element, Idn, SoeAttribute, encode_list
 from eap.gateway.error_table import Cause
@@ -136,12 +138,20 @@ def test_vendor_codec_passes_messages() -> None:
     assert not codec.is_step(message)
 
 
-@pytest.mark.parametrize("body", ["0600", "0000", ""])
-def test_ethernet_codec_has_no_remote_slaves(body: str) -> None:
-    codec = EthernetCodec(Station().link(), SIZES, memory_share())
-    with pytest.raises(GatewayError) as caught:
-        answer(codec, body)
-    assert caught.value.cause is Cause.NO_PROTOCOL
+def test_ethernet_codec_collects_frames_for_remote_slaves() -> None:
+    station = Station()
+    codec = EthernetCodec(station.link(), SIZES, memory_share())
+    frame = bytes(range(200))
+    for fragment in iter_ethernet(frame, 3, 96):
+        assert answer(codec, fragment) == []
+    assert station.asked == [Write(IndexGroup.EOE, 0, frame)]
+
+
+def test_ethernet_codec_passes_settings_of_remote_slaves() -> None:
+    station = Station(bytes.fromhex("0700 0000"))
+    codec = EthernetCodec(station.link(), SIZES, memory_share())
+    assert answer(codec, "0600 0000") == ["07000000"]
+    assert station.asked == [ReadWrite(IndexGroup.EOE, EoeType.GET_IP_REQUEST, 1024, b"")]
 
 
 # AoE
