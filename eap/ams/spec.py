@@ -76,6 +76,8 @@ class RouteSpec(SpecStruct, frozen=True, kw_only=True):
         is_derived: Whether it follows from the ports of the plant and not from a route entry.
         is_client: Whether its own end requested it by "add route" (UDP 48899): it may be a client,
             which has connections of its own and does not listen.
+        file_flags: ``Flags`` of the StaticRoutes file that it is from, for an export; no effect.
+        file_timeout: ``Timeout`` of that file, likewise.
     """
 
     name: str
@@ -89,6 +91,8 @@ class RouteSpec(SpecStruct, frozen=True, kw_only=True):
     is_probed: bool = True
     is_derived: bool = False
     is_client: bool = False
+    file_flags: str = ""
+    file_timeout: str = ""
 
 
 class AccessService(StrEnum):

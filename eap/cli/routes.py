@@ -288,7 +288,8 @@ def import_routes(
     """Add the routes of FILE (StaticRoutes.xml of TwinCAT) to the router of STATION.
 
     Reads name, address and NetID of each route; its type must be TCP_IP.  An existing route is
-    replaced.  FILE - is stdin.
+    replaced.  Flags and Timeout are kept for an export, without effect.  Brokers (Mqtt) belong to
+    the plant file: the reason has their entry.  FILE - is stdin.
 
     Exits with 1 when a route cannot be added; the other routes are added.
     """
@@ -311,9 +312,10 @@ def import_routes(
 @click.argument("file", type=_FILE, required=False, metavar="[FILE]")
 @plant_option
 def export(station: str, file: Path | None, plant: str | None) -> None:
-    """Write the AMS/TCP routes of STATION to FILE or stdout, in TwinCAT's StaticRoutes format.
+    """Write routes and brokers of STATION to FILE or stdout, in TwinCAT's StaticRoutes format.
 
-    The format has no other transports; routes with other transports are named on stderr.
+    The format has AMS/TCP routes and MQTT brokers, here without keys and passwords; other routes
+    are named on stderr.
     """
     from eap.control.routes import ROUTES_EXPORT
     from eap.ops.client import connect_station

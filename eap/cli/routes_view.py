@@ -74,7 +74,8 @@ def import_table(rows: Iterable[ImportRow], *, is_done: bool) -> Iterator[TextTa
     outcome_heading = "Added" if is_done else "Would be added"
     table = TextTable("Route", "NetID", "Via", Column(outcome_heading, wraps=True))
     for row in rows:
-        outcome = Styled(row.reason or "yes", style=_STYLES["down" if row.reason else "up"])
+        text = row.reason or ("yes" if not row.note else f"yes; {row.note}")
+        outcome = Styled(text, style=_STYLES["down" if row.reason else "up"])
         table.add_row(row.name, row.net_id, row.via, outcome)
     yield table
 

@@ -334,12 +334,16 @@ class RemoteRouteResult(Document, frozen=True, kw_only=True):
 
 
 class ImportRow(Document, frozen=True, kw_only=True):
-    """One route of a file; *reason* is empty if it was added."""
+    """One route or broker of a file; *reason* is empty if it was added.
+
+    *note* names what the file has beside, such as flags that are kept without effect.
+    """
 
     name: str
     net_id: str
     via: str
     reason: str = ""
+    note: str = ""
 
 
 class Export(Document, frozen=True, kw_only=True):

@@ -8,12 +8,14 @@ from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import Any
 
+import msgspec
+
 from eap.ams.directory import AmsAddress, Directory, parse_via
-from eap.ams.spec import RouteSpec, TransportKind
+from eap.ams.spec import MqttSpec, RouteSpec, TransportKind
 from eap.codec import staticroutes
 from eap.codec.ads import AdsError
 from eap.codec.ams import AMS_TCP_PORT
-from eap.codec.staticroutes import TCP_IP, StaticRoute
+from eap.codec.staticroutes import TCP_IP, StaticBroker, StaticRoute
 from eap.control import device as device_records
 from eap.control import routes as records
 from eap.control.bus import to_octets
@@ -174,7 +176,7 @@ class RouteMethods:
 
     async def _add(self, wanted: records.RoutesAddParameters) -> records.AddedRoute:
         view = self._view(wanted.station)
-        row = await self._take(view, wanted)
+        row = await self._take(view, self._spec(wanted), wanted.replaces)
         warnings = [text for text in view.warnings() if f"route {row.name} " in text]
         return records.AddedRoute(route=row, warnings=warnings)
 
@@ -235,24 +237,39 @@ class RouteMethods:
         except ValueError as exc:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
         rows = []
-        for route in found:
+        for route in found.routes:
             rows.append(await self._import_one(view, route, dry_run=wanted.dry_run))
             await asyncio.sleep(0)  # others have their turns between
+        networks = {each.network for each in view.routes.spec.mqtt}
+        rows += [_broker_row(each, networks) for each in found.brokers]
         return rows
 
     def _export(self, wanted: records.RoutesExportParameters) -> records.Export:
         view = self._view(wanted.station)
         routes, left_out = [], []
+        added = {(each.net_id, each.octets): each for each in view.routes.added}
         for route in view.router.table:
             # StaticRoutes files know neither default routes nor virtual NetIDs.
             is_plain = route.octets and route.real is None
             if is_plain and route.hop.kind == TransportKind.AMS_TCP:
-                address = route.hop.connection.removesuffix(_USUAL_PORT)
-                routes.append(StaticRoute(route.name, str(route.net_id), address))
-            else:
+                kept = added.get((str(route.net_id), route.octets))
+                routes.append(
+                    StaticRoute(
+                        route.name,
+                        str(route.net_id),
+                        route.hop.connection.removesuffix(_USUAL_PORT),
+                        flags=kept.file_flags if kept else "",
+                        timeout=kept.file_timeout if kept else "",
+                        is_unidirectional=route.is_unidirectional,
+                    )
+                )
+            elif route.hop.kind != TransportKind.MQTT:
                 left_out.append(route.name)
         router = view.router
-        xml = staticroutes.dump(router.name, str(router.net_id), routes, tcp_port=AMS_TCP_PORT)
+        brokers = [_static_broker(each) for each in view.routes.spec.mqtt]
+        xml = staticroutes.dump(
+            router.name, str(router.net_id), routes, brokers, tcp_port=AMS_TCP_PORT
+        )
         return records.Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
 
     async def _import_one(
@@ -260,28 +277,40 @@ class RouteMethods:
     ) -> records.ImportRow:
         via, reason = f"{TransportKind.AMS_TCP}:{route.address}", ""
         wanted = records.RoutesAddParameters(
-            station=view.router.name, name=route.name, net_id=route.net_id, via=via
+            station=view.router.name,
+            name=route.name,
+            net_id=route.net_id,
+            via=via,
+            unidirectional=route.is_unidirectional,
         )
-        if route.type != TCP_IP:
+        if route.security:
+            # Without it the packets would cross the network in clear text.
+            reason = f"it is protected by {route.security}, which AMS/TCP has not here"
+        elif route.type != TCP_IP:
             reason = f"its type is {route.type!r}, expected {TCP_IP}"
         elif not route.address or not route.net_id or not route.name:
             reason = "it lacks Name, NetId or Address"
         else:
             try:
+                spec = msgspec.structs.replace(
+                    self._spec(wanted), file_flags=route.flags, file_timeout=route.timeout
+                )
                 if dry_run:
-                    view.routes.check(self._spec(wanted))
+                    view.routes.check(spec)
                 else:
-                    await self._take(view, wanted)
+                    await self._take(view, spec)
             except ControlError as exc:
                 reason = str(exc)
-        return records.ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
+        note = "" if reason else _kept_note(route)
+        return records.ImportRow(
+            name=route.name, net_id=route.net_id, via=via, reason=reason, note=note
+        )
 
     async def _take(
-        self, view: RouterView, wanted: records.RoutesAddParameters
+        self, view: RouterView, spec: RouteSpec, replaces: str = ""
     ) -> records.RouteRow:
-        spec = self._spec(wanted)
         with unless_unavailable():
-            route = await view.routes.add(spec, replaces=wanted.replaces)
+            route = await view.routes.add(spec, replaces=replaces)
         return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
 
     def _spec(self, wanted: records.RoutesAddParameters) -> RouteSpec:
@@ -324,6 +353,49 @@ class RouteMethods:
 
     def _view(self, station: str) -> RouterView:
         return of_station(station, self._views)
+
+
+def _kept_note(route: StaticRoute) -> str:
+    """Return a note on what is kept for an export and has no effect."""
+    kept = [f"Flags {route.flags}"] if route.flags else []
+    kept += [f"Timeout {route.timeout}"] if route.timeout else []
+    return f"{' and '.join(kept)} kept for an export, without effect" if kept else ""
+
+
+def _broker_row(broker: StaticBroker, networks: set[str]) -> records.ImportRow:
+    """Return the row of a broker, which only a plant file can add."""
+    via, reason = f"{TransportKind.MQTT}:{broker.topic}", ""
+    if broker.topic not in networks:
+        scheme = "mqtts" if broker.has_tls or broker.has_psk else "mqtt"
+        keys = [
+            f'mqtt: "{scheme}://{broker.address}:{broker.port}"',
+            f"network: {broker.topic}",
+            *((f"user: {broker.user}",) if broker.user else ()),
+            *(("unidirectional: true",) if broker.is_unidirectional else ()),
+        ]
+        needed = [
+            *(("password_file",) if broker.user else ()),
+            *(("tls with ca, certificate and key",) if broker.has_tls else ()),
+        ]
+        reason = f"a broker belongs to the plant file: - {{{', '.join(keys)}}}"
+        reason += f"; write {' and '.join(needed)} too" if needed else ""
+        if broker.has_psk:
+            reason += "; pre-shared keys are not supported, use certificates"
+    return records.ImportRow(name=broker.topic, net_id="", via=via, reason=reason)
+
+
+def _static_broker(spec: MqttSpec) -> StaticBroker:
+    tls = spec.tls
+    return StaticBroker(
+        spec.host,
+        spec.port,
+        spec.network,
+        spec.user,
+        tls.ca if tls else "",
+        tls.certificate if tls else "",
+        has_tls=tls is not None,
+        is_unidirectional=spec.is_unidirectional,
+    )
 
 
 def _neighbour_row(view: RouterView, found: FoundRouter) -> records.NeighbourRow:

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from eap.ams.routes import Origin, Route
-from eap.codec.staticroutes import StaticRoute, dump, parse
+from eap.ams.spec import MqttSpec, RoutingSpec, TlsSpec
+from eap.codec.staticroutes import StaticBroker, StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
 from eap.ids import Endpoint, NetId
 from eap.services.control.route_methods import RouteMethods
@@ -161,7 +162,66 @@ def test_import_adds_valid_routes_and_reports_the_rest(ask, left):
     with pytest.raises(ControlError) as caught:
         ask("import", station="left", xml="<a/>")
     code, text = caught.value.code, str(caught.value)
-    assert (code, text) == ("value", "it begins with 'a', expected TcConfig")
+    assert (code, text) == ("value", "line 1: it begins with 'a', expected TcConfig")
+
+
+def test_import_keeps_flags_and_timeout_for_an_export(ask, left):
+    plc = StaticRoute(
+        "plc", "5.1.2.3.1.1", "10.0.0.5", flags="64", timeout="5", is_unidirectional=True
+    )
+    (row,) = ask("import", station="left", xml=dump("x", "1.1.1.1.1.1", [plc], tcp_port=48898))
+    assert (row.reason, row.note) == (
+        "",
+        "Flags 64 and Timeout 5 kept for an export, without effect",
+    )
+    (route,) = (each for each in left.router.table if each.name == "plc")
+    assert (route.is_unidirectional, route.timeout_ns) == (True, 0)
+    assert names(Left()) == ["right", "plc"]  # as it was stored
+    assert parse(ask("export", station="left").xml).routes == [plc]
+
+
+def test_import_does_not_open_a_protected_route_in_clear_text(ask, left):
+    xml = dump("x", "1.1.1.1.1.1", [StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5")], tcp_port=48898)
+    xml = xml.replace("</Route>", "<Tls><Ca>ca.crt</Ca><Key>secret-1</Key></Tls></Route>")
+    (row,) = ask("import", station="left", xml=xml)
+    assert row.reason == "it is protected by Tls, which AMS/TCP has not here"
+    assert names(left) == ["right"]
+
+
+def test_import_names_the_plant_file_entry_of_a_broker(ask, left):
+    brokers = [
+        StaticBroker("broker.hall", 8883, "hall", "me", "ca.crt", "a.crt", has_tls=True),
+        StaticBroker("other", 8883, "other", has_psk=True),
+        StaticBroker("known", 1883, "line"),
+    ]
+    xml = dump("x", "1.1.1.1.1.1", (), brokers, tcp_port=48898)
+    xml = xml.replace("<Topic>other</Topic>", "<Topic>other</Topic><Psk><Pwd>secret-1</Pwd></Psk>")
+    left.routes.replace_spec(RoutingSpec(mqtt=(MqttSpec(network="line", host="known"),)))
+    hall, other, known = ask("import", station="left", xml=xml)
+    assert (hall.name, hall.via) == ("hall", "mqtt:hall")
+    assert hall.reason == (
+        'a broker belongs to the plant file: - {mqtt: "mqtts://broker.hall:8883", network: hall,'
+        " user: me}; write password_file and tls with ca, certificate and key too"
+    )
+    assert "pre-shared keys are not supported" in other.reason
+    assert "secret-1" not in other.reason
+    assert known.reason == ""
+
+
+def test_export_has_brokers_without_secrets(ask, left):
+    tls = TlsSpec(ca="/etc/ca.crt", certificate="/etc/a.crt", key="/etc/a.key")
+    hall = MqttSpec(
+        network="hall", host="broker.hall", port=8883, user="me", password_file="/etc/pw", tls=tls
+    )
+    left.routes.replace_spec(RoutingSpec(mqtt=(hall,)))
+    found = ask("export", station="left")
+    assert "a.key" not in found.xml
+    assert "/etc/pw" not in found.xml
+    assert parse(found.xml).brokers == [
+        StaticBroker(
+            "broker.hall", 8883, "hall", "me", "/etc/ca.crt", "/etc/a.crt", has_tls=True
+        )
+    ]  # fmt: skip
 
 
 def test_export_holds_ams_tcp_and_names_the_rest(ask):
@@ -170,7 +230,7 @@ def test_export_holds_ams_tcp_and_names_the_rest(ask):
     ask("add", **(PLC | {"name": "nat", "net_id": "5.1.2.5.1.1", "virtual": "9.9.9.9.1.1"}))
     found = ask("export", station="left")
     assert found.left_out == ["right", "nat"]
-    assert parse(found.xml) == [
+    assert parse(found.xml).routes == [
         StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
         StaticRoute("behind", "5.1.2.4.1.1", "plc:1000"),
     ]
