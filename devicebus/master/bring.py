@@ -14,7 +14,7 @@ from devicebus.master.configuration import (
 )
 from devicebus.master.cycle import Participation
 from devicebus.master.esm import acknowledge, change_state, path
-from devicebus.master.image import MAX_FMMUS, SlaveLayout
+from devicebus.master.image import MAX_FMMUS, SlaveLayout, SlaveProcessData
 from devicebus.master.mailboxes import MailboxArea, configure
 from devicebus.master.procedure import Procedure, Sleep, write
 from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
@@ -152,9 +152,13 @@ def _begin_preop(bus: BusState, slave: BusSlave) -> Procedure[None]:
 
 def _prepare_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     yield from prepare_safeop(bus, slave)
-    layout = bus.image.layout.slaves.get(slave.station) if bus.image is not None else None
-    if layout is None:
+    image = bus.image
+    if image is None or slave.station not in image.layout.slaves:
         return
+    layout = image.replan_slave(
+        SlaveProcessData(slave.station, slave.channels, slave.found.esc.fmmus),
+        is_described=slave.expected is not None and bool(slave.expected.channels),
+    )
     yield from prepare_registers(bus, slave)
     # Between the write of the first FMMU and SAFEOP the slave counts partly or fully.
     bus.set_participation(slave, Participation.UNCERTAIN)

@@ -13,9 +13,10 @@ from devicebus.master.cycle import Cycle, Participation
 from devicebus.master.image import BusImage
 from devicebus.master.link import CEILING_NS, RETRIES, Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
+from devicebus.master.matching import ExpectedSlave
 from devicebus.master.pdo import ProcessDataChannel
 from devicebus.master.procedure import Runner, Task
-from devicebus.master.scan import FIRST_STATION, ExpectedSlave, FoundSlave
+from devicebus.master.scan import FIRST_STATION, FoundSlave
 from devicebus.wire.alstatus import AlState
 from eap.od.slave_config import SlaveConfig
 
@@ -44,6 +45,13 @@ class SlaveBack(msgspec.Struct, frozen=True):
     at_ns: int
 
 
+class SlaveAbsent(msgspec.Struct, frozen=True):
+    """An optional slave was unplugged."""
+
+    station: int
+    at_ns: int
+
+
 class SlaveFailed(msgspec.Struct, frozen=True):
     """A slave could not be brought back to its target state; the master retries."""
 
@@ -64,7 +72,9 @@ class BusBack(msgspec.Struct, frozen=True):
     at_ns: int
 
 
-Event: TypeAlias = SlaveLost | SlaveLeft | SlaveBack | SlaveFailed | BusLost | BusBack | Unsolicited
+Event: TypeAlias = (
+    SlaveLost | SlaveLeft | SlaveBack | SlaveAbsent | SlaveFailed | BusLost | BusBack | Unsolicited
+)
 
 
 MAX_EVENTS = 1000
@@ -111,7 +121,7 @@ class ChangeCount:
 
 
 # Attributes of a slave whose changes users of the bus see.
-_NOTED = frozenset(("state", "target", "is_lost", "mailbox", "work"))
+_NOTED = frozenset(("state", "target", "is_lost", "is_absent", "mailbox", "work", "found"))
 _UNSET = object()
 
 
@@ -122,6 +132,7 @@ class BusSlave:
         revision: Count of changes of the bus at its last change.
         state: AL state at the last read; None after the slave was lost, until the next read.
         target: Requested state.
+        expected: The slave that it stands for; None if nothing is expected.
         config: Its configuration.
         is_configured: True if its PDOs and start-up writes of PS are done since it entered PREOP.
         is_set_up: True while its sync managers and FMMUs are configured for process data.
@@ -129,6 +140,7 @@ class BusSlave:
         mailbox: Open mailbox; None in states without one.
         missing_since_ns: Time at which it left its target state; None while it is there.
         is_lost: True from a missing answer until the slave is configured again.
+        is_absent: True while an optional slave is not plugged in; it is lost then, too.
         work: Task that brings it to a state.
         retry_ns: Earliest time of the next attempt.
     """
@@ -138,7 +150,7 @@ class BusSlave:
         found: FoundSlave,
         name: str,
         changes: ChangeCount | None = None,
-        config: SlaveConfig | None = None,
+        expected: ExpectedSlave | None = None,
     ) -> None:
         self._changes = changes or ChangeCount()
         self.revision = 0
@@ -147,13 +159,15 @@ class BusSlave:
         self.station = found.station
         self.state: AlState | None = None
         self.target = AlState.INIT
-        self.config = config or SlaveConfig()
+        self.expected = expected
+        self.config = expected.config if expected is not None else SlaveConfig()
         self.is_configured = False
         self.is_set_up = False
         self.channels: tuple[ProcessDataChannel, ...] = ()
         self.mailbox: Mailbox | None = None
         self.missing_since_ns: int | None = None
         self.is_lost = False
+        self.is_absent = False
         self.work: Task[Any] | None = None
         self.retry_ns = 0
 
@@ -182,6 +196,11 @@ class BusSlave:
         """True while a task brings it to a state."""
         return self.work is not None and not self.work.is_done
 
+    @property
+    def is_optional(self) -> bool:
+        """True if it may be absent."""
+        return self.expected is not None and self.expected.is_optional
+
     def mark_lost(self) -> None:
         """Mark the slave as lost: it does not answer, or another device is in its place."""
         self.is_lost = True
@@ -199,6 +218,9 @@ class BusState:
         reference: Station address of the slave whose clock the others follow.
         is_lost: True while no frame comes back, so that the state of every slave is unknown.
         needs_check: True after a faulty cycle: the watch reads the slaves' states soon.
+        knows_lrw: True if the cycle uses LRW.
+        probe_ns: Time of the next look at slaves that are not expected.
+        strangers: Slaves that are plugged in, but not expected, in words.
     """
 
     def __init__(self, settings: MasterSettings) -> None:
@@ -216,6 +238,9 @@ class BusState:
         self.reference: int | None = None
         self.is_lost = False
         self.needs_check = False
+        self.knows_lrw = False
+        self.strangers: tuple[str, ...] = ()
+        self.probe_ns = 0
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
 
     @property
@@ -224,6 +249,17 @@ class BusState:
         return self.settings.clocks or any(
             each.config.sync is not None and each.config.sync.activate >> 8
             for each in self.settings.expected
+        )
+
+    def lacks_group(self, slave: BusSlave) -> bool:
+        """Return true for an absent slave, of whose hot-connect group others are there."""
+        group = slave.config.group
+        return (
+            slave.is_absent
+            and bool(group)
+            and any(
+                each.config.group == group and not each.is_lost for each in self.slaves.values()
+            )
         )
 
     def emit(self, event: Event) -> None:
@@ -275,3 +311,4 @@ class BusState:
         # Without cycles nothing refills the budget: acyclic datagrams would stop for ever.
         self.link.stop_cycles()
         self.is_lost = self.needs_check = False
+        self.strangers = ()

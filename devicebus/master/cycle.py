@@ -30,7 +30,12 @@ class Participation(Enum):
     """Not configured: it does not count."""
     UNCERTAIN = auto()
     """Counts or not: it is being configured, or is lost and may return as it was."""
+    AWAY = auto()
+    """Unplugged: it does not count, but may return as it was."""
     ACTIVE = auto()
+
+
+_COUNTING = frozenset((Participation.ACTIVE, Participation.UNCERTAIN))
 
 
 class CycleStats(msgspec.Struct, frozen=True, kw_only=True):
@@ -96,6 +101,7 @@ class Cycle:
         ]
         self._all_active = [False] * len(self._members)
         self._allowed = (0,) * len(self._datagrams)
+        self._expected_each = (0,) * len(self._datagrams)
         self._expected = 0
         for number in range(len(self._members)):
             self._update_expected(number)
@@ -119,7 +125,7 @@ class Cycle:
     @property
     def is_full(self) -> bool:
         """True if the last cycle came back with the full working counter of all active slaves."""
-        return self.is_good and self._received == self._expected > 0
+        return self.is_good and self._received >= self._expected > 0
 
     def start(self, now_ns: int) -> None:
         """Queue this cycle's datagrams, unless MAX_UNDER_WAY cycles are in flight."""
@@ -220,21 +226,26 @@ class Cycle:
         members = self._members[number]
         participations = [self._participation[slave.station] for slave in members]
         self._all_active[number] = all(each is Participation.ACTIVE for each in participations)
-        allowed = list(self._allowed)
+        allowed, expected = list(self._allowed), list(self._expected_each)
         for at, datagram in enumerate(self._datagrams):
             if datagram.group != number:
                 continue
             # Bit n: working counter n is allowed.  An active slave shifts all, an uncertain one
             # adds the shifted alternatives.
             counts = 1
+            expected[at] = 0
             for slave, participation in zip(members, participations, strict=True):
+                count = _count(datagram.command, slave)
                 if participation is Participation.ACTIVE:
-                    counts <<= _count(datagram.command, slave)
-                elif participation is Participation.UNCERTAIN:
-                    counts |= counts << _count(datagram.command, slave)
+                    counts <<= count
+                elif participation is not Participation.ABSENT:
+                    counts |= counts << count
+                if participation in _COUNTING:
+                    expected[at] += count
             allowed[at] = counts
         self._allowed = tuple(allowed)
-        self._expected = sum(counts.bit_length() - 1 for counts in allowed)
+        self._expected_each = tuple(expected)
+        self._expected = sum(expected)
 
 
 def _datagrams_of(number: int, group: DatagramGroup, *, knows_lrw: bool) -> list[_CyclicDatagram]:

@@ -18,6 +18,7 @@ from devicebus.master.pdo import ProcessDataChannel
 from devicebus.wire.register import FMMU_READ, FMMU_WRITE, Fmmu, SyncManager
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType, Value
+from eap.ids import ObjectId
 
 BASE = 0x0001_0000
 """First logical address."""
@@ -118,6 +119,28 @@ def plan_image(slaves: Sequence[SlaveProcessData]) -> ProcessDataLayout:
             DatagramGroup(address, start[0], outputs - start[0], start[1], inputs - start[1])
         )
     return ProcessDataLayout(layouts, tuple(groups), tuple(variables))
+
+
+def replan_slave(layout: ProcessDataLayout, slave: SlaveProcessData) -> ProcessDataLayout:
+    """Return the layout with the process data of one slave as it is now, at its offsets.
+
+    Raises BusError if it has another size than planned.
+    """
+    old = layout.slaves[slave.station]
+    group = layout.groups[old.group]
+    shift = group.address - group.outputs, group.address + group.outputs_size - group.inputs
+    new = _plan_slave(slave, old.group, (old.outputs, old.inputs), shift)
+    if (new.outputs_size, new.inputs_size) != (old.outputs_size, old.inputs_size):
+        raise BusError(
+            f"slave {slave.station}: it has {new.outputs_size} bytes of outputs and"
+            f" {new.inputs_size} of inputs, but {old.outputs_size} and {old.inputs_size} are"
+            " planned: correct its description, or restart the bus"
+        )
+    variables = [each for each in layout.variables if each.station != slave.station]
+    return layout._replace(
+        slaves={**layout.slaves, slave.station: new},
+        variables=(*variables, *_variables(slave, new)),
+    )
 
 
 def _group(slaves: Sequence[SlaveProcessData]) -> Iterator[list[SlaveProcessData]]:
@@ -232,9 +255,36 @@ class BusImage:
 
     def __init__(self, layout: ProcessDataLayout) -> None:
         self.layout = layout
+        self._planned: dict[int, SlaveProcessData] = {}
         self.outputs = bytearray(layout.outputs_size)
         self.inputs = bytearray(layout.inputs_size)
         self._variables = {(each.station, each.name): each for each in layout.variables}
+
+    def replan_slave(self, slave: SlaveProcessData, *, is_described: bool) -> SlaveLayout:
+        """Plan one slave again as it is now, at its offsets; return its part.
+
+        Raises BusError if it has another size than planned or, if it was described, other entries.
+        """
+        if self._is_planned(slave):
+            return self.layout.slaves[slave.station]
+        layout = replan_slave(self.layout, slave)
+        before, after = (_entries_of(each, slave.station) for each in (self.layout, layout))
+        if is_described and before != after:
+            wrong = next(each for each in (*after, *before) if (each in before) != (each in after))
+            verb = "has" if wrong in after else "lacks"
+            raise BusError(
+                f"slave {slave.station}: its process data is not as described: it {verb}"
+                f" {'output' if wrong.is_output else 'input'}"
+                f" {ObjectId(wrong.object_index, wrong.subindex)} of {wrong.bit_length} bits at bit"
+                f" {wrong.bit_offset}"
+            )
+        self.layout = layout
+        self._variables = {(each.station, each.name): each for each in layout.variables}
+        self._planned[slave.station] = slave
+        return layout.slaves[slave.station]
+
+    def _is_planned(self, slave: SlaveProcessData) -> bool:
+        return self._planned.get(slave.station) == slave
 
     def variable(self, station: int, name: str) -> ProcessVariable:
         """Return an entry by its slave and name; raise BusError with the known names."""
@@ -285,6 +335,22 @@ class BusImage:
         word = int.from_bytes(self.outputs[first:end], "little") & ~(mask << shift)
         word |= (int.from_bytes(octets, "little") & mask) << shift
         self.outputs[first:end] = word.to_bytes(end - first, "little")
+
+
+class _Place(NamedTuple):
+    is_output: bool
+    object_index: int
+    subindex: int
+    bit_offset: int
+    bit_length: int
+
+
+def _entries_of(layout: ProcessDataLayout, station: int) -> list[_Place]:
+    return [
+        _Place(each.is_output, each.index, each.subindex, each.bit_offset, each.bit_length)
+        for each in layout.variables
+        if each.station == station
+    ]
 
 
 def data_type_of(variable: ProcessVariable) -> DataType | None:

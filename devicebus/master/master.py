@@ -82,6 +82,15 @@ class Master:
         return self._bus.cycle
 
     @property
+    def strangers(self) -> tuple[str, ...]:
+        """Slaves that were plugged in, but are not expected, in words."""
+        return self._bus.strangers
+
+    def lacks_group(self, slave: BusSlave) -> bool:
+        """Return true for an absent slave, of whose hot-connect group others are there."""
+        return self._bus.lacks_group(slave)
+
+    @property
     def is_waiting(self) -> bool:
         """True while frames may come back."""
         return self._bus.link.is_waiting
@@ -119,6 +128,8 @@ class Master:
         Raises BusError for an unknown slave, or one whose state is being changed.
         """
         slave = self._slave(station)
+        if slave.is_absent:
+            raise BusError(f"slave {station} ({slave.name}) is absent: plug it in")
         if slave.is_busy:
             raise BusError(f"slave {station} is being brought to {slave.target.name} already")
         slave.target = target
@@ -234,6 +245,8 @@ class Master:
 def why_closed(slave: BusSlave) -> NoMailboxError | MailboxClosedError:
     """Return the error of a slave without an open mailbox: permanent, by its state, or for now."""
     name = f"slave {slave.station} ({slave.name})"
+    if slave.is_absent:
+        return MailboxClosedError(f"{name} is absent")
     if slave.is_lost:
         return MailboxClosedError(f"{name} does not answer")
     if slave.found.fault or not standard_mailbox(slave.found.sii.fixed).is_there:

@@ -1,4 +1,4 @@
-"""Scan of a bus: number, identity and topology of the slaves, compared with the expected ones.
+"""Scan of a bus: number, identity and topology of the slaves.
 
 A frame leaves a slave through its open ports in the order 3, 1, 2 and enters at port 0, so the open
 ports of all slaves in the order of the frame give the tree (ETG.1000.4, DL status).
@@ -6,13 +6,10 @@ ports of all slaves in the order of the frame give the tree (ETG.1000.4, DL stat
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from difflib import SequenceMatcher
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import msgspec
-
-from devicebus.errors import BusError, IdentityError
+from devicebus.errors import BusError
 from devicebus.master.eeprom import read_image, read_words, take_over
 from devicebus.master.procedure import Procedure, not_answered, together
 from devicebus.wire import sii
@@ -21,7 +18,6 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 from devicebus.wire.sii import Sii, SiiFixed
 from eap.codec.wire import WireStruct, u8, u16, u32
 from eap.errors import EapError
-from eap.od.slave_config import SlaveConfig
 
 _ORDER = (3, 1, 2)
 
@@ -35,6 +31,10 @@ class TopologyNode(NamedTuple):
     """Position of the slave that it is connected to; None for the master."""
     parent_port: int
     entry_port: int
+
+
+NOWHERE = TopologyNode((), None, 0, 0)
+"""Topology node of a slave that is not there."""
 
 
 def open_ports(status: DlStatus) -> tuple[int, ...]:
@@ -171,6 +171,26 @@ def scan(first_station: int = FIRST_STATION) -> Procedure[tuple[FoundSlave, ...]
     )
 
 
+def find_slave(station: int) -> Procedure[FoundSlave]:
+    """Read registers and EEPROM of one slave; position and topology node are those of none.
+
+    Raises WorkingCounterError if it does not answer.
+    """
+    (registers,) = yield from _read_registers([station])
+    (image,) = yield from together([read_image(station)])
+    return _found(-1, station, registers, NOWHERE, image)
+
+
+def read_topology(count: int) -> Procedure[list[tuple[int, TopologyNode]]]:
+    """Return station address and topology node at each of the first *count* positions."""
+    stations = yield from read_stations(count)
+    replies = yield from in_frames(
+        [aprd(at, Register.DL_STATUS, DlStatus.SIZE) for at in range(count)]
+    )
+    nodes = find_topology([DlStatus.decode(reply.data) for reply in replies])
+    return list(zip(stations, nodes, strict=True))
+
+
 def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
     """Assign station addresses to the slaves at the given positions.
 
@@ -259,117 +279,3 @@ def in_frames(datagrams: Sequence[DatagramRequest]) -> Procedure[list[DatagramRe
         answers, _ = yield datagrams[start : start + _DATAGRAMS_PER_STEP]
         replies += answers
     return replies
-
-
-class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
-    """Configured slave; None accepts any value."""
-
-    name: str
-    vendor: int
-    product: int
-    revision: int | None = None
-    serial: int | None = None
-    alias: int | None = None
-    """Alias; a slave with one other than 0 may have any position (:func:`match_aliases`)."""
-    config: SlaveConfig = SlaveConfig()
-
-
-def fits(expected: ExpectedSlave, identity: Identity) -> bool:
-    """Return true if *identity* fits the expected slave."""
-    return (
-        (expected.vendor, expected.product) == (identity.vendor, identity.product)
-        and expected.revision in {None, identity.revision}
-        and expected.serial in {None, identity.serial}
-    )
-
-
-def check_bus(expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]) -> None:
-    """Compare found with expected slaves; raise IdentityError with every difference."""
-    lines = list(iter_differences(expected, found))
-    if lines:
-        text = "\n  ".join(lines)
-        raise IdentityError(
-            f"the bus is not as configured ({len(expected)} slaves expected, {len(found)} found):"
-            f"\n  {text}"
-        )
-
-
-def match_aliases(expected: Sequence[ExpectedSlave], aliases: Sequence[int]) -> tuple[int, ...]:
-    """Return the number of the expected slave for each position.
-
-    A slave with an alias may have any position; the slaves behind it, up to the next one with an
-    alias, stay behind it.  If an alias is missing or found twice, the order is the expected one.
-
-    Args:
-        expected: Expected slaves in the order of the configuration.
-        aliases: Aliases of the found slaves in the order of the segment.
-    """
-    blocks: dict[int, list[int]] = {0: []}
-    for number, each in enumerate(expected):
-        if each.alias and each.alias in blocks:
-            return tuple(range(len(expected)))
-        if each.alias:
-            blocks[each.alias] = []
-        blocks[next(reversed(blocks))].append(number)
-    order = [alias for alias in aliases if alias and alias in blocks]
-    if sorted([0, *order]) != sorted(blocks):
-        return tuple(range(len(expected)))
-    return tuple(number for alias in (0, *order) for number in blocks[alias])
-
-
-def iter_differences(
-    expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]
-) -> Iterator[str]:
-    """Yield one line for each difference; a missing slave does not make those behind it differ.
-
-    With the expected number of slaves, they are compared by position.
-    """
-    if len(expected) == len(found):
-        for each, slave in zip(expected, found, strict=True):
-            yield from _compare(each, slave)
-        return
-    matcher = SequenceMatcher(
-        None,
-        [(each.vendor, each.product) for each in expected],
-        [(each.identity.vendor, each.identity.product) for each in found],
-        # A bus has many equal slaves, which autojunk would ignore as noise.
-        autojunk=False,
-    )
-    for _, start, end, there, there_end in matcher.get_opcodes():
-        pairs = min(end - start, there_end - there)
-        for offset in range(pairs):
-            yield from _compare(expected[start + offset], found[there + offset])
-        for missing in expected[start + pairs : end]:
-            before = f"after {found[there - 1 + pairs].name}" if there + pairs else "at the start"
-            yield f"{missing.name} is missing {before}, expected {_describe(missing)}"
-        for slave in found[there + pairs : there_end]:
-            yield f"{_name_of(slave)}: {slave.fault or slave.identity}, expected no slave here"
-
-
-def _compare(expected: ExpectedSlave, slave: FoundSlave) -> Iterator[str]:
-    if slave.fault:
-        yield f"{_name_of(slave)}: {slave.fault}, expected {expected.name}"
-    elif not fits(expected, slave.identity):
-        serial = f", serial {slave.identity.serial}" if expected.serial is not None else ""
-        yield (
-            f"{_name_of(slave)}: {slave.identity}{serial},"
-            f" expected {expected.name} with {_describe(expected)}"
-        )
-    elif expected.alias not in {None, slave.alias}:
-        yield (
-            f"{_name_of(slave)}: alias {slave.alias}, expected {expected.name} with alias"
-            f" {expected.alias}"
-        )
-
-
-def _name_of(slave: FoundSlave) -> str:
-    return f"position {slave.position} (station {slave.station})"
-
-
-def _describe(expected: ExpectedSlave) -> str:
-    text = f"vendor 0x{expected.vendor:08X}, product 0x{expected.product:08X}"
-    if expected.revision is not None:
-        text += f", revision 0x{expected.revision:08X}"
-    if expected.serial is not None:
-        text += f", serial {expected.serial}"
-    return text

@@ -11,10 +11,12 @@ from devicebus.master.configuration import prepare_safeop, run_writes, transitio
 from devicebus.master.cycle import Cycle
 from devicebus.master.esm import POLL_NS, TIMEOUT_NS
 from devicebus.master.findings import join_errors
+from devicebus.master.hotconnect import absent_slave, read_marks
 from devicebus.master.image import BusImage, SlaveProcessData, plan_image
+from devicebus.master.matching import ExpectedSlave, Marks, match_slaves
 from devicebus.master.pdo import ProcessDataChannel, channels_from_sii
 from devicebus.master.procedure import Procedure, Sleep, together
-from devicebus.master.scan import FoundSlave, assign_stations, check_bus, match_aliases, scan
+from devicebus.master.scan import FoundSlave, assign_stations, scan
 from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
 from devicebus.wire.datagram import brd, bwr
 from devicebus.wire.register import AlControl, AlStatus, Register
@@ -39,7 +41,7 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
     bus.slaves = {slave.station: slave for slave in slaves}
     for slave in slaves:
         slave.target = target
-    starting = _StartingSlaves(slaves)
+    starting = _StartingSlaves([slave for slave in slaves if not slave.is_absent])
     yield from starting.run_all(lambda slave: bring(bus, slave, AlState.INIT))
     if target is not AlState.INIT:
         yield from starting.run_all(lambda slave: bring(bus, slave, AlState.PREOP))
@@ -91,6 +93,7 @@ def set_up_cycle(bus: BusState) -> None:
         bus.needs_check = True
 
     bus.image = BusImage(layout)
+    bus.knows_lrw = knows_lrw
     bus.cycle = Cycle(bus.link, bus.image, on_fault, knows_lrw=knows_lrw)
     bus.distribute_time(bus.reference)
 
@@ -100,8 +103,8 @@ def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusS
     expected = bus.settings.expected
     if not expected:
         return [BusSlave(slave, slave.name, bus.changes) for slave in found]
-    order = match_aliases(expected, [slave.alias for slave in found])
-    check_bus([expected[number] for number in order], found)
+    marks = yield from _read_marks(expected, found)
+    order = match_slaves(expected, found, marks)
     stations = [bus.settings.first_station + number for number in order]
     moved = [
         (slave.position, station)
@@ -110,22 +113,46 @@ def _identify(bus: BusState, found: Sequence[FoundSlave]) -> Procedure[list[BusS
     ]
     if moved:
         yield from assign_stations(moved)
-    return [
-        BusSlave(
-            slave._replace(station=station),
-            expected[number].name,
-            bus.changes,
-            expected[number].config,
+    present = {
+        number: BusSlave(
+            slave._replace(station=station), expected[number].name, bus.changes, expected[number]
         )
         for slave, station, number in zip(found, stations, order, strict=True)
-    ]
+    }
+    slaves = list(present.values())
+    for number, each in enumerate(expected):
+        if number not in present:
+            absent = absent_slave(each, bus.settings.first_station + number, bus.changes)
+            # Behind the one that is configured before it, wherever that is on the bus.
+            before = [
+                (slave.station, at)
+                for at, slave in enumerate(slaves, 1)
+                if slave.station < absent.station
+            ]
+            slaves.insert(max(before, default=(0, 0))[1], absent)
+    return slaves
+
+
+def _read_marks(
+    expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]
+) -> Procedure[list[Marks]]:
+    """Return the marks of the found slaves; identifications are read where one is expected."""
+    results = yield from together(
+        [read_marks(expected, slave.station, slave.identity, slave.alias) for slave in found]
+    )
+    for result in results:
+        if isinstance(result, EapError):
+            raise result
+    return [result for result in results if not isinstance(result, EapError)]
 
 
 def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState) -> Procedure[None]:
     """Plan the process image and bring the remaining slaves to SAFEOP or OP."""
-    # Failed slaves get a part of the image by their EEPROM: they can return without a new layout.
+    # Failed slaves get a part of the image by their description or EEPROM: they can return without
+    # a new layout.
     for slave, _ in starting.errors:
-        slave.channels = _channels_by_eeprom(slave)
+        described = slave.expected.channels if slave.expected is not None else ()
+        slave.channels = described or _channels_by_eeprom(slave)
     # Clocks are set before SAFEOP, where slaves with SYNC0 check them.
     if bus.uses_clocks:
         yield from set_clocks(bus)

@@ -20,6 +20,7 @@ from devicebus.master.bus import (
     BusLost,
     BusSlave,
     BusState,
+    SlaveAbsent,
     SlaveBack,
     SlaveFailed,
     SlaveLeft,
@@ -27,6 +28,7 @@ from devicebus.master.bus import (
 )
 from devicebus.master.cycle import Participation
 from devicebus.master.diagnosis import COUNTERS, port_counters
+from devicebus.master.hotconnect import identify_arrivals, refresh_topology, take_in
 from devicebus.master.mailboxes import STATUS
 from devicebus.master.procedure import Procedure, Sleep, Task
 from devicebus.master.scan import (
@@ -152,7 +154,9 @@ def watch(bus: BusState) -> Procedure[None]:
             else:
                 _mark_lost(bus, slave, now_ns)
         lost = [slave for slave in bus.slaves.values() if slave.is_lost]
-        if lost and count > len(bus.slaves) - len(lost):
+        if count <= len(bus.slaves) - len(lost):
+            bus.strangers = ()
+        elif lost:
             yield from _readdress(bus, count, now_ns)
 
 
@@ -171,6 +175,7 @@ def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
     if slave.is_lost:
         return
     slave.mark_lost()
+    slave.is_absent = slave.is_optional
     slave.retry_ns = 0
     slave.missing_since_ns = slave.missing_since_ns or now_ns
     # Cleared first: the end of a cancelled task is not a failed attempt.
@@ -179,11 +184,13 @@ def _mark_lost(bus: BusState, slave: BusSlave, now_ns: int) -> None:
         work.cancel()
     bus.close_mailbox(slave)
     # Its registers may still be configured: it counts again as soon as it is back on the cable.
-    bus.set_participation(slave, Participation.UNCERTAIN)
+    away = Participation.AWAY if slave.is_absent else Participation.UNCERTAIN
+    bus.set_participation(slave, away)
     if slave.station == bus.reference:
         # Otherwise the others would receive the time of an empty datagram.
         bus.distribute_time(None)
-    bus.emit(SlaveLost(slave.station, now_ns))
+    event = SlaveAbsent if slave.is_absent else SlaveLost
+    bus.emit(event(slave.station, now_ns))
 
 
 def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> None:
@@ -200,6 +207,9 @@ def _check_slave(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) 
         return
     if slave.missing_since_ns is None:
         slave.missing_since_ns = now_ns
+        if slave.is_absent:
+            _begin(bus, slave, status, now_ns)
+            return
         shown = status.state | (ERROR if status.error else 0)
         bus.emit(SlaveLeft(slave.station, shown, status.code, now_ns))
     _begin(bus, slave, status, now_ns)
@@ -245,17 +255,17 @@ def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> Non
 def _bring_back(bus: BusState, slave: BusSlave, *, stays: bool) -> Procedure[int]:
     """Bring a slave back to its target state, by INIT unless it *stays*; return the time."""
     if not stays:
-        found = slave.found.identity
-        identity = yield from read_identity(slave.station)
-        if identity != found:
+        try:
+            yield from _recognize(bus, slave)
+        except IdentityError:
             # The other device must not answer under this station address.
             yield [fpwr(slave.station, Register.STATION_ADDRESS, bytes(2))]
-            raise IdentityError(
-                f"in place of {slave.name} (station {slave.station}) there is {identity}, serial"
-                f" {identity.serial}, expected {found}, serial {found.serial}"
-            )
+            raise
         yield from bring(bus, slave, AlState.INIT)
-        slave.is_lost = False
+        was_absent = slave.is_absent
+        slave.is_lost = slave.is_absent = False
+        if was_absent:
+            yield from refresh_topology(bus)
         if bus.uses_clocks:
             yield from set_clocks(bus, only=frozenset((slave.station,)))
     yield from bring(bus, slave, slave.target)
@@ -263,16 +273,41 @@ def _bring_back(bus: BusState, slave: BusSlave, *, stays: bool) -> Procedure[int
     return now_ns
 
 
+def _recognize(bus: BusState, slave: BusSlave) -> Procedure[None]:
+    """Compare a slave that came back with the one that was there, or that is expected.
+
+    Raises IdentityError if it is another one.
+    """
+    found = slave.found.identity
+    identity = yield from read_identity(slave.station)
+    if slave.is_absent or (identity != found and slave.expected is not None):
+        yield from take_in(bus, slave)
+    elif identity != found:
+        raise IdentityError(
+            f"in place of {slave.name} (station {slave.station}) there is {identity}, serial"
+            f" {identity.serial}, expected {found}, serial {found.serial}"
+        )
+
+
 def _readdress(bus: BusState, count: int, now_ns: int) -> Procedure[None]:
     """Assign slaves without a station address that of the lost slave at their position."""
     try:
         stations = yield from read_stations(count)
+        if any(slave.is_absent for slave in bus.slaves.values()):
+            if now_ns >= bus.probe_ns or len(bus.strangers) != count - _known(bus, stations):
+                bus.probe_ns = now_ns + RETRY_NS
+                bus.needs_check |= bool((yield from identify_arrivals(bus, stations)))
+            return
         places = _missing_addresses(bus, stations, now_ns)
         if places:
             yield from assign_stations(places)
             bus.needs_check = True
     except EapError:
         bus.needs_check = True  # the segment has changed meanwhile: poll again
+
+
+def _known(bus: BusState, stations: Sequence[int]) -> int:
+    return sum(station in bus.slaves for station in stations)
 
 
 def _missing_addresses(

@@ -30,6 +30,8 @@ from eap.ops.od import OdObjectRow
 from eap.runtime.bus_status import FindingRow
 from eap.runtime.engine_messages import EoeReport
 
+ABSENT = "absent"
+"""State of an optional slave that is not plugged in."""
 _SHOWN_OCTETS = 32
 _MANY_SLAVES = 16
 """Of more slaves only those with errors are shown."""
@@ -57,7 +59,7 @@ def scan_tables(found: BusScan) -> Iterator[TextTable | str]:
             *numbers,
             str(row.serial),
             str(row.alias or ""),
-            _state(row.state),
+            Styled(ABSENT, style="dim") if row.is_absent else _state(row.state),
             "?" if row.mailbox is None else " ".join(row.mailbox),
         )
     yield table
@@ -112,6 +114,9 @@ def diagnosis_view(
     if found.eoe is not None:
         yield ""
         yield eoe_table(found.eoe)
+    if found.absent:
+        names = ", ".join(f"{each.name} ({each.address})" for each in found.absent)
+        yield Styled(f"not plugged in: {names}", style="dim")
     for row in found.findings:
         yield Styled(finding_line(row, now_s), style="dim" if row.is_over else "red")
 

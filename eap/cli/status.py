@@ -197,6 +197,8 @@ _STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO
 _GOOD, _BAD, _DIM = "green", "bold red", "dim"
 _STATE_STYLES = {"OP": _GOOD, "INIT": _BAD, "PREOP": "yellow", "SAFEOP": "yellow"}
 _OFF = "off"
+_ABSENT = "absent"
+_SLAVE_STYLES = {"OP": _GOOD, _ABSENT: _DIM}
 _FULL_STYLES = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
 _FULL_STYLES |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM, _OFF: _DIM}
 _SPARE_LINES = 2
@@ -376,13 +378,17 @@ def _buses(ports: Sequence[Row]) -> Styled:
         if (bus := port.get("bus")) is None:
             continue
         text.append(f"{', ' if text.plain else ''}{port['name']}: ")
-        states = Counter(slave["state"] or "no answer" for slave in bus["slaves"])
+        states = Counter(map(_slave_state, bus["slaves"]))
         if not bus["is_up"]:
             text.append("down", _BAD)
         for at, (state, number) in enumerate(states.items() if bus["is_up"] else ()):
-            style = _GOOD if state == "OP" else _BAD
+            style = _SLAVE_STYLES.get(state, _BAD)
             text.append(", " if at else "").append(f"{number} {state}", style)
     return text
+
+
+def _slave_state(slave: Row) -> str:
+    return slave["state"] or (_ABSENT if slave.get("is_absent") else "no answer")
 
 
 def _bad_count(number: int) -> Styled:
@@ -539,7 +545,7 @@ def _buses_table(stations: Sequence[Row]) -> TextTable:
         for port in station["ports"]:
             if (bus := port.get("bus")) is None:
                 continue
-            states = Counter(slave["state"] or "no answer" for slave in bus["slaves"])
+            states = Counter(map(_slave_state, bus["slaves"]))
             shown = ", ".join(
                 state if len(states) == 1 else f"{number} {state}"
                 for state, number in states.items()

@@ -6,15 +6,17 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from time import monotonic_ns
 from typing import Protocol
 
 from devicebus.master.bus import MasterSettings
-from devicebus.master.scan import ExpectedSlave
+from devicebus.master.matching import ExpectedSlave
+from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.engine_bus import EngineBus
 from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
@@ -31,7 +33,7 @@ from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
 from eap.pd.link import FrameChannel, FrameHandler
-from eap.pd.spec import BusPortSpec, PortKind, PortSpec, Wake
+from eap.pd.spec import BusPortSpec, BusSlaveSpec, PortKind, PortSpec, Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 from eap.runtime.drop_counters import DropCounterFeed, DropCounters, DropReason
@@ -150,6 +152,7 @@ def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> 
             serial=slave.serial,
             alias=slave.alias,
             config=slave.config,
+            channels=tuple(_channels(slave)),
         )
         for slave in spec.slaves
     ]
@@ -162,6 +165,15 @@ def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> 
         cycle_ns=1000 * cycle_us,
         epoch_offset_ns=epoch_offset_ns,
     )
+
+
+def _channels(slave: BusSlaveSpec) -> Iterator[ProcessDataChannel]:
+    """Yield the described process data, for which a place is kept while the slave is absent."""
+    for entries, is_output in ((slave.outputs, True), (slave.inputs, False)):
+        for manager, mapped in groupby(entries, key=lambda each: each.manager):
+            pdo = Pdo(0, tuple(PdoEntry(e.index, e.subindex, e.bit_length) for e in mapped))
+            # Its sync manager is read from its EEPROM when it is there.
+            yield ProcessDataChannel(manager, 0, 0, is_output, (pdo,))
 
 
 _REFUSALS: Mapping[str, DropReason] = {

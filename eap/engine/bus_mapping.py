@@ -186,8 +186,9 @@ class BusStateVariables:
             return
         self._seen = seen
         slaves = master.slaves
-        # The bus as a whole is as far as its last slave.
-        lowest = min([slave.al_state for slave in slaves.values()], default=0)
+        # The bus as a whole is as far as its last slave; absent optional ones do not count.
+        present = [slave.al_state for slave in slaves.values() if not slave.is_absent]
+        lowest = min(present, default=0)
         values = [lowest, int(seen[2])]
         values += [slaves[at].al_state if at in slaves else 0 for at in self._stations]
         for name, value, shown in zip(self._names, values, self._shown, strict=True):

@@ -101,6 +101,8 @@ def describe_slave(bus: EngineBus, slave: BusSlave, presets: Mapping[int, int]) 
         departures=counts.departures,
         al_code=counts.al_code,
         fault=_fault(bus, slave),
+        is_optional=slave.is_optional,
+        is_absent=slave.is_absent,
     )
 
 
@@ -128,6 +130,8 @@ def _report(
 def _fault(bus: EngineBus, slave: BusSlave) -> str:
     """Return the reason why a slave is not in its target state at this moment."""
     fault = bus.faults.of(slave.station)
+    if bus.master.lacks_group(slave):
+        return f"it is absent, although others of its group {slave.config.group} are there"
     if fault == NO_ANSWER and slave.is_busy and slave.state is not None:
         return f"it answers again and is on its way to {slave.target.name}"
     return fault

@@ -15,6 +15,7 @@ from devicebus.master.bus import (
     BusLost,
     Event,
     MasterSettings,
+    SlaveAbsent,
     SlaveBack,
     SlaveFailed,
     SlaveLeft,
@@ -115,7 +116,7 @@ class SlaveFaults:
                     f"it went to {state_name(event.status)} by itself{code if event.code else ''}"
                 )
                 self._begin(event.station, text, event.at_ns)
-            elif isinstance(event, SlaveBack):
+            elif isinstance(event, SlaveBack | SlaveAbsent):
                 self._end(event.station, event.at_ns)
             elif isinstance(event, Unsolicited):
                 for call in self.on_unsolicited:
@@ -186,7 +187,12 @@ class EngineBus:
     @property
     def fault(self) -> str:
         """Faults of the bus as a whole, one line each; empty if there is none."""
-        faults = (self._wire_fault, self._start_fault, *self._mapping.missing)
+        faults = (
+            self._wire_fault,
+            self._start_fault,
+            *self.master.strangers,
+            *self._mapping.missing,
+        )
         return "\n".join(filter(None, faults))
 
     @property

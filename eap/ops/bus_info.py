@@ -16,13 +16,25 @@ from devicebus.master.diagnosis import (
     diagnose,
 )
 from devicebus.master.esm import read_status
-from devicebus.master.findings import SlaveView, describe_trouble, find_causes, find_silence
+from devicebus.master.findings import (
+    BusFinding,
+    SlaveView,
+    describe_trouble,
+    find_causes,
+    find_silence,
+)
 from devicebus.master.procedure import Procedure, Sleep
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from devicebus.wire.sii import SiiProtocol
 from eap.ops.bus_session import Slave, SlaveBus, choose
-from eap.runtime.bus_status import FindingRow, FrameCounts, find_eoe_faults, finding_row
+from eap.runtime.bus_status import (
+    FindingRow,
+    FrameCounts,
+    NamedSlave,
+    find_eoe_faults,
+    finding_row,
+)
 from eap.runtime.engine_messages import EoeReport
 
 _TRIES = 3
@@ -48,6 +60,8 @@ class ScannedSlave(msgspec.Struct, frozen=True, kw_only=True):
     parent: int | None
     ports: tuple[int, ...]
     fault: str
+    is_absent: bool = False
+    """True for an optional slave of a running station that is not plugged in."""
 
 
 class BusScan(msgspec.Struct, frozen=True):
@@ -103,6 +117,8 @@ class Diagnosis(msgspec.Struct, frozen=True):
     starts_at: ErrorOrigin | None
     slaves: list[DiagnosedSlave]
     eoe: EoeReport | None = None
+    absent: list[NamedSlave] = []
+    """Optional slaves that are not plugged in."""
 
 
 class CounterReset(msgspec.Struct, frozen=True):
@@ -166,7 +182,7 @@ def slave_states(bus: SlaveBus, slave: str | None, target: str | None) -> SlaveS
     """
     units: Sequence[Slave] = [bus.find(slave)] if slave is not None else bus.scan()
     if target is not None:
-        bus.bring(units, AlState[target])
+        bus.bring([unit for unit in units if not unit.is_absent], AlState[target])
     return SlaveStates([_state(bus, unit) for unit in units])
 
 
@@ -181,17 +197,25 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
     Raises:
         BusError: there is no such slave.
     """
-    known = bus.known()
-    names = {each.station: each.name for each in known}
+    all_known = bus.known()
+    known = [each for each in all_known if not each.is_absent]
+    absent = [each for each in all_known if each.is_absent]
+    names = {each.station: each.name for each in all_known}
     units = {each.station: each for each in known}
-    wanted = {choose(known, slave).station} if slave is not None else {*names}
-    found = bus.run(_diagnose(list(names)), "diagnosis")
+    wanted = {choose(all_known, slave).station} if slave is not None else {*names}
+    found = bus.run(_diagnose(list(units)), "diagnosis")
     views = [_view(each, there) for each, there in zip(known, found.slaves, strict=True)]
     history = bus.history()
     if found.is_silent:
         causes = [find_silence(views, history.silent_since_ns if history is not None else None)]
     else:
         causes = [*find_causes(views, found, history), *find_eoe_faults(bus.eoe_report())]
+    # A fault of an absent slave: others of its hot-connect group are there.
+    causes += [
+        BusFinding(what=f"{each.name} ({each.station}): {each.fault}", slaves=(each.station,))
+        for each in absent
+        if each.fault
+    ]
     fault = found.first_fault
     return Diagnosis(
         frames=bus.frame_counts(),
@@ -215,6 +239,7 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
             for each in found.slaves
             if each.station in wanted
         ],
+        absent=[NamedSlave(each.station, each.name) for each in absent if each.station in wanted],
     )
 
 
@@ -230,7 +255,7 @@ def _diagnose(stations: Sequence[int]) -> Procedure[BusDiagnosis]:
 
 def reset_diagnosis(bus: SlaveBus) -> CounterReset:
     """Clear the error counters of all slaves, and forget faults that are over."""
-    stations = [each.station for each in bus.known()]
+    stations = [each.station for each in bus.known() if not each.is_absent]
     bus.run(clear_counters(stations), "clearing error counters")
     bus.forget()
     return CounterReset(stations)
@@ -310,10 +335,13 @@ def _scanned(slave: Slave) -> ScannedSlave:
         parent=slave.parent,
         ports=slave.ports,
         fault=slave.fault,
+        is_absent=slave.is_absent,
     )
 
 
 def _state(bus: SlaveBus, slave: Slave) -> SlaveStateRow:
+    if slave.is_absent:
+        return SlaveStateRow(slave.station, slave.name, None, 0, "it is absent")
     try:
         status = bus.run(read_status(slave.station), f"slave {slave.station}: its state")
     except WorkingCounterError:

@@ -19,7 +19,7 @@ from devicebus.mailbox.conversation import Conversation, MailboxMessage, Mailbox
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.findings import History
 from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
-from devicebus.master.scan import find_topology
+from devicebus.master.scan import TopologyNode, find_topology
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramReply, fprd
 from devicebus.wire.register import AlStatus, DlStatus, Register
@@ -70,11 +70,12 @@ class RunningBus:
             finding, *_ = report_findings(self._report)
             raise FrameLostError(f"{finding.what}; {finding.advice}")
         # The report of the master is from its last cycle; the registers are read now.
-        registers = self.run(_read_registers([slave.station for slave in slaves]))
+        present = [slave.station for slave in slaves if not slave.is_absent]
+        registers = self.run(_read_registers(present))
         nodes = find_topology([dl_status for _, dl_status in registers])
+        rows = iter(zip(registers, nodes, strict=True))
         return [
-            msgspec.structs.replace(slave, status=al_status, parent=node.parent, ports=node.ports)
-            for slave, (al_status, _), node in zip(slaves, registers, nodes, strict=True)
+            slave if slave.is_absent else _with_registers(slave, *next(rows)) for slave in slaves
         ]
 
     def known(self) -> Sequence[Slave]:
@@ -100,6 +101,7 @@ class RunningBus:
                 since_ns=report.since_ns if report.fault else None,
                 mailbox_timeouts=report.mailbox_timeouts,
                 mailbox_late=report.mailbox_late,
+                is_absent=report.is_absent,
             )
             for report in reports
         ]
@@ -236,6 +238,11 @@ def open_running(station: str, port: str, plant: str | None = None) -> Iterator[
     """
     with connect_station(station, plant) as client:
         yield RunningBus(client, station, port)
+
+
+def _with_registers(slave: Slave, read: tuple[AlStatus, DlStatus], node: TopologyNode) -> Slave:
+    al_status, _ = read
+    return msgspec.structs.replace(slave, status=al_status, parent=node.parent, ports=node.ports)
 
 
 def _read_registers(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:

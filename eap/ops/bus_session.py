@@ -282,6 +282,8 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """Age of *fault* in nanoseconds, if it is known."""
     mailbox_timeouts: int = 0
     """Mailbox requests without a reply, as the master of a running station counts them."""
+    is_absent: bool = False
+    """True while it is optional and not plugged in."""
     mailbox_late: int = 0
     """Replies that came after their request had timed out."""
 

@@ -173,6 +173,7 @@ def bus_document(report: BusReport | None, now_s: float) -> dict[str, Any]:
                     "state": state_name(slave.state) if slave.state else None,
                     "target": state_name(slave.target) if slave.target else None,
                     "fault": slave.fault,
+                    "is_absent": slave.is_absent,
                 }
                 for slave in report.slaves
             ],

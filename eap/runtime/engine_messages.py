@@ -154,6 +154,9 @@ class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
     """AL status code when it last did."""
     fault: str = ""
     """Reason why it is not in its target state."""
+    is_optional: bool = False
+    is_absent: bool = False
+    """True while it is optional and not plugged in, which is no fault."""
 
 
 def no_mailbox(slave: SlaveDescription) -> EapError:

@@ -11,8 +11,9 @@ from devicebus.mailbox.server import MailboxServer
 from devicebus.master.esm import change_state
 from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, configure
+from devicebus.master.matching import ExpectedSlave
 from devicebus.master.procedure import Procedure, Runner, Sleep, Step, StepReplies, Task
-from devicebus.master.scan import ExpectedSlave, scan
+from devicebus.master.scan import scan
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.segment import POLL_NS, SegmentEnd, SimulatedSegment
 from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec

@@ -9,6 +9,7 @@ from devicebus.master.bus import (
     BusBack,
     BusLost,
     Event,
+    SlaveAbsent,
     SlaveBack,
     SlaveFailed,
     SlaveLeft,
@@ -89,8 +90,8 @@ def _describe(event: Event, names: Names) -> str:
     match event:
         case BusLost() | BusBack():
             return f"`{type(event).__name__}`"
-        case SlaveLost():
-            return f"`SlaveLost` {names[event.station]}"
+        case SlaveLost() | SlaveAbsent():
+            return f"`{type(event).__name__}` {names[event.station]}"
         case SlaveLeft():
             status = f"{state_name(event.status)}, 0x{event.code:04X} {name_of(event.code)}"
             return f"`SlaveLeft` {names[event.station]}: {status}"

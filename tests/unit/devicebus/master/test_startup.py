@@ -14,7 +14,7 @@ from devicebus.errors import (
 )
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master
-from devicebus.master.scan import ExpectedSlave
+from devicebus.master.matching import ExpectedSlave
 from devicebus.sim.spec import ClockSpec, MailboxSpec
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState

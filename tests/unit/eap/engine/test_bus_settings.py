@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.master.link import CEILING_NS, RETRIES
-from devicebus.master.scan import ExpectedSlave
+from devicebus.master.matching import ExpectedSlave
 from eap.engine.build import master_settings
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, BusSlaveSpec, PortKind, PortSpec

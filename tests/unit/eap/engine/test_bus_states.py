@@ -12,6 +12,8 @@ SLAVES = (BusSlaveSpec("a", 1001, 1, 2), BusSlaveSpec("b", 1002, 1, 2))
 
 
 class Unit:
+    is_absent = False
+
     def __init__(self, al_state):
         self.al_state = al_state
 

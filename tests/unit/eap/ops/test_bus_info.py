@@ -43,6 +43,7 @@ def test_scan(line):
         "parent": 1,
         "ports": (0,),
         "fault": "",
+        "is_absent": False,
     }
     assert [row.parent for row in rows] == [None, 0, 1]
 
