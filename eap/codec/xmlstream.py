@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import codecs
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, NoReturn
 
@@ -147,6 +147,7 @@ class XmlReader:
         roots: Names that the root may have; any if there are none.
         ignored: Names of elements that are dropped wherever they are.
         limits: Limits of the file.
+        select: Called with the tag and the attributes of a wanted element; false drops it.
 
     Raises:
         XmlError: (``feed`` and ``close``) the file is no such file.
@@ -159,10 +160,13 @@ class XmlReader:
         roots: Collection[str] = (),
         ignored: Collection[str] = (),
         limits: XmlLimits = DEFAULT_LIMITS,
+        select: Callable[[XmlElement], bool] | None = None,
     ) -> None:
         from defusedxml.ElementTree import XMLParser  # most programs read no XML
 
-        self._builder = _Builder(frozenset(wanted), tuple(roots), frozenset(ignored), limits)
+        self._builder = _Builder(
+            frozenset(wanted), tuple(roots), frozenset(ignored), limits, select
+        )
         self._parser = XMLParser(target=self._builder, forbid_dtd=True)
         self._expat = self._builder.expat = self._parser.parser
         self._limits = limits
@@ -217,9 +221,10 @@ def read_elements(
     roots: Collection[str] = (),
     ignored: Collection[str] = (),
     limits: XmlLimits = DEFAULT_LIMITS,
+    select: Callable[[XmlElement], bool] | None = None,
 ) -> Iterator[XmlElement]:
     """Yield the *wanted* elements of a file that comes in *chunks*; arguments as for XmlReader."""
-    reader = XmlReader(wanted, roots=roots, ignored=ignored, limits=limits)
+    reader = XmlReader(wanted, roots=roots, ignored=ignored, limits=limits, select=select)
     for chunk in chunks:
         yield from reader.feed(chunk)
     yield from reader.close()
@@ -246,6 +251,7 @@ class _Builder:
         roots: tuple[str, ...],
         ignored: frozenset[str],
         limits: XmlLimits,
+        select: Callable[[XmlElement], bool] | None,
     ) -> None:
         self.root: XmlElement | None = None
         self.above: dict[str, XmlElement] = {}
@@ -253,6 +259,7 @@ class _Builder:
         self._roots = roots
         self._ignored = ignored
         self._limits = limits
+        self._select = select
         self._takes_root = "*" in wanted
         self._wanted = wanted
         # Only inside these is there anything that is wanted.
@@ -303,6 +310,9 @@ class _Builder:
                 self._refuse(f"it begins with {element.tag!r}", " or ".join(self._roots))
         path = "/".join([*self._path, element.tag])
         if path in self._wanted or (self._takes_root and not self._path):
+            if self._select is not None and not self._select(element):
+                self._skipped = 1
+                return
             self._count = 0
             self._push(element)
         elif path in self._leading:
