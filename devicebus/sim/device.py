@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.soe_server import SoeServer
-from devicebus.sim.pdo import ProcessData
+from devicebus.sim.pdo import ProcessChannel, ProcessData
 from devicebus.wire.alstatus import AlState
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
@@ -67,7 +67,7 @@ class Device:
         mailbox: None for a device without a mailbox.
         behaviour: None for a device whose inputs change by downloads only.
         has_boot: True if it supports the state BOOT.
-        output_channel, input_channel: Sync managers of the process data.
+        process_channels: Sync managers of the process data; by default 2 and 3.
         needs_sync0: True if it refuses OP without SYNC0.
         identification: Device ID for a master that requests it.
         channels: Entries of its inputs and outputs by name.
@@ -81,8 +81,7 @@ class Device:
         mailbox: MailboxServer | None = None,
         behaviour: Behaviour | None = None,
         has_boot: bool = False,
-        output_channel: int = 2,
-        input_channel: int = 3,
+        process_channels: Iterable[ProcessChannel] | None = None,
         needs_sync0: bool = False,
         identification: int = 0,
         channels: Mapping[str, tuple[int, int]] | None = None,
@@ -92,12 +91,10 @@ class Device:
         self.mailbox = mailbox
         self.behaviour = behaviour
         self.has_boot = has_boot
-        self.output_channel = output_channel
-        self.input_channel = input_channel
         self.needs_sync0 = needs_sync0
         self.identification = identification
         self.channels = dict(channels or {})
-        self.process_data = ProcessData(dictionary)
+        self.process_data = ProcessData(dictionary, process_channels)
         self._overrides: dict[tuple[int, int], _Override] = {}
         self.al_state = AlState.INIT
         """AL state, set by the slave's state machine."""

@@ -86,6 +86,8 @@ PORTS = 4
 _YES = b"\1"
 _EVENT_DL, _EVENT_AL = 0x0004, 0x0008
 _DEVICE_EMULATION = 0x01
+_DIGITAL_OUTPUTS = 0x0F00
+"""Output registers of controllers with digital I/O, which a sync manager may guard."""
 
 
 class EscSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -156,6 +158,7 @@ class Esc:
         self._guards: tuple[SyncChannel, ...] = ()
         self._areas: dict[tuple[int, int], SyncChannel] = {}
         self.windows: tuple[FmmuWindow, ...] = ()
+        self._data_start = REGISTERS
         self.set_al_status(AlState.INIT, 0)
         # INIT at power-on is no change that the master has to learn.
         self.ecat_event = 0
@@ -223,12 +226,13 @@ class Esc:
     def read(self, address: int, length: int, now_ns: int) -> bytes | None:
         """Return the data of a master's read, None if no byte exists or is readable now."""
         end = address + length
-        if address >= REGISTERS:
+        first = self._data_start
+        if address >= first:
             return self._read_memory(address, end)
-        if end > REGISTERS:
+        if end > first:
             return self._join(
-                (REGISTERS - address, self.read(address, REGISTERS - address, now_ns)),
-                (end - REGISTERS, self._read_memory(REGISTERS, end)),
+                (first - address, self.read(address, first - address, now_ns)),
+                (end - first, self._read_memory(first, end)),
             )
         # An access to unimplemented registers only leaves the working counter unchanged.
         if _YES not in self._readable[address:end]:
@@ -247,12 +251,13 @@ class Esc:
     def write(self, address: int, data: bytes, now_ns: int) -> bool:
         """Execute a master's write; return false if no byte was written."""
         end = address + len(data)
-        if address >= REGISTERS:
+        first = self._data_start
+        if address >= first:
             return self._write_memory(address, data, now_ns)
-        if end > REGISTERS:
-            first_size = REGISTERS - address
+        if end > first:
+            first_size = first - address
             done = self.write(address, data[:first_size], now_ns)
-            return self._write_memory(REGISTERS, data[first_size:], now_ns) or done
+            return self._write_memory(first, data[first_size:], now_ns) or done
         marks = self._writable[address:end]
         if address < _EEPROM_END and end > _EEPROM and not self._takes_eeprom(now_ns):
             return False
@@ -330,6 +335,8 @@ class Esc:
                 self.al_event |= AlEvent.SM_ACTIVATION
         self._guards = tuple(channel for channel in self.channels if channel.is_enabled)
         self._areas = _find_areas(self._guards)
+        starts = (each.start for each in self._guards if each.start >= _DIGITAL_OUTPUTS)
+        self._data_start = min((REGISTERS, *starts))
 
     def _clear_counters(self, start: int, end: int) -> None:
         # Any write clears the whole group of counters, whatever its data.

@@ -90,22 +90,88 @@ class PdoMapping:
         return b"".join(pieces)
 
 
+class ProcessChannel:
+    """Sync manager of process data.
+
+    Args:
+        number: Number of the sync manager.
+        assignment: Object that assigns its PDOs.
+        is_output: True if the master writes it.
+        fixed_size: Size in bytes without PDOs.
+        is_single: True for one buffer (mode of a mailbox) instead of three.
+
+    Attributes:
+        mapping: Mapping, evaluated by :meth:`ProcessData.configure`.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        assignment: int,
+        *,
+        is_output: bool,
+        fixed_size: int = 0,
+        is_single: bool = False,
+    ) -> None:
+        self.number = number
+        self.assignment = assignment
+        self.is_output = is_output
+        self.is_single = is_single
+        self.mapping = PdoMapping()
+        self._fixed_size = fixed_size
+
+    @property
+    def size(self) -> int:
+        """Size in bytes."""
+        return self.mapping.size or self._fixed_size
+
+
 class ProcessData:
     """Outputs and inputs of one slave.
 
+    Args:
+        dictionary: Objects of the device.
+        channels: Its sync managers of process data; by default 2 for outputs and 3 for inputs.
+
     Attributes:
-        outputs, inputs: Mappings, evaluated by :meth:`configure`.
+        channels: All sync managers.
+        active_outputs, active_inputs: Those with data.
     """
 
-    def __init__(self, dictionary: ObjectDictionary) -> None:
+    def __init__(
+        self, dictionary: ObjectDictionary, channels: Iterable[ProcessChannel] | None = None
+    ) -> None:
         self._dictionary = dictionary
-        self.outputs = PdoMapping()
-        self.inputs = PdoMapping()
+        if channels is None:
+            channels = (
+                ProcessChannel(2, OUTPUTS, is_output=True),
+                ProcessChannel(3, INPUTS, is_output=False),
+            )
+        self.channels = tuple(channels)
+        self.active_outputs: tuple[ProcessChannel, ...] = ()
+        self.active_inputs: tuple[ProcessChannel, ...] = ()
+
+    @property
+    def outputs(self) -> PdoMapping:
+        """Mapping of the first sync manager of outputs."""
+        return self._first(is_output=True)
+
+    @property
+    def inputs(self) -> PdoMapping:
+        """Mapping of the first sync manager of inputs."""
+        return self._first(is_output=False)
+
+    def _first(self, *, is_output: bool) -> PdoMapping:
+        found = (each.mapping for each in self.channels if each.is_output is is_output)
+        return next(found, PdoMapping())
 
     def configure(self) -> None:
         """Evaluate assignment and mapping; a mapped entry that does not exist is padding."""
-        self.outputs = self._plan(self._numbers(OUTPUTS))
-        self.inputs = self._plan(self._numbers(INPUTS))
+        for channel in self.channels:
+            channel.mapping = self._plan(self._numbers(channel.assignment))
+        active = [each for each in self.channels if each.size]
+        self.active_outputs = tuple(each for each in active if each.is_output)
+        self.active_inputs = tuple(each for each in active if not each.is_output)
 
     def read_pdo(self, index: int) -> bytes | None:
         """Return the data of one PDO, assigned or not; None if it does not exist."""

@@ -38,17 +38,16 @@ def check_mailbox(esc: Esc) -> bool:
 
 def check_process_data(esc: Esc, device: Device) -> AlStatusCode:
     """Return the AL status code for process data sync managers that do not fit, or NO_ERROR."""
-    sides = (
-        (device.output_channel, True, device.process_data.outputs.size,
-         AlStatusCode.OUTPUT_CONFIGURATION),
-        (device.input_channel, False, device.process_data.inputs.size,
-         AlStatusCode.INPUT_CONFIGURATION),
-    )  # fmt: skip
-    for number, written, size, code in sides:
-        channel = esc.channels[number]
+    for expected in device.process_data.channels:
+        channel, size = esc.channels[expected.number], expected.size
         if channel.length != size:
-            return code
-        if size and (channel.is_mailbox or channel.master_writes is not written):
+            if expected.is_output:
+                return AlStatusCode.OUTPUT_CONFIGURATION
+            return AlStatusCode.INPUT_CONFIGURATION
+        if size and (
+            channel.is_mailbox is not expected.is_single
+            or channel.master_writes is not expected.is_output
+        ):
             return AlStatusCode.SYNC_MANAGER
         if size and any(_meet(channel, each) for each in esc.channels if each is not channel):
             return AlStatusCode.SYNC_MANAGER
@@ -63,11 +62,15 @@ def check_clock(esc: Esc, device: Device) -> AlStatusCode:
     return AlStatusCode.NO_ERROR
 
 
-def _meet(buffered: SyncChannel, other: SyncChannel) -> bool:
-    """Return true if *other* overlaps the three buffers of *buffered*."""
-    end = buffered.start + _BUFFERS * buffered.length
-    other_end = other.start + (1 if other.is_mailbox else _BUFFERS) * other.length
-    return other.length > 0 and buffered.start < other_end and other.start < end
+def _meet(one: SyncChannel, other: SyncChannel) -> bool:
+    """Return true if the buffers of two sync managers overlap."""
+    return other.length > 0 and one.start < _end(other) and other.start < _end(one)
+
+
+def _end(channel: SyncChannel) -> int:
+    # The output registers of a controller below its memory have no buffers.
+    is_single = channel.is_mailbox or channel.start < Register.MEMORY
+    return channel.start + (1 if is_single else _BUFFERS) * channel.length
 
 
 def _is_mailbox(channel: SyncChannel) -> bool:
@@ -105,7 +108,8 @@ class SimulatedSlave:
     def _reset(self) -> None:
         self.device.al_state = AlState.INIT
         self._code = 0
-        self._has_outputs = False
+        self._awaited: set[int] = set()
+        """Sync managers of outputs that have received nothing yet."""
         self._deadline_ns: int | None = None
 
     @property
@@ -143,7 +147,7 @@ class SimulatedSlave:
         if not self.is_powered:
             return
         if self.esc.watchdog.check(now_ns) and self.state is AlState.OP:
-            self.fail(AlStatusCode.WATCHDOG)
+            self._stop_outputs()
         if self._deadline_ns is not None and now_ns >= self._deadline_ns:
             self._deadline_ns = None
             self._refuse(AlStatusCode.NO_OUTPUTS)
@@ -177,6 +181,15 @@ class SimulatedSlave:
     def fail(self, code: int) -> None:
         """Report an application error; in OP the slave falls back to SAFEOP."""
         self._refuse(code)
+
+    def _stop_outputs(self) -> None:
+        """Handle the end of the process data watchdog."""
+        if not self.esc.emulates_device:
+            self.fail(AlStatusCode.WATCHDOG)
+            return
+        # Without an application the outputs go off, and the state stays.
+        for channel in self.device.process_data.active_outputs:
+            channel.mapping.unpack(bytes(channel.size))
 
     def _handle_al_control(self, now_ns: int) -> None:
         at = Register.AL_CONTROL
@@ -227,8 +240,7 @@ class SimulatedSlave:
             code = check_clock(self.esc, self.device)
             # OP needs valid outputs (0x0019 otherwise): the request stays open until the first
             # arrive.
-            waits = self.device.process_data.outputs.size and not self._has_outputs
-            if not code and waits:
+            if not code and self._awaited:
                 self._deadline_ns = now_ns + OUTPUTS_TIMEOUT_NS
             return code
         return 0
@@ -259,9 +271,12 @@ class SimulatedSlave:
         self.device.process_data.configure()
         code = check_process_data(self.esc, self.device)
         if not code:
-            self._has_outputs = False
+            self._await_outputs()
             self._offer_inputs(now_ns)
         return code
+
+    def _await_outputs(self) -> None:
+        self._awaited = {each.number for each in self.device.process_data.active_outputs}
 
     def _enter(self, target: AlState) -> None:
         if target is not AlState.OP:
@@ -274,7 +289,7 @@ class SimulatedSlave:
         if self.state is AlState.OP:
             self.device.al_state = AlState.SAFEOP
             self.esc.watchdog.stop()
-        self._has_outputs = False
+        self._await_outputs()
         self._code = code
         self.esc.set_al_status(self.state | ERROR, code)
 
@@ -328,26 +343,25 @@ class SimulatedSlave:
                 send.put(message)
 
     def _exchange(self, now_ns: int) -> None:
-        process_data = self.device.process_data
-        if process_data.outputs.size:
-            data = self.esc.channels[self.device.output_channel].take()
-            if data is not None:
-                self._has_outputs = True
-                # The first outputs complete the request of OP.
-                if self._deadline_ns is not None:
-                    self._deadline_ns = None
-                    self._enter(AlState.OP)
-                # In SAFEOP outputs are received, as proof that they arrive, but not applied.
-                if self.state is AlState.OP:
-                    process_data.outputs.unpack(data)
+        for channel in self.device.process_data.active_outputs:
+            data = self.esc.channels[channel.number].take()
+            if data is None:
+                continue
+            self._awaited.discard(channel.number)
+            # The first outputs complete the request of OP.
+            if self._deadline_ns is not None and not self._awaited:
+                self._deadline_ns = None
+                self._enter(AlState.OP)
+            # In SAFEOP outputs are received, as proof that they arrive, but not applied.
+            if self.state is AlState.OP:
+                channel.mapping.unpack(data)
         self._offer_inputs(now_ns)
 
     def _offer_inputs(self, now_ns: int) -> None:
         device = self.device
         device.step(now_ns)
-        inputs = device.process_data.inputs
-        if inputs.size:
-            self.esc.channels[device.input_channel].put(inputs.pack())
+        for channel in device.process_data.active_inputs:
+            self.esc.channels[channel.number].put(channel.mapping.pack())
 
 
 _STATES = frozenset(AlState)

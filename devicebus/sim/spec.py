@@ -17,6 +17,7 @@ U32 = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
 Port = Annotated[int, Meta(ge=1, le=3)]
 MailboxSize = Annotated[int, Meta(ge=32, le=1486)]
 Size = Annotated[int, Meta(ge=1, le=16 << 20)]
+DEFAULT_VENDOR = 0x0000_0E5A
 Value: TypeAlias = bool | int | float | str
 
 
@@ -29,6 +30,15 @@ class DeviceKind(Enum):
     DRIVE = "drive"
     GENERIC = "generic"
     ESI = "esi"
+
+
+class ProfileKind(Enum):
+    """Behaviour of a device from an ESI file."""
+
+    AUTO = "auto"
+    """That of a drive if it has the objects of one, 0x6040 and 0x6041."""
+    DRIVE = "drive"
+    NONE = "none"
 
 
 class AccessKind(Enum):
@@ -124,7 +134,8 @@ class ClockSpec(msgspec.Struct, frozen=True, kw_only=True):
     drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
     start_ns: Annotated[int, Meta(ge=0, le=(1 << 63) - 1)] = 0
     """Local time at power-on."""
-    needs_sync0: bool = False
+    needs_sync0: bool | None = None
+    """True if it refuses OP without SYNC0; None for what its ESI file says, or not."""
 
 
 class SlaveSpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,10 +143,12 @@ class SlaveSpec(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     kind: DeviceKind
-    vendor: U32 = 0x0000_0E5A
+    vendor: U32 = DEFAULT_VENDOR
+    """Kind ``esi``: the default stands for any vendor."""
     product: U32 = 0
     """0: default of the kind."""
-    revision: U32 = 0x0001_0000
+    revision: U32 | None = None
+    """None: 0x00010000, or that of the ESI file."""
     serial: U32 = 0
     alias: U16 = 0
     after: str = ""
@@ -151,7 +164,15 @@ class SlaveSpec(msgspec.Struct, frozen=True, kw_only=True):
     objects: tuple[ObjectSpec, ...] = ()
     files: tuple[FileSpec, ...] = ()
     esi: str = ""
-    """Kind ``esi``: ESI file of the vendor, in the folder of the bus file."""
+    """Kind ``esi``: ESI file of the vendor, or a folder of such files; relative to the bus file."""
+    device: str = ""
+    """Kind ``esi``: type of the device in the file, such as ``EL2004``."""
+    modules: tuple[int | str | None, ...] | None = None
+    """Kind ``esi``: idents or names of the modules in its slots; None for its defaults."""
+    profile: ProfileKind = ProfileKind.AUTO
+    """Kind ``esi``: behaviour of the device."""
+    pdo_names: dict[str, str] = {}
+    """Names of PDOs, by index; they come before the names of their entries."""
 
 
 class FaultKind(Enum):
@@ -200,5 +221,7 @@ class BusSpec(msgspec.Struct, frozen=True, kw_only=True):
     slaves: tuple[SlaveSpec, ...]
     ring: bool = False
     """True if the last slave's next port is connected to the master."""
+    esi: str = ""
+    """ESI file or folder of the slaves of kind ``esi`` without their own."""
     cable_ns: Annotated[int, Meta(ge=0, le=1_000_000)] = 50
     faults: tuple[FaultSpec, ...] = ()

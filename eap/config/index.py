@@ -50,6 +50,8 @@ class DescribedPdoEntry(msgspec.Struct, frozen=True):
     bit_length: int
     manager: int = 0
     """Sync manager of the PDO that maps it."""
+    group: str = ""
+    """Name of its PDO, if variables have it before the name of the entry."""
 
 
 class DescribedPdo(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,6 +59,8 @@ class DescribedPdo(msgspec.Struct, frozen=True, kw_only=True):
 
     index: int
     name: str = ""
+    group: str = ""
+    """Name before those of its entries in variables; empty for none."""
     is_output: bool
     manager: int
     """Sync manager that it is assigned to, or may be."""
@@ -187,7 +191,8 @@ def _unique_names(entries: Sequence[DescribedPdoEntry]) -> list[str]:
 
 
 def _plain(entry: DescribedPdoEntry) -> str:
-    return _OTHER.sub("_", entry.name) or _object_suffix(entry)
+    name = _OTHER.sub("_", entry.name) or _object_suffix(entry)
+    return f"{_OTHER.sub('_', entry.group)}.{name}" if entry.group else name
 
 
 def _object_suffix(entry: DescribedPdoEntry) -> str:

@@ -91,7 +91,7 @@ def process_data(
             if index in config.mapping:
                 entries = [_described(slave, each) for each in config.mapping[index]]
             side = sides[0 if pdo.is_output else 1]
-            side += [replace(each, manager=manager) for each in entries]
+            side += [replace(each, manager=manager, group=pdo.group) for each in entries]
     return tuple(sides[0]), tuple(sides[1])
 
 

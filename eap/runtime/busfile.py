@@ -1,7 +1,7 @@
 """Bus files: a simulated segment in YAML, checked as a whole like a plant file.
 
-The cores read no files, so this module reads the files that a bus file refers to (values in CSV,
-device descriptions in XML) and hands them over as bytes.
+The cores read no files, so this module reads the files that a bus file refers to: values in CSV,
+which it hands over as bytes, and device descriptions.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from pathlib import Path
 
 import msgspec
 
+from devicebus.esi.records import EsiDevice
 from devicebus.master.pdo import PdoEntry, channels_from_sii
 from devicebus.sim.devices.build import build_segment, build_slave
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.segment import SegmentEnd, trace_path
-from devicebus.sim.spec import BusSpec, SlaveSpec
+from devicebus.sim.spec import BusSpec, DeviceKind, SlaveSpec
 from devicebus.wire import sii
 from devicebus.wire.sii import Sii, SiiProtocol
 from eap.config.document import convert_to, read
@@ -26,6 +27,7 @@ from eap.config.structs import SlaveSection
 from eap.errors import ConfigError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import ObjectCode
+from eap.runtime.esi_slaves import EsiDevices, describe_device
 from eap.suggest import suggest
 
 MAX_RESOURCE = 16 << 20
@@ -49,12 +51,14 @@ class BusFile(msgspec.Struct, frozen=True):
 
     spec: BusFileSpec
     resources: dict[str, bytes]
-    revised: frozenset[int] = frozenset()
-    """Numbers of the slaves whose revision the file gives."""
+    devices: dict[str, EsiDevice]
+    """Vendors' descriptions of the slaves of kind esi, by their names."""
 
     def build(self) -> FaultySegment:
         """Make the segment with the script of its faults."""
-        return FaultySegment(build_segment(self.spec, self.resources), self.spec.faults)
+        return FaultySegment(
+            build_segment(self.spec, self.resources, self.devices), self.spec.faults
+        )
 
 
 class BusResult(msgspec.Struct, frozen=True):
@@ -71,14 +75,16 @@ def load(path: Path) -> BusResult:
     spec = None if root is None else convert_to(BusFileSpec, root, report, "bus")
     if spec is None or report.findings():
         return BusResult(None, report.findings())
-    slaves = range(len(spec.slaves))
-    # Whether the key is there, not its value: a file that leaves it open accepts any revision.
-    revised = frozenset(n for n in slaves if f"slaves[{n}].revision" in report.lines)
-    bus = BusFile(spec, {}, revised)
+    bus = BusFile(spec, {}, {})
+    devices = EsiDevices(path.parent, report)
     for number, slave in enumerate(spec.slaves):
         at = f"slaves[{number}]"
         for name in _files(slave):
             _read_resource(bus, path.parent / name, name, report, at)
+        if slave.kind is DeviceKind.ESI:
+            device = devices.find(slave, slave.esi or spec.esi, at)
+            if device is not None:
+                bus.devices[slave.name] = device
         _check_wiring(spec, number, report, at)
         if not report.findings():
             _check_slave(slave, bus, report, at)
@@ -133,6 +139,8 @@ def _line(spec: BusSpec) -> tuple[int, ...]:
 
 def _describe(bus: BusFile, number: int) -> DescribedSlave:
     spec = bus.spec.slaves[number]
+    if spec.name in bus.devices:
+        return describe_device(spec, bus.devices[spec.name])
     slave = build_slave(spec, bus.resources)
     image = sii.decode(slave.esc.image)
     dictionary = slave.device.dictionary
@@ -150,7 +158,7 @@ def _describe(bus: BusFile, number: int) -> DescribedSlave:
         name=spec.name,
         vendor=image.fixed.vendor,
         product=image.fixed.product,
-        revision=image.fixed.revision if number in bus.revised else None,
+        revision=spec.revision,
         serial=image.fixed.serial or None,
         alias=image.fixed.alias or None,
         outputs=outputs,
@@ -222,8 +230,6 @@ def _describe_objects(dictionary: ObjectDictionary) -> Iterator[DescribedPdoEntr
 
 
 def _files(slave: SlaveSpec) -> Iterator[str]:
-    if slave.esi:
-        yield slave.esi
     for channel in slave.inputs:
         if channel.csv:
             yield channel.csv
@@ -266,7 +272,7 @@ def _check_wiring(spec: BusSpec, number: int, report: FindingReport, at: str) ->
 
 def _check_slave(slave: SlaveSpec, bus: BusFile, report: FindingReport, at: str) -> None:
     try:
-        build_slave(slave, bus.resources)
+        build_slave(slave, bus.resources, bus.devices.get(slave.name))
     except ValueError as exc:
         report.add(at, f"{slave.name}: {exc}", "a device that can be built")
 
@@ -274,7 +280,7 @@ def _check_slave(slave: SlaveSpec, bus: BusFile, report: FindingReport, at: str)
 def _check_faults(bus: BusFile, report: FindingReport) -> None:
     if not bus.spec.faults:
         return
-    segment = FaultySegment(build_segment(bus.spec, bus.resources))
+    segment = FaultySegment(build_segment(bus.spec, bus.resources, bus.devices))
     for number, fault in enumerate(bus.spec.faults):
         try:
             segment.check(fault)

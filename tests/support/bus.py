@@ -98,13 +98,9 @@ class Bench:
         """Map outputs, then inputs; return the octets mapped."""
         slave = self.slaves[number]
         start = address
-        for unit, (channel, size, kind) in enumerate(
-            (
-                (slave.device.output_channel, slave.device.process_data.outputs.size, 2),
-                (slave.device.input_channel, slave.device.process_data.inputs.size, 1),
-            )
-        ):
-            physical = self.image(number).sync_managers[channel].start
+        for unit, channel in enumerate(slave.device.process_data.channels):
+            size, kind = channel.size, 2 if channel.is_output else 1
+            physical = self.image(number).sync_managers[channel.number].start
             fmmu = Fmmu(address, size, physical_start=physical, type=kind, activate=1)
             if size:
                 self.write(Register.FMMU + 16 * unit, fmmu.encode(), STATION + number)

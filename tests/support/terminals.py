@@ -64,7 +64,11 @@ def _device(code: int, name: str, tag: str, first_pdo: int, first: int, channels
         f"</Entry></{tag}>"
         for number in range(channels)
     )
+    # The layout of real terminals: outputs in registers of the controller, inputs in its memory.
+    outputs = '<Sm StartAddress="#x0f00" ControlByte="#x44" Enable="1">Outputs</Sm>'
+    inputs = '<Sm StartAddress="#x1000" ControlByte="#x00" Enable="1">Inputs</Sm>'
+    manager = outputs if tag == "RxPdo" else inputs
     return (
         f'<Device Physics="KK"><Type ProductCode="#x{code:08X}" RevisionNo="#x00100000">{name}'
-        f"</Type><Name>{name}</Name>{pdos}</Device>"
+        f"</Type><Name>{name}</Name>{manager}{pdos}</Device>"
     )

@@ -8,10 +8,13 @@ from functools import partial
 
 import msgspec
 
+from devicebus.esi.records import EsiDevice
+from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_server import SoeParameter
 from devicebus.sim.device import Behaviour, Device
-from devicebus.sim.devices import drive, esi
+from devicebus.sim.devices import drive, esi, esi_image
 from devicebus.sim.devices.drive import Axes
+from devicebus.sim.devices.esi import EsiPlan
 from devicebus.sim.devices.objects import INPUTS, OUTPUTS, build_dictionary, object_ids_of
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.devices.signal import Signals
@@ -28,16 +31,12 @@ MODULAR_DEVICE = 5001
 _PRODUCTS = {kind: number for number, kind in enumerate(DeviceKind, 1)}
 
 
-def complete(spec: SlaveSpec, resources: Mapping[str, bytes]) -> SlaveSpec:
+def complete(spec: SlaveSpec) -> SlaveSpec:
     """Return *spec* completed with the objects and channels of its kind.
 
     Raises:
-        ValueError: the description of the vendor is missing or cannot be used.
+        ValueError: the description cannot be used.
     """
-    if spec.kind is DeviceKind.ESI:
-        if spec.esi not in resources:
-            raise ValueError("a device of kind esi needs its file (key esi)")
-        return esi.complete(spec, resources[spec.esi])
     if spec.kind is DeviceKind.COUPLER and (spec.inputs or spec.outputs):
         raise ValueError("a coupler has no process data, expected no inputs and no outputs")
     if spec.kind is DeviceKind.DRIVE:
@@ -45,6 +44,7 @@ def complete(spec: SlaveSpec, resources: Mapping[str, bytes]) -> SlaveSpec:
     return msgspec.structs.replace(
         spec,
         product=spec.product or _PRODUCTS[spec.kind],
+        revision=_REVISION if spec.revision is None else spec.revision,
         inputs=(*spec.inputs, *_padding(spec.inputs)),
         outputs=(*spec.outputs, *_padding(spec.outputs)),
     )
@@ -69,68 +69,125 @@ def device_type(spec: SlaveSpec) -> int:
 
 
 def behave(
-    spec: SlaveSpec, dictionary: ObjectDictionary, resources: Mapping[str, bytes]
-) -> tuple[Behaviour | None, dict[int, list[SoeParameter]]]:
-    """Return the behaviour of a device, or None, and the IDNs of each of its axes.
+    spec: SlaveSpec, dictionary: ObjectDictionary, resources: Mapping[str, bytes], axes: int
+) -> Behaviour | None:
+    """Return the behaviour of a device with *axes* axes, or None.
 
     Raises:
         ValueError: the source of an input is invalid.
     """
-    if spec.kind is DeviceKind.DRIVE:
-        axes = drive.Axes(drive.Drive(dictionary, axis) for axis in range(spec.axes))
-        idns = (drive.parameters(axis, spec.name) for axis in axes.drives)
-        return axes, dict(enumerate(idns))
-    signals = Signals(spec, dictionary, resources)
-    return signals or None, {}
+    if axes:
+        return drive.Axes(drive.Drive(dictionary, axis) for axis in range(axes))
+    return Signals(spec, dictionary, resources) or None
 
 
 _MII = 3
+_REVISION = 0x0001_0000
 _NONE: Mapping[str, bytes] = {}
+_NO_DEVICES: Mapping[str, EsiDevice] = {}
 
 
 def build_slave(
-    spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE, *, ports: Iterable[int] = (0, 1)
+    spec: SlaveSpec,
+    resources: Mapping[str, bytes] = _NONE,
+    device: EsiDevice | None = None,
+    *,
+    ports: Iterable[int] = (0, 1),
 ) -> SimulatedSlave:
     """Build one slave.
 
     Args:
         spec: Description of the slave.
         resources: Content of the files named in *spec*.
+        device: Its description by the vendor, for kind esi.
         ports: Its ports.
 
     Raises:
         ValueError: a data type, a value or an entry in *spec* is invalid.
     """
-    spec = complete(spec, resources)
+    if spec.kind is DeviceKind.ESI:
+        if device is None:
+            raise ValueError("a device of kind esi needs its description (key esi)")
+        return _build_esi(spec, resources, esi.plan_device(device, spec.modules), ports)
+    spec = complete(spec)
     dictionary = build_dictionary(spec, device_type(spec))
-    behaviour, drives = behave(spec, dictionary, resources)
-    device = Device(
+    axes = spec.axes if spec.kind is DeviceKind.DRIVE else 0
+    behaviour = behave(spec, dictionary, resources, axes)
+    unit = Device(
         spec.name,
         dictionary,
         behaviour=behaviour,
         has_boot=spec.boot and spec.mailbox is not None,
-        needs_sync0=spec.clock is not None and spec.clock.needs_sync0,
+        needs_sync0=spec.clock is not None and bool(spec.clock.needs_sync0),
         identification=spec.alias,
         channels=_channels(spec),
     )
-    device.process_data.configure()
-    layout = plan_channels(
-        spec.mailbox, device.process_data.outputs.size, device.process_data.inputs.size
-    )
-    device.output_channel = layout.output_channel
-    device.input_channel = layout.input_channel
+    unit.process_data.configure()
+    outputs, inputs = unit.process_data.channels
+    layout = plan_channels(spec.mailbox, outputs.size, inputs.size)
+    outputs.number, inputs.number = layout.output_channel, layout.input_channel
     if spec.mailbox is not None:
-        device.mailbox = build_mailbox(spec.mailbox, spec.files, device, drives)
-    if isinstance(behaviour, Axes):
-        for axis, drive in enumerate(behaviour.drives):
-            drive.report = partial(device.report_error, axis=axis)
+        sizes = MailboxSizes(spec.mailbox.size, spec.mailbox.size)
+        drives = _drive_parameters(behaviour, spec.name)
+        unit.mailbox = build_mailbox(spec.mailbox, spec.files, unit, sizes, drives)
+    _connect_reports(unit)
     emulates = spec.mailbox is None and not layout.channels[0].length + layout.channels[1].length
     image = build_image(spec, dictionary, layout, emulates=emulates, ports=ports)
-    return SimulatedSlave(Esc(image, _settings(spec, ports)), device)
+    return SimulatedSlave(Esc(image, _settings(spec, ports)), unit)
 
 
-def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> SimulatedSegment:
-    """Build and connect all slaves of *bus*.
+def _build_esi(
+    spec: SlaveSpec, resources: Mapping[str, bytes], plan: EsiPlan, ports: Iterable[int]
+) -> SimulatedSlave:
+    """Build a slave with the layout of its vendor's description."""
+    spec = esi.complete(spec, plan)
+    dictionary = esi.build_dictionary(spec, plan, MODULAR_DEVICE)
+    axes = esi.axes_of(dictionary) if esi.is_drive(spec, dictionary) else 0
+    drive.add_missing(dictionary, axes)
+    behaviour = behave(spec, dictionary, resources, axes)
+    unit = Device(
+        spec.name,
+        dictionary,
+        behaviour=behaviour,
+        has_boot=spec.boot,
+        needs_sync0=spec.clock is not None and bool(spec.clock.needs_sync0),
+        identification=spec.alias,
+        process_channels=esi.process_channels(plan),
+        channels=esi.channel_names(spec),
+    )
+    unit.process_data.configure()
+    sizes = esi.mailbox_sizes(plan.device)
+    if spec.mailbox is not None and sizes is not None:
+        drives = _drive_parameters(behaviour, spec.name)
+        unit.mailbox = build_mailbox(spec.mailbox, spec.files, unit, MailboxSizes(*sizes), drives)
+    _connect_reports(unit)
+    settings = msgspec.structs.replace(
+        _settings(spec, ports), ram=esi.memory_size(plan, unit.process_data.channels)
+    )
+    return SimulatedSlave(Esc(esi_image.build_image(spec, plan), settings), unit)
+
+
+def _drive_parameters(behaviour: Behaviour | None, name: str) -> dict[int, list[SoeParameter]]:
+    """Return the IDNs of each axis of a drive."""
+    if not isinstance(behaviour, Axes):
+        return {}
+    idns = (drive.parameters(axis, name) for axis in behaviour.drives)
+    return dict(enumerate(idns))
+
+
+def _connect_reports(unit: Device) -> None:
+    """Report faults of axes by emergencies."""
+    if isinstance(unit.behaviour, Axes):
+        for number, axis in enumerate(unit.behaviour.drives):
+            axis.report = partial(unit.report_error, axis=number)
+
+
+def build_segment(
+    bus: BusSpec,
+    resources: Mapping[str, bytes] = _NONE,
+    devices: Mapping[str, EsiDevice] = _NO_DEVICES,
+) -> SimulatedSegment:
+    """Build and connect all slaves of *bus*; *devices* are those of kind esi by their names.
 
     Raises:
         ValueError: the description of a slave is invalid, or it is connected to a later slave.
@@ -146,7 +203,7 @@ def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Simul
     for cable in cables:
         ports[cable.parent].add(cable.parent_port)
     slaves = [
-        build_slave(spec, resources, ports=there)
+        build_slave(spec, resources, devices.get(spec.name), ports=there)
         for spec, there in zip(bus.slaves, ports, strict=True)
     ]
     ring_end = (len(slaves) - 1, 1) if bus.ring else None

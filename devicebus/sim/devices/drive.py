@@ -14,11 +14,12 @@ import msgspec
 
 from devicebus.errors import SoeError
 from devicebus.mailbox.soe_server import ProcedureCommand, SoeParameter
+from devicebus.sim.devices.objects import described_object
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
 from eap.codec.soe import Display, Idn, SoeAttribute, SoeErrorCode, name_of
 from eap.od.dictionary import ObjectDictionary
-from eap.od.model import Entry
+from eap.od.model import Entry, ObjectCode
 
 FAULT_RESET_BIT = 0x80
 _REMOTE = 0x0200
@@ -126,6 +127,7 @@ AXIS_PDOS = 0x10
 _RX_PDO, _TX_PDO = 0x1600, 0x1A00
 FOLLOWING_ERROR = 0x8611
 NO_WINDOW = 0xFFFF_FFFF
+_WINDOW = 0x6065
 
 _OBJECTS = (
     ObjectSpec(index=0x603F, name="Error code", type="UINT", access=AccessKind.READ),
@@ -172,6 +174,26 @@ def complete(spec: SlaveSpec) -> SlaveSpec:
             _mapped(each, _RX_PDO, axis) for axis in range(spec.axes) for each in _OUTPUTS
         ),
     )
+
+
+def add_missing(dictionary: ObjectDictionary, axes: int) -> None:
+    """Add the objects of the profile that the description of a drive leaves out.
+
+    Raises:
+        ValueError: an object of the profile is no number.
+    """
+    for axis in range(axes):
+        for spec in _OBJECTS:
+            item = _moved(spec, axis)
+            if item.index not in dictionary:
+                dictionary.add(described_object(item))
+            entry = dictionary[item.index].entries[0]
+            if dictionary[item.index].code is not ObjectCode.VAR or not entry.kind.scalar_range:
+                raise ValueError(f"profile drive: object 0x{item.index:04X} is no number")
+        window = dictionary.entry(_WINDOW + AXIS_OBJECTS * axis, 0)
+        # A window of 0 without a unit would fail every motion.
+        if not window.value and window.kind.bit_length == 32:
+            window.value = NO_WINDOW
 
 
 def _moved(item: ObjectSpec, axis: int) -> ObjectSpec:

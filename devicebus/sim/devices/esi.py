@@ -1,281 +1,415 @@
-"""Import of a device from its vendor's ESI file (ETG.2000).
-
-Identity, mailbox, PDOs and object dictionary are imported.  Addresses of sync managers are not: the
-simulated controller has its own.
-"""
+"""Simulated device of a vendor's description: layout, objects and process data of the real one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 import msgspec
-from defusedxml import ElementTree
 
-from devicebus.sim.spec import (
-    AccessKind,
-    ChannelSpec,
-    EntrySpec,
-    MailboxSpec,
-    ObjectSpec,
-    SlaveSpec,
-    Value,
+from devicebus.esi.choice import (
+    default_assignment,
+    default_modules,
+    find_modules,
+    needs_sync0,
+    with_modules,
 )
-from eap.codec import datatypes
+from devicebus.esi.names import ProcessEntry, name_entries, process_entries
+from devicebus.esi.objects import type_of
+from devicebus.esi.records import (
+    EsiAccess,
+    EsiCoe,
+    EsiDevice,
+    EsiObject,
+    EsiPdo,
+    EsiSyncManager,
+    SmUse,
+)
+from devicebus.sim.device import FaultyDictionary
+from devicebus.sim.devices.drive import AXIS_OBJECTS
+from devicebus.sim.devices.objects import (
+    MIN_ROOM,
+    PdoRules,
+    add_entry,
+    assignment,
+    described_object,
+    identity_objects,
+    mapping,
+)
+from devicebus.sim.devices.siibuild import RAM
+from devicebus.sim.pdo import ProcessChannel
+from devicebus.sim.spec import ChannelSpec, ClockSpec, MailboxSpec, ProfileKind, SlaveSpec
+from eap.ids import ObjectId
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RO, RW, RW_PREOP, WO, Access, Entry, ObjectCode, OdObject, array, record
+from eap.suggest import suggest
 
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-
-_BY_BITS = {1: "BOOL", 8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
-_ACCESS = {"ro": AccessKind.READ, "wo": AccessKind.WRITE, "rw": AccessKind.READ_WRITE}
 _STANDARD = frozenset(
-    (0x1000, 0x1001, 0x1008, 0x1009, 0x100A, 0x1018, 0x1C00, *range(0x1600, 0x1800),
-     *range(0x1A00, 0x1C00), *range(0x1C10, 0x1C20))
-)  # fmt: skip
-_MAX_SUBINDEX = 0xFF
+    (0x1000, 0x1001, 0x1008, 0x1009, 0x100A, 0x1018, 0x1C00, *range(0x1C10, 0x1C20))
+)
+_ASSIGN = 0x1C10
+_SM_TYPES = {
+    SmUse.MAILBOX_OUT: 1,
+    SmUse.MAILBOX_IN: 2,
+    SmUse.OUTPUTS: 3,
+    SmUse.INPUTS: 4,
+    SmUse.DYNAMIC_OUTPUTS: 3,
+    SmUse.DYNAMIC_INPUTS: 4,
+}
+_ACCESS = {
+    EsiAccess.READ: RO,
+    EsiAccess.WRITE: WO,
+    EsiAccess.READ_WRITE: RW,
+    EsiAccess.CONFIGURATION: RW_PREOP,
+}
+_SINGLE_BUFFER = 2
+_BUFFERS = 3
+_MEMORY = 0x1000
+_MAX_RAM = 60 << 10
+_CONTROL_WORD, _STATUS_WORD = 0x6040, 0x6041
+_MAX_AXES = 8
+_MODULES, _CONFIGURED_MODULES = 0xF050, 0xF030
+_DEFAULT_MAILBOX = 128
 
 
-class _SubItem(NamedTuple):
-    """Subindex of a data type (ESI element SubItem)."""
+class EsiPlan(NamedTuple):
+    """Device with its modules, and the PDOs of its sync managers by default."""
 
-    subindex: int
-    name: str
-    kind: str
-    bits: int
-    access: AccessKind
+    device: EsiDevice
+    assignment: dict[int, tuple[EsiPdo, ...]]
+    modules: tuple[int, ...] = ()
+    """Idents of the modules in the slots, 0 for none."""
 
+    @property
+    def coe(self) -> EsiCoe | None:
+        """Its CoE, None without one."""
+        return self.device.mailbox.coe if self.device.mailbox else None
 
-def number(text: str) -> int:
-    """Parse a number of an ESI file, ``#x1A00`` or ``6656``; raise ValueError otherwise."""
-    stripped = text.strip().lower()
-    digits = stripped.removeprefix("#x")
-    return int(digits, 10 if digits == stripped else 16)
-
-
-def text_at(element: Element, path: str, default: str) -> str:
-    """Return the text at *path*, or *default*."""
-    return (element.findtext(path) or default).strip()
+    def entries(self) -> Iterator[ProcessEntry]:
+        """Yield the entries of all PDOs, assigned or not."""
+        yield from process_entries(self.device.pdos, is_soe=self.device.is_soe)
 
 
-def type_of(name: str, bits: int) -> str:
-    """Return the type *name* if it has *bits* bits, otherwise a type that holds them."""
-    try:
-        kind = datatypes.parse(name)
-    except ValueError:
-        kind = None
-    if kind is not None and kind.bit_length == bits:
-        return name
-    if bits in _BY_BITS:
-        return _BY_BITS[bits]
-    if bits < 8:
-        return f"BIT{bits}"
-    if bits % 8 == 0:
-        return f"BLOCK({bits // 8})"
-    whole = f"BLOCK({bits // 8 + 1})"
-    return next((kind for size, kind in _BY_BITS.items() if size > bits), whole)
-
-
-def objects(device: Element) -> Iterator[ObjectSpec]:
-    """Yield the objects of a device description.
+def plan_device(device: EsiDevice, modules: Iterable[int | str | None] | None) -> EsiPlan:
+    """Return the plan of a device with *modules*; None for its defaults.
 
     Raises:
-        ValueError: a number is invalid.
+        ValueError: a module does not fit.
     """
-    types = {
-        text_at(each, "Name", ""): each
-        for each in device.iterfind("Profile/Dictionary/DataTypes/DataType")
-    }
-    for item in device.iterfind("Profile/Dictionary/Objects/Object"):
-        index = number(text_at(item, "Index", "0"))
-        bits = number(text_at(item, "BitSize", "0"))
-        # The standard objects are built from identity and PDOs of the file, so that both agree.
-        if index in _STANDARD or not bits:
+    given = None if modules is None else tuple(modules)
+    chosen = default_modules(device) if given is None else find_modules(device, given)
+    whole = with_modules(device, chosen)
+    idents = tuple(module.ident if module else 0 for module in chosen)
+    return EsiPlan(whole, default_assignment(whole), idents)
+
+
+def complete(spec: SlaveSpec, plan: EsiPlan) -> SlaveSpec:
+    """Return *spec* completed by its description; its inputs add sources to those of the file.
+
+    Raises:
+        ValueError: an input or output of *spec* is none of the file, or does not fit it.
+    """
+    device = plan.device
+    assigned = {pdo.index for pdos in plan.assignment.values() for pdo in pdos}
+    own = name_entries(plan.entries(), assigned)
+    inputs = [_channel(name, entry) for name, entry in own if not entry.is_output]
+    outputs = [_channel(name, entry) for name, entry in own if entry.is_output]
+    clock = spec.clock or ClockSpec()
+    needs = needs_sync0(device) if clock.needs_sync0 is None else clock.needs_sync0
+    return msgspec.structs.replace(
+        spec,
+        vendor=device.vendor,
+        product=device.product,
+        revision=device.revision,
+        mailbox=_mailbox(device),
+        clock=msgspec.structs.replace(clock, needs_sync0=needs) if device.has_dc else None,
+        inputs=tuple(_with_sources(inputs, spec.inputs, device)),
+        outputs=tuple(_with_sources(outputs, spec.outputs, device)),
+        boot=spec.boot and bool(device.mailbox) and any(device.eeprom.bootstrap),
+    )
+
+
+def _channel(name: str, entry: ProcessEntry) -> ChannelSpec:
+    return ChannelSpec(
+        name=name,
+        type=type_of(entry.type, entry.bits),
+        object=f"{entry.index:#06x}:{entry.subindex:02x}",
+        bits=entry.bits,
+        pdo=entry.pdo,
+    )
+
+
+def _with_sources(
+    own: list[ChannelSpec], given: tuple[ChannelSpec, ...], device: EsiDevice
+) -> Iterator[ChannelSpec]:
+    """Yield the channels of the file; a given one with the same name or object adds its source."""
+    left = list(given)
+    for channel in own:
+        place = ObjectId.parse(channel.object)
+        found = next(
+            (
+                each
+                for each in left
+                if each.name == channel.name
+                or (each.object and ObjectId.parse(each.object) == place)
+            ),
+            None,
+        )
+        if found is None:
+            yield channel
             continue
-        kind = text_at(item, "Type", "")
-        parts = list(_sub_items(types.get(kind), types))
-        name = text_at(item, "Name", f"0x{index:04X}")
-        if parts:
-            yield ObjectSpec(index=index, name=name, entries=tuple(_entries(item, parts)))
-        elif kind in types or not kind.startswith("DT"):
-            simple = type_of(_base(kind, types), bits)
-            value = _value(item.find("Info"), simple)
-            yield ObjectSpec(index=index, name=name, type=simple, value=value, access=_access(item))
+        left.remove(found)
+        yield msgspec.structs.replace(
+            found, name=channel.name, type=channel.type, object=channel.object,
+            bits=channel.bits, pdo=channel.pdo,
+        )  # fmt: skip
+    if left:
+        hint = suggest(left[0].name, [each.name for each in own])
+        raise ValueError(f"{device.label} has no process data {left[0].name!r}{hint}")
 
 
-def _sub_items(kind: Element | None, types: dict[str, Element]) -> Iterator[_SubItem]:
-    """Yield the subindexes of a data type from 1 on."""
-    for item in () if kind is None else kind.iterfind("SubItem"):
-        name = text_at(item, "Type", "")
-        bits = number(text_at(item, "BitSize", "0"))
-        access = _access(item)
-        # A SubItem without SubIdx is an array: its elements are the subindexes.
-        if item.find("SubIdx") is None:
-            yield from _elements(types.get(name), types, access)
+def _mailbox(device: EsiDevice) -> MailboxSpec | None:
+    mailbox = device.mailbox
+    sizes = mailbox_sizes(device)
+    if mailbox is None or sizes is None:
+        return None
+    return MailboxSpec(
+        size=min(max(32, *sizes), 1486),
+        coe=mailbox.coe is not None,
+        foe=mailbox.foe,
+        soe=bool(mailbox.soe_channels),
+        eoe=mailbox.eoe,
+        voe=mailbox.voe,
+        aoe=mailbox.aoe,
+    )
+
+
+def mailbox_sizes(device: EsiDevice) -> tuple[int, int] | None:
+    """Return the sizes of the mailboxes to and from the slave; None without mailboxes."""
+    found = [each for each in device.sync_managers[:2] if each.is_mailbox]
+    if len(found) < 2:
+        return None
+    to_slave, to_master = (each.default_size or each.min_size or _DEFAULT_MAILBOX for each in found)
+    return to_slave, to_master
+
+
+def is_drive(spec: SlaveSpec, dictionary: ObjectDictionary) -> bool:
+    """Return true if the device behaves as a drive of CiA 402.
+
+    Raises ValueError if it should and has no control and status word.
+    """
+    has_words = axes_of(dictionary) > 0
+    if spec.profile is ProfileKind.DRIVE and not has_words:
+        raise ValueError("profile drive: the device has no objects 0x6040 and 0x6041")
+    return has_words and spec.profile is not ProfileKind.NONE
+
+
+def axes_of(dictionary: ObjectDictionary) -> int:
+    """Return the number of axes with control and status word."""
+    count = 0
+    while count < _MAX_AXES and all(
+        _is_word(dictionary, index + AXIS_OBJECTS * count)
+        for index in (_CONTROL_WORD, _STATUS_WORD)
+    ):
+        count += 1
+    return count
+
+
+def _is_word(dictionary: ObjectDictionary, index: int) -> bool:
+    if index not in dictionary:
+        return False
+    entry = dictionary[index].entries[0]
+    return dictionary[index].code is ObjectCode.VAR and entry.kind.bit_length == 16
+
+
+def process_channels(plan: EsiPlan) -> tuple[ProcessChannel, ...]:
+    """Return the sync managers of the process data; virtual ones need no channel."""
+    return tuple(
+        ProcessChannel(
+            number,
+            _ASSIGN + number,
+            is_output=each.is_output,
+            fixed_size=fixed_size(plan, number),
+            is_single=control_of(each) & 3 == _SINGLE_BUFFER,
+        )
+        for number, each in enumerate(plan.device.sync_managers)
+        if not each.is_mailbox and not each.is_virtual and is_used(each)
+    )
+
+
+def is_used(manager: EsiSyncManager) -> bool:
+    """Return true if process data is exchanged in each cycle; dynamic ones are set up on demand."""
+    return manager.use in {SmUse.OUTPUTS, SmUse.INPUTS}
+
+
+def fixed_size(plan: EsiPlan, number: int) -> int:
+    """Return the size of a sync manager to which no PDO can be assigned."""
+    manager = plan.device.sync_managers[number]
+    if plan.coe is not None:
+        return 0  # its assignment object says what it has
+    can_have = any(
+        pdo.is_output is manager.is_output and pdo.sync_manager in {None, number}
+        for pdo in plan.device.pdos
+    )
+    return 0 if can_have or not manager.is_enabled else manager.default_size or 0
+
+
+def memory_size(plan: EsiPlan, channels: Iterable[ProcessChannel]) -> int:
+    """Return the size of the controller's memory that holds all areas, 8 KiB at least."""
+    ends = [each.start + (each.default_size or 0) for each in plan.device.sync_managers]
+    ends += [
+        plan.device.sync_managers[each.number].start + _BUFFERS * max(each.size, MIN_ROOM)
+        for each in channels
+    ]
+    return min(_MAX_RAM, max([RAM, *(end - _MEMORY for end in ends)]) + 1023 & ~1023)
+
+
+_CONTROLS = {1: 0x26, 2: 0x22, 3: 0x24, 4: 0x20}
+
+
+def control_of(manager: EsiSyncManager) -> int:
+    """Return the control byte of a sync manager, by its use if the file has none."""
+    if manager.control is None:
+        return _CONTROLS[_SM_TYPES[manager.use]]
+    return manager.control
+
+
+def sm_type(manager: EsiSyncManager) -> int:
+    """Return the type of a sync manager as 0x1C00 and the EEPROM have it."""
+    return _SM_TYPES[manager.use]
+
+
+def build_dictionary(spec: SlaveSpec, plan: EsiPlan, device_type: int) -> ObjectDictionary:
+    """Build the dictionary of a device; with SoE it is an internal one of IDNs.
+
+    Raises:
+        ValueError: a type, a value or a PDO cannot be used.
+    """
+    device = plan.device
+    dictionary = FaultyDictionary()
+    if not device.is_soe:
+        for each in identity_objects(spec, _device_type(device, device_type)):
+            dictionary.add(each)
+    for described in spec.objects:
+        dictionary.add(described_object(described))
+    pdos = {pdo.index for pdo in device.pdos}
+    for item in device.objects:
+        if item.index not in dictionary and item.index not in _STANDARD | pdos:
+            dictionary.add(_object(item))
+    _add_entries(spec, plan, dictionary)
+    _add_pdos(plan, dictionary)
+    if not device.is_soe:
+        types = [sm_type(each) for each in device.sync_managers]
+        dictionary.add(array(0x1C00, "Sync manager type", "USINT", types))
+        if device.slots:
+            _add_modules(plan, dictionary)
+    return dictionary
+
+
+def _device_type(device: EsiDevice, default: int) -> int:
+    found = next((each for each in device.objects if each.index == 0x1000), None)
+    if found is not None and found.entries[0].default:
+        return int.from_bytes(found.entries[0].default, "little") & 0xFFFF_FFFF
+    return default if device.profile_number is None else device.profile_number
+
+
+def _object(item: EsiObject) -> OdObject:
+    entries: dict[int, Entry] = {}
+    for each in item.entries:
+        entry = Entry(each.name, each.type, _ACCESS[each.access])
+        if each.default is not None:
+            octets = each.default.rstrip(b"\0") if entry.is_text else each.default
+            entry.default = entry.octets = octets
+        entries[each.subindex] = entry
+    if item.is_record:
+        return record(item.index, item.name, entries)
+    return OdObject(item.index, item.name, ObjectCode.VAR, entries)
+
+
+def _add_entries(spec: SlaveSpec, plan: EsiPlan, dictionary: ObjectDictionary) -> None:
+    """Add the entries of all PDOs; one that is mapped with several lengths has the longest."""
+    widest: dict[tuple[int, int], int] = {}
+    for entry in plan.entries():
+        place = entry.index, entry.subindex
+        widest[place] = max(entry.bits, widest.get(place, 0))
+    by_name = {(channel.object, channel.pdo): channel for channel in (*spec.inputs, *spec.outputs)}
+    for entry in plan.entries():
+        if not entry.index:
             continue
-        subindex = number(text_at(item, "SubIdx", "0"))
-        if 0 < subindex <= _MAX_SUBINDEX and bits:
-            label = text_at(item, "Name", f"SubIndex {subindex:03}")
-            yield _SubItem(subindex, label, type_of(_base(name, types), bits), bits, access)
-
-
-def _elements(
-    array: Element | None, types: dict[str, Element], access: AccessKind
-) -> Iterator[_SubItem]:
-    """Yield the elements of an array."""
-    if array is None:
-        return
-    count = number(text_at(array, "ArrayInfo/Elements", "0"))
-    first = number(text_at(array, "ArrayInfo/LBound", "1"))
-    bits = number(text_at(array, "BitSize", "0")) // count if count else 0
-    if not bits:
-        return
-    kind = type_of(_base(text_at(array, "BaseType", ""), types), bits)
-    for subindex in range(max(first, 1), min(first + count, _MAX_SUBINDEX + 1)):
-        yield _SubItem(subindex, f"SubIndex {subindex:03}", kind, bits, access)
-
-
-def _entries(item: Element, parts: list[_SubItem]) -> Iterator[EntrySpec]:
-    infos = {text_at(each, "Name", ""): each.find("Info") for each in item.iterfind("Info/SubItem")}
-    # A subindex that a file has twice counts once: the last one.
-    for part in {each.subindex: each for each in parts}.values():
-        yield EntrySpec(
-            subindex=part.subindex,
-            name=part.name,
-            type=part.kind,
-            value=_value(infos.get(part.name), part.kind),
-            access=part.access,
+        given = by_name.get((f"{entry.index:#06x}:{entry.subindex:02x}", entry.pdo))
+        channel = ChannelSpec(
+            name=entry.name or f"{entry.index:04X}:{entry.subindex:02X}",
+            type=type_of(entry.type, widest[entry.index, entry.subindex]),
+            value=given.value if given is not None else 0,
+        )
+        right = Access.RX_MAPPABLE if entry.is_output else Access.TX_MAPPABLE
+        add_entry(
+            dictionary,
+            entry.index,
+            entry.subindex,
+            channel,
+            (RW if entry.is_output else RO) | right,
         )
 
 
-def _base(name: str, types: dict[str, Element]) -> str:
-    """Return the base type of a type that the file defines, such as an enumeration."""
-    found = types.get(name)
-    return name if found is None else text_at(found, "BaseType", name)
+def _add_pdos(plan: EsiPlan, dictionary: ObjectDictionary) -> None:
+    device, coe = plan.device, plan.coe
+    mapped: dict[int, list[tuple[int, int, int]]] = {pdo.index: [] for pdo in device.pdos}
+    for entry in plan.entries():
+        mapped[entry.pdo].append((entry.index, entry.subindex, entry.bits))
+    for pdo in device.pdos:
+        if pdo.index in dictionary:
+            raise ValueError(f"PDO 0x{pdo.index:04X} is there twice, or is an object as well")
+        is_fixed = pdo.is_fixed or coe is None or not coe.pdo_config
+        dictionary.add(
+            mapping(
+                pdo.index, mapped[pdo.index], dictionary, is_output=pdo.is_output, is_fixed=is_fixed
+            )
+        )
+    excludes = _exclusions(device.pdos)
+    for number, manager in enumerate(device.sync_managers):
+        if manager.is_mailbox:
+            continue
+        rules = PdoRules(
+            frozenset(pdo.index for pdo in device.pdos if pdo.is_output is manager.is_output),
+            excludes,
+            is_fixed=coe is None or not coe.pdo_assign,
+        )
+        pdos = [pdo.index for pdo in plan.assignment.get(number, ())]
+        dictionary.add(
+            assignment(_ASSIGN + number, pdos, dictionary, rules, is_output=manager.is_output)
+        )
 
 
-def _access(item: Element) -> AccessKind:
-    flags = item.find("Flags/Access")
-    if flags is None:
-        return AccessKind.READ_WRITE
-    access = _ACCESS.get((flags.text or "").strip().lower(), AccessKind.READ_WRITE)
-    restricted = flags.get("WriteRestrictions", "").lower() == "preop"
-    if access is AccessKind.READ_WRITE and restricted:
-        return AccessKind.CONFIGURATION
-    return access
-
-
-def _value(info: Element | None, kind_name: str) -> Value | None:
-    """Return the initial value of an entry; None without one that fits its type."""
-    if info is None:
-        return None
-    kind = datatypes.parse(kind_name)
-    try:
-        if (data := text_at(info, "DefaultData", "")) != "":
-            octets = bytes.fromhex(data).ljust(kind.size, b"\0")
-            plain = kind.to_plain(kind.decode(octets, 0))
-        elif (text := text_at(info, "DefaultString", "")) != "":
-            plain = text
-        elif (text := text_at(info, "DefaultValue", "")) != "":
-            plain = number(text)
-        else:
-            return None
-        kind.encode(plain)
-    except ValueError:
-        return None
-    return None if isinstance(plain, list | dict) else plain
-
-
-_MAX_ENTRY_BITS = 255
-_MINIMUM_MAILBOX = 32
-
-
-def complete(spec: SlaveSpec, xml: bytes) -> SlaveSpec:
-    """Return *spec* completed by the file; the product code in *spec* selects the device.
-
-    Raises:
-        ValueError: the file is no ESI file, or does not describe the device.
-    """
-    root = _parse(xml, spec.esi)
-    device = _choose(root, spec)
-    kind = device.find("Type")
-    attributes = {} if kind is None else kind.attrib
-    own = {each.index for each in spec.objects}
-    return msgspec.structs.replace(
-        spec,
-        vendor=number(text_at(root, "Vendor/Id", "0")),
-        product=number(attributes.get("ProductCode", "0")),
-        revision=number(attributes.get("RevisionNo", "0")),
-        mailbox=_mailbox(device),
-        inputs=spec.inputs or tuple(_channels(device.iterfind("TxPdo"))),
-        outputs=spec.outputs or tuple(_channels(device.iterfind("RxPdo"))),
-        objects=(*spec.objects, *(each for each in objects(device) if each.index not in own)),
-    )
-
-
-def _parse(xml: bytes, name: str) -> Element:
-    try:
-        root: Element = ElementTree.fromstring(xml)
-    except (SyntaxError, ValueError) as exc:
-        raise ValueError(f"{name} is not XML that can be read: {exc}") from None
-    if root.tag != "EtherCATInfo":
-        raise ValueError(f"{name} begins with {root.tag}, expected EtherCATInfo")
-    return root
-
-
-def _choose(root: Element, spec: SlaveSpec) -> Element:
-    devices = list(root.iterfind("Descriptions/Devices/Device"))
-    for device in devices:
-        kind = device.find("Type")
-        code = "0" if kind is None else kind.get("ProductCode", "0")
-        if not spec.product or number(code) == spec.product:
-            return device
-    raise ValueError(
-        f"{spec.esi} describes {len(devices)} devices, none with product code {spec.product:#x}"
-    )
-
-
-def _mailbox(device: Element) -> MailboxSpec | None:
-    mailbox = device.find("Mailbox")
-    if mailbox is None:
-        return None
-    # The first two sync managers are the mailboxes.
-    sizes = [number(each.get("DefaultSize", "128")) for each in device.findall("Sm")[:2]]
-    return MailboxSpec(
-        size=max(_MINIMUM_MAILBOX, min(sizes, default=128)),
-        coe=mailbox.find("CoE") is not None,
-        foe=mailbox.find("FoE") is not None,
-        soe=mailbox.find("SoE") is not None,
-        eoe=mailbox.find("EoE") is not None,
-        voe=mailbox.find("VoE") is not None,
-        aoe=mailbox.find("AoE") is not None,
-    )
-
-
-def _channels(pdos: Iterable[Element]) -> Iterator[ChannelSpec]:
-    """Yield the mapped entries of all PDOs; PDOs without a sync manager can be assigned."""
+def _exclusions(pdos: Iterable[EsiPdo]) -> Mapping[int, frozenset[int]]:
+    found: dict[int, set[int]] = {}
     for pdo in pdos:
-        index = number(text_at(pdo, "Index", "0"))
-        assigned = "Sm" in pdo.attrib
-        for entry in pdo.iterfind("Entry"):
-            bits = number(text_at(entry, "BitLen", "0"))
-            place = number(text_at(entry, "Index", "0"))
-            if not place:
-                yield from _padding(bits, index, assigned=assigned)
-            elif bits:
-                name = f"{place:#06x}:{number(text_at(entry, 'SubIndex', '0'))}"
-                yield ChannelSpec(
-                    name=text_at(entry, "Name", name),
-                    type=type_of(text_at(entry, "DataType", ""), bits),
-                    object=name,
-                    bits=bits,
-                    pdo=index,
-                    assigned=assigned,
-                )
+        for other in pdo.excludes:
+            found.setdefault(pdo.index, set()).add(other)
+            found.setdefault(other, set()).add(pdo.index)
+    return {index: frozenset(others) for index, others in found.items()}
 
 
-def _padding(bits: int, pdo: int, *, assigned: bool) -> Iterator[ChannelSpec]:
-    while bits:
-        part = min(bits, _MAX_ENTRY_BITS)
-        yield ChannelSpec(name="", object="0", bits=part, pdo=pdo, assigned=assigned)
-        bits -= part
+def _add_modules(plan: EsiPlan, dictionary: ObjectDictionary) -> None:
+    """Add the lists of configured and detected modules (ETG.5001)."""
+    for index, name, access in (
+        (_CONFIGURED_MODULES, "Configured module ident list", RW_PREOP),
+        (_MODULES, "Detected module ident list", RO),
+    ):
+        if index not in dictionary:
+            dictionary.add(array(index, name, "UDINT", plan.modules[:254], access))
+
+
+def channel_names(spec: SlaveSpec) -> dict[str, tuple[int, int]]:
+    """Return the entries by names: PDO and entry, and the entry alone where it is unique."""
+    channels = [each for each in (*spec.inputs, *spec.outputs) if each.object]
+    short = Counter(each.name.partition(".")[2] for each in channels)
+    found: dict[str, tuple[int, int]] = {}
+    for each in channels:
+        place = ObjectId.parse(each.object)
+        found[each.name] = place
+        alone = each.name.partition(".")[2]
+        if alone and short[alone] == 1:
+            found.setdefault(alone, place)
+    return found

@@ -6,7 +6,9 @@ of devices.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 from devicebus.sim.device import FaultyDictionary
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
@@ -44,40 +46,64 @@ _PDO_MAPPING = 0x21
 
 
 def mapping(
-    index: int, mapped: Sequence[tuple[int, int, int]], dictionary: ObjectDictionary
+    index: int,
+    mapped: Sequence[tuple[int, int, int]],
+    dictionary: ObjectDictionary,
+    *,
+    is_output: bool,
+    is_fixed: bool = False,
 ) -> OdObject:
     """Return the mapping object of a PDO of entries (index, subindex, bits), without padding.
 
     Only the sync manager begins and ends on whole bytes: PDOs of one bit follow each other bit by
-    bit, as in real digital terminals.  A master may change the mapping in PREOP.
+    bit, as in real digital terminals.  A master may change a mapping in PREOP that is not fixed.
 
     Raises:
-        ValueError: the index is no PDO, or the PDO maps too much.
+        ValueError: the PDO maps too much.
     """
-    if not (0 <= index - RX_PDO < PDOS or 0 <= index - TX_PDO < PDOS):
-        raise ValueError(f"0x{index:04X} is no PDO (0x1600 to 0x17FF, 0x1A00 to 0x1BFF)")
-    name = "TxPDO" if index >= TX_PDO else "RxPDO"
+    name = "RxPDO" if is_output else "TxPDO"
     numbers = [entry << 16 | sub << 8 | bits for entry, sub, bits in mapped]
     if any(bits > 0xFF for _, _, bits in mapped) or len(numbers) > _MAX_ENTRIES:
         raise ValueError(
             f"{name} maps {len(numbers)} entries, expected at most 254 of at most 255 bits"
         )
     room = max(MIN_ROOM, (sum(number & 0xFF for number in numbers) + 7) // 8)
-    limit = min(len(numbers) + SPARE_ENTRIES, _MAX_ENTRIES)
-    count = Entry("SubIndex 000", "USINT", RW_PREOP, len(numbers), maximum=limit)
+    spare = 0 if is_fixed else SPARE_ENTRIES
+    limit = min(len(numbers) + spare, _MAX_ENTRIES)
+    access = RO if is_fixed else RW_PREOP
+    count = Entry("SubIndex 000", "USINT", access, len(numbers), maximum=limit)
     entries = {0: count, **_numbered(index, numbers, limit, "UDINT", count)}
-    count.write = _check_mapping(index, entries, dictionary, room)
+    right = Access.RX_MAPPABLE if is_output else Access.TX_MAPPABLE
+    count.write = _check_mapping(index, entries, dictionary, room, right)
     return OdObject(index, f"{name} mapping", ObjectCode.RECORD, entries, data_type=_PDO_MAPPING)
 
 
-def assignment(index: int, pdos: Sequence[int], dictionary: ObjectDictionary) -> OdObject:
+class PdoRules(NamedTuple):
+    """PDOs that a sync manager may have."""
+
+    known: Container[int]
+    excludes: Mapping[int, Container[int]] = MappingProxyType({})
+    """PDOs that cannot be assigned together with a PDO."""
+    is_fixed: bool = False
+    """True if a master cannot change the assignment."""
+
+
+def assignment(
+    index: int,
+    pdos: Sequence[int],
+    dictionary: ObjectDictionary,
+    rules: PdoRules,
+    *,
+    is_output: bool,
+) -> OdObject:
     """Return the assignment object of a sync manager; a master may change it in PREOP."""
     limit = max(MAX_ASSIGNED, len(pdos))
-    count = Entry("SubIndex 000", "USINT", RW_PREOP, len(pdos), maximum=limit)
+    access = RO if rules.is_fixed else RW_PREOP
+    count = Entry("SubIndex 000", "USINT", access, len(pdos), maximum=limit)
     entries = {0: count, **_numbered(index, pdos, limit, "UINT", count)}
     room = max(MIN_ROOM, (sum(_bits(dictionary, pdo) for pdo in pdos) + 7) // 8)
-    count.write = _check_assignment(index, entries, dictionary, room)
-    title = "RxPDO assign" if index == RX_ASSIGN else "TxPDO assign"
+    count.write = _check_assignment(index, entries, dictionary, room, rules)
+    title = "RxPDO assign" if is_output else "TxPDO assign"
     return OdObject(index, title, ObjectCode.ARRAY, entries, data_type=0x06)
 
 
@@ -88,7 +114,7 @@ def _numbered(
         sub: Entry(
             f"SubIndex {sub:03}",
             kind,
-            RW_PREOP,
+            count.access,
             numbers[sub - 1] if sub <= len(numbers) else 0,
             write=_while_empty(index, sub, count),
         )
@@ -108,9 +134,8 @@ def _while_empty(index: int, sub: int, count: Entry) -> Callable[[bytes], None]:
 
 
 def _check_mapping(
-    index: int, entries: dict[int, Entry], dictionary: ObjectDictionary, room: int
+    index: int, entries: dict[int, Entry], dictionary: ObjectDictionary, room: int, right: Access
 ) -> Callable[[bytes], None]:
-    right = Access.TX_MAPPABLE if index >= TX_PDO else Access.RX_MAPPABLE
     own = {entry.value for entry in entries.values()}
 
     def check(octets: bytes) -> None:
@@ -137,16 +162,20 @@ def _check_mapping(
 
 
 def _check_assignment(
-    index: int, entries: dict[int, Entry], dictionary: ObjectDictionary, room: int
+    index: int, entries: dict[int, Entry], dictionary: ObjectDictionary, room: int, rules: PdoRules
 ) -> Callable[[bytes], None]:
-    first = RX_PDO if index == RX_ASSIGN else TX_PDO
-
     def check(octets: bytes) -> None:
         total = 0
+        before: list[int] = []
         for sub in range(1, octets[0] + 1):
             pdo = entries[sub].value
-            if pdo not in dictionary or not 0 <= pdo - first < PDOS:
+            if pdo not in dictionary or pdo not in rules.known:
                 raise SdoAbortError(AbortCode.PARAMETER, index, sub, f"no PDO 0x{pdo:04X}")
+            other = next((each for each in before if each in rules.excludes.get(pdo, ())), None)
+            if other is not None:
+                message = f"0x{other:04X} and 0x{pdo:04X} exclude each other"
+                raise SdoAbortError(AbortCode.PARAMETER, index, sub, message)
+            before.append(pdo)
             total += _bits(dictionary, pdo)
         if total > 8 * room:
             raise SdoAbortError(AbortCode.PDO_LENGTH, index, 0, f"{total} bits of {8 * room}")
@@ -190,9 +219,9 @@ def build_dictionary(spec: SlaveSpec, device_type: int) -> ObjectDictionary:
     Raises:
         ValueError: a data type, a value or an entry is invalid.
     """
-    dictionary = FaultyDictionary(_identity(spec, device_type))
+    dictionary = FaultyDictionary(identity_objects(spec, device_type))
     for each in spec.objects:
-        dictionary.add(_object(each))
+        dictionary.add(described_object(each))
     _add_side(dictionary, spec.outputs, OUTPUTS, RX_PDO, RW | Access.RX_MAPPABLE)
     _add_side(dictionary, spec.inputs, INPUTS, TX_PDO, RO | Access.TX_MAPPABLE)
     dictionary.add(array(0x1C00, "Sync manager type", "USINT", _SM_TYPES))
@@ -212,20 +241,24 @@ def _add_side(
     for channel, (index, subindex) in zip(channels, object_ids_of(channels, base), strict=True):
         kind = datatypes.parse(channel.type)
         if index:
-            kind = _add_entry(dictionary, index, subindex, channel, access).kind
+            kind = add_entry(dictionary, index, subindex, channel, access).kind
         bits = channel.bits or kind.bit_length
         pdo = channel.pdo or first_pdo
         if not 0 <= pdo - first_pdo < PDOS:
             raise ValueError(f"{channel.name}: 0x{pdo:04X} is no PDO of its direction")
         pdos.setdefault(pdo, []).append((index, subindex, bits))
         assigned[pdo] = assigned.get(pdo, False) or channel.assigned
+    is_output = first_pdo == RX_PDO
     for pdo, mapped in pdos.items():
-        dictionary.add(mapping(pdo, mapped, dictionary))
-    assign = RX_ASSIGN if first_pdo == RX_PDO else TX_ASSIGN
-    dictionary.add(assignment(assign, [pdo for pdo in pdos if assigned[pdo]], dictionary))
+        dictionary.add(mapping(pdo, mapped, dictionary, is_output=is_output))
+    rules = PdoRules(range(first_pdo, first_pdo + PDOS))
+    default = [pdo for pdo in pdos if assigned[pdo]]
+    assign = RX_ASSIGN if is_output else TX_ASSIGN
+    dictionary.add(assignment(assign, default, dictionary, rules, is_output=is_output))
 
 
-def _identity(spec: SlaveSpec, device_type: int) -> Iterable[OdObject]:
+def identity_objects(spec: SlaveSpec, device_type: int) -> Iterable[OdObject]:
+    """Yield the objects 0x1000 to 0x1018."""
     yield variable(0x1000, "Device type", "UDINT", RO, device_type)
     yield variable(0x1001, "Error register", "USINT", RO)
     for index, name, text in (
@@ -237,14 +270,15 @@ def _identity(spec: SlaveSpec, device_type: int) -> Iterable[OdObject]:
     numbers = (
         ("Vendor ID", spec.vendor),
         ("Product code", spec.product),
-        ("Revision number", spec.revision),
+        ("Revision number", spec.revision or 0),
         ("Serial number", spec.serial),
     )
     entries = {sub: Entry(name, "UDINT", RO, value) for sub, (name, value) in enumerate(numbers, 1)}
     yield record(0x1018, "Identity", entries, data_type=_IDENTITY_TYPE)
 
 
-def _object(spec: ObjectSpec) -> OdObject:
+def described_object(spec: ObjectSpec) -> OdObject:
+    """Return the object of *spec*; raise ValueError for an invalid type or value."""
     if not spec.entries:
         return OdObject(spec.index, spec.name, ObjectCode.VAR, {0: _entry(spec)})
     return record(spec.index, spec.name, {each.subindex: _entry(each) for each in spec.entries})
@@ -271,9 +305,10 @@ def _limit(kind: DataType, limit: float | None) -> float | None:
     return number
 
 
-def _add_entry(
+def add_entry(
     dictionary: ObjectDictionary, index: int, subindex: int, channel: ChannelSpec, access: Access
 ) -> Entry:
+    """Return the entry of *channel*, with additional rights if it exists already."""
     if index in dictionary and subindex in dictionary[index].entries:
         entry = dictionary[index].entries[subindex]
         entry.access |= access

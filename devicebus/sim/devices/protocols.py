@@ -31,10 +31,10 @@ def build_mailbox(
     spec: MailboxSpec,
     files: Iterable[FileSpec],
     device: Device,
+    sizes: MailboxSizes,
     drives: Mapping[int, Iterable[SoeParameter]] | None = None,
 ) -> MailboxServer:
     """Build the servers of *device*; SoE has the IDNs of *drives*, VoE echoes."""
-    sizes = MailboxSizes(spec.size, spec.size)
     servers: dict[MailboxType, ProtocolServer] = {}
     if spec.coe:
         servers[MailboxType.COE] = _coe(device, sizes)

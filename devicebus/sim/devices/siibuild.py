@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import msgspec
@@ -45,7 +45,7 @@ _KIBIT = 128
 _MII = 1
 
 
-class _Strings:
+class SiiStrings:
     """String category of an image; other categories refer to its strings by number."""
 
     def __init__(self, *texts: str) -> None:
@@ -125,15 +125,16 @@ def build_image(
     size = mailbox.size if mailbox else 0
     boot = size if spec.boot else 0
     second = _FIRST + size
-    strings = _Strings(spec.name, spec.kind.value)
-    rx_pdos = _pdos(dictionary, RX_PDO, layout.output_channel, strings)
-    tx_pdos = _pdos(dictionary, TX_PDO, layout.input_channel, strings)
+    strings = SiiStrings(spec.name, spec.kind.value)
+    names = {int(index, 16): name for index, name in spec.pdo_names.items()}
+    rx_pdos = _pdos(dictionary, RX_PDO, layout.output_channel, strings, names)
+    tx_pdos = _pdos(dictionary, TX_PDO, layout.input_channel, strings, names)
     fixed = SiiFixed(
         pdi_control=PDI_DIGITAL | DEVICE_EMULATION if emulates else PDI_SPI,
         alias=spec.alias,
         vendor=spec.vendor,
         product=spec.product,
-        revision=spec.revision,
+        revision=spec.revision or 0,
         serial=spec.serial,
         boot_receive_offset=_FIRST if boot else 0,
         boot_receive_size=boot,
@@ -143,9 +144,9 @@ def build_image(
         receive_size=size,
         send_offset=second if size else 0,
         send_size=size,
-        protocols=_protocols(mailbox),
+        protocols=protocols_of(mailbox),
     )
-    return _fill(
+    return fill(
         Sii(
             fixed=fixed,
             strings=tuple(strings.texts),
@@ -160,11 +161,11 @@ def build_image(
     )
 
 
-def _fill(image: Sii) -> bytes:
-    """Return the image padded to the size of its EEPROM, with that size set."""
+def fill(image: Sii, minimum: int = IMAGE_SIZE) -> bytes:
+    """Return the image padded to the size of its EEPROM, at least *minimum*, with that size set."""
     octets = sii.encode(image)
     # EEPROM chips have sizes of powers of two; word 0x3E holds the size in KiBit less one.
-    size = IMAGE_SIZE
+    size = minimum
     while size < len(octets):
         size *= 2
     fixed = msgspec.structs.replace(image.fixed, size=size // _KIBIT - 1)
@@ -191,7 +192,8 @@ def _general(spec: SlaveSpec, ports: Iterable[int]) -> SiiGeneral:
     )
 
 
-def _protocols(mailbox: MailboxSpec | None) -> int:
+def protocols_of(mailbox: MailboxSpec | None) -> int:
+    """Return the bits of word 0x1C."""
     if mailbox is None:
         return 0
     # A field of MailboxSpec has the name of its bit.
@@ -199,7 +201,11 @@ def _protocols(mailbox: MailboxSpec | None) -> int:
 
 
 def _pdos(
-    dictionary: ObjectDictionary, base: int, channel: int, strings: _Strings
+    dictionary: ObjectDictionary,
+    base: int,
+    channel: int,
+    strings: SiiStrings,
+    names: Mapping[int, str],
 ) -> tuple[SiiPdo, ...]:
     found = [item for item in dictionary if 0 <= item.index - base < PDOS]
     assign = dictionary[RX_ASSIGN if base == RX_PDO else TX_ASSIGN]
@@ -214,7 +220,10 @@ def _pdos(
                 item.max_subindex,
                 # 0xFF: the PDO exists, but no sync manager has it by default.
                 channel if item.index in assigned else _NOT_ASSIGNED,
-                name=strings.number(title if len(found) == 1 else f"{title} {item.index - base}"),
+                name=strings.number(
+                    names.get(item.index)
+                    or (title if len(found) == 1 else f"{title} {item.index - base}")
+                ),
             ),
             tuple(
                 _pdo_entry(dictionary, item.entries[sub].value, strings)
@@ -230,7 +239,7 @@ def _rank(assigned: list[int], index: int) -> int:
     return assigned.index(index) if index in assigned else len(assigned)
 
 
-def _pdo_entry(dictionary: ObjectDictionary, number: int, strings: _Strings) -> SiiPdoEntry:
+def _pdo_entry(dictionary: ObjectDictionary, number: int, strings: SiiStrings) -> SiiPdoEntry:
     index, subindex, bits = number >> 16, number >> 8 & 0xFF, number & 0xFF
     if not index:
         return SiiPdoEntry(0, 0, bit_length=bits)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.mailbox import conversation
+from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.sim.device import Device
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.spec import MailboxSpec
@@ -44,7 +45,7 @@ def test_mailbox_spec_has_a_field_for_each_mailbox_type(kind):
 
 @pytest.mark.parametrize("kind", PROTOCOLS)
 def test_simulated_slave_has_a_server_for_each_mailbox_type(kind):
-    server = build_mailbox(only(kind), (), Device("d", ObjectDictionary()))
+    server = build_mailbox(only(kind), (), Device("d", ObjectDictionary()), MailboxSizes())
     assert list(server.protocols) == [kind], (
         f"add {kind.name} to build_mailbox of devicebus/sim/devices/protocols.py"
     )

@@ -250,10 +250,10 @@ def test_engine_bus_terminals_of_one_bit_pdos_share_a_byte_in_the_image(tmp_path
     rig.start()
     rig.wait_op()
     places = {place.name: place.bit_offset for place in rig.image.layout.variables}
-    bits = [places[f"bus0.di8.Signal_60{channel}0_01"] for channel in range(8)]
+    bits = [places[f"bus0.di8.Channel_{channel}.Signal"] for channel in range(1, 9)]
     assert bits == list(range(bits[0], bits[0] + 8))
     assert not bits[0] % 8
-    assert places["bus0.di4.Signal_6000_01"] == bits[0] + 8
-    rig.set("bus0.do8.Signal_7050_01", True)
+    assert places["bus0.di4.Channel_1.Signal"] == bits[0] + 8
+    rig.set("bus0.do8.Channel_6.Signal", True)
     rig.run(5 * MS)
     assert rig.wire.segment.segment.slaves[2].device.process_data.outputs.pack() == b"\x20"

@@ -20,8 +20,8 @@ def spec(kind, **more):
 
 @pytest.mark.parametrize("kind", ["coupler", "digital", "analogue", "drive", "generic"])
 def test_kind_gives_a_product_code_unless_there_is_one(kind):
-    assert complete(spec(kind), {}).product > 0
-    assert complete(spec(kind, product=77), {}).product == 77
+    assert complete(spec(kind)).product > 0
+    assert complete(spec(kind, product=77)).product == 77
 
 
 def test_kind_fills_the_last_byte_of_each_pdo():
@@ -30,7 +30,7 @@ def test_kind_fills_the_last_byte_of_each_pdo():
         ChannelSpec(name="b", type="UINT", pdo=0x1A01),
         ChannelSpec(name="c", type="UINT", bits=12, pdo=0x1A02),
     )
-    filled = complete(spec("digital", inputs=inputs), {}).inputs
+    filled = complete(spec("digital", inputs=inputs)).inputs
     assert filled[:3] == inputs
     assert [(each.object, each.bits, each.pdo) for each in filled[3:]] == [
         ("0", 7, 0),
@@ -52,13 +52,13 @@ def test_behaviour():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (spec("esi", esi="x.xml"), "needs its file"),
+        (spec("esi", esi="x.xml"), "needs its description"),
         (spec("coupler", inputs=(ChannelSpec(name="a"),)), "has no process data"),
     ],
 )
 def test_description_that_cannot_be(given, message):
     with pytest.raises(ValueError, match=message):
-        complete(given, {})
+        build_slave(given)
 
 
 def bus(*specs, **more):

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.sim.devices.objects import assignment, build_dictionary, mapping, object_ids_of
+from devicebus.sim.devices.objects import (
+    PdoRules,
+    assignment,
+    build_dictionary,
+    mapping,
+    object_ids_of,
+)
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
@@ -18,9 +24,9 @@ def dictionary():
     entries = {1: Entry("a", "UINT", readable), 2: Entry("b", "BOOL", readable),
                3: Entry("c", "UINT", RO), 4: Entry("d", "BLOCK(31)", readable)}  # fmt: skip
     found = ObjectDictionary([record(0x6000, "Inputs", entries)])
-    found.add(mapping(0x1A00, [(0x6000, 1, 16)], found))
-    found.add(mapping(0x1A01, [(0x6000, 2, 1)], found))
-    found.add(assignment(0x1C13, [0x1A00], found))
+    found.add(mapping(0x1A00, [(0x6000, 1, 16)], found, is_output=False))
+    found.add(mapping(0x1A01, [(0x6000, 2, 1)], found, is_output=False))
+    found.add(assignment(0x1C13, [0x1A00], found, PdoRules(range(0x1A00, 0x1C00)), is_output=False))
     return found
 
 
@@ -34,7 +40,7 @@ def test_pdo_mapping_has_the_given_entries_without_padding(dictionary):
 
 
 def test_mapping_of_part_of_an_entry_can_be_written_again(dictionary):
-    dictionary.add(mapping(0x1A02, [(0x6000, 1, 12)], dictionary))
+    dictionary.add(mapping(0x1A02, [(0x6000, 1, 12)], dictionary, is_output=False))
     for sub, number, size in ((0, 0, 1), (1, 0x6000_010C, 4), (0, 1, 1)):
         write(dictionary, sub, number, size, 0x1A02)
     assert dictionary.entry(0x1A02, 0).value == 1
@@ -43,13 +49,7 @@ def test_mapping_of_part_of_an_entry_can_be_written_again(dictionary):
 @pytest.mark.parametrize("mapped", [[(0x6000, 1, 256)], [(0x6000, 1, 8)] * 255])
 def test_mapping_that_does_not_fit(mapped):
     with pytest.raises(ValueError, match="expected at most 254"):
-        mapping(0x1A00, mapped, ObjectDictionary())
-
-
-@pytest.mark.parametrize("index", [0x15FF, 0x1800, 0x1C00])
-def test_mapping_at_another_place(index):
-    with pytest.raises(ValueError, match="is no PDO"):
-        mapping(index, [], ObjectDictionary())
+        mapping(0x1A00, mapped, ObjectDictionary(), is_output=False)
 
 
 def test_mapping_is_changed_from_empty(dictionary):

@@ -9,6 +9,7 @@ from scapy.layers.inet import ICMP, IP
 from scapy.layers.l2 import ARP, Ether
 
 from devicebus.mailbox.eoe import FrameAssembler, iter_fragments
+from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.sim.device import Device
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.devices.ethernet_host import mac_of
@@ -28,7 +29,7 @@ from tests.support.bus import generic
 
 def make(spec, files=()):
     device = Device("d", ObjectDictionary())
-    mailbox = build_mailbox(spec, files, device)
+    mailbox = build_mailbox(spec, files, device, MailboxSizes(spec.size, spec.size))
     mailbox.start(spec.size, spec.size)
     return device, mailbox
 

@@ -1,0 +1,213 @@
+"""ESI files of vendors on disk: single files, and folders with a cached list of their devices.
+
+A folder such as that of TwinCAT has a hundred files and thousands of devices.  The list of a file
+is kept with its size and time of change, so that only changed files are read again.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from devicebus.esi.choice import DeviceQuery, choose_device, match_slave
+from devicebus.esi.content import (
+    ROOT,
+    DeviceResult,
+    EsiList,
+    ListedDevice,
+    list_devices,
+    load_device,
+)
+from devicebus.esi.fields import EsiFinding
+from devicebus.esi.records import EsiDevice
+from eap.config.finding import PlantFinding
+from eap.errors import ConfigError
+from eap.runtime import durable
+from eap.runtime.store import state_root
+
+logger = logging.getLogger(__name__)
+
+MAX_FILES = 10_000
+"""Files of a folder; further ones are not read."""
+MAX_DEPTH = 4
+_VERSION = 1
+
+
+class LocatedDevice(NamedTuple):
+    """Device in the list of a file."""
+
+    file: Path
+    listed: ListedDevice
+
+
+class _ListedFile(msgspec.Struct, frozen=True):
+    """A file with the size and time of its last change for which the list is true."""
+
+    size: int
+    changed_ns: int
+    content: EsiList
+
+
+class EsiSource:
+    """Devices of an ESI file, or of all ESI files of a folder.
+
+    Args:
+        path: File or folder.
+
+    Attributes:
+        is_folder: True for a folder.
+
+    Raises:
+        OSError: *path* cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.is_folder = path.is_dir()
+        files = _list_folder(path) if self.is_folder else {path: _read_list(path)}
+        self._files = files
+        self._devices = [
+            LocatedDevice(file, listed)
+            for file, content in files.items()
+            for listed in content.devices
+        ]
+        self._loaded: dict[tuple[Path, int], DeviceResult] = {}
+
+    @property
+    def devices(self) -> Sequence[LocatedDevice]:
+        """All devices."""
+        return self._devices
+
+    def findings(self) -> Iterator[PlantFinding]:
+        """Yield the faults of files whose devices could not all be listed."""
+        for file, content in self._files.items():
+            yield from _findings(file, content.findings)
+
+    def choose(self, query: DeviceQuery) -> LocatedDevice:
+        """Return the device that a configuration names.
+
+        Raises:
+            ValueError: there is none; the message names the source.
+        """
+        if not self.is_folder and query == DeviceQuery() and self._devices:
+            return self._devices[0]
+        try:
+            chosen = choose_device((each.listed for each in self._devices), query)
+        except ValueError as exc:
+            unread = sum(1 for _ in self.findings())
+            hint = f" ({unread} faults in its files)" if unread else ""
+            raise ValueError(f"{self.path.name}: {exc}{hint}") from None
+        return self._located(chosen)
+
+    def match(self, query: DeviceQuery) -> LocatedDevice | None:
+        """Return the description of a slave that was found, None without one."""
+        matched = match_slave((each.listed for each in self._devices), query)
+        return None if matched is None else self._located(matched)
+
+    def load(self, located: LocatedDevice) -> EsiDevice | tuple[PlantFinding, ...]:
+        """Return a device, or the reasons that it cannot be used."""
+        key = located.file, located.listed.number
+        if key not in self._loaded:
+            try:
+                with located.file.open("rb") as stream:
+                    self._loaded[key] = load_device(stream, located.listed)
+            except OSError as exc:
+                fault = EsiFinding(0, f"it cannot be read: {exc.strerror}", "the file as it was")
+                self._loaded[key] = DeviceResult(None, (fault,))
+        result = self._loaded[key]
+        if result.device is not None:
+            return result.device
+        return tuple(_findings(located.file, result.findings))
+
+    def _located(self, listed: ListedDevice) -> LocatedDevice:
+        return next(each for each in self._devices if each.listed is listed)
+
+
+def _findings(file: Path, findings: Sequence[EsiFinding]) -> Iterator[PlantFinding]:
+    for each in findings:
+        yield PlantFinding(str(file), each.line, "", each.message, each.expected)
+
+
+def _read_list(path: Path) -> EsiList:
+    if not path.is_file():
+        # A pipe would wait for a writer.
+        raise OSError(0, "is no regular file" if path.exists() else "does not exist")
+    with path.open("rb") as stream:
+        return list_devices(stream)
+
+
+def _list_folder(folder: Path) -> dict[Path, EsiList]:
+    """Return the lists of all ESI files below *folder*, from the cache where it is true."""
+    cache = _cache_of(folder)
+    known = _read_cache(cache)
+    fresh: dict[str, _ListedFile] = {}
+    for path, status in _files(folder):
+        name = str(path.relative_to(folder))
+        kept = known.get(name)
+        if kept is None or (kept.size, kept.changed_ns) != (status.st_size, status.st_mtime_ns):
+            kept = _ListedFile(status.st_size, status.st_mtime_ns, _list_file(path))
+        fresh[name] = kept
+    if fresh != known:
+        _write_cache(cache, fresh)
+    return {folder / name: each.content for name, each in fresh.items()}
+
+
+def _list_file(path: Path) -> EsiList:
+    try:
+        found = _read_list(path)
+    except OSError as exc:
+        return EsiList(findings=(EsiFinding(0, f"it cannot be read: {exc.strerror}", "a file"),))
+    # Dictionaries and texts of diagnosis lie in the same folders, and are no faults.
+    if not found.devices and any(each.expected == ROOT for each in found.findings):
+        return EsiList()
+    return found
+
+
+def _files(folder: Path) -> Iterator[tuple[Path, os.stat_result]]:
+    """Yield the XML files below *folder* in order, with their status; raise OSError."""
+    count = 0
+    with os.scandir(folder) as entries:
+        entries_here = sorted(entries, key=lambda each: each.name)
+    left = [(each, 1) for each in reversed(entries_here)]
+    while left and count < MAX_FILES:
+        entry, depth = left.pop()
+        try:
+            if entry.is_dir():
+                if depth < MAX_DEPTH:
+                    with os.scandir(entry.path) as inner:
+                        below = sorted(inner, key=lambda each: each.name)
+                    left += [(each, depth + 1) for each in reversed(below)]
+            elif entry.name.lower().endswith(".xml"):
+                status = entry.stat()
+                if stat.S_ISREG(status.st_mode):
+                    count += 1
+                    yield Path(entry.path), status
+        except OSError:
+            continue  # gone meanwhile, or a folder of somebody else
+
+
+def _cache_of(folder: Path) -> Path:
+    name = durable.digest(str(folder.resolve()).encode())[:32]
+    return state_root() / "esi" / f"{name}.json"
+
+
+def _read_cache(path: Path) -> dict[str, _ListedFile]:
+    try:
+        content = durable.unseal(path.read_bytes(), _VERSION)
+        return msgspec.json.decode(content, type=dict[str, _ListedFile])
+    except (OSError, ConfigError, msgspec.MsgspecError):
+        return {}
+
+
+def _write_cache(path: Path, files: dict[str, _ListedFile]) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        durable.replace_file(path, durable.seal(msgspec.json.encode(files), _VERSION))
+    except OSError as exc:
+        logger.debug("the list of ESI files is not kept: %s: %s", path, exc.strerror)
