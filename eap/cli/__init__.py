@@ -2,11 +2,10 @@
 
 A module has the commands of one area and is imported when one of them is used: ``plant`` (check,
 new, run, plan, apply, rollback), ``status``, ``pd``, ``od`` (also state), ``network`` (scan and
-trace),
-``routes``, ``bus``, ``gateway`` (also gw), ``sim``, ``decode`` and ``discover``.  A command reads a
-plant file, starts an appliance in the foreground, or calls an operation of ``eap.ops``, which
-returns a typed result.  ``output`` prints that as JSON or by the command's view (``*_view``,
-``od_text``); ``status_findings`` finds the faults in a status document.  ``params`` has what
-commands share, ``group`` the main command and the exit codes, ``routes_tui`` the live view of
-routes.
+trace), ``routes``, ``bus``, ``gateway`` (also gw), ``sim``, ``decode``, ``discover`` and ``types``.
+A command reads a plant file, starts an appliance in the foreground, or calls an operation of
+``eap.ops``, which returns a typed result.  ``output`` prints that as JSON or by the command's view
+(``*_view``, ``od_text``); ``status_findings`` finds the faults in a status document.  ``params``
+has what commands share, ``group`` the main command and the exit codes, ``routes_tui`` the live view
+of routes.
 """

@@ -348,9 +348,17 @@ def value_text(value: Any) -> str:
         return f"{value:.7g}"  # the precision of a REAL
     if isinstance(value, list):
         value = f"[{', '.join(map(value_text, value))}]"
+    if isinstance(value, dict):
+        value = f"{{{', '.join(f'{name}: {value_text(each)}' for name, each in value.items())}}}"
     text = str(value)
     return (
         text
         if len(text) <= _SHOWN_CHARACTERS
         else f"{text[:_SHOWN_CHARACTERS]}… ({len(text)} characters)"
     )
+
+
+def offset_text(bit_offset: int) -> str:
+    """Return an offset in bytes, with the bit behind a dot if it is not 0."""
+    offset, bit = divmod(bit_offset, 8)
+    return f"{offset}.{bit}" if bit else str(offset)

@@ -32,10 +32,11 @@ def pd() -> None:
 @pd.command("list", short_help="List every PD and every variable.")
 @plant_option
 @station_option
+@click.option("--members", is_flag=True, help="List the members of structs too.")
 @json_option("Print one object per line: a PD, or the variables of a station in no PD.")
-def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
+def list_pds(plant: str | None, station: str | None, members: bool, output: Renderer) -> None:
     """List every PD with ID, version, port and address, and every variable with type and writer."""
-    from eap.cli.pd_view import listed_pds, pd_table
+    from eap.cli.pd_view import listed_pds, pd_table, with_members
     from eap.control.protocol import PD_LIST, VARIABLES
     from eap.ops.client import call_each, connect
 
@@ -44,7 +45,8 @@ def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
         for name in [station] if station else client.info.stations:
             pds = client.call(PD_LIST, station=name)
             variables = client.call(VARIABLES, station=name)
-            rows += listed_pds(name, pds, variables)
+            found = list(listed_pds(name, pds, variables))
+            rows += with_members(found, variables) if members else found
         return rows
 
     with ExitStack() as stack:
@@ -105,7 +107,9 @@ def set_value(words: tuple[str, ...], plant: str | None, output: Renderer) -> No
     """Set a variable whose writer is the application.
 
     VALUE is a literal of the variable's type: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
-    hexadecimal digits for a raw block.
+    hexadecimal digits for a raw block, T#1m30s for a time, the name of a value of an enumeration,
+    '{position: 5, state: On}' for a struct.  VAR may be a part of a variable: axis.position or
+    table[2].x.
     """
     from eap.ops.client import write_variable
 

@@ -16,11 +16,13 @@ from typing import Any, TypeAlias
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from eap.cli.output import Column, Styled, TextTable, quality, value_text
+from eap.cli.output import Column, Styled, TextTable, offset_text, quality, value_text
+from eap.codec.datatypes import parse
+from eap.codec.structures import parts_of
 from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
 from eap.ops.client import connect_station
-from eap.pd.report import PdRow, PdRowVariable
+from eap.pd.report import MemberRow, PdRow, PdRowVariable
 
 
 class UncarriedVariables(Struct, frozen=True):
@@ -64,12 +66,28 @@ def listed_pds(
     yield from pds
     carried = {variable.name for pd in pds for variable in pd.variables}
     rest = [
-        PdRowVariable(variable.name, variable.type, variable.unit, variable.writer)
+        PdRowVariable(variable.name, parse(variable.type).name, variable.unit, variable.writer)
         for variable in variables
         if variable.name not in carried
     ]
     if rest:
         yield UncarriedVariables(station, None, None, rest)
+
+
+def with_members(rows: Iterable[ListedPd], variables: Sequence[VariableRow]) -> list[ListedPd]:
+    """Return *rows* with the members of all structs."""
+    types = {each.name: parse(each.type) for each in variables}
+
+    def expanded(variable: PdRowVariable) -> PdRowVariable:
+        members = [
+            MemberRow(
+                f"{variable.name}{path}", part.kind.name, part.bit_offset, part.kind.bit_length
+            )
+            for path, part in parts_of(types[variable.name])
+        ]
+        return replace(variable, members=members or UNSET)
+
+    return [replace(row, variables=[expanded(each) for each in row.variables]) for row in rows]
 
 
 def pd_table(rows: Iterable[ListedPd]) -> Iterator[TextTable]:
@@ -95,6 +113,9 @@ def pd_table(rows: Iterable[ListedPd]) -> Iterator[TextTable]:
             kind = f"{variable.type} {variable.unit}".rstrip()
             table.add_row(*own, variable.name, kind, variable.writer)
             own = ("",) * len(own)
+            for member in variable.members or ():
+                name = f"  {member.name.removeprefix(variable.name)}"
+                table.add_row(*own, name, f"{member.type} at {offset_text(member.bit_offset)}", "")
         if not row.variables:
             table.add_row(*own)
     yield table

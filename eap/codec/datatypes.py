@@ -9,10 +9,10 @@ the texts of structs and enumerations.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import lru_cache
-from types import MappingProxyType
-from typing import NamedTuple, NoReturn
+from math import isfinite
+from typing import NamedTuple, NoReturn, Protocol
 
 import msgspec
 
@@ -32,7 +32,7 @@ from eap.codec.basetypes import (
 from eap.codec.enumerations import MAX_MEMBERS, make_enumeration
 from eap.codec.structures import MAX_DEPTH, Member, make_structure
 from eap.codec.times import TIMES
-from eap.suggest import suggest
+from eap.suggest import nearest
 
 # Users of types import all of them from here.
 __all__ = [
@@ -41,12 +41,16 @@ __all__ = [
     "Block",
     "Boolean",
     "DataType",
+    "Definitions",
     "Integer",
     "PdoLayout",
     "Plain",
     "Real",
     "String",
     "Value",
+    "byte_bool",
+    "is_base_name",
+    "is_finite",
     "layout",
     "parse",
     "parse_with",
@@ -146,16 +150,37 @@ def parse(text: str) -> DataType:
     Raises:
         ValueError: there is no such type; the message says which one comes near.
     """
-    return parse_with(text, MappingProxyType({}))
+    return _Parser(text, None).whole()
 
 
-def parse_with(text: str, definitions: Mapping[str, DataType]) -> DataType:
-    """Return the type that *text* names; it may refer to *definitions*, by name in upper case.
+class Definitions(Protocol):
+    """Types that a text may refer to by their names."""
+
+    def find(self, name: str) -> DataType | None:
+        """Return the type called *name*, in whatever case; None if there is none."""
+
+    def names(self) -> Iterable[str]:
+        """Return all names, for suggestions."""
+
+
+def parse_with(text: str, definitions: Definitions) -> DataType:
+    """Return the type that *text* names; it may refer to *definitions*.
 
     Raises:
-        ValueError: as of :func:`parse`.
+        ValueError: as of :func:`parse`, and what ``definitions.find`` raises.
     """
     return _Parser(text, definitions).whole()
+
+
+def is_base_name(name: str) -> bool:
+    """Return whether *name* is that of a base type, which no definition can have."""
+    upper = name.upper()
+    return upper in _BASE or upper in _SIZED or upper in _ALIASES or upper in {"ARRAY", "OF"}
+
+
+def byte_bool(kind: DataType) -> DataType:
+    """Return *kind* as it is within an array, a struct or a definition: a BOOL has a byte there."""
+    return _BYTE_BOOL if isinstance(kind, Boolean) and kind.is_bits else kind
 
 
 # A name ends before the dots of a range, a number before its second dot.
@@ -167,7 +192,7 @@ _SPACE = re.compile(r"\s*")
 class _Parser:
     """Position in the text of a type."""
 
-    def __init__(self, text: str, definitions: Mapping[str, DataType]) -> None:
+    def __init__(self, text: str, definitions: Definitions | None) -> None:
         if len(text) > _MAX_TEXT:
             raise ValueError(f"a data type of {len(text)} characters: at most {_MAX_TEXT}")
         self._text = text
@@ -194,7 +219,7 @@ class _Parser:
         while self._take("["):
             depth += 1
             self._check_depth(depth)
-            kind = make_array(self._text[:60], _within(kind), self._dimensions())
+            kind = make_array(self._text[:60], byte_bool(kind), self._dimensions())
         return kind
 
     def _check_depth(self, depth: int) -> None:
@@ -206,18 +231,20 @@ class _Parser:
         dimensions = self._dimensions()
         if self._name().upper() != "OF":
             self._fail()
-        return make_array(self._text[:60], _within(self._type(depth + 1)), dimensions)
+        return make_array(self._text[:60], byte_bool(self._type(depth + 1)), dimensions)
 
     def _single(self, name: str, depth: int) -> DataType:
         if self._take("<"):
             return self._definition(name, depth)
-        kind = self._own.get(name) or self._definitions.get(name.upper())
+        kind = self._own.get(name)
+        if kind is None and self._definitions and not is_base_name(name):
+            kind = self._definitions.find(name)
         if kind is None:
             upper = name.upper()
             kind = self._base(name, _ALIASES.get(upper, upper))
         if isinstance(kind, Integer) and self._take("("):
             return self._subrange(kind)
-        return kind if depth == 0 else _within(kind)
+        return kind if depth == 0 else byte_bool(kind)
 
     def _base(self, name: str, base: str) -> DataType:
         if base in _SIZED:
@@ -231,9 +258,11 @@ class _Parser:
             return _BASE[base]
         if not self._is_word:
             self._fail()
-        known = [*_BASE, *_SIZED, *_ALIASES, *(each.name for each in self._definitions.values())]
+        known = [*_BASE, *_SIZED, *_ALIASES]
+        if self._definitions:
+            known += self._definitions.names()
         meant = _OF_OTHER_LANGUAGES.get(base)
-        hint = f", did you mean {meant}?" if meant else suggest(base, known) or f" {_SUCH_AS}"
+        hint = f", did you mean {meant}?" if meant else _suggestion(name, known)
         raise ValueError(f"{name[:60]!r} is not a data type{hint}")
 
     def _length(self, name: str) -> int:
@@ -289,7 +318,7 @@ class _Parser:
     def _definition(self, name: str, depth: int) -> DataType:
         """Read what stands behind ``NAME<``."""
         self._skip()
-        if name.upper() in _BASE or name.upper() in _SIZED:
+        if is_base_name(name):
             raise ValueError(f"{self._shown} gives {name} another meaning: expected another name")
         if _NUMBER.match(self._text, self._at):
             kind = self._structure(name, depth)
@@ -369,9 +398,11 @@ class _Parser:
         raise ValueError(f"{self._shown} is not a data type {_SUCH_AS}")
 
 
-def _within(kind: DataType) -> DataType:
-    """Return *kind* as it is within an array, a struct or a definition: a BOOL has a byte there."""
-    return _BYTE_BOOL if isinstance(kind, Boolean) and kind.is_bits else kind
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    """Return the name that comes near in whatever case, or examples."""
+    by_case = {each.upper(): each for each in known}
+    near = nearest(name.upper(), by_case)
+    return f", did you mean {by_case[near]}?" if near else f" {_SUCH_AS}"
 
 
 class PdoLayout(NamedTuple):
@@ -397,6 +428,15 @@ def layout(types: Iterable[DataType]) -> PdoLayout:
         offsets.append(end)
         end += kind.bit_length
     return PdoLayout(tuple(offsets), _whole_octet(end) // 8)
+
+
+def is_finite(value: Value) -> bool:
+    """Return whether no number in *value* is infinite or NaN, which JSON cannot carry."""
+    if isinstance(value, dict):
+        return all(map(is_finite, value.values()))
+    if isinstance(value, tuple):
+        return all(map(is_finite, value))
+    return not isinstance(value, float) or isfinite(value)
 
 
 def _whole_octet(bits: int) -> int:

@@ -11,7 +11,7 @@ for bit 5 of byte 3.  A definition that occurs again in the same text is its nam
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -322,6 +322,29 @@ def lay_out_structure(
     return make_structure(name, placed, size + -size % align, align)
 
 
+def place_structure(
+    name: str, members: Sequence[Member], *, size: int | None = None, pack: int = 8
+) -> Structure:
+    """Return a struct whose members lie where a vendor's file or its user says.
+
+    Raises:
+        ValueError: as of :func:`make_structure`.
+    """
+    end = max((each.end for each in members), default=0)
+    align = max((min(each.kind.alignment, pack) for each in members), default=1)
+    size = -(-end // 8) if size is None else size
+    # A layout of another compiler's may be aligned less.
+    while align > 1 and (size % align or any(_is_off(each, align) for each in members)):
+        align //= 2
+    return make_structure(name, members, size, align)
+
+
+def _is_off(member: Member, align: int) -> bool:
+    return not member.kind.is_bits and bool(
+        member.bit_offset % (8 * min(member.kind.alignment, align))
+    )
+
+
 _STEP = re.compile(r"\.([A-Za-z_]\w*)|\[\s*(-?\d{1,6}(?:\s*,\s*-?\d{1,6})*)\s*\]", re.ASCII)
 _DELIMITERS = re.compile(r"[.\[]")
 
@@ -370,6 +393,33 @@ def split_paths(name: str) -> Iterator[tuple[str, str]]:
     for match in reversed(list(_DELIMITERS.finditer(name))):
         if match.start():
             yield name[: match.start()], name[match.start() :]
+
+
+def variable_of(name: str, known: Container[str]) -> str:
+    """Return the one of *known* variables that *name* is or lies in, else *name* itself."""
+    if name in known:
+        return name
+    return next((variable for variable, _ in split_paths(name) if variable in known), name)
+
+
+def find_variable(name: str, type_of: Callable[[str], DataType | None]) -> tuple[str, Part] | None:
+    """Return the variable that *name* is or lies in, and the part; None if there is none.
+
+    Args:
+        name: A variable, or a variable and a path into it; a variable of that name goes first.
+        type_of: Returns the type of a variable, None if there is none.
+
+    Raises:
+        ValueError: the variable has no such part.
+    """
+    kind = type_of(name)
+    if kind is not None:
+        return name, Part(kind, 0)
+    for variable, path in split_paths(name):
+        kind = type_of(variable)
+        if kind is not None:
+            return variable, find_part(kind, path)
+    return None
 
 
 def parts_of(kind: DataType, path: str = "") -> Iterator[tuple[str, Part]]:

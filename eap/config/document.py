@@ -340,12 +340,18 @@ class _Converter:
         if structs:
             is_struct = isinstance(node.value, dict)
             return self.value(node, structs[0] if is_struct else inspect.StrType(), path, key)
+        return self._by_shape(node, kinds, path, key)
+
+    def _by_shape(self, node: Node, kinds: list[inspect.Type], path: str, key: str) -> Any:
+        """Read a value that is a list, a mapping or a scalar in the file."""
         lists = [each for each in kinds if isinstance(each, inspect.VarTupleType)]
-        return (
-            self._list_or_other(node, lists[0], kinds, path, key)
-            if lists
-            else self._plain(node, path, key)
-        )
+        if lists:
+            return self._list_or_other(node, lists[0], kinds, path, key)
+        mappings = [each for each in kinds if isinstance(each, inspect.DictType)]
+        if all(isinstance(each.value_type, inspect.AnyType) for each in mappings):
+            return self._plain(node, path, key)
+        is_text = isinstance(node, ScalarNode) and node.value is not None
+        return self.value(node, inspect.StrType() if is_text else mappings[0], path, key)
 
     def _list_or_other(
         self,
@@ -515,7 +521,9 @@ class _Converter:
         """Read a value whose type depends on the data type of its variable."""
         if isinstance(node.value, list):
             return [self._plain(item, path, f"an element of {key}") for item in node.value]
-        if node.value is None or isinstance(node.value, dict):
+        if isinstance(node.value, dict):
+            return {name: self._plain(item, path, name) for name, (_, item) in node.value.items()}
+        if node.value is None:
             raise self._unexpected(node, path, key, "a value, or a list of values for an array")
         return node.value
 

@@ -384,7 +384,7 @@ def _check_match(
         message = f"{subscription.name!r} has {len(subscription.variables)} variables, but {label} "
         message += f"has {len(theirs)} (line {line})"
         if not report.broken:
-            report.add(f"{at}.variables", message, ", ".join(kind.text for kind in theirs))
+            report.add(f"{at}.variables", message, ", ".join(kind.name for kind in theirs))
         return
     pairs = zip(subscription.variables.items(), sent.pd.variables, theirs, strict=True)
     for (name, variable), their_name, kind in pairs:
@@ -392,9 +392,9 @@ def _check_match(
             ours = datatypes.parse(variable.type)
         except ValueError:
             continue  # reported with the variable
-        if ours != kind:
-            message = f"{name} is {ours.text}, but {label} sends {their_name} as {kind.text} "
-            report.add(f"{at}.variables.{name}", f"{message}(line {line})", kind.text)
+        if ours.wire != kind.wire:
+            message = f"{name} is {ours.name}, but {label} sends {their_name} as {kind.name} "
+            report.add(f"{at}.variables.{name}", f"{message}(line {line})", kind.name)
 
 
 def _check_arrival(

@@ -48,6 +48,8 @@ class FindingReport:
         self.lines: dict[str, int] = {}
         self.broken: set[str] = set()
         self.stations: set[str] = set()
+        self.broken_types: set[str] = set()
+        """Texts of types that have a finding, or whose definition has one."""
         self._nodes: dict[str, Node] = {}
         self._findings: dict[tuple[int, str, str], PlantFinding] = {}
         self._first_use: dict[tuple[int, str, str], PlantFinding] = {}

@@ -19,6 +19,7 @@ import msgspec
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
+from eap.codec.structures import find_variable
 from eap.config.structs import (
     FrameSection,
     FromSection,
@@ -223,6 +224,14 @@ class SentPd(NamedTuple):
         return f"{self.station.name}/{self.pd.name}"
 
 
+class VariablePart(NamedTuple):
+    """A variable, or a member or element of one; *bit_offset* counts from its start."""
+
+    variable: str
+    kind: DataType
+    bit_offset: int = 0
+
+
 class Index:
     """The plant by names; what cannot be resolved is absent.
 
@@ -336,6 +345,20 @@ class Index:
                     if name.startswith(prefix) and rest in sent.pd.variables:
                         return self.type_text(sent.station, rest)
         return None
+
+    def part(self, station: StationSection, name: str) -> VariablePart | None:
+        """Return the variable of *station* that *name* is or lies in; None if there is none.
+
+        Raises:
+            ValueError: its type is invalid, or it has no such part.
+        """
+
+        def type_of(variable: str) -> DataType | None:
+            text = self.type_text(station, variable)
+            return None if text is None else datatypes.parse(text)
+
+        found = find_variable(name, type_of)
+        return None if found is None else VariablePart(found[0], *found[1])
 
     def types(self, sent: SentPd) -> list[DataType] | None:
         """Return the types of the variables of a PD; None if one is missing or invalid."""

@@ -24,6 +24,7 @@ from eap.ams.spec import (
     TransportKind,
 )
 from eap.codec import datatypes
+from eap.codec.structures import complete, variable_of
 from eap.config.access import access_rules, check_access
 from eap.config.brokers import (
     broker_spec,
@@ -38,7 +39,7 @@ from eap.config.document import convert, read, read_net_id
 from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
 from eap.config.finding import FindingReport, PlantFinding
-from eap.config.index import Index, SentPd
+from eap.config.index import Index, SentPd, VariablePart
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.routes import (
     check_routes,
@@ -60,6 +61,7 @@ from eap.config.structs import (
     SubscribeSection,
     VariableSection,
 )
+from eap.config.types import TypeTable, resolve_types
 from eap.config.variables import check_links, check_variables, ends, execution_order, is_bitwise
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.address import address_text, net_id_of, source_octets
@@ -130,9 +132,12 @@ def _station(index: Index, station: StationSection, phase_us: int, folder: Path)
 
 
 def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
-    linked = {link.target for link in station.links}
+    names = index.names(station)
+    linked = {variable_of(link.target, names) for link in station.links}
+    # All sources within one variable are of the engine, or all of services.
+    sources = {variable_of(name, names): each for name, each in station.sources.items()}
     for name, variable in station.variables.items():
-        source = station.sources.get(name)
+        source = sources.get(name)
         writer = Writer.ENGINE if source is not None or name in linked else Writer.APPLICATION
         if isinstance(source, HostSource | CsvSource):
             writer = Writer.SERVICES
@@ -157,7 +162,7 @@ def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
 def _links(index: Index, station: StationSection) -> Iterator[LinkSpec]:
     """Yield the links in execution order: each after those that write its source."""
     spans = [
-        ends(link, _type(index, station, link.source), _type(index, station, link.target))
+        ends(link, _part(index, station, link.source), _part(index, station, link.target))
         for link in station.links
     ]
     for position in execution_order(spans):
@@ -165,8 +170,8 @@ def _links(index: Index, station: StationSection) -> Iterator[LinkSpec]:
         yield LinkSpec(
             source=link.source,
             target=link.target,
-            source_bit=span.source.start,
-            target_bit=span.target.start,
+            source_bit=link.from_bit or 0,
+            target_bit=link.to_bit or 0,
             bits=span.source.bits if is_bitwise(link) else 0,
             scale=1.0 if link.scale is None else link.scale,
             offset=link.offset or 0.0,
@@ -174,8 +179,11 @@ def _links(index: Index, station: StationSection) -> Iterator[LinkSpec]:
         )
 
 
-def _type(index: Index, station: StationSection, name: str) -> datatypes.DataType:
-    return datatypes.parse(index.type_text(station, name) or "")
+def _part(index: Index, station: StationSection, name: str) -> VariablePart:
+    part = index.part(station, name)
+    if part is None:  # the checks report it
+        raise LookupError(name)
+    return part
 
 
 def _variable(name: str, variable: VariableSection, writer: Writer) -> VariableSpec:
@@ -183,7 +191,7 @@ def _variable(name: str, variable: VariableSection, writer: Writer) -> VariableS
     # Converted to the type and back, so that reading a dictionary returns the same value.
     default: Any = None
     if variable.default is not None:
-        default = kind.to_plain(kind.from_plain(variable.default))
+        default = kind.to_plain(kind.from_plain(complete(kind, variable.default)))
     return VariableSpec(
         name=name,
         type=kind.text,
@@ -464,6 +472,8 @@ class PlantResult(msgspec.Struct, frozen=True):
     """Line of each path of the file of a valid plant."""
     warnings: tuple[PlantFinding, ...] = ()
     """Warnings about a plant that is valid."""
+    types: TypeTable | None = None
+    """Types that a valid plant defines."""
 
 
 def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
@@ -477,6 +487,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     if plant_file is None:
         return PlantResult(None, report.findings())
     report.stations |= {station.name for station in plant_file.stations}
+    plant_file, types = resolve_types(plant_file, report, path.parent)
     index = Index(plant_file, describe_buses(plant_file, path.parent, describe_bus, report))
     check_ports(index, report)
     check_gateways(index, report)
@@ -500,7 +511,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
         audit_required=plant_file.access.audit is AuditMode.REQUIRED,
     )
     warnings = (*follow_routes(index, plant.routing, report), *warn_of_open_brokers(index, report))
-    return PlantResult(plant, (), report.lines, warnings)
+    return PlantResult(plant, (), report.lines, warnings, types)
 
 
 PORT = "eap0"

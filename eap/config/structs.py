@@ -6,8 +6,8 @@ Units are in the names.  Every section knows its path in the file, for findings.
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import Annotated, ClassVar, TypeAlias
+from enum import IntEnum, StrEnum
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import msgspec
 from msgspec import Meta
@@ -42,7 +42,7 @@ MAX_BITS = 8 * 0xFFFF
 MAX_ANSWER_MS = 600_000
 """Largest timeout of an answer."""
 BitOffset = Annotated[int, Meta(ge=0, le=MAX_BITS - 1)]
-Plain: TypeAlias = bool | int | float | str | list[bool | int | float]
+Plain: TypeAlias = bool | int | float | str | list[Any] | dict[str, Any]
 
 
 INVALID_NET_ID = NetId(b"")
@@ -226,6 +226,42 @@ class VariableSection(Section, frozen=True):
     default: Plain | None = None
 
     SHORT: ClassVar[str] = "type"
+
+
+class MemberSection(Section, frozen=True):
+    """A member of a struct; the short form is its type."""
+
+    type: str
+    offset: Annotated[int, Meta(ge=0, le=0xFFFF)] | None = None
+    bit: Annotated[int, Meta(ge=0, le=7)] = 0
+    comment: str = ""
+
+    SHORT: ClassVar[str] = "type"
+
+
+class Packing(IntEnum):
+    """Largest alignment of the members of a struct, in bytes; 1 leaves no gaps."""
+
+    ONE = 1
+    TWO = 2
+    FOUR = 4
+    EIGHT = 8
+
+
+class TypeSection(Section, frozen=True):
+    """A type of the plant; the short form is the type that it is another name of."""
+
+    alias: str = ""
+    base: str = ""
+    values: dict[str, int] = {}
+    members: dict[str, MemberSection] = {}
+    union: dict[str, MemberSection] = {}
+    extends: str = ""
+    pack: Packing = Packing.EIGHT
+    size: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0
+
+    SHORT: ClassVar[str] = "alias"
+    FORMS: ClassVar[tuple[str, ...]] = ("alias", "values", "members", "union")
 
 
 class FrameSection(Section, frozen=True):
@@ -466,3 +502,4 @@ class PlantFile(Section, frozen=True):
     stations: tuple[StationSection, ...]
     defaults: Defaults = Defaults()
     access: PlantAccess = PlantAccess()
+    types: dict[str, TypeSection] | tuple[str | dict[str, TypeSection], ...] = {}

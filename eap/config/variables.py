@@ -7,6 +7,7 @@ links in one cycle.
 from __future__ import annotations
 
 import csv
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from heapq import heapify, heappop, heappush
@@ -14,10 +15,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
+from eap.codec.datatypes import Boolean, DataType
+from eap.codec.structures import complete, variable_of
 from eap.config.exchange import is_unresolved
 from eap.config.finding import FindingReport, one_of
-from eap.config.index import Index
+from eap.config.index import Index, VariablePart
 from eap.config.ports import check_names
 from eap.config.structs import LinkSection, StationSection, VariableSection
 from eap.pd.rules import MADE_SUFFIXES
@@ -61,12 +63,13 @@ def check_variables(index: Index, report: FindingReport, folder: Path) -> None:
         for path, (name, variable) in (own | received).items():
             _check_variable(path, name, variable, report)
         for name, source in station.sources.items():
-            if name in index.bus_variables(station):
+            if name.partition("[")[0] in index.bus_variables(station):
                 message = f"{name!r} is on a bus, so it cannot have a source"
                 expected = "a source for a variable of the station, and a link from that one"
                 report.add(f"{station.at}.sources.{name}", message, expected)
             else:
-                _check_source(station, name, source, report, folder)
+                _check_source(index, station, name, source, report, folder)
+        _check_shared_sources(index, station, report)
 
 
 def _check_variable(path: str, name: str, variable: VariableSection, report: FindingReport) -> None:
@@ -76,39 +79,39 @@ def _check_variable(path: str, name: str, variable: VariableSection, report: Fin
     try:
         kind = datatypes.parse(variable.type)
     except ValueError as exc:
-        report.add(f"{path}.type", f"{name}: {exc}", "a data type such as UINT, REAL or BLOCK(64)")
+        if variable.type not in report.broken_types:
+            expected = "a data type such as UINT, REAL or BLOCK(64)"
+            report.add(f"{path}.type", f"{name}: {exc}", expected)
         return
     if variable.default is None:
         return
     try:
-        kind.from_plain(variable.default)
+        kind.from_plain(complete(kind, variable.default))
     except ValueError as exc:
         what, _, expected = str(exc).partition(": expected ")
-        expected = expected or f"a value of {kind.text}"
+        expected = expected or f"a value of {kind.name}"
         report.add(f"{path}.default", f"default of {name}: {what}", expected)
 
 
 def _check_source(
-    station: StationSection, name: str, source: Source, report: FindingReport, folder: Path
+    index: Index,
+    station: StationSection,
+    name: str,
+    source: Source,
+    report: FindingReport,
+    folder: Path,
 ) -> None:
     path = f"{station.at}.sources.{name}"
-    if name not in station.variables:
-        if name not in report.broken:
-            known = station.variables
-            if any(name in (each.variables or {}) for each in station.subscribe):
-                message = f"{name!r} is received, so it cannot have a source"
-            else:
-                message = f"station {station.name} has no variable {name!r}{suggest(name, known)}"
-            report.add(path, message, one_of(known))
+    if variable_of(name, station.variables) not in station.variables:
+        _report_no_variable(station, name, path, report)
         return
     period = getattr(source, "period_ms", 1)
     # msgspec checks no range here: the records of sources are shared with the engine.
     if period <= 0:
         report.add(f"{path}.period_ms", f"period_ms is {period:g}", "more than 0")
-    try:
-        kind = datatypes.parse(station.variables[name].type)
-    except ValueError:
-        return  # reported with the variable
+    kind = _kind(index, report, station, path, name)
+    if kind is None:
+        return
     match source:
         case HostSource():
             _check_number(path, name, kind, report)
@@ -119,12 +122,59 @@ def _check_source(
             _check_number(path, name, kind, report)
             _check_span(path, kind, source, report)
         case RandomSource():
-            pass  # random bytes are values of every type
+            if name not in station.variables:
+                _check_random(path, name, kind, report)
+
+
+def _report_no_variable(
+    station: StationSection, name: str, path: str, report: FindingReport
+) -> None:
+    if name in report.broken:
+        return
+    known = station.variables
+    received = {each for sub in station.subscribe for each in sub.variables or {}}
+    if variable_of(name, received) in received:
+        message = f"{name!r} is received, so it cannot have a source"
+    else:
+        message = f"station {station.name} has no variable {name!r}{suggest(name, known)}"
+    report.add(path, message, one_of(known))
+
+
+def _check_random(path: str, name: str, kind: DataType, report: FindingReport) -> None:
+    # Random bytes are values of every other type; a bit field shares its byte with other members.
+    if kind.is_bits:
+        message = f"{name} is {kind.name}, this source makes whole bytes"
+        report.add(path, message, "another member")
+
+
+def _check_shared_sources(index: Index, station: StationSection, report: FindingReport) -> None:
+    """Report sources that fill the same part of a variable, or one variable in two processes."""
+    spans: dict[str, list[tuple[str, Span, bool]]] = {}
+    for name, source in station.sources.items():
+        try:
+            part = index.part(station, name)
+        except ValueError:
+            continue  # reported with the source
+        if part is None:
+            continue
+        span = Span(part.variable, part.bit_offset, part.kind.bit_length)
+        by_services = isinstance(source, HostSource | CsvSource)
+        others = spans.setdefault(part.variable, [])
+        for other, theirs, is_theirs in others:
+            line = report.line_of(f"{station.at}.sources.{other}")
+            if theirs.overlaps(span):
+                message = f"{name!r} has two sources (the other, {other!r}, in line {line})"
+                report.add(f"{station.at}.sources.{name}", message, "one source for each part")
+            elif is_theirs is not by_services:
+                message = f"{part.variable!r} has sources of two kinds (also in line {line})"
+                expected = "only host and csv sources, or none of them, within one variable"
+                report.add(f"{station.at}.sources.{name}", message, expected)
+        others.append((name, span, by_services))
 
 
 def _check_number(path: str, name: str, kind: DataType, report: FindingReport) -> None:
     if kind.scalar_range is None or kind.is_bits:
-        message = f"{name} is {kind.text}, this source makes numbers"
+        message = f"{name} is {kind.name}, this source makes numbers"
         report.add(path, message, "a number such as UDINT or REAL")
 
 
@@ -152,7 +202,7 @@ def _check_span(
         low = source.offset - abs(source.amplitude)
         high = source.offset + abs(source.amplitude)
     if low < bounds[0] or high > bounds[1]:
-        message = f"the source goes from {low:g} to {high:g}, beyond {kind.text}"
+        message = f"the source goes from {low:g} to {high:g}, beyond {kind.name}"
         report.add(path, message, f"{bounds[0]:g} to {bounds[1]:g}")
 
 
@@ -178,7 +228,7 @@ def _check_csv(
         return
     except ValueError as exc:
         message = f"{source.file}, line {rows.line_num}: {exc}"
-        report.add(f"{path}.column", message, f"values of {kind.text}")
+        report.add(f"{path}.column", message, f"values of {kind.name}")
         return
     if not count:
         report.add(f"{path}.file", f"{source.file} has no rows", "at least one row")
@@ -217,15 +267,19 @@ def is_scaled(link: LinkSection) -> bool:
     return link.scale is not None or link.offset is not None
 
 
-def ends(link: LinkSection, source: DataType, target: DataType) -> Ends:
+def ends(link: LinkSection, source: VariablePart, target: VariablePart) -> Ends:
     """Return the bits at both ends of *link*; without ``bits`` as many as both ends have."""
     if not is_bitwise(link):
         return Ends(
-            Span(link.source, 0, source.bit_length), Span(link.target, 0, target.bit_length)
+            Span(source.variable, source.bit_offset, source.kind.bit_length),
+            Span(target.variable, target.bit_offset, target.kind.bit_length),
         )
     from_bit, to_bit = link.from_bit or 0, link.to_bit or 0
-    bits = link.bits or min(source.bit_length - from_bit, target.bit_length - to_bit)
-    return Ends(Span(link.source, from_bit, bits), Span(link.target, to_bit, bits))
+    bits = link.bits or min(source.kind.bit_length - from_bit, target.kind.bit_length - to_bit)
+    return Ends(
+        Span(source.variable, source.bit_offset + from_bit, bits),
+        Span(target.variable, target.bit_offset + to_bit, bits),
+    )
 
 
 def execution_order(links: Sequence[Ends]) -> list[int]:
@@ -306,11 +360,13 @@ def check_links(index: Index, report: FindingReport) -> None:
     for station in index.plant.stations:
         known: list[tuple[LinkSection, Ends]] = []
         for link in station.links:
-            source = _kind(index, report, station, f"{link.at}.from", link.source)
-            target = _kind(index, report, station, f"{link.at}.to", link.target)
+            source = _part(index, report, station, f"{link.at}.from", link.source)
+            target = _part(index, report, station, f"{link.at}.to", link.target)
             if target is not None:
-                _check_writer(index, report, station, link)
-            if source is None or target is None or not _fits(link, source, target, report):
+                _check_writer(index, report, station, link, target)
+            if source is None or target is None:
+                continue
+            if not _fits(link, source.kind, target.kind, report):
                 continue
             known.append((link, ends(link, source, target)))
         _check_duplicates(known, report)
@@ -320,29 +376,52 @@ def check_links(index: Index, report: FindingReport) -> None:
 def _kind(
     index: Index, report: FindingReport, station: StationSection, path: str, name: str
 ) -> DataType | None:
-    """Return the type of a variable; None, with a finding, if there is none."""
-    text = index.type_text(station, name)
-    if text is None:
-        if not is_unresolved(index, report, station, name):
-            names = index.names(station)
-            message = f"station {station.name} has no variable {name!r}{suggest(name, names)}"
-            report.add(path, message, one_of(names))
-        return None
+    """Return the type of a variable or a part of one; None, with a finding, if there is none."""
+    part = _part(index, report, station, path, name)
+    return None if part is None else part.kind
+
+
+def _part(
+    index: Index, report: FindingReport, station: StationSection, path: str, name: str
+) -> VariablePart | None:
+    """Return a variable or a part of one; None, with a finding, if there is none."""
+    names = index.names(station)
     try:
-        return datatypes.parse(text)
+        part = index.part(station, name)
+    except ValueError as exc:
+        variable = variable_of(name, names)
+        if _has_type(index, station, variable):  # else reported with the variable
+            report.add(path, f"station {station.name} has no {name!r}: {exc}", "a member of it")
+        return None
+    if part is None and not is_unresolved(index, report, station, name):
+        hint = suggest(name, names) or suggest(re.split(r"[.[]", name)[0], names)
+        message = f"station {station.name} has no variable {name!r}{hint}"
+        report.add(path, message, one_of(names))
+    return part
+
+
+def _has_type(index: Index, station: StationSection, variable: str) -> bool:
+    try:
+        datatypes.parse(index.type_text(station, variable) or "")
     except ValueError:
-        return None  # reported with the variable
+        return False
+    return True
 
 
 def _check_writer(
-    index: Index, report: FindingReport, station: StationSection, link: LinkSection
+    index: Index,
+    report: FindingReport,
+    station: StationSection,
+    link: LinkSection,
+    target: VariablePart,
 ) -> None:
-    name = link.target
+    name = target.variable
     on_bus = index.bus_variables(station).get(name)
     if name in station.variables:
-        if name not in station.sources:
+        source = _source_beside(index, station, link, target)
+        if not source:
             return
-        line = report.line_of(f"{station.at}.sources.{name}")
+        line = report.line_of(f"{station.at}.sources.{source}")
         reason = f"has a source (line {line})"
     elif on_bus is None:
         reason = "is received"
@@ -350,7 +429,25 @@ def _check_writer(
         return
     else:
         reason = "comes from a bus"
-    report.add(f"{link.at}.to", f"{name!r} {reason}, so no link can write it", _TARGET)
+    report.add(f"{link.at}.to", f"{link.target!r} {reason}, so no link can write it", _TARGET)
+
+
+def _source_beside(
+    index: Index, station: StationSection, link: LinkSection, target: VariablePart
+) -> str:
+    """Return a source that fills what *link* writes, or its variable from another process."""
+    for name, source in station.sources.items():
+        try:
+            part = index.part(station, name)
+        except ValueError:
+            continue
+        if part is None or part.variable != target.variable:
+            continue
+        span = Span(part.variable, part.bit_offset, part.kind.bit_length)
+        both = ends(link, target, target)
+        if isinstance(source, HostSource | CsvSource) or span.overlaps(both.target):
+            return name
+    return ""
 
 
 def _fits(link: LinkSection, source: DataType, target: DataType, report: FindingReport) -> bool:
@@ -359,7 +456,7 @@ def _fits(link: LinkSection, source: DataType, target: DataType, report: Finding
         return False
     if is_bitwise(link):
         return _fits_bitwise(link, source, target, report)
-    shown = f"{link.source} is {source.text}, {link.target} is {target.text}"
+    shown = f"{link.source} is {source.name}, {link.target} is {target.name}"
     if is_scaled(link):
         return _fits_scaled(link, source, target, shown, report)
     return _fits_whole(link, source, target, shown, report)
@@ -373,7 +470,7 @@ def _fits_whole(
             return True
         report.add(f"{link.at}.swap", shown, "two variables of the same size, at least 2 bytes")
         return False
-    if source != target:
+    if source.wire != target.wire and not (_is_bool(source) and _is_bool(target)):
         expected = (
             f"both alike, or bits: {min(source.bit_length, target.bit_length)}, scale or swap"
         )
@@ -396,11 +493,11 @@ def _fits_bitwise(
         ("to_bit", link.to_bit or 0, link.target, target),
     ):
         if bit >= kind.bit_length:
-            message = f"{name} is {kind.text} and has no bit {bit}"
+            message = f"{name} is {kind.name} and has no bit {bit}"
             report.add(f"{link.at}.{key}", message, f"0 to {kind.bit_length - 1}")
             return False
         if link.bits is not None and bit + link.bits > kind.bit_length:
-            message = f"{name} is {kind.text} and has no {link.bits} bits from bit {bit} on"
+            message = f"{name} is {kind.name} and has no {link.bits} bits from bit {bit} on"
             report.add(f"{link.at}.bits", message, f"at most {kind.bit_length - bit}")
             return False
     return True
@@ -431,13 +528,18 @@ def _fits_scaled(
 
 def _is_number(kind: DataType) -> bool:
     # BOOL has a range from 0 to 1, but a scaled BOOL is an error of the file.
-    return kind.scalar_range is not None and kind.text != "BOOL"
+    return kind.scalar_range is not None and not _is_bool(kind)
+
+
+def _is_bool(kind: DataType) -> bool:
+    """Return whether *kind* is a BOOL; that of a struct has a byte, another one a bit."""
+    return isinstance(kind, Boolean)
 
 
 def _check_duplicates(links: list[tuple[LinkSection, Ends]], report: FindingReport) -> None:
     first: dict[str, list[tuple[LinkSection, Ends]]] = {}
     for link, both in links:
-        others = first.setdefault(link.target, [])
+        others = first.setdefault(both.target.variable, [])
         twice = next((other for other, span in others if span.target.overlaps(both.target)), None)
         others.append((link, both))
         if twice is not None:

@@ -13,6 +13,7 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 
+from eap.codec.datatypes import Plain
 from eap.errors import ControlError, EnvironmentalError
 from eap.ids import decode_value, encode_value
 from eap.pd.report import PdRow
@@ -114,7 +115,7 @@ class WriteParameters(Parameters, frozen=True):
     """``write``: all values are checked before the first is written."""
 
     station: str
-    values: dict[str, bool | int | float | str | list[bool | int | float]]
+    values: dict[str, Plain]
 
 
 class SubscribeParameters(Parameters, frozen=True):

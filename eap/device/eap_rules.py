@@ -13,13 +13,13 @@ can break them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from typing import Any, NamedTuple
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
+from eap.codec.datatypes import DataType, is_finite
+from eap.codec.structures import variable_of
 from eap.ids import Destination, InterfaceUri, MacAddr, ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
@@ -107,9 +107,10 @@ def _flags(data: bytes, _entry: Entry) -> bytes:
 
 def _default(data: bytes, entry: Entry) -> bytes:
     value = entry.kind.decode(data.ljust(entry.kind.size, b"\0"), 0)
-    numbers = value if isinstance(value, tuple) else (value,)
-    if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
+    if not is_finite(value):
         raise ValueError("a default is a finite number")
+    # It is kept as text, from which every part of it has to be read again.
+    entry.kind.from_plain(entry.kind.to_plain(value))
     # A bit field is stored without the bits beyond it.
     return entry.kind.encode(value) if entry.kind.is_bits else data
 
@@ -228,7 +229,7 @@ def check_mapped(
     expected = min(entry.kind.bit_length, WHOLE)
     if mapped.bits != expected:
         detail = (
-            f"{what} is {entry.kind.text}, mapped with {mapped.bits} bits instead of {expected}"
+            f"{what} is {entry.kind.name}, mapped with {mapped.bits} bits instead of {expected}"
         )
         raise SdoAbortError(AbortCode.LENGTH, index, subindex, detail)
 
@@ -256,7 +257,7 @@ def lay_out_mapping(
             continue
         kind = dictionary.entry(mapped.target, mapped.subindex).kind
         if not kind.is_bits and end % 8:
-            detail = f"{kind.text} behind {end} bits: {-end % 8} bits of padding are missing"
+            detail = f"{kind.name} behind {end} bits: {-end % 8} bits of padding are missing"
             raise SdoAbortError(AbortCode.PARAMETER, index, subindex, detail)
         indexes.append(mapped.target)
         end += kind.bit_length
@@ -421,13 +422,16 @@ def _check_station_needs(
     writers: dict[str, Writer] = {}
     for source in before.sources:
         is_engine = isinstance(source, EngineSource)
-        writers[source.variable] = Writer.ENGINE if is_engine else Writer.SERVICES
-    writers |= {link.target: Writer.ENGINE for link in before.links}
-    for name in dict.fromkeys([*writers, *(link.source for link in before.links)]):
+        writer = Writer.ENGINE if is_engine else Writer.SERVICES
+        writers[variable_of(source.variable, types)] = writer
+    writers |= {variable_of(link.target, types): Writer.ENGINE for link in before.links}
+    read = (variable_of(link.source, types) for link in before.links)
+    for name in dict.fromkeys([*writers, *read]):
         if name not in now:
             raise DeviceFault(FaultCode.IN_USE, f"a source or a link needs {name}")
         if now[name].type != types.get(name, now[name].type):
-            detail = f"{name} is {now[name].type}, a source or a link needs {types[name]}"
+            is_now, needed = (datatypes.parse(each).name for each in (now[name].type, types[name]))
+            detail = f"{name} is {is_now}, a source or a link needs {needed}"
             raise DeviceFault(FaultCode.IN_USE, detail)
         if name in writers and (name in received or now[name].writer is not writers[name]):
             detail = f"{name} is filled by a source or a link"

@@ -7,7 +7,6 @@ import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
-from math import isfinite
 from time import monotonic
 from typing import Any, Self, TypeVar
 
@@ -15,7 +14,8 @@ import msgspec
 
 from eap.closeable import Closeable
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
+from eap.codec.datatypes import DataType, is_finite
+from eap.codec.structures import find_variable
 from eap.control.protocol import (
     MAX_LINE,
     SUBSCRIBE,
@@ -370,12 +370,12 @@ def write_variable(station: str, name: str, text: str, plant: str | None) -> Wri
         variables = client.call(VARIABLES, station=station)
         kinds = {each.name: datatypes.parse(each.type) for each in variables}
         value: Any = text
-        # The appliance reports an unknown name itself, with a suggestion.
-        if kind := kinds.get(name):
-            try:
-                value = _to_json(kind, text)
-            except ValueError as exc:
-                raise ControlError(f"variable {station}/{name}: {exc}", code="value") from None
+        try:
+            # The appliance reports an unknown name itself, with a suggestion.
+            if found := find_variable(name, kinds.get):
+                value = _to_json(found[1].kind, text)
+        except ValueError as exc:
+            raise ControlError(f"variable {station}/{name}: {exc}", code="value") from None
         client.call(WRITE, station=station, values={name: value})
     return WrittenVariable(station, name, value)
 
@@ -383,9 +383,8 @@ def write_variable(station: str, name: str, text: str, plant: str | None) -> Wri
 def _to_json(kind: DataType, text: str) -> Any:
     """Read *text* as a value that the control protocol can carry; raise ValueError otherwise."""
     value = kind.parse_text(text)
-    numbers = value if isinstance(value, tuple) else (value,)
     # JSON has no NaN and no infinity.
-    if any(isinstance(number, float) and not isfinite(number) for number in numbers):
+    if not is_finite(value):
         raise ValueError(f"{text!r} cannot be sent to the appliance: expected a finite number")
     return kind.to_plain(value)
 

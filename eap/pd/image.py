@@ -26,6 +26,8 @@ from typing import Any
 import msgspec
 
 from eap.codec import datatypes
+from eap.codec.datatypes import DataType
+from eap.codec.structures import find_variable
 from eap.errors import ImageError, TornReadError
 from eap.pd.layout import (
     HEADER,
@@ -38,11 +40,15 @@ from eap.pd.layout import (
 )
 from eap.pd.spec import Writer
 from eap.pd.words import StationWord
+from eap.suggest import suggest
 
 READ_ATTEMPTS = 1000
 """Spread over a tenth of a second by the pauses of a mapped file: a busy host stalls that long."""
 SNAPSHOT_ATTEMPTS = 200
 """Fewer, because the reader of snapshots has other clients, and gets a copy in any case."""
+
+MAX_PARTS = 10_000
+"""Parts of variables that an image remembers."""
 
 _CODES = {
     (int, 1): "b", (int, 2): "h", (int, 4): "i", (int, 8): "q", (float, 4): "f", (float, 8): "d",
@@ -72,7 +78,38 @@ class Image:
         self.layout = layout
         self.words = memory[WORDS_OFFSET : WORDS_OFFSET + 8 * layout.word_count].cast("q")
         self.slots = {slot.name: slot for slot in layout.variables}
+        self._parts: dict[str, VariableSlot] = {}
         self._pause = pause
+
+    def slot(self, name: str) -> VariableSlot:
+        """Return a variable, or a part of one at a path such as ``axis.position``.
+
+        Raises:
+            ImageError: there is none of that name.
+        """
+        slot = self.slots.get(name) or self._parts.get(name)
+        if slot is None:
+            # A client may write one path in many ways.
+            if len(self._parts) >= MAX_PARTS:
+                self._parts.clear()
+            slot = self._parts[name] = self._find_part(name)
+        return slot
+
+    def _find_part(self, name: str) -> VariableSlot:
+        def type_of(variable: str) -> DataType | None:
+            slot = self.slots.get(variable)
+            return None if slot is None else datatypes.parse(slot.type)
+
+        station = self.layout.station
+        try:
+            found = find_variable(name, type_of)
+        except ValueError as exc:
+            raise ImageError(f"station {station} has no {name!r}: {exc}") from None
+        if found is None:
+            hint = suggest(name, self.slots)
+            raise ImageError(f"station {station} has no variable {name!r}{hint}")
+        slot, part = self.slots[found[0]], found[1]
+        return VariableSlot(name, part.kind.text, slot.writer, slot.bit_offset + part.bit_offset)
 
     def region(self, writer: Writer) -> memoryview:
         """Return the variables of *writer*, live."""
@@ -81,7 +118,7 @@ class Image:
 
     def read(self, name: str) -> Any:
         """Return one variable's value; raise ImageError if there is none of that name."""
-        return datatypes.parse(self._slot(name).type).decode(self.load(name), 0)
+        return datatypes.parse(self.slot(name).type).decode(self.load(name), 0)
 
     def load(self, name: str, *, attempts: int = READ_ATTEMPTS) -> bytes:
         """Return one variable's encoded bytes, in the form of :meth:`encode`.
@@ -89,18 +126,24 @@ class Image:
         Raises:
             ImageError: there is none of that name; TornReadError, if it is only for now.
         """
-        slot = self._slot(name)
+        slot = self.slot(name)
         first, last = slot.bit_offset // 8, _end_octet(slot)
         return extract_value(slot, self._stable_copy(slot.writer, first, last, attempts), 8 * first)
 
     def read_all(self, writers: Collection[Writer] = tuple(Writer)) -> dict[str, Any]:
         """Return all variables of *writers*; those of one writer belong to one moment."""
+        return self.read_slots(self.layout.variables, writers)
+
+    def read_slots(
+        self, slots: Iterable[VariableSlot], writers: Collection[Writer]
+    ) -> dict[str, Any]:
+        """Return those of *slots* that *writers* write; those of one belong to one moment."""
         values = {}
         copies = {}
         for writer in writers:
             region = self.layout.regions[writer]
             copies[writer] = self._stable_copy(writer, region.offset, region.offset + region.size)
-        for slot in self.layout.variables:
+        for slot in slots:
             if slot.writer in copies:
                 region = self.layout.regions[slot.writer]
                 values[slot.name] = _decode(slot, copies[slot.writer], 8 * region.offset)
@@ -143,16 +186,16 @@ class Image:
 
     def encode(self, name: str, value: Any) -> bytes:
         """Return the bytes of *value* for :meth:`store`; raise ValueError if it does not fit."""
-        return datatypes.parse(self._slot(name).type).encode(value)
+        return datatypes.parse(self.slot(name).type).encode(value)
 
     def store(self, name: str, octets: bytes) -> None:
         """Store encoded bytes in a variable, inside a block of :meth:`writing`."""
-        slot = self._slot(name)
+        slot = self.slot(name)
         put(self.memory, slot.bit_offset, datatypes.parse(slot.type).bit_length, octets)
 
     def storer(self, name: str) -> Callable[[Any], None]:
         """Return a function that stores numbers in one variable; they must fit its type."""
-        slot = self._slot(name)
+        slot = self.slot(name)
         kind = datatypes.parse(slot.type)
         limits = kind.scalar_range
         code = "" if limits is None or kind.is_bits else _CODES.get((type(limits[0]), kind.size))
@@ -177,18 +220,13 @@ class Image:
         """Free the slots one by one; nothing can be read or written any more."""
         while self.slots:
             self.slots.popitem()
+        self._parts.clear()
 
     def set_defaults(self) -> None:
         """Store the default of every variable that has one; for a fresh image."""
         for slot in self.layout.variables:
             if slot.default is not None:
                 self.write(slot.name, default_value(slot))
-
-    def _slot(self, name: str) -> VariableSlot:
-        try:
-            return self.slots[name]
-        except KeyError:
-            raise ImageError(f"station {self.layout.station} has no variable {name!r}") from None
 
     def _stable_copy(
         self, writer: Writer, first: int, last: int, attempts: int = READ_ATTEMPTS

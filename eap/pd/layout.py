@@ -23,7 +23,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
+from eap.codec.datatypes import DataType, Plain
 from eap.codec.pd import PdHeader
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.spec import (
@@ -70,7 +70,7 @@ class VariableSlot(SpecRecord, frozen=True):
     bit_offset: int
     unit: str = ""
     comment: str = ""
-    default: bool | int | float | str | list[bool | int | float] | None = None
+    default: Plain | None = None
 
 
 class RegionSlot(SpecRecord, frozen=True):

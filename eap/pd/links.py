@@ -88,7 +88,7 @@ class Links:
         self, image: Image, memory_of: Callable[[Writer], memoryview], links: Iterable[LinkSpec]
     ) -> None:
         def end(name: str) -> _LinkEnd:
-            slot = image.slots[name]
+            slot = image.slot(name)
             return _LinkEnd(slot, datatypes.parse(slot.type), memory_of(slot.writer))
 
         bound = [_bind(link, end(link.source), end(link.target)) for link in links]
@@ -243,7 +243,7 @@ class Generators:
 
 
 def _generator_step(image: Image, source: EngineSource) -> Callable[[int], None]:
-    slot = image.slots[source.variable]
+    slot = image.slot(source.variable)
     kind = datatypes.parse(slot.type)
     if isinstance(source, RandomSource):
         return _random_step(image, source, slot.bit_offset // 8, kind.size)

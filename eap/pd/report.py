@@ -10,6 +10,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from eap.codec import datatypes
 from eap.codec.pd import PdHeader
 from eap.pd.address import from_word, source_text
 from eap.pd.device import DeviceState
@@ -35,13 +36,23 @@ _QUALITY_NS = 100_000
 _QUALITY_MAX = 0xFFFF
 
 
+class MemberRow(msgspec.Struct, frozen=True):
+    """Member of a struct: its path, and its place from the start of the variable in bits."""
+
+    name: str
+    type: str
+    bit_offset: int
+    bits: int
+
+
 class PdRowVariable(msgspec.Struct, frozen=True):
-    """Variable of a PD."""
+    """Variable of a PD; *type* is the name of a type with a definition."""
 
     name: str
     type: str
     unit: str
     writer: str
+    members: list[MemberRow] | UnsetType = UNSET
 
 
 class PdRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -112,7 +123,9 @@ def pd_list(image: Image) -> list[PdRow]:
             length=slot.size,
             port=slot.port,
             poll=slot.poll_request or None,
-            variables=[PdRowVariable(p.name, p.type, p.unit, p.writer) for p in slots],
+            variables=[
+                PdRowVariable(p.name, datatypes.parse(p.type).name, p.unit, p.writer) for p in slots
+            ],
             **direction,
         )
 

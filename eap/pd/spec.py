@@ -14,6 +14,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
+from eap.codec.datatypes import Plain
 from eap.ids import InterfaceUri, NetId, decode_value, encode_value
 from eap.od.slave_config import SlaveConfig
 
@@ -49,7 +50,7 @@ class VariableSpec(SpecRecord, frozen=True):
     name: str
     type: str
     writer: Writer = Writer.APPLICATION
-    default: bool | int | float | str | list[bool | int | float] | None = None
+    default: Plain | None = None
     """Value at the start and, with Substitute.DEFAULT, after a time-out; None is all zero.
 
     Raw blocks take a string of hexadecimal digits.

@@ -15,7 +15,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from time import monotonic_ns, time_ns
-from typing import Any
+from typing import Any, TypeVar
 
 from eap.closeable import Closeable
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
@@ -27,7 +27,9 @@ from eap.pd.spec import Writer
 from eap.pd.txframe import EVENT_BIT
 from eap.pd.words import StationWord
 from eap.runtime.folder import describe_roots, find_running
-from eap.suggest import suggest
+from eap.runtime.records import to_record
+
+T = TypeVar("T")
 
 _GONE_AFTER_S = 2.0
 """Without a cycle for this long the engine counts as gone; a restart takes less."""
@@ -63,16 +65,26 @@ class AttachedStation(Closeable):
         return int(self._current().words[StationWord.CYCLE])
 
     def __getitem__(self, name: str) -> Any:
-        """Return the value of the variable *name*."""
-        return self._current().read(self._require(name))
+        """Return the value of the variable *name*, or of a part such as ``axis.position``."""
+        return self._current().read(name)
 
     def __setitem__(self, name: str, value: Any) -> None:
-        """Write one variable; see :meth:`write`."""
+        """Write one variable or part of one, which leaves its other parts; see :meth:`write`."""
         self.write({name: value})
 
     def read_all(self) -> dict[str, Any]:
         """Return all variables; those of one writer belong to the same cycle."""
         return self._current().read_all()
+
+    def read_as(self, name: str, kind: type[T]) -> T:
+        """Return a struct, or a part of one, as the dataclass or msgspec record *kind*.
+
+        Its fields have the names of members; a member without a field is left out.
+
+        Raises:
+            ValueError: it is no struct, or a field has no member.
+        """
+        return to_record(self[name], kind)
 
     def write(self, values: Mapping[str, Any]) -> None:
         """Write several variables at once: the engine sees all of them or none.
@@ -84,7 +96,7 @@ class AttachedStation(Closeable):
         """
         image = self._current()
         for name in values:
-            slot = image.slots[self._require(name)]
+            slot = image.slot(name)
             if slot.writer is not Writer.APPLICATION:
                 raise WriterConflictError(
                     f"station {self.name}: {name} is written by the {slot.writer}, "
@@ -155,12 +167,6 @@ class AttachedStation(Closeable):
 
     def _gone_after_s(self) -> float:
         return max(_GONE_AFTER_S, _GONE_AFTER_CYCLES * self.cycle_s)
-
-    def _require(self, name: str) -> str:
-        slots = self._file.image.slots
-        if name in slots:
-            return name
-        raise ImageError(f"station {self.name} has no variable {name!r}{suggest(name, slots)}")
 
 
 def attach(station: str, *, plant: str = "") -> AttachedStation:

@@ -296,7 +296,8 @@ _RECORD, _ARRAY, _VAR = ObjectCode.RECORD, ObjectCode.ARRAY, ObjectCode.VAR
 _VARIABLE = (
     derived(Var.BIT_LENGTH, "Bit length", "UDINT", Derived.BIT_LENGTH, "Bits that travel."),
     derived(Var.DATA_TYPE, "Data type", "UINT", Derived.TYPE_CODE, "Index of the base type."),
-    setting(Var.TYPE_NAME, "Type name", "STRING(40)", "Such as UINT, REAL[4] or BLOCK(600).",
+    # As long as an entry description can say: a struct's text has all its members.
+    setting(Var.TYPE_NAME, "Type name", "STRING(8191)", "Such as UINT, REAL[4] or BLOCK(600).",
             default="UINT", key="type", rule=Rule.TYPE),
     config(Var.NAME, "Name", NAME, "Unique in the station.", field="name", rule=Rule.NAME),
     setting(Var.UNIT, "Unit", NAME, "Text for operators.", key="unit"),

@@ -12,10 +12,11 @@ from inspect import isawaitable
 from typing import Any
 
 from eap.codec import datatypes
+from eap.codec.structures import variable_of
 from eap.control import protocol as control
 from eap.control.bus import BUS_METHODS
 from eap.control.protocol import VERSION, ErrorCode, of_station, parameters
-from eap.errors import ControlError, WriterConflictError
+from eap.errors import ControlError, ImageError, WriterConflictError
 from eap.net.image_file import StationImage
 from eap.pd.image import Image
 from eap.pd.layout import VariableSlot
@@ -194,7 +195,7 @@ def _snapshot(image: Image, slots: list[VariableSlot]) -> control.Values:
         source = engine if slot.writer is Writer.ENGINE else image
         values = {slot.name: source.read(slot.name)}
     else:
-        values = engine.read_all((Writer.ENGINE,)) | image.read_all(_OTHERS)
+        values = engine.read_slots(slots, (Writer.ENGINE,)) | image.read_slots(slots, _OTHERS)
     plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in slots}
     cycle = engine.words[StationWord.CYCLE]
     return control.Values(image.layout.station, cycle, plain, _qualities(engine, plain))
@@ -202,11 +203,15 @@ def _snapshot(image: Image, slots: list[VariableSlot]) -> control.Values:
 
 def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
     """Return the quality of those of *names* that are received, None before the first time."""
+    parts: dict[str, list[str]] = {}
+    for name in names:
+        parts.setdefault(variable_of(name, image.slots), []).append(name)
     qualities: dict[str, int | None] = {}
     for rx in image.layout.rx:
         received = image.words[tracker_word(image, rx) + RxWord.RECEIVED]
         value = quality(image, rx) if received else None
-        qualities.update((name, value) for name in rx.variables if name in names)
+        for variable in rx.variables:
+            qualities.update((name, value) for name in parts.get(variable, ()))
     return qualities
 
 
@@ -215,14 +220,10 @@ def _slots_of(image: Image, names: Iterable[str]) -> list[VariableSlot]:
     chosen = list(names)
     if not chosen:
         return list(image.layout.variables)
-    unknown = [name for name in chosen if name not in image.slots]
-    if unknown:
-        raise ControlError(
-            f"station {image.layout.station} has no variable {unknown[0]!r}"
-            f"{suggest(unknown[0], image.slots)}",
-            code=ErrorCode.UNKNOWN_NAME,
-        )
-    return [image.slots[name] for name in chosen]
+    try:
+        return [image.slot(name) for name in chosen]
+    except ImageError as exc:
+        raise ControlError(str(exc), code=ErrorCode.UNKNOWN_NAME) from None
 
 
 def _checked(slot: VariableSlot, value: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
+from eap.codec.structures import find_variable, variable_of
 from eap.errors import EnvironmentalError, ImageError
 from eap.net.host import Host, open_replay
 from eap.net.image_file import StationImage
@@ -52,14 +53,21 @@ async def play_sources(station: StationSpec, image: StationImage) -> None:
         WriterConflictError: another process writes these variables.
     """
     types = {variable.name: datatypes.parse(variable.type) for variable in station.variables}
+
+    def kind_of(name: str) -> DataType:
+        found = find_variable(name, types.get)
+        if found is None:  # the checks of the configuration have found it
+            raise LookupError(name)
+        return found[1].kind
+
     host = Host()
     players: list[tuple[HostSource | CsvSource, Callable[[], Any]]] = []
     for source in station.sources:
         try:
             if isinstance(source, HostSource):
-                players.append((source, _measure(source, host, types[source.variable])))
+                players.append((source, _measure(source, host, kind_of(source.variable))))
             elif isinstance(source, CsvSource):
-                players.append((source, _replay(source, types[source.variable])))
+                players.append((source, _replay(source, kind_of(source.variable))))
         except EnvironmentalError as exc:
             # It was there when the plant was checked; everything else goes on without it.
             logger.warning("%s/%s keeps its value: %s", station.name, source.variable, exc)
@@ -97,7 +105,7 @@ def _sources(station: StationSpec) -> list[tuple[Source, str]]:
     # The same source with another type of its variable has to be started again.
     types = {variable.name: variable.type for variable in station.variables}
     played = (each for each in station.sources if isinstance(each, (HostSource, CsvSource)))
-    return [(each, types[each.variable]) for each in played]
+    return [(each, types[variable_of(each.variable, types)]) for each in played]
 
 
 def _measure(source: HostSource, host: Host, kind: DataType) -> Callable[[], Any]:

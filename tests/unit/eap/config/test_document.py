@@ -186,7 +186,7 @@ def test_document_with_tabs_that_yaml_takes_is_read(tree) -> None:
         ("{kind: counter}", "{kind: counter, variable: x}", "11: unknown key 'variable'"),
         ("{kind: counter}", "{kind: ramp, low: 0, high: .inf, period_ms: 9}", "11: high is inf"),
         ("count: UDINT", "count: [UDINT]", "9: count is a list; a mapping with type"),
-        ("default: 2.5", "default: {a: 1}", "8: default is a mapping; a value, or a list"),
+        ("default: 2.5", "default: {a: }", "8: a has no value; a value, or a list"),
         ("{kind: counter}", "{kind: counter, step: 1.5}", "11: step is 1.5; a whole number"),
         ("variables: {a: REAL, b: UDINT}", "variables: [a, b]", "21: variables is a list; a map"),
         ("variables: {a: REAL, b: UDINT}", "variables: {a: REAL, b: {}}", "21: b has no type; th"),

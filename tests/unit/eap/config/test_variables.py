@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.codec import datatypes
+from eap.config.index import VariablePart
 from eap.config.structs import LinkSection
 from eap.config.variables import (
     Ends,
@@ -154,7 +155,7 @@ def way(source, target, start=0, to=0, bits=16):
 )
 def test_bits_are_as_many_as_both_ends_have(keys, source, target, bits):
     link = LinkSection(source="a", target="b", **keys)
-    found = ends(link, source, target)
+    found = ends(link, VariablePart("a", source), VariablePart("b", target))
     assert (found.source.start, found.target.start, found.source.bits) == bits
     assert found.target.bits == found.source.bits
     assert is_bitwise(link) == bool(keys)
