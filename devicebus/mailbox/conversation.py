@@ -369,7 +369,13 @@ class ReplyRules(NamedTuple):
 
 
 _COE_UNSOLICITED = frozenset(
-    (CoeService.EMERGENCY, CoeService.TX_PDO, CoeService.TX_PDO_REMOTE_REQUEST)
+    (
+        CoeService.EMERGENCY,
+        CoeService.TX_PDO,
+        # No answer has the service of a remote request, whichever way it goes.
+        CoeService.TX_PDO_REMOTE_REQUEST,
+        CoeService.RX_PDO_REMOTE_REQUEST,
+    )
 )
 _SOE_UNSOLICITED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
 _RULES: dict[MailboxType, ReplyRules] = {

@@ -155,8 +155,9 @@ def _parts(frame: DecodedFrame) -> Iterator[str]:
     if message := frame.mailbox:
         packet = packet or message.ams
         data = "" if message.ams else f"  {_octets(message.data)}"
+        service = f" {message.service}" if message.service else ""
         yield (
-            f"{message.protocol}  address {message.address}  counter {message.counter}  "
+            f"{message.protocol}{service}  address {message.address}  counter {message.counter}  "
             f"priority {message.priority}{data}"
         )
         if isinstance(message.detail, int):

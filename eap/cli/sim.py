@@ -77,6 +77,9 @@ def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults:
     segment_process.run(loaded, interface, write_json, second=second, command_fd=command_fd)
 
 
+_TEXT_KEYS = frozenset(("object", "slave", "state"))
+
+
 def parse_fault(words: tuple[str, ...]) -> dict[str, Any]:
     """Read a JSON object, or a kind and ``key=value``; raise UsageError for anything else."""
     if len(words) == 1 and words[0].lstrip().startswith("{"):
@@ -92,8 +95,10 @@ def parse_fault(words: tuple[str, ...]) -> dict[str, Any]:
         key, equals, text = word.partition("=")
         if not key or not equals:
             raise click.UsageError(f"{word!r} is not key=value: a fault is written {_EXAMPLE}")
+        # An object such as 0x1A00 looks like a number, and so may the name of a slave.
+        value = text if key in _TEXT_KEYS else parse_value(text)
         # Either form of the key: options have a hyphen, bus files an underscore.
-        fault[key.replace("-", "_")] = parse_value(text)
+        fault[key.replace("-", "_")] = value
     return fault
 
 

@@ -29,6 +29,36 @@ class CoeService(IntEnum):
     SDO_INFORMATION = 8
 
 
+_TITLES = {
+    CoeService.EMERGENCY: "emergency",
+    CoeService.SDO_REQUEST: "SDO request",
+    CoeService.SDO_RESPONSE: "SDO response",
+    CoeService.TX_PDO: "TxPDO",
+    CoeService.RX_PDO: "RxPDO",
+    CoeService.TX_PDO_REMOTE_REQUEST: "TxPDO remote request",
+    CoeService.RX_PDO_REMOTE_REQUEST: "RxPDO remote request",
+    CoeService.SDO_INFORMATION: "SDO information",
+}
+PDO_SERVICES = frozenset(
+    (
+        CoeService.TX_PDO,
+        CoeService.RX_PDO,
+        CoeService.TX_PDO_REMOTE_REQUEST,
+        CoeService.RX_PDO_REMOTE_REQUEST,
+    )
+)
+"""Services of PDOs in the mailbox, whose header has the number of one."""
+
+
+_PDO_NUMBER = 0x01FF
+"""Bits of the header."""
+
+
+def title_of(service: int) -> str:
+    """Return the name of a service, which a peer may have invented."""
+    return _TITLES[CoeService(service)] if service in _TITLES else f"unknown service {service}"
+
+
 class CoeHeader(WireStruct, frozen=True):
     """ETG.1000.6: the two bytes behind the mailbox header; *number* is that of a PDO, else 0."""
 
@@ -318,3 +348,12 @@ class EntryDescription(msgspec.Struct, frozen=True):
 def _text(octets: Buffer) -> str:
     # Names end with the message; a NUL that a peer adds is no part of them.
     return bytes(octets).rstrip(b"\0").decode(errors="replace")
+
+
+def describe_message(data: Buffer) -> str:
+    """Return service and PDO number of a CoE message in words; empty if it has no header."""
+    if len(data) < CoeHeader.SIZE:
+        return ""
+    service, number = data[1] >> 4, int.from_bytes(data[:2], "little") & _PDO_NUMBER
+    title = title_of(service)
+    return f"{title} {number}" if service in PDO_SERVICES else title

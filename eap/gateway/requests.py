@@ -121,6 +121,12 @@ _RAW = ReadWrite(IndexGroup.VOE, 0, 0, b"")
 # Members of enums are slow to reach.
 _SDO_GROUP = IndexGroup.SDO
 _INFORMATION, _REQUEST = CoeService.SDO_INFORMATION, CoeService.SDO_REQUEST
+_PDOS_READ: dict[int, int] = {
+    CoeService.TX_PDO_REMOTE_REQUEST: 0x1A00,
+    CoeService.RX_PDO_REMOTE_REQUEST: 0x1600,
+}
+"""Services that read a PDO, with the first object of its kind (ETG.1000.6)."""
+_PDO_NUMBER = 0x01FF
 _UPLOAD, _DOWNLOAD = SdoRequest.UPLOAD, SdoRequest.DOWNLOAD
 _SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
 """Services of CoE whose messages may be aborts."""
@@ -158,7 +164,7 @@ def _of_coe(body: bytes) -> Operation | None:
     if service == _INFORMATION and len(body) > CoeHeader.SIZE:
         return _of_info(body)
     if service != _REQUEST:
-        return _RAW
+        return _of_pdo(service, body)
     # Too short for an index: nothing to decide on, and the codec answers with an error.
     if len(body) < CoeHeader.SIZE + 4:
         return None
@@ -169,6 +175,15 @@ def _of_coe(body: bytes) -> Operation | None:
     if specifier == _DOWNLOAD:
         return sdo(index, subindex, complete=complete, data=_written(body))
     return None
+
+
+def _of_pdo(service: int, body: bytes) -> Operation:
+    """Return the operation of a message that is neither an SDO nor SDO information."""
+    if service not in _PDOS_READ:
+        return _RAW
+    # Rules name a PDO by the object that maps it.
+    number = int.from_bytes(body[:2], "little") & _PDO_NUMBER
+    return sdo(_PDOS_READ[service] + number, 0, complete=True)
 
 
 def _written(body: bytes) -> bytes:

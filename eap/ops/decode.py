@@ -17,6 +17,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from devicebus.wire.datagram import iter_datagrams
 from eap.codec import ams, mailbox
+from eap.codec.coe import describe_message
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE, EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxError, MailboxErrorReply, MailboxHeader, MailboxType
 from eap.codec.pd import PD_FRAME_START, PdFrameHeader, PdHeader, follow_pds, iter_pds
@@ -68,7 +69,11 @@ class DecodedAms(Struct, frozen=True, kw_only=True):
 
 
 class DecodedMailbox(Struct, kw_only=True):
-    """Mailbox message of a frame of type 5; *detail* and *reason* of an error reply."""
+    """Mailbox message of a frame of type 5.
+
+    *service* names a message of CoE, with the number of its PDO; *detail* and *reason* are those of
+    an error reply.
+    """
 
     length: int
     address: int
@@ -78,6 +83,7 @@ class DecodedMailbox(Struct, kw_only=True):
     protocol: str
     counter: int
     data: str = ""
+    service: str | UnsetType = UNSET
     ams: DecodedAms | UnsetType = UNSET
     detail: int | UnsetType = UNSET
     reason: str | UnsetType = UNSET
@@ -228,6 +234,8 @@ def _read_mailbox(frame: memoryview, found: DecodedFrame) -> None:
     message.data = data.hex()
     if header.type is MailboxType.AOE:
         message.ams = _decoded_ams(data)
+    elif header.type is MailboxType.COE:
+        message.service = describe_message(data) or UNSET
     elif header.type is MailboxType.ERR:
         reply = MailboxErrorReply.decode(data)
         if reply.detail_type == mailbox.ERROR_REPLY and len(data) == MailboxErrorReply.SIZE:

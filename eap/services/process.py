@@ -330,6 +330,10 @@ class Services:
     def _bridges(self, clients: Mapping[PortName, BusClient]) -> list[EoeBridge]:
         found = []
         for owner, client in clients.items():
+            # Imported here: a plant without buses does not need it.
+            from eap.services.slaves.unsolicited_log import log_unsolicited_pdos
+
+            log_unsolicited_pdos(client)
             if (spec := self._handover.port(owner).eoe) is not None:
                 # Imported here: few plants use EoE.
                 from eap.services.slaves.eoe_bridge import EoeBridge

@@ -172,6 +172,29 @@ def test_protocols_that_are_not_offered_and_messages_that_are_too_long(gateway: 
     assert gateway.talk(VOE, DRIVE, bytes(1100)) == (ERR, bytes.fromhex("0100 0800"))
 
 
+def test_pdos_by_mailbox_are_answered_or_refused(plant: Appliance) -> None:
+    with wire(HOST) as udp:
+        kind, body = udp.talk(COE, SENSOR, bytes.fromhex("0060"))
+        assert (kind, body) == (COE, bytes.fromhex("0040 f503"))  # 1013
+        kind, control_word = udp.talk(COE, DRIVE, bytes.fromhex("0070"))
+        assert (kind, control_word[:2]) == (COE, bytes.fromhex("0050"))
+        # An RxPDO has no confirmation.
+        udp.send(frame(COE, DRIVE, control_word))
+        refused = ERR, bytes.fromhex("0100 0400")
+        # No such PDO, TxPDO and emergency to a slave, and a service that does not exist.
+        for message in ("3360", "3370", "0040 f503", "0010 0000000000000000", "0090 00"):
+            assert udp.talk(COE, SENSOR, bytes.fromhex(message)) == refused
+        # The master has no PDOs.
+        for message in ("0060", "0070", "0050 00"):
+            assert udp.talk(COE, 0, bytes.fromhex(message)) == refused
+
+
+def test_pdo_that_a_slave_sends_by_mailbox_is_named_in_the_log(plant: Appliance) -> None:
+    plant.command("sim", "fault", "mill/bus0", "tx-pdo", "slave=sensor", "object=0x1A00")
+    line = "mill/bus0/sensor: slave 1003 sends by mailbox: CoE TxPDO 0 (2 bytes), not used"
+    wait_until(lambda: line in plant.log())
+
+
 def test_a_request_that_waits_is_answered_once_and_later_it_is_a_new_one(plant: Appliance) -> None:
     asked = frame(COE, MUTE, VENDOR)
     with wire(HOST) as udp:

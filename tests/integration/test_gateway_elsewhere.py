@@ -241,6 +241,11 @@ def test_host_behind_a_remote_slave_answers_ping(udp: Wire) -> None:
     udp.rest()
 
 
+@pytest.mark.parametrize("message", ["0040 00", "0050 00", "0060", "0070"])
+def test_pdos_by_mailbox_are_refused(udp: Wire, message: str) -> None:
+    assert udp.talk(COE, VIRTUAL, bytes.fromhex(message)) == (ERR, bytes.fromhex("0100 0400"))
+
+
 def test_remote_slave_without_ethernet_refuses_it(udp: Wire) -> None:
     assert udp.talk(EOE, 0x9003, bytes.fromhex("0600 0000")) == (ERR, bytes.fromhex("0100 0200"))
 

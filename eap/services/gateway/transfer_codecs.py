@@ -60,7 +60,6 @@ from eap.services.slaves.access import ObjectStream, SlaveAccess
 from eap.services.slaves.file_stream import FileStream
 
 _LAST = 0x01
-_UNANSWERED = frozenset((CoeService.TX_PDO, CoeService.RX_PDO, CoeService.EMERGENCY))
 _QUERIES = frozenset(
     (SdoInfoOpcode.LIST_REQUEST, SdoInfoOpcode.OBJECT_REQUEST, SdoInfoOpcode.ENTRY_REQUEST)
 )
@@ -113,7 +112,8 @@ class ObjectCodec:
             return await self._sdo(rest)
         if service == CoeService.SDO_INFORMATION:
             return await self._info(rest)
-        expects_reply = service not in _UNANSWERED
+        # An RxPDO has no confirmation; a slave refuses what it does not know by a mailbox error.
+        expects_reply = service != CoeService.RX_PDO
         message = await self._access.exchange(MailboxType.COE, body, expects_reply=expects_reply)
         return [message.data] if expects_reply else []
 

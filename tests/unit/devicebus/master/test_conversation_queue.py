@@ -94,6 +94,9 @@ def test_reply_matcher_without_echo_drops_a_late_mailbox_error(matcher):
     [
         (COE, encode_message(CoeService.EMERGENCY, bytes(8)), True),
         (COE, encode_message(CoeService.TX_PDO, bytes(8)), True),
+        (COE, encode_message(CoeService.TX_PDO_REMOTE_REQUEST, b""), True),
+        (COE, encode_message(CoeService.RX_PDO_REMOTE_REQUEST, b""), True),
+        (COE, encode_message(CoeService.RX_PDO, bytes(8)), False),
         (COE, encode_message(CoeService.SDO_RESPONSE, bytes(8)), False),
         (COE, b"\0\xf0", False),
         (COE, b"", False),

@@ -29,6 +29,8 @@ def test_faults_in_words_and_in_json():
     expected = {"kind": "power", "slave": "drive", "for_ms": 500, "drift_ppm": 1.5, "code": 0x51}
     assert parse_fault(words) == expected
     assert parse_fault((json.dumps(expected),)) == expected
+    object_ = parse_fault(("tx-pdo", "object=0x1A00", "slave=7"))
+    assert object_ == {"kind": "tx-pdo", "object": "0x1A00", "slave": "7"}
     for wrong in (("power", "slave"), ("power", "=1"), ("{",), ("{1}",)):
         with pytest.raises(click.UsageError):
             parse_fault(wrong)

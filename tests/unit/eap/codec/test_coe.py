@@ -24,6 +24,7 @@ from eap.codec.coe import (
     SdoSegmentHeader,
     decode_message,
     decode_segment,
+    describe_message,
     encode_abort,
     encode_initiate,
     encode_message,
@@ -257,3 +258,22 @@ def test_garbage_sdo_info_decodes_or_raises_codec_error(record: type, noise: byt
 def test_unknown_opcode_is_malformed() -> None:
     with pytest.raises(MalformedError, match="8 is not a valid SdoInfoOpcode"):
         SdoInfoHeader.decode(bytes.fromhex("08000000"))
+
+
+@pytest.mark.parametrize(
+    ("octets", "text"),
+    [
+        ("0010", "emergency"),
+        ("0020", "SDO request"),
+        ("0030", "SDO response"),
+        ("0340", "TxPDO 3"),
+        ("ff51", "RxPDO 511"),
+        ("0060", "TxPDO remote request 0"),
+        ("0170", "RxPDO remote request 1"),
+        ("0080", "SDO information"),
+        ("00f0", "unknown service 15"),
+        ("00", ""),
+    ],
+)
+def test_message_is_described_by_service_and_pdo(octets: str, text: str) -> None:
+    assert describe_message(bytes.fromhex(octets)) == text

@@ -27,7 +27,10 @@ AMS, REST = "c0a800010201 e903 c0a800320101 0080", "00000000 01000000"
         (COE, "0080 03 00 0000 1810", READ),
         (COE, "0080 05 00 0000 1810 01 7f", READ),
         (COE, "0080", RAW),
+        (COE, "0040 0102", RAW),
         (COE, "0050 0102", RAW),
+        (COE, "0360", READ),
+        (COE, "0371", READ),
         (COE, "", RAW),
         (SOE, "01 40 2000", READ),
         (SOE, "a1 40 2000", READ),
@@ -88,3 +91,11 @@ def test_objects(octets, touched) -> None:
     operation = operation_of(COE, bytes.fromhex(octets))
     assert operation is not None
     assert objects_of(operation) == touched
+
+
+@pytest.mark.parametrize(
+    ("octets", "index"), [("0060", 0x1A00), ("0361", 0x1B03), ("0770", 0x1607)]
+)
+def test_remote_request_is_named_by_the_object_of_its_pdo(octets, index) -> None:
+    operation = operation_of(COE, bytes.fromhex(octets))
+    assert objects_of(operation) == ObjectRange(index, index)
