@@ -14,6 +14,8 @@ import click
 from eap.cli.group import ExitCode
 from eap.cli.output import Renderer, count, repaint, write_view
 from eap.cli.params import PLANT_FILE, examples, json_option
+from eap.errors import ControlError
+from eap.ids import NetId
 
 if TYPE_CHECKING:
     from eap.ops.discover import DiscoveredPd, Discovery
@@ -22,12 +24,25 @@ if TYPE_CHECKING:
 _USUAL_S = 5.0
 """Length of a capture whose result goes to a file, a pipe or a plant file."""
 _REDRAW_S = 1.0
+_FROM_HELP = (
+    "NetID of a publisher: ask its dictionary for names and types, through a running station. May"
+    " be repeated."
+)
+
+
+def _parse_net_id(text: str) -> str:
+    """Read a NetID; raise BadParameter otherwise."""
+    try:
+        return str(NetId.parse(text))
+    except ValueError as exc:
+        raise click.BadParameter(str(exc)) from None
 
 
 @click.command(
     epilog=examples(
         "eapctl discover eth0",
         "eapctl discover eth0 --for 10 --write found.yaml",
+        "eapctl discover eth0 --from 5.23.91.23.2.1",
         "eapctl discover --pcap line.pcapng --plant plant.yaml --json",
     ),
 )
@@ -37,6 +52,9 @@ _REDRAW_S = 1.0
     type=click.Path(path_type=Path),
     metavar="FILE",
     help="Read a pcap or pcapng file instead of an interface.",
+)
+@click.option(
+    "--from", "net_ids", type=_parse_net_id, multiple=True, metavar="NETID", help=_FROM_HELP
 )
 @click.option(
     "--for",
@@ -67,6 +85,7 @@ def discover(
     ctx: click.Context,
     interface: str | None,
     pcap: Path | None,
+    net_ids: tuple[str, ...],
     for_s: float | None,
     plants: tuple[Path, ...],
     target: Path | None,
@@ -82,7 +101,7 @@ def discover(
     """
     from eap.ops.discover import Discovery, discovered
 
-    _check_usage(interface, pcap, for_s)
+    _check_usage(interface, pcap, net_ids, for_s)
     if target is not None and target.exists() and not force:
         raise click.UsageError(f"{target} exists: --force overwrites it")
     takers = _takers(plants)
@@ -95,7 +114,7 @@ def discover(
         if for_s is None and (not is_live or target is not None):
             for_s = _USUAL_S
         _watch(discovery, interface, for_s, takers if is_live else None)
-    rows = discovered(discovery, takers)
+    rows = _completed(discovered(discovery, takers), net_ids, takers)
     _show(rows, discovery, output)
     if target is not None and rows:
         _write(target, rows, pcap or interface)
@@ -105,13 +124,15 @@ def discover(
         ctx.exit(ExitCode.FAILED)
 
 
-def _check_usage(interface: str | None, pcap: Path | None, for_s: float | None) -> None:
+def _check_usage(
+    interface: str | None, pcap: Path | None, net_ids: tuple[str, ...], for_s: float | None
+) -> None:
     if interface is not None and pcap is not None:
         raise click.UsageError("INTERFACE and --pcap are two sources: omit one")
     if interface is None and for_s is not None:
         raise click.UsageError("--for goes with INTERFACE")
-    if interface is None and pcap is None:
-        raise click.UsageError("nothing to look at: give INTERFACE or --pcap FILE")
+    if interface is None and pcap is None and not net_ids:
+        raise click.UsageError("nothing to look at: give INTERFACE, --pcap FILE or --from NETID")
 
 
 def _takers(plants: tuple[Path, ...]) -> list[Taker]:
@@ -171,6 +192,29 @@ def _ended_by_signal() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _completed(
+    rows: list[DiscoveredPd], net_ids: tuple[str, ...], takers: list[Taker]
+) -> list[DiscoveredPd]:
+    """Return the rows with names and types of the dictionaries of publishers."""
+    if not net_ids:
+        return rows
+    from eap.ops.discover import complete
+    from eap.ops.publisher_dictionary import PublishedPd, ask_publisher
+
+    published: list[PublishedPd] = []
+    for net_id in net_ids:
+        try:
+            published += ask_publisher(net_id)
+        except ControlError as exc:
+            if not rows and len(net_ids) == 1:
+                raise
+            click.echo(str(exc), err=True)
+    completed, remarks = complete(rows, published, takers)
+    for remark in remarks:
+        click.echo(remark, err=True)
+    return completed
 
 
 def _show(rows: list[DiscoveredPd], discovery: Discovery, output: Renderer) -> None:

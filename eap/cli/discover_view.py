@@ -38,6 +38,7 @@ def summary(rows: Sequence[DiscoveredPd]) -> str:
 
 def pd_table(rows: Sequence[DiscoveredPd]) -> TextTable:
     """Return a line for each PD."""
+    has_names = any(row.name for row in rows)
     table = TextTable(
         "Publisher",
         Column("ID", is_number=True),
@@ -47,6 +48,7 @@ def pd_table(rows: Sequence[DiscoveredPd]) -> TextTable:
         "Sent",
         Column("Jitter", rank=4, is_number=True),
         "To",
+        *([Column("Name", rank=5)] if has_names else []),
         "Taken by",
     )
     for row in rows:
@@ -59,6 +61,7 @@ def pd_table(rows: Sequence[DiscoveredPd]) -> TextTable:
             trigger_text(row),
             "" if row.jitter_us is None else duration(row.jitter_us),
             destination_text(row),
+            *([row.name or ""] if has_names else []),
             row.taken_by or Styled("none", style="yellow"),
         )
     return table

@@ -13,18 +13,23 @@ from functools import lru_cache
 from ipaddress import IPv4Address
 from pathlib import Path
 from time import monotonic
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from eap.codec.ethercat import EAP_PORT
+from eap.ids import NetId
 from eap.net.capture import FrameCapture
 from eap.ops.decode import Packet, iter_capture, unwrap
 from eap.ops.takers import Taker
 from eap.pd.appearance import guess
-from eap.pd.observer import MAX_PDS, FramePath, ObservedPd, Observer
+from eap.pd.observer import MAX_PDS, FramePath, ObservedPd, Observer, PdKey
 from eap.pd.rhythm import CycleOrder
 from eap.pd.words import PdDropReason, Reason
+
+if TYPE_CHECKING:
+    from eap.ops.publisher_dictionary import PublishedPd  # which loads clients of dictionaries
 
 _UDP_START = 42
 """Offset of a datagram's payload behind Ethernet, IPv4 without options, and UDP."""
@@ -42,6 +47,13 @@ class RefusedBy(Struct, frozen=True):
     reason: str
 
 
+class DiscoveredVariable(Struct, frozen=True):
+    """Variable of a PD by the publisher's own dictionary."""
+
+    name: str
+    type: str
+
+
 class DiscoveredPd(Struct, frozen=True, kw_only=True):
     """``eapctl discover``: one PD on the network.
 
@@ -54,7 +66,9 @@ class DiscoveredPd(Struct, frozen=True, kw_only=True):
         jitter_us: 99th percentile of the deviation from the rhythm, None without one.
         destination: MAC or IPv4 address that it goes to, with a UDP port other than 34980.
         taken_by: Subscriptions that take it, ``STATION/PD``; None if there is none.
-        transport: ``ethernet``, ``udp`` or ``tcp``.
+        name: Of the PD, by the publisher's dictionary; None while that was not asked.
+        variables: Likewise; also None where the dictionary describes another layout.
+        transport: ``ethernet``, ``udp`` or ``tcp``; empty where it was not seen nor told.
         destination_kind: ``unicast``, ``multicast`` or ``broadcast``.
         vlan_id: Of a tagged frame.
         sources: Addresses that it came from.
@@ -83,6 +97,8 @@ class DiscoveredPd(Struct, frozen=True, kw_only=True):
     jitter_us: int | None
     destination: str
     taken_by: str | None
+    name: str | None = None
+    variables: list[DiscoveredVariable] | None = None
     transport: str = ""
     destination_kind: str = ""
     vlan_id: int | None = None
@@ -240,17 +256,19 @@ def discovered(discovery: Discovery, takers: Iterable[Taker]) -> list[Discovered
         _row(each, by_id.get(each.key.pd_id, ()), discovery.now_ns)
         for each in discovery.observer.pds.values()
     ]
-    return sorted(rows, key=lambda row: (_order(row.publisher), row.pd_id, row.destination))
+    return sorted(rows, key=_row_order)
 
 
-def _order(net_id: str) -> tuple[int, ...]:
-    return tuple(map(int, net_id.split(".")))
+def _row_order(row: DiscoveredPd) -> tuple[list[int], int, str]:
+    return [int(part) for part in row.publisher.split(".")], row.pd_id, row.destination
 
 
-def _row(pd: ObservedPd, takers: Sequence[Taker], now_ns: int) -> DiscoveredPd:
-    key, found = pd.key, pd.measure()
+def _compare(key: PdKey, takers: Iterable[Taker]) -> tuple[str | None, list[RefusedBy]]:
+    """Return the subscriptions that take a PD, or those that drop it."""
     taking, refusing = [], []
     for each in takers:
+        if each.subscription.pd_id != key.pd_id:
+            continue
         reason = each.refusal(key)
         if reason is None and each.is_reached(key):
             taking.append(each.name)
@@ -258,6 +276,12 @@ def _row(pd: ObservedPd, takers: Sequence[Taker], now_ns: int) -> DiscoveredPd:
             refusing.append(RefusedBy(each.name, NOT_REACHED))
         elif reason is not PdDropReason.WRONG_PUBLISHER or each.is_reached(key):
             refusing.append(RefusedBy(each.name, reason.value))
+    return ", ".join(taking) or None, [] if taking else refusing
+
+
+def _row(pd: ObservedPd, takers: Iterable[Taker], now_ns: int) -> DiscoveredPd:
+    key, found = pd.key, pd.measure()
+    taken_by, refused_by = _compare(key, takers)
     return DiscoveredPd(
         publisher=str(pd.publisher),
         pd_id=key.pd_id,
@@ -266,7 +290,7 @@ def _row(pd: ObservedPd, takers: Sequence[Taker], now_ns: int) -> DiscoveredPd:
         rate_hz=None if found.rate_hz is None else round(found.rate_hz, 3),
         jitter_us=found.jitter_us,
         destination=key.destination,
-        taken_by=", ".join(taking) or None,
+        taken_by=taken_by,
         transport=key.transport,
         destination_kind=destination_kind(key.transport, key.destination),
         vlan_id=key.vlan_id,
@@ -284,9 +308,67 @@ def _row(pd: ObservedPd, takers: Sequence[Taker], now_ns: int) -> DiscoveredPd:
         cycle_order=pd.cycle.order.value,
         header_length=pd.wrong_length,
         quality=pd.quality,
-        refused_by=[] if taking else refusing,
+        refused_by=refused_by,
         looks_like=[str(part) for part in guess(pd.samples)],
     )
+
+
+def complete(
+    rows: Iterable[DiscoveredPd], published: Sequence[PublishedPd], takers: Sequence[Taker]
+) -> tuple[list[DiscoveredPd], list[str]]:
+    """Return *rows* with names and types of dictionaries, and what does not fit, in words.
+
+    A PD that no frame brought is a row as well, compared with *takers*.
+    """
+    by_key = {(pd.publisher, pd.pd_id): pd for pd in published}
+    found, remarks = [], []
+    for row in rows:
+        known = by_key.get(row.key)
+        if known is None:
+            found.append(row)
+            continue
+        variables = None
+        if (known.version, known.length) == (row.version, row.length):
+            variables = _variables(known)
+        else:
+            remarks.append(
+                f"PD {row.pd_id} of {row.publisher}: seen with version {row.version} and "
+                f"{row.length} bytes, but its dictionary describes version {known.version} with "
+                f"{known.length} bytes"
+            )
+        found.append(replace(row, name=known.name, variables=variables))
+    seen = {row.key for row in found}
+    found += [_unseen(pd, takers) for key, pd in by_key.items() if key not in seen]
+    return sorted(found, key=_row_order), remarks
+
+
+def _unseen(pd: PublishedPd, takers: Iterable[Taker]) -> DiscoveredPd:
+    publisher = NetId.parse(pd.publisher)
+    key = PdKey(
+        publisher, pd.pd_id, pd.version, pd.length, pd.transport, pd.destination, vlan_id=None
+    )
+    taken_by, refused_by = _compare(key, takers) if pd.transport else (None, [])
+    return DiscoveredPd(
+        publisher=pd.publisher,
+        pd_id=pd.pd_id,
+        version=pd.version,
+        length=pd.length,
+        rate_hz=None,
+        jitter_us=None,
+        destination=pd.destination,
+        taken_by=taken_by,
+        refused_by=refused_by,
+        name=pd.name,
+        variables=_variables(pd),
+        transport=pd.transport,
+        destination_kind=destination_kind(pd.transport, pd.destination) if pd.transport else "",
+        trigger=Reason.CYCLE.value if pd.cycle_us else None,
+        period_ms=pd.cycle_us / 1000 if pd.cycle_us else None,
+    )
+
+
+def _variables(pd: PublishedPd) -> list[DiscoveredVariable]:
+    return [DiscoveredVariable(*each) for each in pd.variables]
 
 
 NOT_REACHED = "other_destination"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from ipaddress import IPv4Address
 from typing import NamedTuple
@@ -54,6 +55,9 @@ def discovered_plant(
     for row in sorted(rows, key=lambda row: -row.received):
         if not row.length:
             left_out.append(f"{_label(row)} has no data")
+            continue
+        if not row.transport:
+            left_out.append(f"{_label(row)}: no frame shows where it arrives")
             continue
         taken = ports.setdefault(_port_of(row, interface, own), {})
         if row.key in taken:
@@ -106,9 +110,11 @@ def _text(
         for at, key in enumerate(keys):
             yield f"      - {_port(at, key, f'{prefix}.{number}.2.{at + 1}', ports[key])}"
         yield "    subscribe:"
+        names = Counter(_pd_name(row) for key in keys for row in ports[key].values())
         for at, key in enumerate(keys):
             for row in sorted(ports[key].values(), key=_row_order):
-                yield from _subscription(f"eap{at}", row, len(keys) > 1)
+                suffix = f"-{row.pd_id}-eap{at}" if names[_pd_name(row)] > 1 else ""
+                yield from _subscription(f"eap{at}", row, _pd_name(row) + suffix)
 
 
 def _port_order(key: _PortKey) -> list[int | str]:
@@ -153,17 +159,18 @@ def _host(row: DiscoveredPd) -> str:
     return row.destination if row.transport == "ethernet" else row.destination.partition(":")[0]
 
 
-def _subscription(port: str, row: DiscoveredPd, has_others: bool) -> Iterator[str]:
-    name = f"pd{row.pd_id}-{row.publisher}"
-    if has_others:
-        name += f"-{port}"
+def _pd_name(row: DiscoveredPd) -> str:
+    return f"{row.name or f'pd{row.pd_id}'}-{row.publisher}"
+
+
+def _subscription(port: str, row: DiscoveredPd, name: str) -> Iterator[str]:
     source = [f"publisher: {row.publisher}", f"id: {row.pd_id}"]
     if row.trigger == "cycle" and row.cycle_order == "little" and row.step:
         cycle_us = row.sender_cycle_us or 0
         if _MIN_CYCLE_US <= cycle_us <= _MAX_CYCLE_US and row.step <= _MAX_STEP:
             source += [f"cycle_us: {cycle_us}", f"step: {row.step}"]
     yield f"      # {_label(row)}: {_sent(row)}"
-    for text in row.looks_like:
+    for text in row.looks_like if row.variables is None else ():
         yield f"      # looks like {text}"
     yield f"      - name: {_scalar(name)}"
     yield f"        port: {port}"
@@ -172,7 +179,14 @@ def _subscription(port: str, row: DiscoveredPd, has_others: bool) -> Iterator[st
     if row.version:
         yield f"        version: {row.version}"
     yield "        variables:"
-    yield f"          {_scalar(f'{name}.data')}: {_scalar(f'BLOCK({row.length})')}"
+    for variable, kind in _variables(row):
+        yield f"          {_scalar(f'{name}.{variable}')}: {_scalar(kind)}"
+
+
+def _variables(row: DiscoveredPd) -> list[tuple[str, str]]:
+    if row.variables is None:
+        return [("data", f"BLOCK({row.length})")]
+    return [(each.name, each.type) for each in row.variables]
 
 
 def _label(row: DiscoveredPd) -> str:

@@ -112,6 +112,35 @@ def test_all_pds_are_found_in_a_capture(capture: Path, tmp_path: Path) -> None:
     assert all(row["taken_by"] for row in rows)
 
 
+def test_dictionaries_of_publishers_give_names_and_types(
+    line: Appliance, line_network: Namespace, tmp_path: Path
+) -> None:
+    target = tmp_path / "found.yaml"
+    publishers = ("127.0.1.100.2.1", "127.0.1.2.2.1")
+    asked = [word for each in publishers for word in ("--from", each)]
+    with inside(line_network):
+        rows = discover(line.runtime, "lo", "--for", 1, *asked, "--write", target)
+    named = [row for row in rows if row["publisher"] in publishers]
+    assert len(named) == 14 + 3
+    assert all(row["name"] and row["rate_hz"] for row in named)
+    assert [each["name"] for each in named[0]["variables"]] == ["pieces", "temperature", "belt"]
+    result = run_eapctl(tmp_path, "check", str(target))
+    assert "54 PDs received" in result.stdout
+    assert '"report-127.0.1.2.2.1.position": REAL' in target.read_text()
+
+
+def test_dictionary_alone_lists_pds_that_were_not_seen(line: Appliance) -> None:
+    rows = discover(line.runtime, "--from", "127.0.1.1.2.1")
+    assert [(row["pd_id"], row["name"], row["received"]) for row in rows] == [
+        (2, "to-right", 0),
+        (3, "report", 0),
+    ]
+    assert [row["taken_by"] for row in rows] == ["island-02/left", "control/island-01"]
+    unknown = run_eapctl(line.runtime, "discover", "--from", "9.9.9.9.9.9")
+    assert unknown.returncode == 1
+    assert "no route to 9.9.9.9.9.9" in unknown.stderr
+
+
 def send_again(network: Namespace, path: Path) -> dict[str, int]:
     """Send the captured frames to their destinations at their own pace, from another host."""
     sent: dict[str, int] = {}
