@@ -17,6 +17,7 @@ _LEAST_SAMPLES = 3
 _SHORTEST_TEXT = 4
 _MOST_STEP = 1000
 """Step of a counter from one arrival to the next."""
+_COUNTERS = ((4, "UDINT"), (2, "UINT"), (1, "USINT"))
 _SMALLEST, _LARGEST = 1e-6, 1e9
 """Limits of plausible measured values, other than 0."""
 MAX_PARTS = 24
@@ -92,19 +93,30 @@ def _printable(sample: bytes, offset: int) -> int:
 
 
 def _counter_at(samples: Sequence[bytes], offset: int) -> Part | None:
-    """Recognise a whole number that grows by small steps, and wraps."""
-    for size, kind in ((4, "UDINT"), (2, "UINT"), (1, "USINT")):
-        if offset + size > len(samples[0]):
-            continue
-        values = [int.from_bytes(each[offset : offset + size], "little") for each in samples]
-        wrap = 1 << 8 * size
-        # The first samples follow each other; later ones are further apart.
-        steps = [(after - before) % wrap for before, after in pairwise(values[:8])]
-        if min(steps) > 0 and max(steps) <= min(_MOST_STEP, wrap // 8):
-            if len(set(steps)) == 1:
-                return Part(offset, size, kind, f"a counter, {steps[0]} more each time")
+    """Recognise a whole number that grows by the same small step each time, and wraps."""
+    for size, kind in _COUNTERS:
+        steps = _steps(samples, offset, size)
+        if len(set(steps)) == 1 and 0 < steps[0] <= min(_MOST_STEP, (1 << 8 * size) // 8):
+            return Part(offset, size, kind, f"a counter, {steps[0]} more each time")
+    return None
+
+
+def _uneven_counter_at(samples: Sequence[bytes], offset: int) -> Part | None:
+    """Recognise a whole number that grows by small steps; the low bytes of a REAL may do so too."""
+    for size, kind in _COUNTERS[:2]:
+        steps = _steps(samples, offset, size)
+        if steps and min(steps) > 0 and max(steps) <= _MOST_STEP:
             return Part(offset, size, kind, "a counter")
     return None
+
+
+def _steps(samples: Sequence[bytes], offset: int, size: int) -> list[int]:
+    """Return the differences of a whole number, none if it reaches past the end."""
+    if offset + size > len(samples[0]):
+        return []
+    # The first samples follow each other; later ones are further apart.
+    values = [int.from_bytes(each[offset : offset + size], "little") for each in samples[:8]]
+    return [(after - before) % (1 << 8 * size) for before, after in pairwise(values)]
 
 
 def _real_at(samples: Sequence[bytes], offset: int) -> Part | None:
@@ -156,6 +168,7 @@ _READERS: tuple[Callable[[Sequence[bytes], int], Part | None], ...] = (
     _counter_at,
     _flag_at,
     _real_at,
+    _uneven_counter_at,
     _small_at,
 )
 """In the order in which they are tried."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import struct
 
@@ -49,6 +50,17 @@ def test_counter_of_two_bytes_wraps():
 
 def test_set_point_with_few_digits_is_a_constant_number():
     assert guess([struct.pack("<f", 750.0)] * 3) == [Part(0, 4, "REAL", "750, constant")]
+
+
+def test_slow_sine_is_a_number_and_no_counter_of_its_low_bytes():
+    for phase in range(0, 628, 7):
+        values = [180 + 12.5 * math.sin(phase / 100 + n * 0.00628) for n in range(8)]
+        assert guess([struct.pack("<f", value) for value in values])[0].type == "REAL"
+
+
+def test_counter_with_uneven_steps():
+    samples = [struct.pack("<I", value) for value in (100, 101, 103, 104, 105, 108)]
+    assert guess(samples) == [Part(0, 4, "UDINT", "a counter")]
 
 
 def test_small_numbers_with_a_sign():
