@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from eap.cli.output import Column, Styled, TextTable, count, duration
+from eap.cli.status_findings import PUBLISHER_HINT, VERSION_HINT
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
@@ -21,6 +22,7 @@ _TRIGGERS = {
     "poll": "polled",
 }
 _LISTED = 3
+_HINTS = {"wrong_publisher": PUBLISHER_HINT, "version": VERSION_HINT}
 
 
 def discovery_view(rows: Sequence[DiscoveredPd]) -> Iterator[TextTable | str]:
@@ -144,10 +146,14 @@ def notes(rows: Sequence[DiscoveredPd], discovery: Discovery) -> Iterator[str]:
     yield from discovery.losses.lines()
     for publisher in dict.fromkeys(row.publisher for row in rows):
         yield from _publisher_notes(publisher, [row for row in rows if row.publisher == publisher])
+    reasons = set()
     for row in rows:
         for refused in row.refused_by[:_LISTED]:
+            reasons.add(refused.reason)
             where = f"PD {row.pd_id} of {row.publisher}"
             yield f"{where}: {refused.entry} drops it: {reason_text(row, refused.reason)}"
+    # Once for all of them: the likely reason is a habit of the sender.
+    yield from (hint for reason, hint in _HINTS.items() if reason in reasons)
     others = discovery.observer.other_types
     if others and not rows:
         types = ", ".join(f"type {kind}: {number}" for kind, number in sorted(others.items()))

@@ -12,7 +12,7 @@ omits them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
@@ -57,6 +57,15 @@ _MOST_DESCRIPTORS = 0.9
 """Share of the limit from which on it is a warning."""
 _TOO_LARGE, _NO_SUBSCRIBER = 2, 4
 """Bits of FrameState."""
+PUBLISHER_HINT = (
+    "TwinCAT 2 sends the NetID of its system as publisher, TwinCAT 3 that of the EAP device"
+)
+VERSION_HINT = (
+    "TwinCAT 2 sends a hash of the type of a structure as version: take it over, or set"
+    " ignore_version"
+)
+_HINTS = (PUBLISHER_HINT, VERSION_HINT)
+"""Likely reasons that concern all publishers of a kind: shown once, however many PDs they drop."""
 _OTHER_VERSION, _OTHER_LENGTH = 1, 2
 """Values of VarState of a received PD."""
 
@@ -137,7 +146,21 @@ def findings(status: MergedStatus, now_s: float) -> list[StatusFinding]:
         for station in stations:
             found += [replace(each, plant=plant) for each in _of_station(station)]
     order = list(Severity)
-    return sorted(found, key=lambda each: order.index(each.severity))
+    return _hinted_once(sorted(found, key=lambda each: order.index(each.severity)))
+
+
+def _hinted_once(found: Sequence[StatusFinding]) -> list[StatusFinding]:
+    """Return *found* with each of the general hints at its first place only."""
+    shown: set[str] = set()
+    result = []
+    for each in found:
+        hints = {hint for hint in _HINTS if hint in each.advice}
+        advice = each.advice
+        for hint in hints & shown:
+            advice = advice.replace(f"; {hint}", "")
+        shown |= hints
+        result.append(replace(each, advice=advice))
+    return result
 
 
 def appliance_label(
@@ -343,18 +366,33 @@ def _of_sent(where: str, row: Row) -> Iterator[StatusFinding]:
 def _of_silent(station: Row) -> Iterator[StatusFinding]:
     """Yield the subscriptions that receive nothing; many with the same fault as one finding."""
     stale = [row for row in station["pd"]["rx"] if row["state"] == "stale"]
-    advice = "check its sender and the network path"
-    yield from _grouped(station, stale, "stale: nothing received within the timeout", advice)
+    yield from _silent(station, stale, "stale: nothing received within the timeout", _error)
     waiting = [row for row in station["pd"]["rx"] if row["state"] == "waiting"]
     # Losses are counted only at a fixed step: without one, silence may be as configured.
     cyclic = [row for row in waiting if row["lost"] is not None]
-    yield from _grouped(station, cyclic, "nothing received yet", advice, _warning)
+    yield from _silent(station, cyclic, "nothing received yet", _warning)
     if rest := [row["name"] for row in waiting if row["lost"] is None]:
         yield _info(f"{station['name']} ← {', '.join(rest)}", "nothing received yet")
 
 
+def _silent(
+    station: Row, rows: Sequence[Row], what: str, finding: Callable[..., StatusFinding]
+) -> Iterator[StatusFinding]:
+    """Yield silent subscriptions, those apart whose PD ID another publisher sends."""
+    others = [row for row in rows if row["discarded"].get("wrong_publisher")]
+    alone = [row for row in rows if row not in others]
+    yield from _grouped(station, alone, what, "check its sender and the network path", finding)
+    advice = f"'eapctl discover' shows its NetID; {PUBLISHER_HINT}"
+    what = f"{what}; another publisher sends its PD ID"
+    yield from _grouped(station, others, what, advice, finding)
+
+
 def _grouped(
-    station: Row, rows: Sequence[Row], what: str, advice: str, finding: Any = _error
+    station: Row,
+    rows: Sequence[Row],
+    what: str,
+    advice: str,
+    finding: Callable[..., StatusFinding],
 ) -> Iterator[StatusFinding]:
     name = station["name"]
     if len(rows) <= _LISTED:
@@ -368,14 +406,19 @@ def _grouped(
     yield finding(where, what, advice, min(times, default=None))
 
 
+_RX_REMARKS = ("duplicated", "repeated", "reordered", "late")
+
+
 def _of_received(where: str, row: Row) -> Iterator[StatusFinding]:
     if wrong := {_OTHER_VERSION: "version", _OTHER_LENGTH: "length"}.get(row.get("var_state", 0)):
         advice = "compare the plant files of both stations"
+        if wrong == "version":
+            advice += f"; {VERSION_HINT}"
         yield _error(where, f"dropped: unexpected {wrong}", advice)
     remarks = []
     if row.get("timeouts"):
         remarks.append(f"timed out {times_of(row['timeouts'])}")
-    remarks += [f"{row[key]} {key}" for key in ("duplicated", "reordered", "late") if row[key]]
+    remarks += [f"{row[key]} {key}" for key in _RX_REMARKS if row.get(key)]
     if discarded := _counts(row["discarded"]):
         remarks.append(f"dropped: {discarded}")
     if remarks:

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.cli.status_findings import Severity, StatusFinding, findings
+from eap.cli.status_findings import PUBLISHER_HINT, VERSION_HINT, Severity, StatusFinding, findings
 from eap.ops.client import SilentAppliance
 from tests.support.statusdocument import NOW_S, bus_port, document, frame, merged, rx, tx
 
@@ -207,8 +207,10 @@ def test_cyclic_pd_that_never_came_is_a_warning_and_any_other_a_remark() -> None
     ] == ["warning mixer ← a: nothing received yet", "info mixer ← b: nothing received yet"]
 
 
-@pytest.mark.parametrize(("var_state", "wrong"), [(1, "version"), (2, "length")])
-def test_pd_of_another_layout_is_an_error(var_state: int, wrong: str) -> None:
+@pytest.mark.parametrize(
+    ("var_state", "wrong", "hint"), [(1, "version", f"; {VERSION_HINT}"), (2, "length", "")]
+)
+def test_pd_of_another_layout_is_an_error(var_state: int, wrong: str, hint: str) -> None:
     assert texts(rx=[rx("left", var_state=var_state)]) == [
         (
             f"error mixer ← left: dropped: unexpected {wrong};"
@@ -303,6 +305,33 @@ def test_past_events_are_remarks() -> None:
             " dropped: 5 version, 6 length"
         ),
     ]
+
+
+def test_hints_on_publisher_and_version_are_shown_once() -> None:
+    rows = [
+        rx("a", state="waiting", discarded={"wrong_publisher": 3}),
+        rx("b", state="stale", discarded={"wrong_publisher": 3}),
+        rx("c", var_state=1),
+        rx("d", var_state=1),
+        rx("e", state="waiting"),
+    ]
+    shown = [text for text in texts(rx=rows) if not text.startswith("info")]
+    advice = "'eapctl discover' shows its NetID"
+    assert shown == [
+        (
+            "error mixer ← b: stale: nothing received within the timeout; another publisher sends"
+            f" its PD ID; {advice}; {PUBLISHER_HINT}"
+        ),
+        (
+            "error mixer ← c: dropped: unexpected version; compare the plant files of both"
+            f" stations; {VERSION_HINT}"
+        ),
+        "error mixer ← d: dropped: unexpected version; compare the plant files of both stations",
+        "warning mixer ← e: nothing received yet; check its sender and the network path",
+        (f"warning mixer ← a: nothing received yet; another publisher sends its PD ID; {advice}"),
+    ]
+    for hint in (PUBLISHER_HINT, VERSION_HINT):
+        assert "TwinCAT 2" in hint
 
 
 LISTENER = {
