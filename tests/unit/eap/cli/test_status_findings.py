@@ -214,7 +214,7 @@ def test_pd_of_another_layout_is_an_error(var_state: int, wrong: str, hint: str)
     assert texts(rx=[rx("left", var_state=var_state)]) == [
         (
             f"error mixer ← left: dropped: unexpected {wrong};"
-            " compare the plant files of both stations"
+            f" compare the plant files of both stations{hint}"
         )
     ]
 
