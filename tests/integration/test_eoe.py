@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import signal
 import socket
 import time
 from collections.abc import Iterator
@@ -142,6 +143,21 @@ def test_slaves_reach_each_other(plant: Appliance, host: Namespace) -> None:
     ports = {each["name"]: each for each in ports_of(plant)}
     assert ports["right"]["received"] >= 2
     assert ports["left"]["sent"] >= 2
+
+
+@pytest.mark.parametrize("process", ["services", "engine"])
+def test_page_opens_again_after_a_restart(plant: Appliance, host: Namespace, process: str) -> None:
+    pid = plant.pid(process)
+    os.kill(pid, signal.SIGKILL)
+    plant.wait_for_another(process, pid)
+
+    def is_connected() -> bool:
+        bus = plant.station("mill")["ports"][1].get("bus", {})
+        return {each["ip"] for each in bus.get("eoe", {"slaves": []})["slaves"]} == {LEFT, RIGHT}
+
+    wait_until(is_connected)
+    with page(host, LEFT) as response:
+        assert response.status == 200
 
 
 def test_diagnosis_shows_the_ports_and_a_dead_interface(plant: Appliance, host: Namespace) -> None:

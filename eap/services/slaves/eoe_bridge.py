@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from ipaddress import IPv4Address, IPv4Interface
 from time import monotonic_ns
 
@@ -34,6 +35,8 @@ from eap.services.tasks import TaskSet
 
 OPEN_RETRY_S = 2.0
 """Pause before the interface is opened again."""
+FOLLOW_S = 1.0
+"""Interval at which the description of the bus is confirmed."""
 SETTINGS_TRIES = 3
 SETTINGS_PAUSE_S = 2.0
 """Pause before settings are written again to a slave that did not answer."""
@@ -125,12 +128,12 @@ class EoeBridge:
         self._tap: TapPort | None = None
         self._fault = "the interface is not open yet"
         self._tasks = TaskSet(f"EoE of {bus.name}")
+        bus.listen(self._receive)
+        bus.view.on_change.append(self._update)
 
     async def serve(self) -> None:
         """Connect host and slaves until cancelled."""
-        self._bus.listen(self._receive)
-        self._bus.view.on_change.append(self._update)
-        self._update()
+        self._tasks.start(self._follow())
         try:
             while True:
                 try:
@@ -142,6 +145,14 @@ class EoeBridge:
                 await asyncio.sleep(OPEN_RETRY_S)
         finally:
             await self._tasks.close()
+
+    async def _follow(self) -> None:
+        """Keep the description of the bus complete: a new process gets only what changes."""
+        while True:
+            with suppress(EapError):  # no engine, which will say so itself when it is back
+                await self._bus.view.current()
+            self._update()
+            await asyncio.sleep(FOLLOW_S)
 
     def report(self) -> EoeReport:
         """Return counters and reasons."""

@@ -6,7 +6,9 @@ import os
 import select
 import socket
 import subprocess
+import sys
 from ipaddress import IPv4Interface
+from pathlib import Path
 
 import pytest
 
@@ -104,3 +106,50 @@ def test_missing_device_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(tap, "_DEVICE", str(tmp_path / "tun"))
     with pytest.raises(EnvironmentalError, match="load the kernel module tun"):
         TapPort(NAME)
+
+
+UID = 64_952
+OPEN = """
+import sys
+from eap.errors import EnvironmentalError
+from eap.net.tap import TapPort
+try:
+    port = TapPort(sys.argv[1])
+except EnvironmentalError as exc:
+    print(exc)
+else:
+    print("open", port.is_up())
+"""
+
+
+def open_as_user() -> str:
+    """Return what an ordinary user is told."""
+    if not Path("/dev/net/tun").stat().st_mode & 0o002:
+        pytest.skip("needs /dev/net/tun for every user: chmod 666 /dev/net/tun")
+    # Reading this tree is all that is kept of root.
+    user = ["setpriv", f"--reuid={UID}", f"--regid={UID}", "--clear-groups"]
+    user += ["--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search"]
+    words = [*user, sys.executable, "-c", OPEN, NAME]
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.mark.host_root
+def test_ordinary_user_is_told_how_to_prepare_an_interface():
+    assert open_as_user() == (
+        f"TAP interface {NAME}: not permitted: give this program CAP_NET_ADMIN, or prepare the"
+        f" interface as root: `ip tuntap add dev {NAME} mode tap user {UID}`,"
+        f" `ip link set {NAME} up`"
+    )
+
+
+@pytest.mark.host_root
+def test_ordinary_user_opens_an_interface_that_was_prepared():
+    ip("tuntap", "add", "dev", NAME, "mode", "tap", "user", str(UID))
+    try:
+        assert open_as_user() == (
+            f"TAP interface {NAME} is down: `ip link set {NAME} up` as root switches it on"
+        )
+        ip("link", "set", NAME, "up")
+        assert open_as_user() == "open True"
+    finally:
+        ip("link", "delete", NAME)

@@ -88,6 +88,19 @@ def test_value_on_change_is_sent_at_first_and_when_it_changes():
     play(scene)
 
 
+def test_sum_commands_add_and_delete_notifications():
+    async def scene(client, engine):
+        requests = b"".join(asked(offset).encode() for offset in (WINDOW, 0x5555_0000))
+        added = await client.ask(DRIVE, IndexGroup.SUM_ADD_NOTIFICATION, 2, requests, 16)
+        results = [int.from_bytes(added[at : at + 4], "little") for at in (0, 8)]
+        assert results == [0, AdsError.NOT_FOUND]
+        handle = added[4:8]
+        gone = await client.ask(DRIVE, IndexGroup.SUM_DELETE_NOTIFICATION, 2, 2 * handle, 8)
+        assert gone == bytes(4) + AdsError.NOTIFICATION_HANDLE.to_bytes(4, "little")
+
+    play(scene)
+
+
 def test_deleted_notification_and_gone_client_get_no_more_samples():
     async def scene(client, engine):
         handle = await handle_of(client, asked())
