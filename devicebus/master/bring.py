@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from devicebus.errors import BusError, SiiError
 from devicebus.master.bus import BusSlave, BusState
 from devicebus.master.clocks import synchronize
@@ -17,12 +19,17 @@ from devicebus.master.esm import acknowledge, change_state, path
 from devicebus.master.image import MAX_FMMUS, SlaveLayout, SlaveProcessData
 from devicebus.master.mailboxes import MailboxArea, configure
 from devicebus.master.procedure import Procedure, Sleep, write
+from devicebus.master.scan import FoundSlave, count_slaves, find_ring_end, read_nodes
 from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
 from devicebus.wire.register import Fmmu, Register, SyncManager
 from devicebus.wire.sii import SiiFixed
+from eap.errors import EapError
 from eap.od.slave_config import Transition
 
 MAX_SYNC_MANAGERS = 16
+LOOP_CONTROL = Register.DL_CONTROL + 1
+"""Loop control of the ports, two bits each; 0 opens each port with a link."""
+_ALWAYS_CLOSED = 3
 
 
 def standard_mailbox(fixed: SiiFixed) -> MailboxArea:
@@ -101,9 +108,64 @@ def bring(bus: BusState, slave: BusSlave, target: AlState) -> Procedure[None]:
 
 def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedure[None]:
     """Set the clocks of all slaves, or *only* of the given stations."""
-    _, now_ns = yield Sleep(0)
     present = [slave.found for slave in bus.slaves.values() if not slave.is_lost]
-    states = yield from synchronize(present, now_ns + bus.settings.epoch_offset_ns, only=only)
+    ring = bus.ring
+    if ring is None:
+        yield from _synchronize(bus, present, only)
+        return
+    # A frame that passes a whole ring never comes back through a port, so there would be no round
+    # trip to measure: the last port is closed meanwhile, which makes the ring a line.
+    end = find_ring_end((yield from read_nodes([each.station for each in present])))
+    if not ring.is_whole or end is None:
+        yield from _synchronize_line(bus, present, only)
+        return
+    last, port = present[end[0]].station, end[1]
+    ring.is_opened = True
+    failure: EapError | None = None
+    try:
+        closed = bytes((_ALWAYS_CLOSED << 2 * port,))
+        yield from write(last, LOOP_CONTROL, closed, "loop control")
+        yield from _synchronize_line(bus, present, only)
+    except EapError as exc:
+        failure = exc
+    except GeneratorExit:
+        ring.is_opened = False  # cancelled, so that the next start joins the ring
+        raise
+    yield from write(last, LOOP_CONTROL, b"\0", "loop control")
+    yield from count_slaves()
+    _, now_ns = yield Sleep(0)
+    ring.end_opening(now_ns)
+    if failure is not None:
+        raise failure
+
+
+def _synchronize_line(
+    bus: BusState, present: Sequence[FoundSlave], only: frozenset[int] | None
+) -> Procedure[None]:
+    """Set the clocks of an opened ring by its present topology."""
+    nodes = yield from read_nodes([each.station for each in present])
+    line = [
+        found._replace(position=position, node=node)
+        for position, (found, node) in enumerate(zip(present, nodes, strict=True))
+    ]
+    reached = yield from _count_reached(bus)
+    yield from _synchronize(bus, line, only, reached)
+
+
+def _count_reached(bus: BusState) -> Procedure[int | None]:
+    yield from count_slaves()
+    return None if bus.ring is None or bus.ring.is_opened else bus.ring.reached
+
+
+def _synchronize(
+    bus: BusState,
+    slaves: Sequence[FoundSlave],
+    only: frozenset[int] | None,
+    measured: int | None = None,
+) -> Procedure[None]:
+    _, now_ns = yield Sleep(0)
+    time_ns = now_ns + bus.settings.epoch_offset_ns
+    states = yield from synchronize(slaves, time_ns, only=only, measured=measured)
     bus.distribute_time(states[0].station if states else None)
 
 

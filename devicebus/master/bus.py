@@ -11,11 +11,12 @@ import msgspec
 from devicebus.master.clocks import drift_datagram
 from devicebus.master.cycle import Cycle, Participation
 from devicebus.master.image import BusImage
-from devicebus.master.link import CEILING_NS, RETRIES, Link
+from devicebus.master.link import CEILING_NS, INDEXES, RETRIES, Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
 from devicebus.master.matching import ExpectedSlave
 from devicebus.master.pdo import ProcessDataChannel
 from devicebus.master.procedure import Runner, Task
+from devicebus.master.ring import RING_INDEXES, Ring
 from devicebus.master.scan import FIRST_STATION, FoundSlave
 from devicebus.wire.alstatus import AlState
 from eap.od.slave_config import SlaveConfig
@@ -104,6 +105,8 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Time between two cycles, for SYNC0 and SYNC1 that follow it."""
     epoch_offset_ns: int = 0
     """Offset from the master's time to DC system time (nanoseconds since 2000-01-01)."""
+    redundant: bool = False
+    """True if a second line leads to the other end of the slaves, which then are a ring."""
     allow_lrw: bool = True
     """False exchanges process data by LWR and LRD even if all slaves support LRW."""
 
@@ -221,6 +224,7 @@ class BusState:
         knows_lrw: True if the cycle uses LRW.
         probe_ns: Time of the next look at slaves that are not expected.
         strangers: Slaves that are plugged in, but not expected, in words.
+        ring: Merges the frames of both lines; None on a bus with one line.
     """
 
     def __init__(self, settings: MasterSettings) -> None:
@@ -229,7 +233,9 @@ class BusState:
             ceiling_ns=settings.frame_timeout_ns,
             retries=settings.frame_retries,
             acyclic_octets=settings.acyclic_octets,
+            indexes=RING_INDEXES if settings.redundant else INDEXES,
         )
+        self.ring = Ring(self._handle_ring_change) if settings.redundant else None
         self.runner = Runner(self.link)
         self.changes = ChangeCount()
         self.slaves: dict[int, BusSlave] = {}
@@ -298,6 +304,24 @@ class BusState:
         self.reference = reference
         if self.cycle is not None:
             self.cycle.extra = [] if reference is None else [drift_datagram(reference)]
+
+    @property
+    def beyond_cut(self) -> list[BusSlave]:
+        """Slaves that answer and that only the second line reaches; none in a whole ring."""
+        ring = self.ring
+        if ring is None or ring.is_whole or ring.reached is None:
+            return []
+        return [slave for slave in list(self.slaves.values())[ring.reached :] if not slave.is_lost]
+
+    def _handle_ring_change(self, now_ns: int) -> None:
+        del now_ns
+        self.needs_check = True
+        self.changes.note()
+        assert self.ring is not None  # noqa: S101  it has called
+        clocks = [slave.station for slave in self.beyond_cut if slave.found.esc.has_clock]
+        # Without a clock that leads them, those behind the cut would drift apart.
+        has_time = self.reference is not None and clocks
+        self.ring.second_reference = clocks[0] if has_time else None
 
     def reset(self) -> None:
         """Reset: all slaves become unknown."""

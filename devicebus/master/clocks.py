@@ -45,7 +45,11 @@ class ClockState(NamedTuple):
 
 
 def synchronize(
-    slaves: Sequence[FoundSlave], time_ns: int, *, only: frozenset[int] | None = None
+    slaves: Sequence[FoundSlave],
+    time_ns: int,
+    *,
+    only: frozenset[int] | None = None,
+    measured: int | None = None,
 ) -> Procedure[tuple[ClockState, ...]]:
     """Set delays and offsets; return them, the reference clock first, empty without a clock.
 
@@ -53,6 +57,8 @@ def synchronize(
         slaves: All slaves in the order of the segment.
         time_ns: System time since 2000-01-01, used unless a clock already runs.
         only: Station addresses of slaves that came back; the others stay unchanged.
+        measured: Number of slaves before the cut of a ring.  Those behind it get a delay of 0: their
+            frame enters at port 1 of the last slave, for which find_delays() has no rule.
 
     Raises:
         WorkingCounterError: a slave does not answer.
@@ -66,7 +72,9 @@ def synchronize(
     latched: dict[int, Latched] = {}
     for slave in clocks:
         latched[slave.position] = yield from _read_latched(slave.station)
-    delays = find_delays({each.position: each.node for each in slaves}, latched)
+    line = {at: times for at, times in latched.items() if measured is None or at < measured}
+    delays = dict.fromkeys(latched, 0)
+    delays |= find_delays({each.position: each.node for each in slaves}, line)
     start_ns = time_ns
     # Clocks that run keep their time: a returned slave is set to the system time of the others.
     running = [slave for slave in clocks if only is not None and slave.station not in only]

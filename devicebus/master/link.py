@@ -52,6 +52,7 @@ class RoundTrip:
 
     Args:
         ceiling_ns: Maximum time-out.
+        floor_ns: Minimum time-out.
 
     Attributes:
         timeout_ns: Time-out of a frame that is sent for the first time.
@@ -67,8 +68,8 @@ class RoundTrip:
         "timeout_ns",
     )
 
-    def __init__(self, ceiling_ns: int = CEILING_NS) -> None:
-        self._floor_ns = min(FLOOR_NS, ceiling_ns)
+    def __init__(self, ceiling_ns: int = CEILING_NS, floor_ns: int = FLOOR_NS) -> None:
+        self._floor_ns = min(floor_ns, ceiling_ns)
         self._ceiling_ns = ceiling_ns
         self._backoff_limit_ns = min(BACKOFF_LIMIT_NS, ceiling_ns)
         self._variation_ns = 0
@@ -230,6 +231,7 @@ class Link:
         ceiling_ns: Maximum time-out of a frame.
         retries: Repetitions of a datagram that sets no number of its own.
         acyclic_octets: Budget of acyclic datagrams in a cycle in bytes, headers included.
+        indexes: Number of frame indexes, from 0 on; a ring needs the rest for its second line.
     """
 
     def __init__(
@@ -238,7 +240,9 @@ class Link:
         ceiling_ns: int = CEILING_NS,
         retries: int = RETRIES,
         acyclic_octets: int = 1536,
+        indexes: int = INDEXES,
     ) -> None:
+        self._indexes = indexes
         self._round_trip = RoundTrip(ceiling_ns)
         self._tries = 1 + retries
         self._budget = acyclic_octets
@@ -292,7 +296,7 @@ class Link:
     def frames_to_send(self, now_ns: int) -> list[bytes]:
         """Return the frames to send now."""
         frames: list[bytes] = []
-        while self._cyclic and len(self._in_flight) < INDEXES:
+        while self._cyclic and len(self._in_flight) < self._indexes:
             self._send(self._cyclic, frames, now_ns, cyclic=True)
         while self._may_send_acyclic():
             self._send(self._acyclic, frames, now_ns, cyclic=False)
@@ -383,7 +387,7 @@ class Link:
             bool(self._acyclic)
             and self._acyclic_in_flight < MAX_ACYCLIC_FRAMES
             and (self._credit is None or self._credit > 0)
-            and len(self._in_flight) < INDEXES
+            and len(self._in_flight) < self._indexes
         )
 
     def _send(
@@ -407,12 +411,12 @@ class Link:
     def _free_index(self, now_ns: int) -> int:
         """Return a free index; if all are in use, that of the oldest overdue frame."""
         in_flight, overdue = self._in_flight, self._overdue
-        if len(in_flight) + len(overdue) >= INDEXES:
+        if len(in_flight) + len(overdue) >= self._indexes:
             self._count_lost(next(iter(overdue)), now_ns)
         index = self._index
         while index in in_flight or index in overdue:
-            index = (index + 1) % INDEXES
-        self._index = (index + 1) % INDEXES
+            index = (index + 1) % self._indexes
+        self._index = (index + 1) % self._indexes
         return index
 
     def _count_lost(self, index: int, now_ns: int) -> None:

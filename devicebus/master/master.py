@@ -16,6 +16,7 @@ from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
 from devicebus.master.mailboxes import MailboxStats
 from devicebus.master.procedure import Procedure, Task
+from devicebus.master.ring import Line, Ring
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import shut_down, start_up
 from devicebus.master.watch import (
@@ -60,6 +61,12 @@ class Master:
         self._look: Task[None] | None = None
         self.port_errors = PortErrorLog()
         self._errors_ns = 0
+        self._copies: list[bytes] = []
+
+    @property
+    def ring(self) -> Ring | None:
+        """Ring, None on a bus with one line; read-only."""
+        return self._bus.ring
 
     @property
     def slaves(self) -> dict[int, BusSlave]:
@@ -170,22 +177,43 @@ class Master:
         self._bus.link.stop_cycles()
 
     def frames_to_send(self, now_ns: int) -> list[bytes]:
-        """Return the frames to send now."""
-        return self._bus.link.frames_to_send(now_ns)
+        """Return the frames to send now, on the first line."""
+        frames = self._bus.link.frames_to_send(now_ns)
+        if self._bus.ring is not None and frames:
+            self._copies += self._bus.ring.copy_frames(frames, now_ns)
+        return frames
 
-    def receive_frame(self, data: Buffer, now_ns: int) -> None:
-        """Handle a frame that came back."""
-        self._bus.link.receive_frame(data, now_ns)
+    def take_copies(self) -> list[bytes]:
+        """Return and remove the frames to send on the second line, behind frames_to_send()."""
+        copies, self._copies = self._copies, []
+        return copies
+
+    def receive_frame(self, data: Buffer, now_ns: int, line: Line = Line.FIRST) -> None:
+        """Handle a frame that came back on a line."""
+        ring = self._bus.ring
+        if ring is None:
+            self._bus.link.receive_frame(data, now_ns)
+        elif (merged := ring.receive_frame(line, data, now_ns)) is not None:
+            self._bus.link.receive_frame(merged, now_ns)
+
+    def merge_overdue(self, now_ns: int) -> None:
+        """Handle frames that came back on one line only, while the other is dead."""
+        if self._bus.ring is not None:
+            for merged in self._bus.ring.handle_timeout(now_ns):
+                self._bus.link.receive_frame(merged, now_ns)
 
     def next_timeout(self) -> int | None:
         """Return the time at which :meth:`handle_timeout` must be called."""
         times = [self._bus.link.next_timeout(), self._bus.runner.next_timeout()]
+        if self._bus.ring is not None:
+            times.append(self._bus.ring.next_timeout())
         if self._has_mailbox():
             times.append(self._look_ns)
         return min((at for at in times if at is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
         """Handle expired timers; early calls have no effect."""
+        self.merge_overdue(now_ns)
         self._bus.link.handle_timeout(now_ns)
         self._bus.runner.handle_timeout(now_ns)
         if now_ns >= self._look_ns and self._has_mailbox():

@@ -67,6 +67,15 @@ def find_topology(statuses: Sequence[DlStatus]) -> tuple[TopologyNode, ...]:
     return tuple(nodes)
 
 
+def find_ring_end(nodes: Sequence[TopologyNode]) -> tuple[int, int] | None:
+    """Return position and port of the open end that a frame leaves last; None without one."""
+    for position, node in reversed(list(enumerate(nodes))):
+        taken = {each.parent_port for each in nodes if each.parent == position} | {node.entry_port}
+        if free := [port for port in _ORDER if port in node.ports and port not in taken]:
+            return position, free[-1]
+    return None
+
+
 FIRST_STATION = 1001
 """Station address of the first slave, as TwinCAT counts."""
 MAX_SLAVES = 0xFFFF - FIRST_STATION
@@ -189,6 +198,18 @@ def read_topology(count: int) -> Procedure[list[tuple[int, TopologyNode]]]:
     )
     nodes = find_topology([DlStatus.decode(reply.data) for reply in replies])
     return list(zip(stations, nodes, strict=True))
+
+
+def read_nodes(stations: Sequence[int]) -> Procedure[tuple[TopologyNode, ...]]:
+    """Read the present topology of slaves given in the order of the segment.
+
+    Raises WorkingCounterError if one does not answer.
+    """
+    replies = yield from in_frames([fprd(at, Register.DL_STATUS, DlStatus.SIZE) for at in stations])
+    for station, reply in zip(stations, replies, strict=True):
+        if reply.wkc != 1:
+            raise not_answered(f"slave {station}: reading DL status", reply)
+    return find_topology([DlStatus.decode(reply.data) for reply in replies])
 
 
 def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:

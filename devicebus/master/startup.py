@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from devicebus.errors import BusError, StateTimeoutError
-from devicebus.master.bring import bring, set_clocks
+from devicebus.master.bring import LOOP_CONTROL, bring, set_clocks
 from devicebus.master.bus import BusSlave, BusState
 from devicebus.master.configuration import prepare_safeop, run_writes, transition_of
 from devicebus.master.cycle import Cycle
@@ -36,6 +36,9 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
     bus.reset()
     # The slaves may run under another master: outputs go off before anything is reconfigured.
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
+    if bus.ring is not None:
+        # A master that died while it measured delays has left the ring opened.
+        yield [bwr(LOOP_CONTROL, b"\0")]
     found = yield from scan(bus.settings.first_station)
     slaves = yield from _identify(bus, found)
     bus.slaves = {slave.station: slave for slave in slaves}

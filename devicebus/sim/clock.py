@@ -88,13 +88,15 @@ class Clock:
         pending |= _SYNC1_PENDING * (self.sync1_is_active and time_ns < first)
         self._memory[Register.DC_ACTIVATION_STATUS] = pending
 
-    def latch(self, now_ns: int, port_delays: tuple[int | None, ...]) -> None:
+    def latch(
+        self, now_ns: int, port_delays: tuple[int | None, ...], processing_delay: int
+    ) -> None:
         """Latch the receive times of a frame; a delay of None is a port that it did not pass."""
         for port, delay in enumerate(port_delays):
             if delay is not None:
                 at = Register.DC_RECEIVE_TIME + 4 * port
                 self._set(at, self.local_time(now_ns + delay) % _U32, 4)
-        self._set(Register.DC_RECEIVE_TIME_ECAT, self.local_time(now_ns + (port_delays[0] or 0)), 8)
+        self._set(Register.DC_RECEIVE_TIME_ECAT, self.local_time(now_ns + processing_delay), 8)
 
     def steer(self, data: bytes, now_ns: int) -> None:
         """Compare the system time with a distributed reference time, and correct the clock."""

@@ -120,6 +120,7 @@ class Esc:
         windows: Active FMMUs.
         port_delays: Time from a frame's entry into the segment to its arrival at each port; None
             for a port without arrival; set by the wiring.
+        processing_delay: Time from a frame's entry to its processing here; set by the wiring.
     """
 
     def __init__(self, image: bytes, settings: EscSettings | None = None) -> None:
@@ -148,6 +149,7 @@ class Esc:
         self.event_mask = 0
         self.loops_changed = False
         self.port_delays: tuple[int | None, ...] = (0,) + (None,) * (PORTS - 1)
+        self.processing_delay = 0
         self._describe()
         self.eeprom = Eeprom(self.memory, self._image)
         self.clock = Clock(
@@ -281,7 +283,7 @@ class Esc:
         memory = self.memory
         if page == 0x09:
             # The time is that of the frame's entry into the segment: it reaches this slave later.
-            self.clock.refresh(now_ns + (self.port_delays[0] or 0))
+            self.clock.refresh(now_ns + self.processing_delay)
             return
         if page == 0x05:
             self.eeprom.finish_command(now_ns)
@@ -354,9 +356,9 @@ class Esc:
     def _clock_written(self, start: int, end: int, now_ns: int) -> None:
         # A write to the receive time of port 0 latches all ports.
         if start <= Register.DC_RECEIVE_TIME < end:
-            self.clock.latch(now_ns, self.port_delays)
+            self.clock.latch(now_ns, self.port_delays, self.processing_delay)
         if start <= Register.DC_SYSTEM_TIME < end:
-            entry = now_ns + (self.port_delays[0] or 0)
+            entry = now_ns + self.processing_delay
             last = min(end, Register.DC_SYSTEM_TIME + 8)
             self.clock.steer(bytes(self.memory[Register.DC_SYSTEM_TIME : last]), entry)
         if start < Register.DC_SYSTEM_TIME_FILTER + 2 and end > Register.DC_SYSTEM_TIME_OFFSET:

@@ -21,7 +21,7 @@ from devicebus.mailbox.foe_server import FoeServer
 from devicebus.sim.device import Device, FaultyDictionary
 from devicebus.sim.devices.drive import Axes
 from devicebus.sim.devices.objects import TX_PDO
-from devicebus.sim.segment import SegmentEnd, SimulatedSegment
+from devicebus.sim.segment import SECOND_LINE, SegmentEnd, SimulatedSegment
 from devicebus.sim.slave import SimulatedSlave
 from devicebus.sim.spec import FaultKind, FaultSpec, Value
 from devicebus.wire.alstatus import AlState, AlStatusCode
@@ -192,6 +192,10 @@ class FaultySegment:
     def check(self, spec: FaultSpec) -> None:
         """Raise ValueError for an unknown slave, object or state."""
         needs_slave = spec.kind not in _ON_FRAMES or spec.kind is FaultKind.CORRUPT
+        if spec.second:
+            if spec.kind is not FaultKind.CUT or not self.segment.is_ring:
+                raise ValueError("second: only the cable of a ring (`ring: true`) has it, with cut")
+            needs_slave = False
         if needs_slave and spec.slave not in self._numbers:
             known = ", ".join(self._numbers)
             problem = f"no slave {spec.slave!r}" if spec.slave else "it needs a slave"
@@ -321,7 +325,7 @@ class FaultySegment:
             else:
                 self._on_frames.pop(spec, None)
             return
-        number = self._numbers[spec.slave]
+        number = SECOND_LINE if spec.second else self._numbers[spec.slave]
         if spec.kind is FaultKind.CUT:
             (self.segment.cut if on else self.segment.mend)(number)
         elif spec.kind is FaultKind.POWER:

@@ -27,6 +27,10 @@ PortAt: TypeAlias = "tuple[int, int]"
 """Number of a slave, and one of its ports."""
 
 
+SECOND_LINE = -1
+"""Number of the cable from the ring's end to the second line of the master."""
+
+
 class SegmentEnd(IntEnum):
     """End of the segment at the master; the secondary end exists in a ring only."""
 
@@ -41,6 +45,8 @@ class FramePath(NamedTuple):
     """Slaves that process the frame, in order."""
     arrivals: dict[PortAt, int]
     """Time from its entry to its arrival at each port, in ns."""
+    processed: dict[int, int]
+    """Time from its entry to each slave's processing unit, which a looped port 0 leads to as well."""
     exit: SegmentEnd
     closed_at: int | None
     """Index in *order* of the first slave without a link at port 0."""
@@ -54,6 +60,7 @@ def trace_path(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> FrameP
     """Return the path of a frame from the port where it enters until it leaves the segment."""
     order: list[int] = []
     arrivals: dict[PortAt, int] = {}
+    processed: dict[int, int] = {}
     closed_at = None
     slave, port = enters
     time_ns = 0
@@ -66,10 +73,11 @@ def trace_path(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> FrameP
             if is_loop and closed_at is None:
                 closed_at = len(order)
             order.append(slave)
+            processed[slave] = time_ns
         port = _NEXT_PORT[port]
         target = links.get((slave, port))
         if isinstance(target, SegmentEnd):
-            return FramePath(tuple(order), arrivals, target, closed_at)
+            return FramePath(tuple(order), arrivals, processed, target, closed_at)
         is_loop = target is None
         if target is not None:
             slave, port = target
@@ -132,8 +140,13 @@ class SimulatedSegment:
         self._next_polled = 0
         self._update_wiring()
 
+    @property
+    def is_ring(self) -> bool:
+        """True if it has a second line to the master."""
+        return self._ring_end is not None
+
     def cut(self, child: int) -> None:
-        """Cut the cable at port 0 of slave *child*; 0 is the cable to the master."""
+        """Cut the cable at port 0 of slave *child*, 0 for the cable to the master, or SECOND_LINE."""
         self._cut.add(child)
         self._update_wiring()
 
@@ -236,6 +249,7 @@ class SimulatedSegment:
                 self.slaves[number].esc.port_delays = tuple(
                     path.arrivals.get((number, port)) for port in range(4)
                 )
+                self.slaves[number].esc.processing_delay = path.processed[number]
         joined: list[set[int]] = [set() for _ in self.slaves]
         for number, port in links:
             joined[number].add(port)
@@ -252,7 +266,8 @@ class SimulatedSegment:
             if is_connected and self._is_open(child, 0) and self._is_open(parent, port):
                 links[child, 0] = (parent, port)
                 links[parent, port] = (child, 0)
-        if self._ring_end is not None and self._is_open(*self._ring_end):
+        has_second = self._ring_end is not None and SECOND_LINE not in self._cut
+        if self._ring_end is not None and has_second and self._is_open(*self._ring_end):
             links[self._ring_end] = SegmentEnd.SECONDARY
         return links
 

@@ -208,6 +208,8 @@ class FaultSpec(msgspec.Struct, frozen=True, kw_only=True):
     object: str = ""
     code: U32 = 0
     """SDO abort code, AL status code, FoE error code, or error code of an emergency."""
+    second: bool = False
+    """Cut: the second line of a ring to the master instead of the cable of a slave."""
     axis: Annotated[int, Meta(ge=0, le=7)] = 0
     """Axis of a drive, for its emergency."""
     state: str = ""

@@ -13,6 +13,7 @@ from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, configure
 from devicebus.master.matching import ExpectedSlave
 from devicebus.master.procedure import Procedure, Runner, Sleep, Step, StepReplies, Task
+from devicebus.master.ring import Line as RingEnd
 from devicebus.master.scan import scan
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.segment import POLL_NS, SegmentEnd, SimulatedSegment
@@ -177,9 +178,9 @@ def expect(spec: SlaveSpec, **config) -> ExpectedSlave:
     )
 
 
-def segment(*slaves: SlaveSpec) -> SimulatedSegment:
+def segment(*slaves: SlaveSpec, ring: bool = False) -> SimulatedSegment:
     """A simulated bus of these slaves."""
-    return build_segment(BusSpec(bus="test", slaves=slaves))
+    return build_segment(BusSpec(bus="test", slaves=slaves, ring=ring))
 
 
 class SlowServer(MailboxServer):
@@ -235,6 +236,28 @@ class Paced(Line):
     def events(self):
         """Take all events."""
         return list(iter(self.core.next_event, None))
+
+
+class RingLine(Paced):
+    """Both lines of a ring."""
+
+    def step(self, until_ns):
+        if self.now_ns >= self.next_cycle_ns:
+            self.core.merge_overdue(self.now_ns)
+            self.core.start_cycle(self.now_ns)
+            self.next_cycle_ns = self.now_ns + self.period_ns
+        frames = self.core.frames_to_send(self.now_ns)
+        copies = self.core.take_copies()
+        if not frames:
+            Line.step(self, min(until_ns, self.next_cycle_ns))
+            return
+        self.now_ns += TRIP_NS
+        for pair in zip(frames, copies, strict=True):
+            for end, frame in zip(SegmentEnd, pair, strict=True):
+                octets = bytearray(frame)
+                out = self.segment.process_frame(octets, self.now_ns, end)
+                if out is not None:
+                    self.core.receive_frame(bytes(octets), self.now_ns, RingEnd(out))
 
 
 class Slow(Paced):

@@ -45,7 +45,7 @@ def test_latch_notes_the_ports_that_a_frame_passed(memory):
     clock = Clock(memory, local_start_ns=1 << 32)
     put(memory, Register.DC_RECEIVE_TIME + 12, 0xAAAA, 4)
     clock.local_time(0)
-    clock.latch(1000, (10, 500, None, None))
+    clock.latch(1000, (10, 500, None, None), 10)
     assert [get(memory, 0x0900 + 4 * n, 4) for n in range(4)] == [1010, 1500, 0, 0xAAAA]
     assert get(memory, Register.DC_RECEIVE_TIME_ECAT, 8) == (1 << 32) + 1010
 

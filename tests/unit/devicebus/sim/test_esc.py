@@ -207,7 +207,7 @@ def test_loop_control_is_noted_for_the_wiring(esc):
 
 
 def test_clock_registers(esc):
-    esc.port_delays = (100, 900, None, None)
+    esc.port_delays, esc.processing_delay = (100, 900, None, None), 100
     esc.read(0x0910, 8, 0)
     esc.write(0x0900, bytes(4), 1000)
     assert esc.read(0x0900, 8, 0) == (1000).to_bytes(4, "little") + (1800).to_bytes(4, "little")

@@ -1,0 +1,299 @@
+"""Cable redundancy: both ends of a ring of slaves are connected to the master.
+
+Each frame is sent on both lines, and the two copies that come back are merged into one frame for
+:class:`~devicebus.master.link.Link`.  The rules follow from the way of a frame through a controller
+(ETG.1000.4): it is processed behind port 0 only, and a port without a link loops it back.
+
+- Whole ring: the copy of the first line passes all slaves and arrives on the second line, with all
+  that they did.  The copy of the second line enters the last slave at port 1 and leaves each slave
+  by port 0, so that none processes it: it arrives on the first line as it was sent, and is dropped.
+- Cut ring: each copy is looped back at the cut and returns on its own line.  The slaves before the
+  cut process the first copy.  The second copy is looped back at port 0 of the first slave behind
+  the cut; therefore the slaves behind the cut process it, in the same order as in a whole ring.  No
+  slave processes both, so the working counters add.  Bytes that are read leave the master as zeros:
+  of a datagram that both halves answered, the data is ORed, otherwise it is that of the half that
+  answered.
+
+A position counts from the end at which a frame enters, so a copy with a position command for the
+second line is counted on as if the slaves before the cut had been passed; while their number is not
+known, it is replaced by a NOP.  So is the datagram that distributes the time of the reference clock
+(FRMW): without the reference on its half it would write zeros into all clocks there.  Instead
+another slave can distribute its time behind the cut.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+
+import msgspec
+
+from devicebus.master.link import INDEXES, RoundTrip
+from devicebus.wire.datagram import OVERHEAD, Command, DatagramHeader
+from eap.codec.ethercat import EtherCatHeader
+from eap.codec.wire import Buffer
+
+RING_INDEXES = INDEXES // 2
+"""Frame indexes of a link with a ring: those of the second line have _SECOND_BIT set."""
+# A line that is slow must not be taken for one that is dead.
+WAIT_FLOOR_NS = 500_000
+"""Minimum wait for the other copy of a frame."""
+_CEILING_NS = 100_000_000
+_SECOND_BIT = RING_INDEXES
+_HEADER = struct.Struct("<BBHHHH")
+_SIZE = DatagramHeader.SIZE
+_LENGTH = 0x07FF
+_MORE = 0x8000
+_BY_POSITION = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
+_BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
+_JOINED = frozenset((Command.LRD, Command.LWR, Command.LRW, *_BROADCAST))
+_COUNTED = _BY_POSITION | _BROADCAST
+_NOP, _FRMW = int(Command.NOP), int(Command.FRMW)
+
+
+class Line(IntEnum):
+    """Line from the master to an end of the ring."""
+
+    FIRST = 0
+    SECOND = 1
+
+
+class RingReport(msgspec.Struct, frozen=True, kw_only=True):
+    """State of a ring; times are those of the master."""
+
+    is_whole: bool | None
+    """None before the first frame."""
+    reached: int | None
+    """Number of slaves before the cut; None if it is not known, or in a whole ring."""
+    silent: tuple[int, ...]
+    """Lines (1, 2) whose frames do not come back at all."""
+    cuts: int
+    changed_ns: int
+    """Time of the last cut or mending, 0 before the first."""
+    cut_ns: int
+    """Time of the last cut, 0 before the first."""
+
+
+class _SentCopies:
+    """Frame with its copy for the second line."""
+
+    __slots__ = ("copies", "halves", "is_done", "sent_ns")
+
+    def __init__(self, first: bytes, second: bytes, sent_ns: int) -> None:
+        self.copies = (first, second)
+        self.halves: list[bytes | None] = [None, None]
+        self.sent_ns = sent_ns
+        self.is_done = False
+
+
+class Ring:
+    """Copies of the frames of a link, and the merging of what comes back.
+
+    Args:
+        on_change: Called with the time when the ring was cut or mended, or when the number of
+            slaves before the cut is known.
+
+    Attributes:
+        is_whole: True while frames pass the whole ring; None before the first one.
+        reached: Number of slaves before the cut, None while it is not known.
+        second_reference: Station address of the slave that distributes its time behind a cut.
+        is_opened: True while the master itself has opened the ring, which is no cut.
+        unexpected: Frames that came back and were no copies.
+    """
+
+    def __init__(self, on_change: Callable[[int], None]) -> None:
+        self._on_change = on_change
+        self.is_whole: bool | None = None
+        self.reached: int | None = None
+        self.second_reference: int | None = None
+        self.is_opened = False
+        self.unexpected = 0
+        self._sent: dict[int, _SentCopies] = {}
+        self._waiting: dict[int, _SentCopies] = {}
+        self._silent = [False, False]
+        self._trip = RoundTrip(_CEILING_NS, WAIT_FLOOR_NS)
+        self._cuts = 0
+        self._changed_ns = self._cut_ns = 0
+
+    def copy_frames(self, frames: Sequence[bytes], now_ns: int) -> list[bytes]:
+        """Return the copies for the second line of frames that leave on the first one."""
+        copies = []
+        for frame in frames:
+            copy = self._copy(frame)
+            copies.append(copy)
+            index = frame[3]
+            self._waiting.pop(index, None)
+            self._sent[index] = _SentCopies(frame, copy, now_ns)
+        return copies
+
+    def receive_frame(self, line: Line, data: Buffer, now_ns: int) -> Buffer | None:
+        """Handle a frame that arrives on *line*; return a whole frame for the link, or None."""
+        index = data[3] if len(data) > EtherCatHeader.SIZE + _SIZE else -1
+        copy = Line(index >= _SECOND_BIT)
+        sent = self._sent.get(index & ~_SECOND_BIT) if index >= 0 else None
+        if sent is None or not _is_copy(data, sent.copies[copy]):
+            self.unexpected += 1
+            return None
+        if self._silent[copy]:
+            self._silent[copy] = False
+            self.reached = None  # known again by the next broadcast
+        if copy is not line:
+            self._note(now_ns, is_whole=True)
+            # The copy of the second line was not processed, and would only hide an answer.
+            return None if copy is Line.SECOND else self._finish(sent, data, now_ns)
+        self._note(now_ns, is_whole=False)
+        self._count_slaves(copy, sent.copies[copy], data, now_ns)
+        if sent.is_done:
+            return None
+        sent.halves[copy] = bytes(data)
+        other = Line(1 - copy)
+        if sent.halves[other] is None and not self._silent[other]:
+            self._waiting[sent.copies[0][3]] = sent
+            return None
+        return self._finish(sent, _merge(sent.copies[0], *sent.halves), now_ns)
+
+    def next_timeout(self) -> int | None:
+        """Return the time at which :meth:`handle_timeout` must be called."""
+        times = [sent.sent_ns for sent in self._waiting.values()]
+        return min(times) + self._trip.timeout_ns if times else None
+
+    def handle_timeout(self, now_ns: int) -> list[bytes]:
+        """Return frames of which only one copy came back: the other line is dead."""
+        if not self._waiting:
+            return []
+        limit_ns = now_ns - self._trip.timeout_ns
+        frames = []
+        for sent in [each for each in self._waiting.values() if each.sent_ns <= limit_ns]:
+            dead = Line.FIRST if sent.halves[Line.FIRST] is None else Line.SECOND
+            self._silent[dead] = True
+            if dead is Line.FIRST:
+                self._set_reached(0, now_ns)
+            self._end(sent)
+            frames.append(_merge(sent.copies[0], *sent.halves))
+        return frames
+
+    def end_opening(self, now_ns: int) -> None:
+        """Note that the master has joined the ring again; if it is not whole now, it was cut."""
+        self.is_opened = False
+        if not self.is_whole:
+            self._count_cut(now_ns)
+            self._on_change(now_ns)
+
+    def report(self) -> RingReport:
+        """Return a snapshot of the state."""
+        return RingReport(
+            is_whole=self.is_whole,
+            reached=None if self.is_whole else self.reached,
+            silent=tuple(number for number, each in enumerate(self._silent, 1) if each),
+            cuts=self._cuts,
+            changed_ns=self._changed_ns,
+            cut_ns=self._cut_ns,
+        )
+
+    def _copy(self, frame: bytes) -> bytes:
+        copy = bytearray(frame)
+        offset = EtherCatHeader.SIZE
+        more = _MORE
+        while more:
+            command, index, adp, ado, word, irq = _HEADER.unpack_from(copy, offset)
+            if command in _BY_POSITION:
+                if self.is_whole or self.reached is None:
+                    command = _NOP
+                else:
+                    adp = adp + self.reached & 0xFFFF
+            elif command == _FRMW:
+                if self.is_whole or self.second_reference is None:
+                    command = _NOP
+                else:
+                    adp = self.second_reference
+            _HEADER.pack_into(copy, offset, command, index | _SECOND_BIT, adp, ado, word, irq)
+            offset += OVERHEAD + (word & _LENGTH)
+            more = word & _MORE
+        return bytes(copy)
+
+    def _finish(self, sent: _SentCopies, frame: Buffer, now_ns: int) -> Buffer | None:
+        if sent.is_done:
+            return None
+        self._end(sent)
+        self._trip.measure(now_ns - sent.sent_ns)
+        return frame
+
+    def _end(self, sent: _SentCopies) -> None:
+        sent.is_done = True
+        self._waiting.pop(sent.copies[0][3], None)
+
+    def _note(self, now_ns: int, *, is_whole: bool) -> None:
+        """Note whether the ring is whole."""
+        if is_whole is self.is_whole:
+            return
+        was_whole, self.is_whole = self.is_whole, is_whole
+        self.reached = self.second_reference = None
+        if self.is_opened:
+            return
+        if not is_whole:
+            self._count_cut(now_ns)
+        elif was_whole is not None:
+            self._changed_ns = now_ns
+        self._on_change(now_ns)
+
+    def _count_cut(self, now_ns: int) -> None:
+        self._cuts += 1
+        self._cut_ns = self._changed_ns = now_ns
+
+    def _count_slaves(self, copy: Line, sent: bytes, data: Buffer, now_ns: int) -> None:
+        """Read from a broadcast of the first line how many slaves are before the cut."""
+        # Each slave on the way increments ADP, whether it answers or not.
+        if copy is Line.FIRST and sent[EtherCatHeader.SIZE] in _COUNTED:
+            at = EtherCatHeader.SIZE + 2
+            before = int.from_bytes(sent[at : at + 2], "little")
+            self._set_reached(int.from_bytes(data[at : at + 2], "little") - before & 0xFFFF, now_ns)
+
+    def _set_reached(self, reached: int, now_ns: int) -> None:
+        if reached != self.reached:
+            self.reached = reached
+            self._on_change(now_ns)
+
+
+def _is_copy(data: Buffer, sent: bytes) -> bool:
+    """Return true if *data* has the datagrams of *sent*, processed or not."""
+    if len(data) < len(sent) or data[1] >> 4 != sent[1] >> 4:
+        return False
+    offset = EtherCatHeader.SIZE
+    more = _MORE
+    while more:
+        command, index, _, ado, word, _ = _HEADER.unpack_from(sent, offset)
+        there = _HEADER.unpack_from(data, offset)
+        same = (command, index, ado, word & _LENGTH)
+        if same != (there[0], there[1], there[3], there[4] & _LENGTH):
+            return False
+        offset += OVERHEAD + (word & _LENGTH)
+        more = word & _MORE
+    return True
+
+
+def _merge(sent: bytes, first: bytes | None, second: bytes | None) -> bytes:
+    """Return *sent* with the data and working counters of its copies."""
+    frame = bytearray(sent)
+    offset = EtherCatHeader.SIZE
+    more = _MORE
+    while more:
+        command, _, _, _, word, _ = _HEADER.unpack_from(sent, offset)
+        start = offset + _SIZE
+        end = start + (word & _LENGTH)
+        counts = [
+            int.from_bytes(half[end : end + 2], "little") if half is not None else 0
+            for half in (first, second)
+        ]
+        if all(counts) and command in _JOINED:
+            joined = int.from_bytes(first[start:end], "little")  # type: ignore[index]
+            joined |= int.from_bytes(second[start:end], "little")  # type: ignore[index]
+            frame[start:end] = joined.to_bytes(end - start, "little")
+        elif counts[0]:
+            frame[start:end] = first[start:end]  # type: ignore[index]
+        elif counts[1]:
+            frame[start:end] = second[start:end]  # type: ignore[index]
+        frame[end : end + 2] = (sum(counts) & 0xFFFF).to_bytes(2, "little")
+        offset = end + 2
+        more = word & _MORE
+    return bytes(frame)
