@@ -19,7 +19,7 @@ from devicebus.master.esm import acknowledge, change_state, path
 from devicebus.master.image import MAX_FMMUS, SlaveLayout, SlaveProcessData
 from devicebus.master.mailboxes import MailboxArea, configure
 from devicebus.master.procedure import Procedure, Sleep, write
-from devicebus.master.scan import FoundSlave, count_slaves, find_ring_end, read_nodes
+from devicebus.master.scan import FoundSlave, count_slaves, find_ring_end, read_topology
 from devicebus.wire.alstatus import WITH_PROCESS_DATA, AlState
 from devicebus.wire.register import Fmmu, Register, SyncManager
 from devicebus.wire.sii import SiiFixed
@@ -115,11 +115,12 @@ def set_clocks(bus: BusState, *, only: frozenset[int] | None = None) -> Procedur
         return
     # A frame that passes a whole ring never comes back through a port, so there would be no round
     # trip to measure: the last port is closed meanwhile, which makes the ring a line.
-    end = find_ring_end((yield from read_nodes([each.station for each in present])))
+    topology = yield from read_topology((yield from count_slaves()))
+    end = find_ring_end([node for _, node in topology])
     if not ring.is_whole or end is None:
         yield from _synchronize_line(bus, present, only)
         return
-    last, port = present[end[0]].station, end[1]
+    last, port = topology[end[0]][0], end[1]
     ring.is_opened = True
     failure: EapError | None = None
     try:
@@ -143,18 +144,15 @@ def _synchronize_line(
     bus: BusState, present: Sequence[FoundSlave], only: frozenset[int] | None
 ) -> Procedure[None]:
     """Set the clocks of an opened ring by its present topology."""
-    nodes = yield from read_nodes([each.station for each in present])
+    known = {each.station: each for each in present}
+    topology = yield from read_topology((yield from count_slaves()))
     line = [
-        found._replace(position=position, node=node)
-        for position, (found, node) in enumerate(zip(present, nodes, strict=True))
+        known[station]._replace(position=position, node=node)
+        for position, (station, node) in enumerate(topology)
+        if station in known
     ]
-    reached = yield from _count_reached(bus)
-    yield from _synchronize(bus, line, only, reached)
-
-
-def _count_reached(bus: BusState) -> Procedure[int | None]:
-    yield from count_slaves()
-    return None if bus.ring is None or bus.ring.is_opened else bus.ring.reached
+    is_cut = bus.ring is not None and not bus.ring.is_opened
+    yield from _synchronize(bus, line, only, bus.ring.reached if is_cut and bus.ring else None)
 
 
 def _synchronize(

@@ -11,7 +11,7 @@ import msgspec
 from devicebus.master.clocks import drift_datagram
 from devicebus.master.cycle import Cycle, Participation
 from devicebus.master.image import BusImage
-from devicebus.master.link import CEILING_NS, INDEXES, RETRIES, Link
+from devicebus.master.link import CEILING_NS, INDEXES, MAX_PIGGYBACK, RETRIES, Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
 from devicebus.master.matching import ExpectedSlave
 from devicebus.master.pdo import ProcessDataChannel
@@ -225,6 +225,8 @@ class BusState:
         probe_ns: Time of the next look at slaves that are not expected.
         strangers: Slaves that are plugged in, but not expected, in words.
         ring: Merges the frames of both lines; None on a bus with one line.
+        cut_ends: Station addresses before and behind the last cut of the ring, None in it for the
+            master; None while the place is not known.
     """
 
     def __init__(self, settings: MasterSettings) -> None:
@@ -234,8 +236,13 @@ class BusState:
             retries=settings.frame_retries,
             acyclic_octets=settings.acyclic_octets,
             indexes=RING_INDEXES if settings.redundant else INDEXES,
+            # A cyclic frame does not wait for a dead line, others do.
+            piggyback=0 if settings.redundant else MAX_PIGGYBACK,
         )
-        self.ring = Ring(self._handle_ring_change) if settings.redundant else None
+        self.ring = (
+            Ring(self._handle_ring_change, settings.cycle_ns) if settings.redundant else None
+        )
+        self.cut_ends: tuple[int | None, int | None] | None = None
         self.runner = Runner(self.link)
         self.changes = ChangeCount()
         self.slaves: dict[int, BusSlave] = {}
@@ -311,17 +318,29 @@ class BusState:
         ring = self.ring
         if ring is None or ring.is_whole or ring.reached is None:
             return []
-        return [slave for slave in list(self.slaves.values())[ring.reached :] if not slave.is_lost]
+        return self._answering[ring.reached :]
+
+    @property
+    def _answering(self) -> list[BusSlave]:
+        return [slave for slave in self.slaves.values() if not slave.is_lost]
 
     def _handle_ring_change(self, now_ns: int) -> None:
         del now_ns
         self.needs_check = True
         self.changes.note()
         assert self.ring is not None  # noqa: S101  it has called
+        reached = self.ring.reached
+        if not self.ring.is_whole:
+            self.cut_ends = None if reached is None else self._ends_of_cut(reached)
         clocks = [slave.station for slave in self.beyond_cut if slave.found.esc.has_clock]
         # Without a clock that leads them, those behind the cut would drift apart.
         has_time = self.reference is not None and clocks
         self.ring.second_reference = clocks[0] if has_time else None
+
+    def _ends_of_cut(self, reached: int) -> tuple[int | None, int | None]:
+        stations = [None, *(slave.station for slave in self._answering), None]
+        before, behind = [*stations[reached : reached + 2], None, None][:2]
+        return before, behind
 
     def reset(self) -> None:
         """Reset: all slaves become unknown."""

@@ -57,8 +57,8 @@ def synchronize(
         slaves: All slaves in the order of the segment.
         time_ns: System time since 2000-01-01, used unless a clock already runs.
         only: Station addresses of slaves that came back; the others stay unchanged.
-        measured: Number of slaves before the cut of a ring.  Those behind it get a delay of 0: their
-            frame enters at port 1 of the last slave, for which find_delays() has no rule.
+        measured: Number of slaves before the cut of a ring.  Those behind it get a delay of 0:
+            their frame enters at port 1 of the last slave, for which find_delays() has no rule.
 
     Raises:
         WorkingCounterError: a slave does not answer.

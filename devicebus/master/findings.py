@@ -81,6 +81,17 @@ class BusFinding(msgspec.Struct, frozen=True, kw_only=True):
     """Age of its end in ns, if it has ended and this is known."""
 
 
+class RingCut(NamedTuple):
+    """Last cut of a ring with a second line to the master."""
+
+    ends: tuple[int | None, int | None] | None
+    """Stations before and behind the cut, None in it for the master; None if not known."""
+    since_ns: int
+    """Age of the cut in ns."""
+    until_ns: int | None = None
+    """Age of its mending in ns."""
+
+
 class History(NamedTuple):
     """Past faults of the slaves as a running master noted them."""
 
@@ -94,6 +105,7 @@ class History(NamedTuple):
     """Periods in which errors were counted, by station address and port."""
     mailboxes: tuple[MailboxTimeouts, ...] = ()
     """Slaves with mailbox requests without a reply."""
+    ring: RingCut | None = None
 
 
 def find_causes(
@@ -110,6 +122,11 @@ def find_causes(
     """
     faults = list(diagnosis.faults) if diagnosis is not None else []
     found = []
+    ring = history.ring if history is not None else None
+    cut = find_ring_cut(slaves, ring)
+    if cut and diagnosis is not None:  # the links that it took have the same cause
+        faults = [each for each in faults if not _is_of_cut(each, diagnosis, cut[0])]
+    found += [each for each in cut if not each.is_over]
     for first, count in _silent_runs(slaves):
         before = slaves[first - 1].station if first else None
         there = next((each for each in faults if each.station == before), None)
@@ -125,9 +142,46 @@ def find_causes(
     if diagnosis is not None:
         found += _port_findings(slaves, diagnosis, faults, history)
     past = _past(slaves, history) if history is not None else []
+    past += [each for each in cut if each.is_over]
     missed = find_unanswered(history.mailboxes) if history is not None else []
     present = [each for each in (*found, *missed) if not each.is_over]
     return [*present, *_merged(past, found), *(each for each in missed if each.is_over)]
+
+
+def find_ring_cut(slaves: Sequence[SlaveView], ring: RingCut | None) -> list[BusFinding]:
+    """Return the finding about the last cut of a ring, present or past; none without a cut."""
+    if ring is None:
+        return []
+    ends = "at an unknown place"
+    beside: tuple[int, ...] = ()
+    if ring.ends is not None:
+        names = {each.station: str(each) for each in slaves}
+        beside = tuple(each for each in ring.ends if each in names)
+        first, second = (names.get(each or 0, "") for each in ring.ends)
+        first = first or "the first line of the master"
+        ends = f"between {first} and {second or 'the second line of the master'}"
+    is_over = ring.until_ns is not None
+    return [
+        BusFinding(
+            what=f"the ring {'was' if is_over else 'is'} cut {ends}",
+            advice="" if is_over else "mend the cable: a second cut would lose slaves",
+            slaves=beside,
+            is_over=is_over,
+            since_ns=ring.since_ns,
+            until_ns=ring.until_ns,
+        )
+    ]
+
+
+def _is_of_cut(fault: Fault, diagnosis: BusDiagnosis, cut: BusFinding) -> bool:
+    """Return true if a port has counted nothing but the link that it lost by the cut."""
+    if fault.station not in cut.slaves:
+        return False
+    slave = next(each for each in diagnosis.slaves if each.station == fault.station)
+    return any(
+        port.port == fault.port and port.total == port.lost_links and port.is_open == cut.is_over
+        for port in slave.ports
+    )
 
 
 def find_unanswered(mailboxes: Sequence[MailboxTimeouts]) -> list[BusFinding]:

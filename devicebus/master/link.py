@@ -121,7 +121,7 @@ MAX_DATA = MAX_BODY - OVERHEAD
 MIN_COST = 64
 """Minimum cost of a datagram in the budget."""
 MAX_PIGGYBACK = 256
-"""Bytes of acyclic datagrams in a cyclic frame: 20 µs at 100 Mbit/s."""
+"""Default for the bytes of acyclic datagrams in a cyclic frame: 20 µs at 100 Mbit/s."""
 # More frames would only wait in buffers.
 MAX_ACYCLIC_FRAMES = 8
 """Limit for acyclic frames in flight."""
@@ -231,6 +231,7 @@ class Link:
         ceiling_ns: Maximum time-out of a frame.
         retries: Repetitions of a datagram that sets no number of its own.
         acyclic_octets: Budget of acyclic datagrams in a cycle in bytes, headers included.
+        piggyback: Bytes of acyclic datagrams in a cyclic frame.
         indexes: Number of frame indexes, from 0 on; a ring needs the rest for its second line.
     """
 
@@ -241,8 +242,10 @@ class Link:
         retries: int = RETRIES,
         acyclic_octets: int = 1536,
         indexes: int = INDEXES,
+        piggyback: int = MAX_PIGGYBACK,
     ) -> None:
         self._indexes = indexes
+        self._piggyback = piggyback
         self._round_trip = RoundTrip(ceiling_ns)
         self._tries = 1 + retries
         self._budget = acyclic_octets
@@ -432,7 +435,7 @@ class Link:
         self._fill(items, queue, MAX_BODY, cyclic=cyclic)
         if cyclic and not queue and self._credit is not None and self._credit > 0:
             max_size = MAX_BODY - sum(OVERHEAD + len(item.datagram.data) for item in items)
-            self._fill(items, self._acyclic, min(max_size, MAX_PIGGYBACK), cyclic=False)
+            self._fill(items, self._acyclic, min(max_size, self._piggyback), cyclic=False)
         return items
 
     def _fill(

@@ -69,6 +69,11 @@ class Master:
         return self._bus.ring
 
     @property
+    def cut_ends(self) -> tuple[int | None, int | None] | None:
+        """Stations before and behind the last cut, None in it for the master; None if unknown."""
+        return self._bus.cut_ends
+
+    @property
     def slaves(self) -> dict[int, BusSlave]:
         """Slaves by station address in the order of the segment, read-only."""
         return self._bus.slaves
@@ -243,11 +248,13 @@ class Master:
             },
         )
 
-    def forget_unanswered(self) -> None:
-        """Reset the mailbox requests without a reply, and the late replies, of all slaves."""
+    def forget_past(self) -> None:
+        """Reset mailbox requests without a reply, late replies, and a mended cut of the ring."""
         for slave in self._bus.slaves.values():
             if slave.mailbox is not None:
                 slave.mailbox.forget_unanswered()
+        if self._bus.ring is not None:
+            self._bus.ring.forget_past()
 
     def _stop(self) -> None:
         running, self._running = self._running, None

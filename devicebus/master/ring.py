@@ -19,6 +19,10 @@ second line is counted on as if the slaves before the cut had been passed; while
 known, it is replaced by a NOP.  So is the datagram that distributes the time of the reference clock
 (FRMW): without the reference on its half it would write zeros into all clocks there.  Instead
 another slave can distribute its time behind the cut.
+
+If one copy of a frame does not come, its line may be slow or dead.  A cyclic frame then passes soon
+with the half that came: over a dead line the other one has reached all slaves, and otherwise its
+working counter shows that a half is missing.  Other frames wait until the line is known to be dead.
 """
 
 from __future__ import annotations
@@ -36,9 +40,14 @@ from eap.codec.wire import Buffer
 
 RING_INDEXES = INDEXES // 2
 """Frame indexes of a link with a ring: those of the second line have _SECOND_BIT set."""
-# A line that is slow must not be taken for one that is dead.
-WAIT_FLOOR_NS = 500_000
-"""Minimum wait for the other copy of a frame."""
+# Three quarters of a cycle, so that the half of a dead line does not cost the next cycle.
+_WAIT_SHARE = 0.75
+"""Minimum wait for the other copy of a cyclic frame, in cycles."""
+# Slaves whose answers are on a line that is only slow must not be taken for lost ones.
+DEAD_NS = 50_000_000
+"""Time without a copy after which a line is dead."""
+DEAD_COPIES = 3
+"""Copies that have to be missing on it meanwhile."""
 _CEILING_NS = 100_000_000
 _SECOND_BIT = RING_INDEXES
 _HEADER = struct.Struct("<BBHHHH")
@@ -48,6 +57,7 @@ _MORE = 0x8000
 _BY_POSITION = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
 _BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
 _JOINED = frozenset((Command.LRD, Command.LWR, Command.LRW, *_BROADCAST))
+_CYCLIC = frozenset((Command.LRD, Command.LWR, Command.LRW, Command.FRMW))
 _COUNTED = _BY_POSITION | _BROADCAST
 _NOP, _FRMW = int(Command.NOP), int(Command.FRMW)
 
@@ -65,26 +75,33 @@ class RingReport(msgspec.Struct, frozen=True, kw_only=True):
     is_whole: bool | None
     """None before the first frame."""
     reached: int | None
-    """Number of slaves before the cut; None if it is not known, or in a whole ring."""
+    """Number of slaves before the last cut; None if it is not known."""
     silent: tuple[int, ...]
     """Lines (1, 2) whose frames do not come back at all."""
     cuts: int
-    changed_ns: int
-    """Time of the last cut or mending, 0 before the first."""
-    cut_ns: int
-    """Time of the last cut, 0 before the first."""
+    cut_ns: int | None
+    """Time of the last cut, None before the first."""
+    mended_ns: int | None
+    """Time at which it was mended, None while it lasts."""
 
 
 class _SentCopies:
     """Frame with its copy for the second line."""
 
-    __slots__ = ("copies", "halves", "is_done", "sent_ns")
+    __slots__ = ("copies", "halves", "is_cyclic", "is_done", "second_is_unprocessed", "sent_ns")
 
     def __init__(self, first: bytes, second: bytes, sent_ns: int) -> None:
         self.copies = (first, second)
+        self.is_cyclic = first[EtherCatHeader.SIZE] in _CYCLIC
         self.halves: list[bytes | None] = [None, None]
         self.sent_ns = sent_ns
+        self.second_is_unprocessed = False
         self.is_done = False
+
+    @property
+    def missing_line(self) -> Line:
+        """Line whose copy has not come; the other has."""
+        return Line.FIRST if self.halves[Line.FIRST] is None else Line.SECOND
 
 
 class Ring:
@@ -93,6 +110,7 @@ class Ring:
     Args:
         on_change: Called with the time when the ring was cut or mended, or when the number of
             slaves before the cut is known.
+        cycle_ns: Time between two cyclic frames.
 
     Attributes:
         is_whole: True while frames pass the whole ring; None before the first one.
@@ -102,7 +120,7 @@ class Ring:
         unexpected: Frames that came back and were no copies.
     """
 
-    def __init__(self, on_change: Callable[[int], None]) -> None:
+    def __init__(self, on_change: Callable[[int], None], cycle_ns: int = 1_000_000) -> None:
         self._on_change = on_change
         self.is_whole: bool | None = None
         self.reached: int | None = None
@@ -112,9 +130,13 @@ class Ring:
         self._sent: dict[int, _SentCopies] = {}
         self._waiting: dict[int, _SentCopies] = {}
         self._silent = [False, False]
-        self._trip = RoundTrip(_CEILING_NS, WAIT_FLOOR_NS)
+        self._heard_ns: list[int | None] = [None, None]
+        self._missing = [0, 0]
+        self._trip = RoundTrip(_CEILING_NS, round(_WAIT_SHARE * cycle_ns))
         self._cuts = 0
-        self._changed_ns = self._cut_ns = 0
+        self._place: int | None = None
+        self._cut_ns: int | None = None
+        self._mended_ns: int | None = None
 
     def copy_frames(self, frames: Sequence[bytes], now_ns: int) -> list[bytes]:
         """Return the copies for the second line of frames that leave on the first one."""
@@ -125,6 +147,8 @@ class Ring:
             index = frame[3]
             self._waiting.pop(index, None)
             self._sent[index] = _SentCopies(frame, copy, now_ns)
+        if self._heard_ns[0] is None:
+            self._heard_ns = [now_ns, now_ns]
         return copies
 
     def receive_frame(self, line: Line, data: Buffer, now_ns: int) -> Buffer | None:
@@ -135,43 +159,63 @@ class Ring:
         if sent is None or not _is_copy(data, sent.copies[copy]):
             self.unexpected += 1
             return None
+        self._heard_ns[copy] = now_ns
+        self._missing[copy] = 0
         if self._silent[copy]:
             self._silent[copy] = False
             self.reached = None  # known again by the next broadcast
         if copy is not line:
             self._note(now_ns, is_whole=True)
-            # The copy of the second line was not processed, and would only hide an answer.
-            return None if copy is Line.SECOND else self._finish(sent, data, now_ns)
+            if copy is Line.FIRST:
+                return self._finish(sent, data, now_ns)
+            # Not processed.  If the ring was cut behind it, the half of the first copy is all.
+            sent.second_is_unprocessed = True
+            return self._finish_half(sent, now_ns) if sent.halves[Line.FIRST] else None
         self._note(now_ns, is_whole=False)
         self._count_slaves(copy, sent.copies[copy], data, now_ns)
         if sent.is_done:
             return None
         sent.halves[copy] = bytes(data)
         other = Line(1 - copy)
-        if sent.halves[other] is None and not self._silent[other]:
+        is_expected = not (self._silent[other] or sent.second_is_unprocessed)
+        if sent.halves[other] is None and is_expected:
+            self._missing[other] += 1
             self._waiting[sent.copies[0][3]] = sent
             return None
-        return self._finish(sent, _merge(sent.copies[0], *sent.halves), now_ns)
+        return self._finish_half(sent, now_ns)
 
     def next_timeout(self) -> int | None:
         """Return the time at which :meth:`handle_timeout` must be called."""
-        times = [sent.sent_ns for sent in self._waiting.values()]
-        return min(times) + self._trip.timeout_ns if times else None
+        times = [self._end_of_wait(sent) for sent in self._waiting.values()]
+        return min(times, default=None)
 
     def handle_timeout(self, now_ns: int) -> list[bytes]:
-        """Return frames of which only one copy came back: the other line is dead."""
-        if not self._waiting:
-            return []
-        limit_ns = now_ns - self._trip.timeout_ns
+        """Return the frames that need not wait for their other copy any more."""
         frames = []
-        for sent in [each for each in self._waiting.values() if each.sent_ns <= limit_ns]:
-            dead = Line.FIRST if sent.halves[Line.FIRST] is None else Line.SECOND
-            self._silent[dead] = True
-            if dead is Line.FIRST:
-                self._set_reached(0, now_ns)
-            self._end(sent)
-            frames.append(_merge(sent.copies[0], *sent.halves))
+        for sent in list(self._waiting.values()):
+            if self._end_of_wait(sent) > now_ns:
+                continue
+            line = sent.missing_line
+            if (
+                self._missing[line] >= DEAD_COPIES
+                and now_ns - (self._heard_ns[line] or 0) >= DEAD_NS
+            ):
+                self._silent[line] = True
+                if line is Line.FIRST:
+                    self._set_reached(0, now_ns)
+            if sent.is_cyclic or self._silent[line]:
+                self._end(sent)
+                frames.append(_merge(sent.copies[0], *sent.halves))
+            else:  # the link sends it again
+                del self._waiting[sent.copies[0][3]]
         return frames
+
+    def _end_of_wait(self, sent: _SentCopies) -> int:
+        if sent.is_cyclic:
+            return sent.sent_ns + self._trip.timeout_ns
+        line = sent.missing_line
+        waited_ns = (self._heard_ns[line] or 0) + DEAD_NS
+        return waited_ns if self._missing[line] >= DEAD_COPIES else sent.sent_ns + DEAD_NS
 
     def end_opening(self, now_ns: int) -> None:
         """Note that the master has joined the ring again; if it is not whole now, it was cut."""
@@ -180,15 +224,20 @@ class Ring:
             self._count_cut(now_ns)
             self._on_change(now_ns)
 
+    def forget_past(self) -> None:
+        """Forget a cut that was mended; the number of cuts stays."""
+        if self.is_whole:
+            self._place = self._cut_ns = self._mended_ns = None
+
     def report(self) -> RingReport:
         """Return a snapshot of the state."""
         return RingReport(
             is_whole=self.is_whole,
-            reached=None if self.is_whole else self.reached,
+            reached=self._place,
             silent=tuple(number for number, each in enumerate(self._silent, 1) if each),
             cuts=self._cuts,
-            changed_ns=self._changed_ns,
             cut_ns=self._cut_ns,
+            mended_ns=self._mended_ns,
         )
 
     def _copy(self, frame: bytes) -> bytes:
@@ -212,6 +261,9 @@ class Ring:
             more = word & _MORE
         return bytes(copy)
 
+    def _finish_half(self, sent: _SentCopies, now_ns: int) -> Buffer | None:
+        return self._finish(sent, _merge(sent.copies[0], *sent.halves), now_ns)
+
     def _finish(self, sent: _SentCopies, frame: Buffer, now_ns: int) -> Buffer | None:
         if sent.is_done:
             return None
@@ -227,19 +279,20 @@ class Ring:
         """Note whether the ring is whole."""
         if is_whole is self.is_whole:
             return
-        was_whole, self.is_whole = self.is_whole, is_whole
+        self.is_whole = is_whole
         self.reached = self.second_reference = None
         if self.is_opened:
             return
         if not is_whole:
             self._count_cut(now_ns)
-        elif was_whole is not None:
-            self._changed_ns = now_ns
+        elif self._cut_ns is not None:
+            self._mended_ns = now_ns
         self._on_change(now_ns)
 
     def _count_cut(self, now_ns: int) -> None:
         self._cuts += 1
-        self._cut_ns = self._changed_ns = now_ns
+        self._cut_ns = now_ns
+        self._place = self._mended_ns = None
 
     def _count_slaves(self, copy: Line, sent: bytes, data: Buffer, now_ns: int) -> None:
         """Read from a broadcast of the first line how many slaves are before the cut."""
@@ -252,6 +305,8 @@ class Ring:
     def _set_reached(self, reached: int, now_ns: int) -> None:
         if reached != self.reached:
             self.reached = reached
+            if not self.is_opened:
+                self._place = reached
             self._on_change(now_ns)
 
 

@@ -200,18 +200,6 @@ def read_topology(count: int) -> Procedure[list[tuple[int, TopologyNode]]]:
     return list(zip(stations, nodes, strict=True))
 
 
-def read_nodes(stations: Sequence[int]) -> Procedure[tuple[TopologyNode, ...]]:
-    """Read the present topology of slaves given in the order of the segment.
-
-    Raises WorkingCounterError if one does not answer.
-    """
-    replies = yield from in_frames([fprd(at, Register.DL_STATUS, DlStatus.SIZE) for at in stations])
-    for station, reply in zip(stations, replies, strict=True):
-        if reply.wkc != 1:
-            raise not_answered(f"slave {station}: reading DL status", reply)
-    return find_topology([DlStatus.decode(reply.data) for reply in replies])
-
-
 def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
     """Assign station addresses to the slaves at the given positions.
 

@@ -46,7 +46,7 @@ class FramePath(NamedTuple):
     arrivals: dict[PortAt, int]
     """Time from its entry to its arrival at each port, in ns."""
     processed: dict[int, int]
-    """Time from its entry to each slave's processing unit, which a looped port 0 leads to as well."""
+    """Time from its entry to each slave's processing unit; a looped port 0 leads there, too."""
     exit: SegmentEnd
     closed_at: int | None
     """Index in *order* of the first slave without a link at port 0."""
@@ -84,12 +84,15 @@ def trace_path(links: Links, enters: PortAt, cable_ns: int = CABLE_NS) -> FrameP
             time_ns += FORWARD_NS + cable_ns
 
 
-def dl_status(joined: frozenset[int]) -> int:
-    """Return the DL status of a powered controller with a link at the ports *joined*."""
+def dl_status(joined: frozenset[int], closed_links: frozenset[int] = frozenset()) -> int:
+    """Return the DL status of a powered controller with a link at the ports *joined*.
+
+    Ports of *closed_links* have a link, too, but their loop was closed by the master.
+    """
     status = 0x0007
     for port in range(4):
         closed = port not in joined
-        status |= (not closed) << 4 + port
+        status |= (port in joined or port in closed_links) << 4 + port
         status |= (0x01 if closed else 0x02) << 8 + 2 * port
     return status
 
@@ -146,7 +149,7 @@ class SimulatedSegment:
         return self._ring_end is not None
 
     def cut(self, child: int) -> None:
-        """Cut the cable at port 0 of slave *child*, 0 for the cable to the master, or SECOND_LINE."""
+        """Cut the cable at port 0 of slave *child* (0: to the master), or SECOND_LINE."""
         self._cut.add(child)
         self._update_wiring()
 
@@ -255,7 +258,14 @@ class SimulatedSegment:
             joined[number].add(port)
         for slave, ports in zip(self.slaves, joined, strict=True):
             slave.esc.loops_changed = False
-            slave.esc.set_dl_status(dl_status(frozenset(ports)))
+            slave.esc.set_dl_status(dl_status(frozenset(ports), self._closed_links(slave)))
+
+    def _closed_links(self, slave: SimulatedSlave) -> frozenset[int]:
+        """Return the port of the second line if its loop was closed: its link is not lost."""
+        if self._ring_end is None or SECOND_LINE in self._cut:
+            return frozenset()
+        number, port = self._ring_end
+        return frozenset((port,)) if slave is self.slaves[number] else frozenset()
 
     def _links(self) -> dict[PortAt, PortAt | SegmentEnd]:
         links: dict[PortAt, PortAt | SegmentEnd] = {}

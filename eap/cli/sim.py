@@ -55,7 +55,7 @@ def sim() -> None:
     "--second",
     callback=_parse_interface,
     metavar="URI",
-    help="Second interface of a ring: ethernet://IFACE.",
+    help="Second interface of a ring, of the same kind.",
 )
 @click.option("--faults", is_flag=True, help="Read faults from stdin, one JSON object per line.")
 def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults: bool) -> None:
@@ -68,9 +68,9 @@ def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults:
     from eap.segment import process as segment_process
 
     loaded = busfile.load_or_raise(bus)
-    if second is not None and not (loaded.spec.ring and second.scheme == "ethernet"):
+    if second is not None and not (loaded.spec.ring and second.scheme == interface.scheme):
         raise click.UsageError(
-            "--second needs an ethernet:// interface and a bus file with ring: true"
+            "--second needs an interface of the same kind and a bus file with ring: true"
         )
     # Only on request: a background process that reads its terminal is stopped by SIGTTIN.
     command_fd = sys.stdin.fileno() if faults else None

@@ -40,6 +40,25 @@ def check_bus_port(port: PortSection, uri: InterfaceUri, report: FindingReport) 
     if uri.scheme == "sim" and port.bus and Path(port.bus) != Path(uri.host):
         message = f"port {port.name} simulates {uri.host}, but is described by {port.bus}"
         report.add(f"{port.at}.bus", message, "no key bus: the simulated file is the description")
+    if port.redundant:
+        _check_second_line(port, uri, report)
+
+
+def _check_second_line(port: PortSection, uri: InterfaceUri, report: FindingReport) -> None:
+    """Report an interface that the second line of a ring cannot have."""
+    path = f"{port.at}.redundant"
+    try:
+        second = InterfaceUri.parse(port.redundant)
+    except ValueError as exc:
+        report.add(path, f"redundant: {exc}", f"an interface, such as {uri.scheme}://…")
+        return
+    if second.scheme != uri.scheme or second.options:
+        expected = f"another {uri.scheme}:// interface, without options"
+        report.add(path, f"{second} is no second line beside {uri}", expected)
+    elif uri.scheme == "sim" and Path(second.host) != Path(uri.host):
+        report.add(path, f"the second line simulates {second.host}", f"{uri}: both lines of a ring")
+    elif uri.scheme != "sim" and (second.host, second.port) == (uri.host, uri.port):
+        report.add(path, f"{second} is the first line, too", "another interface")
 
 
 def describe_buses(
@@ -65,6 +84,10 @@ def describe_buses(
             description = known[file]
         if description is not None and not _has_names(path, port, description, report):
             description = None
+        is_line = description is not None and not description.is_ring
+        if is_line and port.redundant.startswith("sim://"):
+            message = f"{file} has one line to the master only"
+            report.add(f"{port.at}.redundant", message, "ring: true in the bus file")
         if description is not None:
             description = _configure(plant, station, port, description, report)
         # The first of two ports of one name counts, as everywhere in the index.
@@ -83,7 +106,7 @@ def _configure(
     slaves = override(description.slaves, port.slaves, report, f"{port.at}.slaves")
     cycle_us = station.cycle_us or plant.defaults.cycle_us
     check_cycles({slave.name: slave for slave in slaves}, cycle_us, report, port.at)
-    return ExpectedBus(slaves)
+    return ExpectedBus(slaves, description.is_ring)
 
 
 def bus_file(port: PortSection, folder: Path) -> tuple[str, Path | None]:

@@ -108,6 +108,8 @@ class ExpectedBus(msgspec.Struct, frozen=True):
     """A bus, in the order of the line."""
 
     slaves: tuple[DescribedSlave, ...] = ()
+    is_ring: bool = False
+    """True if its bus file has a second line to the master."""
 
 
 class BusVariable(NamedTuple):

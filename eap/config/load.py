@@ -328,6 +328,7 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
             port.clocks,
             port.frame_timeout_us,
             port.frame_retries,
+            port.redundant,
         ),
         gateway=gateway_spec(index, station, port),
         eoe=eoe_spec(port),

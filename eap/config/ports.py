@@ -405,6 +405,11 @@ def _check_addresses(index: Index, report: FindingReport) -> None:
                 report.add(path, message, "an address of its own for each port")
                 break
             first[key] = path
+        if port.redundant and port.redundant in {str(each) for each in index.uris.values()} - {
+            str(uri)
+        }:
+            message = f"{port.redundant} is the interface of another port"
+            report.add(f"{port.at}.redundant", message, "an interface of its own for each line")
     # Slaves forward every frame, also those of other stations on the same interface.
     _check_segments(index, report)
 

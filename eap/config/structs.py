@@ -184,6 +184,7 @@ class PortSection(Section, frozen=True):
     clocks: bool = False
     frame_timeout_us: FrameTimeout = 1_000_000
     frame_retries: FrameRetries = 4
+    redundant: str = ""
     gateway: GatewaySection = GatewaySection()
     slaves: dict[str, SlaveSection] = {}
     eoe: EoeSection | None = None
@@ -211,6 +212,7 @@ class PortSection(Section, frozen=True):
         "clocks",
         "frame_timeout_us",
         "frame_retries",
+        "redundant",
         "gateway",
         "slaves",
         "eoe",

@@ -75,7 +75,7 @@ class EngineBuses:
         self.buses = [self._make(given, stations[given.owner.station]) for given in handover.buses]
         self.requests: BusRequestHandler | None = None
         self.arrivals: dict[int, Callable[[int], None]] = {
-            bus.fileno(): bus.drain for bus in self.buses
+            fd: bus.drain for bus in self.buses for fd in bus.filenos()
         }
         if handover.bus_fd != NO_DESCRIPTOR:
             self.requests = BusRequestHandler(
@@ -108,7 +108,8 @@ class EngineBuses:
             if not waiting:
                 return
             times = [end_ns, *(at for bus in waiting if (at := bus.next_timeout()) is not None)]
-            select.select(waiting, [], [], max(0, min(times) - now_ns) / 1e9)
+            lines = [fd for bus in waiting for fd in bus.filenos()]
+            select.select(lines, [], [], max(0, min(times) - now_ns) / 1e9)
             for bus in waiting:
                 bus.drain(clock())
                 bus.handle_timeout(clock())
@@ -124,13 +125,18 @@ class EngineBuses:
         port = self._handover.port(given.owner)
         station = entry.station
         epoch_offset_ns = time.time_ns() - time.monotonic_ns() - _EPOCH_S * 1_000_000_000
+        first = BusPort(socket.socket(fileno=given.engine_fd))
+        second = None
+        if given.second_fd != NO_DESCRIPTOR:
+            second = BusPort(socket.socket(fileno=given.second_fd), source=first.source)
         bus = EngineBus(
             port,
             master_settings(port, station.spec.cycle_us, epoch_offset_ns),
             station.cycle_ns,
             station.image,
             station.memory_of,
-            BusPort(socket.socket(fileno=given.engine_fd)),
+            first,
+            second,
         )
         station.connect_bus(bus)
         entry.buses[port.name] = bus
@@ -164,6 +170,7 @@ def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> 
         clocks=spec.clocks,
         cycle_ns=1000 * cycle_us,
         epoch_offset_ns=epoch_offset_ns,
+        redundant=bool(spec.redundant),
     )
 
 

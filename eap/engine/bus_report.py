@@ -15,6 +15,7 @@ from eap.runtime.engine_messages import (
     BusChange,
     BusReport,
     PortErrorReport,
+    RingState,
     SlaveDescription,
     SlaveReport,
 )
@@ -55,6 +56,21 @@ def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
         received_wkc=cycle.received_wkc if cycle else 0,
         trip_ns=cycle.trip_ns if cycle else 0,
         max_trip_ns=cycle.max_trip_ns if cycle else 0,
+        ring=_ring(bus, now_ns),
+    )
+
+
+def _ring(bus: EngineBus, now_ns: int) -> RingState | None:
+    if bus.master.ring is None:
+        return None
+    report = bus.master.ring.report()
+    return RingState(
+        is_whole=report.is_whole,
+        ends=bus.master.cut_ends if report.cut_ns is not None else None,
+        silent=report.silent,
+        cuts=report.cuts,
+        cut_ns=None if report.cut_ns is None else now_ns - report.cut_ns,
+        mended_ns=None if report.mended_ns is None else now_ns - report.mended_ns,
     )
 
 

@@ -25,6 +25,7 @@ from devicebus.master.findings import NO_ANSWER
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
 from devicebus.master.procedure import Task
+from devicebus.master.ring import Line
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from eap.engine.bus_mapping import BusMapping
 from eap.errors import EnvironmentalError
@@ -154,6 +155,7 @@ class EngineBus:
         image: Of the station.
         memory_of: Returns where a station reads what a writer writes.
         port: The wire.
+        second: Second line to a ring of slaves, None on a bus with one line.
 
     Attributes:
         is_up: Whether the bus has been brought up, in any state of its slaves.
@@ -168,6 +170,7 @@ class EngineBus:
         image: Image,
         memory_of: Callable[[Writer], memoryview],
         port: BusPort,
+        second: BusPort | None = None,
     ) -> None:
         self.spec = spec.bus or BusPortSpec()
         self.master = Master(settings)
@@ -178,6 +181,7 @@ class EngineBus:
         self._is_slow = cycle_ns > _LONG_CYCLE_NS
         self._mapping = BusMapping(spec, image, memory_of)
         self._port = port
+        self._second = second
         self._starting: Task[None] | None = None
         self._start_fault = "it is being brought up"
         self._wire_fault = ""
@@ -204,15 +208,22 @@ class EngineBus:
         """Return the descriptor that becomes readable when a frame waits."""
         return self._port.fileno()
 
+    def filenos(self) -> list[int]:
+        """Return the descriptors of all lines."""
+        return [each.fileno() for each in (self._port, self._second) if each is not None]
+
     def close(self) -> None:
         """Close the bus port."""
         self._port.close()
+        if self._second is not None:
+            self._second.close()
 
     def start(self, now_ns: int) -> None:
         """Begin to bring the bus up."""
-        for _ in range(_MAX_STALE):
-            if self._receive_frame() is None:
-                break  # the rest was for an engine that has died
+        for port in (self._port, self._second):
+            for _ in range(_MAX_STALE):
+                if port is None or self._receive_frame(port) is None:
+                    break  # the rest was for an engine that has died
         self._guarded(self._start, now_ns)
 
     def shut_down(self, now_ns: int) -> Task[None]:
@@ -232,7 +243,7 @@ class EngineBus:
     def forget_past(self) -> None:
         """Forget faults that are over, times of port errors, and mailbox time-outs."""
         self.faults.forget_past()
-        self.master.forget_unanswered()
+        self.master.forget_past()
         self.master.port_errors.clear()
 
     def prepare_mapping(
@@ -337,25 +348,41 @@ class EngineBus:
     def _receive_frames(self, now_ns: int) -> None:
         """Receive a batch of frames first: a frame that waits in the socket is not overdue."""
         for _ in range(BATCH):
-            frame = self._receive_frame()
+            frame = self._receive_frame(self._port)
             if frame is None:
                 break
             self.master.receive_frame(frame, now_ns)
+        if self._second is not None:
+            self._receive_second(self._second, now_ns)
 
-    def _receive_frame(self) -> bytes | None:
+    def _receive_second(self, port: BusPort, now_ns: int) -> None:
+        for _ in range(BATCH):
+            frame = self._receive_frame(port)
+            if frame is None:
+                break
+            self.master.receive_frame(frame, now_ns, Line.SECOND)
+        self.master.merge_overdue(now_ns)
+
+    def _receive_frame(self, port: BusPort) -> bytes | None:
         try:
-            return self._port.receive()
+            return port.receive()
         except EnvironmentalError as exc:
             self._wire_fault = str(exc)
             return None
 
     def _send(self, now_ns: int) -> None:
         for frame in self.master.frames_to_send(now_ns):
-            try:
-                self._port.send(frame)
-                self._wire_fault = ""
-            except EnvironmentalError as exc:
-                self._wire_fault = str(exc)
+            self._send_frame(self._port, frame)
+        if self._second is not None:
+            for frame in self.master.take_copies():
+                self._send_frame(self._second, frame)
+
+    def _send_frame(self, port: BusPort, frame: bytes) -> None:
+        try:
+            port.send(frame)
+            self._wire_fault = ""
+        except EnvironmentalError as exc:
+            self._wire_fault = str(exc)
 
     def _is_busy(self) -> bool:
         """Return whether something is under way that should not wait for the next cycle."""

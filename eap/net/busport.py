@@ -38,13 +38,22 @@ class BusPort:
     Args:
         sock: As :func:`open_bus_socket` returns it, or one of a pair whose other end is a
             :class:`SegmentSocket`.
+        source: Source address of the frames; by default that of the interface.  Both lines of a
+            ring have one, for the frames of each arrive on the other.
     """
 
-    def __init__(self, sock: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, *, source: bytes = b"") -> None:
         self._sock = sock
         self._interface = sock.getsockname()[0] if sock.family == socket.AF_PACKET else ""
-        self._header = _ethernet_header(sock) if sock.family == socket.AF_PACKET else b""
+        self._header = b""
+        if self._interface:
+            self._header = _ethernet_header(source or sock.getsockname()[4])
         sock.setblocking(False)
+
+    @property
+    def source(self) -> bytes:
+        """Source address of the frames on Ethernet, else nothing."""
+        return self._header[6:12]
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -95,7 +104,8 @@ class BusPort:
         """Find the interface that was taken away, if another of its name has come."""
         with suppress(OSError, EnvironmentalError):
             join_type1(self._sock, self._interface, bytes(BUS_MULTICAST_MAC))
-            self._header = _ethernet_header(self._sock)
+            # The address stays, although the new interface may have another one: the frames of
+            # both lines of a ring have the same, and other masters have other addresses.
 
 
 def open_bus_port(interface: InterfaceUri) -> BusPort:
@@ -133,8 +143,8 @@ def _source(data: bytes) -> bytes:
     return bytes((data[6] | _PROCESSED,)) + data[7:12]
 
 
-def _ethernet_header(sock: socket.socket) -> bytes:
-    own = bytearray(sock.getsockname()[4])
+def _ethernet_header(address: bytes) -> bytes:
+    own = bytearray(address)
     own[0] &= ~_PROCESSED  # the bit by which the first slave marks what it has processed
     return bytes(BUS_MULTICAST_MAC) + own + struct.pack("!H", ETHERTYPE)
 

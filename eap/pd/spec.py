@@ -323,6 +323,8 @@ class BusPortSpec(SpecRecord, frozen=True):
     """Upper limit of the time-out after which a frame is sent again."""
     frame_retries: int = 4
     """Times that a frame that is overdue is sent again."""
+    redundant: str = ""
+    """Interface of the second line to the other end of the slaves; empty without a ring."""
 
 
 class LinkSpec(SpecRecord, frozen=True):

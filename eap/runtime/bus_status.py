@@ -13,8 +13,10 @@ from devicebus.master.findings import (
     FaultPeriod,
     History,
     MailboxTimeouts,
+    RingCut,
     SlaveView,
     find_causes,
+    find_ring_cut,
     find_silence,
     find_unanswered,
 )
@@ -75,7 +77,9 @@ def report_findings(report: BusReport) -> list[BusFinding]:
     views = [_view(slave) for slave in report.slaves]
     if is_silent(report):
         return [find_silence(views, report.silent_since_ns)]
+    cut = [each for each in find_ring_cut(views, _ring_cut(report)) if not each.is_over]
     return [
+        *cut,
         *find_causes(views),
         *find_unanswered(_mailboxes(report)),
         *find_eoe_faults(report.eoe),
@@ -113,7 +117,14 @@ def history_of(report: BusReport) -> History:
         for each in slave.port_errors:
             ports[slave.station, each.port] = FaultPeriod(each.since_ns, each.until_ns)
     since_ns = report.silent_since_ns if is_silent(report) else None
-    return History(tuple(over), silence, since_ns, ports, _mailboxes(report))
+    return History(tuple(over), silence, since_ns, ports, _mailboxes(report), _ring_cut(report))
+
+
+def _ring_cut(report: BusReport) -> RingCut | None:
+    ring = report.ring
+    if ring is None or ring.cut_ns is None:
+        return None
+    return RingCut(ring.ends, ring.cut_ns, ring.mended_ns)
 
 
 def _mailboxes(report: BusReport) -> tuple[MailboxTimeouts, ...]:
@@ -187,7 +198,30 @@ def bus_document(report: BusReport | None, now_s: float) -> dict[str, Any]:
             "trip_us": report.trip_ns // 1000,
             "max_trip_us": report.max_trip_ns // 1000,
             "frames": count_frames(report),
+            **_ring_document(report, now_s),
             **({} if report.eoe is None else {"eoe": report.eoe}),
+        }
+    }
+
+
+def _ring_document(report: BusReport, now_s: float) -> dict[str, Any]:
+    """Return the key ``ring``, of a bus with two lines only."""
+    ring = report.ring
+    if ring is None:
+        return {}
+    names = {each.station: each.name for each in report.slaves}
+    ends = [
+        NamedSlave(each, names[each]) if each is not None and each in names else None
+        for each in ring.ends or ()
+    ]
+    return {
+        "ring": {
+            "is_whole": ring.is_whole,
+            "cuts": ring.cuts,
+            "between": ends,
+            "silent_lines": ring.silent,
+            "cut": _moment(ring.cut_ns, now_s),
+            "mended": _moment(ring.mended_ns, now_s),
         }
     }
 

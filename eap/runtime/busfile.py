@@ -121,7 +121,8 @@ def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
         tuple(
             configure(_describe(bus, number), bus.spec.slaves[number].master, report)
             for number in _line(bus.spec)
-        )
+        ),
+        bus.spec.ring,
     )
 
 

@@ -226,6 +226,21 @@ class EoeReport(msgspec.Struct, frozen=True, kw_only=True):
     slaves: tuple[EoePortReport, ...]
 
 
+class RingState(msgspec.Struct, frozen=True, kw_only=True):
+    """Ring with a second line to the master; times are ages in nanoseconds."""
+
+    is_whole: bool | None
+    """None before the first frame."""
+    ends: tuple[int | None, int | None] | None = None
+    """Stations before and behind the last cut, None in it for the master; None if not known."""
+    silent: tuple[int, ...] = ()
+    """Lines (1, 2) whose frames do not come back at all."""
+    cuts: int = 0
+    cut_ns: int | None = None
+    """Age of the last cut."""
+    mended_ns: int | None = None
+
+
 class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Description of a bus; counters since the engine started, times in nanoseconds."""
 
@@ -260,6 +275,8 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     received_wkc: int = 0
     trip_ns: int = 0
     max_trip_ns: int = 0
+    ring: RingState | None = None
+    """None on a bus with one line."""
     malformed: int = 0
     """Malformed messages of services, for all buses of the engine together."""
     dropped: int = 0

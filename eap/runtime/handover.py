@@ -92,6 +92,10 @@ class BusSocket(SpecRecord, frozen=True):
     """Socket on which that process receives commands, one JSON object each, and answers them."""
     command_fd: int = NO_DESCRIPTOR
     """The other side of that pair, for services."""
+    second_fd: int = NO_DESCRIPTOR
+    """Socket of the second line of a ring, for the engine."""
+    segment_second_fd: int = NO_DESCRIPTOR
+    """The other side of its pair, for the process of a simulated segment."""
 
 
 class InheritedRecord(SpecRecord, frozen=True):
@@ -125,6 +129,8 @@ class SegmentHandover(InheritedRecord, frozen=True):
     """This side of the pair with the engine."""
     command_fd: int
     """This side of the pair with services."""
+    second_fd: int = NO_DESCRIPTOR
+    """This side of the pair with the engine for the second line of a ring."""
     realtime: bool = False
     """As in EngineOptions."""
 

@@ -20,14 +20,14 @@ from typing import Any, Protocol
 
 import msgspec
 
-from devicebus.sim.fault import FaultySegment, execute_command
+from devicebus.sim.fault import FaultySegment, Outgoing, execute_command
 from devicebus.sim.segment import SegmentEnd
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net import realtime
 from eap.net.busport import SegmentSocket, open_segment
 from eap.runtime.busfile import BusFile, load_or_raise
-from eap.runtime.handover import SegmentHandover
+from eap.runtime.handover import NO_DESCRIPTOR, SegmentHandover
 from eap.runtime.startup import Startup, catch_end_signals
 
 _BATCH = 64
@@ -142,15 +142,18 @@ def run_for_appliance(handover: SegmentHandover, startup: Startup) -> None:
     startup.step("building the slaves")
     segment = bus.build()
     with catch_end_signals() as end_fd, ExitStack() as stack:
-        frames = SegmentSocket(socket.socket(fileno=handover.frames_fd))
-        stack.callback(frames.close)
+        sockets = {}
+        for side, fd in zip(SegmentEnd, (handover.frames_fd, handover.second_fd), strict=True):
+            if fd != NO_DESCRIPTOR:
+                sockets[side] = frames = SegmentSocket(socket.socket(fileno=fd))
+                stack.callback(frames.close)
+                while frames.receive() is not None:
+                    continue  # sent while no segment ran; the engine no longer waits for it
         commands = stack.enter_context(socket.socket(fileno=handover.command_fd))
-        while frames.receive() is not None:
-            continue  # sent while no segment ran; the engine no longer waits for it
         gc.collect()
         gc.freeze()
         startup.finish({"slaves": len(bus.spec.slaves)})
-        _Loop(segment, {SegmentEnd.PRIMARY: frames}, CommandMessages(commands)).run(end_fd)
+        _Loop(segment, sockets, CommandMessages(commands)).run(end_fd)
 
 
 class _Loop:
@@ -163,6 +166,8 @@ class _Loop:
         self._segment = segment
         self._sockets = sockets
         self._commands = commands
+        self._origins: dict[SegmentEnd, bytes | tuple[str, int]] = {}
+        """Origin of the last frame of each line."""
         self._late_ns = 0
         """Time after which this process has not run for a while, though there was work."""
 
@@ -197,12 +202,20 @@ class _Loop:
             if arrival is None:
                 segment.handle_timeout(now_ns)
             else:
+                self._origins[side] = arrival.origin
                 segment.receive_frame(arrival.frame, now_ns, side=side, origin=arrival.origin)
             for out in segment.frames_to_send(now_ns):
-                if out.side in self._sockets:
-                    self._sockets[out.side].send(out.frame, out.origin)
+                self._send(out)
             if arrival is None:
                 return
+
+    def _send(self, out: Outgoing) -> None:
+        origin = out.origin
+        # By UDP each line of the master has its own address, and takes frames from its end only.
+        if isinstance(origin, tuple) and len(self._sockets) > 1:
+            origin = self._origins.get(out.side)
+        if out.side in self._sockets and origin is not None:
+            self._sockets[out.side].send(out.frame, origin)
 
     def _receive_commands(self) -> bool:
         assert self._commands is not None  # noqa: S101  only called when it is readable

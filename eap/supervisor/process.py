@@ -31,7 +31,7 @@ from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, StationSpec
 from eap.pd.station import Station
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
-from eap.runtime.handover import EngineOptions, Handover, SegmentHandover
+from eap.runtime.handover import NO_DESCRIPTOR, EngineOptions, Handover, SegmentHandover
 from eap.runtime.plantfile import load_plant, require_own_buses
 from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
@@ -423,7 +423,8 @@ def _given_to_segments(
     for owner, handover in handovers:
         name = f"{owner.station}/{owner.port}"
         child = children[name] = Child(f"segment {name}", "eap.segment.process", bytecode)
-        given[child] = handover, [handover.frames_fd, handover.command_fd]
+        wanted = (handover.frames_fd, handover.command_fd, handover.second_fd)
+        given[child] = handover, [fd for fd in wanted if fd != NO_DESCRIPTOR]
     return given
 
 

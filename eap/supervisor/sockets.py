@@ -20,6 +20,7 @@ import msgspec
 from eap.closeable import Closeable
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
+from eap.ids import InterfaceUri
 from eap.net.busport import open_bus_socket
 from eap.net.ipsocket import (
     open_ams_broadcast,
@@ -85,6 +86,7 @@ def segments(
                     port.bus.file,
                     frames_fd=bus.segment_fd,
                     command_fd=bus.segment_command_fd,
+                    second_fd=bus.segment_second_fd,
                     realtime=realtime,
                 ),
             )
@@ -93,10 +95,17 @@ def segments(
 def _open_bus(name: PortName, port: PortSpec, opened: ExitStack) -> BusSocket:
     if not _is_simulated(port):
         sock = opened.enter_context(open_bus_socket(port.interface))
-        return BusSocket(name, engine_fd=sock.fileno())
+        second_fd = NO_DESCRIPTOR
+        if port.bus is not None and port.bus.redundant:
+            second = open_bus_socket(InterfaceUri.parse(port.bus.redundant))
+            second_fd = opened.enter_context(second).fileno()
+        return BusSocket(name, engine_fd=sock.fileno(), second_fd=second_fd)
     engine_fd, segment_fd = open_message_pair(opened)
     command_fd, segment_command_fd = open_message_pair(opened)
-    return BusSocket(name, engine_fd, segment_fd, segment_command_fd, command_fd)
+    lines = (NO_DESCRIPTOR, NO_DESCRIPTOR)
+    if port.bus is not None and port.bus.redundant:
+        lines = open_message_pair(opened)
+    return BusSocket(name, engine_fd, segment_fd, segment_command_fd, command_fd, *lines)
 
 
 def _is_simulated(port: PortSpec) -> bool:
@@ -203,7 +212,7 @@ class SharedSockets(Closeable):
     def engine_descriptors(self) -> list[int]:
         """Return what the engine inherits."""
         wanted = [shared.engine_fd for shared in self.descriptions]
-        wanted += [bus.engine_fd for bus in self.buses]
+        wanted += [fd for bus in self.buses for fd in (bus.engine_fd, bus.second_fd)]
         return _existing(*wanted, self.engine_link, self.engine_bus)
 
     def services_descriptors(self) -> list[int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from tests.support.busline import MS, RingLine, answer, expect, segment, slave
 
 from devicebus.mailbox import coe_client
 from devicebus.master import clocks
@@ -15,6 +14,7 @@ from devicebus.sim.spec import ClockSpec
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Datagram, DatagramHeader, encode_frame
 from devicebus.wire.register import Register
+from tests.support.busline import MS, RingLine, answer, expect, segment, slave
 
 COUNT = 5
 
