@@ -100,6 +100,8 @@ class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True):
     entries: tuple[EntrySpec, ...] = ()
     minimum: float | None = None
     maximum: float | None = None
+    mappable: bool = False
+    """True if a master may map it: as an input if it is read-only, else as an output."""
 
 
 class FileSpec(msgspec.Struct, frozen=True, kw_only=True):

@@ -179,7 +179,7 @@ def _variables(
 
 def _unique_names(entries: Sequence[DescribedPdoEntry]) -> list[str]:
     """Return the last part of the name of each entry; a duplicate gets its object index."""
-    plain = [_plain(entry) for entry in entries]
+    plain = [plain_name(entry) for entry in entries]
     counts = Counter([STATE, *(name for name, e in zip(plain, entries, strict=True) if e.type)])
     # `state` is the AL state of the slave, which each slave has.
     taken = {name for name, times in counts.items() if times == 1} | {STATE}
@@ -193,7 +193,8 @@ def _unique_names(entries: Sequence[DescribedPdoEntry]) -> list[str]:
     return names
 
 
-def _plain(entry: DescribedPdoEntry) -> str:
+def plain_name(entry: DescribedPdoEntry) -> str:
+    """Return the end of the name of an entry's variable, unless another has the same."""
     name = _OTHER.sub("_", entry.name) or _object_suffix(entry)
     return f"{_OTHER.sub('_', entry.group)}.{name}" if entry.group else name
 

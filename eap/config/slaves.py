@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from eap.codec import datatypes
 from eap.codec.soe import Idn
 from eap.config.finding import FindingReport, one_of
-from eap.config.index import DescribedPdo, DescribedPdoEntry, DescribedSlave
+from eap.config.index import DescribedPdo, DescribedPdoEntry, DescribedSlave, plain_name
 from eap.config.structs import SlaveSection, StartupSection
 from eap.ids import ObjectId
 from eap.od.slave_config import (
@@ -260,7 +260,9 @@ def _entries(
     for position, text in enumerate(texts):
         entry = _find_entry(slave, pdo, text)
         if entry is None:
-            report.add(f"{at}[{position}]", f"{slave.name}: {text!r} cannot be mapped", _ENTRY)
+            hint = suggest(text, [plain_name(each) for each in _known_entries(slave).values()])
+            message = f"{slave.name}: {text!r} cannot be mapped{hint}"
+            report.add(f"{at}[{position}]", message, _ENTRY)
         else:
             yield entry
 
@@ -269,7 +271,7 @@ def _find_entry(slave: DescribedSlave, pdo: DescribedPdo, text: str) -> MappedOb
     """Return the entry that *text* means; None if there is none, or its length is not known."""
     same_side = [e for each in slave.pdos if each.is_output is pdo.is_output for e in each.entries]
     for each in (*same_side, *slave.objects):
-        if each.index and each.name == text:
+        if each.index and text in {each.name, plain_name(each)}:
             return MappedObject(each.index, each.subindex, each.bit_length)
     place, slash, bits_text = text.partition("/")
     try:

@@ -130,17 +130,19 @@ NO_WINDOW = 0xFFFF_FFFF
 _WINDOW = 0x6065
 
 _OBJECTS = (
-    ObjectSpec(index=0x603F, name="Error code", type="UINT", access=AccessKind.READ),
+    ObjectSpec(index=0x603F, name="Error code", type="UINT", access=AccessKind.READ, mappable=True),
     ObjectSpec(index=0x6040, name="Controlword", type="UINT"),
     ObjectSpec(index=0x6041, name="Statusword", type="UINT", access=AccessKind.READ),
-    ObjectSpec(index=0x6060, name="Modes of operation", type="SINT", value=CYCLIC_POSITION),
+    ObjectSpec(index=0x6060, name="Modes of operation", type="SINT", value=CYCLIC_POSITION,
+               mappable=True),
     ObjectSpec(index=0x6061, name="Modes of operation display", type="SINT",
-               access=AccessKind.READ, value=CYCLIC_POSITION),
+               access=AccessKind.READ, value=CYCLIC_POSITION, mappable=True),
     ObjectSpec(index=0x6064, name="Position actual value", type="DINT", access=AccessKind.READ),
-    ObjectSpec(index=0x606C, name="Velocity actual value", type="DINT", access=AccessKind.READ),
+    ObjectSpec(index=0x606C, name="Velocity actual value", type="DINT", access=AccessKind.READ,
+               mappable=True),
     ObjectSpec(index=0x6065, name="Following error window", type="UDINT", value=NO_WINDOW),
     ObjectSpec(index=0x607A, name="Target position", type="DINT"),
-    ObjectSpec(index=0x60FF, name="Target velocity", type="DINT"),
+    ObjectSpec(index=0x60FF, name="Target velocity", type="DINT", mappable=True),
     ObjectSpec(index=0x6502, name="Supported drive modes", type="UDINT",
                access=AccessKind.READ, value=_MODES),
 )  # fmt: skip

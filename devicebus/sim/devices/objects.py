@@ -280,7 +280,11 @@ def identity_objects(spec: SlaveSpec, device_type: int) -> Iterable[OdObject]:
 def described_object(spec: ObjectSpec) -> OdObject:
     """Return the object of *spec*; raise ValueError for an invalid type or value."""
     if not spec.entries:
-        return OdObject(spec.index, spec.name, ObjectCode.VAR, {0: _entry(spec)})
+        entry = _entry(spec)
+        if spec.mappable:
+            is_input = spec.access is AccessKind.READ
+            entry.access |= Access.TX_MAPPABLE if is_input else Access.RX_MAPPABLE
+        return OdObject(spec.index, spec.name, ObjectCode.VAR, {0: entry})
     return record(spec.index, spec.name, {each.subindex: _entry(each) for each in spec.entries})
 
 

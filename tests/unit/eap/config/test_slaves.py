@@ -206,7 +206,10 @@ timeouts: {preop_ms: 100}
         ("pdos: CSP", "pdos is 'CSP'; expected a mapping or a list"),
         ("mapping: {0x1A01: [status]}", "drive: the mapping of PDO 0x1A01 (Fixed) is fixed"),
         ("mapping: {0x1A09: [status]}", "drive has no PDO '0x1A09'"),
-        ("mapping: {0x1A00: [states]}", "drive: 'states' cannot be mapped; expected the name of"),
+        (
+            "mapping: {0x1A00: [states]}",
+            "drive: 'states' cannot be mapped, did you mean status?; expected",
+        ),
         ('mapping: {0x1A00: ["0x2009"]}', "drive: '0x2009' cannot be mapped"),
         ('mapping: {0x1A00: ["0x2009/256"]}', "drive: '0x2009/256' cannot be mapped"),
         ('startup: [{sdo: "0x6060"}]', "start-up write of 0x6060 without data; expected one of"),
