@@ -112,7 +112,7 @@ class SlaveAds:
     ) -> None:
         self._bus = bus
         self._sampler = AdsClient(Endpoint("", ""), net_id, DEVICE_PORT)
-        self._notifications = SlaveNotifications(net_id, self._sample, send, budget)
+        self._notifications = SlaveNotifications(net_id, self._sample, send, budget, self._name_of)
         self._states = states
         self._files = SlaveFiles()
         self._ethernet = SlaveEthernet(bus)
@@ -154,6 +154,11 @@ class SlaveAds:
     def client_gone(self, endpoint: Endpoint) -> None:
         """End the notifications of a connection that is closed."""
         self._notifications.client_gone(endpoint)
+
+    def _name_of(self, station: int) -> str:
+        """Return the name of a slave with that of its bus."""
+        slave = self._bus.view.latest.slaves.get(station)
+        return f"{self._bus.name}/{station if slave is None else slave.name}"
 
     async def _sample(self, station: int, place: Read) -> bytes:
         """Read a value for notifications; raise AdsRefusedError or the errors of a SlaveAccess."""

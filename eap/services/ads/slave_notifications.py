@@ -30,13 +30,14 @@ from eap.ads.notifications import (
 )
 from eap.ads.request import AdsRefusedError, Read
 from eap.ads.space import Source
-from eap.codec.ads import AdsError
+from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification, to_filetime
 from eap.errors import EapError
 from eap.gateway.error_table import ads_result
-from eap.ids import Endpoint, NetId
+from eap.ids import Endpoint, NetId, ObjectId
 from eap.services.ads.ads_service import first_handle
 from eap.services.ads.master_ads import Send
+from eap.services.limited_log import caused_by
 from eap.services.tasks import TaskSet
 
 SHORTEST_CYCLE_NS = 20_000_000
@@ -66,6 +67,7 @@ _FOR_NOW = frozenset(
 )
 """Errors that may pass without anybody's doing: a state change, a power cycle, a cut cable."""
 _NS_PER_S = 1_000_000_000
+_SUBINDEX = 0xFF
 
 ReadValue: TypeAlias = Callable[[int, Read], Awaitable[bytes]]
 """Reads a value of the slave with a station address; raises AdsRefusedError or EapError."""
@@ -222,10 +224,17 @@ class _SlaveSampler:
         read: Reads a value.
         send: Sends a packet to a client.
         budget: Shared with other slaves.
+        name_of: Returns the name of a slave, for the log.
     """
 
     def __init__(
-        self, station: int, net_id: NetId, read: ReadValue, send: Send, budget: SamplingBudget
+        self,
+        station: int,
+        net_id: NetId,
+        read: ReadValue,
+        send: Send,
+        budget: SamplingBudget,
+        name_of: Callable[[int], str],
     ) -> None:
         self.by_handle: dict[int, tuple[SampledValue, AdsClient]] = {}
         self._station = station
@@ -233,6 +242,7 @@ class _SlaveSampler:
         self._read = read
         self._send = send
         self._budget = budget
+        self._name_of = name_of
         self._values: dict[tuple[int, int], SampledValue] = {}
         self._pace = Pace(SLAVE_READINGS)
         self._wake = asyncio.Event()
@@ -353,12 +363,19 @@ class _SlaveSampler:
         error = value.error
         if error is None or (was_failing and not ended):
             return
-        text = error.why or AdsError.words_of(error.result)
-        place = f"group 0x{value.place.group:X}, offset 0x{value.place.offset:08X}"
-        what = f"{ended} notifications ended" if ended else "notifications without samples"
+        ends = f"{ended} notification{'s' if ended > 1 else ''} ended"
+        what = ends if ended else "notifications without samples"
+        name, text = self._name_of(self._station), error.why or AdsError.words_of(error.result)
         logger.warning(
-            "%s of slave %d at %s, %s: %s", what, self._station, self._net_id, place, text
-        )
+            "%s: %s of %s: %s", name, what, _place_text(value.place), text,
+            extra=caused_by((name, bool(ended), text), name),
+        )  # fmt: skip
+
+
+def _place_text(place: Read) -> str:
+    if place.group == IndexGroup.SDO:
+        return f"object {ObjectId(place.offset >> 16, place.offset & _SUBINDEX)}"
+    return f"group 0x{place.group:X}, offset 0x{place.offset:08X}"
 
 
 class SlaveNotifications:
@@ -369,13 +386,22 @@ class SlaveNotifications:
         read: Reads a value of a slave.
         send: Sends a packet to a client.
         budget: Of the appliance.
+        name_of: Returns the name of a slave, for the log.
     """
 
-    def __init__(self, net_id: NetId, read: ReadValue, send: Send, budget: SamplingBudget) -> None:
+    def __init__(
+        self,
+        net_id: NetId,
+        read: ReadValue,
+        send: Send,
+        budget: SamplingBudget,
+        name_of: Callable[[int], str],
+    ) -> None:
         self._net_id = net_id
         self._read = read
         self._send = send
         self._budget = budget
+        self._name_of = name_of
         self._samplers: dict[int, _SlaveSampler] = {}
         self._adding: Counter[Endpoint] = Counter()
         self._gone: set[Endpoint] = set()
@@ -390,7 +416,7 @@ class SlaveNotifications:
         sampler = self._samplers.get(station)
         if sampler is None:
             sampler = self._samplers[station] = _SlaveSampler(
-                station, self._net_id, self._read, self._send, self._budget
+                station, self._net_id, self._read, self._send, self._budget, self._name_of
             )
         endpoint = client.endpoint
         self._adding[endpoint] += 1

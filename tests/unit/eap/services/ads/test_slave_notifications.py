@@ -207,6 +207,7 @@ class Line:
             self.read,
             lambda endpoint, packet: self.told.append((endpoint, packet)),
             self.budget,
+            lambda station: f"left/bus0/{station}",
         )
 
     async def read(self, station: int, place: Read) -> bytes:
@@ -275,7 +276,7 @@ def test_refusal_ends_a_notification_with_an_empty_sample(caplog):
         reads = len(line.reads)
         await asyncio.sleep(0.1)
         assert len(line.reads) == reads
-        assert "1 notifications ended of slave 1001 at 5.1.1.1.3.1" in caplog.text
+        assert "left/bus0/1001: 1 notification ended of object 0x0000:00: no such" in caplog.text
         assert caplog.text.count("no such object") == 1
         with pytest.raises(AdsRefusedError):
             line.notifications.delete(1001, ME, handle)
@@ -303,7 +304,7 @@ def test_silent_slave_gets_few_readings_and_ends_its_notifications(monkeypatch, 
         count = len(line.reads)
         await wait(lambda: samples(line.told, ME.endpoint)[-1] == (handle, b""))
         assert 2 <= len(line.reads) - count <= 12
-        assert "notifications without samples of slave 1001" in caplog.text
+        assert "left/bus0/1001: notifications without samples of object 0x0000:00" in caplog.text
 
     on_line(scene)
 
