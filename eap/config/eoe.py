@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from ipaddress import IPv4Address, IPv4Interface
 
 from eap.codec.eoe import NAME_SIZE
@@ -10,7 +10,7 @@ from eap.config.bus import find_slave
 from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.routes import SectionError
-from eap.config.structs import EoeSlaveSection, PortSection
+from eap.config.structs import EoeSection, EoeSlaveSection, PortSection, StationSection
 from eap.ids import MacAddr
 from eap.pd.spec import EoeSlaveSpec, EoeSpec, PortKind
 
@@ -25,16 +25,18 @@ _GROUP = 0x01
 
 def eoe_spec(port: PortSection) -> EoeSpec | None:
     """Return the specification of EoE at a bus port; the checks have passed it."""
-    section = port.eoe
-    if section is None:
+    slaves = dict(_slaves_of(port))
+    if port.eoe is None and not slaves:
         return None
+    section = port.eoe or EoeSection()
     return EoeSpec(
         interface=section.interface or default_interface(port),
         address=section.address,
         slaves=tuple(
             EoeSlaveSpec(slave, each.ip, each.gateway, each.dns, each.name, each.mac)
-            for slave, each in section.slaves.items()
+            for slave, each in slaves.items()
         ),
+        connects_all=port.eoe is not None and not port.eoe.slaves,
     )
 
 
@@ -43,36 +45,74 @@ def default_interface(port: PortSection) -> str:
     return f"eoe-{port.name}"
 
 
+def _slaves_of(port: PortSection) -> Iterator[tuple[str, EoeSlaveSection]]:
+    """Yield the slaves that are connected: those of the port's key, and by keys of their own."""
+    if port.eoe is not None:
+        yield from port.eoe.slaves.items()
+    for name, slave in port.slaves.items():
+        if slave.eoe is not None:
+            yield name, slave.eoe
+
+
 def check_eoe(index: Index, report: FindingReport) -> None:
     """Report every invalid key of EoE."""
     for station in index.plant.stations:
         for port in station.ports:
-            if port.kind is not PortKind.BUS or port.eoe is None:
+            if port.kind is not PortKind.BUS:
                 continue
-            _check_interface(port, report)
-            if port.eoe.address:
-                _check(f"{port.eoe.at}.address", port.eoe.address, _parse_interface, report)
-            first: dict[str, str] = {}
-            for name, settings in port.eoe.slaves.items():
-                try:
-                    find_slave(index, station, port, name)
-                except SectionError as exc:
-                    if port.name not in index.unread_buses(station):
-                        report.add(settings.at, str(exc), "a slave of this bus, by name or address")
-                _check_settings(settings, report)
-                _check_address_once(port, settings, first, report)
+            if port.eoe is not None:
+                _check_port(index, station, port, port.eoe, report)
+            elif eoe_spec(port) is not None:
+                _check_interface(port, port.at, report)
+            _check_slaves(port, report)
 
 
-def _check_interface(port: PortSection, report: FindingReport) -> None:
-    assert port.eoe is not None  # noqa: S101  the caller has looked
-    name = port.eoe.interface or default_interface(port)
+def _check_port(
+    index: Index,
+    station: StationSection,
+    port: PortSection,
+    section: EoeSection,
+    report: FindingReport,
+) -> None:
+    path = f"{section.at}.interface"
+    _check_interface(port, path if path in report.lines else section.at, report)
+    if section.address:
+        _check(f"{section.at}.address", section.address, _parse_interface, report)
+    for name, settings in section.slaves.items():
+        try:
+            find_slave(index, station, port, name)
+        except SectionError as exc:
+            if port.name not in index.unread_buses(station):
+                report.add(settings.at, str(exc), "a slave of this bus, by name or address")
+
+
+def _check_slaves(port: PortSection, report: FindingReport) -> None:
+    """Check the settings of all slaves, and that none has them, or an address, twice."""
+    addresses: dict[str, str] = {}
+    names: dict[str, str] = {}
+    if port.eoe is not None and port.eoe.address:
+        addresses[port.eoe.address.partition("/")[0]] = f"{port.eoe.at}.address"
+    for name, settings in _slaves_of(port):
+        _check_settings(settings, report)
+        if name in names:
+            line = report.line_of(names[name])
+            message = f"slave {name} has eoe already (line {line})"
+            report.add(settings.at, message, "one of the two")
+        names.setdefault(name, settings.at)
+        address, path = settings.ip.partition("/")[0], f"{settings.at}.ip"
+        if address in addresses:
+            line = report.line_of(addresses[address])
+            message = f"{address} is used twice (first in line {line})"
+            report.add(path, message, "an address of its own")
+        if address:
+            addresses.setdefault(address, path)
+
+
+def _check_interface(port: PortSection, path: str, report: FindingReport) -> None:
+    name = (port.eoe.interface if port.eoe is not None else "") or default_interface(port)
     is_valid = len(name.encode()) <= NAME_LIMIT and name not in {".", ".."}
-    if is_valid and not any(each.isspace() or each in "/:%" for each in name):
-        return
-    path = f"{port.eoe.at}.interface"
-    if path not in report.lines:
-        path = port.eoe.at
-    report.add(path, f"TAP interface {name!r}", f"interface: {_INTERFACE}")
+    if not is_valid or any(each.isspace() or each in "/:%" for each in name):
+        report.add(path, f"TAP interface {name!r}", f"interface: {_INTERFACE}")
 
 
 def _check_settings(settings: EoeSlaveSection, report: FindingReport) -> None:
@@ -91,22 +131,6 @@ def _check_settings(settings: EoeSlaveSection, report: FindingReport) -> None:
         if not settings.ip:
             message = f"{key} is given, but no ip: settings are written together with an address"
             report.add(f"{settings.at}.{key}", message, f"ip: {_WITH_NETWORK}")
-
-
-def _check_address_once(
-    port: PortSection, settings: EoeSlaveSection, first: dict[str, str], report: FindingReport
-) -> None:
-    assert port.eoe is not None  # noqa: S101  the caller has looked
-    if port.eoe.address:
-        first.setdefault(port.eoe.address.partition("/")[0], f"{port.eoe.at}.address")
-    address = settings.ip.partition("/")[0]
-    if not address:
-        return
-    path = f"{settings.at}.ip"
-    if address in first:
-        message = f"{address} is used twice (first in line {report.line_of(first[address])})"
-        report.add(path, message, "an address of its own")
-    first.setdefault(address, path)
 
 
 def _check(path: str, text: str, parse: Callable[[str], str], report: FindingReport) -> None:

@@ -139,13 +139,16 @@ class EoeKind(StrEnum):
 
 
 class EoeSlaveSection(Section, frozen=True):
-    """A slave that is connected by EoE, with its IP settings."""
+    """A slave that is connected by EoE, with its IP settings; the short form is ``kind``."""
 
+    kind: EoeKind = EoeKind.TAP
     ip: str = ""
     gateway: str = ""
     dns: str = ""
     name: str = ""
     mac: str = ""
+
+    SHORT: ClassVar[str] = "kind"
 
 
 class EoeSection(Section, frozen=True):
@@ -157,6 +160,12 @@ class EoeSection(Section, frozen=True):
     slaves: dict[str, EoeSlaveSection] = {}
 
     SHORT: ClassVar[str] = "kind"
+
+
+class PortSlaveSection(SlaveSection, frozen=True):
+    """Configuration of a slave in a plant file, with what concerns this host."""
+
+    eoe: EoeSlaveSection | None = None
 
 
 class PortSection(Section, frozen=True):
@@ -186,7 +195,7 @@ class PortSection(Section, frozen=True):
     frame_retries: FrameRetries = 4
     redundant: str = ""
     gateway: GatewaySection = GatewaySection()
-    slaves: dict[str, SlaveSection] = {}
+    slaves: dict[str, PortSlaveSection] = {}
     eoe: EoeSection | None = None
 
     @property

@@ -406,7 +406,8 @@ class EoeSpec(SpecRecord, frozen=True):
     address: str = ""
     """IPv4 address of the interface with the length of its network; empty to leave it alone."""
     slaves: tuple[EoeSlaveSpec, ...] = ()
-    """Empty connects every slave that has EoE."""
+    connects_all: bool = False
+    """True if every slave with EoE is connected, not only those in *slaves*."""
 
 
 class LengthCheck(StrEnum):

@@ -275,10 +275,9 @@ class EoeBridge:
         """Return the settings of a slave that is connected, None for any other slave."""
         if not slave.protocols & SiiProtocol.EOE:
             return None
-        if not self._spec.slaves:
-            return EoeSlaveSpec(slave.name)
         names = {slave.name, str(slave.station)}
-        return next((each for each in self._spec.slaves if each.slave in names), None)
+        default = EoeSlaveSpec(slave.name) if self._spec.connects_all else None
+        return next((each for each in self._spec.slaves if each.slave in names), default)
 
     def _start(self, link: _SlaveLink) -> None:
         link.assembler.reset()

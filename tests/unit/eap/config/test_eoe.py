@@ -17,7 +17,7 @@ def eoe_of(load_plant, eoe: str) -> EoeSpec | None:
 
 
 def test_short_form_connects_every_slave(load_plant):
-    assert eoe_of(load_plant, "tap") == EoeSpec("eoe-bus0")
+    assert eoe_of(load_plant, "tap") == EoeSpec("eoe-bus0", connects_all=True)
 
 
 def test_specification_has_all_keys(load_plant):
@@ -34,6 +34,46 @@ def test_slave_may_be_named_by_its_address(load_plant):
     assert eoe_of(load_plant, "{slaves: {1001: {}}}") == EoeSpec(
         "eoe-bus0", slaves=(EoeSlaveSpec("1001"),)
     )
+
+
+def with_slaves(slaves: str, eoe: str = "") -> tuple[str, str]:
+    port = "name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1"
+    return PORT, f"{PORT}\n      - {{{port}, slaves: {slaves}{eoe}}}"
+
+
+def test_slave_may_have_a_key_of_its_own(load_plant):
+    def loaded(*keys: str) -> EoeSpec | None:
+        return load_plant(with_slaves(*keys)).plant.stations[0].ports[1].eoe
+
+    alone = EoeSlaveSpec("valves")
+    addressed = EoeSlaveSpec("valves", "10.0.0.2/24")
+    assert loaded("{valves: {eoe: tap}}") == EoeSpec("eoe-bus0", slaves=(alone,))
+    assert loaded("{valves: {eoe: {ip: 10.0.0.2/24}}}", ", eoe: tap") == EoeSpec(
+        "eoe-bus0", slaves=(addressed,), connects_all=True
+    )
+    assert loaded("{valves: {optional: true}}") is None
+
+
+@pytest.mark.parametrize(
+    ("slaves", "eoe", "finding"),
+    [
+        ("{valves: {eoe: {ip: here}}}", "", "ip 'here'"),
+        ("{valves: {eoe: tun}}", "", "kind is 'tun'"),
+        (
+            "{valves: {eoe: tap}}",
+            ", eoe: {slaves: {valves: tap}}",
+            "slave valves has eoe already (line 7); one of the two",
+        ),
+        (
+            "{valves: {eoe: {ip: 10.0.0.1/24}}}",
+            ", eoe: {address: 10.0.0.1/24}",
+            "10.0.0.1 is used twice",
+        ),
+    ],
+)
+def test_each_mistake_at_a_slave_is_one_finding(findings, slaves, eoe, finding):
+    [found] = findings(with_slaves(slaves, eoe))
+    assert found.startswith(f"7: {finding}")
 
 
 @pytest.mark.parametrize(

@@ -187,7 +187,7 @@ def test_all_slaves_with_eoe_are_connected_without_a_list():
         await stage.ports_are(lambda ports: {*ports} == {"left", "right"})
         assert [each.ip for each in stage.bridge.report().slaves] == ["", ""]
 
-    play(scene, EoeSpec("eoe0"))
+    play(scene, EoeSpec("eoe0", connects_all=True))
 
 
 def test_slave_is_disconnected_in_init_and_gets_its_settings_again():
