@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -110,7 +111,7 @@ def discover(
     if pcap is not None:
         fault = _read(discovery, pcap)
     elif interface is not None:
-        is_live = sys.stdout.isatty() and not output.is_json
+        is_live = sys.stdout.isatty() and not output.is_json and not _is_plain()
         if for_s is None and (not is_live or target is not None):
             for_s = _USUAL_S
         _watch(discovery, interface, for_s, takers if is_live else None)
@@ -122,6 +123,11 @@ def discover(
         raise click.UsageError(fault)
     if not rows:
         ctx.exit(ExitCode.FAILED)
+
+
+def _is_plain() -> bool:
+    """Return whether the terminal cannot draw over what it shows."""
+    return os.environ.get("TERM", "dumb").lower() in {"", "dumb", "unknown"}
 
 
 def _check_usage(

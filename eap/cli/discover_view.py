@@ -51,7 +51,7 @@ def pd_table(rows: Sequence[DiscoveredPd]) -> TextTable:
         Column("Jitter", rank=4, is_number=True),
         "To",
         *([Column("Name", rank=5)] if has_names else []),
-        "Taken by",
+        Column("Taken by", wraps=True),
     )
     for row in rows:
         table.add_row(

@@ -105,7 +105,7 @@ def open_capture(interface: str, program: Sequence[bpf.Instruction]) -> socket.s
         EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
     """
     check_interface(interface)
-    sock = _closed_socket(interface)
+    sock = _closed_socket(interface, instead="")
     try:
         bpf.attach(sock, program)
         sock.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
@@ -136,12 +136,15 @@ def _open(interface: str, program: Sequence[bpf.Instruction]) -> socket.socket:
     return sock
 
 
-def _closed_socket(interface: str) -> socket.socket:
+_BY_UDP = "; or use udp://ADDRESS, which needs no privilege"
+
+
+def _closed_socket(interface: str, *, instead: str = _BY_UDP) -> socket.socket:
     """Return a socket of protocol 0: no foreign frame gets in before its filter is in place."""
     try:
         return socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     except PermissionError:
-        raise EnvironmentalError(missing_capability(interface)) from None
+        raise EnvironmentalError(missing_capability(interface, instead=instead)) from None
 
 
 def _join(sock: socket.socket, interface: str, protocol: int) -> None:
@@ -164,8 +167,11 @@ def _explain(interface: str, error: OSError | EnvironmentalError) -> Environment
     return EnvironmentalError(f"interface {interface}: {error.strerror}")
 
 
-def missing_capability(interface: str) -> str:
-    """Return in one line what opening *interface* needs and how to get it for this run only."""
+def missing_capability(interface: str, *, instead: str = _BY_UDP) -> str:
+    """Return in one line what opening *interface* needs and how to get it for this run only.
+
+    *instead* is what works without it.
+    """
     start = f"ethernet://{interface} needs the capability CAP_NET_RAW"
     if os.geteuid() == 0:
         cure = "root lacks it here: give it to the container (such as --cap-add=NET_RAW)"
@@ -176,4 +182,4 @@ def missing_capability(interface: str) -> str:
             f"--regid={os.getgid()} --init-groups --inh-caps=+net_raw --ambient-caps=+net_raw "
             f"{command}`"
         )
-    return f"{start}; {cure}; or use udp://ADDRESS, which needs no privilege"
+    return f"{start}; {cure}{instead}"

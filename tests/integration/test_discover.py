@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import socket
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -14,12 +16,21 @@ from typing import Any
 import dpkt
 import pytest
 
-from eap.codec.ethercat import FrameType
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
+from eap.ids import NetId
 from eap.net import interface
 from eap.net.capture import FrameCapture
 from eap.ops.decode import iter_capture
-from tests.support.appliance import Appliance, Plants, run_eapctl, troubles, wait_until
-from tests.support.namespaces import Namespace, enter, enter_network, namespace
+from tests.support.appliance import (
+    EAPCTL,
+    Appliance,
+    Plants,
+    run_eapctl,
+    troubles,
+    wait_until,
+)
+from tests.support.namespaces import Namespace, cable, enter, enter_network, namespace
 from tests.support.pages import ROOT, Shell, commands, shell
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
@@ -139,6 +150,72 @@ def test_dictionary_alone_lists_pds_that_were_not_seen(line: Appliance) -> None:
     unknown = run_eapctl(line.runtime, "discover", "--from", "9.9.9.9.9.9")
     assert unknown.returncode == 1
     assert "no route to 9.9.9.9.9.9" in unknown.stderr
+
+
+@pytest.fixture(scope="module")
+def pair(module_farm: Plants) -> Iterator[Namespace]:
+    """Two stations on one cable; the network of the left one."""
+    plant = ROOT / "config/ethernet-pair.yaml"
+    with cable() as ends:
+        for name, end in zip(("left", "right"), ends, strict=True):
+            module_farm.run(plant, "--station", name, prefix=end.prefix)
+        yield ends[0]
+
+
+@pytest.mark.host_root
+def test_discover_needs_one_capability_and_sees_both_directions(
+    pair: Namespace, tmp_path: Path
+) -> None:
+    user = ["setpriv", "--reuid=64951", "--regid=64951", "--clear-groups"]
+    # dac_read_search: this tree may belong to another user.
+    capabilities = "+net_raw,+dac_read_search"
+    user += [f"--inh-caps={capabilities}", f"--ambient-caps={capabilities}"]
+    plant = str(ROOT / "config/ethernet-pair.yaml")
+    command = [*pair.prefix, *user, *EAPCTL, "discover", "line0", "--for", "0.5", "--json"]
+    done = subprocess.run(
+        [*command, "--plant", plant],
+        env=os.environ | {"EAP_RUNTIME_DIR": str(tmp_path / "none")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = [json.loads(row) for row in done.stdout.splitlines()]
+    assert [(row["publisher"], row["destination"]) for row in rows] == [
+        ("10.88.164.1.2.1", "01:01:05:04:00:00"),
+        ("10.88.164.2.2.1", "01:01:05:04:00:00"),
+    ]
+    assert [row["taken_by"] for row in rows] == ["right/peer", "left/peer"]
+    assert rows[0]["sources"] == [pair.mac()]
+    assert {row["step"] for row in rows} == {1}
+
+
+LENIENT = """
+plant: lenient
+stations:
+  - name: panel
+    net_id: 10.0.9.9.1.1
+    ports:
+      - {name: eap0, kind: eap, interface: "udp://127.0.1.1", net_id: 10.0.9.9.2.1, length: lenient}
+    subscribe:
+      - {name: tool, port: eap0, from: {publisher: 5.5.5.5.1.1, id: 7}, foreign: true,
+         variables: {level: UINT}}
+"""
+
+
+def test_lenient_port_takes_frames_of_a_tool_with_wrong_length(farm: Plants) -> None:
+    with namespace() as network:
+        appliance = farm.run(farm.write(LENIENT), prefix=network.prefix)
+        with network.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            for cycle in range(3):
+                header = PdFrameHeader(NetId.parse("5.5.5.5.1.1"), 1, cycle)
+                right = encode_frame(header, [(PdHeader(7, 0, 2), b"\x34\x12")])
+                sock.sendto(EtherCatHeader(4).encode() + right[2:], ("127.0.1.1", 34980))
+        wait_until(lambda: appliance.rx("panel", "tool")["received"] == 3)
+        assert appliance.rx("panel", "tool")["discarded"] == {"wrong_length": 3}
+        assert appliance.status()["stations"][0]["discarded"] == {"wrong_length": 3}
+        assert appliance.values("panel")["level"] == 0x1234
+        appliance.stop()
 
 
 def send_again(network: Namespace, path: Path) -> dict[str, int]:
