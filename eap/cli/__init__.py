@@ -2,7 +2,8 @@
 
 A module has the commands of one area and is imported when one of them is used: ``plant`` (check,
 new, run, plan, apply, rollback), ``status``, ``pd``, ``od`` (also state), ``network`` (scan and
-trace), ``routes``, ``bus``, ``gateway`` (also gw), ``sim``, ``decode``, ``discover`` and ``types``.
+trace), ``routes``, ``bus``, ``gateway`` (also gw), ``sim``, ``decode``, ``discover``, ``types`` and
+``files`` (import and export-peer).
 A command reads a plant file, starts an appliance in the foreground, or calls an operation of
 ``eap.ops``, which returns a typed result.  ``output`` prints that as JSON or by the command's view
 (``*_view``, ``od_text``); ``status_findings`` finds the faults in a status document.  ``params``

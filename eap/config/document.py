@@ -71,9 +71,17 @@ class _UnreadableError(Exception):
 
 def read(path: Path, report: FindingReport) -> Node | None:
     """Return the tree of the file at *path*; None, with findings, if it has none."""
-    text = ""
     try:
         text = _text(path)
+    except _UnreadableError as exc:
+        report.add("", str(exc), exc.expected, line=exc.line)
+        return None
+    return parse(text, report)
+
+
+def parse(text: str, report: FindingReport) -> Node | None:
+    """Return the tree of a YAML text; None, with findings, if it has none."""
+    try:
         return _Builder(report).build(text)
     except _UnreadableError as exc:
         report.add("", str(exc), exc.expected, line=exc.line)

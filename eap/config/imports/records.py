@@ -113,6 +113,7 @@ class EapImportDevice(msgspec.Struct, frozen=True, kw_only=True):
         name: As in the project.
         net_id: Its own NetID; None if the file has none that can be used.
         mac: MAC address of its network adapter; may be empty.
+        cycle_us: Its cycle; 0 if the file does not say.
         is_disabled: It is disabled in the project.
         boxes: Its publishers and subscribers.
         file: Its file.
@@ -122,6 +123,7 @@ class EapImportDevice(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     net_id: NetId | None = None
     mac: str = ""
+    cycle_us: int = 0
     is_disabled: bool = False
     boxes: tuple[EapBox, ...] = ()
     file: str = ""

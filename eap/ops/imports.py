@@ -1,0 +1,364 @@
+"""Import of files of other tools into a plant file."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from ipaddress import IPv4Address
+from pathlib import Path
+
+import msgspec
+
+from eap.codec.xmlstream import CHUNK, XmlError, XmlReader
+from eap.config.finding import PlantFinding
+from eap.config.imports.insertion import InsertionError, insert_stations
+from eap.config.imports.planttext import plant_text, station_lines
+from eap.config.imports.records import ImportNote, ImportReport, Outcome
+from eap.config.imports.resolution import resolve, with_peers
+from eap.config.imports.stations import (
+    DEFAULT_CYCLE_US,
+    ImportedSystem,
+    PlannedPort,
+    PlannedStation,
+    PlannedVariable,
+    PublisherIdentity,
+    UniqueNames,
+    made_up_net_id,
+    plain_name,
+    plan_station,
+)
+from eap.config.imports.treeitems import ROOTS as TREE_ROOTS
+from eap.config.imports.treeitems import TreeItem, assemble, read_tree_items
+from eap.config.imports.twincat import ITEM, PROJECT, TwinCatProject, read_project
+from eap.config.imports.typefile import ROOTS as TYPE_ROOTS
+from eap.config.imports.typefile import TypeFile, TypeRecord, read_type_file
+from eap.config.imports.typenames import TypeNames
+from eap.config.types import type_text
+from eap.errors import ConfigError
+from eap.ids import InterfaceUri, NetId
+from eap.runtime.durable import whole_file
+from eap.runtime.plantfile import load_plant
+
+NUMBER = "{n}"
+DEFAULT_ADDRESS = "ethernet://line{n}"
+"""No interface is called so on purpose: nothing is sent before the user has named his own."""
+EDC = (
+    "EDC files have no public description, so none is read: export the publishers and subscribers"
+    " of the EAP device as XML descriptions in TwinCAT (Export XML Description), or import the"
+    " project itself"
+)
+_VERSIONS = (
+    "A project does not show the data type versions of its variables: 0, the default of TwinCAT 3,"
+    " is assumed.  If a PD counts as wrong_version, write its version, or ignore_version: true."
+)
+
+
+class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of an import.
+
+    Attributes:
+        plant: Name of the plant; empty for that of the file.
+        address: Pattern of the interfaces of ports; ``{n}`` is the number of the port.
+        identity: NetID that publishers send as their own.
+        to: Destination of publishers whose file has none that can be used.
+        peer: Name of a station that is made as the other side; empty for none.
+    """
+
+    plant: str = ""
+    address: str = DEFAULT_ADDRESS
+    identity: PublisherIdentity = PublisherIdentity.DEVICE
+    to: str = ""
+    peer: str = ""
+
+
+class ImportResult(msgspec.Struct, frozen=True, kw_only=True):
+    """``eapctl import``.
+
+    Attributes:
+        ok: Everything could be read.
+        file: The plant file that was written; empty if none was.
+        plant: Name of the plant in it.
+        added_to: Existing plant file that the stations were to be added to; empty for none.
+        why_beside: Reason that another file than *added_to* was written; empty if it was that one.
+        stations: Names of the stations.
+        notes: Outcome for each part of the files, with the reason.
+        findings: Errors; nothing is written then.
+    """
+
+    ok: bool
+    file: str = ""
+    plant: str = ""
+    added_to: str = ""
+    why_beside: str = ""
+    stations: tuple[str, ...] = ()
+    notes: tuple[ImportNote, ...] = ()
+    findings: tuple[PlantFinding, ...] = ()
+
+
+class _Sources(msgspec.Struct):
+    """Content of the files of one import."""
+
+    projects: list[TwinCatProject] = []
+    types: list[tuple[str, TypeFile]] = []
+    items: list[TreeItem] = []
+
+
+def run_import(
+    files: Sequence[Path], target: Path | None, choices: ImportChoices
+) -> tuple[ImportResult, str]:
+    """Read *files* and write, or add to, the plant file *target*.
+
+    Returns:
+        The report, and the text of the plant file; empty if there is none.
+
+    Raises:
+        ConfigError: an option cannot be used.
+    """
+    report = ImportReport()
+    stations, types = _plan(_read(files, report), choices, report)
+    if report.findings or not stations:
+        if not report.findings:
+            report.add(str(files[0]), 0, "nothing to import", "an EAP device, or symbols")
+        return _result(report), ""
+    name = choices.plant or (target.stem if target else files[0].stem)
+    head = [f"Made by 'eapctl import {' '.join(each.name for each in files)}'."]
+    text = plant_text(name, stations, types, head=head)
+    result = _result(report, name, stations)
+    if target is None:
+        return result, text
+    return _write(target, text, stations, types, result), text
+
+
+def _result(
+    report: ImportReport, plant: str = "", stations: Sequence[PlannedStation] = ()
+) -> ImportResult:
+    notes = sorted(report.notes, key=lambda each: (each.file, each.line))
+    return ImportResult(
+        ok=not report.findings,
+        plant=plant,
+        stations=tuple(each.name for each in stations),
+        notes=tuple(notes),
+        findings=tuple(dict.fromkeys(report.findings)),
+    )
+
+
+def _read(files: Sequence[Path], report: ImportReport) -> _Sources:
+    sources = _Sources()
+    for path in files:
+        file = str(path)
+        if path.suffix.lower() == ".edc":
+            report.add(file, 0, EDC, "a .tsproj, .xti, .tmc, .tpy or .xml file")
+            continue
+        root = _root_of(path, report)
+        if root in {PROJECT, ITEM}:
+            sources.projects.append(read_project(file, _chunks, report))
+        elif root in TYPE_ROOTS:
+            sources.types.append((file, read_type_file(_chunks(file), file, report)))
+        elif root in TREE_ROOTS:
+            sources.items += read_tree_items(_chunks(file), file, report)
+        elif root:
+            expected = "TcSmProject, TcSmItem, TcModuleClass, PlcProjectInfo or TreeItem"
+            report.add(file, 1, f"it begins with {root!r}, which is not imported", expected)
+    return sources
+
+
+def _root_of(path: Path, report: ImportReport) -> str:
+    """Return the name of the first element of a file; empty, with a finding, if there is none."""
+    reader = XmlReader(())
+    try:
+        for chunk in _chunks(str(path)):
+            reader.feed(chunk)
+            if reader.root is not None:
+                return reader.root.tag
+        reader.close()
+    except XmlError as exc:
+        if reader.root is not None:
+            return reader.root.tag
+        report.add_error(str(path), exc)
+    except OSError as exc:
+        report.add(str(path), 0, f"cannot be read: {exc.strerror or exc}", "an XML file")
+    return "" if reader.root is None else reader.root.tag
+
+
+def _chunks(file: str) -> Iterator[bytes]:
+    path = Path(file)
+    # A pipe would block the reader, a device might never end.
+    if path.exists() and not path.is_file():
+        raise OSError(f"{file} is not a regular file")
+    with path.open("rb") as opened:
+        while chunk := opened.read(CHUNK):
+            yield chunk
+
+
+def _plan(
+    sources: _Sources, choices: ImportChoices, report: ImportReport
+) -> tuple[list[PlannedStation], list[str]]:
+    """Return the stations, and the lines of the section of their types."""
+    types = TypeNames(_records(sources), report)
+    interfaces = _interfaces(choices.address)
+    names = UniqueNames()
+    stations = [
+        plan_station(system, interfaces, choices.identity, report)
+        for system in _systems(sources, types, names, report)
+    ]
+    if not stations:
+        stations = [
+            station
+            for file, found in sources.types
+            if (station := _of_symbols(file, found, types, names, interfaces, report))
+        ]
+    elif choices.peer:
+        stations = with_peers(stations, choices.peer, interfaces)
+    types.take_findings()
+    return resolve(stations, choices.to, report), types.section()
+
+
+def _records(sources: _Sources) -> Iterator[tuple[str, Sequence[TypeRecord]]]:
+    for project in sources.projects:
+        yield project.file, project.types
+    for file, found in sources.types:
+        yield file, found.types
+
+
+def _systems(
+    sources: _Sources, types: TypeNames, names: UniqueNames, report: ImportReport
+) -> Iterator[ImportedSystem]:
+    for project in sources.projects:
+        if project.devices:
+            yield ImportedSystem(
+                name=names.take(plain_name(Path(project.file).stem, "station")),
+                net_id=project.net_id,
+                devices=project.devices,
+                cycles_us=tuple({each.cycle_us for each in project.tasks if each.cycle_us}),
+                type_text=types.text_of,
+                remarks=(_VERSIONS,),
+            )
+    if devices := assemble(sources.items, report):
+        yield ImportedSystem(
+            name=names.take(plain_name(Path(sources.items[0].file).stem, "station")),
+            net_id=None,
+            devices=devices,
+            cycles_us=tuple({each.cycle_us for each in devices if each.cycle_us}),
+            type_text=types.text_of,
+        )
+
+
+def _of_symbols(
+    file: str,
+    found: TypeFile,
+    types: TypeNames,
+    names: UniqueNames,
+    interfaces: Iterator[InterfaceUri],
+    report: ImportReport,
+) -> PlannedStation | None:
+    """Return a station that has the symbols of a TMC or TPY file as variables."""
+    net_id = made_up_net_id(uri := next(interfaces))
+    if found.net_id:
+        try:
+            net_id = NetId.parse(found.net_id)
+        except ValueError as exc:
+            report.add(file, 0, str(exc), "an AMS NetID")
+    has_areas = any(each.area for each in found.symbols)
+    variables = []
+    for symbol in found.symbols:
+        if has_areas and not symbol.area:
+            continue
+        try:
+            kind = types.parse(type_text(symbol.type, symbol.bounds))
+            if symbol.bits != 8 * kind.size:
+                raise ValueError(f"it has {symbol.bits} bits, its type {8 * kind.size}")  # noqa: TRY301
+            variable = PlannedVariable(symbol.name, kind.name, symbol.comment)
+        except ValueError as exc:
+            report.note(file, symbol.line, symbol.name, Outcome.LEFT, str(exc))
+            continue
+        variables.append(variable)
+        report.note(file, symbol.line, symbol.name, Outcome.TAKEN, f"variable {kind.name}")
+    if not variables:
+        return None
+    port = PlannedPort(name="eap0", interface=str(uri), net_id=NetId(bytes(net_id[:4]) + b"\2\1"))
+    router = NetId(bytes(net_id[:4]) + b"\1\1")
+    return PlannedStation(
+        name=names.take(plain_name(Path(file).stem, "station")),
+        net_id=router,
+        cycle_us=DEFAULT_CYCLE_US,
+        ports=(port,),
+        variables=tuple(variables),
+        remarks=("Symbols of a program: publish those that others need.",),
+    )
+
+
+def _interfaces(pattern: str) -> Iterator[InterfaceUri]:
+    """Yield the interface of each port in turn; raise ConfigError for an invalid pattern."""
+    for number in itertools.count(1):
+        text = pattern.replace(NUMBER, str(number))
+        try:
+            uri = InterfaceUri.parse(text if "://" in text else f"udp://{text}")
+            if uri.scheme == "udp" and NUMBER not in pattern:
+                uri = InterfaceUri(uri.scheme, str(IPv4Address(uri.host) + (number - 1)), uri.port)
+        except ValueError as exc:
+            raise ConfigError(f"address {pattern!r}: {exc}") from None
+        yield uri
+
+
+def _write(
+    target: Path,
+    text: str,
+    stations: Sequence[PlannedStation],
+    types: Sequence[str],
+    result: ImportResult,
+) -> ImportResult:
+    """Write *text* to *target*, or add the stations to it; check the file before it is there."""
+    replace = msgspec.structs.replace
+    if not target.exists():
+        return _checked(target, text, result)
+    result = replace(result, added_to=str(target))
+    before = load_plant(target)
+    if before.findings:
+        return replace(result, ok=False, findings=before.findings)
+    lines = [line for each in stations for line in (*station_lines(each), "")][:-1]
+    try:
+        merged = insert_stations(_text(target), lines, types)
+    except InsertionError as exc:
+        why = str(exc)
+    else:
+        added = _checked(target, merged, result)
+        if added.ok:
+            return added
+        # Both are right by themselves: a station of that name, or of that NetID, is there already.
+        why = "; ".join(each.message for each in added.findings[:3])
+    beside = _beside(target)
+    return replace(_checked(beside, text, result), why_beside=why)
+
+
+def _text(path: Path) -> str:
+    # Line ends and the byte order mark stay as they are.
+    return path.read_bytes().decode("utf-8")
+
+
+def _checked(target: Path, text: str, result: ImportResult) -> ImportResult:
+    """Write *text* to *target* if it is a plant without errors."""
+    # In the folder of the plant file: paths in it start there.
+    trial = target.with_name(f".{target.name}.{os.getpid()}.yaml")
+    replace = msgspec.structs.replace
+    try:
+        trial.write_bytes(text.encode())
+        loaded = load_plant(trial)
+    finally:
+        trial.unlink(missing_ok=True)
+    if loaded.findings:
+        own = tuple(replace(each, file=str(target)) for each in loaded.findings)
+        return replace(result, ok=False, findings=own)
+    with whole_file(target) as file:
+        file.write(text.encode())
+    name = loaded.plant.name if loaded.plant else result.plant
+    return replace(result, file=str(target), plant=name)
+
+
+def _beside(target: Path) -> Path:
+    """Return the name of a new file beside *target*."""
+    names = (
+        target.with_name(f"{target.stem}-import{number or ''}{target.suffix}")
+        for number in itertools.count()
+    )
+    return next(each for each in names if not each.exists())
