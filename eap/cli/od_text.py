@@ -156,6 +156,9 @@ def _literal(entry: Entry, data: str) -> str:
     # Tried by reading it back: a float, or a text with padding, may have bytes that no literal has.
     if kind is None or text is None or not _is_exact(kind, text, octets):
         return f"{RAW} {data}"
+    if kind.name != kind.text:
+        # Behind the type, whose whole definition would be needed, nobody finds the value.
+        return f"{RAW} {data}  # {kind.name} {text}"
     is_text = kind.text.startswith("STRING")
     return f"{kind.text} {json.dumps(text, ensure_ascii=False) if is_text else text}"
 

@@ -349,13 +349,19 @@ def value_text(value: Any) -> str:
     if isinstance(value, list):
         value = f"[{', '.join(map(value_text, value))}]"
     if isinstance(value, dict):
-        value = f"{{{', '.join(f'{name}: {value_text(each)}' for name, each in value.items())}}}"
+        value = f"{{{', '.join(f'{name}: {_member_text(each)}' for name, each in value.items())}}}"
     text = str(value)
     return (
         text
         if len(text) <= _SHOWN_CHARACTERS
         else f"{text[:_SHOWN_CHARACTERS]}… ({len(text)} characters)"
     )
+
+
+def _member_text(value: Any) -> str:
+    from eap.codec.literals import write_literal
+
+    return write_literal(value) if isinstance(value, str) else value_text(value)
 
 
 def offset_text(bit_offset: int) -> str:

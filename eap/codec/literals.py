@@ -7,7 +7,9 @@ it is quoted.  JSON of such a value is read as well.
 from __future__ import annotations
 
 import re
-from typing import TypeAlias
+from typing import Any, TypeAlias
+
+import msgspec
 
 Literal: TypeAlias = "str | list[Literal] | dict[str, Literal]"
 """Parts of a value: single ones are texts, for the type to read."""
@@ -17,6 +19,7 @@ _SPACE = re.compile(r"\s*")
 _QUOTED = re.compile(r""""((?:[^"\\]|\\.)*)"|'((?:[^']|'')*)'""", re.DOTALL)
 _ESCAPE = re.compile(r"\\(u[0-9a-fA-F]{4}|.)", re.DOTALL)
 _CONTROLS = {"n": "\n", "t": "\t", "r": "\r", "b": "\b", "f": "\f"}
+_SIGNS = re.compile(r"""[,\[\]{}"']""")
 _VALUE = re.compile(r"[^,\[\]{}]*")
 _NAME = re.compile(r"[^,\[\]{}:=]*")
 
@@ -35,10 +38,23 @@ def read_literal(text: str) -> Literal:
     return parts[0] if len(parts) == 1 else parts
 
 
-def quote(text: str) -> str:
-    """Return *text* as :func:`read_literal` reads it, with quotes where it needs them."""
-    if text and text == text.strip() and not re.search(r"""[,\[\]{}"'\\:=]""", text):
+def write_literal(plain: Any) -> str:
+    """Return a value of YAML or JSON as :func:`read_literal` reads it."""
+    if isinstance(plain, list):
+        return f"[{', '.join(map(write_literal, plain))}]"
+    if isinstance(plain, dict):
+        return f"{{{', '.join(f'{name}: {write_literal(each)}' for name, each in plain.items())}}}"
+    if isinstance(plain, bool):
+        return "true" if plain else "false"
+    return _quoted(plain) if isinstance(plain, str) else str(plain)
+
+
+def _quoted(text: str) -> str:
+    """Return *text* with quotes where it needs them."""
+    if text and text.isprintable() and text == text.strip() and not _SIGNS.search(text):
         return text
+    if not text.isprintable():
+        return msgspec.json.encode(text).decode()
     return "'" + text.replace("'", "''") + "'"
 
 

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from eap.codec import datatypes
 from eap.codec.pd import FIRST_PD, PdHeader
+from eap.codec.structures import variable_of
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.ports import (
@@ -115,7 +116,11 @@ def _check_pd(
         ):
             names = index.names(station)
             message = f"station {station.name} has no variable {name!r}{suggest(name, names)}"
-            report.add(f"{pd.at}.variables[{position}]", message, one_of(names))
+            expected = one_of(names)
+            if (variable := variable_of(name, names)) in names:
+                message = f"{name!r} is a part of {variable!r}; a PD carries whole variables"
+                expected = f"{variable}, or a variable of its own that a link fills"
+            report.add(f"{pd.at}.variables[{position}]", message, expected)
     _check_triggers(index, report, station, pd)
 
 

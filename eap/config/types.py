@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 MAX_TYPE_FILE = 64 << 20
 """Bytes of the largest file of types."""
 _CHUNK = 1 << 16
+_MANY_ROWS = 50
+"""Members of a layout in a finding; of larger ones only those that differ."""
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,254}", re.ASCII)
 _A_TYPE = "a data type such as UINT, REAL or BLOCK(64)"
 
@@ -309,6 +311,8 @@ def _side_by_side(
         ours = other.by_name[member.name].bit_offset if other else None
         rows.append((member.name, given, _place(ours, kind.bit_length), kind.name))
     size = _place(None, other.bit_length) if other else ""
+    if len(rows) > _MANY_ROWS:
+        rows = [row for row in rows if _differ(row[1], row[2])][:_MANY_ROWS]
     rows.append(("(all)", _place(None, each.bits or None), size, ""))
     width = max(len(name) for name, *_ in rows)
     yield f"  {'':{width}}  {'given':>12}  {'computed':>12}"

@@ -10,10 +10,9 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-from eap.codec.datatypes import DataType, Plain
+from eap.codec.datatypes import Block, DataType, Plain
+from eap.codec.literals import write_literal
 from eap.od.profiles.table import Form, from_text, to_text
-
-_OCTETS = 0x0A
 
 
 class _Known(NamedTuple):
@@ -60,7 +59,7 @@ def plain(kind: DataType, name: str, octets: bytes) -> Plain | None:
         return octets.rstrip(b"\0").decode(errors="replace")
     if len(octets) != kind.size:
         return None
-    if kind.code == _OCTETS:
+    if isinstance(kind, Block):
         form = _form(kind, name)
         return octets.hex() if form is Form.PLAIN else to_text(form, kind, octets)
     try:
@@ -93,7 +92,9 @@ def show(kind: DataType, name: str, octets: bytes) -> str | None:
         return "true" if value else "false"
     if isinstance(value, float):
         value = _short(kind, value)
-    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+    if isinstance(value, list) and not any(isinstance(each, list | dict | str) for each in value):
+        return ",".join(map(str, value))
+    return str(value) if isinstance(value, str) else write_literal(value)
 
 
 def _short(kind: DataType, value: float) -> float:

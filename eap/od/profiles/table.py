@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
+from eap.codec.literals import write_literal
 from eap.ids import MacAddr, NetId, ObjectId
 from eap.od.model import RO, RW_PREOP, Access, Entry, ObjectCode, OdObject, ReadHook
 
@@ -82,9 +83,9 @@ def to_text(form: Form, kind: DataType, octets: bytes) -> str:
         return f"0x{value:0{2 * kind.size}X}"
     if isinstance(value, bytes):
         return value.hex(" ")
-    if isinstance(value, tuple):
-        return ", ".join(str(number) for number in value)
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    if isinstance(value, tuple | dict):
+        return write_literal(kind.to_plain(value)).removeprefix("[").removesuffix("]")
+    return str(value).lower() if isinstance(value, bool) else str(kind.to_plain(value))
 
 
 def from_text(form: Form, kind: DataType, text: str) -> bytes:

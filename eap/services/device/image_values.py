@@ -110,11 +110,12 @@ def _applied(function: Callable[[Image, Any], int], image: Image, slot: Any) -> 
 
 
 def _value(image: Image, name: str) -> bytes | None:
-    slot = image.slots.get(name)
-    if slot is None:
+    if name not in image.slots:
         return None
-    kind = datatypes.parse(slot.type)
-    return kind.encode(image.read(name)).ljust(kind.size, b"\0")
+    # The bytes as they are: a peer may have sent what no value of the type encodes to.
+    octets = image.load(name)
+    is_text = datatypes.parse(image.slots[name].type).is_text
+    return octets.partition(b"\0")[0].ljust(len(octets), b"\0") if is_text else octets
 
 
 def _encode(kind: DataType, number: int) -> bytes:

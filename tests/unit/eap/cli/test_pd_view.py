@@ -3,10 +3,17 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 
-from eap.cli.pd_view import UncarriedVariables, ValueChange, change_lines, listed_pds
+from eap.cli.pd_view import (
+    UncarriedVariables,
+    ValueChange,
+    change_lines,
+    listed_pds,
+    with_members,
+)
 from eap.control.protocol import VariableRow
-from eap.pd.report import PdRow, PdRowVariable
+from eap.pd.report import MemberRow, PdRow, PdRowVariable
 from tests.support.records import record
 
 
@@ -28,6 +35,7 @@ def change_line(value: object, **more: Any) -> str:
         ([1.0, 2.5], "[1, 2.5]"),
         (None, "None"),
         ("ab" * 30, "ab" * 24 + "… (60 characters)"),
+        ({"x": 1.5, "on": True, "t": "a, b"}, "{x: 1.5, on: true, t: 'a, b'}"),
     ],
 )
 def test_change_as_a_line(value: object, text: str) -> None:
@@ -53,3 +61,19 @@ def test_variables_of_no_pd_have_a_row_of_their_own() -> None:
     rest = UncarriedVariables("mixer", None, None, [PdRowVariable("level", "INT", "", "engine")])
     assert list(listed_pds("mixer", pds, listed)) == [*pds, rest]
     assert list(listed_pds("mixer", pds, listed[:1])) == pds
+
+
+def test_members_of_structs_are_listed_with_their_places() -> None:
+    text = "S<8/4:a@0 INT,f@2.1 BIT,p@4 P<4/2:x@0 INT,y@2 INT>>"
+    listed = [VariableRow(name, kind, "engine", "", "") for name, kind in
+              (("axis", text), ("speed", "INT"))]  # fmt: skip
+    (row,) = with_members(list(listed_pds("mixer", [], listed)), listed)
+    axis, speed = row.variables
+    assert (axis.type, speed.members) == ("S", UNSET)
+    assert axis.members == [
+        MemberRow("axis.a", "INT", 0, 16),
+        MemberRow("axis.f", "BIT1", 17, 1),
+        MemberRow("axis.p", "P", 32, 32),
+        MemberRow("axis.p.x", "INT", 32, 16),
+        MemberRow("axis.p.y", "INT", 48, 16),
+    ]

@@ -508,3 +508,47 @@ def test_samples_reach_back_a_quarter_of_a_second_if_there_is_room(cycle_us, oct
     assert slot.size % 8 == slot.offset % 8 == 0
     assert slot.offset == slot.last
     assert layout.directory_offset == slot.offset + slot.count * slot.size
+
+
+AXIS = "S<32/8:a@0 INT,f@2.1 BIT3,on@3 BOOL,r@8 LREAL,p@16 P<3/1:x@0 BYTE,y@1 INT>[1..2]>"
+
+
+def test_image_reads_and_writes_members_without_touching_others():
+    image = image_of(station(variables=written("axis:" + AXIS, "axis.odd:UINT")))
+    whole = image.read("axis")
+    with image.writing(Writer.APPLICATION):
+        image.write("axis.f", 5)
+        image.write("axis.on", value=True)
+        image.write("axis.p[2].y", -2)
+        image.write("axis.odd", 7)
+    whole.update(f=5, on=True, p=({"x": 0, "y": 0}, {"x": 0, "y": -2}))
+    assert image.read("axis") == whole
+    assert image.read("axis.f") == 5
+    assert image.read("axis.p[2]") == {"x": 0, "y": -2}
+    assert image.read("axis.odd") == 7  # a variable goes before a member
+    assert image.slot("axis.r").bit_offset == image.slots["axis"].bit_offset + 64
+    slots = [image.slot("axis.f"), image.slot("axis.p[2].y")]
+    assert image.read_slots(slots, tuple(Writer)) == {"axis.f": 5, "axis.p[2].y": -2}
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("axis.b", "station a has no 'axis.b': S has no member 'b'"),
+        ("axis.p[3]", "has no element 3: 1 to 2"),
+        ("axes.a", "station a has no variable 'axes.a'"),
+        ("axis.p[" + "1" * 5000 + "]", "is no path"),
+    ],
+)
+def test_image_names_a_part_that_is_not_there(name, reason):
+    image = image_of(station(variables=written("axis:" + AXIS)))
+    with pytest.raises(ImageError, match=reason):
+        image.read(name)
+
+
+def test_image_remembers_a_bounded_number_of_parts(monkeypatch):
+    image = image_of(station(variables=written("v:BYTE[60]")))
+    monkeypatch.setattr("eap.pd.image.MAX_PARTS", 10)
+    for index in range(60):
+        image.read(f"v[{index}]")
+    assert len(image._parts) <= 10

@@ -322,3 +322,39 @@ def test_random_variables_of_one_seed_and_size_share_their_bytes() -> None:
         tracemalloc.stop()
     assert len(made) == 20
     assert kept < 200_000  # one sequence takes 66 kB
+
+
+AXIS = "S<24/8:a@0 INT,f@2.1 BIT3,on@3 BOOL,r@8 LREAL,j@16 T<INT(-5..5)>>"
+
+
+def test_links_copy_members_and_leave_the_others():
+    image = linked(
+        LinkSpec("axis.r", "copy.r"),
+        LinkSpec("axis.on", "flag"),
+        LinkSpec("flag", "copy.on"),
+        LinkSpec("axis.f", "copy.f", bits=3),
+        LinkSpec("copy.r", "r"),
+        LinkSpec("axis.a", "copy.j", scale=1.0, offset=0.0),
+        LinkSpec("word", "copy.j"),
+        variables=(
+            *received(f"copy:{AXIS}", "flag:BOOL", "r:LREAL"),
+            *written(f"axis:{AXIS}", "word:INT"),
+        ),
+        axis={"a": 7, "f": 5, "on": True, "r": 2.5, "j": 0},
+        copy={"a": 3, "f": 0, "on": False, "r": 0.0, "j": 1},
+        word=-100,
+    )
+    # The target stays within its subrange.
+    assert image.read("copy") == {"a": 3, "f": 5, "on": True, "r": 2.5, "j": -5}
+    assert (image.read("flag"), image.read("r")) == (True, 2.5)
+
+
+def test_generators_fill_members():
+    image = image_of(station(variables=received(f"axis:{AXIS}")))
+    sources = [CounterSource("axis.a"), CounterSource("axis.j"), CounterSource("axis.f")]
+    generators = Generators(image, sources)
+    generators.run(7)
+    # A counter wraps with its type: from 5 to -5, and from 7 to 0.
+    assert image.read("axis") == {"a": 7, "f": 7, "on": False, "r": 0.0, "j": -4}
+    generators.run(8)
+    assert image.read("axis.f") == 0

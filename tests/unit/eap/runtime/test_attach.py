@@ -8,12 +8,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
 import msgspec
 import pytest
 
 import eap
+from eap.codec.times import LongDuration
 from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.ids import InterfaceUri, NetId
@@ -43,6 +46,7 @@ from tests.support.eventually import wait_until
 pytestmark = pytest.mark.net  # threads and real time
 
 CYCLE_US = 2000
+AXIS = "ST_Axis<24/8:x@0 LREAL,state@8 E_State<INT:Off=0,On=1>,at@16 LTIME>"
 
 
 def spec(*more: VariableSpec) -> StationSpec:
@@ -197,6 +201,30 @@ def test_writes_are_seen_together(path: Path) -> None:
         assert (station["setpoint"], station["mode"]) == (500, 3)
         station["mode"] = 4
         assert station["mode"] == 4
+
+
+@dataclass
+class Axis:
+    x: float
+    state: int
+
+
+def test_attach_reads_and_writes_members_of_a_struct(path: Path) -> None:
+    axis = VariableSpec("axis", AXIS, default={"x": 1.5, "state": "On", "at": "LTIME#7ns"})
+    with running(path, spec(axis)), eap.attach("mixer") as station:
+        assert station["axis"] == {"x": 1.5, "state": 1, "at": LongDuration.of(7)}
+        station["axis.x"] = 2.5
+        station.write({"axis.state": "Off", "mode": 3})
+        assert station.read_as("axis", Axis) == Axis(2.5, 0)
+        assert station["axis.at"].ns == 7
+        value = station["axis"]
+        value["at"] = timedelta(microseconds=5)
+        station["axis"] = value
+        assert station["axis.at"] == timedelta(microseconds=5)
+        with pytest.raises(ValueError, match="a value of ST_Axis lacks state, at"):
+            station["axis"] = {"x": 1.0}
+        with pytest.raises(ImageError, match="ST_Axis has no member 'y'"):
+            station["axis.y"] = 1
 
 
 def test_attach_write_of_unfit_value_writes_nothing(path: Path) -> None:
