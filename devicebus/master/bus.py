@@ -239,9 +239,9 @@ class BusState:
             # A cyclic frame does not wait for a dead line, others do.
             piggyback=0 if settings.redundant else MAX_PIGGYBACK,
         )
-        self.ring = (
-            Ring(self._handle_ring_change, settings.cycle_ns) if settings.redundant else None
-        )
+        self.ring: Ring | None = None
+        if settings.redundant:
+            self.ring = Ring(self._handle_ring_change, self._is_expected)
         self.cut_ends: tuple[int | None, int | None] | None = None
         self.runner = Runner(self.link)
         self.changes = ChangeCount()
@@ -336,6 +336,9 @@ class BusState:
         # Without a clock that leads them, those behind the cut would drift apart.
         has_time = self.reference is not None and clocks
         self.ring.second_reference = clocks[0] if has_time else None
+
+    def _is_expected(self, address: int, wkc: int) -> bool | None:
+        return None if self.cycle is None else self.cycle.is_expected(address, wkc)
 
     def _ends_of_cut(self, reached: int) -> tuple[int | None, int | None]:
         stations = [None, *(slave.station for slave in self._answering), None]

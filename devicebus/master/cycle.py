@@ -127,6 +127,13 @@ class Cycle:
         """True if the last cycle came back with the full working counter of all active slaves."""
         return self.is_good and self._received >= self._expected > 0
 
+    def is_expected(self, address: int, wkc: int) -> bool | None:
+        """Return whether a datagram may have this working counter; None for another address."""
+        for datagram, counts in zip(self._datagrams, self._allowed, strict=True):
+            if datagram.address == address:
+                return bool(counts >> wkc & 1)
+        return None
+
     def start(self, now_ns: int) -> None:
         """Queue this cycle's datagrams, unless MAX_UNDER_WAY cycles are in flight."""
         self._link.start_cycle()

@@ -52,7 +52,6 @@ class RoundTrip:
 
     Args:
         ceiling_ns: Maximum time-out.
-        floor_ns: Minimum time-out.
 
     Attributes:
         timeout_ns: Time-out of a frame that is sent for the first time.
@@ -68,8 +67,8 @@ class RoundTrip:
         "timeout_ns",
     )
 
-    def __init__(self, ceiling_ns: int = CEILING_NS, floor_ns: int = FLOOR_NS) -> None:
-        self._floor_ns = min(floor_ns, ceiling_ns)
+    def __init__(self, ceiling_ns: int = CEILING_NS) -> None:
+        self._floor_ns = min(FLOOR_NS, ceiling_ns)
         self._ceiling_ns = ceiling_ns
         self._backoff_limit_ns = min(BACKOFF_LIMIT_NS, ceiling_ns)
         self._variation_ns = 0

@@ -20,9 +20,9 @@ known, it is replaced by a NOP.  So is the datagram that distributes the time of
 (FRMW): without the reference on its half it would write zeros into all clocks there.  Instead
 another slave can distribute its time behind the cut.
 
-If one copy of a frame does not come, its line may be slow or dead.  A cyclic frame then passes soon
-with the half that came: over a dead line the other one has reached all slaves, and otherwise its
-working counter shows that a half is missing.  Other frames wait until the line is known to be dead.
+If one copy of a frame does not come, its line may be slow or dead.  A cyclic frame passes with one
+half if its working counters are those of all slaves, which the other line has then not reached.
+Other frames wait until the line is known to be dead.
 """
 
 from __future__ import annotations
@@ -33,22 +33,18 @@ from enum import IntEnum
 
 import msgspec
 
-from devicebus.master.link import INDEXES, RoundTrip
+from devicebus.master.link import INDEXES
 from devicebus.wire.datagram import OVERHEAD, Command, DatagramHeader
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.wire import Buffer
 
 RING_INDEXES = INDEXES // 2
 """Frame indexes of a link with a ring: those of the second line have _SECOND_BIT set."""
-# Three quarters of a cycle, so that the half of a dead line does not cost the next cycle.
-_WAIT_SHARE = 0.75
-"""Minimum wait for the other copy of a cyclic frame, in cycles."""
 # Slaves whose answers are on a line that is only slow must not be taken for lost ones.
 DEAD_NS = 50_000_000
 """Time without a copy after which a line is dead."""
 DEAD_COPIES = 3
 """Copies that have to be missing on it meanwhile."""
-_CEILING_NS = 100_000_000
 _SECOND_BIT = RING_INDEXES
 _HEADER = struct.Struct("<BBHHHH")
 _SIZE = DatagramHeader.SIZE
@@ -56,8 +52,8 @@ _LENGTH = 0x07FF
 _MORE = 0x8000
 _BY_POSITION = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
 _BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
-_JOINED = frozenset((Command.LRD, Command.LWR, Command.LRW, *_BROADCAST))
-_CYCLIC = frozenset((Command.LRD, Command.LWR, Command.LRW, Command.FRMW))
+_LOGICAL = frozenset((Command.LRD, Command.LWR, Command.LRW))
+_JOINED = _LOGICAL | _BROADCAST
 _COUNTED = _BY_POSITION | _BROADCAST
 _NOP, _FRMW = int(Command.NOP), int(Command.FRMW)
 
@@ -88,12 +84,12 @@ class RingReport(msgspec.Struct, frozen=True, kw_only=True):
 class _SentCopies:
     """Frame with its copy for the second line."""
 
-    __slots__ = ("copies", "halves", "is_cyclic", "is_done", "second_is_unprocessed", "sent_ns")
+    __slots__ = ("copies", "halves", "is_done", "number", "second_is_unprocessed", "sent_ns")
 
-    def __init__(self, first: bytes, second: bytes, sent_ns: int) -> None:
+    def __init__(self, first: bytes, second: bytes, number: int, sent_ns: int) -> None:
         self.copies = (first, second)
-        self.is_cyclic = first[EtherCatHeader.SIZE] in _CYCLIC
         self.halves: list[bytes | None] = [None, None]
+        self.number = number
         self.sent_ns = sent_ns
         self.second_is_unprocessed = False
         self.is_done = False
@@ -110,7 +106,8 @@ class Ring:
     Args:
         on_change: Called with the time when the ring was cut or mended, or when the number of
             slaves before the cut is known.
-        cycle_ns: Time between two cyclic frames.
+        is_expected: Returns true if a working counter is that of all slaves, for a logical datagram
+            with an address, or None for another address.
 
     Attributes:
         is_whole: True while frames pass the whole ring; None before the first one.
@@ -120,8 +117,11 @@ class Ring:
         unexpected: Frames that came back and were no copies.
     """
 
-    def __init__(self, on_change: Callable[[int], None], cycle_ns: int = 1_000_000) -> None:
+    def __init__(
+        self, on_change: Callable[[int], None], is_expected: Callable[[int, int], bool | None]
+    ) -> None:
         self._on_change = on_change
+        self._is_expected = is_expected
         self.is_whole: bool | None = None
         self.reached: int | None = None
         self.second_reference: int | None = None
@@ -130,9 +130,9 @@ class Ring:
         self._sent: dict[int, _SentCopies] = {}
         self._waiting: dict[int, _SentCopies] = {}
         self._silent = [False, False]
-        self._heard_ns: list[int | None] = [None, None]
+        self._heard_ns = [0, 0]
         self._missing = [0, 0]
-        self._trip = RoundTrip(_CEILING_NS, round(_WAIT_SHARE * cycle_ns))
+        self._number = self._judged = 0
         self._cuts = 0
         self._place: int | None = None
         self._cut_ns: int | None = None
@@ -146,8 +146,9 @@ class Ring:
             copies.append(copy)
             index = frame[3]
             self._waiting.pop(index, None)
-            self._sent[index] = _SentCopies(frame, copy, now_ns)
-        if self._heard_ns[0] is None:
+            self._number += 1
+            self._sent[index] = _SentCopies(frame, copy, self._number, now_ns)
+        if not self._heard_ns[0]:
             self._heard_ns = [now_ns, now_ns]
         return copies
 
@@ -165,24 +166,25 @@ class Ring:
             self._silent[copy] = False
             self.reached = None  # known again by the next broadcast
         if copy is not line:
-            self._note(now_ns, is_whole=True)
+            self._note(sent, now_ns, is_whole=True)
             if copy is Line.FIRST:
-                return self._finish(sent, data, now_ns)
+                return self._finish(sent, data)
             # Not processed.  If the ring was cut behind it, the half of the first copy is all.
             sent.second_is_unprocessed = True
-            return self._finish_half(sent, now_ns) if sent.halves[Line.FIRST] else None
-        self._note(now_ns, is_whole=False)
+            return self._finish_half(sent) if sent.halves[Line.FIRST] else None
+        self._note(sent, now_ns, is_whole=False)
         self._count_slaves(copy, sent.copies[copy], data, now_ns)
         if sent.is_done:
             return None
         sent.halves[copy] = bytes(data)
         other = Line(1 - copy)
-        is_expected = not (self._silent[other] or sent.second_is_unprocessed)
-        if sent.halves[other] is None and is_expected:
+        if sent.halves[other] is None:
             self._missing[other] += 1
-            self._waiting[sent.copies[0][3]] = sent
-            return None
-        return self._finish_half(sent, now_ns)
+            is_alone = self._silent[other] or sent.second_is_unprocessed
+            if not is_alone and not self._is_of_all_slaves(sent.copies[copy], data):
+                self._waiting[sent.copies[0][3]] = sent
+                return None
+        return self._finish_half(sent)
 
     def next_timeout(self) -> int | None:
         """Return the time at which :meth:`handle_timeout` must be called."""
@@ -190,32 +192,43 @@ class Ring:
         return min(times, default=None)
 
     def handle_timeout(self, now_ns: int) -> list[bytes]:
-        """Return the frames that need not wait for their other copy any more."""
+        """Return the frames whose other copy will not come because its line is dead."""
         frames = []
-        for sent in list(self._waiting.values()):
+        for index, sent in list(self._waiting.items()):
             if self._end_of_wait(sent) > now_ns:
                 continue
             line = sent.missing_line
-            if (
-                self._missing[line] >= DEAD_COPIES
-                and now_ns - (self._heard_ns[line] or 0) >= DEAD_NS
-            ):
+            if self._missing[line] >= DEAD_COPIES and now_ns - self._heard_ns[line] >= DEAD_NS:
                 self._silent[line] = True
                 if line is Line.FIRST:
                     self._set_reached(0, now_ns)
-            if sent.is_cyclic or self._silent[line]:
                 self._end(sent)
                 frames.append(_merge(sent.copies[0], *sent.halves))
-            else:  # the link sends it again
-                del self._waiting[sent.copies[0][3]]
+            else:  # the link sends it again, or the next cycle replaces it
+                del self._waiting[index]
         return frames
 
     def _end_of_wait(self, sent: _SentCopies) -> int:
-        if sent.is_cyclic:
-            return sent.sent_ns + self._trip.timeout_ns
         line = sent.missing_line
-        waited_ns = (self._heard_ns[line] or 0) + DEAD_NS
-        return waited_ns if self._missing[line] >= DEAD_COPIES else sent.sent_ns + DEAD_NS
+        begun_ns = self._heard_ns[line] if self._missing[line] >= DEAD_COPIES else sent.sent_ns
+        return begun_ns + DEAD_NS
+
+    def _is_of_all_slaves(self, sent: bytes, data: Buffer) -> bool:
+        """Return true for a cyclic frame if the slaves of this half are all that exchange data."""
+        is_cyclic = False
+        offset = EtherCatHeader.SIZE
+        more = _MORE
+        while more:
+            command, _, adp, ado, word, _ = _HEADER.unpack_from(sent, offset)
+            end = offset + _SIZE + (word & _LENGTH)
+            if command in _LOGICAL:
+                is_cyclic = True
+                wkc = int.from_bytes(data[end : end + 2], "little")
+                if not self._is_expected(ado << 16 | adp, wkc):
+                    return False
+            offset = end + 2
+            more = word & _MORE
+        return is_cyclic
 
     def end_opening(self, now_ns: int) -> None:
         """Note that the master has joined the ring again; if it is not whole now, it was cut."""
@@ -261,22 +274,24 @@ class Ring:
             more = word & _MORE
         return bytes(copy)
 
-    def _finish_half(self, sent: _SentCopies, now_ns: int) -> Buffer | None:
-        return self._finish(sent, _merge(sent.copies[0], *sent.halves), now_ns)
+    def _finish_half(self, sent: _SentCopies) -> Buffer | None:
+        return self._finish(sent, _merge(sent.copies[0], *sent.halves))
 
-    def _finish(self, sent: _SentCopies, frame: Buffer, now_ns: int) -> Buffer | None:
+    def _finish(self, sent: _SentCopies, frame: Buffer) -> Buffer | None:
         if sent.is_done:
             return None
         self._end(sent)
-        self._trip.measure(now_ns - sent.sent_ns)
         return frame
 
     def _end(self, sent: _SentCopies) -> None:
         sent.is_done = True
         self._waiting.pop(sent.copies[0][3], None)
 
-    def _note(self, now_ns: int, *, is_whole: bool) -> None:
-        """Note whether the ring is whole."""
+    def _note(self, sent: _SentCopies, now_ns: int, *, is_whole: bool) -> None:
+        """Note whether the ring was whole for a frame, unless a later one has told more."""
+        if sent.number < self._judged:
+            return
+        self._judged = sent.number
         if is_whole is self.is_whole:
             return
         self.is_whole = is_whole

@@ -223,7 +223,7 @@ def test_returned_slave_of_a_ring_gets_the_time_of_the_others():
 
 def test_foreign_frames_are_counted_and_change_nothing():
     changes = []
-    ring = Ring(changes.append)
+    ring = Ring(changes.append, lambda address, wkc: None)
     (frame,) = [encode_frame([Datagram(DatagramHeader(7, 3, 0, 0, 1), bytes(1))])]
     (copy,) = ring.copy_frames([frame], 0)
     other = bytearray(answer(frame))
@@ -235,7 +235,7 @@ def test_foreign_frames_are_counted_and_change_nothing():
 
 
 def test_ring_merges_both_halves_of_a_frame():
-    ring = Ring(lambda now_ns: None)
+    ring = Ring(lambda now_ns: None, lambda address, wkc: wkc == 6)
     datagrams = [
         Datagram(DatagramHeader(12, 9, 0, 1, 4), b"\x0f\0\0\0"),
         Datagram(DatagramHeader(4, 9, 1002, 0x130, 2), bytes(2)),
