@@ -45,6 +45,8 @@ class Shape(msgspec.Struct, frozen=True):
     frames: int
     pds: int
     size: int
+    type: str = ""
+    """Type of each PD's variable; a raw block if empty."""
 
     @property
     def frame_size(self) -> int:
@@ -53,7 +55,7 @@ class Shape(msgspec.Struct, frozen=True):
 
     def variables(self) -> list[list[VariableSpec]]:
         """Return the variables of each frame, one a PD; only the engine writes them."""
-        kind = f"BLOCK({self.size})"
+        kind = self.type or f"BLOCK({self.size})"
         return [
             [VariableSpec(f"v{frame}-{pd}", kind, Writer.ENGINE) for pd in range(self.pds)]
             for frame in range(self.frames)
