@@ -17,7 +17,8 @@ from eap.cli.params import json_option
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from eap.ops.decode import DecodedAms, DecodedDatagram, DecodedFrame, Packet
+    from eap.ops.decode import DecodedAms, DecodedDatagram, DecodedFrame
+    from eap.ops.packets import Packet
 
 _NAMES = {
     1: "datagrams",
@@ -68,7 +69,8 @@ def _frames(source: str) -> Iterator[DecodedFrame]:
 
 def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
     from eap.errors import CodecError
-    from eap.ops.decode import CycleOrders, decode_frame, iter_capture
+    from eap.ops.decode import CycleOrders, decode_frame
+    from eap.ops.packets import iter_capture
 
     orders = CycleOrders()
     try:
@@ -84,7 +86,8 @@ def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
 
 
 def _frames_of_octets(octets: bytes) -> Iterator[DecodedFrame]:
-    from eap.ops.decode import cut_frames, decode_frame, unwrap
+    from eap.ops.decode import decode_frame
+    from eap.ops.packets import cut_frames, unwrap
 
     packet = unwrap(octets)
     if packet is None:

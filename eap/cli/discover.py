@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING
 
 import click
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 _USUAL_S = 5.0
 """Length of a capture whose result goes to a file, a pipe or a plant file."""
 _REDRAW_S = 1.0
+_REST = 10
+"""Time between two screens at least, as a multiple of the time that the first one took."""
 _FROM_HELP = (
     "NetID of a publisher: ask its dictionary for names and types, through a running station. May"
     " be repeated."
@@ -175,15 +178,19 @@ def _watch(
     from eap.cli.discover_view import live_view
     from eap.ops.discover import discovered
 
-    drawn_ns = None
+    # A screen of thousands of PDs takes long: then there are fewer of them, so that the capture is
+    # read in time.
+    draw_at = 0.0
     with _ended_by_signal():
         try:
             for _ in discovery.watch(interface, for_s):
                 if takers is None:
                     continue
-                if drawn_ns is None or discovery.now_ns - drawn_ns >= _REDRAW_S * 1e9:
-                    drawn_ns = discovery.now_ns
-                    repaint(live_view(discovered(discovery, takers), discovery, interface))
+                start = monotonic()
+                if start >= draw_at:
+                    rows = discovered(discovery, takers, with_guess=False)
+                    repaint(live_view(rows, discovery, interface))
+                    draw_at = monotonic() + max(_REDRAW_S, _REST * (monotonic() - start))
         except KeyboardInterrupt:
             pass
     if takers is not None:

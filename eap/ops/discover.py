@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import NetId
 from eap.net.capture import FrameCapture
-from eap.ops.decode import Packet, iter_capture, unwrap
+from eap.ops.packets import Packet, capture_drops, iter_capture, unwrap
 from eap.ops.takers import Taker
 from eap.pd.appearance import guess
 from eap.pd.observer import MAX_PDS, FramePath, ObservedPd, Observer, PdKey
@@ -129,7 +129,7 @@ class CaptureLosses(NamedTuple):
     """Packets and frames that the capture did not see, or could not read."""
 
     dropped: int | None
-    """Packets that the kernel dropped; None where that is not known."""
+    """Packets that the kernel or the capturing program dropped; None where that is not known."""
     cut: int
     """Frames of which only the begin was there."""
     malformed: int
@@ -139,7 +139,7 @@ class CaptureLosses(NamedTuple):
     def lines(self) -> Iterator[str]:
         """Yield a line for each kind of loss."""
         if self.dropped:
-            yield f"capture: {self.dropped} packets lost by the kernel; rates and gaps are wrong"
+            yield f"capture: {self.dropped} packets lost: too fast; rates and gaps are wrong"
         if self.cut:
             yield f"capture: {self.cut} frames with their begin only: in fragments, or cut"
         if self.malformed:
@@ -197,6 +197,7 @@ class Discovery:
             OSError: the file cannot be read.
             MalformedError: it is no capture of Ethernet, or is damaged; the frames before count.
         """
+        self._dropped = capture_drops(path)
         for frame in iter_capture(path):
             self.now_ns = frame.at_ns
             self.observer.receive_frame(frame.data, frame.at_ns, frame_path(frame.packet))
@@ -247,13 +248,15 @@ def frame_path(packet: Packet) -> FramePath:
     return FramePath(packet.transport, source, destination, packet.vlan_id)
 
 
-def discovered(discovery: Discovery, takers: Iterable[Taker]) -> list[DiscoveredPd]:
-    """Return a row for each PD, by publisher and ID."""
+def discovered(
+    discovery: Discovery, takers: Iterable[Taker], *, with_guess: bool = True
+) -> list[DiscoveredPd]:
+    """Return a row for each PD, by publisher and ID; the guess of its content takes longest."""
     by_id: dict[int, list[Taker]] = {}
     for taker in takers:
         by_id.setdefault(taker.subscription.pd_id, []).append(taker)
     rows = [
-        _row(each, by_id.get(each.key.pd_id, ()), discovery.now_ns)
+        _row(each, by_id.get(each.key.pd_id, ()), discovery.now_ns, with_guess=with_guess)
         for each in discovery.observer.pds.values()
     ]
     return sorted(rows, key=_row_order)
@@ -279,7 +282,7 @@ def _compare(key: PdKey, takers: Iterable[Taker]) -> tuple[str | None, list[Refu
     return ", ".join(taking) or None, [] if taking else refusing
 
 
-def _row(pd: ObservedPd, takers: Iterable[Taker], now_ns: int) -> DiscoveredPd:
+def _row(pd: ObservedPd, takers: Iterable[Taker], now_ns: int, *, with_guess: bool) -> DiscoveredPd:
     key, found = pd.key, pd.measure()
     taken_by, refused_by = _compare(key, takers)
     return DiscoveredPd(
@@ -309,7 +312,7 @@ def _row(pd: ObservedPd, takers: Iterable[Taker], now_ns: int) -> DiscoveredPd:
         header_length=pd.wrong_length,
         quality=pd.quality,
         refused_by=refused_by,
-        looks_like=[str(part) for part in guess(pd.samples)],
+        looks_like=[str(part) for part in guess(pd.samples)] if with_guess else [],
     )
 
 

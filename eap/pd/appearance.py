@@ -22,6 +22,8 @@ _SMALLEST, _LARGEST = 1e-6, 1e9
 """Limits of plausible measured values, other than 0."""
 MAX_PARTS = 24
 """Parts that are named; the rest is one."""
+_EXAMINED = 256
+"""Bytes at the begin that are looked at; the rest is one part."""
 
 
 class Part(NamedTuple):
@@ -50,7 +52,7 @@ def guess(samples: Sequence[bytes]) -> list[Part]:
     while offset < size:
         part = None
         # Unknown bytes are passed by twos: few variables have an odd size.
-        if len(parts) < MAX_PARTS - 1 and (offset - anchor) % 2 == 0:
+        if len(parts) < MAX_PARTS - 1 and offset < _EXAMINED and (offset - anchor) % 2 == 0:
             part = _part_at(samples, offset)
         found = part or Part(offset, 1, "BLOCK", "")
         before = parts[-1] if parts else None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.ops.decode import decode_frame, unwrap
+from eap.ops.decode import decode_frame
+from eap.ops.packets import unwrap
 
 
 def fuzz_one(data: bytes) -> None:

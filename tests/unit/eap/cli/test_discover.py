@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import random
 import struct
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import dpkt
 import pytest
 from click.testing import CliRunner, Result
 
@@ -208,6 +210,32 @@ def test_truncated_capture_shows_what_came_before(capture: Path) -> None:
     assert len(rows(result)) == 3
     capture.write_bytes(octets[:12])
     assert "no whole pcap or pcapng file" in run("--pcap", capture).stderr
+
+
+def statistics(order: str, *options: tuple[int, int]) -> bytes:
+    """An Interface Statistics Block of pcapng."""
+    body = struct.pack(f"{order}III", 0, 0, 0)
+    for code, count in options:
+        body += struct.pack(f"{order}HHQ", code, 8, count)
+    body += bytes(4)
+    size = len(body) + 12
+    return struct.pack(f"{order}II", 5, size) + body + struct.pack(f"{order}I", size)
+
+
+def test_losses_that_a_pcapng_file_tells_are_shown(tmp_path: Path) -> None:
+    path = tmp_path / "x.pcapng"
+    with path.open("wb") as file:
+        writer = dpkt.pcapng.Writer(file)
+        for number, octets in enumerate(mixer(range(8))):
+            writer.writepkt(octets, ts=number / 100)
+        file.write(statistics("<" if sys.byteorder == "little" else ">", (4, 8), (5, 3), (7, 4)))
+    result = run("--pcap", path, "--json")
+    assert (result.exit_code, len(rows(result))) == (0, 2)
+    assert "capture: 7 packets lost" in result.stderr
+    whole = path.read_bytes()
+    for size in range(len(whole) - 60, len(whole)):
+        path.write_bytes(whole[:size])
+        assert run("--pcap", path).exit_code in {0, 2}
 
 
 def test_hostile_packets_do_no_harm(tmp_path: Path) -> None:
