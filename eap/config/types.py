@@ -89,7 +89,8 @@ class TypeTable:
     """Types by name, resolved when they are used.
 
     Args:
-        definitions: In the order of the files; a name that occurs twice is a finding.
+        definitions: In the order of the files; a name that occurs twice is a finding, in files of
+            controllers when it is used.
         report: Takes the findings.
     """
 
@@ -98,6 +99,7 @@ class TypeTable:
         self._definitions: dict[str, TypeDefinition] = {}
         self._found: dict[str, DataType] = {}
         self._broken: set[str] = set()
+        self._ambiguous: dict[str, tuple[TypeDefinition, str]] = {}
         self._open: list[str] = []
         for each in definitions:
             self._add(each)
@@ -133,6 +135,9 @@ class TypeTable:
             return None
         if key in self._broken:
             raise _ReportedTypeError(name)
+        if key in self._ambiguous:
+            self._broken.add(key)
+            raise self._reported(*self._ambiguous[key], "each name once")
         if key in self._open or len(self._open) >= MAX_DEPTH:
             raise self._too_deep(key, definition)
         self._open.append(key)
@@ -166,8 +171,12 @@ class TypeTable:
             first = self._definitions[key]
             where = f"{first.file or 'line'} {first.line or self._report.line_of(first.path)}"
             message = f"type {each.name} is defined twice (first in {where})"
-            if not each.file or not _same(first, each):
+            if not each.file:
                 self._add_finding(each, message, "each name once")
+            elif not _same(first, each):
+                # Libraries of a controller may have types of one name, which is no error unless
+                # a variable has one of them.
+                self._ambiguous.setdefault(key, (each, message))
             return
         self._definitions[key] = each
 

@@ -34,7 +34,6 @@ from eap.config.imports.twincat import ITEM, PROJECT, TwinCatProject, read_proje
 from eap.config.imports.typefile import ROOTS as TYPE_ROOTS
 from eap.config.imports.typefile import TypeFile, TypeRecord, read_type_file
 from eap.config.imports.typenames import TypeNames
-from eap.config.types import type_text
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri, NetId
 from eap.runtime.durable import whole_file
@@ -48,6 +47,12 @@ EDC = (
     " of the EAP device as XML descriptions in TwinCAT (Export XML Description), or import the"
     " project itself"
 )
+_ARCHIVE = "it is an archive: unpack it, and import the .tsproj file in it"
+_NOT_READ = {".edc": EDC, ".tszip": _ARCHIVE, ".tnzip": _ARCHIVE, ".tpzip": _ARCHIVE}
+_OTHER_ROOTS = {
+    "TcConfig": ": 'eapctl routes import STATION FILE' takes the routes of it",
+    "EtherCATInfo": ": a bus file names it as the description of a slave (esi)",
+}
 _VERSIONS = (
     "A project does not show the data type versions of its variables: 0, the default of TwinCAT 3,"
     " is assumed.  If a PD counts as wrong_version, write its version, or ignore_version: true."
@@ -119,7 +124,8 @@ def run_import(
     stations, types = _plan(_read(files, report), choices, report)
     if report.findings or not stations:
         if not report.findings:
-            report.add(str(files[0]), 0, "nothing to import", "an EAP device, or symbols")
+            message = "nothing to import: it has no EAP device that is in use, and no symbols"
+            report.add(str(files[0]), 0, message, "an EAP device (DevType 112), or symbols")
         return _result(report), ""
     name = choices.plant or (target.stem if target else files[0].stem)
     head = [f"Made by 'eapctl import {' '.join(each.name for each in files)}'."]
@@ -147,8 +153,8 @@ def _read(files: Sequence[Path], report: ImportReport) -> _Sources:
     sources = _Sources()
     for path in files:
         file = str(path)
-        if path.suffix.lower() == ".edc":
-            report.add(file, 0, EDC, "a .tsproj, .xti, .tmc, .tpy or .xml file")
+        if reason := _NOT_READ.get(path.suffix.lower()):
+            report.add(file, 0, reason, "a .tsproj, .xti, .tmc, .tpy or .xml file")
             continue
         root = _root_of(path, report)
         if root in {PROJECT, ITEM}:
@@ -158,8 +164,9 @@ def _read(files: Sequence[Path], report: ImportReport) -> _Sources:
         elif root in TREE_ROOTS:
             sources.items += read_tree_items(_chunks(file), file, report)
         elif root:
+            hint = _OTHER_ROOTS.get(root, "")
             expected = "TcSmProject, TcSmItem, TcModuleClass, PlcProjectInfo or TreeItem"
-            report.add(file, 1, f"it begins with {root!r}, which is not imported", expected)
+            report.add(file, 1, f"it begins with {root!r}, which is not imported{hint}", expected)
     return sources
 
 
@@ -202,15 +209,17 @@ def _plan(
         plan_station(system, interfaces, choices.identity, report)
         for system in _systems(sources, types, names, report)
     ]
-    if not stations:
+    types.take_findings()
+    # Without a port, as all devices are disabled, there is no station.
+    stations = [each for each in stations if each.ports]
+    if not sources.projects and not sources.items:
         stations = [
             station
             for file, found in sources.types
             if (station := _of_symbols(file, found, types, names, interfaces, report))
         ]
-    elif choices.peer:
+    elif choices.peer and stations:
         stations = with_peers(stations, choices.peer, interfaces)
-    types.take_findings()
     return resolve(stations, choices.to, report), types.section()
 
 
@@ -264,15 +273,11 @@ def _of_symbols(
     for symbol in found.symbols:
         if has_areas and not symbol.area:
             continue
-        try:
-            kind = types.parse(type_text(symbol.type, symbol.bounds))
-            if symbol.bits != 8 * kind.size:
-                raise ValueError(f"it has {symbol.bits} bits, its type {8 * kind.size}")  # noqa: TRY301
-            variable = PlannedVariable(symbol.name, kind.name, symbol.comment)
-        except ValueError as exc:
-            report.note(file, symbol.line, symbol.name, Outcome.LEFT, str(exc))
+        kind = types.parse_if_usable(symbol)
+        if isinstance(kind, str):
+            report.note(file, symbol.line, symbol.name, Outcome.LEFT, kind)
             continue
-        variables.append(variable)
+        variables.append(PlannedVariable(symbol.name, kind.name, symbol.comment))
         report.note(file, symbol.line, symbol.name, Outcome.TAKEN, f"variable {kind.name}")
     if not variables:
         return None

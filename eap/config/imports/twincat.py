@@ -181,7 +181,7 @@ class _Project:
         """Take the device of a file that is no project."""
         self._devices += [(each, file) for each in items if each.tag == "Device"]
         for each in items:
-            if each.tag == "Box":
+            if each.tag == "Box" and each.get("BoxType") in {str(PUBLISHER), str(SUBSCRIBER)}:
                 message = "a box without its device: its NetID is unknown"
                 expected = "the file of its device, or the project"
                 self._report.add(file, each.line, message, expected)

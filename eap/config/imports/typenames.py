@@ -11,7 +11,7 @@ from eap.codec.structures import Structure, lay_out_structure
 from eap.config.finding import FindingReport
 from eap.config.imports.planttext import scalar
 from eap.config.imports.records import EapVariable, ImportReport, Outcome
-from eap.config.imports.typefile import TypeRecord
+from eap.config.imports.typefile import ArrayBound, SymbolRecord, TypeRecord
 from eap.config.types import TypeTable, definition_of, type_text
 
 if TYPE_CHECKING:
@@ -78,16 +78,32 @@ class TypeNames:
             )
         return kind.name
 
-    def parse(self, text: str, guid: str = "") -> DataType:
+    def parse(self, text: str, guid: str = "", bounds: Sequence[ArrayBound] = ()) -> DataType:
         """Return a type by its name in TwinCAT; raise ValueError if it cannot be used."""
         name = self._by_guid.get(guid, "") or text
-        ours = type_text(name)
+        ours = type_text(name, bounds)
         kind = self._table.parse(_BIT_TYPES.get(ours.upper(), ours))
         self._use(kind)
         return kind
 
+    def parse_if_usable(self, symbol: SymbolRecord) -> DataType | str:
+        """Return the type of a symbol, or the reason that it cannot be used."""
+        before = self._findings.findings()
+        try:
+            kind = self.parse(symbol.type, bounds=symbol.bounds)
+        except ValueError as exc:
+            for each in self._findings.findings():
+                if each not in before:
+                    return f"{each.message}; expected {each.expected}"
+            # Reported with another variable.
+            known = f"its type {symbol.type} cannot be used"
+            return str(exc) if " " in str(exc) else known
+        if symbol.bits not in {0, 8 * kind.size}:
+            return f"it has {symbol.bits} bits, its type {kind.name} has {8 * kind.size}"
+        return kind
+
     def take_findings(self) -> None:
-        """Report what was found wrong with the types that are used."""
+        """Report the errors of the types that are used."""
         self._report.findings += self._findings.findings()
 
     def section(self) -> list[str]:
@@ -98,11 +114,11 @@ class TypeNames:
 
     def _use(self, kind: DataType) -> None:
         """Note all definitions in *kind*, those that others need first."""
-        if isinstance(kind, Array):
-            self._use(kind.element)
-        elif kind.alias_of is not None:
+        if kind.alias_of is not None:
             self._use(kind.alias_of)
             self._used[kind.name] = kind
+        elif isinstance(kind, Array):
+            self._use(kind.element)
         elif isinstance(kind, Structure):
             for member in kind.members:
                 self._use(member.kind)

@@ -99,6 +99,18 @@ def test_types_of_a_file_are_laid_out_as_it_says(tmp_path):
     )
 
 
+def test_types_of_one_name_in_a_file_are_a_finding_when_one_is_used(tmp_path, monkeypatch):
+    second = TMC[TMC.index("<DataType>") : TMC.index("</DataType>")].replace("BYTE", "WORD")
+    name = second[second.index("<Name") :].partition(">")[2].partition("<")[0]
+    twice = TMC.replace("</DataTypes>", f"{second}<SubItem><Name>more</Name><Type>INT</Type>"
+        "<BitSize>16</BitSize><BitOffs>800</BitOffs></SubItem></DataType></DataTypes>")  # fmt: skip
+    monkeypatch.setattr(f"{__name__}.TMC", twice)
+    types = "  - axis.tmc\n  - {ST_Own: {members: {a: INT}}}"
+    assert not findings(tmp_path, types=types, axis="ST_Own")
+    (finding,) = findings(tmp_path, types=types, axis=name)
+    assert f"type {name} is defined twice (first in" in finding
+
+
 def test_type_of_a_file_that_nothing_uses_is_no_finding(tmp_path):
     # Files of controllers have function blocks too.
     assert not findings(tmp_path, types="  - axis.tmc", axis="ST_A")

@@ -4,6 +4,8 @@ import shutil
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from eap.config.imports.records import EapBox, EapImportDevice, EapVariable, Outcome
 from eap.config.imports.stations import PublisherIdentity
@@ -276,6 +278,55 @@ def test_pointers_are_refused(importer: Importer, kind: str, size: int) -> None:
     assert not importer.plant.exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "reason"),
+    [
+        ("a.tszip", "PK", "it is an archive: unpack it"),
+        ("a.xml", "<TcConfig/>", "'eapctl routes import STATION FILE' takes the routes of it"),
+        ("a.xml", "<EtherCATInfo/>", "a bus file names it"),
+        ("a.xti", '<TcSmItem><Box BoxType="9099"/></TcSmItem>', "nothing to import"),
+        ("a.tsproj", project(device(more='Disabled="1"')), "no EAP device that is in use"),
+    ],
+)
+def test_files_without_process_data_are_refused_with_the_reason(
+    importer: Importer, name: str, text: str, reason: str
+) -> None:
+    result = importer.run(importer.put(name, text))
+    assert not result.ok
+    assert reason in messages(result)[0]
+    assert not importer.plant.exists()
+
+
+@given(st.data())
+def test_damaged_projects_are_imported_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    octets = bytearray(LINE.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(octets) - 1))
+        match data.draw(st.sampled_from(("cut", "change", "remove", "repeat"))):
+            case "cut":
+                del octets[at + 1 :]
+            case "change":
+                octets[at] = data.draw(st.integers(0, 255))
+            case "remove":
+                del octets[at : at + data.draw(st.integers(1, 200))]
+            case _:
+                octets[at:at] = octets[at : at + data.draw(st.integers(1, 200))]
+        if not octets:
+            break
+    folder = tmp_path_factory.getbasetemp() / "damaged"
+    folder.mkdir(exist_ok=True)
+    (folder / "Line.tsproj").write_bytes(octets)
+    plant = folder / "line.yaml"
+    plant.unlink(missing_ok=True)
+    result, _ = run_import([folder / "Line.tsproj"], plant, UDP)
+    assert result.ok == plant.exists()
+    assert result.ok or result.findings
+    if result.ok:
+        assert not load_plant(plant).findings
+
+
 def test_all_findings_come_at_once_and_nothing_is_written(importer: Importer) -> None:
     files = [
         importer.put("a.tsproj", "<TcSmProject>"),
@@ -334,6 +385,10 @@ def test_symbols_of_a_tmc_file_become_variables(importer: Importer) -> None:
         "</BaseType><EnumInfo><Text>Off</Text><Enum>0</Enum></EnumInfo></DataType></DataTypes>"
         '<Modules><Module><DataAreas><DataArea><AreaNo AreaType="OutputSrc">1</AreaNo>'
         "<Symbol><Name>MAIN.mode</Name><BitSize>16</BitSize><BaseType>E_M</BaseType></Symbol>"
+        "<Symbol><Name>MAIN.text</Name><BitSize>648</BitSize><BaseType>STRING(80)</BaseType></Symbol>"
+        "<Symbol><Name>MAIN.list</Name><BitSize>32</BitSize><BaseType>INT</BaseType><ArrayInfo>"
+        "<LBound>1</LBound><Elements>2</Elements></ArrayInfo></Symbol>"
+        "<Symbol><Name>MAIN.bare</Name><BaseType>INT</BaseType></Symbol>"
         "<Symbol><Name>MAIN.odd</Name><BitSize>8</BitSize><BaseType>LREAL</BaseType></Symbol>"
         "<Symbol><Name>MAIN.far</Name><BitSize>8</BitSize><BaseType>FB_X</BaseType></Symbol>"
         '</DataArea><DataArea><AreaNo AreaType="Internal">3</AreaNo><Symbol><Name>hidden</Name>'
@@ -343,11 +398,17 @@ def test_symbols_of_a_tmc_file_become_variables(importer: Importer) -> None:
     result = importer.run(importer.put("axis.tmc", tmc))
     assert result.ok
     assert [(each.item, each.outcome) for each in result.notes] == [
-        ("MAIN.mode", Outcome.TAKEN), ("MAIN.odd", Outcome.LEFT), ("MAIN.far", Outcome.LEFT),
+        ("MAIN.mode", Outcome.TAKEN), ("MAIN.text", Outcome.TAKEN), ("MAIN.list", Outcome.TAKEN),
+        ("MAIN.bare", Outcome.TAKEN), ("MAIN.odd", Outcome.LEFT), ("MAIN.far", Outcome.LEFT),
     ]  # fmt: skip
     (station,) = importer.loaded().stations
     assert station.name == "axis"
-    assert {each.name: each.type for each in station.variables} == {"MAIN.mode": "E_M<INT:Off=0>"}
+    assert {each.name: each.type for each in station.variables} == {
+        "MAIN.mode": "E_M<INT:Off=0>",
+        "MAIN.text": "STRING(81)",
+        "MAIN.list": "INT[1..2]",
+        "MAIN.bare": "INT",
+    }
 
 
 def test_tree_items_become_a_station(importer: Importer) -> None:
