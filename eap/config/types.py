@@ -99,8 +99,9 @@ class TypeTable:
         self._definitions: dict[str, TypeDefinition] = {}
         self._found: dict[str, DataType] = {}
         self._broken: set[str] = set()
-        self._ambiguous: dict[str, tuple[TypeDefinition, str]] = {}
         self._open: list[str] = []
+        self._twice: dict[str, tuple[TypeDefinition, str]] = {}
+        """Names that two files define differently, with the second one and its finding."""
         for each in definitions:
             self._add(each)
 
@@ -135,9 +136,9 @@ class TypeTable:
             return None
         if key in self._broken:
             raise _ReportedTypeError(name)
-        if key in self._ambiguous:
+        if key in self._twice:
             self._broken.add(key)
-            raise self._reported(*self._ambiguous[key], "each name once")
+            raise self._reported(*self._twice[key], "a file with one type of that name")
         if key in self._open or len(self._open) >= MAX_DEPTH:
             raise self._too_deep(key, definition)
         self._open.append(key)
@@ -171,12 +172,11 @@ class TypeTable:
             first = self._definitions[key]
             where = f"{first.file or 'line'} {first.line or self._report.line_of(first.path)}"
             message = f"type {each.name} is defined twice (first in {where})"
-            if not each.file:
+            if not each.file or not first.file:
                 self._add_finding(each, message, "each name once")
             elif not _same(first, each):
-                # Libraries of a controller may have types of one name, which is no error unless
-                # a variable has one of them.
-                self._ambiguous.setdefault(key, (each, message))
+                # Libraries have types of one name; that matters only where one is used.
+                self._twice.setdefault(key, (each, message))
             return
         self._definitions[key] = each
 
@@ -200,7 +200,10 @@ class TypeTable:
             kind: DataType = make_enumeration(each.name, self.parse(each.base or "INT"), numbers)
         elif each.members or each.extends:
             return self._structure(each)
+        elif not each.base:
+            raise ValueError(f"{each.name} has no members: expected a type with values")
         else:
+            _refuse_pointer(each.name, each.base)
             kind = datatypes.byte_bool(self.parse(each.base)).named(each.name)
         if each.bits and kind.bit_length != each.bits:
             raise ValueError(
@@ -247,13 +250,15 @@ class TypeTable:
 
     def _member(self, each: TypeDefinition, member: MemberDefinition) -> DataType:
         try:
+            _refuse_pointer(f"{member.name} of {each.name}", member.type)
             text = "BOOL" if member.type.upper() == "BIT" and member.bits == 8 else member.type
             return datatypes.byte_bool(self.parse(text))
         except _ReportedTypeError:
             raise
         except ValueError as exc:
             what, _, expected = str(exc).partition(": expected ")
-            message = f"{member.name} of {each.name}: {what}"
+            own = f"{member.name} of {each.name}"
+            message = what if what.startswith(own) else f"{own}: {what}"
             where = msgspec.structs.replace(each, path=member.path, line=member.line)
             raise self._reported(where, message, expected or _A_TYPE) from None
 
@@ -292,6 +297,14 @@ class TypeTable:
             self._report.adopt([finding])
         else:
             self._report.add(each.path, message, expected)
+
+
+_POINTER = "POINTER TO "
+
+
+def _refuse_pointer(name: str, text: str) -> None:
+    if text.startswith(_POINTER) or text.upper() in _POINTERS:
+        raise ValueError(f"{name} is a pointer: expected a value, a pointer is none elsewhere")
 
 
 def _same(first: TypeDefinition, second: TypeDefinition) -> bool:
@@ -466,7 +479,7 @@ def definition_of(record: TypeRecord, file: str) -> TypeDefinition:
     kind = record.kind.value
     base = type_text(record.base, record.bounds) if record.base else ""
     if record.is_pointer:
-        base = f"POINTER TO {base}"  # which is no type, and named so in the finding
+        base = _POINTER + base
     return TypeDefinition(
         name=record.name,
         base=base,
@@ -474,7 +487,7 @@ def definition_of(record: TypeRecord, file: str) -> TypeDefinition:
         members=tuple(
             MemberDefinition(
                 name=each.name,
-                type=("POINTER TO " if each.is_pointer else "") + type_text(each.type, each.bounds),
+                type=(_POINTER if each.is_pointer else "") + type_text(each.type, each.bounds),
                 bit_offset=each.bit_offset,
                 bits=each.bits,
                 line=each.line,
@@ -490,6 +503,7 @@ def definition_of(record: TypeRecord, file: str) -> TypeDefinition:
     )
 
 
+_POINTERS = {"PVOID", "ITCUNKNOWN"}
 _PACKS = {0: 1, 1: 1, 2: 2, 4: 4, 8: 8}
 """Packing by the attribute pack_mode: 0 and 1 leave no gaps."""
 _SYSTEM = {
@@ -501,6 +515,10 @@ _SYSTEM = {
     "OTCID": "UDINT",
     "FILETIME": "ULINT",
     "DCTIME": "ULINT",
+    "HRESULT": "DINT",
+    "GUID": "BLOCK(16)",
+    "CLSID": "BLOCK(16)",
+    "IID": "BLOCK(16)",
 }
 """Types of the TwinCAT system as those that they consist of."""
 _STRING = re.compile(r"\b(W?)STRING\b(?:\s*[(\[]\s*(\d{1,6})\s*[)\]])?", re.IGNORECASE | re.ASCII)

@@ -130,9 +130,18 @@ def test_size_that_contradicts_the_file_is_shown_beside_ours(tmp_path):
     ]
 
 
+def test_type_of_two_files_is_ambiguous_only_where_it_is_used(tmp_path):
+    other = TMC.replace("<BitSize>192</BitSize>", "<BitSize>256</BitSize>")
+    (tmp_path / "other.tmc").write_text(other)
+    types = "  - axis.tmc\n  - other.tmc"
+    assert not findings(tmp_path, types=types, axis="E_M")  # which both define alike
+    (found,) = findings(tmp_path, types=types, axis="ST_A")
+    assert found.startswith("other.tmc:2: type ST_A is defined twice (first in ")
+
+
 def test_pointer_is_refused_where_the_type_is_used(tmp_path):
     (found,) = findings(tmp_path, types="  - axis.tmc", axis="FB_X")
-    assert found.startswith("axis.tmc:13: p of FB_X: 'POINTER TO INT' is not a data type")
+    assert found == ("axis.tmc:13: p of FB_X is a pointer; a value, a pointer is none elsewhere")
 
 
 @pytest.mark.parametrize(
