@@ -7,6 +7,7 @@ sends everything that the project expects from it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import TypeAlias
 
 import msgspec
 
@@ -25,7 +26,8 @@ from eap.config.imports.stations import (
 from eap.ids import InterfaceUri, NetId
 
 _MIN_TIMEOUT_MS = 100
-_Owner = tuple[PlannedStation, PlannedPort]
+_Owner: TypeAlias = tuple[PlannedStation, PlannedPort]
+_Sent: TypeAlias = dict[str | tuple[str, str, int], tuple[PlannedFrame, PlannedPd]]
 
 
 def with_peers(
@@ -71,11 +73,13 @@ def resolve(
         ]
         done.append(msgspec.structs.replace(station, frames=tuple(frames)))
     # Frames first: a subscription needs to know whether its publisher is a comment.
-    known = _owners(done)
+    known, sent = _owners(done), _sent(done)
     done = [
         msgspec.structs.replace(
             station,
-            subscriptions=tuple(_resolve_source(each, known) for each in station.subscriptions),
+            subscriptions=tuple(
+                _resolve_source(each, known, sent) for each in station.subscriptions
+            ),
         )
         for station in done
     ]
@@ -150,41 +154,49 @@ def _sends_to_group(station: PlannedStation, port: PlannedPort) -> bool:
     )
 
 
+def _sent(stations: Sequence[PlannedStation]) -> _Sent:
+    """Return all PDs that are sent, by station, port and ID, and by ``STATION/PD``."""
+    found: _Sent = {}
+    for station in stations:
+        for frame in station.frames:
+            for pd in frame.pds:
+                found.setdefault((station.name, frame.port, pd.id), (frame, pd))
+                found.setdefault(f"{station.name}/{pd.name}", (frame, pd))
+    return found
+
+
 def _resolve_source(
-    subscription: PlannedSubscription, known: dict[NetId, _Owner]
+    subscription: PlannedSubscription, known: dict[NetId, _Owner], sent: _Sent
 ) -> PlannedSubscription:
     replace = msgspec.structs.replace
     if subscription.reasons:
         return subscription
-    if subscription.source:
-        reasons = tuple(
-            f"{subscription.source}, its publisher, is a comment"
-            for station, _ in known.values()
-            for frame in station.frames
-            for pd in frame.pds
-            if frame.reasons and f"{station.name}/{pd.name}" == subscription.source
-        )
-        return replace(subscription, reasons=tuple(dict.fromkeys(reasons)))
+    if source := subscription.source:
+        is_off = source in sent and sent[source][0].reasons
+        reasons = (f"{source}, its publisher, is a comment",) if is_off else ()
+        return replace(subscription, reasons=reasons)
     owner = known.get(subscription.publisher) if subscription.publisher else None
     if owner is None:
         return replace(subscription, remarks=(*subscription.remarks, *_readings(subscription)))
     station, port = owner
-    for frame in station.frames:
-        for pd in frame.pds:
-            if frame.port != port.name or pd.id != subscription.id:
-                continue
-            source = f"{station.name}/{pd.name}"
-            if frame.reasons:
-                reason = f"{source}, its publisher, is a comment"
-            elif pd.variable.type != subscription.variable.type:
-                reason = f"{source} is {pd.variable.type}, not {subscription.variable.type}"
-            else:
-                remark = f"in the project from {subscription.publisher}, PD {subscription.id}"
-                remarks = (*subscription.remarks, remark)
-                return replace(subscription, source=source, version=pd.version, remarks=remarks)
-            return replace(subscription, reasons=(*subscription.reasons, reason))
-    reason = f"{station.name} sends no PD {subscription.id}"
-    return replace(subscription, reasons=(*subscription.reasons, reason))
+    match = sent.get((station.name, port.name, subscription.id))
+    if match is None:
+        return replace(subscription, reasons=(f"{station.name} sends no PD {subscription.id}",))
+    frame, pd = match
+    source = f"{station.name}/{pd.name}"
+    reason = ""
+    if frame.reasons:
+        reason = f"{source}, its publisher, is a comment"
+    elif pd.variable.type != subscription.variable.type:
+        reason = f"{source} is {pd.variable.type}, not {subscription.variable.type}"
+    remark = f"in the project from {subscription.publisher}, PD {subscription.id}"
+    return replace(
+        subscription,
+        source=source,
+        version=pd.version,
+        reasons=(reason,) if reason else (),
+        remarks=(*subscription.remarks, remark),
+    )
 
 
 def _readings(subscription: PlannedSubscription) -> Iterator[str]:

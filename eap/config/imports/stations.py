@@ -209,15 +209,17 @@ class UniqueNames:
 
     def __init__(self, used: Iterable[str] = ()) -> None:
         self._used = set(used)
+        self._last: dict[str, int] = {}
+        """Last number behind a name."""
 
     def take(self, name: str, owner: str = "") -> str:
         """Return *name*, or one made of *owner* and it, or one with a number."""
         candidates = [name, f"{owner}-{name}"] if owner else [name]
         chosen = next((each for each in candidates if each not in self._used), "")
-        number = 2
+        base = candidates[-1]
         while not chosen or chosen in self._used:
-            chosen = f"{candidates[-1]}-{number}"
-            number += 1
+            self._last[base] = self._last.get(base, 1) + 1
+            chosen = f"{base}-{self._last[base]}"
         self._used.add(chosen)
         return chosen
 
