@@ -39,7 +39,7 @@ from devicebus.master.scan import (
     read_stations,
 )
 from devicebus.wire.alstatus import ERROR, WITH_PROCESS_DATA, AlState
-from devicebus.wire.datagram import fprd, fpwr
+from devicebus.wire.datagram import DatagramReply, aprd, fprd, fpwr
 from devicebus.wire.register import AlStatus, Register, SmStatus
 from eap.errors import EapError
 
@@ -148,16 +148,27 @@ def watch(bus: BusState) -> Procedure[None]:
         if bus.is_lost:
             bus.is_lost = False
             bus.emit(BusBack(now_ns))
-        for slave, reply in zip(list(bus.slaves.values()), replies, strict=True):
-            if reply.wkc:
-                _check_slave(bus, slave, AlStatus.decode(reply.data), now_ns)
-            else:
-                _mark_lost(bus, slave, now_ns)
+        doubled = _check_slaves(bus, replies, now_ns)
+        if doubled:
+            yield from _separate(bus, doubled, count)
         lost = [slave for slave in bus.slaves.values() if slave.is_lost]
         if count <= len(bus.slaves) - len(lost):
             bus.strangers = ()
         elif lost:
             yield from _readdress(bus, count, now_ns)
+
+
+def _check_slaves(bus: BusState, replies: Sequence[DatagramReply], now_ns: int) -> list[BusSlave]:
+    """Handle the AL status of all slaves; return those whose station address another one has."""
+    doubled = []
+    for slave, reply in zip(list(bus.slaves.values()), replies, strict=True):
+        if reply.wkc > 1:
+            doubled.append(slave)  # what the two have answered is the state of neither
+        elif reply.wkc:
+            _check_slave(bus, slave, AlStatus.decode(reply.data), now_ns)
+        else:
+            _mark_lost(bus, slave, now_ns)
+    return doubled
 
 
 def _wait_for_period(bus: BusState) -> Procedure[int]:
@@ -287,6 +298,29 @@ def _recognize(bus: BusState, slave: BusSlave) -> Procedure[None]:
             f"in place of {slave.name} (station {slave.station}) there is {identity}, serial"
             f" {identity.serial}, expected {found}, serial {found.serial}"
         )
+
+
+def _separate(bus: BusState, doubled: Sequence[BusSlave], count: int) -> Procedure[None]:
+    """Take the station address from slaves that were plugged in with that of another."""
+    try:
+        stations = yield from read_stations(count)
+        replies = yield from in_frames(
+            [aprd(at, Register.AL_STATUS, AlStatus.SIZE) for at in range(count)]
+        )
+        statuses = [AlStatus.decode(reply.data) for reply in replies]
+        for slave in doubled:
+            places = [at for at, station in enumerate(stations) if station == slave.station]
+            # The slave of this bus is in its target state, or at its position.
+            places.sort(
+                key=lambda at, slave=slave: (  # type: ignore[misc]
+                    statuses[at].state != slave.target or bool(statuses[at].error),
+                    at != slave.found.position,
+                )
+            )
+            yield from assign_stations([(at, 0) for at in places[1:]])
+    except EapError:
+        pass  # the segment has changed meanwhile
+    bus.needs_check = True
 
 
 def _readdress(bus: BusState, count: int, now_ns: int) -> Procedure[None]:

@@ -301,3 +301,16 @@ def test_read_identification_leaves_the_state_as_it_is():
     assert run(line, read_identification(1001)) == 77
     assert line.segment.slaves[0].state is AlState.INIT
     assert line.segment.slaves[0].esc.memory[0x130] == 1
+
+
+@pytest.mark.parametrize("stale", [1001, 1002])
+def test_slave_with_the_address_of_another_is_taken_in_without_it(stale):
+    line = tree()
+    line.segment.cut(1)
+    bring(line)
+    line.tool.esc.memory[0x10:0x12] = stale.to_bytes(2, "little")
+    line.segment.mend(1)
+    line.elapse(2500 * MS)
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
+    assert all(exchange(line, station) for station in line.core.slaves)
+    assert line.core.cycle.is_full
