@@ -139,10 +139,12 @@ def test_page_opens_beside_sdos_which_do_not_starve(plant: Appliance, host: Name
 
 
 def test_slaves_reach_each_other(plant: Appliance, host: Namespace) -> None:
-    # "left" has looked for its gateway by ARP, and "right" has answered it alone.
-    ports = {each["name"]: each for each in ports_of(plant)}
-    assert ports["right"]["received"] >= 2
-    assert ports["left"]["sent"] >= 2
+    # "left" looks for its gateway by ARP, and "right" answers it alone.
+    def have_met() -> bool:
+        ports = {each["name"]: each for each in ports_of(plant)}
+        return ports["right"]["received"] >= 2 and ports["left"]["sent"] >= 2
+
+    wait_until(have_met)
 
 
 @pytest.mark.parametrize("process", ["services", "engine"])

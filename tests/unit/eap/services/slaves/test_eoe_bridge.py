@@ -15,7 +15,9 @@ from scapy.layers.l2 import ARP, Ether
 
 from devicebus.mailbox import coe_client
 from devicebus.master.mailboxes import Unsolicited
+from devicebus.sim.spec import FaultKind, FaultSpec
 from devicebus.wire.alstatus import AlState
+from eap.codec.eoe import EoeResult
 from eap.codec.mailbox import MailboxType
 from eap.errors import EnvironmentalError
 from eap.ids import MacAddr
@@ -84,10 +86,14 @@ class PairedTap:
 class Scene:
     """A bridge between simulated slaves and a host."""
 
-    def __init__(self, spec: EoeSpec, error: str) -> None:
+    def __init__(
+        self, spec: EoeSpec, error: str, prepare: Callable[[LoopBus], None] | None
+    ) -> None:
         with tempfile.TemporaryDirectory() as folder:
             (Path(folder) / "drives.yaml").write_text(BUS)
             self.line = LoopBus("drives", Path(folder))
+        if prepare is not None:
+            prepare(self.line)
         self.engine = FakeEngine(FakeBus(self.line))
         self.link = EngineLink(self.engine.services, silence_limit_s=1.0)
         self.bus = BusClient(self.link, 0, PORT)
@@ -125,9 +131,10 @@ def play(
     spec: EoeSpec = SPEC,
     *,
     error: str = "",
+    prepare: Callable[[LoopBus], None] | None = None,
 ) -> None:
     async def run() -> None:
-        stage = Scene(spec, error)
+        stage = Scene(spec, error, prepare)
         serving = asyncio.ensure_future(stage.bridge.serve())
         try:
             async with asyncio.timeout(20):
@@ -197,6 +204,38 @@ def test_slave_is_disconnected_in_init_and_gets_its_settings_again():
         await stage.ports_are(lambda ports: not ports["left"].is_connected)
         assert stage.bridge.report().slaves[0].addresses == ()
         await stage.bus.bring(1001, AlState.PREOP)
+        await stage.ports_are(lambda ports: ports["left"].ip == "10.0.0.10")
+
+    play(scene)
+
+
+def test_settings_that_a_slave_refuses_are_a_finding(caplog):
+    async def scene(stage):
+        await stage.ports_are(lambda ports: len(ports) == 2 and ports["left"].fault)
+        (finding,) = find_eoe_faults(stage.bridge.report())
+        assert finding.slaves == (1001,)
+        refusal = "EoE: IP settings: EoE set IP: IP is not supported (0x0201)"
+        assert finding.what == f"slave 1001 (left): {refusal}"
+        await stage.ports_are(lambda ports: ports["right"].ip)
+        assert f"left/bus0/left: {refusal.removeprefix('EoE: ')}" in caplog.text
+
+    def refuse(line: LoopBus) -> None:
+        server = line.segment.segment.slaves[0].device.mailbox.protocols[MailboxType.EOE]
+        server._accept = lambda settings: EoeResult.NO_IP
+
+    play(scene, prepare=refuse)
+
+
+def test_settings_are_written_again_to_a_slave_that_did_not_answer(monkeypatch):
+    monkeypatch.setattr(eoe_bridge, "SETTINGS_PAUSE_S", 0.05)
+
+    async def scene(stage):
+        deaf = FaultSpec(kind=FaultKind.MAILBOX, slave="left")
+        stage.line.segment.begin(deaf, stage.line.now_ns)
+        await stage.bus.bring(1001, AlState.INIT)
+        await stage.bus.bring(1001, AlState.PREOP)
+        await stage.ports_are(lambda ports: "no EOE reply" in ports["left"].fault)
+        stage.line.segment.end(deaf, stage.line.now_ns)
         await stage.ports_are(lambda ports: ports["left"].ip == "10.0.0.10")
 
     play(scene)
