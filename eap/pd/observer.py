@@ -15,7 +15,7 @@ from eap.codec.wire import Buffer
 from eap.errors import CodecError
 from eap.ids import NetId
 from eap.pd.link import TOGGLE_BIT
-from eap.pd.rhythm import CycleWatch, Measured, Rhythm
+from eap.pd.rhythm import CycleOrder, CycleWatch, Measured, Rhythm
 from eap.pd.words import Reason
 
 MAX_PDS = 4096
@@ -138,12 +138,14 @@ class ObservedPd:
     def measure(self) -> Measured:
         """Return the statistics of the latest arrivals.
 
-        A regular answer cannot be told from a cyclic PD.  Only the port number tells, where the
-        requester sent from another one than 34980.
+        A regular answer looks like a cyclic PD.  It is told from one by the port number, where the
+        requester sends from another one than 34980, and by the cycle counter: a cyclic PD has the
+        same step each time, an answer only if the rhythms of both stations fit.
         """
         found = self.rhythm.measure(self.cycle.order)
         port = self.key.destination.partition(":")[2] if self.key.transport == "udp" else ""
-        if self.is_answer and (port or found.trigger not in {None, Reason.CYCLE}):
+        is_uneven = not found.step and self.cycle.order is not CycleOrder.CONSTANT
+        if self.is_answer and found.trigger is not None and (port or is_uneven):
             found.trigger = Reason.POLL
         return found
 

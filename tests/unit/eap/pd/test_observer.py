@@ -115,6 +115,17 @@ def test_answers_to_another_port_than_the_usual_are_polled():
     assert answered.measure().trigger is Reason.POLL
 
 
+def test_answers_to_regular_requests_have_uneven_steps_of_the_counter():
+    observer = Observer()
+    for number in range(20):
+        at_ns = number * 44 * MS
+        observer.receive_frame(octets([(7, b"?")], cycle=number), at_ns, FramePath("udp", B, A))
+        observer.receive_frame(octets([(8, b"!")], cycle=at_ns // (10 * MS)), at_ns + MS, TO_B)
+    asked, answered = observer.pds.values()
+    assert asked.measure().trigger is Reason.CYCLE
+    assert (answered.measure().trigger, answered.measure().step) == (Reason.POLL, 0)
+
+
 def test_irregular_answers_of_a_host_are_polled_and_other_pds_are_not():
     observer, noise, at_ns = Observer(), random.Random(3), 0
     for number in range(30):
