@@ -33,6 +33,8 @@ from eap.runtime.engine_messages import EoeReport
 ABSENT = "absent"
 """State of an optional slave that is not plugged in."""
 _SHOWN_OCTETS = 32
+_SHOWN_EMERGENCIES = 4
+"""Emergencies of a slave that are shown without --full."""
 _MANY_SLAVES = 16
 """Of more slaves only those with errors are shown."""
 _COMMAND_STATES = {0x0: "idle", 0x3: "done", 0x7: "executing", 0xF: "failed"}
@@ -111,6 +113,9 @@ def diagnosis_view(
         f" {frames.retried} repeated\nround trip {duration(frames.round_trip_us)},"
         f" timeout {duration(frames.timeout_us)}"
     )
+    if table := _emergency_table(found.slaves, now_s, is_full=is_full):
+        yield ""
+        yield table
     if found.eoe is not None:
         yield ""
         yield eoe_table(found.eoe)
@@ -119,6 +124,34 @@ def diagnosis_view(
         yield Styled(f"not plugged in: {names}", style="dim")
     for row in found.findings:
         yield Styled(finding_line(row, now_s), style="dim" if row.is_over else "red")
+
+
+def _emergency_table(
+    slaves: Sequence[DiagnosedSlave], now_s: float, *, is_full: bool
+) -> TextTable | None:
+    """Return the latest emergencies, the newest first; None without any."""
+    if not any(row.emergencies for row in slaves):
+        return None
+    table = TextTable(
+        "Slave",
+        Column("Count", is_number=True),
+        Column("Ago", is_number=True),
+        Column("By", rank=1),
+        "Emergency",
+        Column("Meaning", wraps=True),
+        Column("Register", rank=2),
+        Column("Data", rank=3),
+    )
+    for row in slaves:
+        first = (f"{row.address} {row.name}", str(row.emergencies))
+        newest = row.latest_emergencies[::-1]
+        for each in newest if is_full else newest[:_SHOWN_EMERGENCIES]:
+            ago = "" if each.time is None else _ago(each.time, now_s)
+            by = f"{each.protocol} drive {each.drive}" if each.drive else each.protocol
+            code, register = f"0x{each.code:04X}", f"0x{each.register:02X}"
+            table.add_row(*first, ago, by, code, each.text, register, each.data)
+            first = ("", "")
+    return table
 
 
 def eoe_table(report: EoeReport) -> TextTable:

@@ -14,6 +14,7 @@ from eap.runtime.bus_errors import to_record
 from eap.runtime.engine_messages import (
     BusChange,
     BusReport,
+    EmergencyReport,
     PortErrorReport,
     RingState,
     SlaveDescription,
@@ -126,6 +127,7 @@ def _report(
     bus: EngineBus, slave: BusSlave, presets: Mapping[int, int], now_ns: int
 ) -> SlaveReport:
     last = bus.faults.last(slave.station)
+    emergencies = bus.faults.emergencies.of(slave.station)
     stats = slave.mailbox.stats() if slave.mailbox is not None else None
     missed_ns = None if stats is None else stats.unanswered_ns
     return SlaveReport(
@@ -139,6 +141,18 @@ def _report(
         port_errors=tuple(
             PortErrorReport(port, now_ns - seen.since_ns, now_ns - seen.until_ns)
             for port, seen in bus.master.port_errors.of(slave.station).items()
+        ),
+        emergencies=emergencies.number,
+        latest_emergencies=tuple(
+            EmergencyReport(
+                ago_ns=now_ns - each.at_ns,
+                protocol=each.protocol,
+                drive=each.drive,
+                code=each.code,
+                register=each.register,
+                data=each.data.hex(),
+            )
+            for each in emergencies.latest
         ),
     )
 

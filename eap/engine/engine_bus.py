@@ -21,6 +21,7 @@ from devicebus.master.bus import (
     SlaveLeft,
     SlaveLost,
 )
+from devicebus.master.emergencies import EmergencyLog
 from devicebus.master.findings import NO_ANSWER
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
@@ -69,10 +70,14 @@ class SlaveFaults:
 
     Attributes:
         on_unsolicited: Called with each message that a slave sent unasked.
+        emergencies: Emergencies of the slaves.
+        now_ns: Time of the present or last cycle.
     """
 
     def __init__(self) -> None:
         self.on_unsolicited: list[Callable[[Unsolicited], None]] = []
+        self.emergencies = EmergencyLog()
+        self.now_ns = 0
         self._faults: dict[int, SlaveFault] = {}
         self._counts: dict[int, FaultCounts] = {}
 
@@ -90,7 +95,8 @@ class SlaveFaults:
         return self._counts.get(station, FaultCounts())
 
     def forget_past(self) -> None:
-        """Forget the faults that are over; their numbers stay."""
+        """Forget the faults and emergencies that are over; the numbers of faults stay."""
+        self.emergencies.clear()
         self._faults = {at: each for at, each in self._faults.items() if each.until_ns is None}
 
     def end_all(self, now_ns: int) -> None:
@@ -120,6 +126,7 @@ class SlaveFaults:
             elif isinstance(event, SlaveBack | SlaveAbsent):
                 self._end(event.station, event.at_ns)
             elif isinstance(event, Unsolicited):
+                self.emergencies.take(event, self.now_ns)
                 for call in self.on_unsolicited:
                     call(event)
 
@@ -334,6 +341,7 @@ class EngineBus:
         self._mapping.put_outputs()
         self.master.start_cycle(now_ns)
         self._send(now_ns)
+        self.faults.now_ns = now_ns
         self.faults.handle_events(self.master)
 
     def _handle_timeout(self, now_ns: int) -> None:

@@ -7,7 +7,7 @@ the sizes of mailboxes that files need, and for hints about refused requests.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import NoReturn, TypeVar
 
@@ -32,6 +32,7 @@ from eap.gateway.slaves import NO_DICTIONARY, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.ops.bus_session import Begin, Slave, choose, no_mailbox
 from eap.runtime.bus_status import FrameCounts
+from eap.runtime.engine_messages import SlaveReport
 
 T = TypeVar("T")
 
@@ -156,6 +157,10 @@ class GatewayBus:
 
     def forget(self) -> None:
         """Do nothing: a gateway has no such service."""
+
+    def reports(self) -> Mapping[int, SlaveReport]:
+        """Return nothing: a gateway reports no history."""
+        return {}
 
     def eoe_report(self) -> None:
         """Return None: a gateway reports no Ethernet frames."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import msgspec
 
@@ -29,13 +30,16 @@ from devicebus.wire.alstatus import AlState, name_of, state_name
 from devicebus.wire.sii import SiiProtocol
 from eap.ops.bus_session import Slave, SlaveBus, choose
 from eap.runtime.bus_status import (
+    EmergencyRow,
     FindingRow,
     FrameCounts,
     NamedSlave,
+    emergency_rows,
+    find_emergencies,
     find_eoe_faults,
     finding_row,
 )
-from eap.runtime.engine_messages import EoeReport
+from eap.runtime.engine_messages import EoeReport, SlaveReport
 
 _TRIES = 3
 _PAUSE_NS = 100_000_000
@@ -105,6 +109,9 @@ class DiagnosedSlave(msgspec.Struct, frozen=True):
     reason: str
     answers: bool
     ports: tuple[PortErrors, ...]
+    emergencies: int = 0
+    latest_emergencies: list[EmergencyRow] = []
+    """The latest, oldest first."""
     mailbox_timeouts: int = 0
     mailbox_late: int = 0
 
@@ -205,11 +212,15 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
     wanted = {choose(all_known, slave).station} if slave is not None else {*names}
     found = bus.run(_diagnose(list(units)), "diagnosis")
     views = [_view(each, there) for each, there in zip(known, found.slaves, strict=True)]
-    history = bus.history()
+    history, reports = bus.history(), bus.reports()
     if found.is_silent:
         causes = [find_silence(views, history.silent_since_ns if history is not None else None)]
     else:
-        causes = [*find_causes(views, found, history), *find_eoe_faults(bus.eoe_report())]
+        causes = [
+            *find_causes(views, found, history),
+            *find_emergencies(reports.values()),
+            *find_eoe_faults(bus.eoe_report()),
+        ]
     # A fault of an absent slave: others of its hot-connect group are there.
     causes += [
         BusFinding(what=f"{each.name} ({each.station}): {each.fault}", slaves=(each.station,))
@@ -235,12 +246,20 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
                 ports=each.ports,
                 mailbox_timeouts=units[each.station].mailbox_timeouts,
                 mailbox_late=units[each.station].mailbox_late,
+                **_emergencies(reports.get(each.station), now_s),
             )
             for each in found.slaves
             if each.station in wanted
         ],
         absent=[NamedSlave(each.station, each.name) for each in absent if each.station in wanted],
     )
+
+
+def _emergencies(report: SlaveReport | None, now_s: float) -> dict[str, Any]:
+    if report is None:
+        return {}
+    rows = emergency_rows(report, now_s)
+    return {"emergencies": report.emergencies, "latest_emergencies": rows}
 
 
 def _diagnose(stations: Sequence[int]) -> Procedure[BusDiagnosis]:

@@ -7,7 +7,7 @@ has begun there ends with its connection.
 from __future__ import annotations
 
 import select
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from time import monotonic, monotonic_ns
 from typing import Any, TypeVar
@@ -158,6 +158,10 @@ class RunningBus:
         """Run a procedure to its end and return its result, or raise its error."""
         del name
         return drive(procedure, self._step)
+
+    def reports(self) -> Mapping[int, SlaveReport]:
+        """Return the reports of the master by station address, as of the last :meth:`known`."""
+        return self._reports
 
     def eoe_report(self) -> EoeReport | None:
         """Return the state of the Ethernet switch as of the last :meth:`known`; None without."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import select
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Protocol, TypeAlias, TypeVar
 
@@ -36,7 +36,7 @@ from eap.errors import EapError
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
 from eap.runtime.bus_status import FrameCounts, count_frames
-from eap.runtime.engine_messages import EoeReport
+from eap.runtime.engine_messages import EoeReport, SlaveReport
 
 T = TypeVar("T")
 
@@ -139,6 +139,10 @@ class BusSession:
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the frames of this session."""
         return count_frames(self._bus.link.stats())
+
+    def reports(self) -> Mapping[int, SlaveReport]:
+        """Return nothing: this master keeps no history."""
+        return {}
 
     def eoe_report(self) -> None:
         """Return None: this master carries no Ethernet frames."""
@@ -317,6 +321,9 @@ class SlaveBus(Protocol):
 
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the master's frames."""
+
+    def reports(self) -> Mapping[int, SlaveReport]:
+        """Return the reports of a running master by station address; else nothing."""
 
     def eoe_report(self) -> EoeReport | None:
         """Return the state of the Ethernet switch; None without one."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import msgspec
 
+from devicebus.master.emergencies import describe_code
 from devicebus.master.findings import (
     NO_ANSWER,
     BusFinding,
@@ -22,7 +23,7 @@ from devicebus.master.findings import (
 )
 from devicebus.master.link import LinkStats
 from devicebus.wire.alstatus import state_name
-from eap.runtime.engine_messages import BusReport, EoeReport, SlaveReport
+from eap.runtime.engine_messages import BusReport, EmergencyReport, EoeReport, SlaveReport
 
 
 class NamedSlave(msgspec.Struct, frozen=True):
@@ -42,6 +43,19 @@ class FindingRow(msgspec.Struct, frozen=True, kw_only=True):
     is_over: bool
     since: float | None
     until: float | None
+
+
+class EmergencyRow(msgspec.Struct, frozen=True, kw_only=True):
+    """Emergency of a slave as JSON has it; *time* is a Unix time."""
+
+    time: float | None
+    protocol: str
+    drive: int
+    code: int
+    text: str
+    """Class of the code."""
+    register: int
+    data: str
 
 
 class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,7 +96,46 @@ def report_findings(report: BusReport) -> list[BusFinding]:
         *cut,
         *find_causes(views),
         *find_unanswered(_mailboxes(report)),
+        *find_emergencies(report.slaves),
         *find_eoe_faults(report.eoe),
+    ]
+
+
+def find_emergencies(slaves: Iterable[SlaveReport]) -> Iterator[BusFinding]:
+    """Yield the errors that slaves have reported by emergencies and not taken back."""
+    for slave in slaves:
+        last = {(each.protocol, each.drive): each for each in slave.latest_emergencies}
+        for each in last.values():
+            if each.code:
+                yield BusFinding(
+                    what=f"{slave.name} ({slave.station}) reports emergency {_describe(each)}",
+                    advice="read its error objects, see the manual of the device",
+                    slaves=(slave.station,),
+                    since_ns=each.ago_ns,
+                )
+
+
+def _describe(emergency: EmergencyReport) -> str:
+    drive = f" of drive {emergency.drive}" if emergency.drive else ""
+    return (
+        f"0x{emergency.code:04X} by {emergency.protocol}{drive}: {describe_code(emergency.code)},"
+        f" error register 0x{emergency.register:02X}"
+    )
+
+
+def emergency_rows(slave: SlaveReport, now_s: float) -> list[EmergencyRow]:
+    """Return the latest emergencies of a slave at *now_s* (Unix time), oldest first."""
+    return [
+        EmergencyRow(
+            time=_moment(each.ago_ns, now_s),
+            protocol=each.protocol,
+            drive=each.drive,
+            code=each.code,
+            text=describe_code(each.code),
+            register=each.register,
+            data=each.data,
+        )
+        for each in slave.latest_emergencies
     ]
 
 
@@ -185,6 +238,8 @@ def bus_document(report: BusReport | None, now_s: float) -> dict[str, Any]:
                     "target": state_name(slave.target) if slave.target else None,
                     "fault": slave.fault,
                     "is_absent": slave.is_absent,
+                    "emergencies": slave.emergencies,
+                    "last_emergency": next(reversed(emergency_rows(slave, now_s)), None),
                 }
                 for slave in report.slaves
             ],

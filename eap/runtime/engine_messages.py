@@ -166,6 +166,21 @@ def no_mailbox(slave: SlaveDescription) -> EapError:
     return NoMailboxError(f"slave {slave.station} ({slave.name}) has no open mailbox")
 
 
+class EmergencyReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Emergency of a slave."""
+
+    ago_ns: int
+    protocol: str
+    """``CoE`` or ``SoE``."""
+    drive: int
+    """Number of the drive, by SoE only."""
+    code: int
+    """0 takes the errors of its sender back."""
+    register: int
+    data: str
+    """Five bytes of the vendor in hexadecimal digits."""
+
+
 class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
     """A slave with the times of its faults."""
 
@@ -183,6 +198,10 @@ class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
     """Replies that came after their request had timed out."""
     port_errors: tuple[PortErrorReport, ...] = ()
     """Ports whose errors were counted while the master read them."""
+    emergencies: int = 0
+    """Number since the engine started, or since ForgetFaults."""
+    latest_emergencies: tuple[EmergencyReport, ...] = ()
+    """The latest, oldest first."""
 
 
 class EoePortReport(msgspec.Struct, frozen=True, kw_only=True):

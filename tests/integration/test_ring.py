@@ -139,6 +139,24 @@ def test_cut_ring_goes_on_and_names_the_place(running: Appliance, where, before,
     wait_until(lambda: "the ring was cut" not in diag(running))
 
 
+def test_emergencies_of_a_slave_are_shown_until_they_are_taken_back(running: Appliance):
+    fault = ("sim", "fault", "one/bus0", "emergency", "slave=sensor", "code=0x8611")
+    running.command(*fault)
+    text = "sensor (1004) reports emergency 0x8611 by CoE: monitoring, error register 0x01"
+    wait_until(lambda: text in diag(running))
+    shown = diag(running)
+    assert "Emergency Meaning" in shown
+    assert "0x8611 monitoring" in shown
+    assert text in running.command("status")
+    found = json.loads(running.command("bus", "diag", "one/bus0", "sensor", "--json"))["slaves"]
+    assert found[0]["latest_emergencies"][0]["code"] == 0x8611
+    running.command(*fault, "--end")
+    wait_until(lambda: text not in diag(running))
+    assert bus_of(running)["slaves"][3]["last_emergency"]["code"] == 0
+    running.command("bus", "diag", "one/bus0", "--reset")
+    assert "0x8611" not in diag(running)
+
+
 @pytest.mark.root
 def test_ring_over_two_interfaces_survives_each_of_its_cables(farm: Plants):
     folder = with_bus(farm)

@@ -194,3 +194,24 @@ def test_report_counts_mailbox_requests_without_reply_until_they_are_reset(tmp_p
     assert len(history.mailboxes) == 1
     rig.bus.forget_past()
     assert findings(rig) == ([], History())
+
+
+def test_emergencies_are_reported_with_their_age_until_they_are_forgotten(tmp_path):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    device = rig.wire.segment.segment.slaves[1].device
+    device.report_error(0x8611)
+    rig.run(100 * MS)
+    io = report_bus(rig.bus, rig.now_ns).slaves[1]
+    (found,) = io.latest_emergencies
+    assert io.emergencies == 1
+    assert (found.protocol, found.code, found.register) == ("CoE", 0x8611, 1)
+    assert 0 < found.ago_ns <= 100 * MS
+    (finding,) = report_findings(report_bus(rig.bus, rig.now_ns))
+    assert finding.what.startswith("io (1002) reports emergency 0x8611 by CoE: monitoring")
+    device.report_error(0)
+    rig.run(100 * MS)
+    assert report_findings(report_bus(rig.bus, rig.now_ns)) == []
+    assert report_bus(rig.bus, rig.now_ns).slaves[1].emergencies == 2
+    rig.bus.forget_past()
+    assert report_bus(rig.bus, rig.now_ns).slaves[1].emergencies == 0
