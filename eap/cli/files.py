@@ -112,14 +112,16 @@ def import_files(
 
 
 def _import_lines(result: ImportResult, target: Path | None) -> Iterator[RenderableType]:
-    if result.notes:
+    # What was taken is of no interest when nothing is written.
+    notes = [each for each in result.notes if result.ok or each.outcome != "taken"]
+    if notes:
         table = TextTable(
             "Outcome",
             Column("Part", wraps=True),
             Column("Reason", wraps=True),
             Column("Where", rank=1),
         )
-        for note in result.notes:
+        for note in notes:
             where = f"{Path(note.file).name}:{note.line}" if note.line else Path(note.file).name
             table.add_row(note.outcome.value, note.item, note.message, where)
         yield table

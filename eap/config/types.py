@@ -81,7 +81,7 @@ class TypeDefinition(msgspec.Struct, frozen=True, kw_only=True):
     line: int = 0
 
 
-class _ReportedTypeError(ValueError):
+class ReportedTypeError(ValueError):
     """The type was reported; what refers to it needs no finding."""
 
 
@@ -135,7 +135,7 @@ class TypeTable:
         if definition is None:
             return None
         if key in self._broken:
-            raise _ReportedTypeError(name)
+            raise ReportedTypeError(name)
         if key in self._twice:
             self._broken.add(key)
             raise self._reported(*self._twice[key], "a file with one type of that name")
@@ -144,7 +144,7 @@ class TypeTable:
         self._open.append(key)
         try:
             kind = self._build(definition)
-        except _ReportedTypeError:
+        except ReportedTypeError:
             self._broken.add(key)
             raise
         finally:
@@ -185,7 +185,7 @@ class TypeTable:
             kind = self._make(each)
             # Complete texts are read by other processes: their limits hold here already.
             return datatypes.parse(kind.text)
-        except _ReportedTypeError:
+        except ReportedTypeError:
             raise
         except ValueError as exc:
             what, _, expected = str(exc).partition(": expected ")
@@ -253,7 +253,7 @@ class TypeTable:
             _refuse_pointer(f"{member.name} of {each.name}", member.type)
             text = "BOOL" if member.type.upper() == "BIT" and member.bits == 8 else member.type
             return datatypes.byte_bool(self.parse(text))
-        except _ReportedTypeError:
+        except ReportedTypeError:
             raise
         except ValueError as exc:
             what, _, expected = str(exc).partition(": expected ")
@@ -287,9 +287,9 @@ class TypeTable:
         message = f"{chain[0]} is nested too deeply"
         return self._reported(each, message, f"at most {MAX_DEPTH} levels")
 
-    def _reported(self, each: TypeDefinition, message: str, expected: str) -> _ReportedTypeError:
+    def _reported(self, each: TypeDefinition, message: str, expected: str) -> ReportedTypeError:
         self._add_finding(each, message, expected)
-        return _ReportedTypeError(each.name)
+        return ReportedTypeError(each.name)
 
     def _add_finding(self, each: TypeDefinition, message: str, expected: str) -> None:
         if each.file:
@@ -371,7 +371,7 @@ def resolve_types(plant: PlantFile, report: FindingReport, folder: Path) -> Type
         return TypedPlant(plant, table)
     for each in list(table):
         if not each.file:
-            with suppress(_ReportedTypeError):
+            with suppress(ReportedTypeError):
                 table.find(each.name)
     stations = tuple(_resolved(station, table, report) for station in plant.stations)
     return TypedPlant(msgspec.structs.replace(plant, stations=stations), table)
@@ -396,7 +396,7 @@ def _complete(
 ) -> VariableSection:
     try:
         text = table.parse(variable.type).text
-    except _ReportedTypeError:
+    except ReportedTypeError:
         report.broken_types.add(variable.type)
         return variable
     except ValueError as exc:

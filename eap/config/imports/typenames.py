@@ -12,7 +12,7 @@ from eap.config.finding import FindingReport
 from eap.config.imports.planttext import scalar
 from eap.config.imports.records import EapVariable, ImportReport, Outcome
 from eap.config.imports.typefile import ArrayBound, SymbolRecord, TypeRecord
-from eap.config.types import TypeTable, definition_of, type_text
+from eap.config.types import ReportedTypeError, TypeTable, definition_of, type_text
 
 if TYPE_CHECKING:
     from eap.codec.datatypes import DataType
@@ -53,13 +53,12 @@ class TypeNames:
         """
         if not variable.type and not variable.bits:
             raise ValueError(f"{variable.name} has neither a type nor a length")
-        known = len(self._findings.findings())
         try:
             kind = self.parse(variable.type, variable.guid)
+        except ReportedTypeError:
+            text = f"{variable.name}: its type {variable.type} cannot be used"
+            raise ValueError(text) from None
         except ValueError:
-            if len(self._findings.findings()) > known:
-                text = f"{variable.name}: its type {variable.type} cannot be used"
-                raise ValueError(text) from None
             if not variable.bits:
                 raise
             block = f"BLOCK({variable.bits // 8})"
@@ -91,20 +90,22 @@ class TypeNames:
         before = self._findings.findings()
         try:
             kind = self.parse(symbol.type, bounds=symbol.bounds)
+        except ReportedTypeError:
+            new = (each for each in self._findings.findings() if each not in before)
+            first = next(new, None)  # none if it was reported with another symbol
+            if first is None:
+                return f"its type {symbol.type} cannot be used"
+            return f"{first.message}; expected {first.expected}"
         except ValueError as exc:
-            for each in self._findings.findings():
-                if each not in before:
-                    return f"{each.message}; expected {each.expected}"
-            # Reported with another variable.
-            known = f"its type {symbol.type} cannot be used"
-            return str(exc) if " " in str(exc) else known
+            return str(exc)
         if symbol.bits not in {0, 8 * kind.size}:
             return f"it has {symbol.bits} bits, its type {kind.name} has {8 * kind.size}"
         return kind
 
     def take_findings(self) -> None:
         """Report the errors of the types that are used."""
-        self._report.findings += self._findings.findings()
+        # They are the cause of the others.
+        self._report.findings[:0] = self._findings.findings()
 
     def section(self) -> list[str]:
         """Return the lines of the section ``types``: all types in use, empty if there are none."""

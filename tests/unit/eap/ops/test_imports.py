@@ -234,15 +234,17 @@ def test_type_with_another_size_than_its_members_is_refused_with_both_layouts(
         "<BitSize>8</BitSize><BitOffs>0</BitOffs></SubItem><SubItem><Name>r</Name><Type>LREAL</Type>"
         "<BitSize>64</BitSize><BitOffs>64</BitOffs></SubItem></DataType>"
     )
-    text = project(device(publisher("A", ("V", 1, "ST_A", 12))), types=types)
-    result = importer.run(importer.put("Line.tsproj", text))
+    box = publisher("A", ("V", 1, "ST_A", 12), ("W", 2, "ST_A", 12))
+    result = importer.run(importer.put("Line.tsproj", project(device(box), types=types)))
     assert not result.ok
     assert not importer.plant.exists()
     (layout,) = (each for each in result.findings if each.path == "ST_A")
     assert (Path(layout.file).name, layout.line) == ("Line.tsproj", 1)
     assert "given" in layout.expected
     assert "computed" in layout.expected
-    assert "V: its type ST_A cannot be used" in messages(result)
+    assert [each for each in messages(result) if "cannot be used" in each] == [
+        "V: its type ST_A cannot be used", "W: its type ST_A cannot be used",
+    ]  # fmt: skip
 
 
 def test_variable_with_another_length_than_its_type_is_refused(importer: Importer) -> None:
@@ -366,9 +368,19 @@ def test_stations_that_cannot_be_added_are_written_beside(importer: Importer) ->
     result = importer.run(LINE, choices=choices)
     assert importer.text == before
     assert result.file == str(importer.folder / "plant-import.yaml")
-    assert "it has types of its own" in result.why_beside
+    assert "NetID 192.168.5.1.1.1 is used twice" in result.why_beside
     importer.loaded(Path(result.file))
     assert importer.run(LINE, choices=choices).file.endswith("plant-import1.yaml")
+
+
+def test_second_project_with_the_same_types_is_added(importer: Importer) -> None:
+    importer.run(LINE)
+    text = LINE.read_text().replace("192.168.5.1.", "192.168.5.9.").replace("c0a80502", "c0a80509")
+    other = importer.put("Other.tsproj", text)
+    result = importer.run(other, choices=ImportChoices(address="127.0.9.9"))
+    assert result.why_beside == ""
+    assert [each.name for each in importer.loaded().stations] == ["Line", "Other"]
+    assert importer.text.count("ST_Axis: {members") == 1
 
 
 def test_plant_file_with_errors_is_not_touched(importer: Importer) -> None:

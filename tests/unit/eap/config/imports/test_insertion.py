@@ -51,7 +51,10 @@ def test_file_without_a_line_end_gets_one() -> None:
         ("plant: a\n", [], "it has no list of stations"),
         ("plant: a\nstations: []\n", [], "it has no list of stations"),
         ("plant: [a\n", [], "not a plant file that can be read"),
-        (f"types: {{}}\n{PLANT}", TYPES, "it has types of its own"),
+        (f"types: {{}}\n{PLANT}", TYPES, "its types are not a mapping from names"),
+        (f"types: [a.tmc]\n{PLANT}", TYPES, "its types are not a mapping from names"),
+        (f"types: {{A: INT}}\n{PLANT}", TYPES, "not written with a line for each type"),
+        (f"types:\n  E_Mode: INT\n{PLANT}", TYPES, "it has another type E_Mode"),
         (
             "plant: a\nstations:\n  - &one\n    name: one\n  - <<: *one\n    text: |\n      x\n",
             [],
@@ -72,3 +75,32 @@ def test_files_that_lines_cannot_be_added_to_are_refused(
         return
     with pytest.raises(InsertionError, match=reason):
         insert_stations(text, STATION, types)
+
+
+def test_types_are_added_to_those_that_are_there() -> None:
+    types = [
+        *TYPES,
+        "  ST_A: {members: {",
+        "    a: INT,",
+        "    b: INT}}",
+        "  ST_B: {alias: ST_A}",
+    ]
+    own = "types:\n    E_Mode: {base: INT, values: {Off: 0}}  # mine\n    ST_B: {alias: ST_A}\n"
+    lines = insert_stations(own + PLANT, STATION, types).split("\n")
+    assert lines[:7] == [
+        "types:",
+        "    E_Mode: {base: INT, values: {Off: 0}}  # mine",
+        "    ST_B: {alias: ST_A}",
+        "    ST_A: {members: {",
+        "      a: INT,",
+        "      b: INT}}",
+        "# A plant, with comments.",
+    ]
+    assert "  - name: two" in lines
+
+
+def test_types_that_are_there_already_are_not_added() -> None:
+    text = f"{TYPES[0]}\n{TYPES[1]}\n{PLANT}"
+    assert insert_stations(text, STATION, TYPES) == f"{TYPES[0]}\n{TYPES[1]}\n" + insert_stations(
+        PLANT, STATION
+    )
