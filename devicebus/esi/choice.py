@@ -141,26 +141,6 @@ def manager_for(device: EsiDevice, pdo: EsiPdo) -> int | None:
     )
 
 
-def find_pdo(device: EsiDevice, name: str | int) -> EsiPdo:
-    """Return a PDO by its index or name.
-
-    Raises:
-        ValueError: there is none, or several have the name.
-    """
-    if isinstance(name, int):
-        fitting = [pdo for pdo in device.pdos if pdo.index == name]
-    else:
-        fitting = [pdo for pdo in device.pdos if pdo.name.casefold() == name.casefold()]
-    if len(fitting) == 1:
-        return fitting[0]
-    shown = f"0x{name:04X}" if isinstance(name, int) else repr(name)
-    if fitting:
-        indexes = ", ".join(f"0x{pdo.index:04X}" for pdo in fitting)
-        raise ValueError(f"{device.label} has several PDOs {shown}: use an index ({indexes})")
-    hint = suggest(name, [pdo.name for pdo in device.pdos]) if isinstance(name, str) else ""
-    raise ValueError(f"{device.label} has no PDO {shown}{hint}")
-
-
 def expand_slots(device: EsiDevice) -> tuple[EsiSlot, ...]:
     """Return the slot of each position: one that takes several modules is there as often."""
     positions: list[EsiSlot] = []

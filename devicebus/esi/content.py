@@ -140,7 +140,7 @@ def _with_modules(device: EsiDevice, stream: BinaryIO, line: int, fields: Fields
         stream.seek(0)
         device = msgspec.structs.replace(device, modules=tuple(_modules(stream, device, fields)))
         _check_slots(device, line, fields)
-    findings = tuple(fields.findings)
+    findings = tuple(sorted(fields.findings))
     return DeviceResult(None if findings else device, findings)
 
 

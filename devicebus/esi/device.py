@@ -197,7 +197,7 @@ def _pdos(parent: XmlElement, managers: int, fields: Fields) -> Iterator[EsiPdo]
 def _pdo(each: XmlElement, managers: int, fields: Fields) -> EsiPdo:
     index_node = each.find("Index")
     index = fields.child(each, "Index", bits=16)
-    if index_node is None or not index:
+    if index_node is None or not index_node.text:
         missing = "refers to a group (Ref)" if "Ref" in each.attrib else "has no index"
         fields.report(each.line, f"a {each.tag} {missing}", "element Index with its object")
     manager = fields.optional_attribute(each, "Sm", bits=8)

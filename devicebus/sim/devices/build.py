@@ -19,6 +19,7 @@ from devicebus.sim.devices.objects import INPUTS, OUTPUTS, build_dictionary, obj
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.devices.signal import Signals
 from devicebus.sim.devices.siibuild import RAM, build_image, plan_channels
+from devicebus.sim.devices.soe_drive import SoeAxes, soe_parameters
 from devicebus.sim.esc import Esc, EscSettings
 from devicebus.sim.segment import Cable, SimulatedSegment
 from devicebus.sim.slave import SimulatedSlave
@@ -144,7 +145,11 @@ def _build_esi(
     dictionary = esi.build_dictionary(spec, plan, MODULAR_DEVICE)
     axes = esi.axes_of(dictionary) if esi.is_drive(spec, dictionary) else 0
     drive.add_missing(dictionary, axes)
-    behaviour = behave(spec, dictionary, resources, axes)
+    behaviour: Behaviour | None
+    if plan.device.is_soe and plan.device.mailbox is not None:
+        behaviour = SoeAxes(dictionary, plan.device.mailbox.soe_channels)
+    else:
+        behaviour = behave(spec, dictionary, resources, axes)
     unit = Device(
         spec.name,
         dictionary,
@@ -159,6 +164,8 @@ def _build_esi(
     sizes = esi.mailbox_sizes(plan.device)
     if spec.mailbox is not None and sizes is not None:
         drives = _drive_parameters(behaviour, spec.name)
+        if plan.device.is_soe:
+            drives = soe_parameters(plan.device, dictionary)
         unit.mailbox = build_mailbox(spec.mailbox, spec.files, unit, MailboxSizes(*sizes), drives)
     _connect_reports(unit)
     settings = msgspec.structs.replace(

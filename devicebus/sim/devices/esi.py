@@ -21,11 +21,13 @@ from devicebus.esi.records import (
     EsiAccess,
     EsiCoe,
     EsiDevice,
+    EsiInitCommand,
     EsiObject,
     EsiPdo,
     EsiSyncManager,
     SmUse,
 )
+from devicebus.mailbox.protocol import MINIMUM_SIZE
 from devicebus.sim.device import FaultyDictionary
 from devicebus.sim.devices.drive import AXIS_OBJECTS
 from devicebus.sim.devices.objects import (
@@ -186,12 +188,19 @@ def _mailbox(device: EsiDevice) -> MailboxSpec | None:
 
 
 def mailbox_sizes(device: EsiDevice) -> tuple[int, int] | None:
-    """Return the sizes of the mailboxes to and from the slave; None without mailboxes."""
+    """Return the sizes of the mailboxes to and from the slave; None without mailboxes.
+
+    A mailbox ends where the next sync manager begins, also if its file has it longer.
+    """
     found = [each for each in device.sync_managers[:2] if each.is_mailbox]
     if len(found) < 2:
         return None
-    to_slave, to_master = (each.default_size or each.min_size or _DEFAULT_MAILBOX for each in found)
-    return to_slave, to_master
+    sizes = []
+    for each in found:
+        size = each.default_size or each.min_size or _DEFAULT_MAILBOX
+        rooms = (other.start - each.start for other in device.sync_managers)
+        sizes.append(min([size, *(room for room in rooms if room >= MINIMUM_SIZE)]))
+    return sizes[0], sizes[1]
 
 
 def is_drive(spec: SlaveSpec, dictionary: ObjectDictionary) -> bool:
@@ -304,7 +313,34 @@ def build_dictionary(spec: SlaveSpec, plan: EsiPlan, device_type: int) -> Object
         dictionary.add(array(0x1C00, "Sync manager type", "USINT", types))
         if device.slots:
             _add_modules(plan, dictionary)
+        for command in device.init_commands:
+            if not command.is_soe:
+                _add_written(command, dictionary)
     return dictionary
+
+
+def _add_written(command: EsiInitCommand, dictionary: ObjectDictionary) -> None:
+    """Add the target of a start-up write that the dictionary of the file leaves out."""
+    known = dict(dictionary[command.index].entries) if command.index in dictionary else {}
+    if known and (command.complete_access or command.subindex in known):
+        return
+    data, name = command.data, command.comment or f"0x{command.index:04X}"
+    if command.complete_access and data and data[0]:
+        # Subindex 0 takes two bytes, all entries have the same size.
+        size = max(1, (len(data) - 2) // data[0])
+        entries = {sub: _unknown(size, name) for sub in range(1, data[0] + 1)}
+        dictionary.add(record(command.index, name, entries))
+    elif command.subindex == 0:
+        entry = _unknown(len(data), name)
+        dictionary.add(OdObject(command.index, name, ObjectCode.VAR, {0: entry}))
+    else:
+        known.pop(0, None)
+        known[command.subindex] = _unknown(len(data), name)
+        dictionary.add(record(command.index, name, known))
+
+
+def _unknown(size: int, name: str) -> Entry:
+    return Entry(name, type_of("", 8 * max(1, size)), RW)
 
 
 def _device_type(device: EsiDevice, default: int) -> int:
@@ -361,7 +397,8 @@ def _add_pdos(plan: EsiPlan, dictionary: ObjectDictionary) -> None:
     for pdo in device.pdos:
         if pdo.index in dictionary:
             raise ValueError(f"PDO 0x{pdo.index:04X} is there twice, or is an object as well")
-        is_fixed = pdo.is_fixed or coe is None or not coe.pdo_config
+        # With SoE the lists S-0-0016 and S-0-0024 change a telegram.
+        is_fixed = not device.is_soe and (pdo.is_fixed or coe is None or not coe.pdo_config)
         dictionary.add(
             mapping(
                 pdo.index, mapped[pdo.index], dictionary, is_output=pdo.is_output, is_fixed=is_fixed

@@ -15,6 +15,7 @@ from devicebus.sim.spec import SlaveSpec
 from devicebus.wire import sii
 from devicebus.wire.sii import (
     Sii,
+    SiiCategory,
     SiiDc,
     SiiFixed,
     SiiGeneral,
@@ -33,6 +34,8 @@ _NOT_ASSIGNED = 0xFF
 _FMMUS = {"Outputs": 1, "Inputs": 2, "MBoxState": 3, "DynamicOutputs": 1, "DynamicInputs": 2}
 _PHYSICS = {"Y": 1, "K": 3, "L": 2, "H": 1}
 _MAX_ENTRIES = 0xFF
+_OWN = frozenset(SiiCategory)
+"""Categories that are made from the description."""
 _MINIMUM = 256
 
 
@@ -52,7 +55,7 @@ def build_image(spec: SlaveSpec, plan: EsiPlan) -> bytes:
         rx_pdos=_pdos(plan, strings, is_output=True),
         tx_pdos=_pdos(plan, strings, is_output=False),
         dc=tuple(_dc(each, strings) for each in device.op_modes),
-        other=device.eeprom.categories,
+        other=tuple(each for each in device.eeprom.categories if each[0] not in _OWN),
     )
     image = msgspec.structs.replace(image, strings=tuple(strings.texts))
     try:
