@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from eap.codec.soe import Idn
     from eap.ids import ObjectId
     from eap.ops.bus_foe import FileTransfer
+    from eap.ops.scanned_bus import WrittenBus
 
 STATES = ("INIT", "PREOP", "BOOT", "SAFEOP", "OP")
 _U32 = 0xFFFFFFFF
@@ -63,17 +64,64 @@ def bus() -> None:
     """
 
 
-@click.command(cls=BusCommand)
+@click.command(
+    cls=BusCommand,
+    epilog=examples(
+        "eapctl bus scan island-02/bus0",
+        "eapctl bus scan --interface ethernet://eth1 --write bus.yaml --esi esi/",
+    ),
+)
 @bus_options
+@click.option(
+    "--write",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="BUS.yaml",
+    help="Write a bus file that describes the slaves.",
+)
+@click.option(
+    "--esi",
+    type=click.Path(exists=True, path_type=Path),
+    metavar="PATH",
+    help="With --write: ESI files of the vendors, a folder or one file.",
+)
+@click.option("--force", is_flag=True, help="With --write: overwrite an existing file.")
 @json_option("Print one object.")
-def scan(bus: BusAddress, output: Renderer) -> None:
-    """Show all slaves with identity, state, alias and mailbox protocols."""
-    from eap.cli.bus_view import scan_tables
+def scan(
+    bus: BusAddress, target: Path | None, esi: Path | None, force: bool, output: Renderer
+) -> None:
+    """Show all slaves with identity, state, alias and mailbox protocols.
+
+    With --write the process data is read as well, and BUS.yaml describes both, so that the bus port
+    of a plant has its variables.  A slave with an ESI file refers to that file; others are
+    described by their EEPROM and their objects.
+    """
+    from eap.cli.bus_view import scan_tables, written_bus_view
     from eap.ops.bus_info import scan_slaves
 
+    if target is None:
+        if esi is not None or force:
+            raise click.UsageError("--esi and --force belong to --write BUS.yaml")
+        with open_session(bus) as session:
+            found = scan_slaves(session)
+        output.show(found, scan_tables)
+        return
+    if target.exists() and not force:
+        raise click.UsageError(f"{target} exists: --force overwrites it")
+    output.show(_write_bus(bus, target, esi), written_bus_view)
+
+
+def _write_bus(bus: BusAddress, target: Path, esi: Path | None) -> WrittenBus:
+    from eap.ops.scanned_bus import bus_text, describe_slaves, written
+    from eap.runtime.durable import whole_file
+    from eap.runtime.esi_files import EsiSource
+
+    source = None if esi is None else EsiSource(esi)
     with open_session(bus) as session:
-        found = scan_slaves(session)
-    output.show(found, scan_tables)
+        slaves = describe_slaves(session, source)
+    with whole_file(target) as file:
+        file.write(bus_text(target.stem, target.parent, slaves).encode())
+    return written(target, slaves)
 
 
 @click.command(cls=BusCommand)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
 
 from msgspec import UNSET
 
@@ -29,6 +30,9 @@ from eap.ops.bus_objects import (
 from eap.ops.od import OdObjectRow
 from eap.runtime.bus_status import FindingRow
 from eap.runtime.engine_messages import EoeReport
+
+if TYPE_CHECKING:
+    from eap.ops.scanned_bus import WrittenBus
 
 ABSENT = "absent"
 """State of an optional slave that is not plugged in."""
@@ -68,6 +72,18 @@ def scan_tables(found: BusScan) -> Iterator[TextTable | str]:
     if faults := fault_lines(found.slaves):
         yield ""
         yield from faults
+
+
+def written_bus_view(done: WrittenBus) -> Iterator[TextTable | str]:
+    """Yield the slaves of a bus file that was written, and differences from their descriptions."""
+    table = TextTable("Slave", "Name", Column("Described by", wraps=True))
+    for row in done.slaves:
+        file = PurePath(row.file).name
+        described = f"{file} ({row.device})" if row.file else "EEPROM and objects"
+        table.add_row(str(row.address), row.name, described)
+    yield table
+    yield from (f"{row.name}: {note}" for row in done.slaves for note in row.notes)
+    yield f"\n{done.file} written: {count(len(done.slaves), 'slave')}"
 
 
 def state_view(found: SlaveStates, note: str) -> Iterator[TextTable | str]:

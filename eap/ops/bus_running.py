@@ -246,7 +246,13 @@ def open_running(station: str, port: str, plant: str | None = None) -> Iterator[
 
 def _with_registers(slave: Slave, read: tuple[AlStatus, DlStatus], node: TopologyNode) -> Slave:
     al_status, _ = read
-    return msgspec.structs.replace(slave, status=al_status, parent=node.parent, ports=node.ports)
+    return msgspec.structs.replace(
+        slave,
+        status=al_status,
+        parent=node.parent,
+        ports=node.ports,
+        parent_port=node.parent_port,
+    )
 
 
 def _read_registers(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:

@@ -240,6 +240,7 @@ def _slave(found: FoundSlave) -> Slave:
         protocols=found.sii.fixed.protocols,
         parent=found.node.parent,
         ports=found.node.ports,
+        parent_port=found.node.parent_port,
         fault=found.fault,
     )
 
@@ -278,6 +279,8 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """Position of the slave that it is wired to; None for the master."""
     ports: tuple[int, ...]
     """Open ports."""
+    parent_port: int = 1
+    """Port of the parent that it is wired to."""
     fault: str = ""
     """Reason why its description is incomplete or its position is wrong."""
     target: int = 0

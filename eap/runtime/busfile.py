@@ -6,7 +6,7 @@ which it hands over as bytes, and device descriptions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import msgspec
@@ -145,7 +145,7 @@ def _describe(bus: BusFile, number: int) -> DescribedSlave:
     slave = build_slave(spec, bus.resources)
     image = sii.decode(slave.esc.image)
     dictionary = slave.device.dictionary
-    pdos = _describe_pdos(image, dictionary)
+    pdos = _describe_pdos(image, dictionary, spec.pdo_names)
     outputs, inputs = (
         tuple(
             entry
@@ -173,8 +173,11 @@ def _describe(bus: BusFile, number: int) -> DescribedSlave:
     )
 
 
-def _describe_pdos(image: Sii, dictionary: ObjectDictionary) -> list[DescribedPdo]:
+def _describe_pdos(
+    image: Sii, dictionary: ObjectDictionary, named: Mapping[str, str]
+) -> list[DescribedPdo]:
     """Return the PDOs of an EEPROM in the order of their sync managers."""
+    groups = {int(index, 16): name for index, name in named.items()}
     sides: dict[bool, list[int]] = {True: [], False: []}
     for channel in channels_from_sii(image):
         sides[channel.is_output].append(channel.number)
@@ -187,7 +190,10 @@ def _describe_pdos(image: Sii, dictionary: ObjectDictionary) -> list[DescribedPd
             manager = pdo.header.sync_manager if assigned else managers[0]
             entries = [
                 _describe_entry(
-                    PdoEntry(each.index, each.subindex, each.bit_length), dictionary, manager
+                    PdoEntry(each.index, each.subindex, each.bit_length),
+                    dictionary,
+                    manager,
+                    groups.get(pdo.header.index, ""),
                 )
                 for each in pdo.entries
             ]
@@ -195,6 +201,7 @@ def _describe_pdos(image: Sii, dictionary: ObjectDictionary) -> list[DescribedPd
                 DescribedPdo(
                     index=pdo.header.index,
                     name=image.string(pdo.header.name),
+                    group=groups.get(pdo.header.index, ""),
                     is_output=is_output,
                     manager=manager,
                     assigned=assigned,
@@ -205,13 +212,13 @@ def _describe_pdos(image: Sii, dictionary: ObjectDictionary) -> list[DescribedPd
 
 
 def _describe_entry(
-    entry: PdoEntry, dictionary: ObjectDictionary, manager: int
+    entry: PdoEntry, dictionary: ObjectDictionary, manager: int, group: str
 ) -> DescribedPdoEntry:
     place = entry.index, entry.subindex, entry.bit_length
     if not entry.index:
-        return DescribedPdoEntry("", "", *place, manager)
+        return DescribedPdoEntry("", "", *place, manager, group)
     known = dictionary.entry(entry.index, entry.subindex)
-    return DescribedPdoEntry(known.name, known.kind.text, *place, manager)
+    return DescribedPdoEntry(known.name, known.kind.text, *place, manager, group)
 
 
 _FIRST_APPLICATION_OBJECT = 0x2000
@@ -272,6 +279,13 @@ def _check_wiring(spec: BusSpec, number: int, report: FindingReport, at: str) ->
 
 
 def _check_slave(slave: SlaveSpec, bus: BusFile, report: FindingReport, at: str) -> None:
+    for index in slave.pdo_names:
+        try:
+            int(index, 16)
+        except ValueError:
+            message = f"{slave.name}: {index!r} is no PDO"
+            report.add(f"{at}.pdo_names", message, "an index such as 0x1A00")
+            return
     try:
         build_slave(slave, bus.resources, bus.devices.get(slave.name))
     except ValueError as exc:

@@ -100,8 +100,9 @@ class EsiSource:
         try:
             chosen = choose_device((each.listed for each in self._devices), query)
         except ValueError as exc:
-            unread = sum(1 for _ in self.findings())
-            hint = f" ({unread} faults in its files)" if unread else ""
+            bad = sum(bool(content.findings) for content in self._files.values())
+            have = "has" if bad == 1 else "have"
+            hint = f" ({bad} of its files {have} faults)" if bad else ""
             raise ValueError(f"{self.path.name}: {exc}{hint}") from None
         return self._located(chosen)
 
