@@ -315,8 +315,8 @@ def _of_cycles(station: Row) -> Iterator[StatusFinding]:
         yield _info(name, f"{count(overruns, 'cycle')} skipped: overrun")
     if torn := station.get("torn"):
         yield _info(name, f"{count(torn, 'torn write')} read")
-    if discarded := _counts(station["discarded"]):
-        yield _info(name, f"dropped: {discarded}")
+    for text in _dropped(station["discarded"]):
+        yield _info(name, text)
 
 
 _BUS_COUNTERS = (
@@ -381,7 +381,10 @@ def _silent(
     """Yield silent subscriptions, those apart whose PD ID another publisher sends."""
     others = [row for row in rows if row["discarded"].get("wrong_publisher")]
     alone = [row for row in rows if row not in others]
-    yield from _grouped(station, alone, what, "check its sender and the network path", finding)
+    advice = "check its sender and the network path"
+    if station["discarded"].get("truncated"):
+        advice += "; frames were dropped as truncated: 'eapctl discover' shows a wrong length"
+    yield from _grouped(station, alone, what, advice, finding)
     advice = f"'eapctl discover' shows its NetID; {PUBLISHER_HINT}"
     what = f"{what}; another publisher sends its PD ID"
     yield from _grouped(station, others, what, advice, finding)
@@ -419,8 +422,7 @@ def _of_received(where: str, row: Row) -> Iterator[StatusFinding]:
     if row.get("timeouts"):
         remarks.append(f"timed out {times_of(row['timeouts'])}")
     remarks += [f"{row[key]} {key}" for key in _RX_REMARKS if row.get(key)]
-    if discarded := _counts(row["discarded"]):
-        remarks.append(f"dropped: {discarded}")
+    remarks += _dropped(row["discarded"])
     if remarks:
         yield _info(where, "; ".join(remarks))
 
@@ -446,6 +448,17 @@ def _of_sources(station: Row) -> Iterator[StatusFinding]:
             yield _info(where, text)
         else:
             yield _warning(where, text, "stop the wrong sender")
+
+
+_WRONG_LENGTH = "wrong_length"
+
+
+def _dropped(counts: Row) -> Iterator[str]:
+    """Yield what was dropped, and what was taken though its frame was not right."""
+    if dropped := _counts({why: n for why, n in counts.items() if why != _WRONG_LENGTH}):
+        yield f"dropped: {dropped}"
+    if taken := counts.get(_WRONG_LENGTH):
+        yield f"taken in spite of a wrong frame length: {taken}"
 
 
 def _counts(counts: Row) -> str:

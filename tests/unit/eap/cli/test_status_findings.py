@@ -307,6 +307,24 @@ def test_past_events_are_remarks() -> None:
     ]
 
 
+def test_frames_with_a_wrong_length_are_told_from_dropped_ones() -> None:
+    left = rx("left", discarded={"wrong_length": 3, "version": 1})
+    assert texts(rx=[left], discarded={"wrong_length": 3, "truncated": 2}) == [
+        "info mixer: dropped: 2 truncated",
+        "info mixer: taken in spite of a wrong frame length: 3",
+        "info mixer ← left: dropped: 1 version; taken in spite of a wrong frame length: 3",
+    ]
+
+
+def test_silent_pd_beside_truncated_frames_may_have_a_wrong_length() -> None:
+    silent = rx("left", state="waiting")
+    advice = "check its sender and the network path; frames were dropped as truncated"
+    assert texts(rx=[silent], discarded={"truncated": 2})[0] == (
+        f"warning mixer ← left: nothing received yet; {advice}: 'eapctl discover' shows a wrong"
+        " length"
+    )
+
+
 def test_hints_on_publisher_and_version_are_shown_once() -> None:
     rows = [
         rx("a", state="waiting", discarded={"wrong_publisher": 3}),
