@@ -338,11 +338,19 @@ def _plan_summary(report: PlanReport) -> Iterator[str]:
 
 def change_text(change: ObjectChange, name: str) -> str:
     """Return one change, such as ``~ 0xD000:07 TxPD 0 (state): Cycle time  10000 -> 20000 us``."""
-    old, new = change.old, change.new
+    old, new = _shortened(change.old), _shortened(change.new)
     values = f"{old or _EMPTY} -> {new or _EMPTY}" if change.change == "changed" else new
     unit = f" {change.unit}" if values and change.unit else ""
     entry = ObjectId(change.index, change.subindex)
     return f"{_SIGNS[change.change]} {entry} {name}  {values}{unit}".rstrip()
+
+
+_SHOWN = 120
+"""Characters of a value; the whole definition of a type has more."""
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
 def _change_lines(changes: Sequence[ObjectChange]) -> Iterator[str]:

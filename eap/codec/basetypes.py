@@ -355,8 +355,9 @@ class WideString(DataType, frozen=True):
         return text
 
     def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read the text up to the first NUL."""
-        text = bytes(buffer[offset : offset + self.size]).decode("utf-16-le", errors="replace")
+        """Read the text up to the first NUL, or up to the place of the last one."""
+        octets = bytes(buffer[offset : offset + self.size - 2])
+        text = octets.decode("utf-16-le", errors="replace")
         return text.partition("\0")[0]
 
 

@@ -422,6 +422,30 @@ def find_variable(name: str, type_of: Callable[[str], DataType | None]) -> tuple
     return None
 
 
+class SharedPart(NamedTuple):
+    """A part that two types have in common, with its place in each of them."""
+
+    old_bit: int
+    new_bit: int
+    bits: int
+
+
+def shared_parts(old: DataType, new: DataType) -> Iterator[SharedPart]:
+    """Yield what both types have: all if they are equal, else members of one name and type."""
+    if old == new:
+        yield SharedPart(0, 0, new.bit_length)
+    elif (
+        isinstance(old, Structure)
+        and isinstance(new, Structure)
+        and not (old.is_union or new.is_union)
+    ):
+        for member in new.members:
+            if (was := old.by_name.get(member.name)) is None:
+                continue
+            for old_bit, new_bit, bits in shared_parts(was.kind, member.kind):
+                yield SharedPart(was.bit_offset + old_bit, member.bit_offset + new_bit, bits)
+
+
 def parts_of(kind: DataType, path: str = "") -> Iterator[tuple[str, Part]]:
     """Yield the members of *kind*, those of nested structs too, with their paths.
 

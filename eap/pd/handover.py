@@ -1,7 +1,7 @@
 """Handover of a process image to the one that replaces it: counters, trackers and values.
 
-Rule 1: objects are matched by name.  Variables keep their value if their type is the same too;
-frames and PDs keep their counters.
+Rule 1: objects are matched by name.  Variables keep their value if their type is the same too, and
+so do members of structs; frames and PDs keep their counters.
 Rule 2: a tracker continues for all subscriptions that shared it, as long as they still may share
 one.  A subscription to another publisher keeps its sums, and its tracker forgets the sender.
 Rule 3: everything is planned beside running cycles; between two cycles, only bytes are copied.
@@ -17,6 +17,7 @@ from msgspec.structs import asdict
 
 from eap.codec import datatypes
 from eap.codec.pd import PdHeader
+from eap.codec.structures import shared_parts
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxSlot
@@ -267,12 +268,12 @@ def _plan_values(old: Image, new: Image) -> tuple[CopyPlan, CopyPlan]:
     others: list[Move] = []
     for name, slot in new.slots.items():
         was = old.slots.get(name)
-        # Compared as parsed types: the same type can be written in more than one way.
-        if was is None or datatypes.parse(was.type) != datatypes.parse(slot.type):
+        if was is None:
             continue
-        bits = datatypes.parse(slot.type).bit_length
         moves = engine if was.writer is Writer.ENGINE else others
-        moves.append(Move(was.bit_offset, slot.bit_offset, bits))
+        # Compared as parsed types: the same type can be written in more than one way.
+        parts = shared_parts(datatypes.parse(was.type), datatypes.parse(slot.type))
+        moves += [Move(was.bit_offset + a, slot.bit_offset + b, bits) for a, b, bits in parts]
     before = {slot.name: slot for slot in old.layout.rx}
     for pd in new.layout.rx:
         if pd.name in before:  # its header holds the quality

@@ -32,7 +32,9 @@ from eap.pd.spec import (
 CYCLE_US = 10_000
 TYPES = (
     "BOOL", "BIT3", "SINT", "UINT", "UDINT", "LINT", "REAL", "LREAL", "INT24", "UINT[3]",
-    "REAL[2]", "STRING(5)", "BLOCK(7)", "BLOCK(100)",
+    "REAL[2]", "STRING(5)", "BLOCK(7)", "BLOCK(100)", "BOOL[3]", "TIME", "LTIME[1..2]",
+    "WSTRING(3)",
+    "S<24/8:a@0 INT,f@2.1 BIT3,on@3 BOOL,p@4 P<3/1:x@0 BYTE,y@1 INT>[2],d@12 DT,r@16 LREAL>",
 )  # fmt: skip
 PORTS = (
     PortSpec(

@@ -160,6 +160,51 @@ def test_text_ends_at_nul_and_survives_bad_octets() -> None:
     assert parse("STRING(2)").read(b"a\xff", 0) == "a\N{REPLACEMENT CHARACTER}"
 
 
+@pytest.mark.parametrize(
+    ("octets", "text"),
+    [
+        ("610000006200", "a"),
+        ("61006200", "ab"),
+        ("00d86200", "\N{REPLACEMENT CHARACTER}b"),
+        ("3dd800de", "\N{GRINNING FACE}"),
+        ("61003dd800de", "a\N{REPLACEMENT CHARACTER}"),
+    ],
+)
+def test_wide_text_ends_at_nul_and_survives_bad_units(octets: str, text: str) -> None:
+    kind = parse("WSTRING(2)")
+    # The last unit is that of the NUL, whatever a peer puts there.
+    read = kind.read(bytes.fromhex(octets).ljust(6, b"\0"), 0)
+    assert read == text
+    assert kind.read(kind.encode(read), 0) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "reason"),
+    [
+        ("WSTRING(2)", "abc", "at most 2 units of UTF-16, this text has 3"),
+        ("WSTRING(2)", "a\N{GRINNING FACE}", "this text has 3"),
+        ("WSTRING(2)", "a\0", "without NUL"),
+        ("WSTRING(2)", "\ud800", "surrogates"),
+        ("WSTRING(2)", 5, "expected a text"),
+        ("WCHAR", "ab", "one character below U.10000"),
+        ("WCHAR", "\N{GRINNING FACE}", "one character"),
+        ("WCHAR", "\ud800", "one character"),
+        ("WCHAR", "\0", "one character"),
+        ("WCHAR", 5, "one character"),
+    ],
+)
+def test_wrong_wide_text_is_refused(text: str, value: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        parse(text).encode(value)
+
+
+def test_wide_char_is_one_unit_or_empty() -> None:
+    kind = parse("WCHAR")
+    assert kind.encode("Ω").hex() == "a903"
+    assert (kind.read(b"\xa9\x03", 0), kind.read(b"\0\0", 0)) == ("Ω", "")
+    assert kind.parse_text("Ω") == "Ω"
+
+
 def test_not_a_number_passes() -> None:
     kind = parse("LREAL")
     value = kind.read(struct.pack("<d", math.nan), 0)

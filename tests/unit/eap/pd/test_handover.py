@@ -443,3 +443,17 @@ def test_needs_new_start_reports_changed_gateway():
     before = replace(left(), ports=(replace(BUS, gateway=GatewaySpec()),))
     after = replace(left(), ports=(replace(BUS, gateway=GatewaySpec(silent=True)),))
     assert needs_new_start(before, after) == [f"port bus0: gateway is another one{END}"]
+
+
+def test_members_of_a_changed_struct_keep_their_values():
+    inner = "P<4/2:x@0 INT,y@2 INT>"
+    before = f"S<16/8:a@0 INT,f@2.0 BIT,g@2.1 BIT,p@4 {inner},r@8 LREAL>"
+    after = "S<24/8:n@0 INT,g@2.3 BIT,p@4 P<6/2:z@0 INT,y@2 INT,x@4 INT>,r@16 LREAL,a@12 DINT>"
+    defaults = {"n": 9, "g": 0, "p": {"z": 8, "y": 0, "x": 0}, "r": 0.0, "a": 7}
+    old = image_of(station(variables=(VariableSpec("v", before),)))
+    new = image_of(station(variables=(VariableSpec("v", after, default=defaults),)))
+    old.write("v", {"a": 5, "f": 1, "g": 1, "p": {"x": 3, "y": 4}, "r": 2.5})
+    handover = ImageHandover(old, new)
+    handover.carry_values(old.memory)
+    # Of another type, or new: as the default.
+    assert new.read("v") == {"n": 9, "g": 1, "p": {"z": 8, "y": 4, "x": 3}, "r": 2.5, "a": 7}
