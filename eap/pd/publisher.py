@@ -11,6 +11,7 @@ from eap.pd.image import Image, Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
 from eap.pd.poll import PollRequests
+from eap.pd.quality import NO_ORIGINS, Origins, forwarded_quality
 from eap.pd.spec import TriggerSpec, TxFrameSpec
 from eap.pd.txframe import (
     EVENT_BIT,
@@ -90,6 +91,7 @@ class Publisher:
         publisher: NetID of the port.
         channel: Destination of the frames; it defines the bytes before the EtherCAT header.
         frames: The port's TxFrames, each with its place and the places of its PDs.
+        origins: Subscriptions from which its variables get their values.
     """
 
     def __init__(
@@ -99,6 +101,7 @@ class Publisher:
         publisher: NetId,
         channel: FrameChannel,
         frames: Iterable[FrameRow],
+        origins: Origins = NO_ORIGINS,
     ) -> None:
         self._image = image
         self._inputs = inputs
@@ -114,6 +117,7 @@ class Publisher:
                     where,
                     Trigger(pd.trigger, plan_schedule(pd.trigger, cycle_us, gate)),
                     Gather(image, inputs, pd.variables),
+                    forwarded_quality(image, pd.variables, origins),
                 )
                 for pd, where in zip(spec.pds, slots, strict=True)
             )
@@ -345,6 +349,7 @@ class PollResponder:
         channel: Sends the answers.
         frames: The TxFrames with their polled PDs.
         requests: Pending requests by sender.
+        origins: Subscriptions from which its variables get their values.
     """
 
     def __init__(
@@ -355,6 +360,7 @@ class PollResponder:
         channel: FrameChannel,
         frames: Iterable[FrameRow],
         requests: PollRequests,
+        origins: Origins = NO_ORIGINS,
     ) -> None:
         self._image = image
         self._inputs = inputs
@@ -365,7 +371,12 @@ class PollResponder:
             _ResponseFrame(
                 slot,
                 tuple(
-                    TxPd(where, Trigger(TriggerSpec(), None), Gather(image, inputs, pd.variables))
+                    TxPd(
+                        where,
+                        Trigger(TriggerSpec(), None),
+                        Gather(image, inputs, pd.variables),
+                        forwarded_quality(image, pd.variables, origins),
+                    )
                     for pd, where in zip(spec.pds, slots, strict=True)
                 ),
             )

@@ -11,12 +11,12 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from eap.codec import datatypes
-from eap.codec.pd import PdHeader
 from eap.pd.address import from_word, source_text
 from eap.pd.device import DeviceState
 from eap.pd.image import Image
 from eap.pd.layout import FrameSlot, RxSlot, TxSlot
 from eap.pd.monitor import SubscriberPresence
+from eap.pd.quality import quality, tracker_word
 from eap.pd.words import (
     HISTOGRAM_BINS,
     PD_DROP_REASONS,
@@ -31,9 +31,6 @@ from eap.pd.words import (
     TxWord,
     percentile,
 )
-
-_QUALITY_NS = 100_000
-_QUALITY_MAX = 0xFFFF
 
 
 class MemberRow(msgspec.Struct, frozen=True):
@@ -141,27 +138,6 @@ def pd_list(image: Image) -> list[PdRow]:
     ]
     received = [row(slot, direction="rx", publisher=slot.publisher or None) for slot in layout.rx]
     return sent + received
-
-
-def tracker_word(image: Image, slot: RxSlot) -> int:
-    """Return the index of the first word of the block that holds a subscription's tracker."""
-    return int(image.words[slot.words + RxWord.TRACKER]) or slot.words
-
-
-def quality(image: Image, slot: RxSlot) -> int:
-    """Return the age of a subscription's data in units of 100 us, saturated at 65535.
-
-    It is the Quality that the frame carried plus the receiver's own cycles since, and with polled
-    data the time from the request to the answer; the rest of a unit is carried from cycle
-    to cycle.
-    """
-    words = image.words
-    first = tracker_word(image, slot)
-    cycles = words[StationWord.CYCLE] - words[first + RxWord.ARRIVED_IN_CYCLE]
-    own_ns = max(cycles, 0) * image.layout.cycle_us * 1000 + words[slot.words + RxWord.RESPONSE_NS]
-    # Derived when it is read: counting it up in each cycle would cost the cycle for each PD.
-    sent = PdHeader.decode(image.memory, slot.offset).quality
-    return min(sent + own_ns // _QUALITY_NS, _QUALITY_MAX)
 
 
 def var_state(image: Image, slot: RxSlot) -> int:

@@ -23,6 +23,7 @@ from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, StateChannel
 from eap.pd.links import Generators, Links
 from eap.pd.poll import outgoing_polls, requests_at
 from eap.pd.publisher import FrameRow, PollResponder, Publisher
+from eap.pd.quality import find_origins
 from eap.pd.spec import EngineSource, LengthCheck, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
@@ -76,6 +77,7 @@ class Station:
         self._computes = bool(generated or spec.links)
         """True if variables are computed in the cycle."""
         self._has_own_variables = self._computes
+        self._origins = find_origins(image.layout, spec.links)
         self.buses: list[CyclicBus] = []
         self._publishers: list[tuple[Publisher | PollResponder, FrameChannel]] = []
         self._sending: list[tuple[Publisher | PollResponder, FrameChannel]] = []
@@ -133,11 +135,13 @@ class Station:
         out = StateChannel(channel, self._words) if own.eap_sm else channel
         publisher = None
         if pushed := _pds_of(frames, polled=False):
-            publisher = Publisher(self.image, self._inputs, net_id, out, pushed)
+            publisher = Publisher(self.image, self._inputs, net_id, out, pushed, self._origins)
             self._publishers.append((publisher, out))
         if polled := _pds_of(frames, polled=True):
             requests = self._requests[port]
-            answerer = PollResponder(self.image, self._inputs, net_id, out, polled, requests)
+            answerer = PollResponder(
+                self.image, self._inputs, net_id, out, polled, requests, self._origins
+            )
             self._publishers.append((answerer, out))
         self._ports[port] = channel, publisher
         self._teach(port)

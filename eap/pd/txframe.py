@@ -25,6 +25,7 @@ from eap.ids import NetId
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
+from eap.pd.quality import ForwardedQuality
 from eap.pd.spec import TriggerSpec, Writer
 from eap.pd.words import REASON_INDEX, Reason
 
@@ -241,12 +242,20 @@ _put_u16 = struct.Struct("<H").pack_into
 class TxPd:
     """One TxPD at run time."""
 
-    __slots__ = ("data", "gather", "reason", "slot", "trigger")
+    __slots__ = ("data", "gather", "quality", "reason", "slot", "trigger")
 
-    def __init__(self, slot: TxSlot, trigger: Trigger, gather: Gather) -> None:
+    def __init__(
+        self,
+        slot: TxSlot,
+        trigger: Trigger,
+        gather: Gather,
+        quality: ForwardedQuality | None = None,
+    ) -> None:
         self.slot = slot
         self.trigger = trigger
         self.gather = gather
+        self.quality = quality
+        """Quality of received values among the variables; None if there are none."""
         self.data: bytes | None = None
         """Data that this cycle would send, if the trigger needs it."""
         self.reason = 0
@@ -267,7 +276,7 @@ class TxPd:
 class Selection:
     """A buffer for some of a frame's PDs, and where their data goes in it."""
 
-    __slots__ = ("_bits", "_copies", "_cycle_offset", "out", "pds")
+    __slots__ = ("_copies", "_cycle_offset", "_others", "out", "pds")
 
     def __init__(self, out: OutFrame, pds: tuple[TxPd, ...]) -> None:
         self.out = out
@@ -276,7 +285,8 @@ class Selection:
         placed = list(zip(pds, _data_offsets(pds, out.headroom), strict=True))
         # One flat list of all PDs' copies: a call for each PD would take longer than the copies.
         self._copies = [copy for pd, offset in placed for copy in pd.gather.copies(offset)]
-        self._bits = [(pd.gather.bits_into, at) for pd, at in placed if pd.gather.has_bits]
+        self._others = [(pd.gather.bits_into, at) for pd, at in placed if pd.gather.has_bits]
+        self._others += [(pd.quality.into, at) for pd, at in placed if pd.quality is not None]
 
     def patch(self, cycle: int) -> None:
         """Write the counter and the current data of all PDs."""
@@ -284,8 +294,8 @@ class Selection:
         _put_u16(view, self._cycle_offset, cycle & 0xFFFF)
         for where, data in self._copies:
             view[where] = data
-        for bits_into, offset in self._bits:
-            bits_into(view, offset)
+        for write_into, offset in self._others:
+            write_into(view, offset)
 
 
 class TxFrame:

@@ -12,7 +12,8 @@ from eap.ids import InterfaceUri, NetId
 from eap.net import realtime
 from eap.net.ticker import Ticker
 from eap.pd.engine import Engine
-from eap.pd.report import station_status, tracker_word
+from eap.pd.quality import tracker_word
+from eap.pd.report import station_status
 from eap.pd.spec import (
     REQUESTER,
     CounterSource,

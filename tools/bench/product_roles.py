@@ -14,7 +14,7 @@ from typing import Any
 from eap.net.image_file import open_image
 from eap.net.ticker import Ticker
 from eap.pd.engine import Engine
-from eap.pd.report import tracker_word
+from eap.pd.quality import tracker_word
 from eap.pd.words import RxWord
 from tools.bench.network import Page
 from tools.bench.pacing import BURST, answer, send_for

@@ -14,7 +14,7 @@ from eap.net.image_file import ImageFile, create_image
 from eap.net.packetsocket import open_packet_pair
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
-from eap.pd.report import tracker_word
+from eap.pd.quality import tracker_word
 from eap.pd.spec import (
     PortKind,
     PortSpec,

@@ -20,7 +20,8 @@ from eap.errors import ControlError, ImageError, WriterConflictError
 from eap.net.image_file import StationImage
 from eap.pd.image import Image
 from eap.pd.layout import VariableSlot
-from eap.pd.report import PdRow, pd_list, quality, tracker_word
+from eap.pd.quality import quality, tracker_word
+from eap.pd.report import PdRow, pd_list
 from eap.pd.spec import Writer
 from eap.pd.words import RxWord, StationWord
 from eap.suggest import suggest

@@ -24,7 +24,8 @@ from eap.pd.layout import (
     RxSlot,
     TxSlot,
 )
-from eap.pd.report import frame_state, quality, tracker_word, tx_status, tx_var_state, var_state
+from eap.pd.quality import quality, tracker_word
+from eap.pd.report import frame_state, tx_status, tx_var_state, var_state
 from eap.pd.words import (
     PD_DROP_INDEX,
     REASON_INDEX,
@@ -36,8 +37,6 @@ from eap.pd.words import (
     TxWord,
 )
 
-_NEVER = 0xFFFF
-"""Quality of what has never been received: as old as can be told."""
 _KINDS: dict[str, DataType] = {
     row.live: datatypes.parse(row.kind)
     for each in profile.ALL
@@ -157,10 +156,6 @@ def _discarded(reason: PdDropReason) -> Callable[[Image, RxSlot], int]:
     return lambda image, slot: int(image.words[slot.words + offset])
 
 
-def _quality(image: Image, slot: RxSlot) -> int:
-    return quality(image, slot) if _tracked(RxWord.RECEIVED)(image, slot) else _NEVER
-
-
 def _cycle_index(image: Image, slot: RxSlot) -> int:
     last = _tracked(RxWord.LAST_CYCLE)(image, slot)
     return last & 0xFFFF if _tracked(RxWord.RECEIVED)(image, slot) else 0
@@ -193,7 +188,7 @@ _OF_TX: dict[str, Callable[[Image, TxSlot], int]] = {
     EapLive.TX_SKIPPED: _tx_word(TxWord.SKIPPED),
 } | {key: _sent(reason) for reason in Reason if (key := f"tx_sent_{reason}") in _KINDS}
 _OF_RX: dict[str, Callable[[Image, RxSlot], int]] = {
-    EapLive.RX_QUALITY: _quality,
+    EapLive.RX_QUALITY: quality,
     EapLive.RX_CYCLE_INDEX: _cycle_index,
     EapLive.RX_VAR_STATE: var_state,
     EapLive.RX_STATE: _tracked(RxWord.STATE),

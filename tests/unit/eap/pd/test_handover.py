@@ -15,7 +15,8 @@ from eap.pd.handover import ImageHandover, needs_new_start
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot, TxSlot
 from eap.pd.monitor import SubscriberPresence
-from eap.pd.report import station_status, tracker_word
+from eap.pd.quality import tracker_word
+from eap.pd.report import station_status
 from eap.pd.spec import (
     BusPortSpec,
     GatewaySpec,

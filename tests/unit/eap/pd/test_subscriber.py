@@ -14,7 +14,8 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import EAP_SM_OFFSET, PdFrameHeader
 from eap.ids import NetId
 from eap.pd.poll import REQUESTERS_PER_CYCLE, PollRequests
-from eap.pd.report import quality, station_status
+from eap.pd.quality import quality
+from eap.pd.report import station_status
 from eap.pd.spec import RxAlternateSpec, RxPdSpec, SentVariableSpec, Substitute
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import RxState, RxWord
