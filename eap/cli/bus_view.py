@@ -90,7 +90,8 @@ def state_view(found: SlaveStates, note: str) -> Iterator[TextTable | str]:
     """Yield the table of the slaves' states, and *note* unless it is empty."""
     table = TextTable("Slave", "Name", "State", Column("Reason", wraps=True))
     for row in found.slaves:
-        table.add_row(str(row.address), row.name, _state(row.state), _reason(row))
+        shown = Styled(ABSENT, style="dim") if row.is_absent else _state(row.state)
+        table.add_row(str(row.address), row.name, shown, _reason(row))
     yield table
     if note:
         yield note

@@ -425,7 +425,7 @@ def _data(
     size = 0 if known is None else (known.bit_length + 7) // 8
     is_text = known is not None and known.type.startswith("STRING")
     if size and len(data) != size and not is_text:
-        message = f"{target} of {slave.name} has {size} bytes, but {len(data)} are written"
+        message = f"{target} of {slave.name}: {len(data)} bytes of data"
         report.add(section.at, message, f"{size} bytes")
         raise _BadKeyError
     return data

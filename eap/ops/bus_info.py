@@ -82,6 +82,7 @@ class SlaveStateRow(msgspec.Struct, frozen=True):
     state: str | None
     code: int
     reason: str
+    is_absent: bool = False
 
 
 class SlaveStates(msgspec.Struct, frozen=True):
@@ -360,7 +361,7 @@ def _scanned(slave: Slave) -> ScannedSlave:
 
 def _state(bus: SlaveBus, slave: Slave) -> SlaveStateRow:
     if slave.is_absent:
-        return SlaveStateRow(slave.station, slave.name, None, 0, "it is absent")
+        return SlaveStateRow(slave.station, slave.name, None, 0, "", is_absent=True)
     try:
         status = bus.run(read_status(slave.station), f"slave {slave.station}: its state")
     except WorkingCounterError:

@@ -215,7 +215,10 @@ timeouts: {preop_ms: 100}
         ('startup: [{sdo: "0x6060"}]', "start-up write of 0x6060 without data; expected one of"),
         ('startup: [{sdo: "0x6060", value: 1, data: "01"}]', "start-up write of 0x6060 without"),
         ('startup: [{sdo: "0x6060", value: 200}]', "0x6060 of drive: 200"),
-        ('startup: [{sdo: "0x6060", data: "0102"}]', "has 1 bytes, but 2 are written"),
+        (
+            'startup: [{sdo: "0x6060", data: "0102"}]',
+            "0x6060 of drive: 2 bytes of data; expected 1 bytes",
+        ),
         ('startup: [{sdo: "0x6060", data: "0x1"}]', "data '0x1'; expected hexadecimal bytes"),
         ('startup: [{sdo: "0x9000", value: 1}]', "the type of 0x9000 of drive is not known; exp"),
         ('startup: [{sdo: "0x9000", value: 1, type: UNIT}]', "'UNIT' is not a data type"),
