@@ -7,12 +7,13 @@ and each PD that it finds is compared with the subscriptions of plants.
 from __future__ import annotations
 
 import select
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import lru_cache
 from ipaddress import IPv4Address
 from pathlib import Path
 from time import monotonic
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec import Struct
@@ -135,11 +136,16 @@ class CaptureLosses(NamedTuple):
     malformed: int
     not_kept: int
     """PDs beyond the limit of the observer."""
+    errors: Mapping[str, int] = MappingProxyType({})
+    """Failed system calls by errno name: ENETDOWN when the interface went down or away."""
 
     def lines(self) -> Iterator[str]:
         """Yield a line for each kind of loss."""
         if self.dropped:
             yield f"capture: {self.dropped} packets lost: too fast; rates and gaps are wrong"
+        for name, number in self.errors.items():
+            why = "interface down" if name == "ENETDOWN" else name
+            yield f"capture: {why}, {'once' if number == 1 else f'{number} times'}"
         if self.cut:
             yield f"capture: {self.cut} frames with their begin only: in fragments, or cut"
         if self.malformed:
@@ -161,12 +167,13 @@ class Discovery:
         self.now_ns = 0
         self._paths: dict[tuple[bytes, int], FramePath] = {}
         self._dropped: int | None = None
+        self._errors: Mapping[str, int] = {}
 
     @property
     def losses(self) -> CaptureLosses:
         """Losses so far."""
         seen = self.observer
-        return CaptureLosses(self._dropped, seen.cut, seen.malformed, seen.not_kept)
+        return CaptureLosses(self._dropped, seen.cut, seen.malformed, seen.not_kept, self._errors)
 
     def watch(self, interface: str, for_s: float | None) -> Iterator[None]:
         """Capture at *interface* for *for_s* seconds, or without end; yield now and then.
@@ -178,6 +185,7 @@ class Discovery:
         with closing(FrameCapture(interface)) as capture:
             poll = select.poll()
             poll.register(capture.fileno(), select.POLLIN)
+            self._errors = capture.errors
             while True:
                 left_s = _TICK_S if end_s is None else min(_TICK_S, end_s - monotonic())
                 if left_s <= 0:

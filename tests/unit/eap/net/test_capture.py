@@ -10,6 +10,7 @@ import pytest
 
 from eap.net.capture import FrameCapture
 from tests.support.packets import ethernet, tcp_segment, udp
+from tests.unit.eap.net.conftest import ip, wait_for_links
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
 
@@ -95,6 +96,15 @@ def test_capture_counts_what_it_could_not_keep(capture, left):
         left.send(udp(bytes(1000)))
     assert capture.dropped > 0
     assert capture.dropped > 0  # the kernel's own counter starts again with each reading
+
+
+def test_capture_outlives_an_interface_that_goes_down(capture, left):
+    ip("link set right down")
+    ip("link set right up")
+    wait_for_links("left", "right")
+    left.send(udp(FRAME))
+    assert len(captured(capture, 1)) == 1
+    assert capture.errors == {"ENETDOWN": 1}
 
 
 def test_fragments_but_the_first_are_left_out(capture, left):
