@@ -178,9 +178,10 @@ class IndexGroup(IntEnum):
     VOE = 0xF430
     """Written: a message with its VoE header."""
     EOE = 0xF440
-    """Own format: a Write has an Ethernet frame for the slave, a Read returns those that it has
-    sent, each behind its length as 16 bits (offset: any number that the client chooses); a
-    ReadWrite has the body of a request for settings (offset: its type) and returns the answer."""
+    """Own format: a Write has an Ethernet frame for the slave.  The offset of a ReadWrite is the
+    type of a message: 0 returns the frames that the slave has sent, each behind its length as 16
+    bits, to the reader with the number of four bytes that is written; a request for settings has
+    its body there, and returns the answer."""
     ROUTE_QUERY = 0x4541_5001
     """Own format: of the system service, where it forwards requests to, see ``HopQuestion``."""
 

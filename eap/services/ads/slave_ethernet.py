@@ -1,9 +1,11 @@
 """Ethernet frames of slaves by ADS, through their EoE (own format).
 
-A Write sends a frame to the slave.  A Read returns the frames that the slave has sent since the
-last one, each behind its length as 16 bits; its offset is a number of the client's choice, so that
-several readers of one NetID do not share frames.  A ReadWrite passes a request for settings: the
-offset is its type, data and answer are as in the mailbox.
+A Write sends a frame to the slave.  A ReadWrite with offset 0 returns the frames that the slave has
+sent since the last one, each behind its length as 16 bits; it writes a number of four bytes that
+the client chooses, so that several readers of one NetID do not share frames.  A ReadWrite with
+another offset passes a request for settings: the offset is its type, data and answer are as in the
+mailbox.  Frames are not fetched by Read: what everybody may read are values, not the traffic of
+others.
 
 A reader that does not come back is forgotten.  What it does not fetch in time is dropped, as
 switches do.
@@ -35,7 +37,8 @@ from eap.services.slaves.access import LocalSlave
 from eap.services.slaves.bus_client import BusClient
 
 READER_NS = 60_000_000_000
-"""For how long after its last Read a client gets the frames of a slave."""
+"""For how long after it has fetched frames a client gets the next ones."""
+NUMBER_SIZE = 4
 MAX_READERS = 8
 """Of one slave; a new one replaces the one that was silent longest."""
 MAX_QUEUED = 64
@@ -60,7 +63,7 @@ class SlaveEthernet:
 
     def __init__(self, bus: BusClient) -> None:
         self._bus = bus
-        self._readers: dict[int, dict[tuple[NetId, int], _Reader]] = {}
+        self._readers: dict[int, dict[tuple[NetId, bytes], _Reader]] = {}
         self._assemblers: dict[int, FrameAssembler] = {}
         self._numbers: dict[int, int] = {}
         bus.listen(self._receive)
@@ -79,11 +82,16 @@ class SlaveEthernet:
             EapError: the slave does not do it, as a SlaveAccess says.
         """
         match operation:
-            case Read(_, offset, length):
-                return self._read(station, (client.net_id, offset), length)
+            case Read():
+                raise AdsRefusedError(AdsError.SERVICE, "frames are fetched by ReadWrite")
             case Write():
                 await self._send(access, station, operation.data)
                 return b""
+            case ReadWrite(_, EoeType.FRAGMENT, length, number):
+                if len(number) != NUMBER_SIZE:
+                    why = f"a number of {len(number)} bytes, expected {NUMBER_SIZE}"
+                    raise AdsRefusedError(AdsError.SIZE, why)
+                return self._fetch(station, (client.net_id, number), length)
         if operation.offset not in REQUESTS:
             raise AdsRefusedError(AdsError.INDEX_OFFSET, f"{operation.offset} is no request of EoE")
         request = encode_message(EoeType(operation.offset), operation.data)
@@ -98,7 +106,7 @@ class SlaveEthernet:
         except CodecError as exc:
             raise AdsRefusedError(AdsError.SIZE, str(exc)) from None
 
-    def _read(self, station: int, key: tuple[NetId, int], length: int) -> bytes:
+    def _fetch(self, station: int, key: tuple[NetId, bytes], length: int) -> bytes:
         if length < _SHORTEST_READ:
             why = f"room for {length} bytes, expected at least {_SHORTEST_READ}"
             raise AdsRefusedError(AdsError.SIZE, why)

@@ -58,7 +58,12 @@ from eap.services.gateway.admission import (
     result_of,
 )
 from eap.services.gateway.dialect_handler import DialectHandler, DialectTarget
-from eap.services.gateway.message_codecs import EoeListener, EoeListeners, codec_for
+from eap.services.gateway.message_codecs import (
+    EoeListener,
+    EoeListeners,
+    begins_to_listen,
+    codec_for,
+)
 from eap.services.gateway.remote_ethernet import RemoteEthernet
 from eap.services.gateway.reply_encoder import ErrorLog, GatewayRequest, ReplyEncoder, Send
 from eap.services.gateway.sessions import (
@@ -315,7 +320,7 @@ class MailboxGateway:
             case RemoteAddress():
                 sizes = MailboxSizes.of_data(self.settings.max_size)
                 slave = self._open_remote(destination)
-                if kind is MailboxType.EOE:
+                if kind is MailboxType.EOE and begins_to_listen(body):
                     self._ethernet.add(station, slave, endpoint, request.send)
                 begin = partial(self._begin, key, slave, sizes)
                 return await self._slaves.get(key, begin).handle(body, is_step=is_step)
@@ -369,7 +374,7 @@ class MailboxGateway:
         kind, body, station = key.kind, request.body, key.address
         slave = await self._find(station)
         check_slave(kind, body, slave)
-        if kind is MailboxType.EOE:
+        if kind is MailboxType.EOE and begins_to_listen(body):
             address, now_ns = request.header.address, monotonic_ns()
             self._listeners.add(station, request.endpoint, address, request.send, now_ns)
         session = self._slaves.get(key, partial(self._begin_local, key, slave))

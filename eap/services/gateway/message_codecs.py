@@ -17,6 +17,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.ams.reassembly import FragmentAssembler, iter_fragments
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
+from eap.codec.eoe import READS as EOE_READS
 from eap.codec.eoe import REQUESTS as EOE_REQUESTS
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import SoeHeader, SoeOpcode, encode_fragments
@@ -35,6 +36,7 @@ MAX_LISTENERS = 8
 """Of one slave."""
 MAX_WRITTEN = 0x10004
 """Octets of the longest list of SoE that is written in fragments."""
+_TYPE = 0x0F
 _UNKNOWN_GROUP = frozenset((AdsError.INDEX_GROUP, AdsError.SERVICE))
 """Results of a station without EoE in its ADS services."""
 
@@ -195,6 +197,14 @@ class EthernetCodec(MessageCodec):
                 raise GatewayError(Cause.NO_PROTOCOL) from None
             raise
         return [message.data] if expects_reply else []
+
+
+def begins_to_listen(body: bytes) -> bool:
+    """Return whether the sender of an EoE message gets the frames of the slave from now on.
+
+    Settings may be read by everybody, the traffic of others may not.
+    """
+    return bool(body) and body[0] & _TYPE not in EOE_READS
 
 
 class EoeListener(NamedTuple):

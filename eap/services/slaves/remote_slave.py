@@ -264,7 +264,9 @@ class RemoteSlave:
         Args:
             reader: Number of the caller at the other station.
         """
-        return split_counted(await self.perform(Read(IndexGroup.EOE, reader, BLOCK)))
+        number = reader.to_bytes(4, "little")
+        fetch = ReadWrite(IndexGroup.EOE, EoeType.FRAGMENT, BLOCK, number)
+        return split_counted(await self.perform(fetch))
 
     async def perform(
         self, operation: Operation, *, port: int | None = None, timeout_s: float | None = None

@@ -33,7 +33,12 @@ HERE = Endpoint("udp:eap0", "127.0.0.1:1")
 
 
 async def read(client: Client, reader: int = 1) -> list[Ether]:
-    return [Ether(each) for each in split_counted(await client.read(DRIVE, EOE, reader, 4096))]
+    return [Ether(each) for each in await fetch(client, reader, 4096)]
+
+
+async def fetch(client: Client, reader: int, length: int) -> list[bytes]:
+    number = reader.to_bytes(4, "little")
+    return split_counted(await client.ask(DRIVE, EOE, 0, number, length))
 
 
 async def set_ip(client: Client) -> None:
@@ -97,12 +102,12 @@ def test_reader_is_bounded_and_forgotten(monkeypatch):
         tell(slave_ethernet.MAX_QUEUED + 6)
         await asyncio.sleep(0.05)
         assert await read(client, 1) == []  # the third one has replaced it
-        first = await client.read(DRIVE, EOE, 3, 2 + 1522)
-        assert split_counted(first)[0][0] == 6  # the oldest were dropped
-        assert len(split_counted(first)) == 1524 // 62
+        first = await fetch(client, 3, 2 + 1522)
+        assert first[0][0] == 6  # the oldest were dropped
+        assert len(first) == 1524 // 62
         monkeypatch.setattr(slave_ethernet, "READER_NS", -1)
         await read(client, 3)
-        await client.read(DRIVE, EOE, 3, 1 << 16)
+        await fetch(client, 3, 1 << 16)
         tell(1)
         await asyncio.sleep(0.05)
         assert await read(client, 3) == []
@@ -113,10 +118,12 @@ def test_reader_is_bounded_and_forgotten(monkeypatch):
 @pytest.mark.parametrize(
     ("operation", "result"),
     [
-        (Read(EOE, 0, 100), AdsError.SIZE),
+        (ReadWrite(EOE, 0, 100, bytes(4)), AdsError.SIZE),
+        (ReadWrite(EOE, 0, 4096, bytes(3)), AdsError.SIZE),
+        (Read(EOE, 0, 4096), AdsError.SERVICE),
         (Write(EOE, 0, bytes(1600)), AdsError.SIZE),
         (Write(EOE, 0, b""), AdsError.SIZE),
-        (ReadWrite(EOE, 0, 64, b""), AdsError.INDEX_OFFSET),
+        (ReadWrite(EOE, 3, 64, b""), AdsError.INDEX_OFFSET),
         (ReadWrite(EOE, 99, 64, b""), AdsError.INDEX_OFFSET),
     ],
 )
@@ -129,7 +136,7 @@ def test_wrong_requests_are_refused(operation, result):
 
 def test_slave_without_eoe_refuses_frames():
     async def scene(client, engine):
-        assert (await client.do(1001, Read(EOE, 0, 4096))).result == AdsError.SERVICE
+        assert (await client.do(1001, ReadWrite(EOE, 0, 4096, bytes(4)))).result == AdsError.SERVICE
 
     play(scene, "files")
 
@@ -149,7 +156,7 @@ def test_broken_fragments_are_ignored():
 @pytest.mark.parametrize(
     ("operation", "service"),
     [
-        (Read(EOE, 1, 64), AccessService.READ),
+        (ReadWrite(EOE, 0, 4096, bytes(4)), AccessService.RAW),
         (ReadWrite(EOE, EoeType.GET_IP_REQUEST, 64, b""), AccessService.READ),
         (ReadWrite(EOE, EoeType.SET_IP_REQUEST, 64, b""), AccessService.RAW),
         (Write(EOE, 0, PING), AccessService.RAW),

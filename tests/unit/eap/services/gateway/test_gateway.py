@@ -339,6 +339,20 @@ def test_a_mailbox_error_is_no_request() -> None:
     play(scene)
 
 
+def test_client_that_only_reads_settings_hears_no_frames() -> None:
+    async def scene(desk: Desk) -> None:
+        heard: list[bytes] = []
+        frame = encode_frame(MailboxHeader(0, 1001, type=EOE), bytes.fromhex("06000000"))
+        task = desk.gateway.receive(frame, HERE, heard.append)
+        assert task is not None
+        await task
+        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, EOE, b"an Ethernet frame")))
+        await desk.handle(COE, 1001, VENDOR)
+        assert len(heard) == 1  # the answer
+
+    play(scene)
+
+
 def test_ethernet_frames_of_a_slave_go_to_its_clients() -> None:
     async def scene(desk: Desk) -> None:
         heard: list[bytes] = []
