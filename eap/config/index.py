@@ -227,12 +227,33 @@ class SentPd(NamedTuple):
         return f"{self.station.name}/{self.pd.name}"
 
 
+class Span(NamedTuple):
+    """Consecutive bits of one variable."""
+
+    variable: str
+    start: int
+    bits: int
+
+    def overlaps(self, other: Span) -> bool:
+        """Return whether both spans have a bit in common."""
+        return (
+            self.variable == other.variable
+            and self.start < other.start + other.bits
+            and other.start < self.start + self.bits
+        )
+
+
 class VariablePart(NamedTuple):
     """A variable, or a member or element of one; *bit_offset* counts from its start."""
 
     variable: str
     kind: DataType
     bit_offset: int = 0
+
+    @property
+    def span(self) -> Span:
+        """All of its bits."""
+        return Span(self.variable, self.bit_offset, self.kind.bit_length)
 
 
 class Index:

@@ -40,6 +40,7 @@ from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index, SentPd, VariablePart
+from eap.config.links import check_links, ends, execution_order, is_bitwise
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.routes import (
     check_routes,
@@ -62,7 +63,7 @@ from eap.config.structs import (
     VariableSection,
 )
 from eap.config.types import TypeTable, resolve_types
-from eap.config.variables import check_links, check_variables, ends, execution_order, is_bitwise
+from eap.config.variables import check_variables
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (

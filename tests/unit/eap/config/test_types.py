@@ -281,6 +281,16 @@ def test_wrong_member_has_a_finding(tmp_path, more, finding):
     assert finding in found[0]
 
 
+def test_variable_with_the_name_of_a_member_is_refused(tmp_path):
+    loaded(tmp_path)
+    file = tmp_path / "plant.yaml"
+    more = "flag: BOOL\n      axis.jog: INT\n      axis.other: INT"
+    file.write_text(file.read_text().replace("flag: BOOL", more))
+    (found,) = load(file, lambda *_: pytest.fail("no bus")).findings
+    assert found.message == "variable 'axis.jog' has the name of a member of 'axis'"
+    assert found.line == 17
+
+
 def test_default_of_a_struct_names_some_members(tmp_path):
     axis = "{type: ST_Axis, default: {state: On, table: [{x: 1, y: 2.5}, {x: 2, y: 3.5}]}}"
     (station,) = loaded(tmp_path, axis=axis).plant.stations

@@ -5,17 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.codec import datatypes
-from eap.config.index import VariablePart
+from eap.config.index import Span, VariablePart
+from eap.config.links import Ends, ends, execution_order, find_loops, is_bitwise, is_scaled
 from eap.config.structs import LinkSection
-from eap.config.variables import (
-    Ends,
-    Span,
-    ends,
-    execution_order,
-    find_loops,
-    is_bitwise,
-    is_scaled,
-)
 
 COUNTER = "count: {kind: counter}"
 
