@@ -288,7 +288,7 @@ def test_variable_with_the_name_of_a_member_is_refused(tmp_path):
     file.write_text(file.read_text().replace("flag: BOOL", more))
     (found,) = load(file, lambda *_: pytest.fail("no bus")).findings
     assert found.message == "variable 'axis.jog' has the name of a member of 'axis'"
-    assert found.line == 17
+    assert found.line == 18
 
 
 def test_default_of_a_struct_names_some_members(tmp_path):
