@@ -209,24 +209,24 @@ class EoePortReport(msgspec.Struct, frozen=True, kw_only=True):
 
     station: int
     name: str
-    is_connected: bool
+    is_connected: bool = False
     """True while its mailbox is open."""
-    ip: str
+    ip: str = ""
     """Address that it has accepted, empty if none was written."""
-    fault: str
-    """Reason that its IP settings were not written."""
-    received: int
+    fault: str = ""
+    """Reason that its IP settings were not written, or that it has no EoE."""
+    received: int = 0
     """Came from the slave."""
-    sent: int
+    sent: int = 0
     """Went to the slave."""
-    dropped: int
+    dropped: int = 0
     """Not sent, because too many waited, or the slave was not connected."""
-    invalid: int
+    invalid: int = 0
     """Came from the slave with fragments missing, or a wrong length."""
-    failed: int
+    failed: int = 0
     """Sent, but not taken by the slave."""
-    last_error: str
-    addresses: tuple[str, ...]
+    last_error: str = ""
+    addresses: tuple[str, ...] = ()
     """MAC addresses behind it."""
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from ipaddress import IPv4Address, IPv4Interface
 from time import monotonic_ns
@@ -164,7 +164,10 @@ class EoeBridge:
             received=host.received,
             sent=host.sent,
             dropped=host.dropped + (self._tap.dropped if self._tap is not None else 0),
-            slaves=tuple(self._port_report(link, now_ns) for link in self._links.values()),
+            slaves=(
+                *(self._port_report(link, now_ns) for link in self._links.values()),
+                *self._unsupported(),
+            ),
         )
 
     def _describe_link(self) -> str:
@@ -192,6 +195,15 @@ class EoeBridge:
                 str(MacAddr(mac)) for mac in self._switch.addresses(link.station, now_ns)
             ),
         )
+
+    def _unsupported(self) -> Iterator[EoePortReport]:
+        """Yield the slaves of the plant file that have no EoE."""
+        for slave in self._bus.view.latest.slaves.values():
+            names = {slave.name, str(slave.station)}
+            is_wanted = any(each.slave in names for each in self._spec.slaves)
+            if is_wanted and slave.state and not slave.protocols & SiiProtocol.EOE:
+                fault = "the slave does not support EoE: remove it from the plant file"
+                yield EoePortReport(station=slave.station, name=slave.name, fault=fault)
 
     def _fail(self, reason: str) -> None:
         if reason != self._fault:

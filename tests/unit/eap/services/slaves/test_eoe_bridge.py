@@ -209,6 +209,15 @@ def test_slave_is_disconnected_in_init_and_gets_its_settings_again():
     play(scene)
 
 
+def test_slave_without_eoe_in_the_plant_file_is_a_finding():
+    async def scene(stage):
+        await stage.ports_are(lambda ports: "deaf" in ports and not ports["deaf"].is_connected)
+        (finding,) = find_eoe_faults(stage.bridge.report())
+        assert finding.what.startswith("slave 1003 (deaf): EoE: the slave does not support EoE")
+
+    play(scene, EoeSpec("eoe0", slaves=(EoeSlaveSpec("deaf"),)))
+
+
 def test_settings_that_a_slave_refuses_are_a_finding(caplog):
     async def scene(stage):
         await stage.ports_are(lambda ports: len(ports) == 2 and ports["left"].fault)
