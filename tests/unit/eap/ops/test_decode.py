@@ -107,6 +107,14 @@ def test_good_pds_before_a_bad_one_are_shown() -> None:
     assert "PD 2 has 1 of 9 bytes" in fields.error
 
 
+@pytest.mark.parametrize(
+    ("octets", "service"),
+    [("0850 0200 e903 00 13 0360", "TxPDO remote request 3"), ("0750 0100 e903 00 13 03", None)],
+)
+def test_coe_message_is_named(octets: str, service: str | None) -> None:
+    assert plain(bytes.fromhex(octets))["mailbox"].get("service") == service
+
+
 def test_bad_ams_leaves_the_mailbox_readable() -> None:
     fields = decode_frame(bytes.fromhex("0850 0200 e903 00 11 abcd"))
     assert fields.mailbox.protocol == "AoE"
