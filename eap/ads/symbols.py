@@ -1,11 +1,12 @@
-"""ADS symbols: the variables of one configuration, their types, handles and values.
+"""ADS symbols: the variables of one configuration, their parts, types, handles and values.
 
-Numbers of odd widths are widened to the next type that IEC 61131-3 has, so that every client can
-read them; texts get the NUL at their end that a PLC's strings have.
+A member or an element is a symbol too, by its path (``axis.position``, ``table[2].x``); the upload
+lists variables only, and their types, as TwinCAT does.
 
-A handle is made of the version of the table and the index of the symbol in it.  So nothing is kept
-for a client, a handle outlives its connection, and one of an older table is refused as such.  Case
-does not matter in a name, unless it makes two names of one.
+A handle is made of the version of the table and the number of the symbol in it: first those of the
+variables, then those of their parts.  So nothing is kept for a client, a handle outlives its
+connection, and one of an older table is refused as such.  Case does not matter in a name, unless it
+makes two names of one.
 """
 
 from __future__ import annotations
@@ -13,146 +14,36 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Collection, Iterable
 from functools import cached_property, partial
+from itertools import accumulate
 from typing import NamedTuple, Protocol
 
 from eap.ads.request import AdsRefusedError
 from eap.ads.space import AdsSpace, Source
+from eap.ads.symbolparts import (
+    SymbolPart,
+    count_parts,
+    find_by_number,
+    find_by_path,
+    find_path_at,
+)
+from eap.ads.symboltypes import SymbolType, TypeEntries, memory_type, symbol_type, type_key
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import (
-    AdsType,
-    DataTypeEntry,
     HandleInfo,
     SymbolAddress,
     SymbolEntry,
     SymbolFlag,
     UploadInfo,
     decode_name,
-    encode_data_type,
     encode_entry,
     encode_text,
 )
-from eap.codec.datatypes import Array, Boolean, DataType, Integer, Real, String
-
-_INTEGERS = {
-    (True, 1): (AdsType.INT8, "SINT"),
-    (True, 2): (AdsType.INT16, "INT"),
-    (True, 4): (AdsType.INT32, "DINT"),
-    (True, 8): (AdsType.INT64, "LINT"),
-    (False, 1): (AdsType.UINT8, "USINT"),
-    (False, 2): (AdsType.UINT16, "UINT"),
-    (False, 4): (AdsType.UINT32, "UDINT"),
-    (False, 8): (AdsType.UINT64, "ULINT"),
-}
-_REALS = {4: (AdsType.REAL32, "REAL"), 8: (AdsType.REAL64, "LREAL")}
-
-
-class SymbolType(NamedTuple):
-    """ADS form of one of our types, with conversion of values both ways."""
-
-    kind: DataType
-    id: AdsType
-    name: str
-    """As IEC 61131-3 writes it."""
-    size: int
-    """Bytes for a client."""
-
-    def describe(self) -> list[DataTypeEntry]:
-        """Return the data type entries of this type and of its elements."""
-        if _is_bytes(self.kind):
-            of = DataTypeEntry("BYTE", AdsType.UINT8, 1)
-        elif isinstance(self.kind, Array):
-            (of,) = symbol_type(self.kind.element).describe()
-        else:
-            return [DataTypeEntry(self.name, self.id, self.size)]
-        return [of, DataTypeEntry(self.name, self.id, self.size, of.name, self.size // of.size)]
-
-    def to_client(self, octets: bytes) -> bytes:
-        """Convert the bytes of our type to those that a client reads."""
-        if self.size == self.kind.size:
-            return octets
-        if isinstance(self.kind, String):
-            return octets + b"\0"
-        return self._resized(octets, _element(self.kind).size, self.size // self.kind.count)
-
-    def from_client(self, data: bytes) -> bytes:
-        """Return the bytes of our type for what a client writes.
-
-        Raises:
-            AdsRefusedError: SIZE or VALUE.
-        """
-        if isinstance(self.kind, String):
-            return self._from_text(data)
-        if len(data) != self.size:
-            raise AdsRefusedError(AdsError.SIZE)
-        if isinstance(self.kind, Boolean):
-            return bytes((any(data),))
-        element = _element(self.kind)
-        if self.size != self.kind.size:
-            return self._resized(data, self.size // self.kind.count, element.size)
-        if element.is_bits and data[0] >> element.bit_length:
-            raise AdsRefusedError(AdsError.VALUE)
-        return data
-
-    def _from_text(self, data: bytes) -> bytes:
-        if len(data) > self.size:
-            raise AdsRefusedError(AdsError.SIZE)
-        text, _, _ = data.partition(b"\0")
-        if len(text) > self.kind.size:
-            raise AdsRefusedError(AdsError.SIZE)
-        return text.ljust(self.kind.size, b"\0")
-
-    def _resized(self, data: bytes, before: int, after: int) -> bytes:
-        element = _element(self.kind)
-        signed = isinstance(element, Integer) and element.signed
-        octets = bytearray()
-        for at in range(0, len(data), before):
-            number = int.from_bytes(data[at : at + before], "little", signed=signed)
-            try:
-                octets += number.to_bytes(after, "little", signed=signed)
-            except OverflowError:
-                raise AdsRefusedError(AdsError.VALUE) from None
-        return bytes(octets)
-
-
-def symbol_type(kind: DataType) -> SymbolType:
-    """Return how clients know *kind*."""
-    if isinstance(kind, String):
-        return SymbolType(kind, AdsType.STRING, f"STRING({kind.size})", kind.size + 1)
-    if _is_bytes(kind):
-        return SymbolType(kind, AdsType.UINT8, f"ARRAY [0..{kind.size - 1}] OF BYTE", kind.size)
-    element = _element(kind)
-    type_id, name, size = _scalar(element)
-    if isinstance(kind, Array):
-        name = f"ARRAY [0..{kind.count - 1}] OF {name}"
-    return SymbolType(kind, type_id, name, size * kind.count)
-
-
-def _is_bytes(kind: DataType) -> bool:
-    """Return whether clients know *kind* as bytes: it is neither a text nor made of numbers."""
-    return not isinstance(kind, String) and not isinstance(_element(kind), Boolean | Integer | Real)
-
-
-def _element(kind: DataType) -> DataType:
-    return kind.element if isinstance(kind, Array) else kind
-
-
-def _scalar(kind: DataType) -> tuple[AdsType, str, int]:
-    if isinstance(kind, Boolean):
-        return AdsType.BIT, "BOOL", 1
-    if isinstance(kind, Real):
-        return *_REALS[kind.size], kind.size
-    signed = isinstance(kind, Integer) and kind.signed
-    size = next(size for size in (1, 2, 4, 8) if size >= kind.size)
-    type_id, name = _INTEGERS[signed, size]
-    # BYTE, WORD and DWORD keep their names; only their ids are those of numbers.
-    own = kind.text if kind.text in {"BYTE", "WORD", "DWORD"} else name
-    return type_id, own, size
-
+from eap.codec.datatypes import DataType
+from eap.codec.structures import split_paths
 
 _INDEX_BITS = 24
-# Clients take texts without it for texts in the code page of TwinCAT.
-_UTF_8 = (("TcEncoding", "UTF-8"),)
-"""Attribute of texts."""
+_MAX_NAME = 2048
+"""Characters of the longest name that is looked up."""
 _ALIGNMENT = 8
 """Bytes: no value of a client's lies across what its processor reads at once."""
 
@@ -168,8 +59,9 @@ class SymbolVariable(NamedTuple):
 
 
 class Symbol(NamedTuple):
-    """One variable, how clients know its type, and where they find it."""
+    """A variable or a part of one, how clients know its type, and where they find it."""
 
+    name: str
     variable: SymbolVariable
     type: SymbolType
     address: SymbolAddress
@@ -177,15 +69,19 @@ class Symbol(NamedTuple):
     def describe(self) -> bytes:
         """Return its entry."""
         flags = SymbolFlag.READ_ONLY if self.variable.read_only else 0
+        if self.address.group == IndexGroup.DATA_BITS:
+            flags |= SymbolFlag.BIT_VALUE
         return encode_entry(
             SymbolEntry(
                 self.address,
                 self.type.id,
                 flags,
-                self.variable.name,
+                self.name,
                 self.type.name,
-                self.variable.comment,
-                _UTF_8 if self.type.id == AdsType.STRING else (),
+                self.variable.comment if self.name == self.variable.name else "",
+                self.type.dimensions,
+                self.type.guid,
+                self.type.attributes,
             )
         )
 
@@ -193,6 +89,23 @@ class Symbol(NamedTuple):
         """Return *handle* with size and name of its type."""
         name = encode_text(self.type.name)
         return HandleInfo(handle, self.type.size, 0, len(name)).encode() + name + b"\0"
+
+    def part(self, part: SymbolPart) -> Symbol:
+        """Return the symbol of a part of this variable."""
+        if not part.path:
+            return self
+        group, offset = self.address.group, self.address.offset
+        if part.kind.is_bits:
+            kind = memory_type(part.kind)
+            group, offset = IndexGroup.DATA_BITS, 8 * offset + part.bit_offset
+        elif self.type.size == self.type.kind.size:
+            kind = memory_type(part.kind)
+            offset += part.bit_offset // 8
+        else:  # an element of an array that is widened
+            kind = symbol_type(part.kind)
+            offset += part.bit_offset // part.kind.bit_length * kind.size
+        address = SymbolAddress(group, offset, kind.size)
+        return Symbol(self.name + part.path, self.variable, kind, address)
 
 
 class SymbolTable:
@@ -206,23 +119,25 @@ class SymbolTable:
     def __init__(self, variables: Iterable[SymbolVariable], version: int) -> None:
         self.version = version & 0xFF
         self._symbols: list[Symbol] = []
+        types = TypeEntries()
         offset = 0
         for variable in variables:
             kind = symbol_type(variable.type)
             address = SymbolAddress(IndexGroup.DATA, offset, kind.size)
-            self._symbols.append(Symbol(variable, kind, address))
+            self._symbols.append(Symbol(variable.name, variable, kind, address))
+            types.add(kind)
             offset += kind.size + -kind.size % _ALIGNMENT
         self._offsets = [symbol.address.offset for symbol in self._symbols]
-        self._indexes = {symbol.variable.name: n for n, symbol in enumerate(self._symbols)}
+        self._indexes = {symbol.name: n for n, symbol in enumerate(self._symbols)}
         self._folded: dict[str, int | None] = {}
         for name, index in self._indexes.items():
             key = name.casefold()
             self._folded[key] = None if key in self._folded else index
-        self._types = {
-            entry.name: encode_data_type(entry)
-            for symbol in self._symbols
-            for entry in symbol.type.describe()
-        }
+        parts = (count_parts(symbol.variable.type) - 1 for symbol in self._symbols)
+        # Numbers of the variables are 1 and on: no handle is 0, even with version 0.
+        self._numbers = list(accumulate(parts, initial=len(self._symbols) + 1))
+        """First number of the parts of each variable, and behind those of the last one."""
+        self._types = types.encode()
         self.type_upload = b"".join(self._types.values())
 
     @cached_property
@@ -240,46 +155,99 @@ class SymbolTable:
     def data_type(self, name: str) -> bytes:
         """Return the entry of a type that symbols have; refuse with SYMBOL_NOT_FOUND."""
         try:
-            return self._types[name.upper()]
+            return self._types[type_key(name)]
         except KeyError:
             raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND) from None
 
-    def handle_of(self, name: str) -> int:
-        """Return the handle of a symbol; refuse with SYMBOL_NOT_FOUND."""
-        index = self._indexes.get(name)
-        if index is None:
-            index = self._folded.get(name.casefold())
+    def find(self, name: str) -> tuple[Symbol, int]:
+        """Return a symbol and its handle.
+
+        Raises:
+            AdsRefusedError: SYMBOL_NOT_FOUND; NO_MORE_HANDLES, if the variables have too many
+                parts.
+        """
+        index, path = self._index_of(name), ""
+        if index is None and len(name) <= _MAX_NAME:
+            for variable, rest in split_paths(name):
+                index, path = self._index_of(variable), rest
+                if index is not None:
+                    break
         if index is None:
             raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND)
-        # Plus 1: no handle is 0, even with version 0.
-        return self.version << _INDEX_BITS | index + 1
+        symbol, number = self._symbols[index], index + 1
+        if path:
+            try:
+                part = find_by_path(symbol.variable.type, path)
+            except ValueError as exc:
+                raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND, f"{name[:60]}: {exc}") from None
+            symbol, number = symbol.part(part), self._numbers[index] + part.number - 1
+        if number >> _INDEX_BITS:
+            raise AdsRefusedError(AdsError.NO_MORE_HANDLES)
+        return symbol, self.version << _INDEX_BITS | number
+
+    def _index_of(self, variable: str) -> int | None:
+        index = self._indexes.get(variable)
+        return self._folded.get(variable.casefold()) if index is None else index
 
     def by_handle(self, handle: int) -> Symbol:
         """Return a symbol; refuse handles of other tables, and those that never were any."""
         if handle >> _INDEX_BITS != self.version:
             raise AdsRefusedError(AdsError.SYMBOL_VERSION)
-        index = (handle & (1 << _INDEX_BITS) - 1) - 1
-        if not 0 <= index < len(self._symbols):
+        number = handle & (1 << _INDEX_BITS) - 1
+        if 0 < number <= len(self._symbols):
+            return self._symbols[number - 1]
+        if not 0 < number < self._numbers[-1]:
             raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND)
-        return self._symbols[index]
+        index = bisect_right(self._numbers, number) - 1
+        symbol = self._symbols[index]
+        part = find_by_number(symbol.variable.type, number - self._numbers[index] + 1)
+        return symbol.part(part)
 
     def successor_of(self, symbol: Symbol) -> Symbol:
         """Return the symbol here for *symbol* of an older table; refuse with SYMBOL_VERSION."""
-        index = self._indexes.get(symbol.variable.name)
-        if index is None or self._symbols[index].type != symbol.type:
+        try:
+            successor, _ = self.find(symbol.name)
+        except AdsRefusedError:
+            raise AdsRefusedError(AdsError.SYMBOL_VERSION) from None
+        if successor.name != symbol.name or successor.type != symbol.type:
             raise AdsRefusedError(AdsError.SYMBOL_VERSION)
-        return self._symbols[index]
+        return successor
 
     def at(self, offset: int) -> tuple[Symbol, int]:
-        """Return the symbol that *offset* lies in, and how far; refuse with INDEX_OFFSET."""
+        """Return the variable that *offset* lies in, and how far; refuse with INDEX_OFFSET."""
         index = bisect_right(self._offsets, offset) - 1
         if index < 0 or offset >= self._offsets[index] + self._symbols[index].address.size:
             raise AdsRefusedError(AdsError.INDEX_OFFSET)
         return self._symbols[index], offset - self._offsets[index]
 
+    def part_at(self, offset: int, size: int) -> Symbol:
+        """Return the variable or part of *size* bytes at *offset*; a text may be longer.
+
+        Raises:
+            AdsRefusedError: INDEX_OFFSET, if there is no variable; SIZE, if none has this size.
+        """
+        symbol, start = self.at(offset)
+        is_memory = symbol.type.size == symbol.type.kind.size
+        if not start and (size == symbol.type.size or not is_memory):
+            return symbol
+        if not is_memory:
+            raise AdsRefusedError(AdsError.SIZE)
+        path = find_path_at(symbol.variable.type, 8 * start, 8 * size) if size else None
+        if path is None:
+            raise AdsRefusedError(AdsError.SIZE)
+        return symbol.part(find_by_path(symbol.variable.type, path))
+
+    def bits_at(self, offset: int) -> Symbol:
+        """Return the bit field at an offset in bits; refuse with INDEX_OFFSET."""
+        symbol, start = self.at(offset // 8)
+        path = find_path_at(symbol.variable.type, 8 * start + offset % 8, 0)
+        if not path:
+            raise AdsRefusedError(AdsError.INDEX_OFFSET)
+        return symbol.part(find_by_path(symbol.variable.type, path))
+
 
 class VariableStore(Protocol):
-    """Store of the values; both methods raise AdsRefusedError, BUSY for a passing reason."""
+    """Store of the values by name or path; raises AdsRefusedError, BUSY for a passing reason."""
 
     def read(self, name: str) -> bytes:
         """Return the bytes of a value, as its type has them."""
@@ -299,6 +267,7 @@ class SymbolSpace(AdsSpace):
     groups: Collection[int] = frozenset(
         (
             IndexGroup.DATA,
+            IndexGroup.DATA_BITS,
             IndexGroup.SYMBOL_HANDLE,
             IndexGroup.VALUE_BY_NAME,
             IndexGroup.VALUE_BY_HANDLE,
@@ -349,13 +318,14 @@ class SymbolSpace(AdsSpace):
             if len(data) != 4:
                 raise AdsRefusedError(AdsError.SIZE)
             return
-        symbol, start = self._find(group, offset)
-        if start:
-            raise AdsRefusedError(AdsError.SIZE)
+        if group == IndexGroup.DATA:
+            symbol = self._table.part_at(offset, len(data))
+        else:
+            symbol, _ = self._find(group, offset)
         if symbol.variable.read_only:
-            why = f"{symbol.variable.name} {symbol.variable.read_only}"
+            why = f"{symbol.name} {symbol.variable.read_only}"
             raise AdsRefusedError(AdsError.ACCESS, why)
-        self._store.write(symbol.variable.name, symbol.type.from_client(data))
+        self._store.write(symbol.name, symbol.type.from_client(data))
 
     def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
         """Return value, handle or description of the name in *data*."""
@@ -364,8 +334,7 @@ class SymbolSpace(AdsSpace):
         name = decode_name(data)
         if group == IndexGroup.DATA_TYPE_BY_NAME:
             return _whole(self._table.data_type(name), length)
-        handle = self._table.handle_of(name)
-        symbol = self._table.by_handle(handle)
+        symbol, handle = self._table.find(name)
         if group == IndexGroup.VALUE_BY_NAME:
             return self._value(symbol)[:length]
         if group == IndexGroup.SYMBOL_HANDLE:
@@ -397,12 +366,14 @@ class SymbolSpace(AdsSpace):
     def _find(self, group: int, offset: int) -> tuple[Symbol, int]:
         if group == IndexGroup.DATA:
             return self._table.at(offset)
+        if group == IndexGroup.DATA_BITS:
+            return self._table.bits_at(offset), 0
         if group in _BY_HANDLE:
             return self._table.by_handle(offset), 0
         raise AdsRefusedError(AdsError.ACCESS)
 
     def _value(self, symbol: Symbol) -> bytes:
-        return symbol.type.to_client(self._store.read(symbol.variable.name))
+        return symbol.type.to_client(self._store.read(symbol.name))
 
 
 _BY_HANDLE = frozenset((IndexGroup.VALUE_BY_HANDLE, IndexGroup.SYMBOL_NOTIFICATION))

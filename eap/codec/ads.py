@@ -132,6 +132,8 @@ class IndexGroup(IntEnum):
     """Of the system service: states, version and platform in 16 bytes."""
     DATA = 0x4040
     """The memory of variables; a symbol gives the address of each."""
+    DATA_BITS = 0x4041
+    """Bit fields of structs in that memory, offset in bits; own format, near 0x4021 of a PLC."""
     IO_DEVICES = 0x5000
     """And those that follow: plus the id of a device."""
     SYMBOL_HANDLE = 0xF003

@@ -1,17 +1,16 @@
 """ADS symbols and data types: entries of variables and of their types.
 
 AdsSymbolEntry and its kin of AdsDef.h; AdsDatatypeEntry and AdsDatatypeArrayInfo of Beckhoff's
-TcAdsDef.h, as the open client ads-client reads them.  Structures, methods and attributes of data
-types do not occur here.
+TcAdsDef.h, as the open client ads-client reads them.  Methods, copy masks and the lists of newer
+releases do not occur here.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum, IntFlag
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from eap.codec.wire import Buffer, WireStruct, u16, u32
-from eap.errors import MalformedError, TruncatedError
+from eap.codec.wire import Buffer, Scalar, WireStruct, u16, u32
 
 CODE_PAGE = 1252
 _ENCODING = f"cp{CODE_PAGE}"
@@ -47,6 +46,7 @@ class SymbolFlag(IntFlag):
 
     PERSISTENT = 0x0001
     BIT_VALUE = 0x0002
+    TYPE_GUID = 0x0008
     READ_ONLY = 0x0020
     ATTRIBUTES = 0x1000
 
@@ -92,6 +92,13 @@ class _InfoTail(WireStruct, frozen=True):
 _INFO_3_SIZE = 64
 
 
+class ArrayDimension(WireStruct, frozen=True):
+    """AdsDatatypeArrayInfo: one dimension of an array."""
+
+    lower_bound: Annotated[int, Scalar("i")]
+    elements: u32
+
+
 class _SymbolHead(WireStruct, frozen=True):
     """AdsSymbolEntry; lengths of texts without their NUL."""
 
@@ -100,7 +107,8 @@ class _SymbolHead(WireStruct, frozen=True):
     offset: u32
     size: u32
     type: u32
-    flags: u32
+    flags: u16
+    dimensions: u16
     name_length: u16
     type_length: u16
     comment_length: u16
@@ -119,7 +127,7 @@ class HandleInfo(WireStruct, frozen=True):
 
 
 class SymbolEntry(NamedTuple):
-    """One variable as a server describes it."""
+    """One variable, or a part of one, as a server describes it."""
 
     address: SymbolAddress
     type: int
@@ -128,6 +136,10 @@ class SymbolEntry(NamedTuple):
     name: str
     type_name: str
     comment: str = ""
+    dimensions: tuple[ArrayDimension, ...] = ()
+    """Of an array."""
+    guid: bytes = b""
+    """GUID of the type, 16 bytes; empty if none is known."""
     attributes: tuple[tuple[str, str], ...] = ()
     """Names and values."""
 
@@ -135,23 +147,31 @@ class SymbolEntry(NamedTuple):
 def encode_entry(entry: SymbolEntry) -> bytes:
     """Return an entry with its texts, each cut to MAX_TEXT bytes and ended by a NUL."""
     texts = [encode_text(text) for text in (entry.name, entry.type_name, entry.comment)]
-    lengths = [len(text) for text in texts]
+    flags = entry.flags
+    if entry.guid:
+        flags |= SymbolFlag.TYPE_GUID
+    if entry.attributes:
+        flags |= SymbolFlag.ATTRIBUTES
+    parts = [text + b"\0" for text in texts]
+    parts += [each.encode() for each in entry.dimensions]
+    parts += [entry.guid, _encode_attributes(entry.attributes)]
+    behind = b"".join(parts)
     address = entry.address
-    attributes = _encode_attributes(entry.attributes)
     head = _SymbolHead(
-        _SymbolHead.SIZE + sum(lengths) + len(texts) + len(attributes),
+        _SymbolHead.SIZE + len(behind),
         address.group,
         address.offset,
         address.size,
         entry.type,
-        entry.flags | (SymbolFlag.ATTRIBUTES if attributes else 0),
-        *lengths,
+        flags,
+        len(entry.dimensions),
+        *map(len, texts),
     )
-    return head.encode() + b"".join(text + b"\0" for text in texts) + attributes
+    return head.encode() + behind
 
 
 def _encode_attributes(attributes: tuple[tuple[str, str], ...]) -> bytes:
-    """Return the part behind the texts, as the open client ads-client reads it."""
+    """Return names and values behind their number, as the open client ads-client reads them."""
     if not attributes:
         return b""
     octets = bytearray(len(attributes).to_bytes(2, "little"))
@@ -159,38 +179,6 @@ def _encode_attributes(attributes: tuple[tuple[str, str], ...]) -> bytes:
         name, value = map(encode_text, attribute)
         octets += bytes((len(name), len(value))) + name + b"\0" + value + b"\0"
     return bytes(octets)
-
-
-def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
-    """Return the entry at *offset* without its attributes, and where the next one begins.
-
-    Raises:
-        TruncatedError: the data ends before the entry does.
-        MalformedError: its texts do not fit in it.
-    """
-    head = _SymbolHead.decode(data, offset)
-    end = offset + head.entry_length
-    lengths = (head.name_length, head.type_length, head.comment_length)
-    if head.entry_length < _SymbolHead.SIZE + sum(lengths) + len(lengths):
-        raise MalformedError(
-            f"{head.entry_length} bytes do not hold texts of {lengths}",
-            layout="AdsSymbolEntry",
-            offset=offset,
-        )
-    if end > len(data):
-        raise TruncatedError(
-            f"{head.entry_length} bytes, but {len(data) - offset} follow",
-            layout="AdsSymbolEntry",
-            offset=offset,
-        )
-    texts = []
-    at = offset + _SymbolHead.SIZE
-    for length in lengths:
-        texts.append(bytes(data[at : at + length]).decode(_ENCODING, "replace"))
-        at += length + 1
-    address = SymbolAddress(head.group, head.offset, head.size)
-    name, type_name, comment = texts
-    return SymbolEntry(address, head.type, head.flags, name, type_name, comment), end
 
 
 def encode_text(text: str) -> bytes:
@@ -211,6 +199,12 @@ class DataTypeFlag(IntFlag):
     """ADSDATATYPEFLAG."""
 
     DATA_TYPE = 0x0001
+    DATA_ITEM = 0x0002
+    BIT_VALUES = 0x0020
+    """Size and offset are numbers of bits."""
+    TYPE_GUID = 0x0080
+    ATTRIBUTES = 0x1000
+    ENUM_INFOS = 0x2000
 
 
 class _DataTypeHead(WireStruct, frozen=True):
@@ -231,44 +225,75 @@ class _DataTypeHead(WireStruct, frozen=True):
     items: u16
 
 
-class _Dimension(WireStruct, frozen=True):
-    lower_bound: u32
-    elements: u32
-
-
 class DataTypeEntry(NamedTuple):
-    """A number, a text, or a list of one dimension that begins with element 0."""
+    """A type, or with DATA_ITEM a member of one."""
 
     name: str
+    """Of a member its own name."""
     type: int
-    """Id of the type, or of the elements."""
+    """An AdsType."""
     size: int
-    """Bytes."""
-    element: str = ""
-    """Name of the elements' type; empty if it is no list."""
-    elements: int = 0
-    """Of a list."""
+    """Bytes, or bits with BIT_VALUES."""
+    type_name: str = ""
+    """Type of a member, of an array's elements, or that an alias or enumeration is based on."""
+    comment: str = ""
+    flags: int = DataTypeFlag.DATA_TYPE
+    """Without those that follow from the fields below."""
+    offset: int = 0
+    """Of a member, in the unit of the size."""
+    hash: int = 0
+    """Changes with the type."""
+    type_hash: int = 0
+    """Hash of the type called *type_name*."""
+    dimensions: tuple[ArrayDimension, ...] = ()
+    items: tuple[DataTypeEntry, ...] = ()
+    """Members of a struct."""
+    guid: bytes = b""
+    """16 bytes; empty if none is known."""
+    attributes: tuple[tuple[str, str], ...] = ()
+    values: tuple[tuple[str, int], ...] = ()
+    """Names and numbers of an enumeration."""
 
 
 def encode_data_type(entry: DataTypeEntry) -> bytes:
-    """Return an entry with its texts and its dimension, if it has one."""
-    name, element = encode_text(entry.name), encode_text(entry.element)
-    behind = name + b"\0" + element + b"\0\0"
-    if entry.elements:
-        behind += _Dimension(0, entry.elements).encode()
+    """Return an entry with its texts, dimensions and members, whose entries have the same form."""
+    texts = [encode_text(text) for text in (entry.name, entry.type_name, entry.comment)]
+    flags = entry.flags
+    if entry.guid:
+        flags |= DataTypeFlag.TYPE_GUID
+    if entry.attributes:
+        flags |= DataTypeFlag.ATTRIBUTES
+    if entry.values:
+        flags |= DataTypeFlag.ENUM_INFOS
+    parts = [text + b"\0" for text in texts]
+    parts += [each.encode() for each in entry.dimensions]
+    parts += [encode_data_type(item) for item in entry.items]
+    parts += [entry.guid, _encode_attributes(entry.attributes), _encode_values(entry)]
+    behind = b"".join(parts)
     head = _DataTypeHead(
         entry_length=_DataTypeHead.SIZE + len(behind),
         version=1,
-        hash=0,
-        type_hash=0,
+        hash=entry.hash,
+        type_hash=entry.type_hash,
         size=entry.size,
-        offset=0,
+        offset=entry.offset,
         type=entry.type,
-        flags=DataTypeFlag.DATA_TYPE,
-        name_length=len(name),
-        type_length=len(element),
-        comment_length=0,
-        dimensions=1 if entry.elements else 0,
-        items=0,
+        flags=flags,
+        name_length=len(texts[0]),
+        type_length=len(texts[1]),
+        comment_length=len(texts[2]),
+        dimensions=len(entry.dimensions),
+        items=len(entry.items),
     )
     return head.encode() + behind
+
+
+def _encode_values(entry: DataTypeEntry) -> bytes:
+    if not entry.values:
+        return b""
+    octets = bytearray(len(entry.values).to_bytes(2, "little"))
+    for text, number in entry.values:
+        name = encode_text(text)
+        octets += bytes((len(name),)) + name + b"\0"
+        octets += (number & (1 << 8 * entry.size) - 1).to_bytes(entry.size, "little")
+    return bytes(octets)

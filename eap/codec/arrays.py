@@ -61,7 +61,12 @@ class Array(DataType, frozen=True, kw_only=True):
         return f"{self.element.compose(seen)}[{_shape_text(self.dimensions)}]"
 
     def encode(self, value: Any) -> bytes:
-        """Return the bytes of a sequence of exactly as many elements; errors name the element."""
+        """Return the bytes of a sequence of exactly as many elements; take bytes as they are.
+
+        Errors name the element.
+        """
+        if isinstance(value, bytes) and len(value) == self.size:
+            return value
         items = self._flat(value)
         packer = _packer(self.element, self.count)
         if packer:

@@ -80,12 +80,16 @@ class Structure(DataType, frozen=True, kw_only=True):
         return {name: _decode(kind, buffer, offset, bit) for name, kind, bit in self.members}
 
     def encode(self, value: Any) -> bytes:
-        """Return the bytes of a mapping, dataclass or record; gaps are zero.
+        """Return the bytes of a mapping, dataclass or record, with gaps of zeros.
+
+        Bytes are taken as they are: the memory of a controller.
 
         Raises:
             ValueError: a member is missing, unknown, or has another type; members of a union
                 contradict each other.
         """
+        if isinstance(value, bytes) and len(value) == self.size:
+            return value
         given = self._given(value)
         if self.is_union:
             return self._encode_union(given)
@@ -345,7 +349,8 @@ def _is_off(member: Member, align: int) -> bool:
     )
 
 
-_STEP = re.compile(r"\.([A-Za-z_]\w*)|\[\s*(-?\d{1,6}(?:\s*,\s*-?\d{1,6})*)\s*\]", re.ASCII)
+PATH_STEP = re.compile(r"\.([A-Za-z_]\w*)|\[\s*(-?\d{1,6}(?:\s*,\s*-?\d{1,6})*)\s*\]", re.ASCII)
+"""One step of a path: a member, or the indexes of an element."""
 _DELIMITERS = re.compile(r"[.\[]")
 
 
@@ -365,7 +370,7 @@ def find_part(kind: DataType, path: str) -> Part:
     """
     bit_offset, at = 0, 0
     while at < len(path):
-        step = _STEP.match(path, at)
+        step = PATH_STEP.match(path, at)
         if step is None:
             raise ValueError(f"{path[at:][:60]!r} is no path such as .member or [1]")
         where = path[:at] or "it"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 
 import pytest
 
@@ -29,8 +30,12 @@ def test_types_page_commands_print_the_shown_output(reader: Shell) -> None:
             name = text.partition("\n")[0].removeprefix("# ")
             (reader.folder / name).write_text(text)
         elif kind == "python":
+            if "pyads" in text and find_spec("pyads") is None:
+                continue
             (reader.folder / "program.py").write_text(text)
-            assert reader.run(f"{sys.executable} program.py") == ""
+            printed = reader.run(f"{sys.executable} program.py")
+            # AdsLib in pyads says so of each connection that ends.
+            assert re.sub(r".* Info: connection closed by remote\n", "", printed) == ""
         else:
             for command, expected in commands(text):
                 check(reader, command, plain(expected))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from eap.ads.device import AdsDevice
 from eap.ads.io import IoDevice, IoDeviceType, IoSpace, MasterSpace, SlaveState
@@ -11,6 +11,7 @@ from eap.ads.space import OP, SAFEOP, SystemSpace, al_state_for, states_of
 from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, AdsSystemState, device_name
+from eap.codec.structures import Part, find_variable
 from eap.ids import NetId
 
 BUS_NET_ID = NetId.parse("5.23.91.23.2.1")
@@ -34,9 +35,9 @@ READ_ONLY = "count"
 class DictStore:
     """Values as octets; *broken* names are refused with what it says."""
 
-    def __init__(self) -> None:
-        self.types = {name: datatypes.parse(kind) for name, (kind, _) in VALUES.items()}
-        self.octets = {n: self.types[n].encode(value) for n, (_, value) in VALUES.items()}
+    def __init__(self, values: Mapping[str, tuple[str, object]] = VALUES) -> None:
+        self.types = {name: datatypes.parse(kind) for name, (kind, _) in values.items()}
+        self.octets = {n: self.types[n].encode(value) for n, (_, value) in values.items()}
         self.broken: dict[str, AdsError] = {}
 
     def set(self, name, value) -> None:
@@ -48,13 +49,30 @@ class DictStore:
     def read(self, name: str) -> bytes:
         if name in self.broken:
             raise AdsRefusedError(self.broken[name])
-        return self.octets[name]
+        variable, part = self._find(name)
+        offset, bit = divmod(part.bit_offset, 8)
+        if part.kind.is_bits and variable != name:
+            return bytes((self.octets[variable][offset] >> bit & (1 << part.kind.bit_length) - 1,))
+        return self.octets[variable][offset : offset + part.kind.size]
 
     def write(self, name: str, octets: bytes) -> None:
         if name in self.broken:
             raise AdsRefusedError(self.broken[name])
-        assert len(octets) == self.types[name].size
-        self.octets[name] = octets
+        variable, part = self._find(name)
+        assert len(octets) == part.kind.size
+        whole = bytearray(self.octets[variable])
+        offset, bit = divmod(part.bit_offset, 8)
+        if part.kind.is_bits and variable != name:
+            mask = (1 << part.kind.bit_length) - 1 << bit
+            whole[offset] = whole[offset] & ~mask | octets[0] << bit
+        else:
+            whole[offset : offset + len(octets)] = octets
+        self.octets[variable] = bytes(whole)
+
+    def _find(self, name: str) -> tuple[str, Part]:
+        found = find_variable(name, self.types.get)
+        assert found is not None
+        return found
 
 
 def variables(store: DictStore) -> list[SymbolVariable]:

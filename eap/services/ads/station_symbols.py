@@ -26,7 +26,9 @@ from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import to_filetime
-from eap.codec.datatypes import String
+from eap.codec.basetypes import WideString
+from eap.codec.datatypes import Array, String
+from eap.codec.structures import Structure
 from eap.errors import ImageError, TornReadError, WriterConflictError
 from eap.ids import Endpoint, NetId
 from eap.net.image_file import StationImage
@@ -66,7 +68,7 @@ class ImageVariables:
         """Return the bytes of a value; refuse with BUSY while its writer is in the middle."""
         # Values of one notification come from one sample, not from the running image.
         if self._sample is not None:
-            return extract_value(self._image.slots[name], self._sample, self._first_bit)
+            return extract_value(self._image.slot(name), self._sample, self._first_bit)
         try:
             return self._image.load(name, attempts=_ATTEMPTS)
         except TornReadError as exc:
@@ -74,9 +76,11 @@ class ImageVariables:
 
     def write(self, name: str, octets: bytes) -> None:
         """Store a value; raise BUSY while another program writes, VALUE if it is invalid."""
-        kind = datatypes.parse(self._image.slots[name].type)
-        # A text of a client with another encoding than ours: its bytes go on as they are.
-        value = bytes(octets) if isinstance(kind, String) else kind.decode(octets, 0)
+        kind = datatypes.parse(self._image.slot(name).type)
+        # Bytes of texts go on as they are, whatever their encoding; so does the memory of a struct,
+        # in which other members may have values that are none of their types.
+        is_memory = isinstance(kind, String | WideString | Structure | Array)
+        value = bytes(octets) if is_memory else kind.decode(octets, 0)
         try:
             self._station.write_once(Writer.APPLICATION, {name: value})
         except WriterConflictError as exc:

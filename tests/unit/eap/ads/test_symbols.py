@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ads.request import AdsRefusedError
-from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable, symbol_type
+from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
+from eap.ads.symboltypes import TypeEntries, symbol_type
 from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import (
@@ -16,9 +17,9 @@ from eap.codec.adssymbol import (
     SymbolEntry,
     SymbolFlag,
     UploadInfo,
-    decode_entry,
 )
 from tests.support.adsdevice import VALUES, DictStore, variables
+from tests.support.adstypes import decode_entries, decode_entry, decode_types
 
 
 @pytest.mark.parametrize(
@@ -126,7 +127,13 @@ def test_texts_may_be_shorter_and_truth_any_octet() -> None:
     ],
 )
 def test_type_describes_its_elements(text: str, entries: list) -> None:
-    assert symbol_type(datatypes.parse(text)).describe() == entries
+    types = TypeEntries()
+    types.add(symbol_type(datatypes.parse(text)))
+    described = decode_types(b"".join(types.encode().values())).values()
+    assert entries == [
+        (each.name, each.type, each.size, each.type_name, sum(d.elements for d in each.dimensions))
+        for each in described
+    ]
 
 
 TEXTS = ["INT24", "UINT56[3]", "BIT5", "REAL", "LINT[2]", "STRING(9)", "BLOCK(5)", "BOOL", "DWORD"]
@@ -147,10 +154,10 @@ def test_written_value_is_read_back_by_client(text: str, data: st.DataObject) ->
 def test_case_of_names_matters_only_between_two_that_differ_in_it() -> None:
     kind = datatypes.parse("USINT")
     table = SymbolTable([SymbolVariable(name, kind) for name in ("Pump", "valve", "Valve")], 0)
-    assert table.handle_of("PUMP") == table.handle_of("Pump")
-    assert table.handle_of("valve") != table.handle_of("Valve")
+    assert table.find("PUMP") == table.find("Pump")
+    assert table.find("valve") != table.find("Valve")
     with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
-        table.handle_of("VALVE")
+        table.find("VALVE")
 
 
 def test_table_without_symbols() -> None:
@@ -216,21 +223,19 @@ def test_table_is_uploaded(space) -> None:
         int.from_bytes(space.read(G.SYMBOL_UPLOAD_INFO, 0, 8)[n : n + 4], "little") for n in (0, 4)
     )
     octets = space.read(G.SYMBOL_UPLOAD, 0, size)
-    entries, at = [], 0
-    while at < len(octets):
-        entry, at = decode_entry(octets, at)
-        entries.append(entry)
+    entries = decode_entries(octets)
     assert (count, size) == (len(VALUES), len(octets))
-    assert [entry.name for entry in entries] == list(VALUES)
+    assert list(entries) == list(VALUES)
     one, end = decode_entry(space.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 798, b"count"))
-    assert one == entries[2]
+    assert one == entries["count"]
     assert one == SymbolEntry(
         SymbolAddress(G.DATA, 16, 4),
         AdsType.UINT32,
-        SymbolFlag.READ_ONLY,
+        SymbolFlag.READ_ONLY | SymbolFlag.TYPE_GUID,
         "count",
         "UDINT",
         "comment of count",
+        guid=bytes.fromhex("95190718 0000 0000 0000 000000000008"),
     )
     assert end == len(space.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 798, b"count"))
     info = space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 1024)
@@ -244,16 +249,12 @@ def test_types_of_symbols_are_uploaded(space) -> None:
     info = UploadInfo.decode(space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 24))
     octets = space.read(G.DATA_TYPE_UPLOAD, 0, BIG)
     assert len(octets) == info.type_size
-    entries, at = {}, 0
-    while at < len(octets):
-        size = int.from_bytes(octets[at : at + 4], "little")
-        length = int.from_bytes(octets[at + 32 : at + 34], "little")
-        entries[octets[at + 42 : at + 42 + length].decode()] = octets[at : at + size]
-        at += size
+    entries = decode_types(octets)
     assert len(entries) == info.types
     assert {"INT", "ARRAY [0..3] OF INT", "STRING(15)", "BYTE", "BOOL"} <= set(entries)
     for name, entry in entries.items():
-        assert space.read_write(G.DATA_TYPE_BY_NAME, 0, BIG, name.lower().encode()) == entry
+        one = space.read_write(G.DATA_TYPE_BY_NAME, 0, BIG, name.lower().encode())
+        assert decode_types(one) == {name: entry}
     with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
         space.read_write(G.DATA_TYPE_BY_NAME, 0, BIG, b"ST_PUMP")
     with pytest.raises(AdsRefusedError, match="SIZE"):
@@ -315,7 +316,7 @@ def test_watch_continues_for_symbol_of_the_next_table(space, store) -> None:
             value()
 
 
-@pytest.mark.parametrize("number", [1 << 24, (1 << 24) + len(VALUES) + 1])
+@pytest.mark.parametrize("number", [1 << 24, (1 << 24) + len(VALUES) + 4 + 2 + 1])
 def test_handles_that_never_were_any(space, number: int) -> None:
     with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
         space.read(G.VALUE_BY_HANDLE, number, 4)
