@@ -176,7 +176,8 @@ def _plan_slave(
     managers = []
     for channel in slave.channels:
         side = 0 if channel.is_output else 1
-        managers.append((channel.number, _sync_manager(channel)))
+        if not channel.is_virtual:
+            managers.append((channel.number, _sync_manager(channel)))
         if not channel.size:
             continue
         fmmus.append(

@@ -18,7 +18,7 @@ from devicebus.errors import BusError, MailboxProtocolError
 from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.wire.sii import Sii, SiiPdo, SiiSyncManager
+from devicebus.wire.sii import VIRTUAL, Sii, SiiPdo, SiiSyncManager
 from eap.ids import ObjectId
 from eap.od.abort import SdoAbortError
 from eap.od.slave_config import SlaveConfig
@@ -58,6 +58,8 @@ class ProcessDataChannel(NamedTuple):
     pdos: tuple[Pdo, ...]
     fixed_size: int = 0
     """Size in bytes without PDOs."""
+    is_virtual: bool = False
+    """True if the FMMU maps registers: no sync manager is set up."""
 
     @property
     def size(self) -> int:
@@ -83,6 +85,7 @@ def channels_from_sii(
             is_output,
             tuple(_pdos_of(sii, number, assignment.get(number), is_output=is_output)),
             manager.length if manager.enable & 1 and number not in assignment else 0,
+            bool(manager.enable & VIRTUAL),
         )
         for number, manager in enumerate(sii.sync_managers)
         if (is_output := _is_output(manager)) is not None

@@ -94,6 +94,10 @@ class SiiSyncManager(WireStruct, frozen=True):
     type: u8 = 0
 
 
+VIRTUAL = 0x04
+"""Bit of SiiSyncManager.enable: a sync manager that is not set up."""
+
+
 class SiiPdoHeader(WireStruct, frozen=True):
     """ETG.2010 table 14: a PDO, in front of its entries."""
 

@@ -28,7 +28,7 @@ from eap.codec import datatypes
 from eap.errors import CodecError
 
 # ETG.2010, sync manager element: enable byte.
-_ENABLED, _VIRTUAL, _OP_ONLY = 0x01, 0x04, 0x08
+_ENABLED, _OP_ONLY = 0x01, 0x08
 _FIXED, _MANDATORY, _IS_VIRTUAL = 0x0010, 0x0001, 0x0040
 _NOT_ASSIGNED = 0xFF
 _FMMUS = {"Outputs": 1, "Inputs": 2, "MBoxState": 3, "DynamicOutputs": 1, "DynamicInputs": 2}
@@ -132,7 +132,7 @@ def _sync_managers(plan: EsiPlan) -> tuple[SiiSyncManager, ...]:
             length = (bits + 7) // 8 or fixed_size(plan, number)
         enable = _ENABLED * (each.is_enabled and length > 0)
         if each.is_virtual:
-            enable = _VIRTUAL
+            enable = sii.VIRTUAL
         enable |= _OP_ONLY * each.op_only
         found.append(
             SiiSyncManager(each.start, length, control_of(each), enable=enable, type=sm_type(each))

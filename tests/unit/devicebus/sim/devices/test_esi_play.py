@@ -295,6 +295,21 @@ def test_several_sync_managers_of_one_direction():
     assert line.core.image.inputs == b"\x56"
 
 
+def test_virtual_sync_manager_is_mapped_and_not_set_up():
+    xml = f"""{HEAD}<Device><Type ProductCode="7" RevisionNo="1">L</Type>
+      <Sm StartAddress="#x1000" ControlByte="#x00">Inputs</Sm>
+      <Sm StartAddress="#x0990" Virtual="true">Inputs</Sm>
+      <TxPdo Sm="0"><Index>#x1a00</Index><Name>C</Name>{entry("#x6000", 1, 8, "c", "USINT")}</TxPdo>
+      <TxPdo Sm="1" Virtual="1"><Index>#x1a10</Index><Name>DC</Name>
+        {entry("#x1d09", "#x90", 64, "NextSync0", "ULINT")}</TxPdo><Dc/></Device>{TAIL}"""
+    line = started(device_of(xml))
+    controller = slave_of(line).esc
+    controller.memory[0x0990:0x0998] = bytes.fromhex("0102030405060708")
+    line.elapse(4 * CYCLE_NS)
+    assert line.core.image.inputs[1:] == bytes.fromhex("0102030405060708")
+    assert controller.memory[0x0808:0x0810] == bytes(8)
+
+
 def test_pdo_index_that_is_an_object_is_refused():
     xml = (
         f'{HEAD}<Device><Type ProductCode="7">T</Type><Sm StartAddress="#x1000">Inputs</Sm>'
