@@ -160,7 +160,7 @@ def _modules(stream: BinaryIO, device: EsiDevice, fields: Fields) -> Iterator[Es
         if count > MAX_MODULES:
             fields.report(element.line, f"more than {MAX_MODULES} modules", "a smaller file")
             return
-        yield read_module(element, len(device.sync_managers), fields)
+        yield read_module(element, device.sync_managers, fields)
 
 
 def _check_slots(device: EsiDevice, line: int, fields: Fields) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from devicebus.esi.fields import Fields, english, flag
@@ -82,7 +82,7 @@ def read_device(element: XmlElement, vendor: int, vendor_name: str, fields: Fiel
         physics=element.get("Physics"),
         sync_managers=managers,
         fmmus=tuple(_fmmus(element, fields)),
-        pdos=tuple(_pdos(element, len(managers), fields)),
+        pdos=tuple(_pdos(element, managers, fields)),
         mailbox=None if mailbox is None else _mailbox(mailbox, fields),
         init_commands=() if mailbox is None else tuple(_init_commands(mailbox, fields)),
         op_modes=() if modes is None else tuple(_op_modes(modes, fields)),
@@ -102,7 +102,9 @@ def read_device(element: XmlElement, vendor: int, vendor_name: str, fields: Fiel
     )
 
 
-def read_module(element: XmlElement, sync_managers: int, fields: Fields) -> EsiModule:
+def read_module(
+    element: XmlElement, sync_managers: Sequence[EsiSyncManager], fields: Fields
+) -> EsiModule:
     """Return the module of *element*."""
     kind = element.find("Type")
     mailbox = element.find("Mailbox")
@@ -185,7 +187,9 @@ def _fmmus(device: XmlElement, fields: Fields) -> Iterator[EsiFmmu]:
         yield EsiFmmu(each.text, manager, flag(each, "OpOnly"))
 
 
-def _pdos(parent: XmlElement, managers: int, fields: Fields) -> Iterator[EsiPdo]:
+def _pdos(
+    parent: XmlElement, managers: Sequence[EsiSyncManager], fields: Fields
+) -> Iterator[EsiPdo]:
     found = [each for each in parent.children if each.tag in {"RxPdo", "TxPdo"}]
     if len(found) > MAX_PDOS:
         message = f"{len(found)} PDOs"
@@ -194,17 +198,22 @@ def _pdos(parent: XmlElement, managers: int, fields: Fields) -> Iterator[EsiPdo]
         yield _pdo(each, managers, fields)
 
 
-def _pdo(each: XmlElement, managers: int, fields: Fields) -> EsiPdo:
+def _pdo(each: XmlElement, managers: Sequence[EsiSyncManager], fields: Fields) -> EsiPdo:
     index_node = each.find("Index")
     index = fields.child(each, "Index", bits=16)
     if index_node is None or not index_node.text:
         missing = "refers to a group (Ref)" if "Ref" in each.attrib else "has no index"
         fields.report(each.line, f"a {each.tag} {missing}", "element Index with its object")
     manager = fields.optional_attribute(each, "Sm", bits=8)
-    if manager is not None and manager >= managers:
+    if manager is not None and manager >= len(managers):
         message = f"{each.tag} 0x{index:04X} is for sync manager {manager}"
-        fields.report(each.line, message, f"one of the {managers} sync managers of the device")
+        fields.report(each.line, message, f"one of the {len(managers)} sync managers of the device")
         manager = None
+    elif manager is not None and managers[manager].is_output is not (each.tag == "RxPdo"):
+        message = (
+            f"{each.tag} 0x{index:04X} is for sync manager {manager} ({managers[manager].use})"
+        )
+        fields.report(each.line, message, "a sync manager of its direction")
     entries = [_entry(entry, fields) for entry in each.iterfind("Entry")]
     if len(entries) > MAX_ENTRIES:
         message = f"{each.tag} 0x{index:04X} has {len(entries)} entries"

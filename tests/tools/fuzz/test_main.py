@@ -13,7 +13,7 @@ from tools.fuzz.__main__ import fuzz, list_targets, load_seeds, load_target, mai
 from tools.fuzz.mutator import mutations
 
 INPUTS = 3000
-SLOW = {"datagram": 1000, "gateway": 1000, "sii": 1000}
+SLOW = {"datagram": 1000, "esi": 100, "gateway": 1000, "sii": 1000}
 """Targets that build slaves or a gateway, or read as a master does, for each input."""
 
 

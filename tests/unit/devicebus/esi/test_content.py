@@ -157,9 +157,14 @@ def test_all_faults_of_a_device_are_found_with_their_lines():
     ],
 )
 def test_fault_of_a_device(old, new, message):
-    (finding,) = load(esi(DRIVE.replace(old, new))).findings
+    finding, *_ = load(esi(DRIVE.replace(old, new))).findings
     assert message in finding.message
     assert finding.line > 0
+
+
+def test_pdo_at_a_sync_manager_of_the_other_direction_is_found():
+    (finding,) = load(esi(DRIVE.replace('Sm="2"', 'Sm="3"'))).findings
+    assert finding.message == "RxPdo 0x1600 is for sync manager 3 (Inputs)"
 
 
 def test_missing_default_module_is_found():
