@@ -112,16 +112,20 @@ def scan(
 
 
 def _write_bus(bus: BusAddress, target: Path, esi: Path | None) -> WrittenBus:
+    from eap.errors import EnvironmentalError
     from eap.ops.scanned_bus import bus_text, describe_slaves, written
     from eap.runtime.durable import whole_file
     from eap.runtime.esi_files import EsiSource
 
-    source = None if esi is None else EsiSource(esi)
+    try:
+        source = None if esi is None else EsiSource(esi)
+    except OSError as exc:
+        raise EnvironmentalError(f"{esi} cannot be read: {exc.strerror}") from None
     with open_session(bus) as session:
         slaves = describe_slaves(session, source)
     with whole_file(target) as file:
         file.write(bus_text(target.stem, target.parent, slaves).encode())
-    return written(target, slaves)
+    return written(target, slaves, source)
 
 
 @click.command(cls=BusCommand)

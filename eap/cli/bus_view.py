@@ -83,6 +83,7 @@ def written_bus_view(done: WrittenBus) -> Iterator[TextTable | str]:
         table.add_row(str(row.address), row.name, described)
     yield table
     yield from (f"{row.name}: {note}" for row in done.slaves for note in row.notes)
+    yield from done.faults
     yield f"\n{done.file} written: {count(len(done.slaves), 'slave')}"
 
 

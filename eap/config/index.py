@@ -97,6 +97,8 @@ class DescribedSlave(msgspec.Struct, frozen=True, kw_only=True):
     objects: tuple[DescribedPdoEntry, ...] = ()
     """Known entries of its dictionary."""
     op_modes: tuple[OpMode, ...] = ()
+    assignments: Mapping[str, Mapping[int, tuple[int, ...]]] = {}
+    """Named PDO assignments of its description, by sync manager."""
     managers: Mapping[int, bool] = {}
     """Sync managers of process data; true for outputs."""
     has_coe: bool = True

@@ -155,6 +155,8 @@ def _assigned(
                 continue
             pdos = list(_pdos(slave, names, report, f"{at}.{text}"))
             assignment[manager] = tuple(each.index for each in pdos)
+    elif len(keys.pdos) == 1 and keys.pdos[0] in slave.assignments:
+        assignment |= slave.assignments[keys.pdos[0]]
     else:
         chosen = list(_pdos(slave, keys.pdos, report, at))
         # A list replaces the PDOs of each direction of which it names one.
@@ -182,7 +184,7 @@ def _pdos(
 
 
 def _names(slave: DescribedSlave) -> list[str]:
-    return [each.name for each in slave.pdos if each.name]
+    return [*slave.assignments, *(each.name for each in slave.pdos if each.name)]
 
 
 def _find_pdo(slave: DescribedSlave, text: str) -> DescribedPdo | None:

@@ -55,6 +55,8 @@ class WrittenBus(msgspec.Struct, frozen=True):
 
     file: str
     slaves: list[WrittenSlave]
+    faults: list[str]
+    """Faults of ESI files, whose devices could not all be listed."""
 
 
 class FoundDescription(msgspec.Struct, frozen=True, kw_only=True):
@@ -175,7 +177,7 @@ def _free_name(slave: Slave, content: Sii, device: EsiDevice | None, taken: set[
     return name
 
 
-def written(file: Path, found: Sequence[FoundDescription]) -> WrittenBus:
+def written(file: Path, found: Sequence[FoundDescription], source: EsiSource | None) -> WrittenBus:
     """Return the result of writing *found* to *file*."""
     return WrittenBus(
         str(file),
@@ -189,6 +191,7 @@ def written(file: Path, found: Sequence[FoundDescription]) -> WrittenBus:
             )
             for each in found
         ],
+        [] if source is None else [str(each) for each in source.findings()],
     )
 
 

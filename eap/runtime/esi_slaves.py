@@ -102,6 +102,7 @@ def describe_device(spec: SlaveSpec, device: EsiDevice) -> DescribedSlave:
         pdos=pdos,
         objects=tuple(_objects(whole)),
         op_modes=tuple(each.mode for each in whole.op_modes),
+        assignments=_assignments(whole),
         managers={
             number: each.is_output
             for number, each in enumerate(whole.sync_managers)
@@ -111,6 +112,16 @@ def describe_device(spec: SlaveSpec, device: EsiDevice) -> DescribedSlave:
         has_soe=mailbox is not None and bool(mailbox.soe_channels),
         has_clock=whole.has_dc,
     )
+
+
+def _assignments(device: EsiDevice) -> dict[str, dict[int, tuple[int, ...]]]:
+    """Return the named PDO assignments of a device that it can have."""
+    known = {pdo.index for pdo in device.pdos}
+    return {
+        each.name: dict(each.sync_managers)
+        for each in device.alternatives
+        if each.name and known.issuperset(i for _, pdos in each.sync_managers for i in pdos)
+    }
 
 
 def _pdos(plan: EsiPlan) -> Iterator[DescribedPdo]:

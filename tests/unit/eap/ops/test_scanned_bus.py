@@ -111,6 +111,15 @@ def test_other_assignment_of_a_slave_is_kept(written, tmp_path):
     assert "bus0.axis.csp.Controlword" in variables(file)
 
 
+def test_faults_of_other_files_are_shown(written, tmp_path):
+    esi = tmp_path / "esi"
+    esi.mkdir()
+    (esi / "bad.xml").write_text("<EtherCATInfo><Vendor>")
+    (esi / "drive.xml").write_bytes((CONFIG / "esi" / "drive.xml").read_bytes())
+    _, shown = written("cell", "--esi", str(esi))
+    assert f"{esi}/bad.xml:1: not XML that can be read" in shown
+
+
 def test_existing_file_is_kept(written, tmp_path):
     (tmp_path / "found.yaml").write_text("mine")
     file, shown = written("coe", expected=2)

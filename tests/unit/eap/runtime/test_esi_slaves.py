@@ -92,6 +92,15 @@ def test_keys_of_the_master_change_the_configuration_of_the_file(folder):
     ]
 
 
+def test_named_assignment_of_the_file_is_chosen(folder):
+    (slave,) = describe(folder, "name: ai, device: AI2, master: {pdos: [Compact]}").slaves
+    assert slave.config.assignment == {3: (0x1A01, 0x1A03)}
+    assert [(each.group, each.name) for each in slave.inputs] == [
+        ("AI Compact Channel 1", "Value"),
+        ("AI Compact Channel 2", "Value"),
+    ]
+
+
 def test_pdos_that_exclude_each_other_are_found(folder):
     found, *_ = findings(folder, "name: axis, device: SD1, master: {pdos: [csv, csp]}")
     assert "PDO 0x1601 (csv) excludes 0x1600 (csp)" in found
