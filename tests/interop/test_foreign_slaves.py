@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -76,44 +76,64 @@ INTERFACES = {
 }
 
 
-@contextmanager
-def kickcat_slave():
-    library = DRIVE.parents[2] / "lib"
+def start_slave(stack):
+    """Start the foreign slave; it ends with *stack*."""
     process = subprocess.Popen(
-        [SIMULATOR, "-i", FAR, "-s", "ecat402-drive.json"],
-        cwd=DEVICES,
-        stdout=subprocess.DEVNULL,
-        env={**os.environ, "LD_LIBRARY_PATH": os.environ.get("LD_LIBRARY_PATH", str(library))},
+        [SIMULATOR, "-i", FAR, "-s", "ecat402-drive.json"], cwd=DEVICES, stdout=subprocess.DEVNULL
     )
-    try:
-        yield
-    finally:
-        process.kill()
-        process.wait()
+    stack.callback(process.wait)
+    stack.callback(process.kill)
+    return process
+
+
+def enabled(appliance):
+    return appliance.values("axis")[f"{IN}.Status_Word"] & 0x6F == 0x27
+
+
+def run_plant(farm, kind, bus=BUS):
+    shutil.copy(DRIVE, farm.folder / "drive.xml")
+    (farm.folder / "drive.yaml").write_text(bus)
+    text = PLANT.replace("ADDRESS", own_address(0)).replace("INTERFACE", INTERFACES[kind])
+    return farm.run(farm.write(text.replace("OUT.", f"{OUT}.").replace("IN.", f"{IN}.")))
 
 
 @pytest.mark.parametrize("kind", INTERFACES)
 def test_drive_is_enabled_in_csp_with_sync0_by_one_bus_file(kind):
     # The appliance is inside: it ends before its network does.
-    with veth_pair(), kickcat_slave(), plants() as farm:
-        enable_and_follow(farm, kind)
+    with veth_pair(), ExitStack() as stack, plants() as farm:
+        start_slave(stack)
+        appliance = run_plant(farm, kind)
+        wait_until(lambda: enabled(appliance))
+        assert appliance.values("axis")[f"{IN}.Operation_mode_display"] == 8
+        first = appliance.values("axis")[f"{IN}.Actual_position"]
+        wait_until(lambda: appliance.values("axis")[f"{IN}.Actual_position"] > first)
+        assigned = appliance.command("bus", "sdo", "read", "axis/bus0", "drive", "0x1C12:1")
+        assert "0x1601" in assigned
+        rows = [(4, 1001, 0x0980, bytes(2).hex(), 0), (4, 1001, 0x09A0, bytes(4).hex(), 0)]
+        replies = appliance.request("bus_transfer", station="axis", port="bus0", datagrams=rows)
+        assert [each[1] for each in replies["replies"]] == [
+            "0003",
+            (4_000_000).to_bytes(4, "little").hex(),
+        ]
 
 
-def enable_and_follow(farm, kind):
-    shutil.copy(DRIVE, farm.folder / "drive.xml")
-    (farm.folder / "drive.yaml").write_text(BUS)
-    text = PLANT.replace("ADDRESS", own_address(0)).replace("INTERFACE", INTERFACES[kind])
-    plant = farm.write(text.replace("OUT.", f"{OUT}.").replace("IN.", f"{IN}."))
-    appliance = farm.run(plant)
-    wait_until(lambda: appliance.values("axis")[f"{IN}.Status_Word"] & 0x6F == 0x27)
-    assert appliance.values("axis")[f"{IN}.Operation_mode_display"] == 8
-    first = appliance.values("axis")[f"{IN}.Actual_position"]
-    wait_until(lambda: appliance.values("axis")[f"{IN}.Actual_position"] > first)
-    assigned = appliance.command("bus", "sdo", "read", "axis/bus0", "drive", "0x1C12:1")
-    assert "0x1601" in assigned
-    rows = [(4, 1001, 0x0980, bytes(2).hex(), 0), (4, 1001, 0x09A0, bytes(4).hex(), 0)]
-    replies = appliance.request("bus_transfer", station="axis", port="bus0", datagrams=rows)
-    assert [each[1] for each in replies["replies"]] == [
-        "0003",
-        (4_000_000).to_bytes(4, "little").hex(),
-    ]
+def test_foreign_drive_is_configured_again_after_a_loss_of_power():
+    with veth_pair(), ExitStack() as stack, plants() as farm:
+        process = start_slave(stack)
+        appliance = run_plant(farm, "foreign")
+        wait_until(lambda: enabled(appliance))
+        process.kill()
+        wait_until(lambda: appliance.values("axis")["bus0.drive.state"] == 0)
+        start_slave(stack)
+        wait_until(lambda: appliance.values("axis")["bus0.drive.state"] == 8)
+        wait_until(lambda: enabled(appliance))
+        assert appliance.values("axis")[f"{IN}.Operation_mode_display"] == 8
+
+
+def test_write_that_the_foreign_drive_refuses_is_named():
+    wrong = BUS.replace("startup:", 'startup:\n        - {sdo: "0x5FFF", data: "01"}')
+    with veth_pair(), ExitStack() as stack, plants() as farm:
+        start_slave(stack)
+        appliance = run_plant(farm, "foreign", wrong)
+        text = "start-up write of 0x5FFF:00 in PS (data 01): object does not exist (0x06020000)"
+        wait_until(lambda: text in " ".join(appliance.command("status").split()))
