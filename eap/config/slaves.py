@@ -38,6 +38,10 @@ _ENTRY = "the name of an entry, INDEX:SUB, INDEX:SUB/BITS, or 0/BITS for padding
 _DATA = "hexadecimal bytes, least significant first, such as 0a 00"
 _SYNC0_BIT, _SYNC1_BIT = 0x0200, 0x0400
 _CYCLIC_BIT = 0x0100
+_TIMES = 1 << 32
+"""Times in nanoseconds are 32 bits in the registers."""
+_MAX_ENTRIES = 254
+_MANAGERS = {str(number): number for number in range(16)}
 
 
 class _BadKeyError(Exception):
@@ -114,6 +118,17 @@ def check_cycles(
         signals = None if mode is None else mode.signals(cycle_ns)
         if signals is None:
             continue
+        times = (
+            ("SYNC0 every", signals.cycle0_ns),
+            ("SYNC1 after", signals.cycle1_ns),
+            ("SYNC0 shifted by", abs(signals.shift0_ns)),
+        )
+        wrong = [f"{what} {time / US:g} µs" for what, time in times if not 0 <= time < _TIMES]
+        for text in wrong:
+            message = f"{name}: {text} does not fit the register"
+            report.add(f"{at}.slaves.{name}.sync0", message, "0 to 4294967 µs")
+        if wrong:
+            continue
         sync0 = signals.cycle0_ns
         if sync0 % cycle_ns and cycle_ns % sync0:
             report.add(
@@ -149,8 +164,8 @@ def _assigned(
     at = f"{keys.at}.pdos"
     if isinstance(keys.pdos, dict):
         for text, names in keys.pdos.items():
-            manager = int(text) if text.isdecimal() else -1
-            if not 0 <= manager < 16:
+            manager = _MANAGERS.get(text)
+            if manager is None:
                 report.add(f"{at}.{text}", f"{text!r} is no sync manager", "a number from 0 to 15")
                 continue
             pdos = list(_pdos(slave, names, report, f"{at}.{text}"))
@@ -252,6 +267,10 @@ def _mapped(
             # A slave lets a PDO be changed only while it is not assigned.
             assigned = default_assignment(slave).get(pdo.manager, ())
             assignment.setdefault(pdo.manager, assigned)
+            if len(entries) > _MAX_ENTRIES:
+                message = f"{slave.name}: {len(entries)} entries in PDO {pdo.label}"
+                report.add(at, message, f"at most {_MAX_ENTRIES}")
+                continue
             mapping[pdo.index] = tuple(_entries(slave, pdo, entries, report, at))
     return replace(config, mapping=mapping, assignment=assignment)
 

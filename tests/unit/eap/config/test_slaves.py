@@ -229,6 +229,12 @@ timeouts: {preop_ms: 100}
         ('startup: [{transition: SS, sdo: "9000", data: "01"}]', "'SS' is no transition; expected"),
         ("startup: [{transition: 5}]", "'5' is no transition; expected one of IP, PS, SO"),
         ("dc: DC-Sync", "drive has no mode 'DC-Sync', did you mean DC-Synchron?; expected one of"),
+        ("pdos: {16: [CSP]}", "'16' is no sync manager"),
+        (f"pdos: {{{'9' * 900}: [CSP]}}", "is no sync manager"),
+        (
+            f"mapping: {{0x1A00: [{', '.join(['status'] * 255)}]}}",
+            "drive: 255 entries in PDO 0x1A00 (Status); expected at most 254",
+        ),
         ("sync1: {}", "drive: SYNC1 without SYNC0; expected sync0 beside sync1"),
         ("sync0: {cycle_us: 0}", "cycle_us is 0; expected a whole number of microseconds from 1"),
         ("identification: switch", "identification 'switch'; expected one of alias, id, serial"),
@@ -268,6 +274,21 @@ def test_sync0_must_fit_the_cycle_of_the_bus(cycle_us, fits):
     found = [str(each) for each in report.findings()]
     expected = ["p: drive: SYNC0 every 300 µs does not fit the cycle of 1000 µs; expected a mul"]
     assert [each[: len(expected[0])] for each in found] == ([] if fits else expected)
+
+
+@pytest.mark.parametrize(
+    ("mode", "text"),
+    [
+        (OpMode(shift0_ns=10**30), "SYNC0 shifted by 1e+27 µs does not fit the register"),
+        (OpMode(activate=0x700, shift1_ns=-10), "SYNC1 after -0.01 µs does not fit the register"),
+        (OpMode(factor0=5000), "SYNC0 every 5e+06 µs does not fit the register; expected 0 to"),
+    ],
+)
+def test_times_must_fit_their_registers(mode, text):
+    report = FindingReport("p")
+    check_cycles({"drive": replace(DRIVE, config=SlaveConfig(sync=mode))}, 1000, report, "ports[0]")
+    (finding,) = report.findings()
+    assert f"drive: {text}" in str(finding)
 
 
 def test_plant_keys_go_over_those_of_the_bus_file():
