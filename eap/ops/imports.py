@@ -36,6 +36,7 @@ from eap.config.imports.typefile import TypeFile, TypeRecord, read_type_file
 from eap.config.imports.typenames import TypeNames
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri, NetId
+from eap.pd.rules import is_name
 from eap.runtime.durable import whole_file
 from eap.runtime.plantfile import load_plant
 
@@ -270,10 +271,14 @@ def _of_symbols(
             report.add(file, 0, str(exc), "an AMS NetID")
     has_areas = any(each.area for each in found.symbols)
     variables = []
+    used: set[str] = set()
     for symbol in found.symbols:
         if has_areas and not symbol.area:
             continue
         kind = types.parse_if_usable(symbol)
+        if symbol.name in used or not is_name(symbol.name):
+            kind = "its name is used twice, or has spaces or slashes"
+        used.add(symbol.name)
         if isinstance(kind, str):
             report.note(file, symbol.line, symbol.name, Outcome.LEFT, kind)
             continue

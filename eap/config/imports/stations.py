@@ -11,7 +11,7 @@ system.  One of them is used, the other one is written beside it.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import StrEnum
 from ipaddress import IPv4Address
 
@@ -302,6 +302,7 @@ class _StationBuilder:
             each.net_id or NetId(bytes(system[:4]) + bytes((2 + number, 1)))
             for number, each in enumerate(self._devices)
         ]
+        self._check_unique(own, system)
         sent = list(own)
         if identity is PublisherIdentity.SYSTEM and own:
             router, sent[0] = own[0], system
@@ -324,6 +325,16 @@ class _StationBuilder:
                 )
             )
         return router, ports
+
+    def _check_unique(self, own: Sequence[NetId], system: NetId) -> None:
+        """Report devices that have the NetID of another one, or of the system."""
+        used = {system: "the system"}
+        for device, net_id in zip(self._devices, own, strict=True):
+            if net_id in used:
+                message = f"{device.name}: its AmsNetId {net_id} is that of {used[net_id]} too"
+                expected = "a NetID of its own for each device"
+                self._report.add(device.file, device.line, message, expected, item=device.name)
+            used[net_id] = device.name
 
     def _cycle(self) -> int:
         linked = {

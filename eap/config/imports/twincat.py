@@ -165,7 +165,8 @@ class _Project:
             self._report.add(file, 0, message, "a file of the project, in its folder")
         project = reader.above(_PROJECT)
         if project is not None and (text := project.get("TargetNetId")):
-            self._net_id = self._parse_net_id(text, file, project.line)
+            net_id = self._parse_net_id(text, file, project.line)
+            self._net_id = net_id if net_id and any(net_id) else None
         if file == self._file and reader.root is not None and reader.root.tag == ITEM:
             self._take_items(items, file)
         return items

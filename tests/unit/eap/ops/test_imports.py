@@ -401,6 +401,8 @@ def test_symbols_of_a_tmc_file_become_variables(importer: Importer) -> None:
         "<Symbol><Name>MAIN.list</Name><BitSize>32</BitSize><BaseType>INT</BaseType><ArrayInfo>"
         "<LBound>1</LBound><Elements>2</Elements></ArrayInfo></Symbol>"
         "<Symbol><Name>MAIN.bare</Name><BaseType>INT</BaseType></Symbol>"
+        "<Symbol><Name>MAIN.mode</Name><BitSize>16</BitSize><BaseType>INT</BaseType></Symbol>"
+        "<Symbol><Name>a b</Name><BitSize>16</BitSize><BaseType>INT</BaseType></Symbol>"
         "<Symbol><Name>MAIN.odd</Name><BitSize>8</BitSize><BaseType>LREAL</BaseType></Symbol>"
         "<Symbol><Name>MAIN.far</Name><BitSize>8</BitSize><BaseType>FB_X</BaseType></Symbol>"
         '</DataArea><DataArea><AreaNo AreaType="Internal">3</AreaNo><Symbol><Name>hidden</Name>'
@@ -411,7 +413,8 @@ def test_symbols_of_a_tmc_file_become_variables(importer: Importer) -> None:
     assert result.ok
     assert [(each.item, each.outcome) for each in result.notes] == [
         ("MAIN.mode", Outcome.TAKEN), ("MAIN.text", Outcome.TAKEN), ("MAIN.list", Outcome.TAKEN),
-        ("MAIN.bare", Outcome.TAKEN), ("MAIN.odd", Outcome.LEFT), ("MAIN.far", Outcome.LEFT),
+        ("MAIN.bare", Outcome.TAKEN), ("MAIN.mode", Outcome.LEFT), ("a b", Outcome.LEFT),
+        ("MAIN.odd", Outcome.LEFT), ("MAIN.far", Outcome.LEFT),
     ]  # fmt: skip
     (station,) = importer.loaded().stations
     assert station.name == "axis"
@@ -450,6 +453,25 @@ def test_tree_items_become_a_station(importer: Importer) -> None:
 def test_address_pattern_that_is_no_interface_is_refused(importer: Importer) -> None:
     with pytest.raises(ConfigError, match="address 'x://'"):
         importer.run(LINE, choices=ImportChoices(address="x://"))
+
+
+def test_devices_of_one_net_id_are_refused(importer: Importer) -> None:
+    text = project(device(name="A"), device(name="B"), device(name="C", net_id="192.168.5.1.1.1"))
+    result = importer.run(importer.put("Line.tsproj", text))
+    assert messages(result) == [
+        "B: its AmsNetId 192.168.5.1.2.1 is that of A too",
+        "C: its AmsNetId 192.168.5.1.1.1 is that of the system too",
+    ]
+
+
+def test_project_without_any_net_id_gets_one_of_its_address(importer: Importer) -> None:
+    text = project(device(net_id=""), target='TargetNetId="0.0.0.0.0.0"')
+    result = importer.run(importer.put("Line.tsproj", text))
+    (station,) = importer.loaded().stations
+    assert (str(station.net_id), str(station.ports[0].net_id)) == (
+        "127.0.9.1.1.1", "127.0.9.1.2.1"
+    )  # fmt: skip
+    assert "no NetID in the project: 127.0.9.1.1.1 is made up" in result.notes[0].message
 
 
 def test_disabled_device_is_left(importer: Importer) -> None:
