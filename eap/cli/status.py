@@ -441,6 +441,7 @@ def full_view(document: StatusReport, now_s: float) -> Iterator[RenderableType]:
     if any("bus" in port for station in stations for port in station["ports"]):
         yield ""
         yield _buses_table(stations)
+        yield from _eoe_tables(stations)
     yield ""
     yield _process_data(stations)
     if any(is_special(row) for station in stations for row in station.get("frames", ())):
@@ -560,6 +561,20 @@ def _buses_table(stations: Sequence[Row]) -> TextTable:
                 duration(bus["trip_us"]),
             )
     return table
+
+
+def _eoe_tables(stations: Sequence[Row]) -> Iterator[TextTable | str]:
+    """Yield the ports of each bus with a TAP interface."""
+    # Imported here: few plants use EoE.
+    import msgspec
+
+    from eap.cli.bus_view import eoe_table
+    from eap.runtime.engine_messages import EoeReport
+
+    for port in (port for station in stations for port in station["ports"]):
+        if (report := port.get("bus", {}).get("eoe")) is not None:
+            yield ""
+            yield eoe_table(msgspec.convert(report, EoeReport))
 
 
 def _process_data(stations: Sequence[Row]) -> TextTable:

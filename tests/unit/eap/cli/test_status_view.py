@@ -71,6 +71,18 @@ def test_listeners_and_descriptors_are_shown() -> None:
     assert row_of(text, "ams-tcp") == "ams-tcp 10.0.0.1:48898 7 of 128 1 2 3"
 
 
+def test_ethernet_of_a_bus_is_shown() -> None:
+    slave = {"station": 1001, "name": "drive", "is_connected": True, "ip": "10.0.0.2",
+             "received": 7, "sent": 8}  # fmt: skip
+    eoe = {"interface": "eoe0", "address": "", "fault": "", "received": 3, "sent": 4, "dropped": 5,
+           "slaves": [slave]}  # fmt: skip
+    status = document()
+    status["stations"][0]["ports"].append(bus_port(eoe=eoe))
+    text = show(status)
+    assert row_of(text, "eoe0") == "eoe0 open 3 4 5"
+    assert row_of(text, "1001 drive") == "1001 drive 10.0.0.2 7 8 0 0 0"
+
+
 def test_process_that_starts_is_shown_as_such() -> None:
     status = document()
     status["processes"]["engine"]["step"] = "building station mixer"
