@@ -56,7 +56,7 @@ _OTHER_ROOTS = {
 }
 _VERSIONS = (
     "A project does not show the data type versions of its variables: 0, the default of TwinCAT 3,"
-    " is assumed.  If a PD counts as wrong_version, write its version, or ignore_version: true."
+    " is assumed.  If PDs are dropped for their version, write it, or ignore_version: true."
 )
 
 
