@@ -124,6 +124,8 @@ class EapDictionary(ObjectDictionary):
 
     Attributes:
         on_request: Called with the number of the state that a client writes to 0xF200:01.
+        on_download: Called with index, sub-index, bytes, and whether the access was complete, after
+            a client wrote configuration in PreOp.
         on_change: Called with index and sub-index after a client wrote configuration in SafeOp or
             Op, where an object says that this may be done; a DeviceFault refuses it.
     """
@@ -142,6 +144,7 @@ class EapDictionary(ObjectDictionary):
         self.live: LiveValues = live or NoLiveValues()
         self.identity = identity
         self.on_request: Callable[[int], object] | None = None
+        self.on_download: Callable[[int, int, bytes, bool], object] | None = None
         self.on_change: Callable[[int, int], None] | None = None
         self._net_id = self.port.net_id
         self._members: dict[int, dict[int, OdObject]] = {row.first: {} for row in profile.ALL}
@@ -361,6 +364,7 @@ class EapDictionary(ObjectDictionary):
                 raise SdoAbortError(AbortCode.NO_OBJECT, index, 0)
             self._write(row, index, subindex, data, state)
             self._finish_download(row, index, [subindex], state)
+        self._note_download(index, subindex, data, state, complete=False)
 
     def download_complete(self, index: int, first: int, data: bytes, state: OdState) -> None:
         """Write a whole object by complete access; sub-index 0 sets the length of a list."""
@@ -371,6 +375,13 @@ class EapDictionary(ObjectDictionary):
             self._finish_download(
                 row, index, list(self[index].entries) if index in self else [], state
             )
+        self._note_download(index, first, data, state, complete=True)
+
+    def _note_download(
+        self, index: int, subindex: int, data: bytes, state: OdState, *, complete: bool
+    ) -> None:
+        if state is OdState.PREOP and index != profile.CONTROL and self.on_download is not None:
+            self.on_download(index, subindex, data, complete)
 
     def check_download(
         self, index: int, subindex: int, size: int, state: OdState, *, complete: bool = False

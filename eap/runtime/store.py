@@ -28,6 +28,7 @@ from eap.errors import ConfigError, EnvironmentalError
 from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
 from eap.pd.spec import SpecRecord, StationSpec
+from eap.runtime.draft import DraftFile
 from eap.runtime.durable import digest, put_aside, replace_file, seal, unseal
 from eap.runtime.folder import folder_name
 
@@ -223,6 +224,7 @@ class StationStore:
         configuration: Specification and objects of its devices.
         routes: Routes that were added to those of its router.
         routing: Routes and access rules that were applied.
+        draft: Downloads in PreOp that are not part of the configuration yet.
     """
 
     def __init__(self, plant: str, station: str) -> None:
@@ -236,6 +238,7 @@ class StationStore:
         self.routing: StationFile[AppliedRouting] = StationFile(
             folder / "routing", station, AppliedRouting, "routes and access rules"
         )
+        self.draft = DraftFile(folder / "drafts" / f"{folder_name(station)}.jsonl", station)
 
     def set_aside(self) -> bool:
         """Hide all stored files, so that the plant file alone counts; return whether one existed.

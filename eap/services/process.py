@@ -167,7 +167,7 @@ class StationDevices:
             hardware_version=os.uname().machine,
             software_version=self._release,
         )
-        device = StationDevice(keeper, ImageValues(image), identity)
+        device = StationDevice(keeper, ImageValues(image), identity, store.draft)
         self.by_station[name] = device
         self.routers[name] = router = make_router(station, routing)
         self.routing[name] = StationRouting(

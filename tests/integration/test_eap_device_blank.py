@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 
 import pytest
@@ -78,7 +80,7 @@ MEETS_BLANK = PLANT.replace("to: right/eap0", f"to: {BLANK}").replace(
 def test_blank_station_configured_by_aoe_alone_exchanges_data_with_one_of_a_plant_file(
     farm: Plants,
 ) -> None:
-    """Also after it was killed and started again, without any further download."""
+    """Also after its services were killed between the downloads and SafeOp, and all of it in Op."""
     wait_free(LEFT, RIGHT, BLANK)
     words = ("--blank", "blank", "--interface", f"udp://{BLANK}", "--net-id", f"{BLANK}.2.1")
     known = farm.run(farm.write(MEETS_BLANK))
@@ -87,7 +89,10 @@ def test_blank_station_configured_by_aoe_alone_exchanges_data_with_one_of_a_plan
     assert blank.station("blank")["state"] == "PREOP"
     with UdpClient(BLANK, f"{BLANK}.2.1", source="127.0.0.1") as client:
         configure_blank(Downloads(client))
-        assert bring(client, OP).result == 0
+        services = blank.pid("services")
+        os.kill(services, signal.SIGKILL)
+        blank.wait_for_another("services", services)
+        wait_until(lambda: bring(client, OP).result == 0)
         assert client.read(0xF100, 1).data == b"\x08\0"
     wait_until(lambda: known.values("right")["seen"] == 42)
     wait_until(lambda: blank.values("blank")["setpoint"] == 900)

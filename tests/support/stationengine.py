@@ -63,5 +63,7 @@ def make_device(
 ) -> tuple[StationDevice, StationEngine]:
     """Return a device of the plant ``demo`` and the engine that it asks."""
     engine = engine or StationEngine(spec, state)
-    keeper = StationKeeper(spec, state, StationStore("demo", spec.name).configuration, engine)
-    return StationDevice(keeper, NoLiveValues(), DeviceIdentity(device_name="test")), engine
+    store = StationStore("demo", spec.name)
+    keeper = StationKeeper(spec, state, store.configuration, engine)
+    identity = DeviceIdentity(device_name="test")
+    return StationDevice(keeper, NoLiveValues(), identity, store.draft), engine

@@ -13,7 +13,13 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from eap.device.configuration import adopt_configuration, read_configuration, restore_configuration
+from eap.device.configuration import (
+    StoredError,
+    adopt_configuration,
+    load_configuration,
+    read_configuration,
+    restore_configuration,
+)
 from eap.device.eap_dictionary import DeviceIdentity, EapDictionary, LiveValues
 from eap.device.eap_spec import read_back
 from eap.device.eap_state import EapStateMachine, StateResult
@@ -30,7 +36,8 @@ from eap.runtime.device_change import (
     make_plan,
 )
 from eap.runtime.device_change import plan_rollback as make_rollback
-from eap.runtime.store import Configuration
+from eap.runtime.draft import Download, DraftFile
+from eap.runtime.store import Configuration, digest_of
 from eap.services.device.station_keeper import StationKeeper
 from eap.services.tasks import JobQueue
 
@@ -50,14 +57,24 @@ class StationDevice:
         keeper: Of what it runs.
         values: Where live entries get theirs.
         identity: What 0x1000 to 0x1018 show.
+        draft: Where downloads in PreOp are kept.
 
     Attributes:
         dictionaries: By name of the EAP port.
     """
 
-    def __init__(self, keeper: StationKeeper, values: LiveValues, identity: DeviceIdentity) -> None:
+    def __init__(
+        self,
+        keeper: StationKeeper,
+        values: LiveValues,
+        identity: DeviceIdentity,
+        draft: DraftFile,
+    ) -> None:
         self.name = keeper.spec.name
         self._keeper = keeper
+        self._draft = draft
+        self._base = ""
+        """Digest of the configuration that the draft begins with; empty without a draft."""
         self._jobs = JobQueue(f"station {self.name}")
         self.dictionaries = {
             name: EapDictionary(keeper.spec, name, values, identity)
@@ -81,6 +98,12 @@ class StationDevice:
             dictionary.on_request = self._note_request
             dictionary.on_change = self._note_change
         self._machine.start()
+        if keeper.state is DeviceState.PREOP:
+            self._restore_draft()
+        else:
+            draft.clear()
+        for name, dictionary in self.dictionaries.items():
+            dictionary.on_download = partial(self._keep_download, name)
         if keeper.state is not DeviceState.PREOP:
             self._machine.request(keeper.state)
 
@@ -198,6 +221,7 @@ class StationDevice:
         for name, dictionary in self.dictionaries.items():
             adopt_configuration(dictionary, plan.dictionaries[name])
         self._incomplete = None
+        self._forget_draft()
         return plan, None
 
     async def _write(self, dictionary: EapDictionary, write: Callable[[], ResultT]) -> ResultT:
@@ -240,6 +264,44 @@ class StationDevice:
             self._checked = spec = self._read_back()
             await self._keeper.change(spec, dump_all(self.dictionaries))
         await self._keeper.change_state(wanted)
+        if wanted is not DeviceState.PREOP:
+            self._forget_draft()
+
+    def _restore_draft(self) -> None:
+        """Repeat the downloads that an earlier services process accepted in PreOp."""
+        base = digest_of(self.spec)
+        draft = self._draft.read(base)
+        if draft is None:
+            return
+        self._base, self._is_written = base, True
+        done = 0
+        try:
+            for name, dictionary in self.dictionaries.items():
+                if name in draft.objects:
+                    load_configuration(dictionary, draft.objects[name])
+            for each in draft.downloads:
+                dictionary = self.dictionaries[each.port]
+                write = dictionary.download_complete if each.complete else dictionary.download
+                write(each.index, each.subindex, each.data, OdState.PREOP)
+                done += 1
+        except (StoredError, SdoAbortError, KeyError) as exc:
+            logger.warning(
+                "station %s: only %d of %d downloads in PREOP are back: %s; check the"
+                " configuration before SAFEOP",
+                self.name, done, len(draft.downloads), exc,
+            )  # fmt: skip
+
+    def _keep_download(
+        self, port: str, index: int, subindex: int, data: bytes, complete: bool
+    ) -> None:
+        starts, self._base = not self._base, self._base or digest_of(self.spec)
+        download = Download(port, index, subindex, data, complete)
+        self._draft.append(download, self._base, lambda: dump_all(self.dictionaries), starts=starts)
+
+    def _forget_draft(self) -> None:
+        if self._base:
+            self._base = ""
+            self._draft.clear()
 
     def _read_back(self) -> StationSpec:
         """Return the specification in the dictionaries; raise DeviceFault if it cannot run."""

@@ -14,7 +14,8 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000 import Tx
 from eap.pd.device import DeviceState, FaultCode
 from eap.pd.spec import TriggerSpec, TxFrameSpec, TxPdSpec, VariableSpec
-from eap.runtime.store import StationStore, effective
+from eap.runtime import draft
+from eap.runtime.store import StationStore, digest_of, effective, plant_folder
 from tests.support.stationengine import make_device
 
 TXPD, FRAME, CONTROL, STATUS = 0xD000, 0x8000, 0xF200, 0xF100
@@ -101,6 +102,145 @@ def test_next_services_find_the_same_dictionary(spec):
     assert dump_configuration(again.dictionaries["eap0"]) == dump_configuration(
         device.dictionaries["eap0"]
     )
+
+
+def restarted(device):
+    """The device of the next services process, in PreOp."""
+    return make_device(device.spec, DeviceState.PREOP)[0]
+
+
+def content(device):
+    return dump_configuration(device.dictionaries["eap0"])
+
+
+async def download_three(device):
+    await write(device, CONTROL, 1, 2)
+    await write(device, TXPD, Tx.PD_ID, 77)
+    await write(device, 0x6010, 4, int.from_bytes(b"UINT", "little"), 4)
+    whole = device.upload("eap0", FRAME, 0, complete=True)
+    await device.download("eap0", FRAME, 0, whole, complete=True)
+
+
+def test_next_services_find_downloads_in_preop_that_were_not_taken(spec):
+    device, _ = make_device(spec)
+    unchanged = content(device)
+    asyncio.run(download_three(device))
+    again = restarted(device)
+    assert content(again) == content(device) != unchanged
+    assert again.spec == spec
+
+    async def script():
+        await write(again, TXPD, Tx.PD_ID, 78)  # it goes on where the one before ended
+        await write(restarted(again), CONTROL, 1, 4)
+
+    asyncio.run(script())
+    stored = StationStore("demo", "left").configuration.read()
+    assert [pd.pd_id for frame in stored.spec.frames for pd in frame.pds] == [78]
+
+
+def test_refused_download_in_preop_is_not_repeated(spec):
+    device, _ = make_device(spec)
+
+    async def script():
+        await write(device, CONTROL, 1, 2)
+        with pytest.raises(SdoAbortError):
+            await write(device, TXPD, Tx.PD_ID, 77, 1)
+        await write(device, TXPD, Tx.PD_ID, 78)
+
+    asyncio.run(script())
+    assert content(restarted(device)) == content(device)
+
+
+def test_downloads_that_were_taken_are_not_repeated(spec):
+    device, engine = make_device(spec)
+
+    async def script():
+        await download_three(device)
+        await device.request_state(4)
+        await device.request_state(2)
+
+    asyncio.run(script())
+    again, _ = make_device(engine.spec, DeviceState.PREOP)
+    assert content(again) == content(device)
+    assert StationStore("demo", "left").draft.read(digest_of(engine.spec)) is None
+
+
+def test_apply_in_preop_replaces_downloads(spec):
+    device, engine = make_device(spec)
+
+    async def script():
+        await download_three(device)
+        await device.apply(with_more(spec))
+
+    asyncio.run(script())
+    again, _ = make_device(engine.spec, DeviceState.PREOP)
+    assert content(again) == content(device)
+
+
+def test_downloads_of_another_configuration_are_left_out(spec):
+    asyncio.run(download_three(make_device(spec)[0]))
+    other = replace(spec, frames=())
+    again, _ = make_device(other, DeviceState.PREOP)
+    assert content(again) == content(make_device(other, DeviceState.OP)[0])
+
+
+def test_many_downloads_are_kept_in_bounded_space(spec, monkeypatch):
+    monkeypatch.setattr(draft, "SHORTEN_AT", 300)
+    device, _ = make_device(spec)
+
+    async def script():
+        await write(device, CONTROL, 1, 2)
+        for number in range(50):
+            await write(device, TXPD, Tx.PD_ID, number + 1)
+            assert content(restarted(device)) == content(device)
+
+    asyncio.run(script())
+    found = StationStore("demo", "left").draft.read(digest_of(spec))
+    assert found.objects
+    assert len(found.downloads) < 10
+
+
+def test_downloads_that_cannot_be_kept_are_warned_of_once(spec, caplog):
+    device, _ = make_device(spec)
+    folder = plant_folder("demo")
+    folder.mkdir(parents=True)
+    (folder / "drafts").write_text("a file in place of the folder")
+    asyncio.run(download_three(device))
+    (warning,) = [each.message for each in caplog.records if "cannot be kept" in each.message]
+    assert warning.startswith("station left: downloads in PREOP cannot be kept in ")
+    (folder / "drafts").unlink()
+    asyncio.run(write(device, TXPD, Tx.PD_ID, 79))
+    assert content(restarted(device)) == content(device)
+
+
+@pytest.mark.parametrize("cut", range(1, 40, 6))
+def test_line_that_a_kill_has_cut_is_left_out(spec, cut):
+    device, _ = make_device(spec)
+
+    async def script():
+        await write(device, CONTROL, 1, 2)
+        await write(device, TXPD, Tx.PD_ID, 77)
+        before = content(device)
+        await write(device, TXPD, Tx.PD_ID, 78)
+        path = plant_folder("demo") / "drafts" / "left.jsonl"
+        path.write_bytes(path.read_bytes()[:-cut])
+        again = restarted(device)
+        assert content(again) == before
+        await write(again, TXPD, Tx.PD_ID, 79)
+        assert content(restarted(again)) == content(again)
+
+    asyncio.run(script())
+
+
+def test_damaged_downloads_are_put_aside_with_a_warning(spec, caplog):
+    device, _ = make_device(spec)
+    unchanged = content(device)
+    asyncio.run(download_three(device))
+    path = plant_folder("demo") / "drafts" / "left.jsonl"
+    path.write_bytes(path.read_bytes().replace(b'"index"', b'"indox"', 1))
+    assert content(restarted(device)) == unchanged
+    assert "downloads in PREOP cannot be read" in caplog.text
+    assert path.with_suffix(".damaged").exists()
 
 
 def test_refused_state_says_why_and_by_which_object(spec):
