@@ -29,6 +29,8 @@ from eap.od.slave_config import (
 )
 from eap.suggest import suggest
 
+MODULE_LIST = 0xF030
+"""Object with the idents of the configured modules (ETG.5001)."""
 _LOW = 0xFFFF
 _MAX_INDEX = 0xFFFF
 
@@ -283,11 +285,14 @@ _SYNC0 = 0x0200
 """Bit of AssignActivate: register 0x0981, bit 1."""
 
 
-def default_config(device: EsiDevice, assignment: Mapping[int, Sequence[EsiPdo]]) -> SlaveConfig:
+def default_config(
+    device: EsiDevice, assignment: Mapping[int, Sequence[EsiPdo]], modules: Sequence[int] = ()
+) -> SlaveConfig:
     """Return the configuration that a tool gives a slave with this description.
 
-    Its PDO assignment where the slave takes one, its start-up writes, its first operation mode,
-    time-outs and the rule for its revision.
+    The list of the idents of its *modules* where the slave wants it, its PDO assignment where the
+    slave takes one, its start-up writes, its first operation mode, time-outs and the rule for its
+    revision.
     """
     coe = device.mailbox.coe if device.mailbox else None
     takes_pdos = coe is not None and coe.pdo_assign
@@ -300,12 +305,22 @@ def default_config(device: EsiDevice, assignment: Mapping[int, Sequence[EsiPdo]]
             if takes_pdos and any(manager_for(device, pdo) == number for pdo in device.pdos)
         },
         fixed_pdos=not takes_pdos,
-        writes=tuple(_writes(device)),
+        writes=(*_module_list(device, modules), *_writes(device)),
         sync=mode if mode is not None and mode.activate >> 8 else None,
         timeouts=device.timeouts,
         revision_rule=device.revision_rule or RevisionRule.EXACT,
         identification=identification,
     )
+
+
+def _module_list(device: EsiDevice, modules: Sequence[int]) -> Iterator[SdoWrite]:
+    """Yield the writes of the configured module ident list (ETG.5001, object 0xF030)."""
+    if not (device.downloads_modules and modules):
+        return
+    yield SdoWrite(index=MODULE_LIST, data=b"\0", comment="modules")
+    for subindex, ident in enumerate(modules, 1):
+        yield SdoWrite(index=MODULE_LIST, subindex=subindex, data=ident.to_bytes(4, "little"))
+    yield SdoWrite(index=MODULE_LIST, data=bytes((len(modules),)), comment="number of modules")
 
 
 def _writes(device: EsiDevice) -> Iterator[SdoWrite | IdnWrite]:

@@ -334,8 +334,7 @@ def _op_modes(modes: XmlElement, fields: Fields) -> Iterator[EsiOpMode]:
             factor1=_factor(each, "CycleTimeSync1", 0, fields),
             shift1_ns=fields.child(each, "ShiftTimeSync1", is_signed=True),
         )
-        assignment = tuple(_assignments(each, fields))
-        yield EsiOpMode(mode=mode, description=english(each, "Desc"), assignment=assignment)
+        yield EsiOpMode(mode=mode, description=english(each, "Desc"))
 
 
 def _factor(mode: XmlElement, tag: str, default: int, fields: Fields) -> int:
@@ -347,7 +346,7 @@ def _factor(mode: XmlElement, tag: str, default: int, fields: Fields) -> int:
 
 
 def _assignments(parent: XmlElement, fields: Fields) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Yield the PDOs of each sync manager of an operation mode or alternative."""
+    """Yield the PDOs of each sync manager of an alternative."""
     for each in parent.iterfind("Sm"):
         pdos = tuple(
             fields.number(pdo.text, pdo.line, "Pdo", bits=16)

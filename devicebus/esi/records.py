@@ -140,12 +140,10 @@ class EsiMailbox(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EsiOpMode(msgspec.Struct, frozen=True, kw_only=True):
-    """Element Dc/OpMode: the mode, and its own PDO assignment if it has one."""
+    """Element Dc/OpMode."""
 
     mode: OpMode
     description: str = ""
-    assignment: tuple[tuple[int, tuple[int, ...]], ...] = ()
-    """PDOs by sync manager."""
 
 
 class EsiEeprom(msgspec.Struct, frozen=True, kw_only=True):

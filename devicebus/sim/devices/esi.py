@@ -9,6 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from devicebus.esi.choice import (
+    MODULE_LIST,
     default_assignment,
     default_modules,
     find_modules,
@@ -71,7 +72,9 @@ _MEMORY = 0x1000
 _MAX_RAM = 60 << 10
 _CONTROL_WORD, _STATUS_WORD = 0x6040, 0x6041
 _MAX_AXES = 8
-_MODULES, _CONFIGURED_MODULES = 0xF050, 0xF030
+DETECTED_MODULES = 0xF050
+"""Object with the idents of the modules that are there (ETG.5001)."""
+_MAX_MODULES = 254
 _DEFAULT_MAILBOX = 128
 
 
@@ -430,12 +433,17 @@ def _exclusions(pdos: Iterable[EsiPdo]) -> Mapping[int, frozenset[int]]:
 
 def _add_modules(plan: EsiPlan, dictionary: ObjectDictionary) -> None:
     """Add the lists of configured and detected modules (ETG.5001)."""
-    for index, name, access in (
-        (_CONFIGURED_MODULES, "Configured module ident list", RW_PREOP),
-        (_MODULES, "Detected module ident list", RO),
-    ):
-        if index not in dictionary:
-            dictionary.add(array(index, name, "UDINT", plan.modules[:254], access))
+    modules = plan.modules[:_MAX_MODULES]
+    if DETECTED_MODULES not in dictionary:
+        dictionary.add(array(DETECTED_MODULES, "Detected module ident list", "UDINT", modules))
+    if MODULE_LIST not in dictionary:
+        entries = {
+            subindex: Entry(f"SubIndex {subindex:03}", "UDINT", RW_PREOP, ident)
+            for subindex, ident in enumerate(modules, 1)
+        }
+        entries[0] = Entry("SubIndex 000", "USINT", RW_PREOP, len(modules), maximum=len(modules))
+        name = "Configured module ident list"
+        dictionary.add(OdObject(MODULE_LIST, name, ObjectCode.ARRAY, entries, data_type=0x07))
 
 
 def channel_names(spec: SlaveSpec) -> dict[str, tuple[int, int]]:

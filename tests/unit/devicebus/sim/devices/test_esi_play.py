@@ -51,7 +51,9 @@ def wire(device, config=None, modules=None, **spec):
         name="x",
         vendor=device.vendor,
         product=device.product,
-        config=default_config(plan.device, plan.assignment) if config is None else config,
+        config=default_config(plan.device, plan.assignment, plan.modules)
+        if config is None
+        else config,
     )
     return Paced(Master(MasterSettings(expected=(expected,), cycle_ns=CYCLE_NS)), segment)
 
@@ -251,7 +253,7 @@ MODULAR = f"""{HEAD}<Device><Type ProductCode="6" RevisionNo="1">M</Type>
   <Sm StartAddress="#x1100" ControlByte="#x24">Outputs</Sm>
   <Sm StartAddress="#x1200" ControlByte="#x20">Inputs</Sm>
   <Mailbox><CoE SdoInfo="1" PdoAssign="1"/></Mailbox>
-  <Slots MaxSlotCount="4" SlotPdoIncrement="1" SlotIndexIncrement="16">
+  <Slots DownloadModuleIdentList="1" MaxSlotCount="4" SlotPdoIncrement="1" SlotIndexIncrement="16">
     <Slot MinInstances="0" MaxInstances="4"><ModuleIdent>#x10</ModuleIdent>
       <ModuleIdent>#x20</ModuleIdent></Slot></Slots></Device></Devices><Modules>
   <Module><Type ModuleIdent="#x10">IN</Type><TxPdo Sm="3"><Index DependOnSlot="1">#x1a00</Index>
@@ -274,6 +276,12 @@ def test_modules_are_in_their_slots():
         0x6030,
     ]
     assert [dictionary.entry(0xF050, sub).value for sub in range(1, 5)] == [0x10, 0, 0x20, 0x10]
+    written = [(each.subindex, each.data) for each in line.core.slaves[1001].config.writes]
+    assert written == [
+        (0, b"\0"),
+        *((sub, bytes((ident, 0, 0, 0))) for sub, ident in enumerate((0x10, 0, 0x20, 0x10), 1)),
+        (0, b"\4"),
+    ]
     assert (len(line.core.image.outputs), len(line.core.image.inputs)) == (2, 2)
 
 
