@@ -18,7 +18,7 @@ from devicebus.master import eeprom
 from devicebus.master.image import ProcessVariable, data_type_of
 from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel, channels_from_sii, read_channels
 from devicebus.master.procedure import read
-from devicebus.sim.devices.esi import plan_device
+from devicebus.sim.devices.esi import DETECTED_MODULES, plan_device
 from devicebus.wire import sii
 from devicebus.wire.register import Register
 from devicebus.wire.sii import Sii, SiiProtocol
@@ -27,7 +27,6 @@ from eap.od.slave_config import RevisionRule
 from eap.ops.bus_session import Begin, Slave, SlaveBus
 from eap.runtime.esi_files import EsiSource
 
-_DETECTED_MODULES = 0xF050
 _MAX_MODULES = 254
 _MAX_MAILBOX, _MIN_MAILBOX = 1486, 32
 _CLOCK = 0x04
@@ -144,10 +143,10 @@ def _channels(
 def _modules(bus: SlaveBus, slave: Slave, notes: list[str]) -> tuple[int, ...]:
     """Return the idents of the modules that a slave detects, 0 for an empty slot."""
     try:
-        octets = bus.converse(slave, _upload(_DETECTED_MODULES, 0), "counting modules")
+        octets = bus.converse(slave, _upload(DETECTED_MODULES, 0), "counting modules")
         idents = []
         for subindex in range(1, min(octets[0], _MAX_MODULES) + 1 if octets else 0):
-            ident = bus.converse(slave, _upload(_DETECTED_MODULES, subindex), "modules")
+            ident = bus.converse(slave, _upload(DETECTED_MODULES, subindex), "modules")
             idents.append(int.from_bytes(ident, "little"))
     except EapError as exc:
         notes.append(f"its modules are not known, the usual ones are assumed: {exc}")

@@ -98,7 +98,7 @@ def describe_device(spec: SlaveSpec, device: EsiDevice) -> DescribedSlave:
         alias=spec.alias or None,
         outputs=tuple(_assigned(plan, is_output=True)),
         inputs=tuple(_assigned(plan, is_output=False)),
-        config=default_config(whole, plan.assignment),
+        config=default_config(whole, plan.assignment, plan.modules),
         pdos=pdos,
         objects=tuple(_objects(whole)),
         op_modes=tuple(each.mode for each in whole.op_modes),

@@ -15,7 +15,7 @@ from tools.fuzz.messages import cut
 
 _FILES = tuple(
     (Path(__file__).parents[3] / "config" / "esi" / name).read_bytes()
-    for name in ("drive.xml", "terminals.xml")
+    for name in ("drive.xml", "modular.xml", "terminals.xml")
 )
 _VALUE = re.compile(rb'(?<=[>"])[^<>"\n]+(?=[<"])')
 _HOSTILE = (

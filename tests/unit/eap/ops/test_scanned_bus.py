@@ -24,8 +24,8 @@ def state(tmp_path, monkeypatch):
 def written(tmp_path, capsys, monkeypatch):
     """Scan a simulated bus; return the written file and what is shown."""
 
-    def scan(bus, *words, expected=0):
-        LoopBus(bus).replace(monkeypatch)
+    def scan(bus, *words, expected=0, folder=CONFIG / "buses"):
+        LoopBus(bus, folder).replace(monkeypatch)
         file = tmp_path / "found.yaml"
         with pytest.raises(SystemExit) as end:
             main(["bus", "scan", *WHERE, "--write", str(file), *words], prog_name="eapctl")
@@ -118,6 +118,18 @@ def test_faults_of_other_files_are_shown(written, tmp_path):
     (esi / "drive.xml").write_bytes((CONFIG / "esi" / "drive.xml").read_bytes())
     _, shown = written("cell", "--esi", str(esi))
     assert f"{esi}/bad.xml:1: not XML that can be read" in shown
+
+
+def test_modules_that_a_slave_detects_are_written(written, tmp_path):
+    bus = tmp_path / "modular.yaml"
+    bus.write_text(
+        f"bus: m\nesi: {CONFIG / 'esi'}\nslaves:\n"
+        "  - {name: ms, kind: esi, device: MS4, modules: [TEMP, null, RELAY, TEMP]}\n"
+    )
+    file, _ = written("modular", "--esi", str(CONFIG / "esi"), folder=tmp_path)
+    assert "modules: [0x10, null, 0x20, 0x10]" in file.read_text()
+    assert variables(file) == variables(bus)
+    assert "bus0.ms.Temperature.Value_6030_01" in variables(file)
 
 
 def test_existing_file_is_kept(written, tmp_path):

@@ -115,11 +115,24 @@ def test_all_findings_come_at_once(folder):
         "name: d, device: DO4, esi: nowhere.xml",
     )
     assert [each.partition("; expected")[0] for each in found] == [
-        "bus.yaml:4: a: esi: none of 6 devices is DO5, did you mean DO4?",
+        "bus.yaml:4: a: esi: none of 7 devices is DO5, did you mean DO4?",
         "bus.yaml:5: b: esi: DO4 has no revision 0x00110000; known: 0x00100000, 0x00120000",
         "bus.yaml:6: c: esi is a folder",
         "bus.yaml:7: nowhere.xml cannot be read: does not exist",
     ]
+
+
+def test_modules_of_slots_have_variables_and_start_up_writes(folder):
+    (slave,) = describe(folder, "name: ms, device: MS4, modules: [RELAY, TEMP]").slaves
+    assert [(each.index, each.group) for each in (*slave.outputs, *slave.inputs)] == [
+        (0x7000, "Relay"),
+        (0x6010, "Temperature"),
+    ]
+    *modules, sensor = slave.config.writes
+    assert [(each.index, each.subindex) for each in modules] == [
+        (0xF030, 0), (0xF030, 1), (0xF030, 2), (0xF030, 0),
+    ]  # fmt: skip
+    assert (sensor.index, sensor.data) == (0x8010, b"\x03\x00")
 
 
 def test_module_that_does_not_fit_is_found(folder):
