@@ -16,7 +16,7 @@ from devicebus.mailbox.conversation import Conversation, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec import datatypes
 from eap.codec.coe import EntryDescription
-from eap.codec.datatypes import DataType
+from eap.codec.datatypes import Block, DataType
 from eap.codec.soe import (
     Display,
     Element,
@@ -288,7 +288,7 @@ def _value_of(kind: DataType | None, octets: bytes, *, complete: bool) -> Any:
         return int.from_bytes(octets, "little") if is_number else None
     if kind.is_text:
         return octets.rstrip(b"\0").decode(errors="replace")
-    if kind.code == _OCTETS:
+    if isinstance(kind, Block):
         return octets.hex()
     if len(octets) == kind.size:
         with suppress(ValueError):
