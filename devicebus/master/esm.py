@@ -74,17 +74,19 @@ def acknowledge(station: int) -> Procedure[AlState]:
 def read_identification(station: int) -> Procedure[int]:
     """Return the identification that a slave shows on request; 0 if it has none (ETG.1020).
 
+    The request is one of INIT: a slave may still be on its way there, and another state would call
+    it back.
+
     Raises WorkingCounterError if it does not answer.
     """
-    status = yield from read_status(station)
-    control = AlControl(status.state, identification=1).encode()
+    control = AlControl(AlState.INIT, identification=1).encode()
     yield from write(station, Register.AL_CONTROL, control, "AL control")
     status = yield from _poll_until(
         station, lambda status: bool(status.identification), ACKNOWLEDGE_TIMEOUT_NS
     )
     value = status.code if status.identification else 0
     # Without the request again: the AL status code is then that of errors.
-    yield from write(station, Register.AL_CONTROL, AlControl(status.state).encode(), "AL control")
+    yield from write(station, Register.AL_CONTROL, AlControl(AlState.INIT).encode(), "AL control")
     return value
 
 
