@@ -33,7 +33,7 @@ from enum import IntEnum
 
 import msgspec
 
-from devicebus.master.link import INDEXES
+from devicebus.master.link import INDEXES, RoundTrip
 from devicebus.wire.datagram import OVERHEAD, Command, DatagramHeader
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.wire import Buffer
@@ -42,7 +42,9 @@ RING_INDEXES = INDEXES // 2
 """Frame indexes of a link with a ring: those of the second line have _SECOND_BIT set."""
 # Slaves whose answers are on a line that is only slow must not be taken for lost ones.
 DEAD_NS = 50_000_000
-"""Time without a copy after which a line is dead."""
+"""Minimum time without a copy after which a line is dead."""
+DEAD_TIMEOUTS = 4
+"""The same in time-outs that follow the round trip of copies: a slow bus is not dead."""
 DEAD_COPIES = 3
 """Copies that have to be missing on it meanwhile."""
 _SECOND_BIT = RING_INDEXES
@@ -133,6 +135,7 @@ class Ring:
         self._heard_ns = [0, 0]
         self._missing = [0, 0]
         self._number = self._judged = 0
+        self._trip = RoundTrip()
         self._cuts = 0
         self._place: int | None = None
         self._cut_ns: int | None = None
@@ -161,6 +164,7 @@ class Ring:
             self.unexpected += 1
             return None
         self._heard_ns[copy] = now_ns
+        self._trip.measure(now_ns - sent.sent_ns)
         self._missing[copy] = 0
         if self._silent[copy]:
             self._silent[copy] = False
@@ -181,6 +185,7 @@ class Ring:
         if sent.halves[other] is None:
             self._missing[other] += 1
             is_alone = self._silent[other] or sent.second_is_unprocessed
+            is_alone = is_alone or (self.is_opened and copy is Line.FIRST)
             if not is_alone and not self._is_of_all_slaves(sent.copies[copy], data):
                 self._waiting[sent.copies[0][3]] = sent
                 return None
@@ -198,7 +203,10 @@ class Ring:
             if self._end_of_wait(sent) > now_ns:
                 continue
             line = sent.missing_line
-            if self._missing[line] >= DEAD_COPIES and now_ns - self._heard_ns[line] >= DEAD_NS:
+            if (
+                self._missing[line] >= DEAD_COPIES
+                and now_ns - self._heard_ns[line] >= self._dead_ns
+            ):
                 self._silent[line] = True
                 if line is Line.FIRST:
                     self._set_reached(0, now_ns)
@@ -211,7 +219,11 @@ class Ring:
     def _end_of_wait(self, sent: _SentCopies) -> int:
         line = sent.missing_line
         begun_ns = self._heard_ns[line] if self._missing[line] >= DEAD_COPIES else sent.sent_ns
-        return begun_ns + DEAD_NS
+        return begun_ns + self._dead_ns
+
+    @property
+    def _dead_ns(self) -> int:
+        return max(DEAD_NS, DEAD_TIMEOUTS * self._trip.timeout_ns)
 
     def _is_of_all_slaves(self, sent: bytes, data: Buffer) -> bool:
         """Return true for a cyclic frame if the slaves of this half are all that exchange data."""

@@ -183,31 +183,38 @@ class _Loop:
                     return
                 if fd == command_fd and not self._receive_commands():
                     poll.unregister(fd)
-            for side, sock in self._sockets.items():
-                self._forward_frames(side, sock)
+            self._forward_frames()
 
     def _poll_timeout_ms(self) -> float | None:
         due, now_ns = self._segment.next_timeout(), time.monotonic_ns()
         self._late_ns = _NEVER_NS if due is None else max(due, now_ns) + _STALL_NS
         return None if due is None else max(0.0, (due - now_ns) / _MS)
 
-    def _forward_frames(self, side: SegmentEnd, sock: SegmentSocket) -> None:
-        segment = self._segment
+    def _forward_frames(self) -> None:
+        """Forward the frames that wait, at most a batch of each line."""
+        waiting = list(self._sockets.items())
+        # In turn: the copies of a frame on both lines of a ring pass at about the same time.
         for _ in range(_BATCH):
-            arrival = sock.receive()
-            now_ns = time.monotonic_ns()
-            if arrival is not None and now_ns > self._late_ns:
-                segment.segment.postpone_timeouts(now_ns)
-            self._late_ns = now_ns + _STALL_NS
-            if arrival is None:
-                segment.handle_timeout(now_ns)
-            else:
-                self._origins[side] = arrival.origin
-                segment.receive_frame(arrival.frame, now_ns, side=side, origin=arrival.origin)
-            for out in segment.frames_to_send(now_ns):
-                self._send(out)
-            if arrival is None:
+            waiting = [line for line in waiting if self._forward_frame(*line)]
+            if not waiting:
                 return
+
+    def _forward_frame(self, side: SegmentEnd, sock: SegmentSocket) -> bool:
+        """Forward the next frame of a line; return False if none waits."""
+        segment = self._segment
+        arrival = sock.receive()
+        now_ns = time.monotonic_ns()
+        if arrival is not None and now_ns > self._late_ns:
+            segment.segment.postpone_timeouts(now_ns)
+        self._late_ns = now_ns + _STALL_NS
+        if arrival is None:
+            segment.handle_timeout(now_ns)
+        else:
+            self._origins[side] = arrival.origin
+            segment.receive_frame(arrival.frame, now_ns, side=side, origin=arrival.origin)
+        for out in segment.frames_to_send(now_ns):
+            self._send(out)
+        return arrival is not None
 
     def _send(self, out: Outgoing) -> None:
         origin = out.origin

@@ -202,3 +202,41 @@ def test_ring_by_udp(farm: Plants):
         check_data(appliance)
         assert bus_of(appliance)["ring"]["is_whole"] is False
         assert appliance.stop()[0] == 0
+
+
+COUNT = 200
+LONG_BUS = "bus: long\nring: true\nslaves:\n" + "".join(
+    f"  - {{name: s{number}, kind: digital, product: 7, inputs: [{{name: echo, follows: lamp}}],"
+    " outputs: [{name: lamp}]}\n"
+    for number in range(COUNT)
+)
+
+
+def test_200_slaves_in_a_ring_keep_states_and_data_over_a_cut(farm: Plants):
+    (farm.folder / "ring.yaml").write_text(LONG_BUS)
+    appliance = farm.run(farm.write(PLANT.format(address=own_address(4), lines=SIMULATED)))
+
+    def show(pattern: int) -> None:
+        """Give each slave an output of its own, and wait until all inputs show them."""
+        lamps = {f"bus0.s{n}.lamp": bool(pattern >> n % 7 & 1) for n in range(COUNT)}
+        appliance.request("write", station="one", values=lamps)
+        echoes = {name.replace("lamp", "echo"): value for name, value in lamps.items()}
+        wait_until(lambda: echoes.items() <= appliance.values("one").items())
+
+    def slaves() -> list[dict]:
+        return bus_of(appliance).get("slaves", [])
+
+    wait_until(lambda: len(slaves()) == COUNT and {each["state"] for each in slaves()} == {"OP"})
+    show(0b1010011)
+    appliance.command("sim", "fault", "one/bus0", "cut", "slave=s100")
+    show(0b0101100)
+    wait_until(lambda: bus_of(appliance)["ring"]["between"])
+    assert [each["name"] for each in bus_of(appliance)["ring"]["between"]] == ["s99", "s100"]
+    appliance.command("sim", "fault", "one/bus0", "cut", "slave=s100", "--end")
+    show(0b1110001)
+    wait_until(lambda: bus_of(appliance)["ring"]["is_whole"])
+    report = appliance.request("bus_describe", station="one", port="bus0")
+    assert {each["state"] for each in report["slaves"]} == {OP}
+    assert {(each["losses"], each["departures"]) for each in report["slaves"]} == {(0, 0)}
+    assert report["wkc_errors"] <= 4
+    assert appliance.stop()[0] == 0

@@ -284,5 +284,5 @@ def test_frames_that_waited_for_a_late_process_come_before_watchdogs(
     loop = segment_process._Loop(segment, {SegmentEnd.PRIMARY: sock}, None)
     monkeypatch.setattr(FaultySegment, "next_timeout", lambda _: 10**9 + 100_000_000)
     loop._poll_timeout_ms()
-    loop._forward_frames(SegmentEnd.PRIMARY, sock)
+    loop._forward_frames()
     assert len(calls) == postponed
