@@ -219,7 +219,7 @@ def _without_absent(
     """Return the numbers of the expected slaves without optional ones that are absent.
 
     Those are left out with which the bus differs least from the expected one; of equal slaves the
-    first are present.
+    first are taken to be present.
     """
     optional = [number for number, each in enumerate(expected) if each.is_optional]
     everyone = list(range(len(expected)))
@@ -228,31 +228,52 @@ def _without_absent(
         and all(_is_match(*each) for each in zip(expected, found, marks, strict=True))
     ):
         return everyone
-    # Slaves in front of the first optional one, and behind the last, have a certain position: the
-    # alignment of the others takes the product of their numbers.
-    head = 0
-    while head < min(optional[0], len(found)):
-        if not _is_match(expected[head], found[head], marks[head]):
-            break
-        head += 1
-    tail = 0
-    while tail < min(len(expected) - 1 - optional[-1], len(found) - head):
-        at = -1 - tail
-        if not _is_match(expected[at], found[at], marks[at]):
-            break
-        tail += 1
-    end, found_end = len(expected) - tail, len(found) - tail
-    left_out = _left_out(expected[head:end], found[head:found_end], marks[head:found_end])
-    return [number for number in everyone if number - head not in left_out]
+    left_out = _absent_exactly(expected, found, marks)
+    if left_out is None:
+        left_out = _absent_nearly(expected, found, marks)
+    return [number for number in everyone if number not in left_out]
+
+
+def _absent_exactly(
+    expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave], marks: Sequence[Marks]
+) -> set[int] | None:
+    """Return the optional slaves without which the bus is exactly as expected; None if it is not.
+
+    The work grows with the number of slaves times that of the absent ones.
+    """
+    rows, columns = len(expected), len(found)
+    absent = rows - columns
+    # fitting: all (i, j) for which found[j:] is expected[i:] without optional slaves.
+    fitting = {(rows, columns)}
+    for i in reversed(range(rows)):
+        for j in range(max(0, i - absent), min(i, columns) + 1):
+            is_absent = expected[i].is_optional and (i + 1, j) in fitting
+            if is_absent or (
+                (i + 1, j + 1) in fitting and _is_match(expected[i], found[j], marks[j])
+            ):
+                fitting.add((i, j))
+    if (0, 0) not in fitting:
+        return None
+    left_out = set()
+    j = 0
+    for i in range(rows):
+        if (i + 1, j + 1) in fitting and _is_match(expected[i], found[j], marks[j]):
+            j += 1
+        else:
+            left_out.add(i)
+    return left_out
 
 
 _OTHER_REVISION, _OTHER_SLAVE = 1, 2
 
 
-def _left_out(
+def _absent_nearly(
     expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave], marks: Sequence[Marks]
 ) -> set[int]:
-    """Return the optional slaves that an alignment with the fewest differences leaves out."""
+    """Return the optional slaves that an alignment with the fewest differences leaves out.
+
+    For the message about a bus that is not as expected: the work grows with the square of its size.
+    """
     rows, columns = len(expected), len(found)
     # costs[i][j]: differences between expected[i:] and found[j:].
     costs = [[0] * (columns + 1) for _ in range(rows + 1)]
