@@ -11,7 +11,7 @@ import click
 
 from eap.cli.group import ExitCode
 from eap.cli.output import Column, Renderer, TextTable, count, write_text
-from eap.cli.params import PLANT_FILE, examples, json_option
+from eap.cli.params import PLANT_FILE, examples, json_option, parse_cycle
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -64,6 +64,13 @@ if TYPE_CHECKING:
     help="Destination of publishers whose file has none that can be used: multicast, an address.",
 )
 @click.option(
+    "--cycle",
+    "cycle_us",
+    callback=parse_cycle,
+    metavar="MS",
+    help="Device cycle in milliseconds [default: that of the task in the project]",
+)
+@click.option(
     "--peer",
     default="",
     metavar="NAME",
@@ -79,6 +86,7 @@ def import_files(
     address: str,
     identity: str,
     to: str,
+    cycle_us: int | None,
     peer: str,
     output: Renderer,
 ) -> None:
@@ -98,7 +106,12 @@ def import_files(
     if is_stdout and output.is_json:
         raise click.UsageError("--json describes the written file: name a file instead of -")
     choices = ImportChoices(
-        plant=name, address=address, identity=PublisherIdentity(identity), to=to, peer=peer
+        plant=name,
+        address=address,
+        identity=PublisherIdentity(identity),
+        to=to,
+        cycle_us=cycle_us or 0,
+        peer=peer,
     )
     result, text = run_import(files, None if is_stdout else target, choices)
     for finding in result.findings:

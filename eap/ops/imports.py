@@ -68,6 +68,7 @@ class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
         address: Pattern of the interfaces of ports; ``{n}`` is the number of the port.
         identity: NetID that publishers send as their own.
         to: Destination of publishers whose file has none that can be used.
+        cycle_us: Cycle of the imported stations; 0 for that of their tasks.
         peer: Name of a station that is made as the other side; empty for none.
     """
 
@@ -75,6 +76,7 @@ class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
     address: str = DEFAULT_ADDRESS
     identity: PublisherIdentity = PublisherIdentity.DEVICE
     to: str = ""
+    cycle_us: int = 0
     peer: str = ""
 
 
@@ -207,7 +209,7 @@ def _plan(
     interfaces = _interfaces(choices.address)
     names = UniqueNames()
     stations = [
-        plan_station(system, interfaces, choices.identity, report)
+        plan_station(system, interfaces, choices.identity, choices.cycle_us, report)
         for system in _systems(sources, types, names, report)
     ]
     types.take_findings()
@@ -219,6 +221,10 @@ def _plan(
             for file, found in sources.types
             if (station := _of_symbols(file, found, types, names, interfaces, report))
         ]
+        if choices.cycle_us:
+            stations = [
+                msgspec.structs.replace(each, cycle_us=choices.cycle_us) for each in stations
+            ]
     elif choices.peer and stations:
         stations = with_peers(stations, choices.peer, interfaces)
     return resolve(stations, choices.to, report), types.section()

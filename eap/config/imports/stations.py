@@ -228,6 +228,7 @@ def plan_station(
     system: ImportedSystem,
     interfaces: Iterator[InterfaceUri],
     identity: PublisherIdentity,
+    cycle_us: int,
     report: ImportReport,
 ) -> PlannedStation:
     """Return the station for one controller; its frames to NetIDs have no destination yet.
@@ -236,9 +237,10 @@ def plan_station(
         system: The controller.
         interfaces: Yields the interface of each port.
         identity: NetID that its publishers send as their own.
+        cycle_us: Its cycle; 0 for that of its tasks.
         report: Takes notes, and the types that cannot be used.
     """
-    return _StationBuilder(system, interfaces, identity, report).build()
+    return _StationBuilder(system, interfaces, identity, cycle_us, report).build()
 
 
 class _StationBuilder:
@@ -249,13 +251,16 @@ class _StationBuilder:
         system: ImportedSystem,
         interfaces: Iterator[InterfaceUri],
         identity: PublisherIdentity,
+        cycle_us: int,
         report: ImportReport,
     ) -> None:
         self._system = system
         self._report = report
         self._devices = [each for each in system.devices if self._is_enabled(each)]
         self._router, self._ports = self._addresses(interfaces, identity)
-        self._cycle_us = self._cycle()
+        self._guessed = ""
+        """Reason that the cycle is a guess."""
+        self._cycle_us = cycle_us or self._cycle()
         self._names = UniqueNames()
         self._frame_names = UniqueNames()
         self._sent: dict[tuple[str, int], str] = {}
@@ -346,8 +351,8 @@ class _StationBuilder:
         }
         found = linked or set(self._system.cycles_us)
         if not found or (not linked and len(found) > 1):
-            why = "has several tasks, none with a link to EAP" if found else "names no task"
-            self._warn(f"the project {why}: cycle_us {DEFAULT_CYCLE_US} is assumed")
+            why = "several tasks, and none has a link to EAP" if found else "no task in the files"
+            self._guessed = f"its cycle is not known ({why}): give it with --cycle"
             return DEFAULT_CYCLE_US
         cycle_us = min(found)
         limited = min(max(cycle_us, MIN_CYCLE_US), MAX_CYCLE_US)
@@ -364,6 +369,7 @@ class _StationBuilder:
         owner = plain_name(box.name, "publisher")
         to, wanted = _destination(box, port)
         reasons = [f"unknown setting in line {each.line}: {each.text}" for each in box.unknown]
+        reasons += [self._guessed] if self._guessed else []
         if box.is_disabled:
             reasons.append("disabled in the project")
         if (box.vlan_id, box.vlan_priority) != port.vlan:

@@ -210,6 +210,23 @@ def test_cycles_of_several_tasks(importer: Importer) -> None:
     assert [frame.pds[0].trigger.cycle_us for frame in station.frames] == [0, 10_000]
 
 
+@pytest.mark.parametrize(
+    ("tasks", "why"),
+    [([], "no task in the files"), ([("A", 1_000), ("B", 2_000)], "several tasks, and none has")],
+)
+def test_publisher_of_unknown_cycle_is_a_comment_until_it_is_given(
+    importer: Importer, tasks: list[tuple[str, int]], why: str
+) -> None:
+    path = importer.put("Line.tsproj", project(device(publisher("A", SPEED)), tasks=tasks))
+    (comment,) = comments(importer.run(path, choices=ImportChoices()))
+    assert f"its cycle is not known ({why}" in comment
+    importer.plant.unlink()
+    result = importer.run(path, choices=ImportChoices(cycle_us=4_000))
+    assert not comments(result)
+    (station,) = importer.loaded().stations
+    assert (station.cycle_us, len(station.frames)) == (4_000, 1)
+
+
 def test_task_that_is_no_multiple_makes_a_comment(importer: Importer) -> None:
     mapping = links("A", ("Fast Outputs^a", "Speed^Outputs^VarData")) + links(
         "B", ("Slow Outputs^b", "Running^Outputs^VarData")
