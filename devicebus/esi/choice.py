@@ -61,11 +61,11 @@ class DeviceQuery(NamedTuple):
         return ", ".join(parts) or "any device"
 
 
-def choose_device(devices: Iterable[ListedDevice], query: DeviceQuery) -> ListedDevice:
-    """Return the device that a configuration names; a revision is meant exactly.
+def choose_devices(devices: Iterable[ListedDevice], query: DeviceQuery) -> list[ListedDevice]:
+    """Return the devices that a configuration names, the best first; a revision is meant exactly.
 
-    Without one it is the highest, of those without a special version (low word 0) if there are
-    any.
+    Without one the highest comes first, and those without a special version (low word 0) before
+    the others.  Old revisions that a newer one hides are lower than it, so they need no rule.
 
     Raises:
         ValueError: there is none; the message has the known types or revisions.
@@ -77,27 +77,27 @@ def choose_device(devices: Iterable[ListedDevice], query: DeviceQuery) -> Listed
         hint = suggest(query.type, types) if query.type else ""
         raise ValueError(f"none of {len(known)} devices is {query}{hint}")
     if query.revision is None:
-        # Old revisions that a newer one hides are lower than it, so they need no rule.
-        return max(found, key=lambda each: (not each.revision & _LOW, each.revision))
+        return sorted(
+            found, key=lambda each: (not each.revision & _LOW, each.revision), reverse=True
+        )
     exact = [each for each in found if each.revision == query.revision]
     if not exact:
         revisions = ", ".join(f"0x{each:08X}" for each in sorted({d.revision for d in found}))
         raise ValueError(f"{query} has no revision 0x{query.revision:08X}; known: {revisions}")
-    return exact[0]
+    return exact
 
 
-def match_slave(devices: Iterable[ListedDevice], query: DeviceQuery) -> ListedDevice | None:
-    """Return the description of a slave with the revision of *query*, or None.
+def match_slave(devices: Iterable[ListedDevice], query: DeviceQuery) -> list[ListedDevice]:
+    """Return the descriptions of a slave with the revision of *query*, the best first.
 
-    That is the one of its revision, also if a newer one hides it, else the highest one that is not
-    above it: the high word counts, the low word is a special version and must be the same.
+    That is the one of its revision, also if a newer one hides it, then those that are not above
+    it: the high word counts, the low word is a special version and must be the same.
     """
     found = [each for each in devices if query.fits(each)]
-    if query.revision is None:
-        return max(found, key=lambda each: each.revision, default=None)
-    low = query.revision & _LOW
-    older = [d for d in found if d.revision & _LOW == low and d.revision <= query.revision]
-    return max(older, key=lambda each: each.revision, default=None)
+    if query.revision is not None:
+        low = query.revision & _LOW
+        found = [d for d in found if d.revision & _LOW == low and d.revision <= query.revision]
+    return sorted(found, key=lambda each: each.revision, reverse=True)
 
 
 def default_assignment(device: EsiDevice) -> dict[int, tuple[EsiPdo, ...]]:

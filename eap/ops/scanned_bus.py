@@ -114,19 +114,19 @@ def _find_device(
     if source is None:
         return None, None
     query = DeviceQuery(slave.vendor, slave.product, "", slave.revision)
-    located = source.match(query)
-    if located is None:
+    found = source.match(query)
+    if found is None:
         notes.append(f"no description of {query}, revision 0x{slave.revision:08X} or older")
         return None, None
-    device = source.load(located)
-    if isinstance(device, EsiDevice):
-        if device.revision != slave.revision:
-            notes.append(
-                f"described as revision 0x{device.revision:08X}, it has 0x{slave.revision:08X}"
-            )
-        return device, located.file
-    notes.append(f"{located.listed.type} cannot be used: {device[0]}")
-    return None, None
+    device, (file, listed) = found.device, found.located
+    if device is None:
+        notes.append(f"{listed.type} cannot be used: {found.findings[0]}")
+        return None, None
+    if device.revision != slave.revision:
+        notes.append(
+            f"described as revision 0x{device.revision:08X}, it has 0x{slave.revision:08X}"
+        )
+    return device, file
 
 
 def _channels(

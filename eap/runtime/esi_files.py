@@ -9,13 +9,13 @@ from __future__ import annotations
 import logging
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
-from devicebus.esi.choice import DeviceQuery, choose_device, match_slave
+from devicebus.esi.choice import DeviceQuery, choose_devices, match_slave
 from devicebus.esi.content import (
     ROOT,
     DeviceResult,
@@ -44,6 +44,14 @@ class LocatedDevice(NamedTuple):
 
     file: Path
     listed: ListedDevice
+
+
+class FoundDevice(NamedTuple):
+    """Device that was chosen; None with the reasons if it cannot be used."""
+
+    located: LocatedDevice
+    device: EsiDevice | None
+    findings: tuple[PlantFinding, ...] = ()
 
 
 class _ListedFile(msgspec.Struct, frozen=True):
@@ -89,27 +97,40 @@ class EsiSource:
         for file, content in self._files.items():
             yield from _findings(file, content.findings)
 
-    def choose(self, query: DeviceQuery) -> LocatedDevice:
+    def choose(self, query: DeviceQuery) -> FoundDevice:
         """Return the device that a configuration names.
+
+        Without a revision it is the highest one that can be used.
 
         Raises:
             ValueError: there is none; the message names the source.
         """
         if not self.is_folder and query == DeviceQuery() and self._devices:
-            return self._devices[0]
+            return self._first(self._devices[:1])
         try:
-            chosen = choose_device((each.listed for each in self._devices), query)
+            chosen = choose_devices((each.listed for each in self._devices), query)
         except ValueError as exc:
             bad = sum(bool(content.findings) for content in self._files.values())
             have = "has" if bad == 1 else "have"
             hint = f" ({bad} of its files {have} faults)" if bad else ""
             raise ValueError(f"{self.path.name}: {exc}{hint}") from None
-        return self._located(chosen)
+        return self._first(map(self._located, chosen))
 
-    def match(self, query: DeviceQuery) -> LocatedDevice | None:
-        """Return the description of a slave that was found, None without one."""
+    def match(self, query: DeviceQuery) -> FoundDevice | None:
+        """Return the best description of a slave that can be used, None without one."""
         matched = match_slave((each.listed for each in self._devices), query)
-        return None if matched is None else self._located(matched)
+        return self._first(map(self._located, matched)) if matched else None
+
+    def _first(self, candidates: Iterable[LocatedDevice]) -> FoundDevice:
+        """Return the first device that can be used, else the first one with its faults."""
+        failed = None
+        for located in candidates:
+            result = self.load(located)
+            if isinstance(result, EsiDevice):
+                return FoundDevice(located, result)
+            failed = failed or FoundDevice(located, None, result)
+        assert failed is not None  # noqa: S101  there is a candidate
+        return failed
 
     def load(self, located: LocatedDevice) -> EsiDevice | tuple[PlantFinding, ...]:
         """Return a device, or the reasons that it cannot be used."""

@@ -49,18 +49,17 @@ class EsiDevices:
             self._report.add(at, f"{spec.name}: {name} is a folder", _NAMED)
             return None
         try:
-            located = source.choose(query)
+            found = source.choose(query)
         except ValueError as exc:
             self._report.add(at, f"{spec.name}: {exc}", _NAMED)
             return None
-        device = source.load(located)
-        if isinstance(device, EsiDevice):
-            return device
-        count = len(device)
-        message = f"{spec.name}: {located.listed.type} cannot be used: {count} faults in its file"
-        self._report.add(at, message, "a description without faults")
-        self._report.adopt(device)
-        return None
+        if found.device is None:
+            listed, count = found.located.listed, len(found.findings)
+            faults = "1 fault" if count == 1 else f"{count} faults"
+            message = f"{spec.name}: {listed.type} cannot be used: {faults} in its file"
+            self._report.add(at, message, "a description without faults")
+            self._report.adopt(found.findings)
+        return found.device
 
     def _source(self, name: str, at: str) -> EsiSource | None:
         if name in self._sources:

@@ -6,7 +6,7 @@ import pytest
 
 from devicebus.esi.choice import (
     DeviceQuery,
-    choose_device,
+    choose_devices,
     default_assignment,
     default_config,
     default_modules,
@@ -46,22 +46,22 @@ def query(revision=None, **more):
 
 @pytest.mark.parametrize("revision", REVISIONS)
 def test_revision_asked_for_is_honoured(revision):
-    assert choose_device(LIST, query(revision)).revision == revision
+    assert choose_devices(LIST, query(revision))[0].revision == revision
 
 
 def test_revision_that_is_missing_names_the_known_ones():
     with pytest.raises(ValueError, match="no revision 0x00990000; known: 0x00100000, 0x00100016"):
-        choose_device(LIST, query(0x0099_0000))
+        choose_devices(LIST, query(0x0099_0000))
 
 
 def test_highest_revision_without_a_special_version_by_default():
-    assert choose_device(LIST, query()).revision == 0x0012_0000
+    assert choose_devices(LIST, query())[0].revision == 0x0012_0000
 
 
 def test_device_by_its_type():
-    assert choose_device(LIST, DeviceQuery(type="el3204")).product == PRODUCT
+    assert choose_devices(LIST, DeviceQuery(type="el3204"))[0].product == PRODUCT
     with pytest.raises(ValueError, match=r"none of 5 devices is EL3240, did you mean EL3204\?"):
-        choose_device(LIST, DeviceQuery(type="EL3240"))
+        choose_devices(LIST, DeviceQuery(type="EL3240"))
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_device_by_its_type():
 )
 def test_slave_has_the_highest_revision_that_is_not_above_it(slave, description):
     found = match_slave(LIST, query(slave))
-    assert (found and found.revision) == description
+    assert (found[0].revision if found else None) == description
 
 
 BUFFERS = (

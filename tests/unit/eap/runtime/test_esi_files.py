@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from devicebus.esi.choice import DeviceQuery
-from devicebus.esi.records import EsiDevice
 from eap.runtime import esi_files
 from eap.runtime.esi_files import EsiSource
 
@@ -96,17 +95,25 @@ def test_bad_file_of_a_folder_is_a_finding(folder):
 
 def test_device_is_chosen_by_type_and_revision(folder):
     source = EsiSource(folder)
-    assert source.choose(DeviceQuery(type="do4")).listed.revision == 0x0012_0000
-    asked = source.choose(DeviceQuery(product=DO4, revision=0x0010_0000))
-    device = source.load(asked)
-    assert isinstance(device, EsiDevice)
+    assert source.choose(DeviceQuery(type="do4")).device.revision == 0x0012_0000
+    device = source.choose(DeviceQuery(product=DO4, revision=0x0010_0000)).device
     assert (device.revision, len(device.pdos)) == (0x0010_0000, 2)
+
+
+def test_description_that_cannot_be_used_gives_way_to_an_older_one(folder):
+    old = (folder / "terminals.XML").read_text().replace("#x00120000", "#x270B0000")
+    (folder / "old.xml").write_text(old.replace('Sm="0"', 'Sm="9"'))
+    source = EsiSource(folder)
+    assert source.choose(DeviceQuery(type="DO4")).device.revision == 0x0012_0000
+    asked = source.choose(DeviceQuery(type="DO4", revision=0x270B_0000))
+    assert asked.device is None
+    assert "sync manager 9" in asked.findings[0].message
 
 
 def test_slave_is_matched_with_an_older_description(folder):
     source = EsiSource(folder)
     found = source.match(DeviceQuery(0xE5A, DO4, "", 0x0011_0000))
-    assert found.listed.revision == 0x0010_0000
+    assert found.device.revision == 0x0010_0000
     assert source.match(DeviceQuery(0xE5A, 0x99, "", 0x0011_0000)) is None
 
 
@@ -120,9 +127,8 @@ def test_unknown_device_names_faults_of_the_folder(folder):
 
 def test_file_that_is_gone_is_a_finding(folder):
     source = EsiSource(folder)
-    located = source.choose(DeviceQuery(type="SD1"))
-    located.file.unlink()
-    (finding,) = source.load(located)
+    (folder / "sub" / "drive.xml").unlink()
+    (finding,) = source.choose(DeviceQuery(type="SD1")).findings
     assert "it cannot be read: No such file" in finding.message
 
 
