@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Collection, Iterable
-from functools import cached_property, partial
+from contextlib import suppress
+from functools import cached_property, lru_cache, partial
 from itertools import accumulate
 from typing import NamedTuple, Protocol
 
@@ -42,6 +43,8 @@ from eap.codec.datatypes import DataType
 from eap.codec.structures import split_paths
 
 _INDEX_BITS = 24
+_MAX_PARTS = 4096
+"""Parts with handles that a table remembers."""
 _MAX_NAME = 2048
 """Characters of the longest name that is looked up."""
 _ALIGNMENT = 8
@@ -137,6 +140,7 @@ class SymbolTable:
         # Numbers of the variables are 1 and on: no handle is 0, even with version 0.
         self._numbers = list(accumulate(parts, initial=len(self._symbols) + 1))
         """First number of the parts of each variable, and behind those of the last one."""
+        self._part = lru_cache(maxsize=_MAX_PARTS)(self._part_by_number)
         self._types = types.encode()
         self.type_upload = b"".join(self._types.values())
 
@@ -198,6 +202,9 @@ class SymbolTable:
             return self._symbols[number - 1]
         if not 0 < number < self._numbers[-1]:
             raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND)
+        return self._part(number)
+
+    def _part_by_number(self, number: int) -> Symbol:
         index = bisect_right(self._numbers, number) - 1
         symbol = self._symbols[index]
         part = find_by_number(symbol.variable.type, number - self._numbers[index] + 1)
@@ -353,6 +360,10 @@ class SymbolSpace(AdsSpace):
         symbol, start = self._find(group, offset)
         if start + length > symbol.address.size:
             raise AdsRefusedError(AdsError.SIZE)
+        if group == IndexGroup.DATA:
+            # A member is watched by itself: its struct may change, and be large.
+            with suppress(AdsRefusedError):
+                symbol, start = self._table.part_at(offset, length), 0
         table = self._table
 
         def source() -> bytes:

@@ -275,7 +275,8 @@ class TypeEntries:
             offset //= 8
         return DataTypeEntry(
             member.name, of.id, base.size, of.name, flags=flags, offset=offset, hash=base.hash,
-            type_hash=base.type_hash, guid=base.guid, attributes=base.attributes,
+            type_hash=base.type_hash, dimensions=base.dimensions, guid=base.guid,
+            attributes=base.attributes,
         )  # fmt: skip
 
 

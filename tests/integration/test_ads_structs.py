@@ -25,20 +25,7 @@ pytestmark = pytest.mark.net
 ADDRESS, OTHER = "127.9.76.1", "127.9.76.2"
 PORT = f"{ADDRESS}.2.1"
 DEVICE = 0xFFFF
-PLANT = f"""\
-plant: structs
-defaults: {{cycle_us: 2000}}
-types:
-  E_State: {{base: INT, values: {{Off: 0, On: 1, Fault: -2}}}}
-  T_Speed: INT
-  ST_Inner: {{members: {{a: BYTE, b: LREAL, c: "INT[3]"}}}}
-  ST_Bits: {{members: {{ready: BIT, alarm: {{type: BIT}}, count: USINT}}}}
-  U_Either: {{union: {{real: LREAL, words: "WORD[4]"}}}}
-  ST_Packed:
-    pack: 1
-    members: {{on: BOOL, value: LREAL, name: STRING(21), wide: WSTRING(5), list: "INT[3]"}}
-  ST_Forty:
-    members:
+MEMBERS = """\
       flag: BOOL
       byte: BYTE
       word: WORD
@@ -79,20 +66,39 @@ types:
       bits: ST_Bits
       either: U_Either
       end: USINT
-stations:
+"""
+TYPES = "".join(
+    f"  ST_Forty{pack}:\n    pack: {pack}\n    members:\n{MEMBERS}" for pack in (1, 2, 4, 8)
+)
+PLANT = f"""\
+plant: structs
+defaults: {{cycle_us: 2000}}
+types:
+  E_State: {{base: INT, values: {{Off: 0, On: 1, Fault: -2}}}}
+  T_Speed: INT
+  ST_Inner: {{members: {{a: BYTE, b: LREAL, c: "INT[3]"}}}}
+  ST_Bits: {{members: {{ready: BIT, alarm: {{type: BIT}}, count: USINT}}}}
+  U_Either: {{union: {{real: LREAL, words: "WORD[4]"}}}}
+  ST_Packed:
+    pack: 1
+    members: {{on: BOOL, value: LREAL, name: STRING(21), wide: WSTRING(5), list: "INT[3]"}}
+{TYPES}stations:
   - name: tower
     net_id: {ADDRESS}.1.1
     ports:
       - {{name: eap0, kind: eap, interface: "udp://{ADDRESS}", net_id: {PORT}}}
     variables:
-      axis: ST_Forty
+      axis1: ST_Forty1
+      axis2: ST_Forty2
+      axis4: ST_Forty4
+      axis8: ST_Forty8
       packed: {{type: ST_Packed, default: {{name: left}}}}
       table: "ST_Inner[3]"
       ramp: ST_Inner
     sources:
       ramp.b: {{kind: ramp, low: 0, high: 1000, period_ms: 60000}}
     frames: [{{name: out, port: eap0, to: panel/eap0}}]
-    publish: [{{name: state, frame: out, id: 1, variables: [axis, packed]}}]
+    publish: [{{name: state, frame: out, id: 1, variables: [axis1, axis8, packed]}}]
   - name: panel
     net_id: {OTHER}.1.1
     ports:
@@ -227,34 +233,38 @@ def test_pyads_reads_and_writes_packed_struct(appliance, tower, types) -> None:
     assert appliance.values("tower")["packed"] == wanted | {"value": 4.5, "list": [1, -2, 7]}
 
 
-def test_pyads_reads_and_writes_forty_members_with_padding(appliance, tower, types) -> None:
-    forty = definition(types, "ST_Forty")
-    assert len(types["ST_Forty"].items) == len(VALUES) == 40
-    assert pyads.size_of_structure(forty) == types["ST_Forty"].size
-    octets = ctypes.c_uint8 * types["ST_Forty"].size
-    tower.write_by_name("axis", [0] * types["ST_Forty"].size, octets)
+@pytest.mark.parametrize("pack", [1, 2, 4, 8])
+def test_pyads_reads_and_writes_forty_members(appliance, tower, types, pack: int) -> None:
+    axis, described = f"axis{pack}", types[f"ST_Forty{pack}"]
+    forty = definition(types, f"ST_Forty{pack}")
+    assert len(described.items) == len(VALUES) == 40
+    assert pyads.size_of_structure(forty) == described.size
+    assert any(name.startswith("pad") for name, *_ in forty) is (pack > 1)
+    octets = ctypes.c_uint8 * described.size
+    tower.write_by_name(axis, [0] * described.size, octets)
     for path, value in LEAVES.items():
         kind = KINDS.get(path.partition("[")[0])  # else pyads finds it by the name of the type
-        tower.write_by_name(f"axis.{path}", value, kind)
-        assert tower.read_by_name(f"axis.{path}", kind) == value
-    assert appliance.values("tower")["axis"] == SHOWN
-    wait_until(lambda: received(appliance, "axis") == SHOWN)
-    read = tower.read_structure_by_name("axis", forty)
+        tower.write_by_name(f"{axis}.{path}", value, kind)
+        assert tower.read_by_name(f"{axis}.{path}", kind) == value
+    assert appliance.values("tower")[axis] == SHOWN
+    if pack in {1, 8}:
+        wait_until(lambda: received(appliance, axis) == SHOWN)
+    read = tower.read_structure_by_name(axis, forty)
     simple = [name for name in VALUES if name in LEAVES] + ["texts", "states"]
     assert len(simple) == 34
     assert {name: read[name] for name in simple} == {name: VALUES[name] for name in simple}
-    before = tower.read_by_name("axis", octets)
+    before = tower.read_by_name(axis, octets)
     changed = {"dint": 77, "text": "plain"}  # pyads pads a text by its characters, not its bytes
-    tower.write_structure_by_name("axis", read | changed, forty)
-    assert appliance.values("tower")["axis"] == SHOWN | changed
+    tower.write_structure_by_name(axis, read | changed, forty)
+    assert appliance.values("tower")[axis] == SHOWN | changed
     for name in changed:
-        tower.write_by_name(f"axis.{name}", VALUES[name])
-    assert tower.read_by_name("axis", octets) == before
+        tower.write_by_name(f"{axis}.{name}", VALUES[name])
+    assert tower.read_by_name(axis, octets) == before
 
 
 def test_pyads_lists_variables_and_takes_arrays_of_structs(appliance, tower, types) -> None:
     symbols = {symbol.name: symbol for symbol in tower.get_all_symbols()}
-    assert symbols["axis"].symbol_type == "ST_Forty"
+    assert symbols["axis8"].symbol_type == "ST_Forty8"
     assert symbols["table"].symbol_type == "ARRAY [0..2] OF ST_Inner"
     assert not any("." in name for name in symbols if name.startswith(("axis", "table")))
     inner = definition(types, "ST_Inner")
@@ -276,7 +286,13 @@ def test_members_of_sources_and_hostile_names_are_refused(tower) -> None:
         return int(refused.value.err_code)
 
     assert refusal("ramp.b") == AdsError.ACCESS
-    for name in ("axis[99999999999]", "table[3].b", "axis" + ".inner" * 50, "axis.inner.", "x.b"):
+    for name in (
+        "axis8[99999999999]",
+        "table[3].b",
+        "axis8" + ".inner" * 50,
+        "axis8.inner.",
+        "x.b",
+    ):
         assert refusal(name) == AdsError.SYMBOL_NOT_FOUND
 
 
@@ -326,31 +342,33 @@ const client = new Client({
   const values = JSON.parse(given);
   const symbols = await client.getSymbols();
   const types = await client.getDataTypes(false);
-  const empty = await client.getDefaultPlcObject("ST_Forty");
-  await client.writeValue("axis", empty);
-  const blank = (await client.readValue("axis")).value;
   for (const name of JSON.parse(long)) values[name] = BigInt(values[name]);
-  await client.writeValue("axis", values);
-  const read = (await client.readValue("axis")).value;
-  await client.writeValue("axis.inners[2]", { b: 8.5 }, true);
-  await client.writeValue("AXIS.BITS.ALARM", true);
-  const member = (await client.readValue("axis.inners[2].b")).value;
-  const alarm = (await client.readValue("axis.bits.alarm")).value;
-  const text = (await client.readValue("axis.wide")).value;
+  const empty = await client.getDefaultPlcObject("ST_Forty8");
+  const read = [];
+  for (const pack of [1, 2, 4, 8]) {
+    await client.writeValue(`axis${pack}`, empty);
+    read.push((await client.readValue(`axis${pack}`)).value);
+    await client.writeValue(`axis${pack}`, values);
+    read.push((await client.readValue(`axis${pack}`)).value);
+  }
+  await client.writeValue("axis8.inners[2]", { b: 8.5 }, true);
+  await client.writeValue("AXIS8.BITS.ALARM", true);
+  const member = (await client.readValue("axis8.inners[2].b")).value;
+  const alarm = (await client.readValue("axis8.bits.alarm")).value;
+  const text = (await client.readValue("axis8.wide")).value;
   const told = [];
-  const subscription = await client.subscribeValue("axis.grid[3,1]", (data) => {
+  const subscription = await client.subscribeValue("axis8.grid[3,1]", (data) => {
     told.push(data.value);
-    if (told.length == 1) client.writeValue("axis.grid[3,1]", 12.5);
+    if (told.length == 1) client.writeValue("axis8.grid[3,1]", 12.5);
   }, 20);
   while (told.length < 2) await new Promise((resolve) => setTimeout(resolve, 10));
   await subscription.unsubscribe();
   const seen = {
     symbols: Object.values(symbols).map((each) => [each.name, each.type]),
     types: Object.fromEntries(Object.values(types).map((each) => [each.name, each.size])),
-    full: (await client.getDataTypes(true))["st_forty"].subItems.length,
+    full: (await client.getDataTypes(true))["st_forty8"].subItems.length,
     state: (await client.getDataType("E_State")).enumInfos.map((each) => [each.name, each.value]),
-    same: JSON.stringify(blank, plain) == JSON.stringify(empty, plain),
-    read, member, alarm, text, told,
+    empty, read, member, alarm, text, told,
   };
   console.log(JSON.stringify(seen, plain));
   await client.disconnect();
@@ -386,14 +404,14 @@ def test_ads_client_reads_and_writes_structs_as_objects(appliance, types) -> Non
     )
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout)
-    assert ["axis", "ST_Forty"] in seen["symbols"]
+    assert ["axis8", "ST_Forty8"] in seen["symbols"]
     sizes = {each.name: each.size for each in types.values()}
     assert {name: seen["types"][name] for name in sizes} == sizes
     assert seen["full"] == 40
     assert seen["state"] == [["Off", 0], ["On", 1], ["Fault", -2]]
-    assert seen["same"] is True
     off, on, fault = ({"name": name, "value": value} for name, value in seen["state"])
-    assert seen["read"] == given | {"state": on, "states": [fault, off]}
+    filled = given | {"state": on, "states": [fault, off]}
+    assert seen["read"] == [seen["empty"], filled] * 4
     assert (seen["member"], seen["alarm"], seen["text"]) == (8.5, True, VALUES["wide"])
     assert seen["told"] == [6.0, 12.5]
     inners = [VALUES["inners"][0], VALUES["inners"][1] | {"b": 8.5}]
@@ -402,7 +420,8 @@ def test_ads_client_reads_and_writes_structs_as_objects(appliance, types) -> Non
         "inners": inners,
         "bits": {"ready": 1, "alarm": 1, "count": 3},
     }
-    assert appliance.values("tower")["axis"] == shown
+    values = appliance.values("tower")
+    assert [values[f"axis{pack}"] for pack in (1, 2, 4, 8)] == [SHOWN, SHOWN, SHOWN, shown]
 
 
 def test_changed_type_is_a_new_version_of_the_symbols(appliance, tower, types, tmp_path) -> None:
@@ -416,7 +435,7 @@ def test_changed_type_is_a_new_version_of_the_symbols(appliance, tower, types, t
     after = decode_types(bytes(tower.read(0xF00E, 0, ctypes.c_uint8 * info.type_size)))
     assert [each.name for each in after["ST_Inner"].items] == ["b", "a"]
     assert after["ST_Inner"].hash != types["ST_Inner"].hash
-    assert after["ST_Forty"].hash != types["ST_Forty"].hash
+    assert after["ST_Forty8"].hash != types["ST_Forty8"].hash
     assert after["ST_Packed"] == types["ST_Packed"]
     assert after["ST_Packed"].flags == DataTypeFlag.DATA_TYPE
     assert tower.read_by_name("table[0].b") == 0.0

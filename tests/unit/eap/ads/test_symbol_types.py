@@ -169,6 +169,7 @@ def test_struct_is_described_with_its_members(space) -> None:
         ArrayDimension(0, 2),
         ArrayDimension(1, 2),
     )
+    assert axis.items[-1].dimensions == (ArrayDimension(0, 2), ArrayDimension(1, 2))
     state = types["E_State"]
     assert (state.type_name, state.flags, state.values) == (
         "INT", 0x2001, (("Off", 0), ("On", 1), ("Fault", -2)),
@@ -379,7 +380,10 @@ def test_variable_with_the_name_of_a_path_goes_first() -> None:
 
 
 def test_watch_of_a_member_follows_it_to_the_next_table(space, store) -> None:
-    watched = space.watch(G.VALUE_BY_HANDLE, handle(space, "axis.position"), 8)
+    by_handle = space.watch(G.VALUE_BY_HANDLE, handle(space, "axis.position"), 8)
+    by_address = space.watch(G.DATA, 0, 8)
+    two_members = space.watch(G.DATA, 0, 10)
+    assert two_members() == bytes(range(10))
     del store.types["level"]
     moved = AXIS.replace("ST_Axis<80", "ST_Axis<88").replace(
         "position@0 LREAL", "position@80 LREAL"
@@ -387,11 +391,12 @@ def test_watch_of_a_member_follows_it_to_the_next_table(space, store) -> None:
     store.types["axis"] = datatypes.parse(moved)
     store.octets["axis"] = bytes(80) + b"\7" * 8
     space.replace(table_of(store, 2), store)
-    assert watched() == b"\7" * 8
+    assert by_handle() == by_address() == b"\7" * 8
     store.types["axis"] = datatypes.parse(moved.replace("LREAL", "LINT"))
     space.replace(table_of(store, 3), store)
-    with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
-        watched()
+    for watched in (by_handle, by_address, two_members):
+        with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
+            watched()
 
 
 @given(st.integers(0, 100), st.integers(1, 100))
