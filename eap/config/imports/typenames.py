@@ -53,6 +53,8 @@ class TypeNames:
         """
         if not variable.type and not variable.bits:
             raise ValueError(f"{variable.name} has neither a type nor a length")
+        if variable.bits % 8:
+            raise ValueError(f"{variable.name} has {variable.bits} bits, no whole bytes")
         try:
             kind = self.parse(variable.type, variable.guid)
         except ReportedTypeError:

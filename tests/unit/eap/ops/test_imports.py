@@ -270,6 +270,15 @@ def test_variable_with_another_length_than_its_type_is_refused(importer: Importe
     assert not importer.plant.exists()
 
 
+def test_variable_that_is_no_whole_bytes_is_refused(importer: Importer) -> None:
+    box = EapBox(
+        name="Out", is_publisher=True, variables=(EapVariable(name="V", nv_id=1, type="X", bits=4),)
+    )
+    xml = tree_items_text([EapImportDevice(name="EAP", boxes=(box,))])
+    result = importer.run(importer.put("Line.xml", xml))
+    assert messages(result) == ["V has 4 bits, no whole bytes"]
+
+
 def test_type_that_no_file_has_is_a_block_with_a_warning(importer: Importer) -> None:
     result = importer.import_project(
         device(publisher("A", ("V", 1, "ST_Far", 12))),
