@@ -182,6 +182,12 @@ def _assigned(
         for each in chosen:
             assignment[each.manager] = (*assignment.get(each.manager, ()), each.index)
     _check_assignment(slave, assignment, report, at)
+    # Without CoE the length of a sync manager chooses its PDOs: no object has to be written.
+    usual = default_assignment(slave)
+    is_other = any(pdos != usual.get(number, ()) for number, pdos in assignment.items())
+    if config.fixed_pdos and slave.has_coe and is_other:
+        message = f"{slave.name}: its PDO assignment is fixed"
+        report.add(at, message, "its default PDOs: its description has no PdoAssign")
     return replace(config, assignment=assignment)
 
 

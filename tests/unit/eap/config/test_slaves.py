@@ -265,6 +265,21 @@ def test_finding_about_what_the_slave_lacks(tmp_path, lacks, text, finding):
 
 
 @pytest.mark.parametrize(
+    ("text", "has_coe", "is_refused"),
+    [
+        ("pdos: [CSP, 0x1602]", True, True),
+        ("pdos: [CSP]", True, False),
+        ("pdos: {3: []}", False, False),
+    ],
+)
+def test_fixed_assignment_can_be_changed_without_coe_only(tmp_path, text, has_coe, is_refused):
+    keys, report = read_keys(tmp_path, text)
+    configure(replace(DRIVE, has_coe=has_coe, config=SlaveConfig(fixed_pdos=True)), keys, report)
+    found = [str(each) for each in report.findings()]
+    assert ["its PDO assignment is fixed" in each for each in found] == [True] * is_refused
+
+
+@pytest.mark.parametrize(
     ("cycle_us", "fits"), [(250, True), (1000, True), (500, True), (2000, True), (300, False)]
 )
 def test_sync0_must_fit_the_cycle_of_the_bus(cycle_us, fits):
