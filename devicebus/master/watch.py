@@ -255,6 +255,8 @@ def _begin(bus: BusState, slave: BusSlave, status: AlStatus, now_ns: int) -> Non
             if isinstance(error, IdentityError):
                 slave.mark_lost()
                 bus.close_mailbox(slave)
+                if slave.is_absent:
+                    return  # the other one is named as a stranger at its position
             bus.emit(SlaveFailed(slave.station, str(error), now_ns))
 
     work = _bring_back(bus, slave, stays=stays)

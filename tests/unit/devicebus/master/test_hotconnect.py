@@ -314,3 +314,17 @@ def test_slave_with_the_address_of_another_is_taken_in_without_it(stale):
     assert {each.state for each in line.segment.slaves} == {AlState.OP}
     assert all(exchange(line, station) for station in line.core.slaves)
     assert line.core.cycle.is_full
+
+
+def test_other_slave_with_the_address_of_the_absent_one_is_a_stranger():
+    line = tree()
+    image = line.tool.esc.image
+    line.tool.esc.image = image[:20] + (9).to_bytes(4, "little") + image[24:]
+    line.segment.cut(1)
+    bring(line)
+    line.tool.esc.memory[0x10:0x12] = (1003).to_bytes(2, "little")
+    line.segment.mend(1)
+    line.elapse(2500 * MS)
+    assert len(line.core.strangers) == 1
+    assert line.events() == []
+    assert line.core.slaves[1003].is_absent
