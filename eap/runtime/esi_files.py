@@ -36,6 +36,7 @@ logger = logging.getLogger(__name__)
 MAX_FILES = 10_000
 """Files of a folder; further ones are not read."""
 MAX_DEPTH = 4
+MAX_FOLDERS = 2000
 _VERSION = 1
 
 
@@ -193,18 +194,15 @@ def _list_file(path: Path) -> EsiList:
 
 def _files(folder: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield the XML files below *folder* in order, with their status; raise OSError."""
-    count = 0
-    with os.scandir(folder) as entries:
-        entries_here = sorted(entries, key=lambda each: each.name)
-    left = [(each, 1) for each in reversed(entries_here)]
-    while left and count < MAX_FILES:
+    count = folders = 0
+    left = [(each, 1) for each in reversed(_entries(folder))]
+    while left and count < MAX_FILES and folders < MAX_FOLDERS:
         entry, depth = left.pop()
         try:
             if entry.is_dir():
+                folders += 1
                 if depth < MAX_DEPTH:
-                    with os.scandir(entry.path) as inner:
-                        below = sorted(inner, key=lambda each: each.name)
-                    left += [(each, depth + 1) for each in reversed(below)]
+                    left += [(each, depth + 1) for each in reversed(_entries(Path(entry.path)))]
             elif entry.name.lower().endswith(".xml"):
                 status = entry.stat()
                 if stat.S_ISREG(status.st_mode):
@@ -212,6 +210,11 @@ def _files(folder: Path) -> Iterator[tuple[Path, os.stat_result]]:
                     yield Path(entry.path), status
         except OSError:
             continue  # gone meanwhile, or a folder of somebody else
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    with os.scandir(folder) as entries:
+        return sorted(entries, key=lambda each: each.name)
 
 
 def _cache_of(folder: Path) -> Path:

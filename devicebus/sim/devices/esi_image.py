@@ -46,6 +46,8 @@ def build_image(spec: SlaveSpec, plan: EsiPlan) -> bytes:
         ValueError: its description does not fit an EEPROM.
     """
     device = plan.device
+    if device.eeprom.image:
+        return _given(spec, device)
     strings = SiiStrings(spec.name, device.group or "Devices")
     image = Sii(
         fixed=_fixed(spec, device),
@@ -62,6 +64,17 @@ def build_image(spec: SlaveSpec, plan: EsiPlan) -> bytes:
         return fill(image, max(_MINIMUM, _power_of_two(device.eeprom.byte_size)))
     except CodecError as exc:
         raise ValueError(f"{device.label} does not fit an EEPROM: {exc}") from None
+
+
+def _given(spec: SlaveSpec, device: EsiDevice) -> bytes:
+    """Return the whole image that a file has, with alias and serial number of the slave."""
+    try:
+        image = sii.decode(device.eeprom.image)
+    except CodecError as exc:
+        raise ValueError(f"{device.label}: its EEPROM image cannot be used: {exc}") from None
+    fixed = msgspec.structs.replace(image.fixed, alias=spec.alias, serial=spec.serial)
+    octets = sii.encode(msgspec.structs.replace(image, fixed=fixed))
+    return octets.ljust(max(_MINIMUM, len(device.eeprom.image)), b"\xff")
 
 
 def _power_of_two(size: int) -> int:

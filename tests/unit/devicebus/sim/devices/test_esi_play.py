@@ -190,6 +190,18 @@ def test_eeprom_has_pdos_clock_modes_and_strings():
     assert not image.general.coe_pdo_configuration
 
 
+def test_whole_image_of_a_file_is_kept_but_for_alias_and_serial_number():
+    text = (ESI / "drive.xml").read_text()
+    image = slave_of(wire(device_of(text))).esc.image
+    given = text.replace("<ByteSize>4096", f"<Data>{image.hex()}</Data><ByteSize>4096")
+    copy = slave_of(wire(device_of(given), serial=7, alias=9)).esc.image
+    read = sii.decode(copy)
+    assert (read.fixed.serial, read.fixed.alias, sii.is_intact(copy)) == (7, 9, True)
+    assert (len(copy), read.rx_pdos) == (len(image), sii.decode(image).rx_pdos)
+    with pytest.raises(ValueError, match="its EEPROM image cannot be used"):
+        wire(device_of(text.replace("<ByteSize>4096", "<Data>0102</Data><ByteSize>4096")))
+
+
 HEAD = "<EtherCATInfo><Vendor><Id>2</Id></Vendor><Descriptions><Devices>"
 TAIL = "</Devices></Descriptions></EtherCATInfo>"
 
