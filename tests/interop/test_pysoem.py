@@ -389,3 +389,31 @@ def test_soem_exchanges_as_many_bytes_of_each_slave_as_our_master(tmp_path, name
             found.write_state()
         finally:
             found.close()
+
+
+def test_soem_drives_the_devices_of_esi_files():
+    """Coupler, terminals and drive of config/esi; the drive follows in CSP with SYNC0."""
+    with veth_pair(), simulator(CONFIG_BUSES / "cell.yaml"):
+        found = pysoem.Master()
+        found.open(NEAR)
+        try:
+            assert found.config_init() == 5
+            drive = found.slaves[4]
+            drive.sdo_write(0x6060, 0, b"\x08")
+            found.config_map()
+            assert found.config_dc()
+            drive.dc_sync(act=True, sync0_cycle_time=1_000_000)
+            go_to_op(found)
+            sizes = [(len(each.output), len(each.input)) for each in found.slaves]
+            assert sizes == [(0, 0), (1, 0), (0, 1), (0, 8), (6, 7)]
+            for word, status in ((6, 0x21), (7, 0x23), (15, 0x27)):
+                for _ in range(3):
+                    drive.output = word.to_bytes(2, "little") + (1000).to_bytes(4, "little")
+                    exchange(found)
+                assert drive.input[0] & 0x6F == status
+            exchange(found)
+            assert drive.input[2:6] == (1000).to_bytes(4, "little")
+            found.state = pysoem.INIT_STATE
+            found.write_state()
+        finally:
+            found.close()
