@@ -15,7 +15,6 @@ from typing import NamedTuple
 from eap.codec.basetypes import WideString
 from eap.codec.datatypes import Array, DataType, String
 from eap.codec.structures import PATH_STEP, Structure
-from eap.suggest import suggest
 
 
 class SymbolPart(NamedTuple):
@@ -134,8 +133,8 @@ def _positions(kind: Structure) -> dict[str, int]:
 def _named_member(part: SymbolPart, kind: Structure, name: str) -> SymbolPart:
     exact = name if name in kind.by_name else _folded(kind).get(name.casefold())
     if exact is None:
-        hint = suggest(name[:255], kind.by_name)
-        raise ValueError(f"{kind.name} has no member {name[:60]!r}{hint}")
+        # Without a suggestion, which takes long in a large struct: any host may ask.
+        raise ValueError(f"{kind.name} has no member {name[:60]!r}")
     return _member(part, kind, _positions(kind)[exact])
 
 

@@ -15,7 +15,7 @@ from bisect import bisect_right
 from collections.abc import Collection, Iterable
 from contextlib import suppress
 from functools import cached_property, lru_cache, partial
-from itertools import accumulate
+from itertools import accumulate, islice
 from typing import NamedTuple, Protocol
 
 from eap.ads.request import AdsRefusedError
@@ -40,7 +40,7 @@ from eap.codec.adssymbol import (
     encode_text,
 )
 from eap.codec.datatypes import DataType
-from eap.codec.structures import split_paths
+from eap.codec.structures import MAX_DEPTH, split_paths
 
 _INDEX_BITS = 24
 _MAX_PARTS = 4096
@@ -172,7 +172,8 @@ class SymbolTable:
         """
         index, path = self._index_of(name), ""
         if index is None and len(name) <= _MAX_NAME:
-            for variable, rest in split_paths(name):
+            # A longer path than types are deep leads nowhere.
+            for variable, rest in islice(split_paths(name), 2 * MAX_DEPTH):
                 index, path = self._index_of(variable), rest
                 if index is not None:
                     break
