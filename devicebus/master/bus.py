@@ -137,6 +137,7 @@ class BusSlave:
         target: Requested state.
         expected: The slave that it stands for; None if nothing is expected.
         config: Its configuration.
+        is_mapped: True once its process data was read; it is the same after a restart of the slave.
         is_configured: True if its PDOs and start-up writes of PS are done since it entered PREOP.
         is_set_up: True while its sync managers and FMMUs are configured for process data.
         channels: Sync managers of its process data.
@@ -164,6 +165,7 @@ class BusSlave:
         self.target = AlState.INIT
         self.expected = expected
         self.config = expected.config if expected is not None else SlaveConfig()
+        self.is_mapped = False
         self.is_configured = False
         self.is_set_up = False
         self.channels: tuple[ProcessDataChannel, ...] = ()

@@ -113,7 +113,10 @@ def prepare_safeop(bus: BusState, slave: BusSlave) -> Procedure[None]:
             slave, "PDO configuration in PS", _ask(bus, slave, writing, "setting PDOs")
         )
     yield from run_writes(bus, slave, Transition.PS)
-    yield from read_process_data(bus, slave)
+    # With the same configuration the mapping is that of the start: it is not read again.
+    if not slave.is_mapped:
+        yield from read_process_data(bus, slave)
+        slave.is_mapped = True
     slave.is_configured = True
 
 

@@ -149,6 +149,7 @@ def take_in(bus: BusState, slave: BusSlave) -> Procedure[None]:
             " bus with it"
         )
     slave.found = found
+    slave.is_mapped = False
 
 
 def refresh_topology(bus: BusState) -> Procedure[None]:
