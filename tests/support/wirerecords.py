@@ -28,4 +28,6 @@ def _field(kind: Scalar | Bits) -> st.SearchStrategy:
     size = struct.calcsize(f"<{kind.code}")
     if kind.code.endswith("s"):
         return st.binary(min_size=size, max_size=size).map(kind.wrap or bytes)
+    if kind.code.islower():
+        return st.integers(-1 << 8 * size - 1, (1 << 8 * size - 1) - 1)
     return st.integers(0, (1 << 8 * size) - 1)
