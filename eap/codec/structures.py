@@ -188,11 +188,18 @@ class Structure(DataType, frozen=True, kw_only=True):
         """Return the bytes of the member that all others given agree with."""
         if not given:
             raise ValueError(f"a value of {self.name} is empty: expected one of its members")
+        refused: ValueError | None = None
         for name in given:
             octets = bytearray(self.size)
-            self._put(octets, self.by_name[name], given[name])
+            try:
+                self._put(octets, self.by_name[name], given[name])
+            except ValueError as exc:  # such as a number that was read, but has no name
+                refused = refused or exc
+                continue
             if len(given) == 1 or self._agree(octets, given):
                 return bytes(octets)
+        if refused:
+            raise refused
         raise ValueError(
             f"members of the union {self.name} contradict each other: expected one of"
             f" {', '.join(given)}"
@@ -201,9 +208,15 @@ class Structure(DataType, frozen=True, kw_only=True):
     def _agree(self, octets: bytes | bytearray, given: Mapping[str, Any]) -> bool:
         for name, value in given.items():
             kind = self.by_name[name].kind
-            # Compared as read again: a text ends at its NUL, whatever is behind it.
             read = _decode(kind, octets, 0, 0)
-            if read != value and repr(read) != repr(_decode(kind, kind.encode(value), 0, 0)):
+            if read == value:
+                continue
+            try:
+                # Compared as read again: a name is a number, and a NaN equals nothing.
+                again = _decode(kind, kind.encode(value), 0, 0)
+            except ValueError:
+                return False
+            if repr(read) != repr(again):
                 return False
         return True
 
