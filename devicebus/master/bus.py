@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, TypeAlias
 
 import msgspec
@@ -12,6 +13,7 @@ from devicebus.master.clocks import drift_datagram
 from devicebus.master.cycle import Cycle, Participation
 from devicebus.master.image import BusImage
 from devicebus.master.link import CEILING_NS, INDEXES, MAX_PIGGYBACK, RETRIES, Link
+from devicebus.master.lock import CycleLock
 from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
 from devicebus.master.matching import ExpectedSlave
 from devicebus.master.pdo import ProcessDataChannel
@@ -19,6 +21,7 @@ from devicebus.master.procedure import Runner, Task
 from devicebus.master.ring import RING_INDEXES, Ring
 from devicebus.master.scan import FIRST_STATION, FoundSlave
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import DatagramReply
 from eap.od.slave_config import SlaveConfig
 
 
@@ -103,6 +106,10 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Set and synchronize distributed clocks, also if no slave is configured for SYNC0."""
     cycle_ns: int = 1_000_000
     """Time between two cycles, for SYNC0 and SYNC1 that follow it."""
+    lock: bool = False
+    """Lock the master's cycle to the reference clock: see CycleLock."""
+    lead_ns: int = 0
+    """Time before SYNC0 at which frames pass the reference clock; 0 for the default."""
     epoch_offset_ns: int = 0
     """Offset from the master's time to DC system time (nanoseconds since 2000-01-01)."""
     redundant: bool = False
@@ -226,6 +233,7 @@ class BusState:
         knows_lrw: True if the cycle uses LRW.
         probe_ns: Time of the next look at slaves that are not expected.
         strangers: Slaves that are plugged in, but not expected, in words.
+        lock: Locks the cycle to the reference clock; None if it runs free.
         ring: Merges the frames of both lines; None on a bus with one line.
         cut_ends: Station addresses before and behind the last cut of the ring, None in it for the
             master; None while the place is not known.
@@ -241,6 +249,7 @@ class BusState:
             # A cyclic frame does not wait for a dead line, others do.
             piggyback=0 if settings.redundant else MAX_PIGGYBACK,
         )
+        self.lock = _make_lock(settings) if settings.lock else None
         self.ring: Ring | None = None
         if settings.redundant:
             self.ring = Ring(self._handle_ring_change, self._is_expected)
@@ -313,6 +322,10 @@ class BusState:
         self.reference = reference
         if self.cycle is not None:
             self.cycle.extra = [] if reference is None else [drift_datagram(reference)]
+            if self.lock is not None:
+                self.cycle.handle_extra = partial(_note_time, self.lock)
+        if self.lock is not None and reference is None:
+            self.lock.hold()
 
     @property
     def beyond_cut(self) -> list[BusSlave]:
@@ -360,3 +373,18 @@ class BusState:
         self.link.stop_cycles()
         self.is_lost = self.needs_check = False
         self.strangers = ()
+
+
+def _make_lock(settings: MasterSettings) -> CycleLock:
+    """Return the lock of a cycle to the reference clock, by the earliest SYNC0 of the slaves."""
+    syncs = [each.config.sync for each in settings.expected if each.config.sync is not None]
+    signals = [found for each in syncs if (found := each.signals(settings.cycle_ns)) is not None]
+    shift_ns = min((each.shift0_ns for each in signals), default=0)
+    return CycleLock(settings.cycle_ns, settings.lead_ns, shift_ns)
+
+
+def _note_time(lock: CycleLock, replies: Sequence[DatagramReply], now_ns: int) -> None:
+    """Give the lock the time that the reference clock has put into the datagram."""
+    for reply in replies[:1]:
+        if reply.wkc:
+            lock.note(int.from_bytes(reply.data, "little"), now_ns)

@@ -88,7 +88,7 @@ class Cycle:
         self._on_fault = on_fault
         self.extra: Sequence[DatagramRequest] = ()
         """Additional datagrams of each cycle; *handle_extra* receives their replies."""
-        self.handle_extra: Callable[[Sequence[DatagramReply]], None] = lambda replies: None
+        self.handle_extra: Callable[[Sequence[DatagramReply], int], None] | None = None
         self._participation = dict.fromkeys(image.layout.slaves, Participation.ABSENT)
         self._datagrams = tuple(
             datagram
@@ -203,7 +203,8 @@ class Cycle:
                 is_good = False
         count = len(self._datagrams)
         self._received = sum(reply.wkc for reply in replies[:count])
-        self.handle_extra(replies[count:])
+        if self.handle_extra is not None:
+            self.handle_extra(replies[count:], now_ns)
         self.is_good = is_good
         if is_good:
             self._good += 1

@@ -14,6 +14,7 @@ from devicebus.master.bus import BusSlave, BusState, Event, MasterSettings
 from devicebus.master.cycle import Cycle, CycleStats
 from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
+from devicebus.master.lock import CycleLock
 from devicebus.master.mailboxes import MailboxStats
 from devicebus.master.procedure import Procedure, Task
 from devicebus.master.ring import Line, Ring
@@ -67,6 +68,16 @@ class Master:
     def ring(self) -> Ring | None:
         """Ring, None on a bus with one line; read-only."""
         return self._bus.ring
+
+    @property
+    def lock(self) -> CycleLock | None:
+        """Lock of the cycle to the reference clock; None if it runs free."""
+        return self._bus.lock
+
+    @property
+    def reference(self) -> int | None:
+        """Station address of the slave whose clock the others follow; None without one."""
+        return self._bus.reference
 
     @property
     def cut_ends(self) -> tuple[int | None, int | None] | None:
@@ -255,6 +266,8 @@ class Master:
                 slave.mailbox.forget_unanswered()
         if self._bus.ring is not None:
             self._bus.ring.forget_past()
+        if self._bus.lock is not None:
+            self._bus.lock.forget_past()
 
     def _stop(self) -> None:
         running, self._running = self._running, None

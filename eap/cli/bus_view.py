@@ -29,7 +29,7 @@ from eap.ops.bus_objects import (
 )
 from eap.ops.od import OdObjectRow
 from eap.runtime.bus_status import FindingRow
-from eap.runtime.engine_messages import EoeReport
+from eap.runtime.engine_messages import EoeReport, LockState
 
 if TYPE_CHECKING:
     from eap.ops.scanned_bus import WrittenBus
@@ -131,6 +131,8 @@ def diagnosis_view(
         f" {frames.retried} repeated\nround trip {duration(frames.round_trip_us)},"
         f" timeout {duration(frames.timeout_us)}"
     )
+    if found.lock is not None:
+        yield _lock_line(found.lock)
     if table := _emergency_table(found.slaves, now_s, is_full=is_full):
         yield ""
         yield table
@@ -142,6 +144,16 @@ def diagnosis_view(
         yield Styled(f"not plugged in: {names}", style="dim")
     for row in found.findings:
         yield Styled(finding_line(row, now_s), style="dim" if row.is_over else "red")
+
+
+def _lock_line(lock: LockState) -> str:
+    state = "locked to" if lock.is_locked else "not locked yet to"
+    clock = "no clock" if lock.reference is None else f"the clock of slave {lock.reference}"
+    return (
+        f"cycle {state} {clock}: offset {lock.offset_ns / 1000:+.1f} µs,"
+        f" drift {lock.drift_ppb / 1000:+.1f} ppm\nframes {duration(lock.lead_ns // 1000)} before"
+        f" SYNC0: {lock.late} too late, {lock.early} too early"
+    )
 
 
 def _emergency_table(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TypeAlias
 
@@ -14,6 +14,7 @@ from eap.config.routes import SectionError
 from eap.config.slaves import check_cycles, override
 from eap.config.structs import Plain, PlantFile, PortSection, StationSection
 from eap.ids import InterfaceUri, is_host
+from eap.od.slave_config import SlaveConfig
 from eap.pd.spec import GatewayAddress, GatewaySpec, PortKind
 from eap.suggest import suggest
 
@@ -61,6 +62,45 @@ def _check_second_line(port: PortSection, uri: InterfaceUri, report: FindingRepo
         report.add(path, f"{second} is the first line, too", "another interface")
 
 
+def uses_sync(configs: Iterable[SlaveConfig]) -> bool:
+    """Return whether a slave is configured for SYNC0."""
+    return any(each.sync is not None and each.sync.activate >> 8 for each in configs)
+
+
+def locked_port(index: Index, station: StationSection) -> str:
+    """Return the bus port whose reference clock the cycle of *station* follows, or nothing.
+
+    That is the one with ``lock_cycle: true``, else the first whose slaves use SYNC0.
+    """
+    ports = [port for port in station.ports if port.kind is PortKind.BUS]
+    for port in ports:
+        if port.lock_cycle:
+            return port.name
+    for port in ports:
+        slaves = index.buses[station.name, port.name].slaves
+        if port.lock_cycle is None and uses_sync(each.config for each in slaves):
+            return port.name
+    return ""
+
+
+def _check_locks(
+    plant: PlantFile,
+    buses: Mapping[tuple[str, str], ExpectedBus | None],
+    report: FindingReport,
+) -> None:
+    """Report cycles that would have to follow two clocks, or none."""
+    for station in plant.stations:
+        locked = [port for port in station.ports if port.lock_cycle]
+        for port in locked[1:]:
+            message = f"the cycle of {station.name} follows the clocks of {locked[0].name} already"
+            report.add(f"{port.at}.lock_cycle", message, "one bus with lock_cycle for a station")
+        for port in locked[:1]:
+            bus = buses.get((station.name, port.name)) or ExpectedBus()
+            if not port.clocks and not uses_sync(slave.config for slave in bus.slaves):
+                message = f"the clocks of {port.name} are not kept together"
+                report.add(f"{port.at}.lock_cycle", message, "clocks: true, or slaves with sync0")
+
+
 def describe_buses(
     plant: PlantFile, folder: Path, describe: DescribeBus, report: FindingReport
 ) -> dict[tuple[str, str], ExpectedBus | None]:
@@ -85,13 +125,14 @@ def describe_buses(
         if description is not None and not _has_names(path, port, description, report):
             description = None
         is_line = description is not None and not description.is_ring
-        if is_line and port.redundant.startswith("sim://"):
+        if is_line and port.redundant.startswith("sim:") and port.redundant == port.interface:
             message = f"{file} has one line to the master only"
             report.add(f"{port.at}.redundant", message, "ring: true in the bus file")
         if description is not None:
             description = _configure(plant, station, port, description, report)
         # The first of two ports of one name counts, as everywhere in the index.
         found.setdefault((station.name, port.name), description)
+    _check_locks(plant, found, report)
     return found
 
 

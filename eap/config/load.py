@@ -34,7 +34,14 @@ from eap.config.brokers import (
     shared_network,
     warn_of_open_brokers,
 )
-from eap.config.bus import DescribeBus, bus_file, check_gateways, describe_buses, gateway_spec
+from eap.config.bus import (
+    DescribeBus,
+    bus_file,
+    check_gateways,
+    describe_buses,
+    gateway_spec,
+    locked_port,
+)
 from eap.config.document import convert, read, read_net_id
 from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
@@ -330,6 +337,8 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
             port.frame_timeout_us,
             port.frame_retries,
             port.redundant,
+            locked_port(index, station) == port.name,
+            port.sync_lead_us,
         ),
         gateway=gateway_spec(index, station, port),
         eoe=eoe_spec(port),

@@ -194,6 +194,8 @@ class PortSection(Section, frozen=True):
     frame_timeout_us: FrameTimeout = 1_000_000
     frame_retries: FrameRetries = 4
     redundant: str = ""
+    lock_cycle: bool | None = None
+    sync_lead_us: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
     gateway: GatewaySection = GatewaySection()
     slaves: dict[str, PortSlaveSection] = {}
     eoe: EoeSection | None = None
@@ -222,6 +224,8 @@ class PortSection(Section, frozen=True):
         "frame_timeout_us",
         "frame_retries",
         "redundant",
+        "lock_cycle",
+        "sync_lead_us",
         "gateway",
         "slaves",
         "eoe",

@@ -137,6 +137,7 @@ class EngineBuses:
             station.memory_of,
             first,
             second,
+            entry.set_step if port.bus is not None and port.bus.lock_cycle else None,
         )
         station.connect_bus(bus)
         entry.buses[port.name] = bus
@@ -170,6 +171,8 @@ def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> 
         clocks=spec.clocks,
         cycle_ns=1000 * cycle_us,
         epoch_offset_ns=epoch_offset_ns,
+        lock=spec.lock_cycle,
+        lead_ns=1000 * spec.sync_lead_us,
         redundant=bool(spec.redundant),
     )
 

@@ -15,6 +15,7 @@ from eap.runtime.engine_messages import (
     BusChange,
     BusReport,
     EmergencyReport,
+    LockState,
     PortErrorReport,
     RingState,
     SlaveDescription,
@@ -58,6 +59,23 @@ def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
         trip_ns=cycle.trip_ns if cycle else 0,
         max_trip_ns=cycle.max_trip_ns if cycle else 0,
         ring=_ring(bus, now_ns),
+        lock=_lock(bus, now_ns),
+    )
+
+
+def _lock(bus: EngineBus, now_ns: int) -> LockState | None:
+    if bus.master.lock is None:
+        return None
+    report = bus.master.lock.report()
+    return LockState(
+        reference=bus.master.reference,
+        is_locked=report.is_locked,
+        offset_ns=report.offset_ns,
+        drift_ppb=report.drift_ppb,
+        lead_ns=report.lead_ns,
+        late=report.late,
+        early=report.early,
+        fault_ns=None if report.fault_ns is None else now_ns - report.fault_ns,
     )
 
 

@@ -163,6 +163,8 @@ class EngineBus:
         memory_of: Returns where a station reads what a writer writes.
         port: The wire.
         second: Second line to a ring of slaves, None on a bus with one line.
+        set_step: Sets the distance to the next cycle of the station in ns; None on a bus whose
+            reference clock it does not follow.
 
     Attributes:
         is_up: Whether the bus has been brought up, in any state of its slaves.
@@ -178,6 +180,7 @@ class EngineBus:
         memory_of: Callable[[Writer], memoryview],
         port: BusPort,
         second: BusPort | None = None,
+        set_step: Callable[[int], None] | None = None,
     ) -> None:
         self.spec = spec.bus or BusPortSpec()
         self.master = Master(settings)
@@ -189,6 +192,7 @@ class EngineBus:
         self._mapping = BusMapping(spec, image, memory_of)
         self._port = port
         self._second = second
+        self._set_step = set_step
         self._starting: Task[None] | None = None
         self._start_fault = "it is being brought up"
         self._wire_fault = ""
@@ -341,6 +345,8 @@ class EngineBus:
         self._mapping.put_outputs()
         self.master.start_cycle(now_ns)
         self._send(now_ns)
+        if self._set_step is not None and self.master.lock is not None:
+            self._set_step(self.master.lock.take_step())
         self.faults.now_ns = now_ns
         self.faults.handle_events(self.master)
 

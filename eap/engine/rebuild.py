@@ -56,6 +56,10 @@ def follow_station(port: TcpPort, station: Station, name: str) -> None:
     port.follow(sends_to(spec, name), [station.handlers[name]] if asks else [])
 
 
+_LOCK_RANGE = 50
+"""A clock of a bus changes the cycle by less than this part of it."""
+
+
 class EngineStation:
     """A station of the engine and its image; both are replaced together."""
 
@@ -65,6 +69,13 @@ class EngineStation:
         self.buses: dict[str, EngineBus] = {}
         """By port."""
         self.tcp_ports: dict[str, TcpPort] = {}
+
+    def set_step(self, step_ns: int) -> None:
+        """Set the distance from the present cycle to the next, as a clock of a bus wants it."""
+        station = self.station
+        # A bus keeps the cycle that it was started with, also if that of the station is changed.
+        if abs(step_ns - station.cycle_ns) * _LOCK_RANGE < station.cycle_ns:
+            station.step_ns = step_ns
 
     def update_tcp(self) -> None:
         """Keep connections only to the present destinations of the station."""

@@ -32,7 +32,7 @@ from eap.gateway.slaves import NO_DICTIONARY, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.ops.bus_session import Begin, Slave, choose, no_mailbox
 from eap.runtime.bus_status import FrameCounts
-from eap.runtime.engine_messages import SlaveReport
+from eap.runtime.engine_messages import LockState, SlaveReport
 
 T = TypeVar("T")
 
@@ -157,6 +157,10 @@ class GatewayBus:
 
     def forget(self) -> None:
         """Do nothing: a gateway has no such service."""
+
+    def lock_state(self) -> LockState | None:
+        """Return None: the cycle of no station follows clocks by way of it."""
+        return None
 
     def reports(self) -> Mapping[int, SlaveReport]:
         """Return nothing: a gateway reports no history."""

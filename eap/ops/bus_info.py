@@ -37,9 +37,10 @@ from eap.runtime.bus_status import (
     emergency_rows,
     find_emergencies,
     find_eoe_faults,
+    find_lock_faults,
     finding_row,
 )
-from eap.runtime.engine_messages import EoeReport, SlaveReport
+from eap.runtime.engine_messages import EoeReport, LockState, SlaveReport
 
 _TRIES = 3
 _PAUSE_NS = 100_000_000
@@ -127,6 +128,8 @@ class Diagnosis(msgspec.Struct, frozen=True):
     eoe: EoeReport | None = None
     absent: list[NamedSlave] = []
     """Optional slaves that are not plugged in."""
+    lock: LockState | None = None
+    """Lock of the station's cycle to the clocks of the bus; None if it runs free."""
 
 
 class CounterReset(msgspec.Struct, frozen=True):
@@ -220,6 +223,7 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
         causes = [
             *find_causes(views, found, history),
             *find_emergencies(reports.values()),
+            *find_lock_faults(bus.lock_state()),
             *find_eoe_faults(bus.eoe_report()),
         ]
     # A fault of an absent slave: others of its hot-connect group are there.
@@ -232,6 +236,7 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
     return Diagnosis(
         frames=bus.frame_counts(),
         eoe=bus.eoe_report(),
+        lock=bus.lock_state(),
         findings=[finding_row(each, names, now_s) for each in causes],
         starts_at=None
         if fault is None

@@ -35,7 +35,7 @@ from eap.runtime.bus_status import (
     is_silent,
     report_findings,
 )
-from eap.runtime.engine_messages import BusReport, EoeReport, SlaveReport, no_mailbox
+from eap.runtime.engine_messages import BusReport, EoeReport, LockState, SlaveReport, no_mailbox
 
 T = TypeVar("T")
 
@@ -158,6 +158,10 @@ class RunningBus:
         """Run a procedure to its end and return its result, or raise its error."""
         del name
         return drive(procedure, self._step)
+
+    def lock_state(self) -> LockState | None:
+        """Return the lock of the cycle to the clocks of the bus, as of the last :meth:`known`."""
+        return self._report.lock
 
     def reports(self) -> Mapping[int, SlaveReport]:
         """Return the reports of the master by station address, as of the last :meth:`known`."""

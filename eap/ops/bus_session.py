@@ -36,7 +36,7 @@ from eap.errors import EapError
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
 from eap.runtime.bus_status import FrameCounts, count_frames
-from eap.runtime.engine_messages import EoeReport, SlaveReport
+from eap.runtime.engine_messages import EoeReport, LockState, SlaveReport
 
 T = TypeVar("T")
 
@@ -139,6 +139,10 @@ class BusSession:
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the frames of this session."""
         return count_frames(self._bus.link.stats())
+
+    def lock_state(self) -> LockState | None:
+        """Return None: the cycle of no station follows clocks by way of it."""
+        return None
 
     def reports(self) -> Mapping[int, SlaveReport]:
         """Return nothing: this master keeps no history."""
@@ -324,6 +328,9 @@ class SlaveBus(Protocol):
 
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the master's frames."""
+
+    def lock_state(self) -> LockState | None:
+        """Return the lock of the cycle to the clocks of the bus; None if it runs free."""
 
     def reports(self) -> Mapping[int, SlaveReport]:
         """Return the reports of a running master by station address; else nothing."""

@@ -84,7 +84,7 @@ class Engine:
             return
         station = self._stations[index]
         station.cycle(due_ns, now_ns)
-        following_ns = due_ns + station.cycle_ns
+        following_ns = due_ns + station.step_ns
         # Missed cycles are counted and not run late: a burst of them would delay all stations.
         if following_ns < now_ns:
             missed = -(-(now_ns - following_ns) // station.cycle_ns)

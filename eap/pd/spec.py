@@ -325,6 +325,10 @@ class BusPortSpec(SpecRecord, frozen=True):
     """Times that a frame that is overdue is sent again."""
     redundant: str = ""
     """Interface of the second line to the other end of the slaves; empty without a ring."""
+    lock_cycle: bool = False
+    """True if the cycle of the station follows the reference clock of this bus."""
+    sync_lead_us: int = 0
+    """Time before SYNC0 at which frames then pass that clock; 0 for 30 % of the cycle."""
 
 
 class LinkSpec(SpecRecord, frozen=True):

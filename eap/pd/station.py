@@ -66,6 +66,8 @@ class Station:
         self.spec = spec
         self.image = image
         self.cycle_ns = spec.cycle_us * 1000
+        self.step_ns = self.cycle_ns
+        """Distance to the next cycle: another one where the station follows a clock of a bus."""
         self.device = EapDevice()
         self._words = image.words
         self._wake = wake

@@ -23,7 +23,16 @@ from devicebus.master.findings import (
 )
 from devicebus.master.link import LinkStats
 from devicebus.wire.alstatus import state_name
-from eap.runtime.engine_messages import BusReport, EmergencyReport, EoeReport, SlaveReport
+from eap.runtime.engine_messages import (
+    BusReport,
+    EmergencyReport,
+    EoeReport,
+    LockState,
+    SlaveReport,
+)
+
+_LOCK_FAULT_NS = 10_000_000_000
+"""Frames that missed their time are a present fault for so long."""
 
 
 class NamedSlave(msgspec.Struct, frozen=True):
@@ -97,8 +106,30 @@ def report_findings(report: BusReport) -> list[BusFinding]:
         *find_causes(views),
         *find_unanswered(_mailboxes(report)),
         *find_emergencies(report.slaves),
+        *find_lock_faults(report.lock),
         *find_eoe_faults(report.eoe),
     ]
+
+
+def find_lock_faults(lock: LockState | None) -> Iterator[BusFinding]:
+    """Yield that frames miss the time before SYNC0, or that there is no clock to follow."""
+    if lock is None:
+        return
+    if lock.reference is None:
+        yield BusFinding(
+            what="the cycle runs free: no slave with a distributed clock answers",
+            advice="check the first slave with a clock",
+        )
+    elif lock.fault_ns is not None and lock.fault_ns < _LOCK_FAULT_NS:
+        yield BusFinding(
+            what=(
+                f"frames miss their time before SYNC0: {lock.late} too late, {lock.early} too early"
+                f" (more than {lock.lead_ns // 2000} µs), last"
+                f" {lock.fault_ns // 1_000_000_000} s ago"
+            ),
+            advice="see the lateness of the cycle in status, or raise sync_lead_us",
+            until_ns=lock.fault_ns,
+        )
 
 
 def find_emergencies(slaves: Iterable[SlaveReport]) -> Iterator[BusFinding]:
@@ -254,6 +285,7 @@ def bus_document(report: BusReport | None, now_s: float) -> dict[str, Any]:
             "max_trip_us": report.max_trip_ns // 1000,
             "frames": count_frames(report),
             **_ring_document(report, now_s),
+            **({} if report.lock is None else {"lock": report.lock}),
             **({} if report.eoe is None else {"eoe": report.eoe}),
         }
     }

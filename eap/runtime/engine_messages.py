@@ -260,6 +260,26 @@ class RingState(msgspec.Struct, frozen=True, kw_only=True):
     mended_ns: int | None = None
 
 
+class LockState(msgspec.Struct, frozen=True, kw_only=True):
+    """Lock of the cycle to the reference clock of the bus; times in nanoseconds."""
+
+    reference: int | None
+    """Station address of the slave with that clock; None without one."""
+    is_locked: bool
+    offset_ns: int
+    """Mean offset of the frames from the set point, positive if they come late."""
+    drift_ppb: int
+    """Drift of the host's clock from the reference, positive if it is fast, in 1e-9."""
+    lead_ns: int
+    """Set point before SYNC0."""
+    late: int
+    """Frames that came later than half of the lead while the cycle was locked."""
+    early: int
+    """Frames that came as much too early."""
+    fault_ns: int | None
+    """Age of the last of both."""
+
+
 class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Description of a bus; counters since the engine started, times in nanoseconds."""
 
@@ -296,6 +316,8 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     max_trip_ns: int = 0
     ring: RingState | None = None
     """None on a bus with one line."""
+    lock: LockState | None = None
+    """None if the cycle does not follow the clocks of this bus."""
     malformed: int = 0
     """Malformed messages of services, for all buses of the engine together."""
     dropped: int = 0

@@ -144,7 +144,7 @@ def test_more_datagrams_go_with_a_cycle():
     f = Fixture()
     taken = []
     f.cycle.extra = [frmw(1, 0x910, 8)]
-    f.cycle.handle_extra = taken.extend
+    f.cycle.handle_extra = lambda replies, now_ns: taken.extend(replies)
     accesses = f.round(7, b"...WXYZ")
     assert [each.command for each in accesses] == [Command.LRW, Command.FRMW]
     assert taken[0].data == b"...WXYZ\0"

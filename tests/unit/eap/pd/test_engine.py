@@ -234,3 +234,14 @@ def test_a_station_that_is_replaced_may_have_another_cycle(before_us, after_us, 
     engine.handle_timeout(due_ns)
     assert new.image.words[StationWord.CYCLE] == 1
     assert new.image.words[StationWord.OVERRUNS] == 0
+
+
+def test_station_that_follows_a_clock_runs_at_its_step():
+    fast, _ = make("fast")
+    engine = Engine([fast])
+    engine.start(10 * MS)
+    run(engine, 11 * MS)
+    fast.step_ns = MS + 700
+    assert run(engine, 14 * MS)[1:] == [13 * MS + 700]
+    fast.step_ns = MS
+    assert run(engine, 15 * MS) == [14 * MS + 1400]
