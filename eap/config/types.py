@@ -272,9 +272,17 @@ class TypeTable:
         other: Structure | None = None
         with suppress(ValueError):
             other = compiled()
-        message = f"{each.name} has {_bytes(each.bits)} there, its members make another size"
-        if other is not None and other.bit_length != each.bits:
-            message = f"{each.name} has {_bytes(each.bits)} there, {other.size} by its members"
+        wrong = [(m, kind) for m, kind in kinds if m.bits not in {None, kind.bit_length}]
+        if wrong:
+            member, kind = wrong[0]
+            message = (
+                f"{member.name} of {each.name} has {_bytes(member.bits or 0)} there,"
+                f" as {kind.name} {_bytes(kind.bit_length)}"
+            )
+        else:
+            ends = ((m.bit_offset or 0) + kind.bit_length for m, kind in kinds)
+            size = max(ends, default=0) if other is None else other.bit_length
+            message = f"{each.name} has {_bytes(each.bits)} there, {_bytes(size)} by its members"
         table = "\n".join(_side_by_side(each, kinds, other))
         return self._reported(each, message, f"one size:\n{table}")
 

@@ -85,7 +85,10 @@ def test_type_of_a_file_is_shown_by_name_as_json(plant: Path) -> None:
     ("words", "reason"),
     [
         (["ST_Axs"], "no type 'ST_Axs', did you mean ST_Axis?"),
-        (["ST_Bad"], "axis.tmc:3: ST_Bad has 2 bytes there, 4 by its members; expected one size:"),
+        (
+            ["ST_Bad"],
+            "axis.tmc:3: b of ST_Bad has 2 bytes there, as REAL 4 bytes; expected one size:",
+        ),
     ],
 )
 def test_type_that_cannot_be_shown(plant: Path, words: list[str], reason: str) -> None:

@@ -119,9 +119,7 @@ def test_type_of_a_file_that_nothing_uses_is_no_finding(tmp_path):
 def test_size_that_contradicts_the_file_is_shown_beside_ours(tmp_path):
     (found,) = findings(tmp_path, types="  - axis.tmc", axis="ST_Wrong")
     what, *table = found.splitlines()
-    assert what == (
-        "axis.tmc:9: ST_Wrong has 16 bytes there, its members make another size; one size:"
-    )
+    assert what == ("axis.tmc:9: r of ST_Wrong has 4 bytes there, as LREAL 8 bytes; one size:")
     assert [line.split() for line in table] == [
         ["given", "computed"],
         ["b", "at", "0", "size", "1", "at", "0", "size", "1", "BYTE"],
@@ -180,7 +178,11 @@ def test_pointer_is_refused_where_the_type_is_used(tmp_path):
         ("  5", "2: types is 5; a mapping or a list"),
         (
             "  A: {size: 8, members: {x: INT}}",
-            "3: A has 8 bytes there, 2 by its members; one size:",
+            "3: A has 8 bytes there, 2 bytes by its members; one size:",
+        ),
+        (
+            "  A: {size: 8, extends: B}\n  B: {members: {x: INT}}",
+            "3: A has 8 bytes there, 2 bytes by its members; one size:",
         ),
         ("\n".join(f"  A{n}: {{members: {{x: A{n + 1}}}}}" for n in range(20)) + "\n  A20: INT",
          "A0 is nested too deeply; at most 16 levels"),
