@@ -24,6 +24,7 @@ from devicebus.master.pdo import (
     write_configuration,
 )
 from devicebus.master.procedure import Procedure, Sleep, Task, write
+from devicebus.master.telegrams import read_telegrams, write_lists
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
 from devicebus.wire.sii import SiiProtocol
@@ -106,9 +107,8 @@ def prepare_safeop(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """
     if slave.is_configured:
         return
-    config = slave.config
-    if slave.mailbox is not None and _has(slave, SiiProtocol.COE) and not config.fixed_pdos:
-        writing = write_configuration(config, slave.mailbox.sizes)
+    writing = _pdo_configuration(slave)
+    if writing is not None:
         yield from _named(
             slave, "PDO configuration in PS", _ask(bus, slave, writing, "setting PDOs")
         )
@@ -120,6 +120,16 @@ def prepare_safeop(bus: BusState, slave: BusSlave) -> Procedure[None]:
     slave.is_configured = True
 
 
+def _pdo_configuration(slave: BusSlave) -> Conversation[None] | None:
+    """Return the conversation that sets the PDOs of a slave; None if it takes none."""
+    if slave.mailbox is None:
+        return None
+    sizes = slave.mailbox.sizes
+    if _has(slave, SiiProtocol.COE):
+        return None if slave.config.fixed_pdos else write_configuration(slave.config, sizes)
+    return write_lists(slave.config.mapping, sizes) if _has(slave, SiiProtocol.SOE) else None
+
+
 def read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Read the PDO mapping of a slave in PREOP."""
     sii, config = slave.found.sii, slave.config
@@ -127,6 +137,8 @@ def read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
         channels = yield from _ask(bus, slave, read_channels(sii), "reading PDOs")
     else:
         channels = channels_from_sii(sii, config.assignment)
+        if slave.mailbox is not None and _has(slave, SiiProtocol.SOE):
+            channels = yield from _ask(bus, slave, read_telegrams(channels), "reading telegrams")
     slave.channels = with_watchdog(channels, enabled=config.watchdogs.enabled)
 
 

@@ -41,6 +41,8 @@ _CYCLIC_BIT = 0x0100
 _TIMES = 1 << 32
 """Times in nanoseconds are 32 bits in the registers."""
 _MAX_ENTRIES = 254
+_FIXED_WORDS = (134, 135)
+"""IDNs of master control word and drive status word."""
 _MANAGERS = {str(number): number for number in range(16)}
 
 
@@ -277,7 +279,8 @@ def _mapped(
                 message = f"{slave.name}: {len(entries)} entries in PDO {pdo.label}"
                 report.add(at, message, f"at most {_MAX_ENTRIES}")
                 continue
-            mapping[pdo.index] = tuple(_entries(slave, pdo, entries, report, at))
+            found = tuple(_entries(slave, pdo, entries, report, at))
+            mapping[pdo.index] = (*_fixed_word(pdo, found), *found)
     return replace(config, mapping=mapping, assignment=assignment)
 
 
@@ -302,13 +305,25 @@ def _find_entry(slave: DescribedSlave, pdo: DescribedPdo, text: str) -> MappedOb
             return MappedObject(each.index, each.subindex, each.bit_length)
     place, slash, bits_text = text.partition("/")
     try:
-        number = ObjectId.parse(place.strip())
+        number = _object_id(place.strip())
         bits = int(bits_text) if slash else _bit_length(slave, number)
     except ValueError:
         return None
     if not 0 < bits <= _MAX_ENTRY_BITS:
         return None
     return MappedObject(number.object_index, number.subindex, bits)
+
+
+def _object_id(text: str) -> ObjectId:
+    """Return an entry as an object or as an IDN; raise ValueError if it is neither."""
+    return ObjectId(Idn.parse(text).number) if text[1:2] == "-" else ObjectId.parse(text)
+
+
+def _fixed_word(pdo: DescribedPdo, entries: Iterable[MappedObject]) -> Iterator[MappedObject]:
+    """Yield the first entry of a telegram (SoE), which no list can leave out."""
+    for first in pdo.entries[:1]:
+        if first.index in _FIXED_WORDS and all(each.index != first.index for each in entries):
+            yield MappedObject(first.index, first.subindex, first.bit_length)
 
 
 def _bit_length(slave: DescribedSlave, number: ObjectId) -> int:

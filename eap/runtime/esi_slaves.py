@@ -146,7 +146,7 @@ def _pdos(plan: EsiPlan) -> Iterator[DescribedPdo]:
             manager=manager,
             assigned=pdo.index in assigned,
             mandatory=pdo.is_mandatory,
-            fixed=pdo.is_fixed or coe is None or not coe.pdo_config,
+            fixed=not plan.device.is_soe and (pdo.is_fixed or coe is None or not coe.pdo_config),
             excludes=pdo.excludes,
             entries=tuple(_entries(pdo, manager)),
         )

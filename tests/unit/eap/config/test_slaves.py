@@ -114,6 +114,15 @@ def test_mapping_by_names_objects_and_lengths(tmp_path):
     assert [each.type for each in found.inputs] == ["UINT", "SINT", "DINT", "", "UINT"]
 
 
+def test_mapping_of_a_telegram_keeps_its_control_word(tmp_path):
+    words = (entry("control word", 134), entry("position", 47, 32, "DINT"))
+    mdt = DescribedPdo(index=24, name="MDT", is_output=True, manager=2, entries=words)
+    drive = replace(DRIVE, pdos=(mdt,), outputs=words, inputs=(), has_coe=False)
+    found = configured(tmp_path, "mapping: {24: [position, S-0-0036/32]}", drive)
+    assert [each.index for each in found.config.mapping[24]] == [134, 47, 36]
+    assert [each.index for each in found.outputs] == [134, 47, 36]
+
+
 def test_start_up_writes_have_values_of_the_described_type(tmp_path):
     found = configured(
         tmp_path,
