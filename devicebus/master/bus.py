@@ -22,6 +22,7 @@ from devicebus.master.ring import RING_INDEXES, Ring
 from devicebus.master.scan import FIRST_STATION, FoundSlave
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import DatagramReply
+from eap.codec.mailbox import MailboxType
 from eap.od.slave_config import SlaveConfig
 
 
@@ -304,7 +305,20 @@ class BusState:
     def open_mailbox(self, slave: BusSlave, area: MailboxArea) -> None:
         """Open the slave's mailbox."""
         self.close_mailbox(slave)
-        slave.mailbox = Mailbox(slave.station, area, self.runner, self.emit)
+        slave.mailbox = Mailbox(slave.station, area, self.runner, self.emit, self.forward)
+
+    def forward(
+        self, source: int, address: int, kind: MailboxType, data: bytes, now_ns: int
+    ) -> bool | None:
+        """Forward a message of a slave to the slave with a station address.
+
+        Returns True if it is queued, False if it is dropped, None if no other slave has the
+        address.
+        """
+        target = self.slaves.get(address)
+        if target is None or address == source:
+            return None
+        return target.mailbox is not None and target.mailbox.post(source, kind, data, now_ns)
 
     def close_mailbox(self, slave: BusSlave) -> None:
         """Close the slave's mailbox; its pending conversations fail."""

@@ -34,6 +34,7 @@ from devicebus.mailbox.conversation import (
 )
 from devicebus.mailbox.protocol import MINIMUM_SIZE, MailboxSizes
 from devicebus.master.conversation_queue import ConversationQueue, QueuedConversation
+from devicebus.master.forwarding import LIMIT_NS, ForwardedMessage, ForwardQueue
 from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure, Runner, Sleep, Task, read, write
 from devicebus.wire.datagram import fprd, fpwr
@@ -196,6 +197,8 @@ class Unsolicited(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 Report: TypeAlias = Callable[[Unsolicited], None]
+Forward: TypeAlias = Callable[[int, int, MailboxType, bytes, int], bool | None]
+"""Forwards a message: source, address, type, data, time; None if it is for no other slave."""
 
 
 class MailboxStats(msgspec.Struct, frozen=True, kw_only=True):
@@ -221,6 +224,10 @@ class MailboxStats(msgspec.Struct, frozen=True, kw_only=True):
     """Messages without a request, because the request had timed out."""
     unsolicited: int
     malformed: int
+    forwarded: int
+    """Messages of this slave that went to other slaves."""
+    forward_dropped: int
+    """Messages from or to this slave that could not be forwarded."""
     latency_ns: int
     """Latency of the last request, from its start to its reply."""
     mean_latency_ns: int
@@ -233,6 +240,8 @@ class RequestCounters:
     __slots__ = (
         "answered",
         "errors",
+        "forward_dropped",
+        "forwarded",
         "last_error",
         "last_ns",
         "late",
@@ -250,6 +259,7 @@ class RequestCounters:
     def __init__(self) -> None:
         self.sent = self.received = self.timeouts = self.errors = 0
         self.late = self.unsolicited = self.malformed = 0
+        self.forwarded = self.forward_dropped = 0
         self.answered = self.last_ns = self.max_ns = self.total_ns = 0
         self.last_error = ""
         self.unanswered = 0
@@ -296,6 +306,8 @@ class RequestCounters:
             late=self.late,
             unsolicited=self.unsolicited,
             malformed=self.malformed,
+            forwarded=self.forwarded,
+            forward_dropped=self.forward_dropped,
             latency_ns=self.last_ns,
             mean_latency_ns=self.total_ns // self.answered if self.answered else 0,
             max_latency_ns=self.max_ns,
@@ -310,15 +322,25 @@ class Mailbox:
         area: Addresses and sizes of its mailbox sync managers.
         runner: Runner of its procedures.
         report: Called with unsolicited messages.
+        forward: Called with messages to other stations.
     """
 
-    def __init__(self, station: int, area: MailboxArea, runner: Runner, report: Report) -> None:
+    def __init__(
+        self,
+        station: int,
+        area: MailboxArea,
+        runner: Runner,
+        report: Report,
+        forward: Forward = lambda *_: None,
+    ) -> None:
         self.station = station
         self.sizes = MailboxSizes(area.to_slave_size, area.to_master_size)
         self._port = MailboxPort(station, area)
         self._runner = runner
         self._report = report
         self._queue = ConversationQueue()
+        self._forward = forward
+        self._forwards = ForwardQueue()
         self._watch = CounterCheck()
         self._counter = 0
         self._work: Task[None] | None = None
@@ -355,6 +377,15 @@ class Mailbox:
         self._queue.add(job)
         self._begin(self._serve(), now_ns)
         return job.task
+
+    def post(self, source: int, kind: MailboxType, data: bytes, now_ns: int) -> bool:
+        """Write a message of another slave as soon as this one takes it; False if it cannot be."""
+        message = ForwardedMessage(source, kind, data, now_ns + LIMIT_NS)
+        fits = MailboxHeader.SIZE + len(data) <= self.sizes.to_slave
+        if not (self._is_open and fits and self._forwards.add(message)):
+            return False
+        self._begin(self._serve(), now_ns)
+        return True
 
     @property
     def is_busy(self) -> bool:
@@ -400,10 +431,11 @@ class Mailbox:
             self._work = self._runner.start(work, now_ns, f"slave {self.station}: its mailbox")
 
     def _serve(self) -> Procedure[None]:
-        """Serve conversations until none is left."""
+        """Serve conversations and forwarded messages until none is left."""
         try:
             _, now_ns = yield Sleep(0)
-            while (ready_ns := self._queue.next_ready()) is not None:
+            while (ready_ns := self._next_ready(now_ns)) is not None:
+                yield from self._deliver()
                 job = self._queue.next_job(now_ns)
                 if job is None:
                     _, now_ns = yield Sleep(min(ready_ns - now_ns, MAX_PAUSE_NS))
@@ -411,6 +443,41 @@ class Mailbox:
                     now_ns = yield from self._serve_one(job)
         finally:
             self._is_busy = False
+
+    def _next_ready(self, now_ns: int) -> int | None:
+        """Return the time of the next work; None without any."""
+        if self._forwards.first is not None:
+            return now_ns + MAX_PAUSE_NS
+        return self._queue.next_ready()
+
+    def _deliver(self) -> Procedure[None]:
+        """Write the messages of other slaves that wait, as far as the slave takes them."""
+        while self._forwards.first is not None:
+            if not (yield from self._write_first()):
+                # A slave whose mailbox is full may not read requests: empty it first.
+                with suppress(EapError):
+                    if (yield from self._port.is_full()):
+                        yield from self._receive(None)
+                return
+
+    def _write_first(self) -> Procedure[bool]:
+        """Write the first message of another slave; return False if it has to wait."""
+        message = self._forwards.first
+        if message is None:
+            return True
+        self._counter = next_counter(self._counter)
+        header = MailboxHeader(0, message.source, type=message.type, counter=self._counter)
+        octets = encode_message(header, message.data)
+        is_written = False
+        with suppress(EapError):  # counted when its time is over
+            written = yield from self._write_message(octets, message.deadline_ns)
+            is_written = written.is_accepted or written.is_ambiguous
+        _, now_ns = yield Sleep(0)
+        if not is_written and now_ns < message.deadline_ns:
+            return False
+        self._forwards.end_first(is_written=is_written)
+        self._counters.forward_dropped += not is_written
+        return True
 
     def _poll(self) -> Procedure[None]:
         """Read waiting messages, then serve conversations that were started meanwhile."""
@@ -473,6 +540,8 @@ class Mailbox:
             if now_ns >= deadline_ns:
                 raise self._timeout(step, "")
             pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)
+            if self._forwards.first is not None:  # the slave may need it for its reply
+                yield from self._write_first()
             is_full = yield from self._is_full(deadline_ns)
 
     def _send(self, step: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage | None]:
@@ -542,21 +611,41 @@ class Mailbox:
             return None
         data = bytes(body)
         # After a repeat request the slave may send a message that has arrived all the same.
-        if not self._watch.is_new(header.counter):
+        if not self._watch.is_new(header.counter) or (
+            header.address and (yield from self._forward_to(header.address, header.type, data))
+        ):
             return None
         if step is not None and self._queue.matcher(step.type).answers(header, data, step):
             if header.type == MailboxType.ERR:
                 raise self._mailbox_error(data)
             self._queue.matcher(step.type).note_part(data)
             return MailboxMessage(header.type, data, counter=header.counter)
-        if self._queue.matcher(header.type).store(data):
-            return None
-        if is_unsolicited(header.type, data):
+        if not self._queue.matcher(header.type).store(data):
+            yield from self._handle_other(header.type, data)
+        return None
+
+    def _handle_other(self, kind: MailboxType, data: bytes) -> Procedure[None]:
+        """Handle a message that answers no request of the master."""
+        source = self._forwards.take_source(kind, data)
+        if source is not None and (yield from self._forward_to(source, kind, data)):
+            return
+        if is_unsolicited(kind, data):
             self._counters.unsolicited += 1
-            self._report(Unsolicited(self.station, header.type, data))
+            self._report(Unsolicited(self.station, kind, data))
         else:
             self._counters.late += 1
-        return None
+
+    def _forward_to(self, address: int, kind: MailboxType, data: bytes) -> Procedure[bool]:
+        """Forward a message to another slave; return False if the address is that of none."""
+        _, now_ns = yield Sleep(0)
+        is_forwarded = self._forward(self.station, address, kind, data, now_ns)
+        if is_forwarded is None:
+            return False
+        self._counters.forwarded += is_forwarded
+        self._counters.forward_dropped += not is_forwarded
+        if is_forwarded:
+            self._forwards.take_source(kind, data)  # a reply with the address echoed
+        return True
 
     def _mailbox_error(self, data: bytes) -> EapError:
         try:

@@ -156,6 +156,8 @@ def _report(
         mailbox_timeouts=0 if stats is None else stats.unanswered,
         mailbox_timeout_ns=None if missed_ns is None else now_ns - missed_ns,
         mailbox_late=0 if stats is None else stats.late,
+        forwarded=0 if stats is None else stats.forwarded,
+        forward_dropped=0 if stats is None else stats.forward_dropped,
         port_errors=tuple(
             PortErrorReport(port, now_ns - seen.since_ns, now_ns - seen.until_ns)
             for port, seen in bus.master.port_errors.of(slave.station).items()

@@ -196,6 +196,10 @@ class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
     """Nanoseconds since the last of them."""
     mailbox_late: int = 0
     """Replies that came after their request had timed out."""
+    forwarded: int = 0
+    """Mailbox messages that it sent to other slaves."""
+    forward_dropped: int = 0
+    """Mailbox messages from or to it that could not be forwarded."""
     port_errors: tuple[PortErrorReport, ...] = ()
     """Ports whose errors were counted while the master read them."""
     emergencies: int = 0
