@@ -38,7 +38,7 @@ _TRANSITIONS = frozenset(("IP", "PS", "SP", "SO", "OS", "OP", "PI", "SI", "OI", 
 _SIZES = ("MinSize", "DefaultSize", "MaxSize")
 
 
-class DeviceIdentity(NamedTuple):
+class EsiIdentity(NamedTuple):
     """Identity of a device, for lists of files too."""
 
     type: str
@@ -48,13 +48,13 @@ class DeviceIdentity(NamedTuple):
     name: str
 
 
-def identify(element: XmlElement, fields: Fields) -> DeviceIdentity:
+def identify(element: XmlElement, fields: Fields) -> EsiIdentity:
     """Return the identity of the device of *element*."""
     kind = element.find("Type")
     if kind is None:
-        return DeviceIdentity("", 0, 0, english(element))
+        return EsiIdentity("", 0, 0, english(element))
     text = " ".join(kind.text.split())
-    return DeviceIdentity(
+    return EsiIdentity(
         text,
         fields.attribute(kind, "ProductCode"),
         fields.attribute(kind, "RevisionNo"),

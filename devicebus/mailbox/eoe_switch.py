@@ -54,7 +54,7 @@ class _Port:
         self.received = self.sent = self.dropped = self.invalid = 0
 
 
-class _Address(NamedTuple):
+class _LearnedPort(NamedTuple):
     port: int
     until_ns: int
 
@@ -70,7 +70,7 @@ class EthernetSwitch:
         self._notify = notify
         self._ports: dict[int, _Port] = {}
         self._connected: set[int] = set()
-        self._addresses: dict[bytes, _Address] = {}
+        self._addresses: dict[bytes, _LearnedPort] = {}
 
     def connect(self, port: int) -> None:
         """Let frames go to a port."""
@@ -124,7 +124,7 @@ class EthernetSwitch:
     def _learn(self, mac: bytes, port: int, now_ns: int) -> None:
         # Behind the others again, so that the first one was silent longest.
         self._addresses.pop(mac, None)
-        self._addresses[mac] = _Address(port, now_ns + AGEING_NS)
+        self._addresses[mac] = _LearnedPort(port, now_ns + AGEING_NS)
         if len(self._addresses) > MAX_ADDRESSES:
             del self._addresses[next(iter(self._addresses))]
 

@@ -17,7 +17,7 @@ from devicebus.master.link import LinkStats
 from devicebus.master.lock import CycleLock
 from devicebus.master.mailboxes import MailboxStats
 from devicebus.master.procedure import Procedure, Task
-from devicebus.master.ring import Line, Ring
+from devicebus.master.ring import Ring, RingEnd
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import shut_down, start_up
 from devicebus.master.watch import (
@@ -204,7 +204,7 @@ class Master:
         copies, self._copies = self._copies, []
         return copies
 
-    def receive_frame(self, data: Buffer, now_ns: int, line: Line = Line.FIRST) -> None:
+    def receive_frame(self, data: Buffer, now_ns: int, line: RingEnd = RingEnd.FIRST) -> None:
         """Handle a frame that came back on a line."""
         ring = self._bus.ring
         if ring is None:

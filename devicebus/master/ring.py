@@ -60,7 +60,7 @@ _COUNTED = _BY_POSITION | _BROADCAST
 _NOP, _FRMW = int(Command.NOP), int(Command.FRMW)
 
 
-class Line(IntEnum):
+class RingEnd(IntEnum):
     """Line from the master to an end of the ring."""
 
     FIRST = 0
@@ -97,9 +97,9 @@ class _SentCopies:
         self.is_done = False
 
     @property
-    def missing_line(self) -> Line:
+    def missing_line(self) -> RingEnd:
         """Line whose copy has not come; the other has."""
-        return Line.FIRST if self.halves[Line.FIRST] is None else Line.SECOND
+        return RingEnd.FIRST if self.halves[RingEnd.FIRST] is None else RingEnd.SECOND
 
 
 class Ring:
@@ -155,10 +155,10 @@ class Ring:
             self._heard_ns = [now_ns, now_ns]
         return copies
 
-    def receive_frame(self, line: Line, data: Buffer, now_ns: int) -> Buffer | None:
+    def receive_frame(self, line: RingEnd, data: Buffer, now_ns: int) -> Buffer | None:
         """Handle a frame that arrives on *line*; return a whole frame for the link, or None."""
         index = data[3] if len(data) > EtherCatHeader.SIZE + _SIZE else -1
-        copy = Line(index >= _SECOND_BIT)
+        copy = RingEnd(index >= _SECOND_BIT)
         sent = self._sent.get(index & ~_SECOND_BIT) if index >= 0 else None
         if sent is None or not _is_copy(data, sent.copies[copy]):
             self.unexpected += 1
@@ -171,21 +171,21 @@ class Ring:
             self.reached = None  # known again by the next broadcast
         if copy is not line:
             self._note(sent, now_ns, is_whole=True)
-            if copy is Line.FIRST:
+            if copy is RingEnd.FIRST:
                 return self._finish(sent, data)
             # Not processed.  If the ring was cut behind it, the half of the first copy is all.
             sent.second_is_unprocessed = True
-            return self._finish_half(sent) if sent.halves[Line.FIRST] else None
+            return self._finish_half(sent) if sent.halves[RingEnd.FIRST] else None
         self._note(sent, now_ns, is_whole=False)
         self._count_slaves(copy, sent.copies[copy], data, now_ns)
         if sent.is_done:
             return None
         sent.halves[copy] = bytes(data)
-        other = Line(1 - copy)
+        other = RingEnd(1 - copy)
         if sent.halves[other] is None:
             self._missing[other] += 1
             is_alone = self._silent[other] or sent.second_is_unprocessed
-            is_alone = is_alone or (self.is_opened and copy is Line.FIRST)
+            is_alone = is_alone or (self.is_opened and copy is RingEnd.FIRST)
             if not is_alone and not self._is_of_all_slaves(sent.copies[copy], data):
                 self._waiting[sent.copies[0][3]] = sent
                 return None
@@ -208,7 +208,7 @@ class Ring:
                 and now_ns - self._heard_ns[line] >= self._dead_ns
             ):
                 self._silent[line] = True
-                if line is Line.FIRST:
+                if line is RingEnd.FIRST:
                     self._set_reached(0, now_ns)
                 self._end(sent)
                 frames.append(_merge(sent.copies[0], *sent.halves))
@@ -321,10 +321,10 @@ class Ring:
         self._cut_ns = now_ns
         self._place = self._mended_ns = None
 
-    def _count_slaves(self, copy: Line, sent: bytes, data: Buffer, now_ns: int) -> None:
+    def _count_slaves(self, copy: RingEnd, sent: bytes, data: Buffer, now_ns: int) -> None:
         """Read from a broadcast of the first line how many slaves are before the cut."""
         # Each slave on the way increments ADP, whether it answers or not.
-        if copy is Line.FIRST and sent[EtherCatHeader.SIZE] in _COUNTED:
+        if copy is RingEnd.FIRST and sent[EtherCatHeader.SIZE] in _COUNTED:
             at = EtherCatHeader.SIZE + 2
             before = int.from_bytes(sent[at : at + 2], "little")
             self._set_reached(int.from_bytes(data[at : at + 2], "little") - before & 0xFFFF, now_ns)

@@ -20,7 +20,7 @@ from eap.errors import ControlError
 from eap.ids import NetId
 
 if TYPE_CHECKING:
-    from eap.ops.discover import DiscoveredPd, Discovery
+    from eap.ops.discover import DiscoveredPd, ObserverFeed
     from eap.ops.takers import Taker
 
 _USUAL_S = 5.0
@@ -103,13 +103,13 @@ def discover(
 
     Exits with 1 when nothing was found, with 2 when the interface or file cannot be read.
     """
-    from eap.ops.discover import Discovery, discovered
+    from eap.ops.discover import ObserverFeed, discovered
 
     _check_usage(interface, pcap, net_ids, for_s)
     if target is not None and target.exists() and not force:
         raise click.UsageError(f"{target} exists: --force overwrites it")
     takers = _takers(plants)
-    discovery = Discovery()
+    discovery = ObserverFeed()
     fault = None
     if pcap is not None:
         fault = _read(discovery, pcap)
@@ -158,7 +158,7 @@ def _takers(plants: tuple[Path, ...]) -> list[Taker]:
     return takers_of(stations)
 
 
-def _read(discovery: Discovery, path: Path) -> str | None:
+def _read(discovery: ObserverFeed, path: Path) -> str | None:
     """Read a capture; return its fault, where what came before it counts all the same."""
     from eap.errors import CodecError
 
@@ -172,7 +172,7 @@ def _read(discovery: Discovery, path: Path) -> str | None:
 
 
 def _watch(
-    discovery: Discovery, interface: str, for_s: float | None, takers: list[Taker] | None
+    discovery: ObserverFeed, interface: str, for_s: float | None, takers: list[Taker] | None
 ) -> None:
     """Watch an interface until the time is over or a signal comes; redraw with *takers*."""
     from eap.cli.discover_view import live_view
@@ -230,7 +230,7 @@ def _completed(
     return completed
 
 
-def _show(rows: list[DiscoveredPd], discovery: Discovery, output: Renderer) -> None:
+def _show(rows: list[DiscoveredPd], discovery: ObserverFeed, output: Renderer) -> None:
     from eap.cli.discover_view import discovery_view, notes
 
     if output.is_json:

@@ -11,7 +11,7 @@ from eap.cli.status_findings import PUBLISHER_HINT, VERSION_HINT
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
-    from eap.ops.discover import DiscoveredPd, Discovery
+    from eap.ops.discover import DiscoveredPd, ObserverFeed
 
 _SPARE_LINES = 4
 """Lines of a live screen beside the rows: heading, column names, rule, prompt."""
@@ -109,7 +109,7 @@ class _LiveTable:
 
 
 def live_view(
-    rows: Sequence[DiscoveredPd], discovery: Discovery, interface: str
+    rows: Sequence[DiscoveredPd], discovery: ObserverFeed, interface: str
 ) -> Iterator[RenderableType]:
     """Yield the screen of a running capture."""
     losses = " ".join(discovery.losses.lines())
@@ -141,7 +141,7 @@ def destination_text(row: DiscoveredPd) -> str:
     return f"{scheme}{row.destination}{vlan}"
 
 
-def notes(rows: Sequence[DiscoveredPd], discovery: Discovery) -> Iterator[str]:
+def notes(rows: Sequence[DiscoveredPd], discovery: ObserverFeed) -> Iterator[str]:
     """Yield what an operator should look at, the losses of the capture among it."""
     yield from discovery.losses.lines()
     for publisher in dict.fromkeys(row.publisher for row in rows):

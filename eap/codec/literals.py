@@ -30,7 +30,7 @@ def read_literal(text: str) -> Literal:
     Raises:
         ValueError: brackets or quotes do not match, or are nested too deeply.
     """
-    reader = _Reader(text)
+    reader = _LiteralReader(text)
     parts = [reader.value(0)]
     while reader.take(","):
         parts.append(reader.value(0))
@@ -58,7 +58,7 @@ def _quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
-class _Reader:
+class _LiteralReader:
     """Position in a text."""
 
     def __init__(self, text: str) -> None:

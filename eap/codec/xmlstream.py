@@ -164,7 +164,7 @@ class XmlReader:
     ) -> None:
         from defusedxml.ElementTree import XMLParser  # most programs read no XML
 
-        self._builder = _Builder(
+        self._builder = _TreeBuilder(
             frozenset(wanted), tuple(roots), frozenset(ignored), limits, select
         )
         self._parser = XMLParser(target=self._builder, forbid_dtd=True)
@@ -242,7 +242,7 @@ def read_tree(
     return root
 
 
-class _Builder:
+class _TreeBuilder:
     """Target of the parser: keeps the elements of interest, with their lines."""
 
     def __init__(

@@ -26,7 +26,7 @@ from devicebus.master.findings import NO_ANSWER
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
 from devicebus.master.procedure import Task
-from devicebus.master.ring import Line
+from devicebus.master.ring import RingEnd
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from eap.engine.bus_mapping import BusMapping
 from eap.errors import EnvironmentalError
@@ -374,7 +374,7 @@ class EngineBus:
             frame = self._receive_frame(port)
             if frame is None:
                 break
-            self.master.receive_frame(frame, now_ns, Line.SECOND)
+            self.master.receive_frame(frame, now_ns, RingEnd.SECOND)
         self.master.merge_overdue(now_ns)
 
     def _receive_frame(self, port: BusPort) -> bytes | None:

@@ -25,7 +25,7 @@ from eap.net.capture import FrameCapture
 from eap.ops.packets import Packet, capture_drops, iter_capture, unwrap
 from eap.ops.takers import Taker
 from eap.pd.appearance import guess
-from eap.pd.observer import MAX_PDS, FramePath, ObservedPd, Observer, PdKey
+from eap.pd.observer import MAX_PDS, ObservedPath, ObservedPd, ObservedPdKey, Observer
 from eap.pd.rhythm import CycleOrder
 from eap.pd.words import PdDropReason, Reason
 
@@ -154,8 +154,8 @@ class CaptureLosses(NamedTuple):
             yield f"capture: {self.not_kept} PDs not kept: more than {MAX_PDS} at a time"
 
 
-class Discovery:
-    """Observer with its source of frames.
+class ObserverFeed:
+    """Observer fed by a source of frames.
 
     Attributes:
         observer: The PDs seen so far.
@@ -165,7 +165,7 @@ class Discovery:
     def __init__(self) -> None:
         self.observer = Observer()
         self.now_ns = 0
-        self._paths: dict[tuple[bytes, int], FramePath] = {}
+        self._paths: dict[tuple[bytes, int], ObservedPath] = {}
         self._dropped: int | None = None
         self._errors: Mapping[str, int] = {}
 
@@ -240,24 +240,24 @@ class Discovery:
             self.observer.receive_frame(packet.payload, at_ns, _tagged(frame_path(packet), tci))
 
 
-def _tagged(path: FramePath, tci: int) -> FramePath:
+def _tagged(path: ObservedPath, tci: int) -> ObservedPath:
     """Return *path* with the VLAN of a tag that the kernel took out."""
     return path._replace(vlan_id=tci & 0xFFF) if tci and path.vlan_id is None else path
 
 
-def frame_path(packet: Packet) -> FramePath:
+def frame_path(packet: Packet) -> ObservedPath:
     """Return the path of a packet, with port numbers only where they are not the usual one."""
     if packet.transport == "ethernet":
-        return FramePath(packet.transport, packet.source, packet.destination, packet.vlan_id)
+        return ObservedPath(packet.transport, packet.source, packet.destination, packet.vlan_id)
     source, destination = (
         host if int(port) == EAP_PORT else f"{host}:{port}"
         for host, _, port in (each.partition(":") for each in (packet.source, packet.destination))
     )
-    return FramePath(packet.transport, source, destination, packet.vlan_id)
+    return ObservedPath(packet.transport, source, destination, packet.vlan_id)
 
 
 def discovered(
-    discovery: Discovery, takers: Iterable[Taker], *, with_guess: bool = True
+    discovery: ObserverFeed, takers: Iterable[Taker], *, with_guess: bool = True
 ) -> list[DiscoveredPd]:
     """Return a row for each PD, by publisher and ID; the guess of its content takes longest."""
     by_id: dict[int, list[Taker]] = {}
@@ -274,7 +274,7 @@ def _row_order(row: DiscoveredPd) -> tuple[list[int], int, str]:
     return [int(part) for part in row.publisher.split(".")], row.pd_id, row.destination
 
 
-def _compare(key: PdKey, takers: Iterable[Taker]) -> tuple[str | None, list[RefusedBy]]:
+def _compare(key: ObservedPdKey, takers: Iterable[Taker]) -> tuple[str | None, list[RefusedBy]]:
     """Return the subscriptions that take a PD, or those that drop it."""
     taking, refusing = [], []
     for each in takers:
@@ -355,7 +355,7 @@ def complete(
 
 def _unseen(pd: PublishedPd, takers: Iterable[Taker]) -> DiscoveredPd:
     publisher = NetId.parse(pd.publisher)
-    key = PdKey(
+    key = ObservedPdKey(
         publisher, pd.pd_id, pd.version, pd.length, pd.transport, pd.destination, vlan_id=None
     )
     taken_by, refused_by = _compare(key, takers) if pd.transport else (None, [])

@@ -14,7 +14,7 @@ from eap.codec.xmlstream import CHUNK, XmlError, XmlReader
 from eap.config.finding import PlantFinding
 from eap.config.imports.insertion import InsertionError, insert_stations
 from eap.config.imports.planttext import plant_text, station_lines
-from eap.config.imports.records import ImportNote, ImportReport, Outcome
+from eap.config.imports.records import ImportNote, ImportOutcome, ImportReport
 from eap.config.imports.resolution import resolve, with_peers
 from eap.config.imports.stations import (
     DEFAULT_CYCLE_US,
@@ -90,7 +90,7 @@ class ImportResult(msgspec.Struct, frozen=True, kw_only=True):
         added_to: Existing plant file that the stations were to be added to; empty for none.
         why_beside: Reason that another file than *added_to* was written; empty if it was that one.
         stations: Names of the stations.
-        notes: Outcome for each part of the files, with the reason.
+        notes: ImportOutcome for each part of the files, with the reason.
         findings: Errors; nothing is written then.
     """
 
@@ -286,10 +286,10 @@ def _of_symbols(
             kind = "its name is used twice, or has spaces or slashes"
         used.add(symbol.name)
         if isinstance(kind, str):
-            report.note(file, symbol.line, symbol.name, Outcome.LEFT, kind)
+            report.note(file, symbol.line, symbol.name, ImportOutcome.LEFT, kind)
             continue
         variables.append(PlannedVariable(symbol.name, kind.name, symbol.comment))
-        report.note(file, symbol.line, symbol.name, Outcome.TAKEN, f"variable {kind.name}")
+        report.note(file, symbol.line, symbol.name, ImportOutcome.TAKEN, f"variable {kind.name}")
     if not variables:
         return None
     port = PlannedPort(name="eap0", interface=str(uri), net_id=NetId(bytes(net_id[:4]) + b"\2\1"))

@@ -12,7 +12,7 @@ from eap.control.device import EXPORT
 from eap.errors import ControlError
 from eap.ids import NetId
 from eap.ops.client import connect_those
-from eap.pd.observer import PdKey
+from eap.pd.observer import ObservedPdKey
 from eap.pd.spec import PortKind, PortSpec, RxPdSpec, StationSpec
 from eap.pd.words import PdDropReason
 
@@ -32,7 +32,7 @@ class Taker(NamedTuple):
         """``STATION/PD``, as the plant file and ``eapctl status`` name it."""
         return f"{self.station}/{self.subscription.name}"
 
-    def refusal(self, pd: PdKey) -> PdDropReason | None:
+    def refusal(self, pd: ObservedPdKey) -> PdDropReason | None:
         """Return the reason for which this subscription drops *pd*, None if it takes it."""
         wanted = self.subscription
         if wanted.publisher and NetId.parse(wanted.publisher) != pd.publisher:
@@ -43,7 +43,7 @@ class Taker(NamedTuple):
             return PdDropReason.VERSION
         return None if pd.length == self.length else PdDropReason.LENGTH
 
-    def is_reached(self, pd: PdKey) -> bool:
+    def is_reached(self, pd: ObservedPdKey) -> bool:
         """Return whether frames to the destination of *pd* can arrive at its port.
 
         The host's own MAC addresses are not known here: any counts as reached.

@@ -26,7 +26,7 @@ _EXAMINED = 256
 """Bytes at the begin that are looked at; the rest is one part."""
 
 
-class Part(NamedTuple):
+class LikelyVariable(NamedTuple):
     """Some bytes of a PD that look like one variable."""
 
     offset: int
@@ -42,19 +42,19 @@ class Part(NamedTuple):
         return f"{where}: {self.type}, {self.text}" if self.text else f"{where}: {self.type}"
 
 
-def guess(samples: Sequence[bytes]) -> list[Part]:
+def guess(samples: Sequence[bytes]) -> list[LikelyVariable]:
     """Return the parts of a PD whose data was *samples*, oldest first; empty with too few."""
     if len(samples) < _LEAST_SAMPLES or not samples[0]:
         return []
     size = len(samples[0])
-    parts: list[Part] = []
+    parts: list[LikelyVariable] = []
     offset = anchor = 0
     while offset < size:
         part = None
         # Unknown bytes are passed by twos: few variables have an odd size.
         if len(parts) < MAX_PARTS - 1 and offset < _EXAMINED and (offset - anchor) % 2 == 0:
             part = _part_at(samples, offset)
-        found = part or Part(offset, 1, "BLOCK", "")
+        found = part or LikelyVariable(offset, 1, "BLOCK", "")
         before = parts[-1] if parts else None
         if part is None and before is not None and before.type == "BLOCK":
             parts[-1] = before._replace(size=before.size + 1)
@@ -66,7 +66,7 @@ def guess(samples: Sequence[bytes]) -> list[Part]:
     return [_describe(samples, each) for each in parts]
 
 
-def _part_at(samples: Sequence[bytes], offset: int) -> Part | None:
+def _part_at(samples: Sequence[bytes], offset: int) -> LikelyVariable | None:
     """Return what begins at *offset*, None if nothing is recognised there."""
     for reader in _READERS:
         part = reader(samples, offset)
@@ -75,7 +75,7 @@ def _part_at(samples: Sequence[bytes], offset: int) -> Part | None:
     return None
 
 
-def _text_at(samples: Sequence[bytes], offset: int) -> Part | None:
+def _text_at(samples: Sequence[bytes], offset: int) -> LikelyVariable | None:
     """Recognise printable ASCII, with the zero bytes behind it."""
     shortest = min(_printable(each, offset) for each in samples)
     if shortest < _SHORTEST_TEXT:
@@ -84,7 +84,7 @@ def _text_at(samples: Sequence[bytes], offset: int) -> Part | None:
     while end < len(samples[0]) and not any(each[end] for each in samples):
         end += 1
     text = samples[-1][offset:end].rstrip(b"\0").decode("ascii", "replace")[:24]
-    return Part(offset, end - offset, f"STRING({end - offset})", f"such as {text!r}")
+    return LikelyVariable(offset, end - offset, f"STRING({end - offset})", f"such as {text!r}")
 
 
 def _printable(sample: bytes, offset: int) -> int:
@@ -94,21 +94,21 @@ def _printable(sample: bytes, offset: int) -> int:
     return end - offset
 
 
-def _counter_at(samples: Sequence[bytes], offset: int) -> Part | None:
+def _counter_at(samples: Sequence[bytes], offset: int) -> LikelyVariable | None:
     """Recognise a whole number that grows by the same small step each time, and wraps."""
     for size, kind in _COUNTERS:
         steps = _steps(samples, offset, size)
         if len(set(steps)) == 1 and 0 < steps[0] <= min(_MOST_STEP, (1 << 8 * size) // 8):
-            return Part(offset, size, kind, f"a counter, {steps[0]} more each time")
+            return LikelyVariable(offset, size, kind, f"a counter, {steps[0]} more each time")
     return None
 
 
-def _uneven_counter_at(samples: Sequence[bytes], offset: int) -> Part | None:
+def _uneven_counter_at(samples: Sequence[bytes], offset: int) -> LikelyVariable | None:
     """Recognise a whole number that grows by small steps; the low bytes of a REAL may do so too."""
     for size, kind in _COUNTERS[:2]:
         steps = _steps(samples, offset, size)
         if steps and min(steps) > 0 and max(steps) <= _MOST_STEP:
-            return Part(offset, size, kind, "a counter")
+            return LikelyVariable(offset, size, kind, "a counter")
     return None
 
 
@@ -121,7 +121,7 @@ def _steps(samples: Sequence[bytes], offset: int, size: int) -> list[int]:
     return [(after - before) % (1 << 8 * size) for before, after in pairwise(values)]
 
 
-def _real_at(samples: Sequence[bytes], offset: int) -> Part | None:
+def _real_at(samples: Sequence[bytes], offset: int) -> LikelyVariable | None:
     """Recognise floating-point numbers of plausible size."""
     for size, kind, form in ((4, "REAL", "<f"), (8, "LREAL", "<d")):
         if offset + size > len(samples[0]):
@@ -130,10 +130,10 @@ def _real_at(samples: Sequence[bytes], offset: int) -> Part | None:
         if not all(map(_is_plausible, values)):
             continue
         if len(set(values)) > 1:
-            return Part(offset, size, kind, f"{min(values):.6g} to {max(values):.6g}")
+            return LikelyVariable(offset, size, kind, f"{min(values):.6g} to {max(values):.6g}")
         # A set point may be constant; then it is a number with few digits, which bytes are rarely.
         if values[0] and struct.pack(form, float(f"{values[0]:.4g}")) == samples[0][offset:][:size]:
-            return Part(offset, size, kind, f"{values[0]:.6g}, constant")
+            return LikelyVariable(offset, size, kind, f"{values[0]:.6g}, constant")
     return None
 
 
@@ -141,14 +141,14 @@ def _is_plausible(value: float) -> bool:
     return isfinite(value) and (value == 0 or _SMALLEST <= abs(value) <= _LARGEST)
 
 
-def _flag_at(samples: Sequence[bytes], offset: int) -> Part | None:
+def _flag_at(samples: Sequence[bytes], offset: int) -> LikelyVariable | None:
     """Recognise a byte that is 0 or 1 by turns."""
     if {each[offset] for each in samples} == {0, 1}:
-        return Part(offset, 1, "BYTE", "0 or 1: a flag")
+        return LikelyVariable(offset, 1, "BYTE", "0 or 1: a flag")
     return None
 
 
-def _small_at(samples: Sequence[bytes], offset: int) -> Part | None:
+def _small_at(samples: Sequence[bytes], offset: int) -> LikelyVariable | None:
     """Recognise a changing whole number of 4 or 2 bytes whose upper half is its sign."""
     for size, kind in ((4, "DINT"), (2, "INT")):
         if offset + size > len(samples[0]):
@@ -161,11 +161,11 @@ def _small_at(samples: Sequence[bytes], offset: int) -> Part | None:
             int.from_bytes(each[offset : offset + size], "little", signed=True) for each in samples
         ]
         if len(set(values)) > 1:
-            return Part(offset, size, kind, f"{min(values)} to {max(values)}")
+            return LikelyVariable(offset, size, kind, f"{min(values)} to {max(values)}")
     return None
 
 
-_READERS: tuple[Callable[[Sequence[bytes], int], Part | None], ...] = (
+_READERS: tuple[Callable[[Sequence[bytes], int], LikelyVariable | None], ...] = (
     _text_at,
     _counter_at,
     _flag_at,
@@ -176,7 +176,7 @@ _READERS: tuple[Callable[[Sequence[bytes], int], Part | None], ...] = (
 """In the order in which they are tried."""
 
 
-def _describe(samples: Sequence[bytes], part: Part) -> Part:
+def _describe(samples: Sequence[bytes], part: LikelyVariable) -> LikelyVariable:
     """Complete a part that nothing recognised: whether its bytes change."""
     if part.type != "BLOCK":
         return part

@@ -35,7 +35,7 @@ _BOTH = 3
 """Both values of the toggle bit."""
 
 
-class FramePath(NamedTuple):
+class ObservedPath(NamedTuple):
     """Route of a frame: addresses as in the plant file, ports only where not the usual one."""
 
     transport: str
@@ -58,7 +58,7 @@ class FramePath(NamedTuple):
         return self.destination.partition(":")[0]
 
 
-class PdKey(NamedTuple):
+class ObservedPdKey(NamedTuple):
     """Identity of an observed PD: two versions, lengths or destinations are two PDs."""
 
     publisher: bytes
@@ -105,7 +105,7 @@ class ObservedPd:
         "wrong_length",
     )
 
-    def __init__(self, key: PdKey) -> None:
+    def __init__(self, key: ObservedPdKey) -> None:
         self.key = key
         self.rhythm = Rhythm()
         self.sources: list[str] = []
@@ -195,15 +195,15 @@ class Observer:
     """
 
     def __init__(self, limit: int = MAX_PDS) -> None:
-        self.pds: dict[PdKey, ObservedPd] = {}
+        self.pds: dict[ObservedPdKey, ObservedPd] = {}
         self.frames = self.wrong_length = self.cut = self.malformed = self.not_kept = 0
         self.other_types: dict[int, int] = {}
         self._limit = limit
-        self._seen_once: dict[PdKey, None] = {}
+        self._seen_once: dict[ObservedPdKey, None] = {}
         self._hosts: dict[str, tuple[int, int]] = {}
         self._room = _SAMPLES_SIZE
 
-    def receive_frame(self, data: Buffer, at_ns: int, path: FramePath) -> None:
+    def receive_frame(self, data: Buffer, at_ns: int, path: ObservedPath) -> None:
         """Note a frame, which starts at its EtherCAT header; nothing in it raises."""
         try:
             ethercat = EtherCatHeader.decode(data)
@@ -220,7 +220,7 @@ class Observer:
         self.cut += frame.is_cut
         asked = self._hosts.get(path.destination_host)
         for pd, content in frame.pds:
-            key = PdKey(
+            key = ObservedPdKey(
                 frame.header.publisher, pd.pd_id, pd.version, pd.length,
                 path.transport, path.destination, path.vlan_id,
             )  # fmt: skip
@@ -237,7 +237,7 @@ class Observer:
         sent = self._hosts.get(path.source_host, _NOTHING_SENT)[0]
         self._hosts[path.source_host] = sent + 1, at_ns
 
-    def _find(self, key: PdKey) -> ObservedPd | None:
+    def _find(self, key: ObservedPdKey) -> ObservedPd | None:
         """Return the PD of *key*, None if there is no room for it."""
         observed = self.pds.get(key)
         if observed is not None:

@@ -13,7 +13,7 @@ from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox, MailboxArea, configure
 from devicebus.master.matching import ExpectedSlave
 from devicebus.master.procedure import Procedure, Runner, Sleep, Step, StepReplies, Task
-from devicebus.master.ring import Line as RingEnd
+from devicebus.master.ring import RingEnd
 from devicebus.master.scan import scan
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.segment import POLL_NS, SegmentEnd, SimulatedSegment

@@ -130,7 +130,7 @@ class EapImportDevice(msgspec.Struct, frozen=True, kw_only=True):
     line: int = 0
 
 
-class Outcome(StrEnum):
+class ImportOutcome(StrEnum):
     """Outcome of the import for one part of a file."""
 
     TAKEN = "taken"
@@ -150,7 +150,7 @@ class ImportNote(msgspec.Struct, frozen=True):
     line: int
     item: str
     """Its path in the project, such as ``Device 1/Box 1/Var 1``."""
-    outcome: Outcome
+    outcome: ImportOutcome
     message: str
 
 
@@ -161,7 +161,7 @@ class ImportReport:
         self.notes: list[ImportNote] = []
         self.findings: list[PlantFinding] = []
 
-    def note(self, file: str, line: int, item: str, outcome: Outcome, message: str) -> None:
+    def note(self, file: str, line: int, item: str, outcome: ImportOutcome, message: str) -> None:
         """Record the outcome for *item*."""
         self.notes.append(ImportNote(file, line, item, outcome, message))
 

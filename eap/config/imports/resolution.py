@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import msgspec
 
-from eap.config.imports.records import ImportReport, Outcome
+from eap.config.imports.records import ImportOutcome, ImportReport
 from eap.config.imports.stations import (
     PlannedFrame,
     PlannedPd,
@@ -333,9 +333,9 @@ def _note_one(
         return
     if planned.reasons:
         message = f"{refused}: {'; '.join(planned.reasons)}"
-        report.note(origin.file, origin.line, origin.item, Outcome.COMMENT, message)
+        report.note(origin.file, origin.line, origin.item, ImportOutcome.COMMENT, message)
         return
-    report.note(origin.file, origin.line, origin.item, Outcome.TAKEN, taken)
+    report.note(origin.file, origin.line, origin.item, ImportOutcome.TAKEN, taken)
     for remark in planned.remarks:
         if "unknown setting" in remark:
-            report.note(origin.file, origin.line, origin.item, Outcome.WARNING, remark)
+            report.note(origin.file, origin.line, origin.item, ImportOutcome.WARNING, remark)

@@ -21,8 +21,8 @@ from eap.config.imports.records import (
     EapBox,
     EapImportDevice,
     EapVariable,
+    ImportOutcome,
     ImportReport,
-    Outcome,
 )
 from eap.ids import BROADCAST_MAC, InterfaceUri, MacAddr, NetId
 
@@ -66,7 +66,7 @@ class ImportedSystem(msgspec.Struct, frozen=True, kw_only=True):
     remarks: tuple[str, ...] = ()
 
 
-class Origin(msgspec.Struct, frozen=True):
+class ImportOrigin(msgspec.Struct, frozen=True):
     """Part of a file that something was made of."""
 
     file: str
@@ -123,7 +123,7 @@ class PlannedFrame(msgspec.Struct, frozen=True, kw_only=True):
     is_changeable: bool = False
     reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
-    origin: Origin | None = None
+    origin: ImportOrigin | None = None
 
 
 class PlannedSubscription(msgspec.Struct, frozen=True, kw_only=True):
@@ -153,7 +153,7 @@ class PlannedSubscription(msgspec.Struct, frozen=True, kw_only=True):
     timeout_ms: int = 0
     reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
-    origin: Origin | None = None
+    origin: ImportOrigin | None = None
 
 
 class PlannedPort(msgspec.Struct, frozen=True, kw_only=True):
@@ -288,7 +288,7 @@ class _StationBuilder:
     def _is_enabled(self, device: EapImportDevice) -> bool:
         if device.is_disabled:
             message = "disabled in the project"
-            self._report.note(device.file, device.line, device.name, Outcome.LEFT, message)
+            self._report.note(device.file, device.line, device.name, ImportOutcome.LEFT, message)
         return not device.is_disabled
 
     def _addresses(
@@ -363,7 +363,7 @@ class _StationBuilder:
     def _warn(self, message: str) -> None:
         first = next(iter(self._system.devices), None)
         file, line = (first.file, first.line) if first else ("", 0)
-        self._report.note(file, line, self._system.name, Outcome.WARNING, message)
+        self._report.note(file, line, self._system.name, ImportOutcome.WARNING, message)
 
     def _frame(self, device: EapImportDevice, box: EapBox, port: PlannedPort) -> PlannedFrame:
         owner = plain_name(box.name, "publisher")
@@ -398,7 +398,7 @@ class _StationBuilder:
             monitor_ms=max(_MIN_MONITOR_MS, box.arp_ms) if is_monitored else 0,
             is_changeable=box.is_changeable,
             reasons=tuple(dict.fromkeys(reasons)),
-            origin=Origin(box.file, box.line, f"{device.name}/{box.name}"),
+            origin=ImportOrigin(box.file, box.line, f"{device.name}/{box.name}"),
         )
 
     def _pd(
@@ -463,7 +463,9 @@ class _StationBuilder:
                     f"unknown setting in line {each.line}: {each.text}"
                     for each in (*box.unknown, *variable.unknown)
                 ),
-                origin=Origin(box.file, variable.line, f"{device.name}/{box.name}/{variable.name}"),
+                origin=ImportOrigin(
+                    box.file, variable.line, f"{device.name}/{box.name}/{variable.name}"
+                ),
             )
 
 

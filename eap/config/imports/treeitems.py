@@ -22,8 +22,8 @@ from eap.config.imports.records import (
     EapBox,
     EapImportDevice,
     EapVariable,
+    ImportOutcome,
     ImportReport,
-    Outcome,
     unknown_children,
 )
 from eap.ids import MacAddr, NetId
@@ -183,7 +183,7 @@ class _Assembly:
         name = item.path[-1]
         if kind != _EAP_DEVICE:
             message = f"ItemSubType {kind}: no EAP device"
-            self._report.note(item.file, element.line, name, Outcome.LEFT, message)
+            self._report.note(item.file, element.line, name, ImportOutcome.LEFT, message)
             return None
         own = element.find("Device")
         return EapImportDevice(

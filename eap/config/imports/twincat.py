@@ -23,8 +23,8 @@ from eap.config.imports.records import (
     EapBox,
     EapImportDevice,
     EapVariable,
+    ImportOutcome,
     ImportReport,
-    Outcome,
     UnknownSetting,
     unknown_attributes,
     unknown_children,
@@ -228,7 +228,7 @@ class _Project:
             if kind != EAP_DEVICE:
                 reason = _DEVICE_TYPES.get(kind, "no EAP device")
                 message = f"DevType {kind}: {reason}"
-                self._report.note(file, element.line, title, Outcome.LEFT, message)
+                self._report.note(file, element.line, title, ImportOutcome.LEFT, message)
                 return None
             return self._eap_device(element, title, file, folder)
         except XmlError as exc:
@@ -243,7 +243,7 @@ class _Project:
         if net_id is not None and not any(net_id[:4]):
             # So it is in a project that was never given a target.
             message = f"its AmsNetId {net_id} belongs to no system"
-            self._report.note(file, element.line, title, Outcome.WARNING, message)
+            self._report.note(file, element.line, title, ImportOutcome.WARNING, message)
             net_id = None
         boxes = [self._box(each, title, file, folder) for each in element.iterfind("Box")]
         if len(boxes) > ITEMS:
@@ -274,7 +274,7 @@ class _Project:
             kind = element.attribute_number("BoxType", 0, _MAX_U16)
             if kind not in {PUBLISHER, SUBSCRIBER}:
                 message = f"BoxType {kind}: neither publisher nor subscriber"
-                self._report.note(file, element.line, item, Outcome.LEFT, message)
+                self._report.note(file, element.line, item, ImportOutcome.LEFT, message)
                 return None
             return self._eap_box(element, title, item, file, is_publisher=kind == PUBLISHER)
         except XmlError as exc:

@@ -10,7 +10,7 @@ from eap.codec.enumerations import Enumeration
 from eap.codec.structures import Structure, lay_out_structure
 from eap.config.finding import FindingReport
 from eap.config.imports.planttext import scalar
-from eap.config.imports.records import EapVariable, ImportReport, Outcome
+from eap.config.imports.records import EapVariable, ImportOutcome, ImportReport
 from eap.config.imports.typefile import ArrayBound, SymbolRecord, TypeRecord
 from eap.config.types import ReportedTypeError, TypeTable, definition_of, type_text
 
@@ -69,7 +69,7 @@ class TypeNames:
                 f"type {name} is in none of the files: {block} is taken; import its TMC file too"
             )
             item = variable.name
-            self._report.note(file, variable.line, item, Outcome.WARNING, message)
+            self._report.note(file, variable.line, item, ImportOutcome.WARNING, message)
             return block
         if variable.bits and kind.size * 8 != variable.bits:
             layout = "".join(f"\n{line}" for line in layout_lines(kind))

@@ -46,7 +46,7 @@ MAX_QUEUED = 64
 _SHORTEST_READ = COUNT_SIZE + MAX_FRAME
 
 
-class _Reader:
+class _FrameQueue:
     __slots__ = ("frames", "until_ns")
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class SlaveEthernet:
 
     def __init__(self, bus: BusClient) -> None:
         self._bus = bus
-        self._readers: dict[int, dict[tuple[NetId, bytes], _Reader]] = {}
+        self._readers: dict[int, dict[tuple[NetId, bytes], _FrameQueue]] = {}
         self._assemblers: dict[int, FrameAssembler] = {}
         self._numbers: dict[int, int] = {}
         bus.listen(self._receive)
@@ -112,7 +112,7 @@ class SlaveEthernet:
             raise AdsRefusedError(AdsError.SIZE, why)
         readers = self._readers.setdefault(station, {})
         # Behind the others, so that the first one was silent longest.
-        reader = readers.pop(key) if key in readers else _Reader()
+        reader = readers.pop(key) if key in readers else _FrameQueue()
         readers[key] = reader
         reader.until_ns = monotonic_ns() + READER_NS
         if len(readers) > MAX_READERS:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from eap.ops.discover import Discovery, discovered
-from eap.pd.observer import MAX_PDS, FramePath
+from eap.ops.discover import ObserverFeed, discovered
+from eap.pd.observer import MAX_PDS, ObservedPath
 
-_PATH = FramePath("udp", "10.0.0.1", "10.0.0.2")
+_PATH = ObservedPath("udp", "10.0.0.1", "10.0.0.2")
 _ROWS_EVERY = 500
 """Inputs between two looks at all rows, which take longer than the packets."""
 
@@ -14,7 +14,7 @@ class _World:
     """The discovery that all inputs go to; begun anew when it is full."""
 
     def __init__(self) -> None:
-        self.discovery = Discovery()
+        self.discovery = ObserverFeed()
         self.inputs = 0
 
 
@@ -36,4 +36,4 @@ def fuzz_one(data: bytes) -> None:
         raise AssertionError(f"{len(observer.pds)} PDs are kept")
     if _WORLD.inputs % _ROWS_EVERY == 0:
         discovered(discovery, ())
-        _WORLD.discovery = Discovery()
+        _WORLD.discovery = ObserverFeed()

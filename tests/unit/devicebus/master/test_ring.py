@@ -8,7 +8,7 @@ from devicebus.mailbox import coe_client
 from devicebus.master import clocks
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master
-from devicebus.master.ring import Line, Ring
+from devicebus.master.ring import Ring, RingEnd
 from devicebus.sim.segment import SECOND_LINE
 from devicebus.sim.spec import ClockSpec
 from devicebus.wire.alstatus import AlState
@@ -229,7 +229,7 @@ def test_foreign_frames_are_counted_and_change_nothing():
     other = bytearray(answer(frame))
     other[2] = 8
     for data in (b"", b"\0" * 5, bytes(other), answer(frame)[:-1], answer(copy)[:10]):
-        for line in Line:
+        for line in RingEnd:
             assert ring.receive_frame(line, data, 1) is None
     assert (ring.unexpected, changes, ring.is_whole) == (10, [], None)
 
@@ -247,9 +247,9 @@ def test_ring_merges_both_halves_of_a_frame():
     second = bytearray(copy)
     second[12:18] = b"\x0f\0\0\x44\3\0"
     second[28:32] = b"\x08\0\1\0"
-    assert ring.receive_frame(Line.FIRST, bytes(first), 1) is None
-    merged = ring.receive_frame(Line.SECOND, bytes(second), 2)
+    assert ring.receive_frame(RingEnd.FIRST, bytes(first), 1) is None
+    merged = ring.receive_frame(RingEnd.SECOND, bytes(second), 2)
     assert merged[12:18] == b"\x0f\x22\0\x44\6\0"
     assert merged[28:32] == b"\x08\0\1\0"
     assert merged[:12] == frame[:12]
-    assert ring.receive_frame(Line.SECOND, bytes(second), 3) is None
+    assert ring.receive_frame(RingEnd.SECOND, bytes(second), 3) is None

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.config.imports.records import EapBox, EapImportDevice, EapVariable, Outcome
+from eap.config.imports.records import EapBox, EapImportDevice, EapVariable, ImportOutcome
 from eap.config.imports.stations import PublisherIdentity
 from eap.config.imports.treeitems import tree_items_text
 from eap.config.load import Plant
@@ -68,7 +68,7 @@ def importer(tmp_path: Path) -> Importer:
 
 
 def comments(result: ImportResult) -> list[str]:
-    return [each.message for each in result.notes if each.outcome is Outcome.COMMENT]
+    return [each.message for each in result.notes if each.outcome is ImportOutcome.COMMENT]
 
 
 def messages(result: ImportResult) -> list[str]:
@@ -286,7 +286,7 @@ def test_type_that_no_file_has_is_a_block_with_a_warning(importer: Importer) -> 
     )
     assert result.ok
     assert [each.type for each in importer.loaded().stations[0].variables][:1] == ["BLOCK(12)"]
-    warnings = [each.message for each in result.notes if each.outcome is Outcome.WARNING]
+    warnings = [each.message for each in result.notes if each.outcome is ImportOutcome.WARNING]
     assert "type ST_Far is in none of the files: BLOCK(12) is taken" in warnings[0]
 
 
@@ -438,9 +438,10 @@ def test_symbols_of_a_tmc_file_become_variables(importer: Importer) -> None:
     result = importer.run(importer.put("axis.tmc", tmc))
     assert result.ok
     assert [(each.item, each.outcome) for each in result.notes] == [
-        ("MAIN.mode", Outcome.TAKEN), ("MAIN.text", Outcome.TAKEN), ("MAIN.list", Outcome.TAKEN),
-        ("MAIN.bare", Outcome.TAKEN), ("MAIN.mode", Outcome.LEFT), ("a b", Outcome.LEFT),
-        ("MAIN.odd", Outcome.LEFT), ("MAIN.far", Outcome.LEFT),
+        ("MAIN.mode", ImportOutcome.TAKEN), ("MAIN.text", ImportOutcome.TAKEN),
+        ("MAIN.list", ImportOutcome.TAKEN), ("MAIN.bare", ImportOutcome.TAKEN),
+        ("MAIN.mode", ImportOutcome.LEFT), ("a b", ImportOutcome.LEFT),
+        ("MAIN.odd", ImportOutcome.LEFT), ("MAIN.far", ImportOutcome.LEFT),
     ]  # fmt: skip
     (station,) = importer.loaded().stations
     assert station.name == "axis"
@@ -504,7 +505,7 @@ def test_disabled_device_is_left(importer: Importer) -> None:
     text = project(device(publisher("A", SPEED), more='Disabled="true"'))
     result = importer.run(importer.put("Line.tsproj", text))
     assert [(each.item, each.outcome, each.message) for each in result.notes][:1] == [
-        (DEVICE, Outcome.LEFT, "disabled in the project")
+        (DEVICE, ImportOutcome.LEFT, "disabled in the project")
     ]
 
 

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from eap.ids import InterfaceUri, NetId
 from eap.ops.takers import takers_of
-from eap.pd.observer import PdKey
+from eap.pd.observer import ObservedPdKey
 from eap.pd.spec import RxAlternateSpec, RxPdSpec, SentVariableSpec
 from eap.pd.words import PdDropReason
 from tests.support.cyclic import PEER, eap_port, received, station
@@ -31,7 +31,7 @@ def taker(interface: str = "udp://10.0.0.1", vlan_id: int = 0, **options: object
     return found
 
 
-def key(**fields: object) -> PdKey:
+def key(**fields: object) -> ObservedPdKey:
     values = {
         "publisher": NetId.parse(PEER),
         "pd_id": 7,
@@ -41,7 +41,7 @@ def key(**fields: object) -> PdKey:
         "destination": "10.0.0.1",
         "vlan_id": None,
     }
-    return PdKey(**values | fields)
+    return ObservedPdKey(**values | fields)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.pd.appearance import MAX_PARTS, Part, guess
+from eap.pd.appearance import MAX_PARTS, LikelyVariable, guess
 
 
 def test_numbers_texts_and_flags_are_recognised():
@@ -49,7 +49,7 @@ def test_counter_of_two_bytes_wraps():
 
 
 def test_set_point_with_few_digits_is_a_constant_number():
-    assert guess([struct.pack("<f", 750.0)] * 3) == [Part(0, 4, "REAL", "750, constant")]
+    assert guess([struct.pack("<f", 750.0)] * 3) == [LikelyVariable(0, 4, "REAL", "750, constant")]
 
 
 def test_slow_sine_is_a_number_and_no_counter_of_its_low_bytes():
@@ -60,7 +60,7 @@ def test_slow_sine_is_a_number_and_no_counter_of_its_low_bytes():
 
 def test_counter_with_uneven_steps():
     samples = [struct.pack("<I", value) for value in (100, 101, 103, 104, 105, 108)]
-    assert guess(samples) == [Part(0, 4, "UDINT", "a counter")]
+    assert guess(samples) == [LikelyVariable(0, 4, "UDINT", "a counter")]
 
 
 def test_small_numbers_with_a_sign():

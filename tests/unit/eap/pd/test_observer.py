@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import EAP_SM_OFFSET
-from eap.pd.observer import FramePath, Observer
+from eap.pd.observer import ObservedPath, Observer
 from eap.pd.rhythm import CycleOrder, swap
 from eap.pd.words import Reason
 from tests.support.cyclic import MS, PEER, octets
 
 A, B = "10.0.0.1", "10.0.0.2"
-TO_B = FramePath("udp", A, B)
-GROUP = FramePath("ethernet", "02:00:00:00:00:01", "01:01:05:04:00:00", 7)
+TO_B = ObservedPath("udp", A, B)
+GROUP = ObservedPath("ethernet", "02:00:00:00:00:01", "01:01:05:04:00:00", 7)
 
 
 def observe(frames, path=TO_B, observer=None):
@@ -107,8 +107,8 @@ def test_answers_to_another_port_than_the_usual_are_polled():
     observer = Observer()
     for number in range(10):
         at_ns = number * 100 * MS
-        observer.receive_frame(octets([(7, b"?")], cycle=number), at_ns, FramePath("udp", B, A))
-        answer = FramePath("udp", A, f"{B}:40000")
+        observer.receive_frame(octets([(7, b"?")], cycle=number), at_ns, ObservedPath("udp", B, A))
+        answer = ObservedPath("udp", A, f"{B}:40000")
         observer.receive_frame(octets([(8, b"!")], cycle=10 * number), at_ns + MS, answer)
     asked, answered = observer.pds.values()
     assert asked.measure().trigger is Reason.CYCLE
@@ -119,7 +119,7 @@ def test_answers_to_regular_requests_have_uneven_steps_of_the_counter():
     observer = Observer()
     for number in range(20):
         at_ns = number * 44 * MS
-        observer.receive_frame(octets([(7, b"?")], cycle=number), at_ns, FramePath("udp", B, A))
+        observer.receive_frame(octets([(7, b"?")], cycle=number), at_ns, ObservedPath("udp", B, A))
         observer.receive_frame(octets([(8, b"!")], cycle=at_ns // (10 * MS)), at_ns + MS, TO_B)
     asked, answered = observer.pds.values()
     assert asked.measure().trigger is Reason.CYCLE
@@ -131,7 +131,7 @@ def test_irregular_answers_of_a_host_are_polled_and_other_pds_are_not():
     for number in range(30):
         at_ns += noise.randint(20, 900) * MS
         observer.receive_frame(
-            octets([(7, b"?")], cycle=at_ns // MS), at_ns, FramePath("udp", B, A)
+            octets([(7, b"?")], cycle=at_ns // MS), at_ns, ObservedPath("udp", B, A)
         )
         data = noise.randbytes(2)
         observer.receive_frame(octets([(8, data)], cycle=at_ns // MS), at_ns + 2 * MS, TO_B)
@@ -177,7 +177,7 @@ def test_memory_is_bounded():
         for number in range(6000):
             publisher = f"9.9.9.{number % 400 // 256}.{number % 256}.1"
             data = noise.randbytes(1400)
-            path = FramePath("udp", f"10.1.{number % 256}.{number // 256}", B)
+            path = ObservedPath("udp", f"10.1.{number % 256}.{number // 256}", B)
             observer.receive_frame(octets([(1, data)], publisher=publisher), number, path)
         assert tracemalloc.get_traced_memory()[0] < 40 << 20
     finally:
