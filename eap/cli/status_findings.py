@@ -281,15 +281,7 @@ def is_hung(station: Row) -> bool:
 def _of_station(station: Row) -> Iterator[StatusFinding]:
     yield from _of_cycles(station)
     for port in station["ports"]:
-        where = f"{station['name']}/{port['name']}"
-        if (bus := port.get("bus")) is not None:
-            yield from _of_bus(where, bus)
-        elif port.get("link") == "down" and port["kind"] != "bus":
-            advice = f"check cable and interface of {port['interface']}"
-            yield _error(where, "link down", advice)
-        # An engine that hangs exchanges no frames either: that is one finding, not one per bus.
-        elif port.get("link") == "down" and not is_hung(station):
-            yield _error(where, "no frame comes back", "check cable and interface of the bus")
+        yield from _of_port(station, port)
     for frame in filter(is_special, station.get("frames", ())):
         if frame["address"] is None:
             waits = f"MAC address of {frame['destination']} unknown: waiting for a frame from it"
@@ -302,6 +294,20 @@ def _of_station(station: Row) -> Iterator[StatusFinding]:
     for row in station["pd"]["rx"]:
         yield from _of_received(f"{station['name']} ← {row['name']}", row)
     yield from _of_sources(station)
+
+
+def _of_port(station: Row, port: Row) -> Iterator[StatusFinding]:
+    where = f"{station['name']}/{port['name']}"
+    if (bus := port.get("bus")) is not None:
+        yield from _of_bus(where, bus)
+    elif fault := port.get("fault"):
+        yield _error(where, fault, "it is found again when it comes back")
+    elif port.get("link") == "down" and port["kind"] != "bus":
+        advice = f"check cable and interface of {port['interface']}"
+        yield _error(where, "link down", advice)
+    # An engine that hangs exchanges no frames either: that is one finding, not one per bus.
+    elif port.get("link") == "down" and not is_hung(station):
+        yield _error(where, "no frame comes back", "check cable and interface of the bus")
 
 
 def _of_cycles(station: Row) -> Iterator[StatusFinding]:

@@ -20,6 +20,7 @@ from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.engine_bus import EngineBus
 from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
+from eap.ids import InterfaceUri
 from eap.net.busport import BusPort
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import create_image
@@ -125,10 +126,15 @@ class EngineBuses:
         port = self._handover.port(given.owner)
         station = entry.station
         epoch_offset_ns = time.time_ns() - time.monotonic_ns() - _EPOCH_S * 1_000_000_000
-        first = BusPort(socket.socket(fileno=given.engine_fd))
+        first = BusPort(socket.socket(fileno=given.engine_fd), interface=port.interface.host)
         second = None
         if given.second_fd != NO_DESCRIPTOR:
-            second = BusPort(socket.socket(fileno=given.second_fd), source=first.source)
+            redundant = InterfaceUri.parse(port.bus.redundant) if port.bus else port.interface
+            second = BusPort(
+                socket.socket(fileno=given.second_fd),
+                interface=redundant.host,
+                source=first.source,
+            )
         bus = EngineBus(
             port,
             master_settings(port, station.spec.cycle_us, epoch_offset_ns),
@@ -342,7 +348,9 @@ class EnginePlant:
         entry.update_tcp()
 
     def _open_interface(self, shared: SharedSocket) -> None:
-        interface = EthernetInterface(socket.socket(fileno=shared.engine_fd), packet_batch())
+        interface = EthernetInterface(
+            socket.socket(fileno=shared.engine_fd), packet_batch(), shared.address
+        )
         self._resources.callback(interface.close)
         stations = sorted({owner.station for owner in shared.owners})
         self._tallies.append(

@@ -10,6 +10,7 @@ other end of a socket pair.
 from __future__ import annotations
 
 import errno
+import os
 import socket
 import struct
 from contextlib import suppress
@@ -38,16 +39,20 @@ class BusPort:
     Args:
         sock: As :func:`open_bus_socket` returns it, or one of a pair whose other end is a
             :class:`SegmentSocket`.
+        interface: Name of the Ethernet interface; by default the one that *sock* is bound to.
         source: Source address of the frames; by default that of the interface.  Both lines of a
             ring have one, for the frames of each arrive on the other.
     """
 
-    def __init__(self, sock: socket.socket, *, source: bytes = b"") -> None:
+    def __init__(self, sock: socket.socket, *, interface: str = "", source: bytes = b"") -> None:
         self._sock = sock
-        self._interface = sock.getsockname()[0] if sock.family == socket.AF_PACKET else ""
+        self._interface = ""
         self._header = b""
-        if self._interface:
-            self._header = _ethernet_header(source or sock.getsockname()[4])
+        if sock.family == socket.AF_PACKET:
+            bound = sock.getsockname()
+            self._interface = interface or bound[0]
+            # The interface may have been deleted while this process did not run.
+            self._header = _ethernet_header(source or bound[4] or _made_up_address())
         sock.setblocking(False)
 
     @property
@@ -141,6 +146,11 @@ def _open_udp(address: str, port: int) -> socket.socket:
 
 def _source(data: bytes) -> bytes:
     return bytes((data[6] | _PROCESSED,)) + data[7:12]
+
+
+def _made_up_address() -> bytes:
+    first, *others = os.urandom(6)
+    return bytes((first & ~0x01, *others))  # no multicast
 
 
 def _ethernet_header(address: bytes) -> bytes:

@@ -6,12 +6,14 @@ import socket
 import struct
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from ctypes import get_errno
+from errno import EAGAIN, ENETDOWN
 
 from eap.codec.ethercat import ETHERTYPE
 from eap.ids import BROADCAST_MAC, EAP_MULTICAST_MAC, Destination, MacAddr
 from eap.net.mmsg import BATCH, BUFFER_SIZE, ReceiveBatch, SendBatch, note_receive_error
-from eap.net.packetsocket import PACKET_ADD_MEMBERSHIP, PACKET_MR_MULTICAST, SOL_PACKET
+from eap.net.packetsocket import InterfaceBinding
 from eap.pd.link import FrameHandler, OutFrame
 
 ETHERNET_HEADER = 14
@@ -20,6 +22,7 @@ MINIMUM_SIZE = 60
 
 _SOURCE = struct.Struct("6x6s").unpack_from
 """The source address in an Ethernet header."""
+_SOURCE_FIELD = slice(6, 12)
 _TPID = 0x8100
 _VID = 0x0FFF
 _CONTROL_SIZE = 72  # a time stamp, then the auxiliary data of a packet
@@ -39,17 +42,28 @@ def packet_batch() -> ReceiveBatch:
 class EthernetInterface:
     """One AF_PACKET socket and the ports of all stations that share it.
 
+    An interface that is deleted and made again is found again by its name, mostly with another
+    address; then frames that were built before get the new one when they are sent.
+
+    Args:
+        sock: Of :func:`eap.net.packetsocket.open_packet_pair`.
+        batch: Receive memory.
+        name: Name of the interface; by default that to which *sock* is bound.
+
     Attributes:
         address: The interface's own MAC address.
         errors: Failed system calls by errno name.
         has_neighbours: Whether several ports share the interface.
         discarded: Frames taken from the wire and dropped here, by reason.
+        on_found: Called after the interface was found again.
     """
 
-    def __init__(self, sock: socket.socket, batch: ReceiveBatch) -> None:
+    def __init__(self, sock: socket.socket, batch: ReceiveBatch, name: str = "") -> None:
         sock.setblocking(False)
-        self.name, _, _, _, hardware = sock.getsockname()
-        self.address = MacAddr(hardware)
+        self._binding = InterfaceBinding(sock, name)
+        self.name = self._binding.name
+        self.address = self._binding.address
+        self.on_found: list[Callable[[], object]] = []
         self.sender = SendBatch(sock)
         self.errors = self.sender.errors
         self.discarded = {"other_vlan": 0, "local_overflow": 0}
@@ -61,8 +75,8 @@ class EthernetInterface:
         self._tags = batch.control.cast("H")
         self._routes: dict[int, dict[int, list[FrameHandler]]] = {}
         self._own_source = bytes(self.address)
+        self._ports: list[EthernetPort] = []
         self.has_neighbours = False
-        self._has_ports = False
         self._local: deque[tuple[FrameHandler, memoryview, int]] = deque()
 
     def port(
@@ -79,18 +93,15 @@ class EthernetInterface:
         the multicast MAC addresses of *join*.
         """
         groups = {EAP_MULTICAST_MAC, *(MacAddr.parse(text) for text in join)}
-        index = socket.if_nametoindex(self.name)
         for group in groups:
-            # Without it the network adapter filters the group out before any socket sees it.
-            membership = struct.pack("@iHH8s", index, PACKET_MR_MULTICAST, len(group), group)
-            self._sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
+            self._binding.join(group)
         by_address = self._routes.setdefault(vlan_id, {})
         for address in (self.address, BROADCAST_MAC, *groups):
             by_address.setdefault(_key(address), []).append(handler)
         # Copies for other ports cost time in each cycle, so a single port makes none.
-        self.has_neighbours = self._has_ports
-        self._has_ports = True
-        return EthernetPort(self, handler, vlan_id, priority)
+        self.has_neighbours = bool(self._ports)
+        self._ports.append(EthernetPort(self, handler, vlan_id, priority))
+        return self._ports[-1]
 
     def drain(self) -> int:
         """Hand every waiting frame to the ports it is for; return how many were handed over."""
@@ -100,12 +111,27 @@ class EthernetInterface:
             if count == 1:
                 return total + self._dispatch_one()
             if count < 0:
-                note_receive_error(self.errors)
+                if self._binding.is_lost or get_errno() != EAGAIN:
+                    self._note_error()
                 break
             total += self._dispatch(count)
             if count < BATCH:
                 break
         return total
+
+    def find(self) -> None:
+        """Look for an interface that was deleted: has it been made again?"""
+        if not self._binding.find():
+            return
+        before, self.address = self.address, self._binding.address
+        if self.address != before:
+            self._own_source = bytes(self.address)
+            for by_address in self._routes.values():
+                by_address[_key(self.address)] = by_address.pop(_key(before))
+            for port in self._ports:
+                port.readdress()
+        for notify in self.on_found:
+            notify()
 
     def deliver(self, frames: Sequence[OutFrame], sender: EthernetPort, now_ns: int) -> None:
         """Keep copies of *frames* for the other ports they are for, until they are drained.
@@ -151,6 +177,13 @@ class EthernetInterface:
     def close(self) -> None:
         """Close the socket."""
         self._sock.close()
+
+    def _note_error(self) -> None:
+        if get_errno() == ENETDOWN:
+            # Once, for switched off as for deleted.
+            self._binding.is_lost = True
+        note_receive_error(self.errors)
+        self.find()
 
     def _dispatch_one(self) -> int:
         handlers = self._handlers(self._heads[0], self._tags[_TCI])
@@ -228,6 +261,11 @@ class EthernetPort:
             self.interface.deliver(sent, self, now_ns)
         return failed
 
+    def readdress(self) -> None:
+        """Write the interface's present address into each frame that is sent from now on."""
+        # Frames are prebuilt, by publishers and repliers; only sending sees all of them.
+        self._send = self._send_readdressed
+
     def link_header(self, destination: str) -> bytes:
         """Return destination, own address, the port's VLAN tag if it has one, and EtherType."""
         target = MacAddr.parse(Destination.parse(destination).host)
@@ -236,6 +274,12 @@ class EthernetPort:
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when a frame waits."""
         return self.interface.fileno()
+
+    def _send_readdressed(self, frames: Sequence[OutFrame]) -> Sequence[OutFrame]:
+        address = self.interface.address
+        for frame in frames:
+            frame.buffer[_SOURCE_FIELD] = address
+        return self.interface.sender.send(frames)
 
 
 def _key(address: bytes | bytearray) -> int:

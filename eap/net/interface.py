@@ -98,6 +98,17 @@ def check_interface(name: str) -> None:
         )
 
 
+def is_switched_on(name: str) -> bool:
+    """Return whether interface *name* exists and is switched on, with or without a cable."""
+    flags = _flags(name)
+    return flags is not None and bool(flags & _IFF_UP)
+
+
+def is_there(name: str) -> bool:
+    """Return whether interface *name* exists."""
+    return _flags(name) is not None
+
+
 def link_is_up(name: str) -> bool:
     """Return whether interface *name* exists, is switched on and has a live cable.
 

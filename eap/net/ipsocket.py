@@ -14,6 +14,8 @@ import errno
 import logging
 import socket
 import struct
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +24,7 @@ from eap.codec.amsdiscovery import AMS_UDP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.net import bpf
-from eap.net.interface import broadcast_of, foreign_address, interface_of
+from eap.net.interface import broadcast_of, foreign_address, interface_of, own_addresses
 from eap.net.mmsg import SO_TIMESTAMPNS
 
 SO_RCVBUFFORCE = 33
@@ -198,6 +200,93 @@ def _join(sock: socket.socket, group: str, interface_address: str) -> None:
 def _bind_to_interface(sock: socket.socket, interface_address: str) -> None:
     name = interface_of(interface_address)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, name.encode())
+
+
+class AddressKeeper:
+    """Holds what sockets have at the interfaces of local addresses, also when these are made again.
+
+    An address that went and came back serves its sockets again by itself.  Memberships, outgoing
+    interfaces and bindings to an interface are kept by its index, which is another one then.
+    """
+
+    def __init__(self) -> None:
+        self._indexes: dict[str, int] = {}
+        self._renewals: dict[str, list[Callable[[int], None]]] = {}
+
+    def keep_group(self, sock: socket.socket, group: str, address: str) -> None:
+        """Keep *sock* in a multicast group, or at the broadcast address, at the interface."""
+        if _is_multicast(group):
+            self._keep(address, lambda before: _join_again(sock, group, address, before))
+        else:
+            self.keep_interface(sock, address)
+
+    def keep_interface(self, sock: socket.socket, address: str) -> None:
+        """Keep *sock* bound to the interface."""
+        self._keep(address, lambda before: _bind_again(sock, address))
+
+    def keep_outgoing(self, sock: socket.socket, address: str) -> None:
+        """Let *sock* send multicast at the interface."""
+        out = socket.inet_aton(address)
+        self._keep(
+            address,
+            lambda before: sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, out),
+        )
+
+    def look(self) -> None:
+        """Renew what belongs to interfaces that were made again since the last call."""
+        if not self._renewals:
+            return
+        names = {address: label.partition(":")[0] for label, address in own_addresses()}
+        for address, renewals in self._renewals.items():
+            index = _index_of(names.get(address, ""))
+            before = self._indexes.get(address, 0)
+            if not index or index == before:
+                continue
+            self._indexes[address] = index
+            for renew in renewals:
+                try:
+                    renew(before)
+                except (OSError, EnvironmentalError) as exc:
+                    logger.warning("%s: its interface was made again: %s", address, exc)
+
+    def _keep(self, address: str, renew: Callable[[int], None]) -> None:
+        self._renewals.setdefault(address, []).append(renew)
+
+
+def _index_of(name: str) -> int:
+    try:
+        return socket.if_nametoindex(name) if name else 0
+    except OSError:
+        return 0  # it has just gone
+
+
+def _join_again(sock: socket.socket, group: str, address: str, before: int) -> None:
+    if before:
+        # The membership of the deleted interface would count against the limit of the kernel.
+        old = struct.pack("@4s4xi", socket.inet_aton(group), before)
+        with suppress(OSError):
+            sock.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, old)
+    membership = socket.inet_aton(group) + socket.inet_aton(address)
+    try:
+        sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:  # it is still a member
+            raise
+
+
+def _bind_again(sock: socket.socket, address: str) -> None:
+    name = interface_of(address)
+    bound = b""
+    with suppress(OSError):  # ENODEV: the interface was deleted
+        bound = sock.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16).rstrip(b"\0")
+    if bound == name.encode():
+        return
+    try:
+        _bind_to_interface(sock, address)
+    except PermissionError:
+        # An ordinary user may bind a socket once.
+        reason = "a second binding needs CAP_NET_RAW: restart the appliance"
+        raise EnvironmentalError(f"broadcasts at {name} are not received: {reason}") from None
 
 
 _PROC = Path("/proc")

@@ -9,6 +9,7 @@ needs no IPv4 address of its own, and the neighbour table is not involved.
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 from collections.abc import Iterable, Iterator
@@ -23,7 +24,12 @@ from eap.net import bpf
 from eap.net.ethernet import ETHERNET_HEADER, MINIMUM_SIZE
 from eap.net.interface import interface_of
 from eap.net.mmsg import count_error
-from eap.net.packetsocket import ARPHRD_LOOPBACK, PACKET_AUXDATA, SOL_PACKET
+from eap.net.packetsocket import (
+    ARPHRD_LOOPBACK,
+    PACKET_AUXDATA,
+    SOL_PACKET,
+    InterfaceBinding,
+)
 from eap.pd.monitor import ProbeResult
 
 _NETLINK_ROUTE = 0
@@ -233,21 +239,31 @@ class ArpSighting(NamedTuple):
 class ArpProber:
     """Sends and receives ARP in one VLAN of an interface; 0 is untagged.  It never waits.
 
+    An interface that is deleted and made again is found again by its name.
+
     Attributes:
         errors: Failed system calls by errno name, and messages that made no sense.
     """
 
-    def __init__(self, sock: socket.socket, *, vlan_id: int = 0, priority: int = 0) -> None:
+    def __init__(
+        self, sock: socket.socket, *, vlan_id: int = 0, priority: int = 0, interface: str = ""
+    ) -> None:
         sock.setblocking(False)
         self.errors: dict[str, int] = {}
-        self.interface, _, _, self._kind, hardware = sock.getsockname()
-        self.mac = MacAddr(hardware)
+        self._kind = sock.getsockname()[3]
+        self._binding = InterfaceBinding(sock, interface)
+        self.interface = self._binding.name
         self._sock = sock
         self._vlan_id = vlan_id
         tag = priority << 13 | vlan_id
-        head = BROADCAST_MAC + self.mac + (struct.pack("!HH", _TPID, tag) if tag else b"")
-        self._head = head + struct.pack("!H", arp.ETHERTYPE_ARP)
+        self._tail = struct.pack("!HH", _TPID, tag) if tag else b""
+        self._tail += struct.pack("!H", arp.ETHERTYPE_ARP)
         self._watched: frozenset[IPv4Address] = frozenset()
+
+    @property
+    def mac(self) -> MacAddr:
+        """Own address."""
+        return self._binding.address
 
     def watch(self, addresses: Iterable[IPv4Address]) -> None:
         """Receive ARP messages about *addresses* from now on, and about no others.
@@ -273,9 +289,10 @@ class ArpProber:
         """
         if self._kind == ARPHRD_LOOPBACK or _is_own(address):
             return False
+        head = BROADCAST_MAC + self.mac + self._tail
         message = arp.ArpMessage.probe(self.mac, address).encode()
         try:
-            self._sock.send((self._head + message).ljust(MINIMUM_SIZE, b"\0"))
+            self._sock.send((head + message).ljust(MINIMUM_SIZE, b"\0"))
         except OSError as error:
             count_error(self.errors, error.errno)
             return False
@@ -291,9 +308,12 @@ class ArpProber:
                 break
             except OSError as error:
                 count_error(self.errors, error.errno)
+                if error.errno == errno.ENETDOWN:
+                    self._binding.is_lost = True
                 break
             if _vlan_of(control) == self._vlan_id and (heard := self._parse(data)):
                 found.append(heard)
+        self._binding.find()
         return found
 
     def fileno(self) -> int:

@@ -11,11 +11,13 @@ import socket
 import struct
 import sys
 from collections.abc import Sequence
+from time import monotonic_ns
 
 from eap.codec.ethercat import ETHERTYPE
 from eap.errors import EnvironmentalError
+from eap.ids import MacAddr
 from eap.net import bpf
-from eap.net.interface import check_interface
+from eap.net.interface import check_interface, is_switched_on
 from eap.net.ipsocket import prepare_receiver
 
 SOL_PACKET = 263
@@ -94,6 +96,80 @@ def open_arp(interface: str) -> socket.socket:
     """
     check_interface(interface)
     return _open(interface, bpf.arp_filter(()))
+
+
+LOOK_NS = 50_000_000
+"""Interval between two looks for an interface that is away."""
+_NO_MAC = MacAddr(bytes(6))
+
+
+class InterfaceBinding:
+    """Interface of a socket of :func:`open_packet_pair` or :func:`open_arp`, found again by name.
+
+    A packet socket is bound to the index of its interface.  An interface that is deleted and made
+    again under the same name has another index, mostly another address, and no memberships.  The
+    kernel reports the loss once, by ENETDOWN: the owner sets :attr:`is_lost` then, and calls
+    :meth:`find` from time to time.
+
+    Args:
+        sock: The socket.
+        name: Name of the interface; by default the one that it is bound to.
+
+    Attributes:
+        name: Name of the interface.
+        address: Own address there; zero as long as it was never seen.
+        is_lost: True if the interface is down or deleted, as far as the owner knows.
+    """
+
+    def __init__(self, sock: socket.socket, name: str = "") -> None:
+        bound = sock.getsockname()
+        self.name: str = name or bound[0]
+        self.is_lost = bound[0] != self.name  # it went while the owner did not run
+        self.address = _NO_MAC if self.is_lost else MacAddr(bound[4])
+        self._sock = sock
+        self._groups: list[bytes] = []
+        self._look_at_ns = 0
+
+    def join(self, group: bytes) -> None:
+        """Receive frames to a multicast MAC address, also after the interface was made again.
+
+        Raises:
+            OSError: the interface does not take it.
+        """
+        if group in self._groups:
+            return
+        self._groups.append(group)
+        if not self.is_lost:
+            self._add_membership(group)
+
+    def find(self) -> bool:
+        """Look for a lost interface; return whether another one was found and joined.
+
+        The name is looked up at most once each LOOK_NS, other calls return at once.
+        """
+        now_ns = monotonic_ns()
+        if not self.is_lost or now_ns < self._look_at_ns:
+            return False
+        self._look_at_ns = now_ns + LOOK_NS
+        try:
+            if self._sock.getsockname()[0] == self.name:
+                # It was only switched off: the kernel goes on by itself once it is on.
+                self.is_lost = not is_switched_on(self.name)
+                return False
+            _join(self._sock, self.name, _ETH_P_ALL)
+            self.address = MacAddr(self._sock.getsockname()[4])
+            for group in self._groups:
+                self._add_membership(group)
+        except (OSError, ValueError, EnvironmentalError):
+            return False  # not there yet, gone again meanwhile, or no Ethernet
+        self.is_lost = not is_switched_on(self.name)
+        return True
+
+    def _add_membership(self, group: bytes) -> None:
+        # Without it the network adapter filters the group out before any socket sees it.
+        index = socket.if_nametoindex(self.name)
+        membership = struct.pack("@iHH8s", index, PACKET_MR_MULTICAST, len(group), group)
+        self._sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
 
 
 def open_capture(interface: str, program: Sequence[bpf.Instruction]) -> socket.socket:

@@ -21,6 +21,7 @@ from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.errors import EnvironmentalError
 from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
 from eap.net.interface import interface_of, link_is_up
+from eap.net.ipsocket import AddressKeeper
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.pd.link import FrameOrigin
@@ -127,7 +128,7 @@ def open_transports(network: Network, engine: socket.socket) -> list[ServedTrans
     """
     links = LinkWatch()
     mailbox = MailboxTransports(network, links, engine)
-    ams = AmsTransports(network)
+    ams = AmsTransports(network, links)
     openers: dict[SocketKind, Callable[[SharedSocket], ServedTransport | None]] = {
         # Unicast first: answers to frames of a group go out by the socket of the unicast address.
         SocketKind.UDP: mailbox.open_unicast,
@@ -152,11 +153,18 @@ def open_transports(network: Network, engine: socket.socket) -> list[ServedTrans
 class LinkWatch:
     """Link state of the interfaces: a pulled cable takes the hops of their transports down.
 
+    Interfaces that were deleted and made again are joined again.
+
     Args:
         is_up: Returns whether the link of an interface is up.
+
+    Attributes:
+        addresses: What sockets have at the interfaces of local addresses.
     """
 
     def __init__(self, is_up: Callable[[str], bool] = link_is_up) -> None:
+        self.addresses = AddressKeeper()
+        self._interfaces: list[EthernetInterface] = []
         self._transports: dict[str, list[tuple[StationRouter, str]]] = {}
         self._is_up = is_up
         self._down: set[str] = set()
@@ -165,14 +173,21 @@ class LinkWatch:
         """Watch *interface* for one transport of *router*."""
         self._transports.setdefault(interface, []).append((router, transport))
 
+    def find_again(self, interface: EthernetInterface) -> None:
+        """Look for *interface* by its name while it is lost."""
+        self._interfaces.append(interface)
+
     async def serve(self) -> None:
-        """Poll until cancelled; return at once without any interface."""
-        while self._transports:
+        """Poll until cancelled."""
+        while True:
             self.poll()
             await asyncio.sleep(LINK_POLL_S)
 
     def poll(self) -> None:
-        """Notify the routers of changed links."""
+        """Join interfaces that were made again; notify the routers of changed links."""
+        self.addresses.look()
+        for ethernet in self._interfaces:
+            ethernet.find()
         for interface, transports in self._transports.items():
             is_up, was_up = self._is_up(interface), interface not in self._down
             if is_up and not was_up:
@@ -212,6 +227,8 @@ class MailboxTransports:
             transport = Transport(f"udp:{owner.port}", max_size, is_hub=True)
             self._network.routers[owner.station].add_transport(transport, sender)
             self._watch_link(shared.address, owner, transport)
+        if not IPv4Address(shared.address).is_unspecified:
+            self._links.addresses.keep_outgoing(self._copy(shared.engine_fd), shared.address)
         self._add_intake(shared.owners, channel, sender, lambda data: False)
         watch_channel(channel)
 
@@ -219,6 +236,11 @@ class MailboxTransports:
         """Open a multicast group; each owner gets all of its frames."""
         channel = self._channel(shared)
         sender = ChannelSender(channel)
+        if not IPv4Address(shared.address).is_unspecified:
+            # Of the engine, too: each socket has memberships of its own.
+            for fd in (shared.engine_fd, shared.services_fd):
+                sock = self._copy(fd)
+                self._links.addresses.keep_group(sock, shared.group, shared.address)
         # An intake for each owner, not a demultiplexer: all members of a group get the frame.
         for owner in shared.owners:
             self._add_intake([owner], channel, sender, lambda data: True)
@@ -231,8 +253,11 @@ class MailboxTransports:
         a station in one VLAN the first one has the transport.
         """
         network = self._network
-        interface = EthernetInterface(socket.socket(fileno=shared.services_fd), packet_batch())
+        interface = EthernetInterface(
+            socket.socket(fileno=shared.services_fd), packet_batch(), shared.address
+        )
         network.resources.callback(interface.close)
+        self._links.find_again(interface)
         intakes: dict[int, list[FrameIntake]] = {}
         ports: dict[int, dict[PortName, EthernetPort]] = {}
         for owner in shared.owners:
@@ -247,7 +272,9 @@ class MailboxTransports:
                 in_vlan[owner] = port
         for vlan_id, (first, *others) in intakes.items():
             owners = [*ports[vlan_id]]
-            segment = EthernetSegment(network.demultiplexer("ethernet", owners), interface.address)
+            demultiplexer = network.demultiplexer("ethernet", owners)
+            segment = EthernetSegment(demultiplexer, lambda: interface.address)
+            interface.on_found.append(segment.forget)
             sender = ChannelSender(ports[vlan_id][owners[0]])
             gateway = network.first_gateways("ethernet", owners)
             mailbox = MailboxIntake(segment, gateway, sender, interface.is_group_frame)
@@ -319,6 +346,11 @@ class MailboxTransports:
         self._network.resources.callback(channel.close)
         return channel
 
+    def _copy(self, fd: int) -> socket.socket:
+        """Return a socket of a descriptor that others close."""
+        sock = socket.fromfd(fd, socket.AF_INET, socket.SOCK_DGRAM)
+        return self._network.resources.enter_context(sock)
+
     def _add_intake(
         self,
         owners: Sequence[PortName],
@@ -355,10 +387,12 @@ class AmsTransports:
 
     Args:
         network: What they are opened with.
+        links: Watches the interfaces.
     """
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: Network, links: LinkWatch) -> None:
         self._network = network
+        self._links = links
         self._clients = AmsClients()
         self._stations: set[str] = set()
 
@@ -385,7 +419,9 @@ class AmsTransports:
             is_broadcast = other.kind is SocketKind.AMS_BROADCAST
             is_same = is_broadcast and other.address == shared.address
             if is_same and other.services_fd != NO_DESCRIPTOR:
-                discovery.watch(network.open_socket(other))
+                broadcasts = network.open_socket(other)
+                self._links.addresses.keep_interface(broadcasts, other.address)
+                discovery.watch(broadcasts)
         for name in names:
             network.routes[name].scanners.append(requests)
 

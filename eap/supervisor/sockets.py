@@ -218,8 +218,10 @@ class SharedSockets(Closeable):
     def services_descriptors(self) -> list[int]:
         """Return what services inherits."""
         wanted = [shared.services_fd for shared in self.descriptions]
-        # Beside what it receives, what ICMP says of the frames that the engine sends:
-        wanted += [each.engine_fd for each in self.descriptions if each.kind is SocketKind.UDP]
+        # Beside what it receives, what ICMP says of the frames that the engine sends, and the
+        # memberships of the engine's sockets, which end with their interface:
+        shared_kinds = SocketKind.UDP, SocketKind.GROUP
+        wanted += [each.engine_fd for each in self.descriptions if each.kind in shared_kinds]
         wanted += [bus.command_fd for bus in self.buses]
         return _existing(*wanted, self.services_link, self.services_bus, self.control)
 

@@ -83,16 +83,21 @@ def cable(*, addresses: bool = False) -> Iterator[tuple[Namespace, Namespace]]:
     """
     with ExitStack() as stack:
         ends = stack.enter_context(namespace()), stack.enter_context(namespace())
-        left, right = (end.name for end in ends)
-        _run(
-            *("ip", "link", "add", "line0", "netns", left, "type", "veth"),
-            *("peer", "name", "line0", "netns", right),
-        )
-        for number, end in enumerate(ends, 1):
-            if addresses:
-                end.ip("addr", "add", f"10.88.164.{number}/24", "broadcast", "+", "dev", "line0")
-            end.plug()
+        lay_cable(ends, addresses=addresses)
         yield ends
+
+
+def lay_cable(ends: tuple[Namespace, Namespace], *, addresses: bool = False) -> None:
+    """Lay a cable between the ``line0`` of two namespaces, which have none."""
+    left, right = (end.name for end in ends)
+    _run(
+        *("ip", "link", "add", "line0", "netns", left, "type", "veth"),
+        *("peer", "name", "line0", "netns", right),
+    )
+    for number, end in enumerate(ends, 1):
+        if addresses:
+            end.ip("addr", "add", f"10.88.164.{number}/24", "broadcast", "+", "dev", "line0")
+        end.plug()
 
 
 @contextmanager

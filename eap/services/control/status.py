@@ -6,13 +6,14 @@ import asyncio
 import os
 import resource
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from ipaddress import IPv4Address
 from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
 from typing import Any
 
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.interface import interface_of, link_is_up
+from eap.net.interface import interface_of, is_there, link_is_up
 from eap.net.limits import ListenerStats
 from eap.pd.image import Image
 from eap.pd.report import station_status
@@ -181,6 +182,8 @@ def _station(
             port.update(bus_document(report, time_ns() / 1e9), link=bus_link(report))
         else:
             port["link"] = link_state(port["interface"])
+            if fault := interface_fault(port["interface"]):
+                port["fault"] = fault
     counts = station["discarded"]
     for by_station in discarded:
         for reason, count in by_station.get(image.layout.station, {}).items():
@@ -204,6 +207,20 @@ def link_state(interface: str) -> str:
     except EnvironmentalError:
         return "down"  # the address has been taken from this machine
     return "up" if link_is_up(name) else "down"
+
+
+def interface_fault(interface: str) -> str:
+    """Return what has become of the network interface behind a port's URI, empty if it is there."""
+    uri = InterfaceUri.parse(interface)
+    if uri.scheme == "ethernet":
+        return "" if is_there(uri.host) else f"interface {uri.host} is gone: it was deleted"
+    if uri.scheme == "loop" or IPv4Address(uri.host).is_unspecified:
+        return ""
+    try:
+        interface_of(uri.host)
+    except EnvironmentalError:
+        return f"address {uri.host} is gone: no interface has it now"
+    return ""
 
 
 def _process(process: ProcessInfo, meter: ProcessMeter, now_ns: int) -> dict[str, Any]:

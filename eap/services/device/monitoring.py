@@ -130,7 +130,12 @@ def open_subscriber_probes(handover: Handover, resources: ExitStack) -> Subscrib
         elif shared.kind is SocketKind.ARP:
             spec = handover.port(shared.owners[0])
             sock = socket.socket(fileno=shared.services_fd)
-            hop_prober = ArpProber(sock, vlan_id=shared.vlan_id, priority=spec.vlan_priority)
+            hop_prober = ArpProber(
+                sock,
+                vlan_id=shared.vlan_id,
+                priority=spec.vlan_priority,
+                interface=shared.address,
+            )
             resources.callback(hop_prober.close)
             endpoints.arp.update(dict.fromkeys(shared.owners, hop_prober))
     return endpoints

@@ -338,13 +338,22 @@ class EthernetSegment:
 
     Args:
         demultiplexer: To the local stations on it.
-        mac: Own address.
+        own_mac: Returns the own address, which changes with the interface.
     """
 
-    def __init__(self, demultiplexer: Demultiplexer, mac: MacAddr) -> None:
-        self.mac = str(mac)
+    def __init__(self, demultiplexer: Demultiplexer, own_mac: Callable[[], MacAddr]) -> None:
+        self._own_mac = own_mac
         self._demultiplexer = demultiplexer
         self._resolutions: dict[NetId, _Resolution] = {}
+
+    @property
+    def mac(self) -> str:
+        """Own address."""
+        return str(self._own_mac())
+
+    def forget(self) -> None:
+        """Forget all addresses: the interface was made again, perhaps on another network."""
+        self._resolutions.clear()
 
     def receive(self, data: bytes, connection: str, *, is_broadcast: bool = False) -> None:
         """Handle a packet; the arguments are those of :meth:`Demultiplexer.receive`."""

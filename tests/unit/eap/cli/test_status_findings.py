@@ -246,6 +246,13 @@ def test_port_without_link_is_an_error() -> None:
     ]
 
 
+def test_port_whose_interface_is_gone_is_named() -> None:
+    port = {"name": "eap0", "kind": "eap", "interface": "ethernet://eth0", "link": "down"}
+    (found,) = texts(ports=[port | {"fault": "interface eth0 is gone: it was deleted"}])
+    fault = "interface eth0 is gone: it was deleted; it is found again when it comes back"
+    assert found == f"error mixer/eap0: {fault}"
+
+
 def test_engine_that_runs_no_station_is_one_finding() -> None:
     silent_bus = {"name": "bus0", "kind": "bus", "interface": "sim://x", "link": "down"}
     status = document(cycle_age_us=3_000_000, ports=[silent_bus])

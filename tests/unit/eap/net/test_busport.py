@@ -10,7 +10,13 @@ import pytest
 
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.busport import BusPort, SegmentSocket, open_bus_port, open_segment
+from eap.net.busport import (
+    BusPort,
+    SegmentSocket,
+    open_bus_port,
+    open_bus_socket,
+    open_segment,
+)
 from eap.net.packetsocket import open_type1
 from tests.unit.eap.net.conftest import ip, wait_for_links
 
@@ -184,6 +190,30 @@ def test_interface_that_is_taken_away_and_made_again(cable):
         for _ in range(3):
             with pytest.raises(EnvironmentalError, match="No such device"):
                 master.send(FRAME)
+        ip(f"link add {near} type veth peer name {distant}")
+        for name in (near, distant):
+            ip(f"link set {name} up")
+        wait_for_links(near, distant)
+        far = open_segment(InterfaceUri.parse(f"ethernet://{distant}"))
+        try:
+            with pytest.raises(EnvironmentalError, match="cannot be reached"):
+                master.send(FRAME)
+            assert exchange(master, far)[: len(FRAME)] == FRAME[:2] + b"\x08" + FRAME[3:]
+        finally:
+            far.close()
+    finally:
+        master.close()
+
+
+@pytest.mark.root
+def test_interface_that_was_away_when_the_process_began_is_found(cable):
+    near, distant = cable
+    sock = open_bus_socket(InterfaceUri.parse(f"ethernet://{near}"))
+    ip(f"link del {near}")
+    master = BusPort(sock, interface=near)
+    try:
+        with pytest.raises(EnvironmentalError, match="cannot be reached"):
+            master.receive()
         ip(f"link add {near} type veth peer name {distant}")
         for name in (near, distant):
             ip(f"link set {name} up")

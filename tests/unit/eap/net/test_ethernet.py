@@ -263,3 +263,76 @@ def test_a_frame_above_the_mtu_is_refused_as_too_large(ends):
     large = OutFrame(bytearray(frame.buffer.ljust(600, b"\0")), 14, GROUP)
     assert list(sender.port.send([frame, large], 0)) == [large]
     assert (frame.oversized, large.oversized) == (False, True)
+
+
+def make_again(left_mac, right_mac):
+    """Delete the cable and lay another one, whose ends have other addresses."""
+    ip("link del left")
+    ip(f"link add left address {left_mac} type veth peer name right address {right_mac}")
+    ip("link set left up")
+    ip("link set right up")
+    wait_for_links("left", "right")
+
+
+def look_until(condition, *listeners):
+    limit = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < limit
+        for each in listeners:
+            each.port.drain(0)
+
+
+def test_interface_made_again_is_found_and_frames_have_its_address(ends):
+    near, far = Listener(ends[0], join=[OTHER_GROUP]), Listener(ends[1], join=[OTHER_GROUP])
+    prebuilt = near.frame(1), far.frame(2)
+    near.port.drain(0)
+    far.port.drain(0)
+    make_again("02:00:00:00:00:11", "02:00:00:00:00:22")
+    look_until(lambda: [str(end.address)[-2:] for end in ends] == ["11", "22"], near, far)
+    assert near.port.send(prebuilt[:1], 0) == ()
+    assert far.drain(1) == [expect(1)]
+    assert [str(mac) for mac in far.sources] == ["02:00:00:00:00:11"]
+    assert far.port.send([prebuilt[1], far.frame(3, OTHER_GROUP)], 0) == ()
+    assert near.drain(2) == [expect(2), expect(3)]
+    assert {str(mac) for mac in near.sources} == {"02:00:00:00:00:22"}
+    assert near.port.send([near.frame(4, "02:00:00:00:00:22")], 0) == ()
+    assert far.drain(2)[1] == expect(4)
+    assert far.for_many == [True, False]
+
+
+def test_interface_only_switched_off_keeps_its_frames(ends):
+    near, far = Listener(ends[0]), Listener(ends[1])
+    prebuilt = near.frame(1)
+    ip("link set left down")
+    near.port.drain(0)
+    assert near.port.send([prebuilt], 0) == [prebuilt]
+    ip("link set left up")
+    wait_for_links("left", "right")
+    look_until(lambda: near.port.send([prebuilt], 0) == (), near)
+    assert far.drain(1) == [expect(1)]
+    assert far.sources == [ends[0].address]
+
+
+def test_interface_away_at_start_is_found_by_its_name(cable):
+    engine, services = open_packet_pair("left")
+    ip("link del left")
+    interface = EthernetInterface(engine, packet_batch(), "left")
+    try:
+        near = Listener(interface)
+        frame = near.frame(1)
+        assert near.port.send([frame], 0) == [frame]
+        ip("link add left address 02:00:00:00:00:11 type veth peer name right")
+        ip("link set left up")
+        ip("link set right up")
+        wait_for_links("left", "right")
+        look_until(lambda: str(interface.address)[-2:] == "11", near)
+        with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0x0300) as other:
+            other.bind(("right", 0x0003))
+            other.settimeout(5)
+            assert near.port.send([frame], 0) == ()
+            while (data := other.recv(2000))[12:14] != b"\x88\xa4":
+                pass
+            assert data[6:12] == bytes(interface.address)
+    finally:
+        interface.close()
+        services.close()

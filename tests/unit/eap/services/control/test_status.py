@@ -25,6 +25,7 @@ from eap.services.control.status import (
     ProcessMeter,
     SharedAnswer,
     appliance_status,
+    interface_fault,
     link_state,
     take_snapshot,
 )
@@ -73,6 +74,21 @@ def test_process_meter_counts_descriptors():
 )
 def test_link_of_the_interface_behind_a_port(interface, link):
     assert link_state(interface) == link
+
+
+@pytest.mark.parametrize(
+    ("interface", "fault"),
+    [
+        ("loop://line", ""),
+        ("udp://127.0.3.4", ""),
+        ("udp://0.0.0.0", ""),
+        ("ethernet://lo", ""),
+        ("ethernet://nosuch0", "interface nosuch0 is gone: it was deleted"),
+        ("tcp://192.0.2.1", "address 192.0.2.1 is gone: no interface has it now"),
+    ],
+)
+def test_interface_that_is_gone_is_named(interface, fault):
+    assert interface_fault(interface) == fault
 
 
 def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):

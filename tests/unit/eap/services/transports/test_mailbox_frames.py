@@ -248,8 +248,9 @@ class Scene:
     def __init__(self, *others) -> None:
         self.station = station(HERE)
         self.wire = Wire()
+        self.own = MacAddr.parse(OWN)
         self.segment = EthernetSegment(
-            demultiplexer(self.station, *others, transport="ethernet:eap0"), MacAddr.parse(OWN)
+            demultiplexer(self.station, *others, transport="ethernet:eap0"), lambda: self.own
         )
         for each in (self.station, *others):
             sender = SegmentSender(self.segment, self.wire, each.net_id)
@@ -323,6 +324,16 @@ def test_segment_repeats_its_query(scene, monkeypatch):
     assert [where for where, _ in forward(scene, 5)] == [str(EAP_MULTICAST_MAC), PEER]
     scene.answer(OTHER)
     assert [where for where, _ in forward(scene, 6)] == [OTHER]
+
+
+def test_segment_forgets_addresses_with_its_interface(scene):
+    forward(scene)
+    scene.answer(PEER)
+    assert [where for where, _ in forward(scene, 2)] == [PEER]
+    scene.own = MacAddr.parse(OTHER)
+    scene.segment.forget()
+    assert next(where for where, _ in forward(scene, 3)) == str(EAP_MULTICAST_MAC)
+    assert scene.segment.mac == OTHER
 
 
 def test_stations_of_this_host_need_no_wire():
