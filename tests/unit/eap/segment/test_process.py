@@ -74,7 +74,7 @@ def run_with(script):
         finally:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    bus = BusFile(BusSpec(bus="b", slaves=(generic("a"), generic("b"))), {})
+    bus = BusFile(BusSpec(bus="b", slaves=(generic("a"), generic("b"))), {}, {})
     try:
         segment_process.run(bus, InterfaceUri.parse("udp://127.0.9.7"), say, command_fd=read_end)
     finally:
@@ -122,7 +122,7 @@ def test_values_by_command_and_answers_with_the_number_of_the_command(master):
 
 
 def test_commands_may_come_in_pieces_and_end(master):
-    bus = BusFile(BusSpec(bus="b", slaves=(generic("a"),)), {})
+    bus = BusFile(BusSpec(bus="b", slaves=(generic("a"),)), {}, {})
     read_end, write_end = os.pipe()
     said = []
 
