@@ -114,6 +114,19 @@ def test_bus_with_cut_ring_starts_with_every_slave_in_its_place(cut):
     assert line.events() == []
 
 
+@pytest.mark.parametrize("cut", [*MASTERS, *CUTS])
+def test_topology_of_a_cut_ring_is_found_over_both_lines(cut):
+    line = up(ring_of(cuts=(cut,)))
+    nodes = [each.found.node for each in line.core.slaves.values()]
+    parents = [None, 0, 1, 2, 3]
+    if cut > 0:
+        parents[cut] = None
+    assert [node.parent for node in nodes] == parents
+    assert [node.parent_port for node in nodes if node.parent is not None] == [1] * (
+        COUNT - parents.count(None)
+    )
+
+
 def test_second_cut_leaves_out_the_slaves_between_and_they_come_back():
     line = up(ring_of())
     line.segment.cut(2)
