@@ -60,9 +60,9 @@ def find_topology(statuses: Sequence[DlStatus]) -> tuple[TopologyNode, ...]:
         while exits and not exits[-1][1]:
             exits.pop()
         parent, port = (exits[-1][0], exits[-1][1].pop(0)) if exits else (None, 0)
-        # The last slave of a line has no link at port 0 if it is entered by another port.  The first
-        # behind the cut of a ring has none either: its frame comes from the second line, turns
-        # round at port 0, and goes on through the other ports.
+        # The last slave of a line has no link at port 0 if it is entered by another port.  The
+        # first behind the cut of a ring has none either: its frame comes from the second line,
+        # turns round at port 0, and goes on through the other ports.
         is_behind_cut = parent is None and len(statuses) > 1
         entry = 0 if 0 in ports or not ports or is_behind_cut else ports[0]
         nodes.append(TopologyNode(ports, parent, port, entry))

@@ -64,7 +64,7 @@ def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
 
 
 def _lock(bus: EngineBus, now_ns: int) -> LockState | None:
-    if bus.master.lock is None:
+    if bus.master.lock is None or bus.master.cycle is None:
         return None
     report = bus.master.lock.report()
     return LockState(
@@ -75,7 +75,8 @@ def _lock(bus: EngineBus, now_ns: int) -> LockState | None:
         lead_ns=report.lead_ns,
         late=report.late,
         early=report.early,
-        fault_ns=None if report.fault_ns is None else now_ns - report.fault_ns,
+        # Simulated slaves get a frame when their process runs, which says nothing about the cycle.
+        fault_ns=None if report.fault_ns is None or bus.is_simulated else now_ns - report.fault_ns,
     )
 
 

@@ -167,6 +167,7 @@ class EngineBus:
             reference clock it does not follow.
 
     Attributes:
+        is_simulated: Whether its slaves are a process of this appliance.
         is_up: Whether the bus has been brought up, in any state of its slaves.
         tasks: Requests that are under way.
     """
@@ -183,6 +184,7 @@ class EngineBus:
         set_step: Callable[[int], None] | None = None,
     ) -> None:
         self.spec = spec.bus or BusPortSpec()
+        self.is_simulated = spec.interface.scheme == "sim"
         self.master = Master(settings)
         self.faults = SlaveFaults()
         self.is_up = False

@@ -321,7 +321,7 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     ring: RingState | None = None
     """None on a bus with one line."""
     lock: LockState | None = None
-    """None if the cycle does not follow the clocks of this bus."""
+    """None if the cycle does not follow the clocks of this bus, or it has no process data yet."""
     malformed: int = 0
     """Malformed messages of services, for all buses of the engine together."""
     dropped: int = 0

@@ -1,14 +1,15 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master.findings import History
 from devicebus.wire.alstatus import AlState
 from eap.codec.mailbox import MailboxType
 from eap.engine.bus_report import report_bus
-from eap.runtime.bus_status import history_of, report_findings
-from eap.runtime.engine_messages import SlaveReport
+from eap.runtime.bus_status import find_lock_faults, history_of, report_findings
+from eap.runtime.engine_messages import LockState, SlaveReport
 from tests.support import enginebus
 from tests.support.cyclic import MS
 from tests.support.enginebus import US, BusRig
@@ -215,3 +216,21 @@ def test_emergencies_are_reported_with_their_age_until_they_are_forgotten(tmp_pa
     assert report_bus(rig.bus, rig.now_ns).slaves[1].emergencies == 2
     rig.bus.forget_past()
     assert report_bus(rig.bus, rig.now_ns).slaves[1].emergencies == 0
+
+
+def test_lock_is_reported_where_the_cycle_follows_the_clocks(tmp_path):
+    rig = BusRig(tmp_path)
+    assert report_bus(rig.bus, rig.now_ns).lock is None
+    lock = LockState(
+        reference=1001, is_locked=True, offset_ns=5, drift_ppb=7, lead_ns=300_000, late=2, early=1,
+        fault_ns=3_000_000_000,
+    )  # fmt: skip
+    (finding,) = find_lock_faults(lock)
+    assert finding.what == (
+        "frames miss their time before SYNC0: 2 too late, 1 too early (more than 150 µs), last 3 s"
+        " ago"
+    )
+    assert list(find_lock_faults(replace(lock, fault_ns=None))) == []
+    assert list(find_lock_faults(replace(lock, fault_ns=11_000_000_000))) == []
+    (finding,) = find_lock_faults(replace(lock, reference=None))
+    assert "runs free" in finding.what
