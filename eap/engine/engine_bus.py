@@ -197,7 +197,7 @@ class EngineBus:
         self._set_step = set_step
         self._starting: Task[None] | None = None
         self._start_fault = "it is being brought up"
-        self._wire_fault = ""
+        self._wire_faults = {port: "" for port in (port, second) if port is not None}
         self._retry_ns: int | None = None
         self._due_ns: int | None = None
 
@@ -205,12 +205,20 @@ class EngineBus:
     def fault(self) -> str:
         """Faults of the bus as a whole, one line each; empty if there is none."""
         faults = (
-            self._wire_fault,
+            *self._line_faults(),
             self._start_fault,
             *self.master.strangers,
             *self._mapping.missing,
         )
         return "\n".join(filter(None, faults))
+
+    def _line_faults(self) -> list[str]:
+        """Return the fault of each line; one line of a ring is named."""
+        faults = list(self._wire_faults.values())
+        if self._second is None:
+            return faults
+        names = ("first line", "second line")
+        return [f"{name}: {each}" for name, each in zip(names, faults, strict=True) if each]
 
     @property
     def revision(self) -> tuple[object, ...]:
@@ -383,7 +391,7 @@ class EngineBus:
         try:
             return port.receive()
         except EnvironmentalError as exc:
-            self._wire_fault = str(exc)
+            self._wire_faults[port] = str(exc)
             return None
 
     def _send(self, now_ns: int) -> None:
@@ -396,9 +404,9 @@ class EngineBus:
     def _send_frame(self, port: BusPort, frame: bytes) -> None:
         try:
             port.send(frame)
-            self._wire_fault = ""
+            self._wire_faults[port] = ""
         except EnvironmentalError as exc:
-            self._wire_fault = str(exc)
+            self._wire_faults[port] = str(exc)
 
     def _is_busy(self) -> bool:
         """Return whether something is under way that should not wait for the next cycle."""

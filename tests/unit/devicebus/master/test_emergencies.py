@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from devicebus.master.emergencies import (
     HISTORY,
@@ -47,6 +49,15 @@ def test_emergencies_of_both_protocols_are_decoded():
 )
 def test_other_and_malformed_messages_are_no_emergencies(kind, octets):
     assert decode_emergency(Unsolicited(1001, kind, octets), 0) is None
+
+
+@given(
+    kind=st.sampled_from([MailboxType.COE, MailboxType.SOE, MailboxType.VOE]),
+    octets=st.binary(max_size=24),
+)
+def test_arbitrary_messages_never_raise(kind, octets):
+    found = decode_emergency(Unsolicited(1001, kind, octets), 0)
+    assert found is None or describe_code(found.code)
 
 
 @pytest.mark.parametrize(

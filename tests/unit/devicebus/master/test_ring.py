@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from devicebus.mailbox import coe_client
 from devicebus.master import clocks
@@ -245,6 +247,28 @@ def test_foreign_frames_are_counted_and_change_nothing():
         for line in RingEnd:
             assert ring.receive_frame(line, data, 1) is None
     assert (ring.unexpected, changes, ring.is_whole) == (10, [], None)
+
+
+@given(
+    data=st.binary(max_size=80),
+    at=st.integers(0, 40),
+    line=st.sampled_from(RingEnd),
+    is_second=st.booleans(),
+)
+def test_damaged_and_arbitrary_frames_never_raise(data, at, line, is_second):
+    ring = Ring(lambda now_ns: None, lambda address, wkc: True)
+    datagrams = [
+        Datagram(DatagramHeader(12, 9, 0, 1, 4), b"\x0f\0\0\0"),
+        Datagram(DatagramHeader(7, 9, 0, 0x130, 2), bytes(2)),
+    ]
+    frame = encode_frame(datagrams)
+    (copy,) = ring.copy_frames([frame], 0)
+    sent = copy if is_second else frame
+    for octets in (data, sent[:at] + data, sent[:at] + data + sent[at + len(data) :], sent[:at]):
+        merged = ring.receive_frame(line, octets, 1)
+        assert merged is None or len(merged) >= len(frame)
+    ring.handle_timeout(10**10)
+    ring.report()
 
 
 def test_ring_merges_both_halves_of_a_frame():
