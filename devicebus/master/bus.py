@@ -340,6 +340,7 @@ class BusState:
                 self.cycle.handle_extra = partial(_note_time, self.lock)
         if self.lock is not None and reference is None:
             self.lock.hold()
+        self.locate_cut()
 
     @property
     def beyond_cut(self) -> list[BusSlave]:
@@ -357,14 +358,24 @@ class BusState:
         del now_ns
         self.needs_check = True
         self.changes.note()
-        assert self.ring is not None  # noqa: S101  it has called
-        reached = self.ring.reached
-        if not self.ring.is_whole:
-            self.cut_ends = None if reached is None else self._ends_of_cut(reached)
+        self.locate_cut()
+
+    def locate_cut(self) -> None:
+        """Find the slaves on both sides of a cut of the ring, and the clock that leads behind it.
+
+        Called when one of these changes: the ring, the slaves, the reference clock.
+        """
+        ring = self.ring
+        # The master itself opens a ring to measure delays.
+        if ring is None or ring.is_opened:
+            return
+        if ring.is_whole is False:
+            is_known = ring.reached is not None and self.slaves
+            self.cut_ends = self._ends_of_cut(ring.reached or 0) if is_known else None
         clocks = [slave.station for slave in self.beyond_cut if slave.found.esc.has_clock]
         # Without a clock that leads them, those behind the cut would drift apart.
         has_time = self.reference is not None and clocks
-        self.ring.second_reference = clocks[0] if has_time else None
+        ring.second_reference = clocks[0] if has_time else None
 
     def _is_expected(self, address: int, wkc: int) -> bool | None:
         return None if self.cycle is None else self.cycle.is_expected(address, wkc)

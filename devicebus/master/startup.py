@@ -42,6 +42,7 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
     found = yield from scan(bus.settings.first_station)
     slaves = yield from _identify(bus, found)
     bus.slaves = {slave.station: slave for slave in slaves}
+    bus.locate_cut()
     for slave in slaves:
         slave.target = target
     starting = _StartingSlaves([slave for slave in slaves if not slave.is_absent])
