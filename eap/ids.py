@@ -12,6 +12,10 @@ STATION_OCTETS = 4
 """Number of leading bytes that all NetIDs of a station usually have in common."""
 
 
+NET_ID = "six numbers from 0 to 255, such as 5.23.91.23.1.1"
+"""Expectation of a finding about a NetID."""
+
+
 class NetId(bytes):
     """An AMS NetID: six bytes, written ``5.23.91.23.1.1``.  Not an IP address."""
 

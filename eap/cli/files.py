@@ -139,14 +139,14 @@ def _import_lines(result: ImportResult, target: Path | None) -> Iterator[Rendera
             table.add_row(note.outcome.value, note.item, note.message, where)
         yield table
     if not result.ok:
-        yield "nothing was written: correct the files, or leave out those that cannot be read"
+        yield "nothing was written: correct the files or the options, or leave files out"
         return
     stations = f"{count(len(result.stations), 'station')} ({', '.join(result.stations)})"
     if target is None:
         yield f"{stations}; nothing was written: name a plant file with -o"
     elif result.why_beside:
         yield f"{result.added_to} is as it was: {result.why_beside}"
-        yield f"{result.file}: {stations} in a plant file of their own"
+        yield f"{result.file}: {stations} in a plant file of their own: take from it what you need"
     elif result.added_to:
         yield f"{result.file}: {stations} added"
     else:
@@ -167,14 +167,14 @@ def _import_lines(result: ImportResult, target: Path | None) -> Iterator[Rendera
     "-o",
     "--output-file",
     "target",
-    type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Automation Interface XML to write; a folder gets one file for each tree item.",
+    help="Automation Interface XML to write; FOLDER/ gets one file for each tree item, - is"
+    " stdout.",
 )
 @click.option("--force", is_flag=True, help="Overwrite existing files.")
 @json_option("Print one object: station, files, and rows of the table.")
 def export_peer(
-    plant: Path, station: str, target: Path | None, force: bool, output: Renderer
+    plant: Path, station: str, target: str | None, force: bool, output: Renderer
 ) -> None:
     """Show or write the TwinCAT configuration of the other side of STATION.
 
@@ -182,11 +182,20 @@ def export_peer(
     and addresses. The XML descriptions are for the Automation Interface, or for 'Import XML
     Description' at each item.
     """
+    from eap.config.imports.treeitems import tree_items_text
     from eap.ops.peers import peer_report, write_peer
 
+    if target == "-" and output.is_json:
+        raise click.UsageError("--json has no room for XML: name a file instead of -")
     devices, report = peer_report(plant, station)
+    if target == "-":
+        write_text(tree_items_text(devices), end="")
+        for remark in report.remarks:
+            output.remark(remark)
+        return
     if target is not None:
-        report = write_peer(devices, report, target, force=force)
+        is_folder = target.endswith("/")
+        report = write_peer(devices, report, Path(target), force=force, is_folder=is_folder)
     output.show(report, _peer_lines)
 
 

@@ -24,7 +24,7 @@ from msgspec import inspect
 
 from eap.config.finding import FindingReport, one_of
 from eap.config.structs import INVALID_NET_ID, PlantFile, Section
-from eap.ids import NetId
+from eap.ids import NET_ID, NetId
 from eap.suggest import nearest, suggest
 
 MAX_FILE = 4 << 20
@@ -540,8 +540,8 @@ def read_net_id(text: str, path: str, report: FindingReport) -> NetId:
     """Return the NetID of a station or port; report an invalid one at *path*."""
     try:
         return NetId.parse(text)
-    except ValueError as exc:
-        report.add(path, f"net_id: {exc}", "an AMS NetID such as 5.23.91.23.1.1")
+    except ValueError:
+        report.add(path, f"net_id: {text!r} is not an AMS NetID", NET_ID)
         return INVALID_NET_ID
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -25,7 +25,6 @@ from eap.config.imports.stations import (
     PublisherIdentity,
     UniqueNames,
     made_up_net_id,
-    plain_name,
     plan_station,
 )
 from eap.config.imports.treeitems import ROOTS as TREE_ROOTS
@@ -34,9 +33,9 @@ from eap.config.imports.twincat import ITEM, PROJECT, TwinCatProject, read_proje
 from eap.config.imports.typefile import ROOTS as TYPE_ROOTS
 from eap.config.imports.typefile import TypeFile, TypeRecord, read_type_file
 from eap.config.imports.typenames import TypeNames
-from eap.errors import ConfigError
-from eap.ids import InterfaceUri, NetId
-from eap.pd.rules import is_name
+from eap.errors import ConfigError, EnvironmentalError
+from eap.ids import NET_ID, InterfaceUri, NetId
+from eap.pd.rules import NAME, is_name, plain_name, plant_name_of
 from eap.runtime.durable import whole_file
 from eap.runtime.plantfile import load_plant
 
@@ -49,7 +48,14 @@ EDC = (
     " project itself"
 )
 _ARCHIVE = "it is an archive: unpack it, and import the .tsproj file in it"
-_NOT_READ = {".edc": EDC, ".tszip": _ARCHIVE, ".tnzip": _ARCHIVE, ".tpzip": _ARCHIVE}
+_SOLUTION = "it is a solution: import the .tsproj file in its folder"
+_NOT_READ = {
+    ".edc": EDC,
+    ".sln": _SOLUTION,
+    ".tszip": _ARCHIVE,
+    ".tnzip": _ARCHIVE,
+    ".tpzip": _ARCHIVE,
+}
 _OTHER_ROOTS = {
     "TcConfig": ": 'eapctl routes import STATION FILE' takes the routes of it",
     "EtherCATInfo": ": a bus file names it as the description of a slave (esi)",
@@ -122,21 +128,28 @@ def run_import(
 
     Raises:
         ConfigError: an option cannot be used.
+        EnvironmentalError: the plant file cannot be written.
     """
+    for kind, text in ("plant", choices.plant), ("station", choices.peer):
+        if text and not is_name(text):
+            raise ConfigError(f"{kind} name {text!r}: expected {NAME}")
     report = ImportReport()
     stations, types = _plan(_read(files, report), choices, report)
     if report.findings or not stations:
         if not report.findings:
-            message = "nothing to import: it has no EAP device that is in use, and no symbols"
-            report.add(str(files[0]), 0, message, "an EAP device (DevType 112), or symbols")
+            expected = "an EAP device (DevType 112) that is enabled, or symbols"
+            report.add(str(files[0]), 0, "nothing in it can be imported", expected)
         return _result(report), ""
-    name = choices.plant or (target.stem if target else files[0].stem)
+    name = choices.plant or plant_name_of((target or files[0]).stem)
     head = [f"Made by 'eapctl import {' '.join(each.name for each in files)}'."]
     text = plant_text(name, stations, types, head=head)
     result = _result(report, name, stations)
-    if target is None:
+    if target is None or not target.exists():
+        result = _checked(text, Path(f"{name}.yaml") if target is None else target, result)
+        if target is not None and result.ok:
+            result = _written(target, text, result)
         return result, text
-    return _write(target, text, stations, types, result), text
+    return _add(target, text, stations, types, result), text
 
 
 def _result(
@@ -154,8 +167,13 @@ def _result(
 
 def _read(files: Sequence[Path], report: ImportReport) -> _Sources:
     sources = _Sources()
+    known: set[Path] = set()
     for path in files:
         file = str(path)
+        if path.resolve() in known:
+            report.add(file, 0, "it is named twice", "each file once")
+            continue
+        known.add(path.resolve())
         if reason := _NOT_READ.get(path.suffix.lower()):
             report.add(file, 0, reason, "a .tsproj, .xti, .tmc, .tpy or .xml file")
             continue
@@ -194,8 +212,10 @@ def _root_of(path: Path, report: ImportReport) -> str:
 def _chunks(file: str) -> Iterator[bytes]:
     path = Path(file)
     # A pipe would block the reader, a device might never end.
+    if path.is_dir():
+        raise OSError("it is a folder")
     if path.exists() and not path.is_file():
-        raise OSError(f"{file} is not a regular file")
+        raise OSError("it is not a regular file")
     with path.open("rb") as opened:
         while chunk := opened.read(CHUNK):
             yield chunk
@@ -240,8 +260,14 @@ def _records(sources: _Sources) -> Iterator[tuple[str, Sequence[TypeRecord]]]:
 def _systems(
     sources: _Sources, types: TypeNames, names: UniqueNames, report: ImportReport
 ) -> Iterator[ImportedSystem]:
+    owners: dict[NetId, str] = {}
     for project in sources.projects:
         if project.devices:
+            if project.net_id is not None:
+                first = owners.setdefault(project.net_id, project.file)
+                if first != project.file:
+                    message = f"its NetID {project.net_id} is that of {first} too"
+                    report.add(project.file, 0, message, "projects of different controllers")
             yield ImportedSystem(
                 name=names.take(plain_name(Path(project.file).stem, "station")),
                 net_id=project.net_id,
@@ -273,8 +299,8 @@ def _of_symbols(
     if found.net_id:
         try:
             net_id = NetId.parse(found.net_id)
-        except ValueError as exc:
-            report.add(file, 0, str(exc), "an AMS NetID")
+        except ValueError:
+            report.add(file, 0, f"{found.net_id!r} is not an AMS NetID", NET_ID)
     has_areas = any(each.area for each in found.symbols)
     variables = []
     used: set[str] = set()
@@ -317,17 +343,15 @@ def _interfaces(pattern: str) -> Iterator[InterfaceUri]:
         yield uri
 
 
-def _write(
+def _add(
     target: Path,
     text: str,
     stations: Sequence[PlannedStation],
     types: Sequence[str],
     result: ImportResult,
 ) -> ImportResult:
-    """Write *text* to *target*, or add the stations to it; check the file before it is there."""
+    """Add the stations to the plant file *target*, or write *text* beside it."""
     replace = msgspec.structs.replace
-    if not target.exists():
-        return _checked(target, text, result)
     result = replace(result, added_to=str(target))
     before = load_plant(target)
     if before.findings:
@@ -338,13 +362,15 @@ def _write(
     except InsertionError as exc:
         why = str(exc)
     else:
-        added = _checked(target, merged, result)
+        # In the folder of the plant file: paths in it start there.
+        added = _checked(merged, target, result, folder=target.parent)
         if added.ok:
-            return added
+            return _written(target, merged, added)
         # Both are right by themselves: a station of that name, or of that NetID, is there already.
         why = "; ".join(each.message for each in added.findings[:3])
     beside = _beside(target)
-    return replace(_checked(beside, text, result), why_beside=why)
+    alone = _checked(text, beside, replace(result, why_beside=why))
+    return _written(beside, text, alone) if alone.ok else alone
 
 
 def _text(path: Path) -> str:
@@ -352,23 +378,31 @@ def _text(path: Path) -> str:
     return path.read_bytes().decode("utf-8")
 
 
-def _checked(target: Path, text: str, result: ImportResult) -> ImportResult:
-    """Write *text* to *target* if it is a plant without errors."""
-    # In the folder of the plant file: paths in it start there.
-    trial = target.with_name(f".{target.name}.{os.getpid()}.yaml")
-    replace = msgspec.structs.replace
+def _checked(
+    text: str, target: Path, result: ImportResult, *, folder: Path | None = None
+) -> ImportResult:
+    """Return *result* with the findings in *text*, which is to be the plant file *target*.
+
+    Files that *text* names are found from *folder*.
+    """
     try:
-        trial.write_bytes(text.encode())
-        loaded = load_plant(trial)
-    finally:
-        trial.unlink(missing_ok=True)
+        with tempfile.NamedTemporaryFile(prefix=".", suffix=".yaml", dir=folder) as trial:
+            trial.write(text.encode())
+            trial.flush()
+            loaded = load_plant(Path(trial.name))
+    except OSError as exc:
+        raise EnvironmentalError(f"{target} cannot be written: {exc.strerror}") from None
+    replace = msgspec.structs.replace
     if loaded.findings:
         own = tuple(replace(each, file=str(target)) for each in loaded.findings)
         return replace(result, ok=False, findings=own)
+    return replace(result, plant=loaded.plant.name if loaded.plant else result.plant)
+
+
+def _written(target: Path, text: str, result: ImportResult) -> ImportResult:
     with whole_file(target) as file:
         file.write(text.encode())
-    name = loaded.plant.name if loaded.plant else result.plant
-    return replace(result, file=str(target), plant=name)
+    return msgspec.structs.replace(result, file=str(target))
 
 
 def _beside(target: Path) -> Path:

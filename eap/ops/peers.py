@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import TypeAlias
 
 import msgspec
 
@@ -14,7 +16,7 @@ from eap.codec.basetypes import Block, Boolean, DataType, Integer, String
 from eap.config.imports.records import EapBox, EapImportDevice, EapVariable
 from eap.config.imports.treeitems import device_items, tree_items_text
 from eap.config.load import Plant
-from eap.errors import ConfigError
+from eap.errors import ConfigError, EnvironmentalError
 from eap.ids import Destination, DestinationKind, NetId
 from eap.ops.plant import load_or_raise
 from eap.pd.spec import REQUESTER, PortKind, PortSpec, RxPdSpec, StationSpec, TxFrameSpec, TxPdSpec
@@ -23,6 +25,9 @@ from eap.suggest import suggest
 
 _ARP_MS = 1000
 """Interval that TwinCAT offers."""
+_Periods: TypeAlias = dict[tuple[str, str, str], str]
+"""Time between two of a variable, by device, box and name."""
+_NO_PERIODS: Mapping[str, str] = MappingProxyType({})
 _ODD_SIZE = re.compile(r"U?INT(24|40|48|56)|BIT\d", re.ASCII)
 
 
@@ -81,13 +86,31 @@ def peer_report(file: Path, station: str) -> tuple[tuple[EapImportDevice, ...], 
 
 
 def write_peer(
-    devices: Sequence[EapImportDevice], report: PeerReport, target: Path, *, force: bool
+    devices: Sequence[EapImportDevice],
+    report: PeerReport,
+    target: Path,
+    *,
+    force: bool,
+    is_folder: bool = False,
 ) -> PeerReport:
     """Write the XML descriptions of *devices*: one file, or one for each item in a folder.
 
+    Args:
+        devices: Of the other side.
+        report: Of them.
+        target: A file, or a folder.
+        force: Overwrite files.
+        is_folder: *target* is a folder, which is made if it is not there.
+
     Raises:
         ConfigError: a file exists and *force* is not set.
+        EnvironmentalError: a file or the folder cannot be written.
     """
+    if is_folder:
+        try:
+            target.mkdir(exist_ok=True)
+        except OSError as exc:
+            raise EnvironmentalError(f"{target} cannot be written: {exc.strerror}") from None
     files: dict[Path, str] = {target: tree_items_text(devices)}
     if target.is_dir():
         items = [item for device in devices for item in device_items(device)]
@@ -137,7 +160,7 @@ class _PeerBuilder:
         self._others = [each for each in plant.stations if each.name != station.name]
         self._types = _types(station)
         self._devices: dict[tuple[str, str], EapImportDevice] = {}
-        self.periods: dict[tuple[str, str, int], str] = {}
+        self.periods: _Periods = {}
         self.remarks: list[str] = []
 
     def devices(self) -> tuple[EapImportDevice, ...]:
@@ -163,9 +186,13 @@ class _PeerBuilder:
             wanted = {each.pd_id for each in subscriptions}
             for frame in other.frames:
                 pds = [pd for pd in frame.pds if pd.pd_id in wanted]
-                if frame.port == other_port.name and pds:
-                    box = self._publisher_box(frame, pds, other, other_port)
-                    self._add_box(self._device_of(other, other_port), box)
+                if frame.port != other_port.name or not pds:
+                    continue
+                if frame.destination == REQUESTER:
+                    self._remark_poll(f"{other.name}/{frame.name}")
+                    continue
+                box = self._publisher_box(frame, pds, other, other_port)
+                self._add_box(self._device_of(other, other_port), box, _periods(frame, pds, other))
 
     def _add_foreign(
         self, port: PortSpec, publisher: str, subscriptions: Sequence[RxPdSpec]
@@ -195,19 +222,16 @@ class _PeerBuilder:
         self, frame: TxFrameSpec, pds: Sequence[TxPdSpec], other: StationSpec, port: PortSpec
     ) -> EapBox:
         types = _types(other)
-        for pd in pds:
-            self._note_period(frame, pd, other)
         mac = udp = ""
         net_id = None
-        if frame.destination != REQUESTER:
-            destination = Destination.parse(frame.destination)
-            match destination.kind:
-                case DestinationKind.MAC:
-                    mac = destination.host
-                case DestinationKind.NET_ID:
-                    net_id = NetId.parse(destination.host)
-                case _:
-                    udp = destination.host
+        destination = Destination.parse(frame.destination)
+        match destination.kind:
+            case DestinationKind.MAC:
+                mac = destination.host
+            case DestinationKind.NET_ID:
+                net_id = NetId.parse(destination.host)
+            case _:
+                udp = destination.host
         return EapBox(
             name=frame.name,
             is_publisher=True,
@@ -232,18 +256,18 @@ class _PeerBuilder:
             if frame.port != port.name:
                 continue
             if frame.destination == REQUESTER:
-                self.remarks.append(
-                    f"frame {frame.name} answers polls: TwinCAT's files have no known form of that"
-                )
+                self._remark_poll(f"{self._station.name}/{frame.name}")
                 continue
             receivers = list(self._receivers(port, frame))
             for other, other_port, pds in receivers:
                 box = self._subscriber_box(frame, pds, port)
-                self._add_box(self._device_of(other, other_port), box)
+                periods = _periods(frame, pds, self._station)
+                self._add_box(self._device_of(other, other_port), box, periods)
             if not receivers:
                 key = "other controllers", ""
                 self._devices.setdefault(key, EapImportDevice(name="EAP other controllers"))
-                self._add_box(key, self._subscriber_box(frame, frame.pds, port))
+                box = self._subscriber_box(frame, frame.pds, port)
+                self._add_box(key, box, _periods(frame, frame.pds, self._station))
 
     def _receivers(
         self, port: PortSpec, frame: TxFrameSpec
@@ -267,9 +291,6 @@ class _PeerBuilder:
             "255.255.255.255",
         }
         is_mac = destination.kind is DestinationKind.MAC
-        pds = list(pds)
-        for pd in pds:
-            self._note_period(frame, pd, self._station)
         return EapBox(
             name=f"from {self._station.name} {frame.name}",
             is_publisher=False,
@@ -282,16 +303,10 @@ class _PeerBuilder:
             ),
         )
 
-    def _note_period(self, frame: TxFrameSpec, pd: TxPdSpec, sender: StationSpec) -> None:
-        cycle_us = pd.trigger.cycle_us or sender.cycle_us * max(
-            frame.divider, pd.trigger.divider, 1
+    def _remark_poll(self, frame: str) -> None:
+        self.remarks.append(
+            f"frame {frame} answers polls: TwinCAT's files have no known form of that"
         )
-        text = f"{cycle_us / 1000:g} ms"
-        if pd.trigger.on_change is not None:
-            text = "on change"
-        elif pd.trigger.event:
-            text = "on event"
-        self.periods[sender.name, pd.name, pd.pd_id] = text
 
     def _variable(
         self,
@@ -332,8 +347,12 @@ class _PeerBuilder:
             )
         return key
 
-    def _add_box(self, key: tuple[str, str], box: EapBox) -> None:
+    def _add_box(
+        self, key: tuple[str, str], box: EapBox, periods: Mapping[str, str] = _NO_PERIODS
+    ) -> None:
         device = self._devices[key]
+        for name, period in periods.items():
+            self.periods[device.name, box.name, name] = period
         self._devices[key] = msgspec.structs.replace(device, boxes=(*device.boxes, box))
 
 
@@ -341,8 +360,20 @@ def _types(station: StationSpec) -> dict[str, DataType]:
     return {each.name: datatypes.parse(each.type) for each in station.variables}
 
 
-def _rows(device: EapImportDevice, periods: dict[tuple[str, str, int], str]) -> Iterator[PeerRow]:
-    by_pd = {(name, pd_id): text for (_, name, pd_id), text in periods.items()}
+def _periods(frame: TxFrameSpec, pds: Iterable[TxPdSpec], sender: StationSpec) -> dict[str, str]:
+    """Return the time between two of each PD, by its name."""
+    found = {}
+    for pd in pds:
+        divider = max(frame.divider, pd.trigger.divider, 1)
+        found[pd.name] = f"{(pd.trigger.cycle_us or sender.cycle_us * divider) / 1000:g} ms"
+        if pd.trigger.on_change is not None:
+            found[pd.name] = "on change"
+        elif pd.trigger.event:
+            found[pd.name] = "on event"
+    return found
+
+
+def _rows(device: EapImportDevice, periods: _Periods) -> Iterator[PeerRow]:
     for box in device.boxes:
         for variable in box.variables:
             yield PeerRow(
@@ -355,7 +386,7 @@ def _rows(device: EapImportDevice, periods: dict[tuple[str, str, int], str]) -> 
                 type=variable.type,
                 bytes=variable.bits // 8,
                 address=_address(box),
-                period=by_pd.get((variable.name, variable.nv_id), ""),
+                period=periods.get((device.name, box.name, variable.name), ""),
             )
 
 

@@ -52,6 +52,16 @@ def is_name(text: str) -> bool:
     return _NAME.fullmatch(text) is not None
 
 
+def plain_name(text: str, default: str) -> str:
+    """Return *text* as a name: without spaces, slashes and dots; *default* if nothing is left."""
+    return re.sub(r"[^\w-]+", "_", text).strip("_") or default
+
+
+def plant_name_of(stem: str) -> str:
+    """Return the name of a plant whose file has the name *stem*, without suffix."""
+    return stem if is_name(stem) else plain_name(stem, "plant")
+
+
 def is_group(text: str, scheme: str) -> bool:
     """Return whether *text* is a multicast address that a port on *scheme* can join."""
     try:

@@ -10,7 +10,6 @@ system.  One of them is used, the other one is written beside it.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import StrEnum
 from ipaddress import IPv4Address
@@ -25,6 +24,7 @@ from eap.config.imports.records import (
     ImportReport,
 )
 from eap.ids import BROADCAST_MAC, InterfaceUri, MacAddr, NetId
+from eap.pd.rules import plain_name
 
 DEFAULT_CYCLE_US = 10_000
 MIN_CYCLE_US, MAX_CYCLE_US = 100, 60_000_000
@@ -199,11 +199,6 @@ class PlannedStation(msgspec.Struct, frozen=True, kw_only=True):
     remarks: tuple[str, ...] = ()
 
 
-def plain_name(text: str, default: str) -> str:
-    """Return *text* as a name of a plant file: without spaces, slashes and dots."""
-    return re.sub(r"[^\w-]+", "_", text).strip("_") or default
-
-
 class UniqueNames:
     """Names that are unique among their like."""
 
@@ -301,10 +296,13 @@ class _StationBuilder:
         if base is None:
             base = made_up_net_id(uris[0] if uris else None)
             self._warn(f"no NetID in the project: {base} is made up, write that of the controller")
-        system = self._system.net_id or NetId(bytes(base[:4]) + b"\1\1")
+        used = {each.net_id for each in self._devices if each.net_id}
+        # A file without the NetID of the system may have a device with the usual one of systems.
+        system = self._system.net_id or _free_net_id(base, 1, used)
         router = system
+        used.add(system)
         own = [
-            each.net_id or NetId(bytes(system[:4]) + bytes((2 + number, 1)))
+            each.net_id or _free_net_id(system, 2 + number, used)
             for number, each in enumerate(self._devices)
         ]
         self._check_unique(own, system)
@@ -324,7 +322,7 @@ class _StationBuilder:
                     vlan=_vlan(device),
                     join=_groups(device, uri.scheme),
                     remarks=(
-                        *_identity_remarks(device, sent[number], names - {sent[number]}),
+                        *_identity_remarks(device, identity, sent[number], names - {sent[number]}),
                         *((_MAC,) if device.mac and uri.scheme == "ethernet" else ()),
                     ),
                 )
@@ -469,6 +467,16 @@ class _StationBuilder:
             )
 
 
+def _free_net_id(base: NetId, first: int, used: set[NetId]) -> NetId:
+    """Return the first ``BASE.N.1`` from *first* on that is not in *used*, and add it there."""
+    head = bytes(base[:4])
+    found = next(
+        net_id for n in range(first, 256) if (net_id := NetId(head + bytes((n, 1)))) not in used
+    )
+    used.add(found)
+    return found
+
+
 def made_up_net_id(uri: InterfaceUri | None) -> NetId:
     """Return a NetID for a system that has none: of its address, else one that nobody has."""
     try:
@@ -525,12 +533,15 @@ def _groups(device: EapImportDevice, scheme: str) -> tuple[str, ...]:
     return tuple(sorted(each for each in found if each and is_group_address(each)))
 
 
-def _identity_remarks(device: EapImportDevice, sent: NetId, others: set[NetId]) -> tuple[str, ...]:
+def _identity_remarks(
+    device: EapImportDevice, identity: PublisherIdentity, sent: NetId, others: set[NetId]
+) -> tuple[str, ...]:
     """Return the comment on the other NetID that the publishers of *device* may send."""
     if not others or not any(each.is_publisher for each in device.boxes):
         return ()
     other = next(iter(others))
-    reading = "system" if other[4:] == b"\1\1" else "device"
+    is_device = identity is PublisherIdentity.DEVICE
+    reading = PublisherIdentity.SYSTEM if is_device else PublisherIdentity.DEVICE
     text = (
         f"The publisher ID is {sent}.  TwinCAT 2 sends the NetID of the system, TwinCAT 3 that of"
         f" the device: if frames carry {other}, import with --publisher {reading}."

@@ -26,7 +26,7 @@ from eap.config.imports.records import (
     ImportReport,
     unknown_children,
 )
-from eap.ids import MacAddr, NetId
+from eap.ids import NET_ID, MacAddr, NetId
 
 ROOTS = "TreeItem", "TreeItems"
 NAMESPACE = "urn:eap-appliance:peer"
@@ -251,8 +251,9 @@ def _net_id(text: str, line: int) -> NetId | None:
         return None
     try:
         net_id = NetId.parse(text)
-    except ValueError as exc:
-        raise XmlError(str(exc), line=line, expected="an AMS NetID") from None
+    except ValueError:
+        message = f"{text!r} is not an AMS NetID"
+        raise XmlError(message, line=line, expected=NET_ID) from None
     return net_id if any(net_id) else None
 
 

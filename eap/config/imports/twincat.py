@@ -30,7 +30,7 @@ from eap.config.imports.records import (
     unknown_children,
 )
 from eap.config.imports.typefile import IGNORED, TSPROJ_TYPE, TypeRecord, read_types
-from eap.ids import MacAddr, NetId
+from eap.ids import NET_ID, MacAddr, NetId
 
 OpenFile: TypeAlias = Callable[[str], Iterable[bytes]]
 """Opens a file by its path; raises OSError."""
@@ -324,8 +324,8 @@ class _Project:
     def _parse_net_id(self, text: str, file: str, line: int) -> NetId | None:
         try:
             return NetId.parse(text)
-        except ValueError as exc:
-            self._report.add(file, line, str(exc), "an AMS NetID such as 5.23.91.23.1.1")
+        except ValueError:
+            self._report.add(file, line, f"{text!r} is not an AMS NetID", NET_ID)
             return None
 
     def _is_inside(self, name: str, file: str, line: int) -> bool:

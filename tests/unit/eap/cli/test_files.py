@@ -102,8 +102,35 @@ def test_export_peer_writes_files_and_names_them(plant: str, tmp_path: Path) -> 
     document = json.loads(run("export-peer", plant, "panel", "--json").stdout)
     assert document["station"] == "panel"
     assert [row["id"] for row in document["rows"]] == [11, 12, 13, 14, 15, 21, 22, 23, 24]
-    imported = run("import", str(file), LINE, "--address", "127.0.9.{n}", "--json")
+    imported = run("import", str(file), "--address", "127.0.9.{n}", "--json")
     assert json.loads(imported.stdout)["ok"]
+
+
+def test_export_peer_makes_the_folder_that_is_named(plant: str, tmp_path: Path) -> None:
+    folder = tmp_path / "items"
+    result = run("export-peer", plant, "panel", "-o", f"{folder}/")
+    assert "23 files written" in result.stdout
+    assert len(list(folder.iterdir())) == 23
+
+
+def test_export_peer_to_stdout_prints_the_xml_only(plant: str, tmp_path: Path) -> None:
+    result = run("export-peer", plant, "panel", "-o", "-")
+    assert result.stdout.startswith("<")
+    file = tmp_path / "peer.xml"
+    file.write_text(result.stdout)
+    assert run("import", str(file), "--address", "127.0.9.{n}").exit_code == 0
+    assert run("export-peer", plant, "panel", "-o", "-", "--json").exit_code == 2
+
+
+@pytest.mark.parametrize("station", ["Line", "panel"])
+def test_exported_peers_are_imported_without_errors(
+    plant: str, tmp_path: Path, station: str
+) -> None:
+    file, again = tmp_path / "peer.xml", tmp_path / "again.yaml"
+    assert run("export-peer", plant, station, "-o", str(file)).exit_code == 0
+    words = "--address", "127.0.8.{n}", "-o", str(again)
+    assert run("import", str(file), *words).exit_code == 0
+    assert run("check", str(again)).exit_code == 0
 
 
 def test_export_peer_of_a_station_alone_says_so(tmp_path: Path) -> None:

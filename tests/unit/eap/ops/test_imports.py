@@ -11,7 +11,7 @@ from eap.config.imports.records import EapBox, EapImportDevice, EapVariable, Imp
 from eap.config.imports.stations import PublisherIdentity
 from eap.config.imports.treeitems import tree_items_text
 from eap.config.load import Plant
-from eap.errors import ConfigError
+from eap.errors import ConfigError, EnvironmentalError
 from eap.ids import NetId
 from eap.ops.imports import ImportChoices, ImportResult, run_import
 from eap.runtime.plantfile import load_plant
@@ -312,8 +312,8 @@ def test_pointers_are_refused(importer: Importer, kind: str, size: int) -> None:
         ("a.tszip", "PK", "it is an archive: unpack it"),
         ("a.xml", "<TcConfig/>", "'eapctl routes import STATION FILE' takes the routes of it"),
         ("a.xml", "<EtherCATInfo/>", "a bus file names it"),
-        ("a.xti", '<TcSmItem><Box BoxType="9099"/></TcSmItem>', "nothing to import"),
-        ("a.tsproj", project(device(more='Disabled="1"')), "no EAP device that is in use"),
+        ("a.xti", '<TcSmItem><Box BoxType="9099"/></TcSmItem>', "nothing in it can be imported"),
+        ("a.tsproj", project(device(more='Disabled="1"')), "nothing in it can be imported"),
     ],
 )
 def test_files_without_process_data_are_refused_with_the_reason(
@@ -323,6 +323,59 @@ def test_files_without_process_data_are_refused_with_the_reason(
     assert not result.ok
     assert reason in messages(result)[0]
     assert not importer.plant.exists()
+
+
+def test_file_that_is_named_twice_is_refused_once(importer: Importer) -> None:
+    result = importer.run(LINE, LINE)
+    assert messages(result) == ["it is named twice"]
+
+
+def test_projects_of_one_controller_are_refused_with_both_files(importer: Importer) -> None:
+    first = importer.put("A.tsproj", LINE.read_text())
+    second = importer.put("B.tsproj", LINE.read_text())
+    result = importer.run(first, second)
+    assert [(each.file, each.message) for each in result.findings] == [
+        (str(second), f"its NetID 192.168.5.1.1.1 is that of {first} too")
+    ]
+    assert not importer.plant.exists()
+
+
+def test_plant_without_a_file_is_checked_too() -> None:
+    choices = ImportChoices(address="127.0.9.{n}", to="nonsense")
+    result, _ = run_import((LINE,), None, choices)
+    assert not result.ok
+    assert "'nonsense' is not an IPv4 address" in messages(result)[0]
+
+
+@pytest.mark.parametrize("choices", [ImportChoices(plant="a b"), ImportChoices(peer="a b")])
+def test_name_with_a_space_is_refused(choices: ImportChoices) -> None:
+    with pytest.raises(ConfigError, match="name 'a b': expected a text without spaces"):
+        run_import((LINE,), None, choices)
+
+
+def test_plant_in_a_file_with_spaces_has_a_name_without(importer: Importer) -> None:
+    importer.plant = importer.folder / "my plant.yaml"
+    assert importer.run(LINE).plant == "my_plant"
+    assert importer.loaded().name == "my_plant"
+
+
+def test_folders_are_named_as_such(importer: Importer) -> None:
+    result = importer.run(importer.folder)
+    assert messages(result) == ["cannot be read: it is a folder"]
+    importer.plant = importer.folder / "none" / "plant.yaml"
+    with pytest.raises(EnvironmentalError, match="cannot be written: No such file"):
+        importer.run(LINE)
+
+
+def test_system_without_a_net_id_gets_one_that_its_devices_do_not_have(importer: Importer) -> None:
+    variable = EapVariable(name="V", nv_id=1, type="DINT", bits=32)
+    box = EapBox(name="B", is_publisher=True, udp="127.0.9.7", variables=(variable,))
+    net_id = NetId.parse("5.1.2.3.1.1")
+    device_ = EapImportDevice(name="D", net_id=net_id, cycle_us=10_000, boxes=(box,))
+    assert importer.run(importer.put("d.xml", tree_items_text([device_]))).findings == ()
+    (station,) = importer.loaded().stations
+    assert (str(station.net_id), str(station.ports[0].net_id)) == ("5.1.2.3.2.1", "5.1.2.3.1.1")
+    assert "import with --publisher system" in " ".join(importer.text.replace("#", " ").split())
 
 
 @given(st.data())

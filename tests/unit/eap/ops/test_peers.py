@@ -11,6 +11,7 @@ from eap.config.imports.treeitems import assemble, read_tree_items
 from eap.errors import ConfigError
 from eap.ids import NetId
 from eap.ops.peers import peer_report, twincat_type, write_peer
+from tests.support.pages import ROOT
 
 PLANT = """\
 plant: hall
@@ -74,6 +75,30 @@ def test_table_has_the_other_side_of_everything(plant: Path) -> None:
         ("EAP other controllers", "subscriber", "c", 3, 0, "ST_A", 16,
          "NetID 9.9.9.9.2.1 01:01:05:04:00:00", "on change"),
     ]  # fmt: skip
+
+
+def test_pds_of_one_name_and_id_keep_the_periods_of_their_senders(plant: Path) -> None:
+    fast = """\
+  - name: fast
+    net_id: 7.7.7.7.1.1
+    cycle_us: 1000
+    ports:
+      - {name: eap0, kind: eap, interface: "ethernet://eth0", net_id: 7.7.7.7.2.1, vlan: {id: 7}}
+    variables: {out: "REAL[3]"}
+    frames: [{name: to-ours, port: eap0, to: multicast}]
+    publish: [{name: out, frame: to-ours, id: 5, variables: [out]}]
+"""
+    taken = "      - {name: plc, port: eap0, from: plc/out}\n"
+    text = PLANT.replace(taken, taken + "      - {name: fast, port: eap0, from: fast/out}\n")
+    plant.write_text(text + fast)
+    found = {row[0]: row[-1] for row in rows(plant) if row[2] == "out"}
+    assert found == {"EAP plc": "2 ms", "EAP fast": "1 ms"}
+
+
+def test_publisher_that_answers_polls_is_a_remark() -> None:
+    _, report = peer_report(ROOT / "config" / "poll.yaml", "desk")
+    assert "answers polls" in " ".join(report.remarks)
+    assert all(row.address for row in report.rows)
 
 
 def test_pd_of_several_variables_is_an_array_with_a_remark(plant: Path) -> None:

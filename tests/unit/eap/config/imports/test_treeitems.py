@@ -144,7 +144,7 @@ def test_every_wrong_item_is_a_finding() -> None:
     _, report = read(*wrong)
     messages = {each.file: each.message for each in report.findings}
     assert messages == {
-        "0.xml": "'2.2.3' is not an AMS NetID (six numbers such as 5.23.91.23.1.1)",
+        "0.xml": "'2.2.3' is not an AMS NetID",
         "1.xml": "MAC address '01 01 04 00 07'",
         "2.xml": "Divider is '0'",
         "3.xml": "NvPubVarDef has no NvId",

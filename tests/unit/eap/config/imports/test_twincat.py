@@ -153,10 +153,7 @@ def test_every_wrong_part_is_a_finding_of_its_own() -> None:
     )
     found, report = read(project(device(*boxes), target='TargetNetId="1.2.3"'))
     assert [str(each).partition(": ")[2] for each in report.findings] == [
-        (
-            "'1.2.3' is not an AMS NetID (six numbers such as 5.23.91.23.1.1); expected an AMS"
-            " NetID such as 5.23.91.23.1.1"
-        ),
+        "'1.2.3' is not an AMS NetID; expected six numbers from 0 to 255, such as 5.23.91.23.1.1",
         "EapVar NvId is '70000'; expected a whole number from 0 to 65535",
         "Publisher is 'xyz'; expected a NetID of 12 hexadecimal digits",
         "Box Disabled is 'maybe'; expected true, false, 1 or 0",
