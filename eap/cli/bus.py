@@ -17,6 +17,7 @@ from eap.cli.params import (
     CommandT,
     StationBus,
     bus_options,
+    check_new_file,
     examples,
     json_option,
     number_up_to,
@@ -106,8 +107,7 @@ def scan(
             found = scan_slaves(session)
         output.show(found, scan_tables)
         return
-    if target.exists() and not force:
-        raise click.UsageError(f"{target} exists: --force overwrites it")
+    check_new_file(target, force=force)
     output.show(_write_bus(bus, target, esi), written_bus_view)
 
 

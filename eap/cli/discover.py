@@ -15,8 +15,8 @@ import click
 
 from eap.cli.group import ExitCode
 from eap.cli.output import Renderer, count, repaint, write_view
-from eap.cli.params import PLANT_FILE, examples, json_option
-from eap.errors import ControlError
+from eap.cli.params import PLANT_FILE, check_new_file, examples, json_option
+from eap.errors import CodecError, ConfigError, ControlError, EnvironmentalError
 from eap.ids import NetId
 
 if TYPE_CHECKING:
@@ -106,8 +106,8 @@ def discover(
     from eap.ops.discover import ObserverFeed, discovered
 
     _check_usage(interface, pcap, net_ids, for_s)
-    if target is not None and target.exists() and not force:
-        raise click.UsageError(f"{target} exists: --force overwrites it")
+    if target is not None:
+        check_new_file(target, force=force)
     takers = _takers(plants)
     discovery = ObserverFeed()
     fault = None
@@ -123,7 +123,7 @@ def discover(
     if target is not None and rows:
         _write(target, rows, pcap or interface)
     if fault is not None:
-        raise click.UsageError(fault)
+        raise ConfigError(fault)
     if not rows:
         ctx.exit(ExitCode.FAILED)
 
@@ -160,15 +160,21 @@ def _takers(plants: tuple[Path, ...]) -> list[Taker]:
 
 def _read(discovery: ObserverFeed, path: Path) -> str | None:
     """Read a capture; return its fault, where what came before it counts all the same."""
-    from eap.errors import CodecError
-
+    # A pipe cannot be read twice, for losses and for frames, and a device might never end.
+    if path.exists() and not path.is_file():
+        kind = "a folder" if path.is_dir() else "no regular file"
+        raise EnvironmentalError(f"{path} cannot be read: it is {kind}")
     try:
         discovery.read(path)
-    except (OSError, CodecError) as exc:
-        if not discovery.observer.frames:
-            raise click.UsageError(str(exc)) from None
-        return str(exc)
-    return None
+    except OSError as exc:
+        fault = f"{path} cannot be read: {exc.strerror}"
+    except CodecError as exc:
+        fault = str(exc)
+    else:
+        return None
+    if not discovery.observer.frames:
+        raise ConfigError(fault)
+    return fault
 
 
 def _watch(
@@ -246,8 +252,11 @@ def _show(rows: list[DiscoveredPd], discovery: ObserverFeed, output: Renderer) -
 
 def _write(target: Path, rows: list[DiscoveredPd], source: Path | str | None) -> None:
     from eap.ops.discovered_plant import discovered_plant
+    from eap.pd.rules import plant_name_of
+    from eap.runtime.durable import whole_file
 
     interface = source if isinstance(source, str) else ""
-    text, taken = discovered_plant(target.stem, rows, interface)
-    target.write_text(text, encoding="utf-8")
+    text, taken = discovered_plant(plant_name_of(target.stem), rows, interface)
+    with whole_file(target) as file:
+        file.write(text.encode())
     click.echo(f"{target}: {count(taken, 'subscription')} written", err=True)

@@ -159,7 +159,10 @@ def notes(rows: Sequence[DiscoveredPd], discovery: ObserverFeed) -> Iterator[str
         types = ", ".join(f"type {kind}: {number}" for kind, number in sorted(others.items()))
         yield f"no process data, but other EtherCAT frames: {types}"
     elif not rows:
-        yield "no process data seen"
+        yield (
+            "no process data seen: a switch passes on to a port only what is sent to it; watch at"
+            " a mirror port, or longer"
+        )
 
 
 def _publisher_notes(publisher: str, rows: Sequence[DiscoveredPd]) -> Iterator[str]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 import click
 
 from eap.cli.output import Renderer
+from eap.errors import ConfigError
 from eap.ids import InterfaceUri, ObjectId
 
 if TYPE_CHECKING:
@@ -121,6 +122,20 @@ def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) ->
             f"{text!r} is not a device cycle: expected 0.1 to 60000 milliseconds"
         )
     return int(cycle_us)
+
+
+def check_new_file(target: Path, *, force: bool) -> None:
+    """Check that *target* can be made, before the work whose result goes there.
+
+    Raises:
+        ConfigError: it exists and is not to be overwritten, or has no folder.
+    """
+    if str(target) == "-":
+        raise ConfigError("the result is a file: name one instead of -")
+    if target.exists() and not force:
+        raise ConfigError(f"{target} exists: overwrite it with --force")
+    if not target.parent.is_dir():
+        raise ConfigError(f"{target} cannot be written: no folder {target.parent}")
 
 
 def examples(*lines: str) -> str:

@@ -11,7 +11,7 @@ import click
 
 from eap.cli.group import ExitCode
 from eap.cli.output import Renderer, count, write_text
-from eap.cli.params import PLANT_FILE, CommandT, json_option, parse_cycle
+from eap.cli.params import PLANT_FILE, CommandT, check_new_file, json_option, parse_cycle
 from eap.errors import ConfigError, ControlError
 from eap.ids import ObjectId
 
@@ -119,9 +119,10 @@ def new(
     'eapctl check' and runs unchanged.
     """
     from eap.config.new_plant import NewPlant, Shape, plant_text
+    from eap.pd.rules import plant_name_of
 
     is_stdout = str(file) == "-"
-    plant = name or ("plant" if is_stdout else file.stem)
+    plant = name or ("plant" if is_stdout else plant_name_of(file.stem))
     text = plant_text(
         plant,
         count,
@@ -146,8 +147,7 @@ def new(
 def _write(file: Path, text: str, *, force: bool) -> None:
     from eap.runtime.durable import whole_file
 
-    if file.exists() and not force:
-        raise click.ClickException(f"{file} exists: overwrite it with --force")
+    check_new_file(file, force=force)
     with whole_file(file) as target:
         target.write(text.encode())
 

@@ -95,7 +95,7 @@ def _text(
     yield "# 'looks like' is a guess from the bytes."
     for each in left_out:
         yield f"# Left out: {each}."
-    yield f"plant: {_scalar(name or 'discovered')}"
+    yield f"plant: {_scalar(name)}"
     yield "stations:"
     stations = list(dict.fromkeys(key.station for key in ports))
     publishers = {pd.publisher for taken in ports.values() for pd in taken.values()}

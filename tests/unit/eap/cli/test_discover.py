@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import struct
 import sys
@@ -197,6 +198,50 @@ def test_two_senders_with_one_net_id_are_named(tmp_path: Path) -> None:
         each[11] = 0x99
     path = write_pcap(tmp_path / "two.pcap", [*oven(), *map(bytes, second)])
     assert f"{OVEN}: sent from 2 addresses" in run("--pcap", path).stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("none.pcap", "No such file or directory"),
+        ("folder", "it is a folder"),
+        ("pipe", "it is no regular file"),
+    ],
+)
+def test_capture_that_is_no_file_is_refused_with_the_reason(
+    tmp_path: Path, name: str, reason: str
+) -> None:
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    path = tmp_path / name
+    result = run("--pcap", path)
+    assert (result.exit_code, result.stderr) == (2, f"{path} cannot be read: {reason}\n")
+
+
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("-", "the result is a file: name one instead of -"),
+        ("none/p.yaml", "none/p.yaml cannot be written: no folder none"),
+        ("line.pcap", "line.pcap exists: overwrite it with --force"),
+    ],
+)
+def test_plant_file_that_cannot_be_made_is_refused_at_once(
+    capture: Path, monkeypatch: pytest.MonkeyPatch, target: str, reason: str
+) -> None:
+    monkeypatch.chdir(capture.parent)
+    result = run("--pcap", capture, "--write", target)
+    assert (result.exit_code, result.stdout, result.stderr) == (2, "", f"{reason}\n")
+    assert not Path("-").exists()
+
+
+def test_plant_in_a_file_with_spaces_has_a_name_without(capture: Path, tmp_path: Path) -> None:
+    target = tmp_path / "my plant.yaml"
+    assert run("--pcap", capture, "--write", target).exit_code == 0
+    found = load_plant(target)
+    assert found.findings == ()
+    assert found.plant is not None
+    assert found.plant.name == "my_plant"
 
 
 def test_truncated_capture_shows_what_came_before(capture: Path) -> None:

@@ -51,7 +51,7 @@ def test_new_keeps_an_existing_file_without_force(run, tmp_path):
     (tmp_path / "hall.yaml").write_text("mine")
     result = run("hall.yaml")
     assert (result.exit_code, result.stderr) == (
-        1,
+        2,
         "hall.yaml exists: overwrite it with --force\n",
     )
     assert (tmp_path / "hall.yaml").read_text() == "mine"
@@ -68,7 +68,7 @@ def test_new_keeps_an_existing_file_without_force(run, tmp_path):
         (("a.yaml", "--cycle", "0.1234"), "0.1 to 60000 milliseconds"),
         (("a.yaml", "--cycle", "fast"), "0.1 to 60000 milliseconds"),
         (("a.yaml", "--address", "300.1.1.1"), "is not an IPv4 address"),
-        (("a b.yaml",), "plant name 'a b'"),
+        (("a.yaml", "--name", "a b"), "plant name 'a b'"),
     ],
 )
 def test_impossible_change_has_its_reason(run, tmp_path, words, reason):
@@ -78,7 +78,12 @@ def test_impossible_change_has_its_reason(run, tmp_path, words, reason):
     assert not list(tmp_path.iterdir())
 
 
+def test_file_name_with_a_space_becomes_a_plant_name_without(run, tmp_path):
+    assert run("my plant.yaml").exit_code == 0
+    assert check(tmp_path / "my plant.yaml").exit_code == 0
+
+
 def test_folder_that_is_not_there(run):
     result = run("nowhere/hall.yaml")
     assert result.exit_code == 2
-    assert "nowhere/hall.yaml cannot be written: No such file or directory" in result.stderr
+    assert "nowhere/hall.yaml cannot be written: no folder nowhere" in result.stderr

@@ -135,7 +135,7 @@ def test_modules_that_a_slave_detects_are_written(written, tmp_path):
 def test_existing_file_is_kept(written, tmp_path):
     (tmp_path / "found.yaml").write_text("mine")
     file, shown = written("coe", expected=2)
-    assert "--force overwrites it" in shown
+    assert "overwrite it with --force" in shown
     assert file.read_text() == "mine"
     written("coe", "--force")
     assert file.read_text() != "mine"
