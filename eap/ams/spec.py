@@ -281,15 +281,13 @@ class DirectoryStation(SpecStruct, frozen=True):
     ports: tuple[DirectoryPort, ...]
 
 
-_NEW_START = "restart the appliance"
-
-
 def describe_routing(old: RoutingSpec, new: RoutingSpec) -> list[str]:
     """Return the differences that can be applied at run time, one line each."""
     found = [
         *_differences(_routes(old.routes), _routes(new.routes)),
         *_differences(_rules(old.access), _rules(new.access)),
         *_differences(_users(old.users), _users(new.users)),
+        *_differences(_brokers(old.mqtt), _brokers(new.mqtt)),
     ]
     before, after = _order(old.access), _order(new.access)
     if before != after and sorted(before) == sorted(after):
@@ -297,16 +295,6 @@ def describe_routing(old: RoutingSpec, new: RoutingSpec) -> list[str]:
     if old.learn != new.learn:
         found.append(f"routes are learned from {_sources(new.learn)}")
     return found
-
-
-def routing_needs_new_start(old: RoutingSpec, new: RoutingSpec) -> list[str]:
-    """Return the differences that need a restart, one line each."""
-    lines = list(_differences(_brokers(old.mqtt), _brokers(new.mqtt)))
-    if any(
-        old.learns_by_mqtt(each.network) != new.learns_by_mqtt(each.network) for each in new.mqtt
-    ):
-        lines.append("routes by MQTT: learn is another one")
-    return [f"{line}: {_NEW_START}" for line in lines]
 
 
 def _sources(learn: bool | tuple[str, ...]) -> str:

@@ -72,12 +72,12 @@ from eap.services.slaves.bus_client import BusClient, open_buses
 from eap.services.slaves.segment_link import SegmentLink
 from eap.services.sockets import Network, open_transports
 from eap.services.transports.accepting import Listeners
+from eap.services.transports.station_brokers import StationBrokers
 
 if TYPE_CHECKING:
     from eap.services.device.master_values import MasterDictionaryProvider
     from eap.services.gateway.gateway import MailboxGateway
     from eap.services.slaves.eoe_bridge import EoeBridge
-    from eap.services.transports.mqtt_transport import MqttTransport
 
 
 _LATELY_NS = 2_000_000_000
@@ -100,6 +100,7 @@ class StationDevices:
         by_station: The devices.
         routers: AMS routers, by station.
         routing: Routing configuration in force, by station.
+        brokers: Connections to MQTT brokers, by station; not open yet.
         ads: ADS services at the NetIDs of routers and EAP ports, by station.
     """
 
@@ -118,6 +119,7 @@ class StationDevices:
         self.by_station: dict[str, StationDevice] = {}
         self.routers: dict[str, StationRouter] = {}
         self.routing: dict[str, StationRouting] = {}
+        self.brokers: dict[str, StationBrokers] = {}
         self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
         self._release = release
@@ -170,11 +172,13 @@ class StationDevices:
         device = StationDevice(keeper, ImageValues(image), identity, store.draft)
         self.by_station[name] = device
         self.routers[name] = router = make_router(station, routing)
+        self.brokers[name] = StationBrokers(router)
         self.routing[name] = StationRouting(
             name,
             StationRoutes(router, routing, store.routes),
             store.routing,
             lambda spec: router.set_access(access_of(station, spec)),
+            self.brokers[name],
         )
         self.routing[name].start()
         self.ads[name] = StationAds(station, device, image, router, identity)
@@ -252,7 +256,7 @@ class Services:
         )
         transports = open_transports(network, self._link)
         bridges = self._bridges(clients)
-        brokers = self._brokers(devices.routers)
+        brokers = self._brokers(devices)
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(clients, devices, providers)
         methods = self._methods(images, buses, devices, gateways, audit)
@@ -318,14 +322,11 @@ class Services:
         providers = open_dictionaries(self._handover, clients, RELEASE)
         return providers, open_gateways(self._handover, clients, providers, routers)
 
-    def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttTransport]:
-        routing = self._handover.routing
-        if not any(spec.mqtt for spec in routing.values()):
-            return ()
-        # Imported here: few plants have a broker.
-        from eap.services.transports.mqtt_transport import open_mqtt_transports
-
-        return open_mqtt_transports(routing, routers, self._counters)
+    def _brokers(self, devices: StationDevices) -> list[StationBrokers]:
+        """Open those that are configured now, which the plant file may not have."""
+        for name, brokers in devices.brokers.items():
+            brokers.open(devices.routing[name].routes.spec, partial(self._counters.count, name))
+        return [*devices.brokers.values()]
 
     def _bridges(self, clients: Mapping[PortName, BusClient]) -> list[EoeBridge]:
         found = []

@@ -71,12 +71,3 @@ def test_a_rule_comes_goes_and_outlives_services_and_a_new_start(farm, file):
     again = farm.run(file)
     assert both() == [DENIED, DENIED]
     assert "no differences" in change(again, "plan", words)
-
-
-def test_a_broker_needs_a_new_start(farm, file):
-    appliance = farm.run(file)
-    broker = "    routes: [{mqtt: mqtt://127.0.0.1, network: n}]\n"
-    file.write_text(PLANT + broker)
-    said = change(appliance, "apply", str(file))
-    assert "MQTT network n: added: restart the appliance" in said
-    assert "no station changed" in said

@@ -194,6 +194,32 @@ def test_one_way_hall_sends_requests_and_gets_none(server, halls):
         assert read("127.0.5.3", by=NORTH) == -NO_ROUTE
 
 
+def test_broker_is_changed_removed_and_taken_back_while_the_station_runs(server, halls):
+    west = "127.0.5.4"
+    with plants() as farm:
+        appliance = farm.run(write_plant(farm.folder, "west", west, 'mqtt: "mqtt://127.0.5.98"'))
+        pids = [appliance.pid(name) for name in ("engine", "services")]
+        assert read(NORTH, by=west) == -NO_ROUTE
+        file = write_plant(farm.folder, "west", west)
+        assert "  * MQTT network works: changed" in appliance.command("plan", str(file))
+        assert "MQTT network works: changed): ok" in appliance.command("apply", str(file))
+        until_read(NORTH, by=west)
+        until_read(west, by=NORTH)
+
+        begin, _, _ = file.read_text().partition("    routes:")
+        file.write_text(begin)
+        assert "MQTT network works: removed): ok" in appliance.command("apply", str(file))
+        assert read(NORTH, by=west) == -NO_ROUTE
+        wait_until(lambda: read(west, by=NORTH) < 0)  # it has told that it leaves
+        assert "MQTT network works: added): ok" in appliance.command("rollback", str(file))
+        until_read(NORTH, by=west)
+        assert [appliance.pid(name) for name in ("engine", "services")] == pids
+
+        os.kill(pids[1], signal.SIGKILL)
+        appliance.wait_for_another("services", pids[1])
+        until_read(NORTH, by=west)
+
+
 @pytest.mark.root
 def test_halls_without_a_way_between_their_networks_meet_at_the_broker(tmp_path):
     """The broker's host has a leg in both networks and forwards nothing."""

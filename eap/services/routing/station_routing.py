@@ -10,11 +10,11 @@ import asyncio
 import logging
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from msgspec.structs import replace
 
-from eap.ams.spec import RoutingSpec, describe_routing, routing_needs_new_start
+from eap.ams.spec import RoutingSpec, describe_routing
 from eap.errors import ControlError, EnvironmentalError
 from eap.runtime.store import AppliedRouting, StationFile, digest_of
 from eap.services.routing.station_routes import StationRoutes
@@ -30,14 +30,22 @@ class RoutingPlan(NamedTuple):
     refused: list[str]
 
 
+class BrokerConnections(Protocol):
+    """Connections of a station to MQTT brokers."""
+
+    async def follow(self, spec: RoutingSpec, put_in_force: Callable[[], None]) -> None:
+        """Close those that *spec* has not, call *put_in_force*, open those that are missing."""
+
+
 class StationRouting:
-    """Routes, access rules and users of one station, which may change while it runs.
+    """Routes, brokers, access rules and users of one station, which may change while it runs.
 
     Args:
         name: Of the station.
         routes: Of the station, not started yet.
         store: Of the applied configuration.
         set_access: Puts the access rules in force.
+        brokers: Connections to MQTT brokers.
     """
 
     def __init__(
@@ -46,8 +54,10 @@ class StationRouting:
         routes: StationRoutes,
         store: StationFile[AppliedRouting],
         set_access: Callable[[RoutingSpec], None],
+        brokers: BrokerConnections,
     ) -> None:
         self.routes = routes
+        self._brokers = brokers
         self._name = name
         self._store = store
         self._set_access = set_access
@@ -77,14 +87,13 @@ class StationRouting:
 
     def plan(self, spec: RoutingSpec) -> RoutingPlan:
         """Return the changes that *spec* makes."""
-        now = self.routes.spec
-        return RoutingPlan(describe_routing(now, spec), routing_needs_new_start(now, spec))
+        return RoutingPlan(describe_routing(self.routes.spec, spec), _missing_for(spec))
 
     async def apply(self, spec: RoutingSpec, cause: str) -> list[str]:
         """Store *spec*, then put it in force; return the changes.
 
         Raises:
-            ControlError: the change needs a restart, or too many changes wait already.
+            ControlError: MQTT is not installed, or too many changes wait already.
             EnvironmentalError: it cannot be stored.
         """
         return await self._jobs.run(partial(self._apply, spec, cause))
@@ -142,5 +151,22 @@ class StationRouting:
     async def _change(self, applied: AppliedRouting) -> None:
         await asyncio.to_thread(self._store.save, applied)  # packets must not wait for the disk
         self._applied = applied
-        self.routes.replace_spec(applied.spec)
-        self._set_access(applied.spec)
+        await self._brokers.follow(applied.spec, partial(self._put_in_force, applied.spec))
+
+    def _put_in_force(self, spec: RoutingSpec) -> None:
+        self.routes.replace_spec(spec)
+        self._set_access(spec)
+
+
+def _missing_for(spec: RoutingSpec) -> list[str]:
+    """Return what this installation lacks for the brokers of *spec*, one line each."""
+    if not spec.mqtt:
+        return []
+    # Imported here: few plants have a broker.
+    from eap.net.mqtt import require_mqtt
+
+    try:
+        require_mqtt()
+    except EnvironmentalError as exc:
+        return [str(exc)]
+    return []

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable
 from time import monotonic_ns
 
 from eap.ams.mqtt.network import (
@@ -20,10 +19,10 @@ from eap.ams.mqtt.network import (
     Publish,
     Subscribe,
 )
-from eap.ams.spec import MqttSpec, RoutingSpec
+from eap.ams.spec import MqttSpec
 from eap.ams.transport_table import Transport
 from eap.net.mqtt import Handlers, MqttLink
-from eap.runtime.drop_counters import DropCounters, DropReason
+from eap.runtime.drop_counters import DropReason
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import mqtt_transport_name
 
@@ -35,33 +34,6 @@ _REFUSALS = {
 }
 
 logger = logging.getLogger(__name__)
-
-
-def open_mqtt_transports(
-    routing: Mapping[str, RoutingSpec],
-    routers: Mapping[str, StationRouter],
-    counters: DropCounters,
-) -> list[MqttTransport]:
-    """Return the MQTT transports of all stations, to be served.
-
-    Args:
-        routing: Routing configuration by station.
-        routers: Routers by station.
-        counters: Of dropped messages.
-
-    Raises:
-        EnvironmentalError: there is a broker, and MQTT is not installed.
-    """
-    return [
-        MqttTransport(
-            spec,
-            routers[station],
-            partial(counters.count, station),
-            learns=config.learns_by_mqtt(spec.network),
-        )
-        for station, config in routing.items()
-        for spec in config.mqtt
-    ]
 
 
 class MqttTransport:
@@ -80,9 +52,13 @@ class MqttTransport:
     """
 
     def __init__(
-        self, spec: MqttSpec, router: StationRouter, count_dropped: Callable[[DropReason], None], *,
+        self,
+        spec: MqttSpec,
+        router: StationRouter,
+        count_dropped: Callable[[DropReason], object],
+        *,
         learns: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.name = mqtt_transport_name(spec)
         self._router = router
         self._count_dropped = count_dropped

@@ -19,7 +19,6 @@ from eap.ams.spec import (
     TlsSpec,
     TransportKind,
     describe_routing,
-    routing_needs_new_start,
 )
 
 
@@ -82,7 +81,6 @@ OLD = RoutingSpec(
 
 def test_equal_specs_have_no_difference():
     assert describe_routing(OLD, replace(OLD)) == []
-    assert routing_needs_new_start(OLD, replace(OLD)) == []
 
 
 def test_each_thing_that_differs_is_one_line():
@@ -112,13 +110,8 @@ def test_the_order_of_rules_matters():
     assert describe_routing(OLD, new) == ["access rules: in another order"]
 
 
-def test_brokers_need_a_new_start():
-    assert routing_needs_new_start(OLD, replace(OLD, mqtt=())) == [
-        "MQTT network n: removed: restart the appliance"
-    ]
-    assert routing_needs_new_start(OLD, replace(OLD, learn=False)) == [
-        "routes by MQTT: learn is another one: restart the appliance"
-    ]
-    assert routing_needs_new_start(OLD, replace(OLD, learn=("mqtt:n",))) == []
-    without = replace(OLD, mqtt=())
-    assert routing_needs_new_start(without, replace(without, learn=False)) == []
+def test_brokers_are_differences():
+    assert describe_routing(OLD, replace(OLD, mqtt=())) == ["MQTT network n: removed"]
+    (broker,) = OLD.mqtt
+    other = replace(OLD, mqtt=(replace(broker, host="other"), replace(broker, network="m")))
+    assert describe_routing(OLD, other) == ["MQTT network n: changed", "MQTT network m: added"]

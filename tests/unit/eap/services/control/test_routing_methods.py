@@ -8,11 +8,12 @@ import pytest
 
 from eap.ams.spec import HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.control.device import RoutingDifference, RunningRouting
-from eap.errors import ControlError
+from eap.errors import ControlError, EnvironmentalError
 from eap.runtime.store import StationStore
 from eap.services.control.route_methods import RoutingMethods
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.routing.station_routing import StationRouting
+from eap.services.transports.station_brokers import StationBrokers
 from tests.support.routing import station
 
 HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")
@@ -23,8 +24,10 @@ NEW = RoutingSpec(routes=(RouteSpec(name="mill", net_id="10.0.0.2.1.1", hop=HOP)
 @pytest.fixture
 def ask(tmp_path, monkeypatch):
     monkeypatch.setenv("EAP_STATE_DIR", str(tmp_path))
-    routes = StationRoutes(station("10.0.0.1.2.1"), OLD, StationStore("p", "left").routes)
-    routing = StationRouting("left", routes, StationStore("p", "left").routing, lambda told: None)
+    router, store = station("10.0.0.1.2.1"), StationStore("p", "left")
+    routes = StationRoutes(router, OLD, store.routes)
+    brokers = StationBrokers(router)
+    routing = StationRouting("left", routes, store.routing, lambda told: None, brokers)
     routing.start()
     methods = RoutingMethods({"left": routing}).table()
 
@@ -46,11 +49,14 @@ def test_apply_and_rollback(ask):
     assert ask("export") == RunningRouting(routing=OLD, previous=NEW, cause="1", undone=True)
 
 
-def test_routing_change_that_needs_a_restart_is_refused(ask):
+def test_routing_change_that_is_impossible_here_is_refused(ask, monkeypatch):
+    def missing():
+        raise EnvironmentalError("MQTT needs aiomqtt")
+
+    monkeypatch.setattr("eap.net.mqtt.require_mqtt", missing)
     broker = RoutingSpec(mqtt=(MqttSpec(network="n", host="broker"),))
-    refused = ["MQTT network n: added: restart the appliance"]
     for answer in (ask("plan", routing=broker), ask("apply", routing=broker)):
-        assert answer.refused == refused
+        assert answer.refused == ["MQTT needs aiomqtt"]
     assert ask("export") == RunningRouting(routing=OLD)
 
 

@@ -5,11 +5,14 @@ import asyncio
 import pytest
 from msgspec.structs import replace
 
+from eap.ams.routes import Origin, Route
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.errors import ControlError, EnvironmentalError
+from eap.ids import Endpoint, NetId
 from eap.runtime.store import StationStore
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.routing.station_routing import StationRouting
+from eap.services.transports.station_brokers import StationBrokers
 from tests.support.routing import station
 
 HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")
@@ -32,7 +35,8 @@ class House:
         self.router = station("10.0.0.1.2.1")
         routes = StationRoutes(self.router, told, StationStore("p", "left").routes)
         store = StationStore("p", "left").routing
-        self.routing = StationRouting("left", routes, store, self.access.append)
+        self.brokers = StationBrokers(self.router)
+        self.routing = StationRouting("left", routes, store, self.access.append, self.brokers)
         self.routing.start()
 
     def names(self):
@@ -99,12 +103,60 @@ def test_apply_of_the_same_routing_changes_nothing():
         asyncio.run(house.routing.roll_back())
 
 
-def test_a_broker_does_not_change_while_it_runs():
-    broker = replace(FILE, mqtt=(MqttSpec(network="n", host="broker"),))
+BROKER = MqttSpec(network="n", host="127.0.0.1", port=1)
+
+
+def test_brokers_come_change_and_go_while_the_station_runs():
+    pytest.importorskip("aiomqtt")
     house = House()
-    with pytest.raises(ControlError, match="MQTT network n: added: restart the appliance"):
-        asyncio.run(house.routing.apply(broker, "1"))
-    assert house.routing.plan(broker).refused
+
+    def networks():
+        return [name for name in house.router._senders if name.startswith("mqtt:")]
+
+    async def script():
+        serving = asyncio.ensure_future(house.brokers.serve())
+        await asyncio.sleep(0)
+        assert await house.routing.apply(replace(FILE, mqtt=(BROKER,)), "1") == [
+            "MQTT network n: added"
+        ]
+        assert networks() == ["mqtt:n"]
+        house.router.add_route(learned(house.routing))
+        other = replace(BROKER, host="127.0.0.2")
+        changed = replace(FILE, mqtt=(other, replace(other, network="m")))
+        assert await house.routing.apply(changed, "2") == [
+            "MQTT network n: changed",
+            "MQTT network m: added",
+        ]
+        assert house.names() == ["mill"]  # what the broker before taught is forgotten
+        assert networks() == ["mqtt:n", "mqtt:m"]
+        assert house.access[-1] == changed
+        assert await house.routing.roll_back() == [
+            "MQTT network m: removed",
+            "MQTT network n: changed",
+        ]
+        assert networks() == ["mqtt:n"]
+        serving.cancel()
+        await asyncio.wait([serving])
+
+    asyncio.run(script())
+    assert House().routing.routes.spec.mqtt == (BROKER,)
+
+
+def learned(routing):
+    net_id = NetId.parse("9.9.9.9.1.1")
+    return Route(net_id, "far", Endpoint("mqtt:n", str(net_id)), Origin.LEARNED)
+
+
+def test_broker_without_mqtt_installed_is_refused(monkeypatch):
+    def missing():
+        raise EnvironmentalError("MQTT needs aiomqtt")
+
+    monkeypatch.setattr("eap.net.mqtt.require_mqtt", missing)
+    house = House()
+    spec = replace(FILE, mqtt=(BROKER,))
+    assert house.routing.plan(spec).refused == ["MQTT needs aiomqtt"]
+    with pytest.raises(ControlError, match="MQTT needs aiomqtt"):
+        asyncio.run(house.routing.apply(spec, "1"))
     assert house.routing.applied is None
 
 
