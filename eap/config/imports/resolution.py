@@ -26,6 +26,10 @@ from eap.config.imports.stations import (
 from eap.ids import InterfaceUri, NetId
 
 _MIN_TIMEOUT_MS = 100
+_ALL = "all", ""
+"""Target of the frame for what several stations expect."""
+_UDP_GROUP = "239.88.164.1"
+_SHARED = "Several stations expect these PDs: their subscribers take them from this group."
 _Owner: TypeAlias = tuple[PlannedStation, PlannedPort]
 _Sent: TypeAlias = dict[str | tuple[str, str, int], tuple[PlannedFrame, PlannedPd]]
 
@@ -249,31 +253,48 @@ def _peer(
         net_id=net_id,
         known_as=frozenset((system, device)),
     )
-    names, variables = UniqueNames(), UniqueNames()
-    frames = []
+    variables = UniqueNames()
+    # By ID: a PD that several stations expect is sent once.
+    takers: dict[int, list[tuple[str, PlannedSubscription]]] = {}
     for station in stations:
-        wanted = [
-            each
-            for each in station.subscriptions
-            if not each.reasons and not each.source
-            and (each.publisher == net_id or (each.publisher is None and is_first))
-        ]  # fmt: skip
-        for target in station.ports:
-            pds = tuple(
-                PlannedPd(
-                    name=names.take(each.name),
-                    id=each.id,
-                    version=each.version,
-                    variable=PlannedVariable(variables.take(each.name), each.variable.type),
-                )
-                for each in wanted
-                if each.port == target.name
+        for each in station.subscriptions:
+            is_any = each.publisher is None and is_first
+            if not each.reasons and not each.source and (each.publisher == net_id or is_any):
+                takers.setdefault(each.id, []).append((station.name, each))
+    by_target: dict[tuple[str, str], list[PlannedSubscription]] = {}
+    for taken in takers.values():
+        targets = {(station_name, each.port) for station_name, each in taken}
+        target = targets.pop() if len(targets) == 1 else _ALL
+        by_target.setdefault(target, []).append(taken[0][1])
+    names = UniqueNames()
+    frames = []
+    for target, wanted in by_target.items():
+        remarks: tuple[str, ...] = ()
+        if port.scheme == "ethernet":
+            # Other ports learn the MAC address of this one by it.
+            to = "multicast"
+        elif target == _ALL:
+            to, remarks = _UDP_GROUP, (_SHARED,)
+        else:
+            to = "/".join(target)
+        pds = tuple(
+            PlannedPd(
+                name=names.take(each.name),
+                id=each.id,
+                version=each.version,
+                variable=PlannedVariable(variables.take(each.name), each.variable.type),
             )
-            if pds:
-                # By multicast on Ethernet: other ports learn the MAC address of this one by it.
-                to = "multicast" if port.scheme == "ethernet" else f"{station.name}/{target.name}"
-                frame_name = names.take(f"to-{station.name}")
-                frames.append(PlannedFrame(name=frame_name, port="eap0", to=to, pds=pds))
+            for each in wanted
+        )
+        frames.append(
+            PlannedFrame(
+                name=names.take(f"to-{target[0]}"),
+                port="eap0",
+                to=to,
+                pds=pds,
+                remarks=remarks,
+            )
+        )
     return PlannedStation(
         name=name,
         net_id=device if net_id == system else system,

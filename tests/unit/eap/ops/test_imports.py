@@ -325,6 +325,24 @@ def test_files_without_process_data_are_refused_with_the_reason(
     assert not importer.plant.exists()
 
 
+@pytest.mark.parametrize("address", ["127.0.9.{n}", "ethernet://eth0"])
+def test_peer_sends_once_what_two_projects_expect(importer: Importer, address: str) -> None:
+    press = LINE.read_text().replace("192.168.5.1.", "192.168.7.1.")
+    # Of the same publisher: one PD in common, the others of its own.
+    for number in (22, 23, 24):
+        press = press.replace(f'NvId="{number}"', f'NvId="{number + 10}"')
+    choices = ImportChoices(address=address, peer="panel")
+    result = importer.run(LINE, importer.put("Press.tsproj", press), choices=choices)
+    assert result.findings == ()
+    *both, panel = importer.loaded().stations
+    sent = {frame.name: [pd.pd_id for pd in frame.pds] for frame in panel.frames}
+    assert sent == {"to-all": [21], "to-Line": [22, 23, 24], "to-Press": [32, 33, 34]}
+    assert [[each.pd_id for each in station.subscriptions] for station in both] == [
+        [21, 22, 23, 24],
+        [21, 32, 33, 34],
+    ]
+
+
 def test_file_that_is_named_twice_is_refused_once(importer: Importer) -> None:
     result = importer.run(LINE, LINE)
     assert messages(result) == ["it is named twice"]
