@@ -272,7 +272,7 @@ def _systems(
                 name=names.take(plain_name(Path(project.file).stem, "station")),
                 net_id=project.net_id,
                 devices=project.devices,
-                cycles_us=tuple({each.cycle_us for each in project.tasks if each.cycle_us}),
+                cycles_us=project.cycles_us,
                 type_text=types.text_of,
                 remarks=(_VERSIONS,),
             )

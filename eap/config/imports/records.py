@@ -15,6 +15,11 @@ from eap.codec.xmlstream import XmlElement, XmlError
 from eap.config.finding import PlantFinding
 from eap.ids import NetId
 
+EAP_DEVICE = 112
+"""DevType, or ItemSubType, of an EAP device."""
+PUBLISHER, SUBSCRIBER = 9051, 9052
+"""BoxTypes."""
+MAX_U16, MAX_U32 = 0xFFFF, 0xFFFF_FFFF
 ITEMS = 10_000
 """Limit of the boxes of one import, and of the variables of one box."""
 
@@ -99,11 +104,6 @@ class EapBox(msgspec.Struct, frozen=True, kw_only=True):
     unknown: tuple[UnknownSetting, ...] = ()
     file: str = ""
     line: int = 0
-
-    @property
-    def has_target(self) -> bool:
-        """True if the file says where a publisher's frames go."""
-        return bool(self.net_id or self.mac or self.udp)
 
 
 class EapImportDevice(msgspec.Struct, frozen=True, kw_only=True):

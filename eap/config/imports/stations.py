@@ -33,6 +33,7 @@ _MAC = (
     "The MAC address is that of the controller's adapter: take it out where another machine runs"
     " this station."
 )
+_GATEWAY = "in the project by gateway {}: here the routes of the host decide"
 _UDP_BROADCAST = "255.255.255.255"
 
 
@@ -396,6 +397,7 @@ class _StationBuilder:
             monitor_ms=max(_MIN_MONITOR_MS, box.arp_ms) if is_monitored else 0,
             is_changeable=box.is_changeable,
             reasons=tuple(dict.fromkeys(reasons)),
+            remarks=(_GATEWAY.format(box.gateway),) if box.gateway and to else (),
             origin=ImportOrigin(box.file, box.line, f"{device.name}/{box.name}"),
         )
 

@@ -18,7 +18,12 @@ import msgspec
 
 from eap.codec.xmlstream import XmlElement, XmlError, read_tree
 from eap.config.imports.records import (
+    EAP_DEVICE,
     ITEMS,
+    MAX_U16,
+    MAX_U32,
+    PUBLISHER,
+    SUBSCRIBER,
     EapBox,
     EapImportDevice,
     EapVariable,
@@ -32,7 +37,6 @@ ROOTS = "TreeItem", "TreeItems"
 NAMESPACE = "urn:eap-appliance:peer"
 """Of the settings that TwinCAT has no known element for."""
 _DEVICE, _BOX, _DATA = 2, 5, 7
-_EAP_DEVICE, _PUBLISHER, _SUBSCRIBER = 112, 9051, 9052
 _PUBLISHER_VARIABLE, _SUBSCRIBER_VARIABLE = 35, 36
 _NO_MAC, _NO_NET_ID, _NO_IP = "00 00 00 00 00 00", "0.0.0.0.0.0", "255.255.255.255"
 _PUBLISHER_KEYS = (
@@ -41,7 +45,6 @@ _PUBLISHER_KEYS = (
 )  # fmt: skip
 _SUBSCRIBER_KEYS = "PublisherNetId", "MulticastMacAddr", "MulticastIpAddr"
 ResultT = TypeVar("ResultT")
-_MAX_U16, _MAX_U32 = 0xFFFF, 0xFFFF_FFFF
 
 
 class TreeItem(msgspec.Struct, frozen=True):
@@ -128,7 +131,7 @@ class _Assembly:
         definition = item.element.find("VarDef")
         if definition is not None:
             kind = definition.findtext("VarType")
-            bits = definition.number_at("VarBitSize", 0, 8 * _MAX_U16)
+            bits = definition.number_at("VarBitSize", 0, 8 * MAX_U16)
             # Below the variable, in its group: ...^Var 1^Outputs^VarData.
             owner = item.path[:-2] if item.path[-1] == "VarData" else item.path
             self._types[owner] = (kind, bits)
@@ -146,10 +149,10 @@ class _Assembly:
             siblings.append(
                 EapVariable(
                     name=item.path[-1],
-                    nv_id=definition.number_at("NvId", 0, _MAX_U16),
+                    nv_id=definition.number_at("NvId", 0, MAX_U16),
                     type=kind,
                     bits=bits,
-                    version=0 if own is None else own.attribute_number("Version", 0, _MAX_U16),
+                    version=0 if own is None else own.attribute_number("Version", 0, MAX_U16),
                     unknown=tuple(unknown_children(definition, ("NvId",))),
                     line=item.element.line,
                 )
@@ -179,9 +182,9 @@ class _Assembly:
         element = item.element
         if element.find("DeviceDef") is None:
             return None
-        kind = element.number_at("ItemSubType", 0, _MAX_U32)
+        kind = element.number_at("ItemSubType", 0, MAX_U32)
         name = item.path[-1]
-        if kind != _EAP_DEVICE:
+        if kind != EAP_DEVICE:
             message = f"ItemSubType {kind}: no EAP device"
             self._report.note(item.file, element.line, name, ImportOutcome.LEFT, message)
             return None
@@ -190,7 +193,7 @@ class _Assembly:
             name=name,
             net_id=None if own is None else _net_id(own.get("NetId"), own.line),
             mac=_mac(element.findtext("DeviceDef/AddressInfo/Pnp/DeviceData"), element.line),
-            cycle_us=0 if own is None else own.attribute_number("CycleUs", 0, _MAX_U32),
+            cycle_us=0 if own is None else own.attribute_number("CycleUs", 0, MAX_U32),
             is_disabled=element.flag_at("Disabled"),
             boxes=tuple(self._boxes.pop(item.path, ())),
             file=item.file,
@@ -206,7 +209,7 @@ def _check_count(siblings: Sequence[object], item: TreeItem) -> None:
 
 def _cycle_us(item: TreeItem) -> int:
     """Return the cycle of a task, 0 for any other item."""
-    return item.element.number_at("TaskDef/CycleTime", 0, _MAX_U32) // 10  # 100 ns
+    return item.element.number_at("TaskDef/CycleTime", 0, MAX_U32) // 10  # 100 ns
 
 
 def _publisher(definition: XmlElement) -> EapBox:
@@ -222,11 +225,11 @@ def _publisher(definition: XmlElement) -> EapBox:
         mac="" if is_udp else _mac(definition.findtext("MacAddress"), line),
         udp=_ip(definition.findtext("Udp/Address"), line) if is_udp else "",
         gateway="" if gateway == _NO_IP else _ip(gateway, line),
-        divider=definition.number_at("IoDiv/Divider", 1, _MAX_U16, 1),
-        modulo=definition.number_at("IoDiv/Modulo", 0, _MAX_U16),
+        divider=definition.number_at("IoDiv/Divider", 1, MAX_U16, 1),
+        modulo=definition.number_at("IoDiv/Modulo", 0, MAX_U16),
         vlan_id=definition.number_at("VLAN/Id", 0, 4094) if has_vlan else 0,
         vlan_priority=definition.number_at("VLAN/Prio", 0, 7) if has_vlan else 0,
-        arp_ms=definition.number_at("ArpInterval", 0, _MAX_U32, 1000),
+        arp_ms=definition.number_at("ArpInterval", 0, MAX_U32, 1000),
         is_monitored=not definition.flag_at("DisableSubscriberMonitoring"),
         is_changeable=definition.flag_at("TargetChangeable"),
         unknown=tuple(unknown_children(definition, _PUBLISHER_KEYS)),
@@ -302,10 +305,10 @@ def device_items(device: EapImportDevice) -> Iterator[tuple[str, str]]:
         f"<DeviceDef>{address}</DeviceDef>",
         f'<eap:Device{net_id} CycleUs="{device.cycle_us}"/>',
     )
-    yield _item(root, _DEVICE, _EAP_DEVICE, definition, is_disabled=device.is_disabled)
+    yield _item(root, _DEVICE, EAP_DEVICE, definition, is_disabled=device.is_disabled)
     for box in device.boxes:
         path = f"{root}^{box.name}"
-        kind = _PUBLISHER if box.is_publisher else _SUBSCRIBER
+        kind = PUBLISHER if box.is_publisher else SUBSCRIBER
         settings = _publisher_lines(box) if box.is_publisher else _subscriber_lines(box)
         lines = ("<BoxDef>", *(f"  {line}" for line in settings), "</BoxDef>")
         yield _item(path, _BOX, kind, lines, is_disabled=box.is_disabled)

@@ -19,7 +19,12 @@ import msgspec
 
 from eap.codec.xmlstream import XmlElement, XmlError, XmlReader
 from eap.config.imports.records import (
+    EAP_DEVICE,
     ITEMS,
+    MAX_U16,
+    MAX_U32,
+    PUBLISHER,
+    SUBSCRIBER,
     EapBox,
     EapImportDevice,
     EapVariable,
@@ -36,7 +41,6 @@ OpenFile: TypeAlias = Callable[[str], Iterable[bytes]]
 """Opens a file by its path; raises OSError."""
 
 PROJECT, ITEM = "TcSmProject", "TcSmItem"
-EAP_DEVICE, PUBLISHER, SUBSCRIBER = 112, 9051, 9052
 _PROJECT = f"{PROJECT}/Project"
 _WANTED = (
     TSPROJ_TYPE,
@@ -62,19 +66,11 @@ _STATES = frozenset(
     ("FrameState", "FrameCtrl", "VarState", "VarCtrl", "Quality", "CycleIndex", "CycleIdx")
 )
 _DATA = "VarData"
-_MAX_U16, _MAX_U32 = 0xFFFF, 0xFFFF_FFFF
 _BOX_ATTRIBUTES = "Id", "BoxType", "File", "Disabled", "AmsPort", "RemoteName"
 _BOX_CHILDREN = "Name", "Comment", "ImageId", "Vars", "Eap"
 _EAP_ATTRIBUTES = "InOut", "Publisher", "ArpRetryInterval"
 _VARIABLE_ATTRIBUTES = "Id", "VarInOut", "NvId", "NvLength"
 _VARIABLE_CHILDREN = "Name", "Comment", "ImageId", "Vars"
-
-
-class PlcTask(msgspec.Struct, frozen=True):
-    """A task of a project."""
-
-    name: str
-    cycle_us: int
 
 
 class TwinCatProject(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,14 +80,14 @@ class TwinCatProject(msgspec.Struct, frozen=True, kw_only=True):
         file: Its file.
         net_id: NetID of the target system; None without one.
         devices: Its EAP devices.
-        tasks: Its tasks.
+        cycles_us: Cycles of its tasks.
         types: Data types.
     """
 
     file: str
     net_id: NetId | None = None
     devices: tuple[EapImportDevice, ...] = ()
-    tasks: tuple[PlcTask, ...] = ()
+    cycles_us: tuple[int, ...] = ()
     types: tuple[TypeRecord, ...] = ()
 
 
@@ -121,7 +117,8 @@ class _Project:
         self._open = open_file
         self._report = report
         self._types: list[XmlElement] = []
-        self._tasks: list[PlcTask] = []
+        self._tasks: list[tuple[str, int]] = []
+        """Name and cycle of each task."""
         self._contexts: dict[str, int] = {}
         """Cycle of each group of variables: ``TIPC^PLC^Instance^PlcTask Inputs``."""
         self._devices: list[tuple[XmlElement, str]] = []
@@ -144,7 +141,7 @@ class _Project:
             file=self._file,
             net_id=self._net_id,
             devices=tuple(self._linked(each) for each in devices),
-            tasks=tuple(self._tasks),
+            cycles_us=tuple({cycle_us for _, cycle_us in self._tasks if cycle_us}),
             types=tuple(read_types(self._types, self._file, self._report)),
         )
 
@@ -192,8 +189,8 @@ class _Project:
             case "DataType":
                 self._types.append(element)
             case "Task":
-                cycle_us = element.attribute_number("CycleTime", 0, _MAX_U32) // 10  # 100 ns
-                self._tasks.append(PlcTask(element.findtext("Name"), cycle_us))
+                cycle_us = element.attribute_number("CycleTime", 0, MAX_U32) // 10  # 100 ns
+                self._tasks.append((element.findtext("Name"), cycle_us))
             case "Project":
                 self._read_plc(element)
             case "Device" if file == self._file and not _is_item(file):
@@ -224,7 +221,7 @@ class _Project:
         title = _name(element, file)
         folder = f"{self._folder}/{_stem(file) if _is_item(file) else title}"
         try:
-            kind = element.attribute_number("DevType", 0, _MAX_U16)
+            kind = element.attribute_number("DevType", 0, MAX_U16)
             if kind != EAP_DEVICE:
                 reason = _DEVICE_TYPES.get(kind, "no EAP device")
                 message = f"DevType {kind}: {reason}"
@@ -271,7 +268,7 @@ class _Project:
         title = _name(element, file)
         item = f"{device}/{title}"
         try:
-            kind = element.attribute_number("BoxType", 0, _MAX_U16)
+            kind = element.attribute_number("BoxType", 0, MAX_U16)
             if kind not in {PUBLISHER, SUBSCRIBER}:
                 message = f"BoxType {kind}: neither publisher nor subscriber"
                 self._report.note(file, element.line, item, ImportOutcome.LEFT, message)
@@ -293,7 +290,7 @@ class _Project:
             unknown += unknown_attributes(eap, _EAP_ATTRIBUTES)
             unknown += unknown_children(eap, ("EapVar",))
             publisher, line = eap.get("Publisher", publisher), eap.line
-            arp_ms = eap.attribute_number("ArpRetryInterval", 0, _MAX_U32, arp_ms)
+            arp_ms = eap.attribute_number("ArpRetryInterval", 0, MAX_U32, arp_ms)
             for each in eap.iterfind("EapVar"):
                 variable = self._variable(each, item, file)
                 if variable is not None:
@@ -380,7 +377,7 @@ class _Project:
         if found is not None:
             return found
         task = link.owner.rpartition("^")[2]
-        return next((each.cycle_us for each in self._tasks if each.name == task), 0)
+        return next((cycle_us for name, cycle_us in self._tasks if name == task), 0)
 
 
 def _variable(element: XmlElement, name: str) -> EapVariable:
@@ -407,10 +404,10 @@ def _variable(element: XmlElement, name: str) -> EapVariable:
         raise XmlError(message, line=element.line, expected=expected)
     return EapVariable(
         name=name,
-        nv_id=element.attribute_number("NvId", 0, _MAX_U16),
+        nv_id=element.attribute_number("NvId", 0, MAX_U16),
         type="" if kind is None else kind.text,
         guid="" if kind is None else kind.get("GUID").upper(),
-        bits=8 * element.attribute_number("NvLength", 0, _MAX_U16),
+        bits=8 * element.attribute_number("NvLength", 0, MAX_U16),
         unknown=tuple(unknown),
         line=element.line,
     )

@@ -343,6 +343,16 @@ def test_peer_sends_once_what_two_projects_expect(importer: Importer, address: s
     ]
 
 
+def test_gateway_of_udp_frames_is_a_comment(importer: Importer) -> None:
+    variable = EapVariable(name="V", nv_id=1, type="DINT", bits=32)
+    box = EapBox(
+        name="B", is_publisher=True, udp="10.0.0.7", gateway="10.1.0.1", variables=(variable,)
+    )
+    text = tree_items_text([EapImportDevice(name="D", cycle_us=10_000, boxes=(box,))])
+    assert importer.run(importer.put("d.xml", text)).ok
+    assert "# in the project by gateway 10.1.0.1: here the routes of the host" in importer.text
+
+
 def test_file_that_is_named_twice_is_refused_once(importer: Importer) -> None:
     result = importer.run(LINE, LINE)
     assert messages(result) == ["it is named twice"]

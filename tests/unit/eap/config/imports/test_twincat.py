@@ -6,7 +6,7 @@ import pytest
 
 from eap.config.imports import twincat
 from eap.config.imports.records import EapVariable, ImportReport
-from eap.config.imports.twincat import PlcTask, read_project
+from eap.config.imports.twincat import read_project
 from eap.ids import NetId
 from tests.support.pages import ROOT
 from tests.support.twincat import (
@@ -41,7 +41,7 @@ def test_project_is_read_with_its_publishers_and_subscribers() -> None:
     found = read_project(str(ROOT / "docs" / "examples" / "Line.tsproj"), open_file, report)
     assert not report.findings
     assert found.net_id == NetId.parse("192.168.5.1.1.1")
-    assert found.tasks == (PlcTask("PlcTask", 10_000),)
+    assert found.cycles_us == (10_000,)
     assert [each.name for each in found.types] == ["ST_Axis", "E_Mode"]
     (eap,) = found.devices
     assert (eap.name, str(eap.net_id), eap.mac) == (DEVICE, "192.168.5.1.2.1", "02:00:00:00:05:01")
