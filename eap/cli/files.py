@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         "eapctl import Line.tsproj --peer panel --address 10.0.0.{n} -o line.yaml",
         "eapctl import Line.tsproj Press.tsproj --address ethernet://eth0 -o hall.yaml",
         "eapctl import axis.tmc -o axis.yaml",
+        "eapctl import cell.eni --esi esi --bus sim -o cell.yaml",
     ),
 )
 @click.argument("files", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="FILE…")
@@ -76,7 +77,20 @@ if TYPE_CHECKING:
     metavar="NAME",
     help="Add a station that receives what the project sends, and sends what it expects.",
 )
-@json_option("Print one object: ok, file, plant, stations, notes, findings.")
+@click.option(
+    "--bus",
+    default="ethernet://bus{n}",
+    show_default=True,
+    metavar="PATTERN",
+    help="Interfaces of bus ports: {n} is the port's number; sim simulates the slaves.",
+)
+@click.option(
+    "--esi",
+    type=click.Path(path_type=Path, exists=True),
+    metavar="PATH",
+    help="ESI file, or folder of ESI files, that describes the slaves of an ENI file further.",
+)
+@json_option("Print one object: ok, file, plant, stations, bus_files, notes, findings.")
 @click.pass_context
 def import_files(
     ctx: click.Context,
@@ -88,13 +102,16 @@ def import_files(
     to: str,
     cycle_us: int | None,
     peer: str,
+    bus: str,
+    esi: Path | None,
     output: Renderer,
 ) -> None:
     """Make a plant file of the files of other tools, or add to one.
 
     FILE is a TwinCAT 3 project (.tsproj) or device (.xti), an Automation Interface description
-    (.xml), or has types and symbols (.tmc, .tpy). The report says what was taken, what was left,
-    and why. A publisher whose settings are not known for certain becomes a comment: nothing is
+    (.xml), has types and symbols (.tmc, .tpy), or describes the slaves of a bus (ENI: .eni, .xml),
+    for which a bus file is written beside PLANT. The report says what was taken, what was left, and
+    why. A publisher whose settings are not known for certain becomes a comment: nothing is
     sent on a guess.
 
     Exits with 2 when a file cannot be read; nothing is written then.
@@ -112,6 +129,8 @@ def import_files(
         to=to,
         cycle_us=cycle_us or 0,
         peer=peer,
+        bus=bus,
+        esi=esi,
     )
     result, text = run_import(files, None if is_stdout else target, choices)
     for finding in result.findings:
@@ -151,6 +170,9 @@ def _import_lines(result: ImportResult, target: Path | None) -> Iterator[Rendera
         yield f"{result.file}: {stations} added"
     else:
         yield f"{result.file}: plant {result.plant}, {stations}"
+    if result.bus_files:
+        names = ", ".join(result.bus_files)
+        yield f"{count(len(result.bus_files), 'file')} for buses: {names}"
 
 
 @click.command(

@@ -394,7 +394,7 @@ _MARKS = (
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 _ENCODING = re.compile(
-    r"utf-?8|us-ascii|ascii|iso-8859-\d\d?|latin-?1|windows-125\d", re.IGNORECASE
+    r"utf-?8|us-ascii|ascii|iso-?8859-\d\d?|latin-?1|windows-125\d", re.IGNORECASE
 )
 _DECLARATION = 256
 """Bytes within which the declaration ends."""

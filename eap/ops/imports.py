@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import itertools
-import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from ipaddress import IPv4Address
 from pathlib import Path
+from tempfile import NamedTemporaryFile, TemporaryDirectory
 
 import msgspec
 
 from eap.codec.xmlstream import CHUNK, XmlError, XmlReader
 from eap.config.finding import PlantFinding
+from eap.config.imports.eni import ROOT as ENI_ROOT
+from eap.config.imports.eni import EniBus, read_eni
 from eap.config.imports.insertion import InsertionError, insert_stations
 from eap.config.imports.planttext import plant_text, station_lines
 from eap.config.imports.records import ImportNote, ImportOutcome, ImportReport
 from eap.config.imports.resolution import resolve, with_peers
 from eap.config.imports.stations import (
     DEFAULT_CYCLE_US,
+    MAX_CYCLE_US,
+    MIN_CYCLE_US,
     ImportedSystem,
     PlannedPort,
     PlannedStation,
@@ -35,8 +40,11 @@ from eap.config.imports.typefile import TypeFile, TypeRecord, read_type_file
 from eap.config.imports.typenames import TypeNames
 from eap.errors import ConfigError, EnvironmentalError
 from eap.ids import NET_ID, InterfaceUri, NetId
+from eap.ops.eni_bus import BusFiles, BusPlan
 from eap.pd.rules import NAME, is_name, plain_name, plant_name_of
+from eap.runtime.busfile import describe
 from eap.runtime.durable import whole_file
+from eap.runtime.esi_files import EsiSource
 from eap.runtime.plantfile import load_plant
 
 NUMBER = "{n}"
@@ -47,6 +55,8 @@ EDC = (
     " of the EAP device as XML descriptions in TwinCAT (Export XML Description), or import the"
     " project itself"
 )
+DEFAULT_BUS = "ethernet://bus{n}"
+SIMULATED = "sim"
 _ARCHIVE = "it is an archive: unpack it, and import the .tsproj file in it"
 _SOLUTION = "it is a solution: import the .tsproj file in its folder"
 _NOT_READ = {
@@ -76,6 +86,8 @@ class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
         to: Destination of publishers whose file has none that can be used.
         cycle_us: Cycle of the imported stations; 0 for that of their tasks.
         peer: Name of a station that is made as the other side; empty for none.
+        bus: Pattern of the interfaces of bus ports, or SIMULATED.
+        esi: ESI file, or folder of ESI files, that describes slaves; None for none.
     """
 
     plant: str = ""
@@ -84,6 +96,8 @@ class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
     to: str = ""
     cycle_us: int = 0
     peer: str = ""
+    bus: str = DEFAULT_BUS
+    esi: Path | None = None
 
 
 class ImportResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -96,6 +110,7 @@ class ImportResult(msgspec.Struct, frozen=True, kw_only=True):
         added_to: Existing plant file that the stations were to be added to; empty for none.
         why_beside: Reason that another file than *added_to* was written; empty if it was that one.
         stations: Names of the stations.
+        bus_files: Bus files, and ESI files that they name, that were written.
         notes: ImportOutcome for each part of the files, with the reason.
         findings: Errors; nothing is written then.
     """
@@ -106,6 +121,7 @@ class ImportResult(msgspec.Struct, frozen=True, kw_only=True):
     added_to: str = ""
     why_beside: str = ""
     stations: tuple[str, ...] = ()
+    bus_files: tuple[str, ...] = ()
     notes: tuple[ImportNote, ...] = ()
     findings: tuple[PlantFinding, ...] = ()
 
@@ -116,6 +132,7 @@ class _Sources(msgspec.Struct):
     projects: list[TwinCatProject] = []
     types: list[tuple[str, TypeFile]] = []
     items: list[TreeItem] = []
+    buses: list[EniBus] = []
 
 
 def run_import(
@@ -134,22 +151,137 @@ def run_import(
         if text and not is_name(text):
             raise ConfigError(f"{kind} name {text!r}: expected {NAME}")
     report = ImportReport()
-    stations, types = _plan(_read(files, report), choices, report)
-    if report.findings or not stations:
-        if not report.findings:
-            expected = "an EAP device (DevType 112) that is enabled, or symbols"
-            report.add(str(files[0]), 0, "nothing in it can be imported", expected)
-        return _result(report), ""
-    name = choices.plant or plant_name_of((target or files[0]).stem)
-    head = [f"Made by 'eapctl import {' '.join(each.name for each in files)}'."]
-    text = plant_text(name, stations, types, head=head)
-    result = _result(report, name, stations)
-    if target is None or not target.exists():
-        result = _checked(text, Path(f"{name}.yaml") if target is None else target, result)
-        if target is not None and result.ok:
-            result = _written(target, text, result)
+    with ExitStack() as stack:
+        # Without a plant file those of its buses are tried only.
+        folder = target.parent if target else Path(stack.enter_context(TemporaryDirectory()))
+        sources = _read(files, report)
+        stations, types = _plan(sources, choices, report)
+        buses = list(_plan_buses(sources.buses, choices, folder, report))
+        if buses and not report.findings:
+            stations = _with_buses(stations, buses, choices, target)
+        if report.findings or not stations:
+            if not report.findings:
+                expected = "an EAP device (DevType 112) that is enabled, symbols, or slaves"
+                report.add(str(files[0]), 0, "nothing in it can be imported", expected)
+            return _result(report), ""
+        name = choices.plant or plant_name_of((target or files[0]).stem)
+        head = [f"Made by 'eapctl import {' '.join(each.name for each in files)}'."]
+        text = plant_text(name, stations, types, head=head)
+        result = _result(report, name, stations)
+        written = stack.enter_context(_bus_files(buses, folder))
+        if target is not None and target.exists():
+            result = _add(target, text, stations, types, result)
+        else:
+            place = Path(f"{name}.yaml") if target is None else target
+            result = _checked(text, place, result, folder=folder if buses else None)
+            if target is not None and result.ok:
+                result = _written(target, text, result)
+        if result.ok and target is not None:
+            result = msgspec.structs.replace(result, bus_files=tuple(map(str, written)))
+            written.clear()
         return result, text
-    return _add(target, text, stations, types, result), text
+
+
+def _plan_buses(
+    buses: Sequence[EniBus], choices: ImportChoices, folder: Path, report: ImportReport
+) -> Iterator[BusFiles]:
+    """Yield the files of each bus, which have been tried; what is wrong goes to *report*."""
+    source = None
+    if choices.esi is not None:
+        try:
+            source = EsiSource(choices.esi)
+        except OSError as exc:
+            raise ConfigError(f"--esi {choices.esi}: {exc.strerror or exc}") from None
+    taken: set[str] = set()
+    for bus in buses:
+        plan = BusPlan(bus, source, report)
+        if report.findings:
+            continue
+        with TemporaryDirectory() as name:
+            trial = plan.files("bus", Path(name))
+            for file, text in trial.texts.items():
+                (Path(name) / file).write_text(text, encoding="utf-8")
+            described = describe(Path(name) / trial.name)
+        if isinstance(described, tuple):
+            for each in described:
+                report.add(bus.file, 0, each.message, each.expected, item=each.path)
+            continue
+        plan.note_order([each.name for each in described.slaves])
+        stem = plain_name(f"{Path(bus.file).stem}-bus", "bus")
+        numbers = (f"{stem}{'' if n == 1 else f'-{n}'}" for n in itertools.count(1))
+        files = (plan.files(each, folder) for each in numbers)
+        free = next(
+            each
+            for each in files
+            if not any(file in taken or (folder / file).exists() for file in each.texts)
+        )
+        taken |= set(free.texts)
+        yield free
+
+
+def _with_buses(
+    stations: list[PlannedStation],
+    buses: Sequence[BusFiles],
+    choices: ImportChoices,
+    target: Path | None,
+) -> list[PlannedStation]:
+    """Return *stations* with a port for each bus: of the only controller, else of a new station."""
+    if not stations or (len(stations) > 1 and not choices.peer):
+        stations = [*stations, _bus_station(buses, stations, target)]
+        owner = stations[-1]
+    else:
+        owner = stations[0]
+    first = len(owner.ports)
+    ports = tuple(
+        PlannedPort(
+            name=f"bus{number}",
+            interface=f"{SIMULATED}://{each.name}"
+            if choices.bus == SIMULATED
+            else choices.bus.replace(NUMBER, str(number + 1)),
+            net_id=NetId(bytes(owner.net_id[:4]) + bytes((2 + first + number, 1))),
+            bus=each.name,
+            clocks=each.has_clock,
+        )
+        for number, each in enumerate(buses)
+    )
+    changed = msgspec.structs.replace(owner, ports=(*owner.ports, *ports))
+    return [changed if each is owner else each for each in stations]
+
+
+def _bus_station(
+    buses: Sequence[BusFiles], others: Sequence[PlannedStation], target: Path | None
+) -> PlannedStation:
+    """Return a station without ports, with a name and a NetID that no other has."""
+    before = load_plant(target).plant if target is not None and target.exists() else None
+    known = [(each.name, each.net_id) for each in others]
+    known += [(each.name, each.net_id) for each in before.stations] if before else []
+    base = made_up_net_id(None)
+    free = (NetId(bytes(base[:3]) + bytes((last,)) + b"\1\1") for last in range(base[3], 255))
+    taken = {bytes(net_id[:4]) for _, net_id in known}
+    cycles = [each.cycle_us for each in buses if each.cycle_us]
+    cycle_us = min(cycles, default=DEFAULT_CYCLE_US)
+    return PlannedStation(
+        name=UniqueNames(name for name, _ in known).take("master"),
+        net_id=next((each for each in free if bytes(each[:4]) not in taken), base),
+        cycle_us=max(MIN_CYCLE_US, min(cycle_us, MAX_CYCLE_US)),
+        remarks=("The NetID is made up: an ENI file has none.",),
+    )
+
+
+@contextmanager
+def _bus_files(buses: Sequence[BusFiles], folder: Path) -> Iterator[list[Path]]:
+    """Write the files of *buses*; those that are still in the list at the end are removed."""
+    written: list[Path] = []
+    try:
+        for each in buses:
+            for name, text in each.texts.items():
+                with whole_file(folder / name) as file:
+                    file.write(text.encode())
+                written.append(folder / name)
+        yield written
+    finally:
+        for path in written:
+            path.unlink(missing_ok=True)
 
 
 def _result(
@@ -175,18 +307,23 @@ def _read(files: Sequence[Path], report: ImportReport) -> _Sources:
             continue
         known.add(path.resolve())
         if reason := _NOT_READ.get(path.suffix.lower()):
-            report.add(file, 0, reason, "a .tsproj, .xti, .tmc, .tpy or .xml file")
+            report.add(file, 0, reason, "a .tsproj, .xti, .tmc, .tpy, .xml or .eni file")
             continue
         root = _root_of(path, report)
         if root in {PROJECT, ITEM}:
             sources.projects.append(read_project(file, _chunks, report))
         elif root in TYPE_ROOTS:
             sources.types.append((file, read_type_file(_chunks(file), file, report)))
+        elif root == ENI_ROOT:
+            bus = read_eni(_chunks(file), file, report)
+            sources.buses += [bus] if bus is not None else []
         elif root in TREE_ROOTS:
             sources.items += read_tree_items(_chunks(file), file, report)
         elif root:
             hint = _OTHER_ROOTS.get(root, "")
-            expected = "TcSmProject, TcSmItem, TcModuleClass, PlcProjectInfo or TreeItem"
+            expected = (
+                "TcSmProject, TcSmItem, TcModuleClass, PlcProjectInfo, TreeItem or EtherCATConfig"
+            )
             report.add(file, 1, f"it begins with {root!r}, which is not imported{hint}", expected)
     return sources
 
@@ -369,7 +506,7 @@ def _add(
         # Both are right by themselves: a station of that name, or of that NetID, is there already.
         why = "; ".join(each.message for each in added.findings[:3])
     beside = _beside(target)
-    alone = _checked(text, beside, replace(result, why_beside=why))
+    alone = _checked(text, beside, replace(result, why_beside=why), folder=target.parent)
     return _written(beside, text, alone) if alone.ok else alone
 
 
@@ -386,7 +523,7 @@ def _checked(
     Files that *text* names are found from *folder*.
     """
     try:
-        with tempfile.NamedTemporaryFile(prefix=".", suffix=".yaml", dir=folder) as trial:
+        with NamedTemporaryFile(prefix=".", suffix=".yaml", dir=folder) as trial:
             trial.write(text.encode())
             trial.flush()
             loaded = load_plant(Path(trial.name))

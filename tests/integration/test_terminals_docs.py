@@ -13,7 +13,9 @@ from tests.support.pages import ROOT, Shell, commands, shell
 
 pytestmark = pytest.mark.net
 
-PAGE = (ROOT / "docs" / "terminals-and-drives.md").read_text()
+PAGE, _, ENI = (
+    (ROOT / "docs" / "terminals-and-drives.md").read_text().partition("## From an ENI file")
+)
 BLOCK = re.compile(r"```(yaml|console)\n(.*?)```", re.DOTALL)
 ARRIVES = ("bus state", "pd watch")
 """Commands whose answer takes a moment to be the shown one."""
@@ -21,13 +23,16 @@ ARRIVES = ("bus state", "pd watch")
 
 @pytest.fixture
 def reader() -> Iterator[Shell]:
-    with shell() as made:
+    with shell(COLUMNS="100") as made:
         shutil.copytree(ROOT / "config" / "esi", made.folder / "esi")
+        shutil.copy(ROOT / "docs" / "examples" / "Cell.xml", made.folder)
         yield made
 
 
-def test_terminals_page_commands_print_the_shown_output(reader: Shell) -> None:
-    for kind, text in BLOCK.findall(PAGE):
+# The second part is a plant of its own, made of an ENI file.
+@pytest.mark.parametrize("part", [PAGE, ENI], ids=["esi", "eni"])
+def test_terminals_page_commands_print_the_shown_output(reader: Shell, part: str) -> None:
+    for kind, text in BLOCK.findall(part):
         if kind == "yaml":
             name = text.partition("\n")[0].removeprefix("# ")
             (reader.folder / name).write_text(text)
@@ -46,5 +51,6 @@ def check(reader: Shell, command: str, expected: str) -> None:
 
 def plain(text: str) -> str:
     """Return the text without times, numbers of cycles and trailing spaces."""
-    lines = re.sub(r"^\d\d:\S+  |  cycle \d+$", "", text, flags=re.MULTILINE).splitlines()
+    text = re.sub(r"^\d\d:\S+  |  cycle \d+(  quality .*)?$", "", text, flags=re.MULTILINE)
+    lines = text.splitlines()
     return "\n".join(line.rstrip() for line in lines).strip()

@@ -127,9 +127,12 @@ def _port(port: PlannedPort) -> str:
     vlan_id, priority = port.vlan
     return _mapping(
         name=scalar(port.name),
-        kind="eap",
-        interface=json.dumps(port.interface),
+        kind="bus" if port.bus else "eap",
+        interface=json.dumps(port.interface, ensure_ascii=False),
         net_id=str(port.net_id),
+        # The bus file of simulated slaves is their description.
+        bus=scalar(port.bus) if port.bus and port.scheme != "sim" else "",
+        clocks=port.clocks,
         mac=json.dumps(port.mac) if port.mac else "",
         vlan=f"{{id: {vlan_id}, priority: {priority}}}" if vlan_id else "",
         join=json.dumps(port.join) if port.join else "",

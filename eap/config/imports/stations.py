@@ -158,7 +158,7 @@ class PlannedSubscription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlannedPort(msgspec.Struct, frozen=True, kw_only=True):
-    """An EAP port.
+    """An EAP port, or a bus port.
 
     Attributes:
         name: Name of the port.
@@ -169,6 +169,8 @@ class PlannedPort(msgspec.Struct, frozen=True, kw_only=True):
         vlan: VLAN and priority, zeros for none.
         join: Multicast groups of its subscribers.
         remarks: Comments beside it.
+        bus: Bus file of a bus port; empty for an EAP port.
+        clocks: The clocks of the slaves of a bus port are set.
     """
 
     name: str
@@ -179,6 +181,8 @@ class PlannedPort(msgspec.Struct, frozen=True, kw_only=True):
     vlan: tuple[int, int] = (0, 0)
     join: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    bus: str = ""
+    clocks: bool = False
 
     @property
     def scheme(self) -> str:
