@@ -80,7 +80,6 @@ class ObservedPd:
         samples: Data of some arrivals, oldest first.
         cycle: The cycle counter of its frames.
         wrong_length: Length of the EtherCAT header where that is not what the PDs take, else None.
-        is_cut: Whether its data was never there as a whole.
         eap_sm: The last EAP SM byte.
         toggles: Whether the toggle bit of that byte has had both values.
         repeated: Arrivals with the cycle counter and the toggle bit of the one before.
@@ -95,7 +94,6 @@ class ObservedPd:
         "_toggled",
         "cycle",
         "eap_sm",
-        "is_cut",
         "key",
         "quality",
         "repeated",
@@ -112,7 +110,6 @@ class ObservedPd:
         self.samples: list[bytes] = []
         self.cycle = CycleWatch()
         self.wrong_length: int | None = None
-        self.is_cut = True
         self.eap_sm = self.repeated = self.quality = 0
         self._toggled = 0
         self._data: bytes | None = None
@@ -164,11 +161,9 @@ class ObservedPd:
         self._toggled |= 2 if toggle else 1
         self.eap_sm, self._last_cycle, self.quality = header.eap_sm, header.cycle, pd.quality
         self.cycle.enter(header.cycle)
-        is_whole = len(data) == pd.length
         is_changed = self._data is None or data != self._data
         if is_changed:
             self._data = bytes(data)
-        self.is_cut = self.is_cut and not is_whole
         self.rhythm.enter(at_ns, header.cycle, is_changed=is_changed)
 
     def enter_request(self, number: int, at_ns: int, asked_ns: int) -> None:

@@ -93,13 +93,12 @@ class Rhythm:
         received: All arrivals.
         first_ns: Time of the first one.
         last_ns: Time of the last one.
-        changed: Arrivals with other data than the one before.
     """
 
-    __slots__ = ("_changes", "_cycles", "_times", "changed", "first_ns", "last_ns", "received")
+    __slots__ = ("_changes", "_cycles", "_times", "first_ns", "last_ns", "received")
 
     def __init__(self) -> None:
-        self.received = self.changed = 0
+        self.received = 0
         self.first_ns = self.last_ns = 0
         self._times = array("q")
         self._cycles = array("H")
@@ -110,7 +109,6 @@ class Rhythm:
         if not self.received:
             self.first_ns = at_ns
         self.received += 1
-        self.changed += is_changed
         self.last_ns = at_ns
         # Cut now and then and not each time: that would move all of it for each arrival.
         if len(self._times) >= 2 * _KEPT:

@@ -72,7 +72,8 @@ def test_cut_frame_still_shows_its_pds():
     frame = octets([(1, b"ab"), (2, bytes(1000)), (3, b"x")])
     observer = observe([frame[:200]])
     assert [key.pd_id for key in observer.pds] == [1, 2]
-    assert [pd.is_cut for pd in observer.pds.values()] == [False, True]
+    # No guess rests on the begin of a PD.
+    assert [pd.samples for pd in observer.pds.values()] == [[b"ab"], []]
     assert (observer.cut, observer.malformed) == (1, 0)
 
 
