@@ -414,8 +414,10 @@ def _systems(
                 remarks=(_VERSIONS,),
             )
     if devices := assemble(sources.items, report):
+        files = {each.file for each in sources.items}
+        title = Path(files.pop()).stem if len(files) == 1 else devices[0].name
         yield ImportedSystem(
-            name=names.take(plain_name(Path(sources.items[0].file).stem, "station")),
+            name=names.take(plain_name(title, "station")),
             net_id=None,
             devices=devices,
             cycles_us=tuple({each.cycle_us for each in devices if each.cycle_us}),

@@ -111,6 +111,10 @@ def test_export_peer_makes_the_folder_that_is_named(plant: str, tmp_path: Path) 
     result = run("export-peer", plant, "panel", "-o", f"{folder}/")
     assert "23 files written" in result.stdout
     assert len(list(folder.iterdir())) == 23
+    again = run("import", *map(str, sorted(folder.iterdir())), "--address", "127.0.9.1")
+    assert again.stdout.endswith(
+        "1 station (EAP_Line); nothing was written: name a plant file with -o\n"
+    )
 
 
 def test_export_peer_to_stdout_prints_the_xml_only(plant: str, tmp_path: Path) -> None:
