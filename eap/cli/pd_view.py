@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from eap.cli.output import Column, Styled, TextTable, offset_text, quality, value_text
 from eap.codec.datatypes import parse
-from eap.codec.structures import parts_of
+from eap.codec.structures import member_type_name, parts_of
 from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
 from eap.ops.client import connect_station
@@ -81,7 +81,10 @@ def with_members(rows: Iterable[ListedPd], variables: Sequence[VariableRow]) -> 
     def expanded(variable: PdRowVariable) -> PdRowVariable:
         members = [
             MemberRow(
-                f"{variable.name}{path}", part.kind.name, part.bit_offset, part.kind.bit_length
+                f"{variable.name}{path}",
+                member_type_name(part.kind),
+                part.bit_offset,
+                part.kind.bit_length,
             )
             for path, part in parts_of(types[variable.name])
         ]

@@ -218,4 +218,4 @@ def make_array(text: str, element: DataType, dimensions: Sequence[Dimension]) ->
 def check_size(text: str, size: int) -> None:
     """Raise ValueError, which begins with *text*, if no variable can have *size* bytes."""
     if not 0 < size <= MAX_SIZE:
-        raise ValueError(f"{text!r} has {size} bytes, expected 1 to {MAX_SIZE}")
+        raise ValueError(f"{text!r} has {size} bytes: expected 1 to {MAX_SIZE}")

@@ -224,7 +224,11 @@ class _Parser:
 
     def _check_depth(self, depth: int) -> None:
         if depth > MAX_DEPTH:
-            raise ValueError(f"{self._shown} is nested too deeply: at most {MAX_DEPTH} levels")
+            # Of a complete text, which users did not write, its name is enough.
+            shown = self._text.partition("<")[0] if "<" in self._text else self._shown
+            raise ValueError(
+                f"{shown[:60]} is nested too deeply: expected {MAX_DEPTH} levels at most"
+            )
 
     def _iec_array(self, depth: int) -> DataType:
         self._expect("[")
@@ -306,7 +310,10 @@ class _Parser:
                 low, high = high, self._number()
                 count = high - low + 1
             if count < 1:
-                check_size(self._text[:60], 0)
+                raise ValueError(
+                    f"{self._shown} has no elements: expected a number of elements, or a lower"
+                    " bound and an upper one such as 1..3"
+                )
             found.append(Dimension(low, count))
         self._expect("]")
         if len(found) > _MAX_DIMENSIONS:

@@ -113,7 +113,7 @@ class Enumeration(Integer, frozen=True):
 def make_enumeration(name: str, base: DataType, numbers: Mapping[str, int]) -> Enumeration:
     """Return the enumeration *name*; raise ValueError if a number does not fit the base."""
     if type(base) is not Integer or base.is_bits or base.bounds:
-        raise ValueError(f"{name} has the base {base.name}: an enumeration needs a whole number")
+        raise ValueError(f"{name} has the base {base.name}: expected a whole number such as INT")
     if not numbers:
         raise ValueError(f"{name} has no values: an enumeration needs at least one")
     if len(numbers) > MAX_MEMBERS:

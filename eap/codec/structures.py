@@ -298,7 +298,10 @@ def _check_overlaps(name: str, members: Iterable[Member]) -> None:
     last: Member | None = None
     for each in sorted(members, key=lambda each: each.bit_offset):
         if last is not None and each.bit_offset < last.end:
-            raise ValueError(f"{each.name} of {name} lies on {last.name}")
+            raise ValueError(
+                f"{each.name} of {name} lies on {last.name}: expected members behind each other,"
+                " or all of them at 0 as in a union"
+            )
         if last is None or each.end > last.end:
             last = each
 
@@ -389,7 +392,7 @@ def find_part(kind: DataType, path: str) -> Part:
         where = path[:at] or "it"
         if step[1] is not None:
             if not isinstance(kind, Structure):
-                raise ValueError(f"{where} is {kind.name} and has no members")
+                raise ValueError(f"{where} is {kind.name} and has no members{_element_hint(kind)}")
             member = kind.by_name.get(step[1])
             if member is None:
                 known = ", ".join(each.name for each in kind.members[:8])
@@ -404,6 +407,13 @@ def find_part(kind: DataType, path: str) -> Part:
             kind = kind.element
         at = step.end()
     return Part(kind, bit_offset)
+
+
+def _element_hint(kind: DataType) -> str:
+    if not isinstance(kind, Array):
+        return ""
+    first = ",".join(str(low) for low, _ in kind.dimensions)
+    return f": expected an element of it before, such as [{first}]"
 
 
 def split_paths(name: str) -> Iterator[tuple[str, str]]:
@@ -462,6 +472,11 @@ def shared_parts(old: DataType, new: DataType) -> Iterator[SharedPart]:
                 continue
             for old_bit, new_bit, bits in shared_parts(was.kind, member.kind):
                 yield SharedPart(was.bit_offset + old_bit, member.bit_offset + new_bit, bits)
+
+
+def member_type_name(kind: DataType) -> str:
+    """Return the name of a member's type: every BOOL of a struct has a byte, as a BOOL8 has."""
+    return "BOOL" if kind.name == "BOOL8" else kind.name
 
 
 def parts_of(kind: DataType, path: str = "") -> Iterator[tuple[str, Part]]:

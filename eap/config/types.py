@@ -66,6 +66,7 @@ class TypeDefinition(msgspec.Struct, frozen=True, kw_only=True):
         file: File that has it; empty for the plant file.
         path: In the plant file.
         line: In another file.
+        is_reported: It had a finding when it was read.
     """
 
     name: str
@@ -79,6 +80,7 @@ class TypeDefinition(msgspec.Struct, frozen=True, kw_only=True):
     file: str = ""
     path: str = ""
     line: int = 0
+    is_reported: bool = False
 
 
 class ReportedTypeError(ValueError):
@@ -134,7 +136,7 @@ class TypeTable:
         definition = self._definitions.get(key)
         if definition is None:
             return None
-        if key in self._broken:
+        if key in self._broken or definition.is_reported:
             raise ReportedTypeError(name)
         if key in self._twice:
             self._broken.add(key)
@@ -214,7 +216,8 @@ class TypeTable:
 
     def _structure(self, each: TypeDefinition) -> Structure:
         base = self._base(each)
-        kinds = [(member, self._member(each, member)) for member in each.members]
+        kinds = self._members(each)
+        _check_names(each, base)
         plan = [(member.name, kind) for member, kind in kinds]
 
         def compiled() -> Structure:
@@ -247,6 +250,19 @@ class TypeTable:
         if isinstance(base, Structure):
             return base
         raise ValueError(f"{each.name} extends {base.name}: expected a struct")
+
+    def _members(self, each: TypeDefinition) -> list[tuple[MemberDefinition, DataType]]:
+        """Return the members with their types, after all of them had their findings."""
+        kinds = []
+        broken: ReportedTypeError | None = None
+        for member in each.members:
+            try:
+                kinds.append((member, self._member(each, member)))
+            except ReportedTypeError as exc:
+                broken = exc
+        if broken:
+            raise broken
+        return kinds
 
     def _member(self, each: TypeDefinition, member: MemberDefinition) -> DataType:
         try:
@@ -305,6 +321,19 @@ class TypeTable:
             self._report.adopt([finding])
         else:
             self._report.add(each.path, message, expected)
+
+
+def _check_names(each: TypeDefinition, base: Structure | None) -> None:
+    # ADS clients and PLC programs know no case: one of two such members could not be reached.
+    seen: dict[str, str] = {}
+    inherited = [member.name for member in base.members] if base else []
+    for name in (*inherited, *(member.name for member in each.members)):
+        other = seen.setdefault(name.upper(), name)
+        if other != name:
+            raise ValueError(
+                f"{each.name} has members {other} and {name}: expected names that differ in"
+                " more than upper and lower case"
+            )
 
 
 _POINTER = "POINTER TO "
@@ -408,7 +437,8 @@ def _complete(
         report.broken_types.add(variable.type)
         return variable
     except ValueError as exc:
-        report.add(f"{variable.at}.type", f"{name}: {exc}", _A_TYPE)
+        what, _, expected = str(exc).partition(": expected ")
+        report.add(f"{variable.at}.type", f"{name}: {what}", expected or _A_TYPE)
         report.broken_types.add(variable.type)
         return variable
     return msgspec.structs.replace(variable, type=text)
@@ -429,8 +459,11 @@ def _of_section(name: str, section: TypeSection, report: FindingReport) -> Itera
     forms = [key for key in TypeSection.FORMS if getattr(section, key)]
     if len(forms) != 1 and not (section.extends and not forms):
         given = f"has {' and '.join(forms)}" if forms else "defines nothing"
-        report.add(section.at, f"type {name} {given}", f"one of {', '.join(TypeSection.FORMS)}")
-        report.broken_types.add(name)
+        # An empty one may be what is left of a key that could not be read.
+        inside = f"{section.at}."
+        if forms or not any(each.path.startswith(inside) for each in report.findings()):
+            report.add(section.at, f"type {name} {given}", f"one of {', '.join(TypeSection.FORMS)}")
+        yield TypeDefinition(name=name, path=section.at, is_reported=True)
         return
     members = section.members or section.union
     yield TypeDefinition(

@@ -86,8 +86,9 @@ def _check_variable(path: str, name: str, variable: VariableSection, report: Fin
         kind = datatypes.parse(variable.type)
     except ValueError as exc:
         if variable.type not in report.broken_types:
-            expected = "a data type such as UINT, REAL or BLOCK(64)"
-            report.add(f"{path}.type", f"{name}: {exc}", expected)
+            what, _, expected = str(exc).partition(": expected ")
+            expected = expected or "a data type such as UINT, REAL or BLOCK(64)"
+            report.add(f"{path}.type", f"{name}: {what}", expected)
         return
     if variable.default is None:
         return

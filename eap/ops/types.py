@@ -9,11 +9,14 @@ import msgspec
 
 from eap.codec.basetypes import DataType
 from eap.codec.enumerations import Enumeration
-from eap.codec.structures import Structure
+from eap.codec.structures import Structure, member_type_name
 from eap.config.types import TypeTable
 from eap.errors import ConfigError
 from eap.runtime.plantfile import load_plant
 from eap.suggest import suggest
+
+_MANY = 12
+"""Names of types in a message."""
 
 
 class LayoutRow(msgspec.Struct, frozen=True):
@@ -69,7 +72,10 @@ def _find(table: TypeTable, path: Path, name: str) -> DataType:
     except ValueError:
         raise ConfigError("\n".join(map(str, table.findings()))) from None
     if kind is None:
-        raise ConfigError(f"{path}: no type {name!r}{suggest(name, table.names())}")
+        known = sorted(table.names())
+        more = ", …" if len(known) > _MANY else ""
+        hint = suggest(name, known) or f"; types: {', '.join(known[:_MANY])}{more}"
+        raise ConfigError(f"{path}: no type {name!r}{hint}")
     return kind
 
 
@@ -96,11 +102,6 @@ def _shown(kind: DataType) -> ShownType:
 
 def _rows(kind: Structure) -> Iterator[LayoutRow]:
     for name, member, bit_offset in kind.members:
-        yield LayoutRow(name, _type_name(member), bit_offset, member.bit_length)
+        yield LayoutRow(name, member_type_name(member), bit_offset, member.bit_length)
     for bit_offset, bits in kind.gaps():
         yield LayoutRow("", "", bit_offset, bits)
-
-
-def _type_name(kind: DataType) -> str:
-    # Every BOOL of a struct has a byte; BOOL8 is the name for variables.
-    return "BOOL" if kind.name == "BOOL8" else kind.name

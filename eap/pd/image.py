@@ -27,7 +27,7 @@ import msgspec
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
-from eap.codec.structures import find_variable
+from eap.codec.structures import find_variable, split_paths
 from eap.errors import ImageError, TornReadError
 from eap.pd.layout import (
     HEADER,
@@ -40,7 +40,7 @@ from eap.pd.layout import (
 )
 from eap.pd.spec import Writer
 from eap.pd.words import StationWord
-from eap.suggest import suggest
+from eap.suggest import nearest
 
 READ_ATTEMPTS = 1000
 """Spread over a tenth of a second by the pauses of a mapped file: a busy host stalls that long."""
@@ -56,6 +56,16 @@ _CODES = {
 """Of those numbers that one call packs; capitals for those without a sign."""
 
 _CYCLE, _FUTEX, _SEQUENCE = StationWord.CYCLE, StationWord.FUTEX, StationWord.ENGINE_SEQUENCE
+
+
+def _near_variable(name: str, known: Iterable[str]) -> str:
+    """Return a hint to the variable that *name*, or the start of a path, comes near to."""
+    by_case = {each.lower(): each for each in known}
+    for each in (name, *(variable for variable, _ in split_paths(name))):
+        near = nearest(each.lower(), by_case)
+        if near is not None:
+            return f", did you mean {by_case[near]}{name[len(each) :]}?"
+    return ""
 
 
 def _no_pause() -> None:
@@ -106,7 +116,7 @@ class Image:
         except ValueError as exc:
             raise ImageError(f"station {station} has no {name!r}: {exc}") from None
         if found is None:
-            hint = suggest(name, self.slots)
+            hint = _near_variable(name, self.slots)
             raise ImageError(f"station {station} has no variable {name!r}{hint}")
         slot, part = self.slots[found[0]], found[1]
         return VariableSlot(name, part.kind.text, slot.writer, slot.bit_offset + part.bit_offset)

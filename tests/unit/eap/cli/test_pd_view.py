@@ -64,7 +64,7 @@ def test_variables_of_no_pd_have_a_row_of_their_own() -> None:
 
 
 def test_members_of_structs_are_listed_with_their_places() -> None:
-    text = "S<8/4:a@0 INT,f@2.1 BIT,p@4 P<4/2:x@0 INT,y@2 INT>>"
+    text = "S<8/4:a@0 INT,f@2.1 BIT,on@3 BOOL,p@4 P<4/2:x@0 INT,y@2 INT>>"
     listed = [VariableRow(name, kind, "engine", "", "") for name, kind in
               (("axis", text), ("speed", "INT"))]  # fmt: skip
     (row,) = with_members(list(listed_pds("mixer", [], listed)), listed)
@@ -73,6 +73,7 @@ def test_members_of_structs_are_listed_with_their_places() -> None:
     assert axis.members == [
         MemberRow("axis.a", "INT", 0, 16),
         MemberRow("axis.f", "BIT1", 17, 1),
+        MemberRow("axis.on", "BOOL", 24, 8),
         MemberRow("axis.p", "P", 32, 32),
         MemberRow("axis.p.x", "INT", 32, 16),
         MemberRow("axis.p.y", "INT", 48, 16),

@@ -84,6 +84,7 @@ def test_type_of_a_file_is_shown_by_name_as_json(plant: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
+        (["Qqqq"], "no type 'Qqqq'; types: "),
         (["ST_Axs"], "no type 'ST_Axs', did you mean ST_Axis?"),
         (
             ["ST_Bad"],

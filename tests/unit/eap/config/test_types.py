@@ -153,16 +153,19 @@ def test_pointer_is_refused_where_the_type_is_used(tmp_path):
         ("  A: {members: {a: Bee}}\n  Be: INT", "3: a of A: 'Bee' is not a data type, did you"),
         ("  A: {members: {a: INT}, values: {b: 1}}", "3: type A has values and members; one of al"),
         ("  A: {pack: 4}", "3: type A defines nothing; one of alias, values, members, union"),
+        ("  A: {members: [x, y]}", "3: members is a list; a mapping from names"),
+        ("  A: {members: {x: INT, X: INT}}", "3: A has members x and X; names that differ in more"),
+        ("  A: {members: {x: 'INT[3..1]'}}", "3: x of A: 'INT[3..1]' has no elements; a number of"),
         ("  A: {pack: 3, members: {a: INT}}", "3: pack is 3; one of 1, 2, 4, 8"),
         ("  UINT: INT", "3: 'UINT' is no name of a type of its own"),
         ("  'A B': INT", "3: 'A B' is no name of a type of its own; letters, digits and _"),
         ("  A: INT\n  a: UINT", "4: type a is defined twice (first in line 3); each name once"),
         ("  A: {values: {x: 40000}}", "3: x of A: 40000 is not a value of INT; a whole number"),
-        ("  A: {base: REAL, values: {x: 1}}", "3: A has the base REAL: an enumeration needs a"),
+        ("  A: {base: REAL, values: {x: 1}}", "3: A has the base REAL; a whole number such as INT"),
         ("  A: {members: {x: 'BYTE[70000]'}}", "3: x of A: 'BYTE[70000]' has 70000 bytes"),
         (
             "  A: {members: {x: 'BYTE[60000]', y: 'BYTE[60000]'}}",
-            "3: 'A' has 120000 bytes, expected 1 to 65535; a type of known parts",
+            "3: 'A' has 120000 bytes; 1 to 65535",
         ),
         (
             "  A: {members: {x: {type: INT, offset: 1}, y: INT}}",
@@ -170,7 +173,7 @@ def test_pointer_is_refused_where_the_type_is_used(tmp_path):
         ),
         (
             "  A: {members: {x: {type: INT, offset: 0}, y: {type: INT, offset: 1}}}",
-            "3: y of A lies on x; a type of known parts",
+            "3: y of A lies on x; members behind each other",
         ),
         ("  A: {extends: E_X, members: {x: INT}}\n  E_X: INT", "3: A extends E_X; a struct"),
         ("  - none.tmc", "3: none.tmc: No such file or directory; a TMC or TPY file"),
@@ -203,6 +206,28 @@ def test_all_wrong_types_are_found_at_once(tmp_path):
         "plant.yaml:5: z of C: 99999 is not a value of INT",
         "plant.yaml:12: axis: 'S' is not a data type (such as UINT, REAL[4] or STRING(16))",
         "plant.yaml:13: copy: 'S' is not a data type (such as UINT, REAL[4] or STRING(16))",
+    ]
+
+
+def test_all_wrong_members_of_a_type_are_found_at_once(tmp_path):
+    types = "  A: {members: {x: FLOAT, y: INT, z: STRING}}"
+    found = [each.split(",")[0] for each in findings(tmp_path, types=types, axis="A")]
+    assert found == [
+        "plant.yaml:3: x of A: 'FLOAT' is not a data type",
+        "plant.yaml:3: z of A: 'STRING' lacks its length in bytes",
+    ]
+
+
+@pytest.mark.parametrize("types", ["  A: {members: [x]}", "  A: {pack: 4}"])
+def test_variable_of_a_type_that_defines_nothing_has_no_finding(tmp_path, types):
+    assert len(findings(tmp_path, types=types, axis="A")) == 1
+
+
+def test_struct_of_too_many_levels_is_named_without_its_text(tmp_path):
+    types = "\n".join(f"  D{n}: {{members: {{x: D{n - 1}}}}}" for n in range(1, 20))
+    found = findings(tmp_path, types=f"  D0: {{members: {{x: INT}}}}\n{types}", axis="INT")
+    assert [each.partition(": ")[2] for each in found] == [
+        "D16 is nested too deeply; 16 levels at most"
     ]
 
 

@@ -536,7 +536,10 @@ def test_image_reads_and_writes_members_without_touching_others():
     [
         ("axis.b", "station a has no 'axis.b': S has no member 'b'"),
         ("axis.p[3]", "has no element 3: 1 to 2"),
-        ("axes.a", "station a has no variable 'axes.a'"),
+        ("axes.a", "station a has no variable 'axes.a', did you mean axis.$"),
+        ("AXIS.f", "has no variable 'AXIS.f', did you mean axis.f?"),
+        ("zzz.f", "has no variable 'zzz.f'$"),
+        ("axis.p.x", r"\.p is P\[1\.\.2\] and has no members: expected .* such as \[1\]"),
         ("axis.p[" + "1" * 5000 + "]", "is no path"),
     ],
 )
