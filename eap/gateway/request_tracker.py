@@ -124,6 +124,12 @@ class RequestTracker:
         self._clients: dict[Endpoint, _TrackedClient] = {}
         self._in_flight = 0
 
+    def set_limits(self, limits: ClientLimits) -> None:
+        """Apply other limits to the next requests; what was taken stays."""
+        self._limits = limits
+        for client in self._clients.values():
+            client.credit = limits.rate  # as one that comes new has it
+
     def admit(self, endpoint: Endpoint, frame: bytes, now_ns: int) -> RequestAdmission:
         """Decide on a request; one that is taken waits until :meth:`answered`.
 

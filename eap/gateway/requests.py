@@ -96,6 +96,11 @@ class AddressMap:
     ) -> None:
         self._virtual = dict(virtual or {})
 
+    def changed(self, other: AddressMap) -> set[int]:
+        """Return the virtual addresses that mean something else in *other*."""
+        both = self._virtual.keys() | other._virtual.keys()
+        return {each for each in both if self._virtual.get(each) != other._virtual.get(each)}
+
     def resolve(self, address: int, stations: tuple[int, ...]) -> Destination:
         """Return the meaning of *address*; *stations* are the slaves of the bus.
 

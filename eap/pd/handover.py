@@ -22,7 +22,7 @@ from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxSlot
 from eap.pd.monitor import SubscriberPresence
-from eap.pd.spec import PortSpec, StationSpec, Writer
+from eap.pd.spec import GatewaySpec, PortSpec, StationSpec, Writer
 from eap.pd.words import (
     REASON_INDEX,
     TRACKER_START,
@@ -35,8 +35,10 @@ from eap.pd.words import (
 
 _IN_FRAMES = {"net_id", "eap_sm", "length"}
 """Fields of a port that only concern the content of its frames."""
-_WHOLE = {"bus", "gateway"}
+_WHOLE = {"bus"}
 """Fields that are too much for a line."""
+_FIXED_OF_GATEWAY = ("port", "full", "padded")
+"""Fields of a gateway that concern its sockets and the dictionary of its master."""
 _OWN_WORDS = {
     StationWord.FUTEX,
     StationWord.ENGINE_SEQUENCE,
@@ -318,7 +320,16 @@ def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
 def _port_differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
     was = asdict(old)
     for field, value in asdict(new).items():
-        if field not in _IN_FRAMES and value != was[field]:
+        if field == "gateway":
+            yield from _gateway_differences(old.gateway or GatewaySpec(), value or GatewaySpec())
+        elif field not in _IN_FRAMES and value != was[field]:
             yield (
                 f"{field} is another one" if field in _WHOLE else f"{field} {was[field]} -> {value}"
             )
+
+
+def _gateway_differences(old: GatewaySpec, new: GatewaySpec) -> Iterator[str]:
+    for field in _FIXED_OF_GATEWAY:
+        was, value = getattr(old, field), getattr(new, field)
+        if was != value:
+            yield f"gateway.{field} {was} -> {value}"

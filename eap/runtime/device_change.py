@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from msgspec.structs import asdict
+
 from eap.device.configuration import (
     EntryChange,
     StoredError,
@@ -20,7 +22,15 @@ from eap.device.eap_spec import fill, read_back
 from eap.device.rollout import bus_variables, kept_versions, without_alternates
 from eap.pd.device import DeviceFault
 from eap.pd.handover import needs_new_start
-from eap.pd.spec import LinkSpec, PortKind, Source, StationSpec, VariableSpec
+from eap.pd.spec import (
+    GatewayAddress,
+    GatewaySpec,
+    LinkSpec,
+    PortKind,
+    Source,
+    StationSpec,
+    VariableSpec,
+)
 from eap.runtime.store import Configuration
 
 
@@ -148,10 +158,30 @@ def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
     on_bus = bus_variables(old) | bus_variables(new)
     return [
         *kept_versions(old, new),
+        *_gateway_changes(old, new),
         *_differences("source of", _source_name, old.sources, new.sources),
         *_differences("link", _link_name, old.links, new.links),
         *_differences("variable", _variable_name, _chosen(old, on_bus), _chosen(new, on_bus)),
     ]
+
+
+def _gateway_changes(old: StationSpec, new: StationSpec) -> Iterator[str]:
+    before = {port.name: port.gateway or GatewaySpec() for port in old.ports}
+    for port in new.ports:
+        was, becomes = before.get(port.name), port.gateway or GatewaySpec()
+        if was is None or was == becomes:
+            continue
+        settings = asdict(was)
+        for field, value in asdict(becomes).items():
+            if field != "addresses" and value != settings[field]:
+                yield f"gateway of {port.name}: {field} {settings[field]} -> {value}"
+        yield from _differences(
+            f"gateway of {port.name}: address", _address_name, was.addresses, becomes.addresses
+        )
+
+
+def _address_name(address: GatewayAddress) -> str:
+    return f"0x{address.address:04X}"
 
 
 def _chosen(spec: StationSpec, names: set[str]) -> tuple[VariableSpec, ...]:

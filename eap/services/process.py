@@ -101,6 +101,7 @@ class StationDevices:
         routers: AMS routers, by station.
         routing: Routing configuration in force, by station.
         brokers: Connections to MQTT brokers, by station; not open yet.
+        keepers: Configurations that the stations run, by station.
         ads: ADS services at the NetIDs of routers and EAP ports, by station.
     """
 
@@ -120,6 +121,7 @@ class StationDevices:
         self.routers: dict[str, StationRouter] = {}
         self.routing: dict[str, StationRouting] = {}
         self.brokers: dict[str, StationBrokers] = {}
+        self.keepers: dict[str, StationKeeper] = {}
         self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
         self._release = release
@@ -162,7 +164,8 @@ class StationDevices:
         if _runs(image):
             self._has_restarted.set()  # the previous services process may have ended in a change
         player = SourcePlayer(station, image)
-        keeper.on_change = player.change
+        keeper.on_change.append(player.change)
+        self.keepers[name] = keeper
         self._players.append(player)
         identity = DeviceIdentity(
             device_name=f"EAP station {name}",
@@ -244,7 +247,7 @@ class Services:
         devices = self._devices(images, link)
         self._startup.step("opening gateways and sockets")
         clients = open_buses(link, [bus.owner for bus in self._handover.buses])
-        providers, gateways = self._gateways(clients, devices.routers)
+        providers, gateways = self._gateways(clients, devices)
         network = Network(
             self._handover,
             devices.routers,
@@ -312,15 +315,27 @@ class Services:
         return devices
 
     def _gateways(
-        self, clients: Mapping[PortName, BusClient], routers: Mapping[str, StationRouter]
+        self, clients: Mapping[PortName, BusClient], devices: StationDevices
     ) -> tuple[Mapping[PortName, MasterDictionaryProvider], Mapping[PortName, MailboxGateway]]:
         if not self._handover.buses:
             return {}, {}
         # Imported here: a plant without buses starts with about 76 modules fewer.
-        from eap.services.gateway.opening import open_dictionaries, open_gateways
+        from eap.services.gateway.opening import (
+            GatewayFollower,
+            open_dictionaries,
+            open_gateways,
+        )
 
         providers = open_dictionaries(self._handover, clients, RELEASE)
-        return providers, open_gateways(self._handover, clients, providers, routers)
+        gateways = open_gateways(self._handover, clients, providers, devices.routers)
+        for station in self._handover.stations:
+            names = [owner for owner in gateways if owner.station == station.name]
+            mine = {owner.port: gateways[owner] for owner in names}
+            if mine:
+                devices.keepers[station.name].on_change.append(
+                    GatewayFollower(station, mine).change
+                )
+        return providers, gateways
 
     def _brokers(self, devices: StationDevices) -> list[StationBrokers]:
         """Open those that are configured now, which the plant file may not have."""

@@ -131,7 +131,7 @@ class StationKeeper:
         self.previous: Configuration | None = None
         self.cause = ""
         self.undone = False
-        self.on_change: Callable[[StationSpec], None] | None = None
+        self.on_change: list[Callable[[StationSpec], None]] = []
         self.unsaved: Unsaved | None = None
         self._store = store
         self._engine = engine
@@ -205,8 +205,8 @@ class StationKeeper:
         self.cause, self.undone = record.cause, record.undone
         if spec != self.spec:
             self.spec = spec
-            if self.on_change is not None:
-                self.on_change(spec)
+            for follow in self.on_change:
+                follow(spec)
 
     async def change_state(self, state: DeviceState) -> None:
         """Bring the station to *state*.

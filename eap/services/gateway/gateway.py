@@ -86,8 +86,8 @@ GATEWAY_ANSWER_S = 0.9
 STALL_S = 2.0
 """Wait of a slave for the client of a file after which that gives way to another client's."""
 
-OpenRemote: TypeAlias = Callable[[RemoteAddress], RemoteSlave]
-"""Returns access to a slave, or the master, of another station."""
+OpenRemote: TypeAlias = Callable[[RemoteAddress, float], RemoteSlave]
+"""Returns access to a slave, or the master, of another station, with the limit for an answer."""
 
 _REJECTIONS = {RequestAdmission.CROWDED: Cause.CROWDED, RequestAdmission.TOO_FAST: Cause.TOO_FAST}
 
@@ -147,7 +147,7 @@ class MailboxGateway:
     ) -> None:
         self.tracker = RequestTracker(settings.limits)
         self.memory, self.file_memory = MemoryBudget(), MemoryBudget()
-        log = ErrorLog(settings.name, settings.names, settings.answer_s)
+        log = _log_of(settings)
         self._encoder = ReplyEncoder(self.tracker, log, is_silent=settings.is_silent)
         self.statistics = self._encoder.statistics
         self.admission = GatewayAdmission(access)
@@ -167,6 +167,21 @@ class MailboxGateway:
         self._listeners = EoeListeners()
         self._ethernet = RemoteEthernet(settings.name, settings.max_size, self._send_fragment)
         bus.listen(self._forward_unsolicited)
+
+    def change(self, settings: Settings, addresses: AddressMap) -> None:
+        """Go on with other settings and addresses.
+
+        Requests that are under way are finished with those before.  Transfers to virtual addresses
+        that mean something else now are aborted.
+        """
+        changed = self._addresses.changed(addresses)
+        self.settings, self._addresses = settings, addresses
+        self.tracker.set_limits(settings.limits)
+        self._encoder.change(_log_of(settings), is_silent=settings.is_silent)
+        self._dialect = DialectHandler(self.admission, settings.max_size, settings.answer_s)
+        if changed:
+            self._slaves.close_to(changed)
+            self._ethernet.forget_slaves()
 
     def start(self) -> None:
         """Take requests, again."""
@@ -319,7 +334,7 @@ class MailboxGateway:
                 return await self._forward_to_slave(request, key, is_step=is_step)
             case RemoteAddress():
                 sizes = MailboxSizes.of_data(self.settings.max_size)
-                slave = self._open_remote(destination)
+                slave = self._open_remote(destination, self.settings.answer_s)
                 if kind is MailboxType.EOE and begins_to_listen(body):
                     self._ethernet.add(station, slave, endpoint, request.send)
                 begin = partial(self._begin, key, slave, sizes)
@@ -466,12 +481,16 @@ class MailboxGateway:
             case MasterAddress():
                 return self._open_master()
             case RemoteAddress():
-                return self._open_remote(destination)
+                return self._open_remote(destination, self.settings.answer_s)
             case SlaveAddress(station):
                 slave = await self._find(station)
                 check_slave(kind, b"", slave)
                 return self._open_local(slave, endpoint)
         raise GatewayError(Cause.NO_SLAVE)
+
+
+def _log_of(settings: Settings) -> ErrorLog:
+    return ErrorLog(settings.name, settings.names, settings.answer_s)
 
 
 def check_slave(kind: MailboxType, body: bytes, slave: SlaveDescription) -> None:

@@ -66,6 +66,14 @@ class RemoteEthernet:
         """Forget a client whose connection is closed."""
         self._listeners.forget(endpoint)
 
+    def forget_slaves(self) -> None:
+        """End all readers: the virtual addresses are other ones.
+
+        A client that goes on to talk EoE gets a reader for the slave that is there now.
+        """
+        self._tasks.cancel()
+        self._listeners = EoeListeners()
+
     async def close(self) -> None:
         """End all readers."""
         await self._tasks.close()

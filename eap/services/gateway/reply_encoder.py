@@ -199,6 +199,11 @@ class ReplyEncoder:
         self._is_silent = is_silent
         self._counters = bytearray(_ADDRESSES)
 
+    def change(self, log: ErrorLog, *, is_silent: bool) -> None:
+        """Go on with other settings; the arguments are those of the class."""
+        self._log = log
+        self._is_silent = is_silent
+
     def answer(
         self,
         request: GatewayRequest,

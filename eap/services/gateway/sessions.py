@@ -8,7 +8,7 @@ Rule 3: a transfer without a next step is aborted, and its memory is freed.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Container, Iterator, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -289,6 +289,11 @@ class SessionTable(Generic[S]):
     def close_of(self, endpoint: Endpoint) -> None:
         """End the sessions of a client."""
         for key in [key for key in self._open if key.endpoint == endpoint]:
+            self.drop(key)
+
+    def close_to(self, addresses: Container[int]) -> None:
+        """End the sessions with some addresses."""
+        for key in [key for key in self._open if key.address in addresses]:
             self.drop(key)
 
     def close(self) -> None:

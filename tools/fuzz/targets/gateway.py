@@ -191,7 +191,7 @@ async def _serve(data: bytes) -> None:
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,
         AddressMap({_VIRTUAL: RemoteAddress(_SETTINGS.net_id, 1001)}),
-        lambda slave: link,
+        lambda slave, answer_s: link,
     )
     transport = GatewayTransport([(gateway, "udp:eap0")])
     answered: list[bytes] = []

@@ -443,7 +443,13 @@ def test_a_bus_is_not_written_out():
 def test_needs_new_start_reports_changed_gateway():
     before = replace(left(), ports=(replace(BUS, gateway=GatewaySpec()),))
     after = replace(left(), ports=(replace(BUS, gateway=GatewaySpec(silent=True)),))
-    assert needs_new_start(before, after) == [f"port bus0: gateway is another one{END}"]
+    assert needs_new_start(before, after) == []
+    fixed = GatewaySpec(port=34990, full=True, rate=9)
+    after = replace(left(), ports=(replace(BUS, gateway=fixed),))
+    assert needs_new_start(before, after) == [
+        f"port bus0: gateway.port 0 -> 34990{END}",
+        f"port bus0: gateway.full False -> True{END}",
+    ]
 
 
 def test_members_of_a_changed_struct_keep_their_values():

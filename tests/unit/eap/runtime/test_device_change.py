@@ -11,6 +11,8 @@ from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import (
     BusPortSpec,
     CounterSource,
+    GatewayAddress,
+    GatewaySpec,
     LinkSpec,
     PortKind,
     PortSpec,
@@ -196,4 +198,21 @@ def test_describe_rest_lists_sources_links_and_bus_variables(plain):
         "link ticks bit 3 to b bit 1: removed",
         "link running to a: changed",
         "variable bus0.valve.valve: changed",
+    ]
+
+
+def test_describe_rest_lists_settings_and_addresses_of_gateways(plain):
+    old = GatewaySpec(rate=5, addresses=(GatewayAddress(0x9001, 1001), GatewayAddress(0x9002, 1)))
+    new = GatewaySpec(
+        silent=True, rate=6, addresses=(GatewayAddress(0x9002, 2), GatewayAddress(0x9003, 3))
+    )
+    before = replace(plain, ports=(*plain.ports, replace(BUS, gateway=old)))
+    after = replace(plain, ports=(*plain.ports, replace(BUS, gateway=new)))
+    assert find_refusals(before, after) == []
+    assert describe_rest(before, after) == [
+        "gateway of bus0: silent False -> True",
+        "gateway of bus0: rate 5 -> 6",
+        "gateway of bus0: address 0x9001: removed",
+        "gateway of bus0: address 0x9002: changed",
+        "gateway of bus0: address 0x9003: added",
     ]

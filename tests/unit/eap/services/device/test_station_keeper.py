@@ -69,7 +69,7 @@ def test_unchanged_station_is_not_stored(keeper, spec):
 
 def test_change_is_kept_and_runs(keeper, engine, spec, changed):
     told = []
-    keeper.on_change = told.append
+    keeper.on_change.append(told.append)
     asyncio.run(keeper.change(changed, NEW))
     assert engine.spec == keeper.spec == changed
     assert told == [changed]

@@ -21,6 +21,7 @@ from eap.codec.mailbox import (
     decode_frame,
     encode_frame,
 )
+from eap.gateway.request_tracker import ClientLimits
 from eap.gateway.requests import AddressMap, RemoteAddress, SlaveAddress
 from eap.ids import Endpoint, NetId
 from eap.od.dictionary import ObjectDictionary
@@ -84,7 +85,7 @@ class Desk:
             self._open_remote,
         )
 
-    def _open_remote(self, slave: RemoteAddress) -> SlaveAccess:
+    def _open_remote(self, slave: RemoteAddress, answer_s: float) -> SlaveAccess:
         self.asked.append(slave)
         return self.station.link()
 
@@ -282,6 +283,24 @@ def test_all_slaves_of_a_bus_that_is_down_are_answered_for() -> None:
         ((header, body),) = await desk.handle(COE, 0xFFFF, VENDOR)
         assert (header.address, body[-4:]) == (0xFFFF, bytes.fromhex("00000206"))
         assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
+
+    play(scene, bus="coe")
+
+
+def test_changed_addresses_and_settings_are_for_the_next_requests() -> None:
+    other = RemoteAddress(ELSEWHERE_BUS, 1004)
+
+    async def scene(desk: Desk) -> None:
+        upload = "0020 40 0180 00 00000000"
+        assert (await desk.one(COE, 1003, upload)).startswith("00 30 41")
+        await desk.one(COE, 0x9001, VENDOR)
+        settings = desk.gateway.settings._replace(is_silent=True, limits=ClientLimits(rate=1))
+        addresses = AddressMap({0x9000: SlaveAddress(1001), 0x9001: other})
+        desk.gateway.change(settings, addresses)
+        await desk.one(COE, 0x9001, VENDOR)  # the first of this second
+        assert desk.asked == [RemoteAddress(ELSEWHERE_BUS, 1003), other]
+        assert len(desk.gateway.transfers()) == 1  # that with 1003, which is what it was
+        assert await desk.handle(COE, 1009, VENDOR) == []  # an error of its own, and too fast
 
     play(scene, bus="coe")
 
