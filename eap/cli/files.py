@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         "eapctl import Line.tsproj Press.tsproj --address ethernet://eth0 -o hall.yaml",
         "eapctl import axis.tmc -o axis.yaml",
         "eapctl import cell.eni --esi esi --bus sim -o cell.yaml",
+        "eapctl import esi --device EK1100 --device EL2004 -o cell.yaml",
     ),
 )
 @click.argument("files", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="FILE…")
@@ -90,6 +91,13 @@ if TYPE_CHECKING:
     metavar="PATH",
     help="ESI file, or folder of ESI files, that describes the slaves of an ENI file further.",
 )
+@click.option(
+    "--device",
+    "devices",
+    multiple=True,
+    metavar="TYPE",
+    help="Slave of a bus that is made of ESI files; repeat it for each, in their order.",
+)
 @json_option("Print one object: ok, file, plant, stations, bus_files, notes, findings.")
 @click.pass_context
 def import_files(
@@ -104,15 +112,16 @@ def import_files(
     peer: str,
     bus: str,
     esi: Path | None,
+    devices: tuple[str, ...],
     output: Renderer,
 ) -> None:
     """Make a plant file of the files of other tools, or add to one.
 
     FILE is a TwinCAT 3 project (.tsproj) or device (.xti), an Automation Interface description
     (.xml), has types and symbols (.tmc, .tpy), or describes the slaves of a bus (ENI: .eni, .xml),
-    for which a bus file is written beside PLANT. The report says what was taken, what was left, and
-    why. A publisher whose settings are not known for certain becomes a comment: nothing is
-    sent on a guess.
+    for which a bus file is written beside PLANT; ESI files give a bus of their devices. The report
+    says what was taken, what was left, and why. A publisher whose settings are not known for
+    certain becomes a comment: nothing is sent on a guess.
 
     Exits with 2 when a file cannot be read; nothing is written then.
     """
@@ -131,8 +140,11 @@ def import_files(
         peer=peer,
         bus=bus,
         esi=esi,
+        devices=devices,
     )
     result, text = run_import(files, None if is_stdout else target, choices)
+    if is_stdout and result.bus_files:
+        raise click.UsageError("a bus file goes beside the plant file: name a file instead of -")
     for finding in result.findings:
         output.remark(str(finding))
     if result.ok and is_stdout:
@@ -170,7 +182,7 @@ def _import_lines(result: ImportResult, target: Path | None) -> Iterator[Rendera
         yield f"{result.file}: {stations} added"
     else:
         yield f"{result.file}: plant {result.plant}, {stations}"
-    if result.bus_files:
+    if result.bus_files and target is not None:
         names = ", ".join(result.bus_files)
         yield f"{count(len(result.bus_files), 'file')} for buses: {names}"
 

@@ -70,7 +70,7 @@ class BusPlan:
         self._eni = eni
         self._source = source
         self._report = report
-        self._variables = _by_slave(eni.variables)
+        self._variables = _by_slave(eni)
         names = UniqueNames()
         self._slaves = [
             _BusSlave(eni=each, name=names.take(plain_name(each.name, "slave")))
@@ -97,8 +97,9 @@ class BusPlan:
             vendor: f"{stem}-esi.xml" if len(vendors) == 1 else f"{stem}-esi-{vendor:X}.xml"
             for vendor in vendors
         }
+        origin = " ".join(Path(self._eni.file).name.split())
         lines = [
-            f"# Made of {Path(self._eni.file).name} by 'eapctl import'.",
+            f"# Made of {origin} by 'eapctl import'.",
             f"bus: {scalar(plain_name(stem, 'bus'))}",
             "slaves:",
         ]
@@ -231,13 +232,13 @@ class BusPlan:
         self._note(slave, ImportOutcome.TAKEN, ", ".join(parts))
 
 
-def _by_slave(variables: Iterable[EniVariable]) -> dict[str, list[EniVariable]]:
+def _by_slave(bus: EniBus) -> dict[str, list[EniVariable]]:
     """Return the variables of each slave: ``SLAVE.PDO.ENTRY``; a slave's name may have dots."""
-    found: dict[str, list[EniVariable]] = {}
-    for each in variables:
+    found: dict[str, list[EniVariable]] = {each.name: [] for each in bus.slaves}
+    for each in bus.variables:
         for end, letter in enumerate(each.name):
-            if letter == ".":
-                found.setdefault(each.name[:end], []).append(each)
+            if letter == "." and each.name[:end] in found:
+                found[each.name[:end]].append(each)
     return found
 
 
@@ -386,7 +387,11 @@ def _write(each: SdoWrite | IdnWrite) -> str:
 def _sync_lines(slave: _BusSlave, cycle_us: int) -> Iterator[str]:
     sync, device = slave.eni.sync, slave.vendor_device
     if sync is None or sync.activate == 0 or not (sync.activate or 0x200) & _SYNC0:
-        if device is not None and any(each.mode.activate for each in device.op_modes):
+        if (
+            device is not None
+            and not slave.eni.by_vendor
+            and any(each.mode.activate for each in device.op_modes)
+        ):
             yield "activate: 0"
         return
     cycle = sync.cycle0_ns / US

@@ -11,10 +11,12 @@ from tempfile import NamedTemporaryFile, TemporaryDirectory
 
 import msgspec
 
+from devicebus.esi.choice import DeviceQuery
+from devicebus.esi.content import ROOT as ESI_ROOT
 from eap.codec.xmlstream import CHUNK, XmlError, XmlReader
 from eap.config.finding import PlantFinding
 from eap.config.imports.eni import ROOT as ENI_ROOT
-from eap.config.imports.eni import EniBus, read_eni
+from eap.config.imports.eni import EniBus, EniSlave, read_eni
 from eap.config.imports.insertion import InsertionError, insert_stations
 from eap.config.imports.planttext import plant_text, station_lines
 from eap.config.imports.records import ImportNote, ImportOutcome, ImportReport
@@ -57,6 +59,8 @@ EDC = (
 )
 DEFAULT_BUS = "ethernet://bus{n}"
 SIMULATED = "sim"
+MAX_DEVICES = 64
+"""Devices of ESI files that become a bus without being named."""
 _ARCHIVE = "it is an archive: unpack it, and import the .tsproj file in it"
 _SOLUTION = "it is a solution: import the .tsproj file in its folder"
 _NOT_READ = {
@@ -68,7 +72,6 @@ _NOT_READ = {
 }
 _OTHER_ROOTS = {
     "TcConfig": ": 'eapctl routes import STATION FILE' takes the routes of it",
-    "EtherCATInfo": ": a bus file names it as the description of a slave (esi)",
 }
 _VERSIONS = (
     "A project does not show the data type versions of its variables: 0, the default of TwinCAT 3,"
@@ -88,6 +91,7 @@ class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
         peer: Name of a station that is made as the other side; empty for none.
         bus: Pattern of the interfaces of bus ports, or SIMULATED.
         esi: ESI file, or folder of ESI files, that describes slaves; None for none.
+        devices: Types of the slaves of a bus that is made of ESI files; all if there are none.
     """
 
     plant: str = ""
@@ -98,6 +102,7 @@ class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
     peer: str = ""
     bus: str = DEFAULT_BUS
     esi: Path | None = None
+    devices: tuple[str, ...] = ()
 
 
 class ImportResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -110,8 +115,8 @@ class ImportResult(msgspec.Struct, frozen=True, kw_only=True):
         added_to: Existing plant file that the stations were to be added to; empty for none.
         why_beside: Reason that another file than *added_to* was written; empty if it was that one.
         stations: Names of the stations.
-        bus_files: Bus files, and ESI files that they name, that were written.
-        notes: ImportOutcome for each part of the files, with the reason.
+        bus_files: Bus files, and ESI files that they name, as they are written with a plant file.
+        notes: Outcome for each part of the files, with the reason.
         findings: Errors; nothing is written then.
     """
 
@@ -132,7 +137,7 @@ class _Sources(msgspec.Struct):
     projects: list[TwinCatProject] = []
     types: list[tuple[str, TypeFile]] = []
     items: list[TreeItem] = []
-    buses: list[EniBus] = []
+    buses: list[tuple[EniBus, EsiSource | None]] = []
 
 
 def run_import(
@@ -154,9 +159,9 @@ def run_import(
     with ExitStack() as stack:
         # Without a plant file those of its buses are tried only.
         folder = target.parent if target else Path(stack.enter_context(TemporaryDirectory()))
-        sources = _read(files, report)
+        sources = _read(files, choices, report)
         stations, types = _plan(sources, choices, report)
-        buses = list(_plan_buses(sources.buses, choices, folder, report))
+        buses = list(_plan_buses(sources.buses, folder, report))
         if buses and not report.findings:
             stations = _with_buses(stations, buses, choices, target)
         if report.findings or not stations:
@@ -176,24 +181,19 @@ def run_import(
             result = _checked(text, place, result, folder=folder if buses else None)
             if target is not None and result.ok:
                 result = _written(target, text, result)
-        if result.ok and target is not None:
+        if result.ok:
             result = msgspec.structs.replace(result, bus_files=tuple(map(str, written)))
-            written.clear()
+            if target is not None:
+                written.clear()
         return result, text
 
 
 def _plan_buses(
-    buses: Sequence[EniBus], choices: ImportChoices, folder: Path, report: ImportReport
+    buses: Sequence[tuple[EniBus, EsiSource | None]], folder: Path, report: ImportReport
 ) -> Iterator[BusFiles]:
     """Yield the files of each bus, which have been tried; what is wrong goes to *report*."""
-    source = None
-    if choices.esi is not None:
-        try:
-            source = EsiSource(choices.esi)
-        except OSError as exc:
-            raise ConfigError(f"--esi {choices.esi}: {exc.strerror or exc}") from None
     taken: set[str] = set()
-    for bus in buses:
+    for bus, source in buses:
         plan = BusPlan(bus, source, report)
         if report.findings:
             continue
@@ -227,7 +227,7 @@ def _with_buses(
 ) -> list[PlannedStation]:
     """Return *stations* with a port for each bus: of the only controller, else of a new station."""
     if not stations or (len(stations) > 1 and not choices.peer):
-        stations = [*stations, _bus_station(buses, stations, target)]
+        stations = [*stations, _bus_station(buses, stations, choices.cycle_us, target)]
         owner = stations[-1]
     else:
         owner = stations[0]
@@ -249,7 +249,7 @@ def _with_buses(
 
 
 def _bus_station(
-    buses: Sequence[BusFiles], others: Sequence[PlannedStation], target: Path | None
+    buses: Sequence[BusFiles], others: Sequence[PlannedStation], cycle_us: int, target: Path | None
 ) -> PlannedStation:
     """Return a station without ports, with a name and a NetID that no other has."""
     before = load_plant(target).plant if target is not None and target.exists() else None
@@ -259,7 +259,7 @@ def _bus_station(
     free = (NetId(bytes(base[:3]) + bytes((last,)) + b"\1\1") for last in range(base[3], 255))
     taken = {bytes(net_id[:4]) for _, net_id in known}
     cycles = [each.cycle_us for each in buses if each.cycle_us]
-    cycle_us = min(cycles, default=DEFAULT_CYCLE_US)
+    cycle_us = cycle_us or min(cycles, default=DEFAULT_CYCLE_US)
     return PlannedStation(
         name=UniqueNames(name for name, _ in known).take("master"),
         net_id=next((each for each in free if bytes(each[:4]) not in taken), base),
@@ -297,8 +297,60 @@ def _result(
     )
 
 
-def _read(files: Sequence[Path], report: ImportReport) -> _Sources:
+def _vendor_files(path: Path | None) -> EsiSource | None:
+    try:
+        return None if path is None else EsiSource(path)
+    except OSError as exc:
+        raise ConfigError(f"--esi {path}: {exc.strerror or exc}") from None
+
+
+def _devices_of(path: Path, types: Sequence[str], report: ImportReport) -> EniBus | None:
+    """Return a bus of the devices of an ESI file or folder; None with findings."""
+    try:
+        source = EsiSource(path)
+    except OSError as exc:
+        report.add(str(path), 0, f"cannot be read: {exc.strerror or exc}", "ESI files")
+        return None
+    chosen = types or list(dict.fromkeys(each.listed.type for each in source.devices))
+    if not chosen:
+        report.findings += source.findings()
+        report.add(
+            str(path),
+            0,
+            "it describes no device",
+            "an ESI file with devices, or a folder of such files",
+        )
+    elif len(chosen) > MAX_DEVICES:
+        message = f"it describes {len(chosen)} devices"
+        report.add(str(path), 0, message, "those of the bus: --device TYPE for each")
+        return None
+    slaves = []
+    for name in chosen:
+        try:
+            found = source.choose(DeviceQuery(type=name))
+        except ValueError as exc:
+            report.add(str(path), 0, str(exc), "a type of its devices (--device)")
+            continue
+        report.findings += found.findings if found.device is None else ()
+        listed = found.located.listed
+        slaves.append(
+            EniSlave(
+                name=listed.type,
+                line=listed.line,
+                address=0,
+                vendor=listed.vendor,
+                product=listed.product,
+                revision=listed.revision,
+                type=listed.type,
+                by_vendor=True,
+            )
+        )
+    return None if report.findings else EniBus(file=str(path), slaves=tuple(slaves))
+
+
+def _read(files: Sequence[Path], choices: ImportChoices, report: ImportReport) -> _Sources:
     sources = _Sources()
+    vendors = _vendor_files(choices.esi)
     known: set[Path] = set()
     for path in files:
         file = str(path)
@@ -309,20 +361,23 @@ def _read(files: Sequence[Path], report: ImportReport) -> _Sources:
         if reason := _NOT_READ.get(path.suffix.lower()):
             report.add(file, 0, reason, "a .tsproj, .xti, .tmc, .tpy, .xml or .eni file")
             continue
-        root = _root_of(path, report)
-        if root in {PROJECT, ITEM}:
+        root = ESI_ROOT if path.is_dir() else _root_of(path, report)
+        if root == ESI_ROOT:
+            made = _devices_of(path, choices.devices, report)
+            sources.buses += [(made, EsiSource(path))] if made is not None else []
+        elif root in {PROJECT, ITEM}:
             sources.projects.append(read_project(file, _chunks, report))
         elif root in TYPE_ROOTS:
             sources.types.append((file, read_type_file(_chunks(file), file, report)))
         elif root == ENI_ROOT:
             bus = read_eni(_chunks(file), file, report)
-            sources.buses += [bus] if bus is not None else []
+            sources.buses += [(bus, vendors)] if bus is not None else []
         elif root in TREE_ROOTS:
             sources.items += read_tree_items(_chunks(file), file, report)
         elif root:
             hint = _OTHER_ROOTS.get(root, "")
             expected = (
-                "TcSmProject, TcSmItem, TcModuleClass, PlcProjectInfo, TreeItem or EtherCATConfig"
+                "TcSmProject, TcSmItem, TcModuleClass, PlcProjectInfo, TreeItem, EtherCATConfig"
             )
             report.add(file, 1, f"it begins with {root!r}, which is not imported{hint}", expected)
     return sources

@@ -20,10 +20,12 @@ ROOT = "EtherCATConfig"
 MAX_SLAVES = 4096
 _MAX_COMMANDS = 10_000
 _MAX_VARIABLES = 100_000
+_MAX_NAME = 200
 _U16, _U32 = 0xFFFF, 0xFFFF_FFFF
 _CONFIG = f"{ROOT}/Config"
 _WANTED = (
     f"{_CONFIG}/Master/Info",
+    f"{_CONFIG}/Master/MailboxStates",
     f"{_CONFIG}/Slave",
     f"{_CONFIG}/Cyclic",
     f"{_CONFIG}/ProcessImage/Inputs",
@@ -100,6 +102,7 @@ class EniSlave(msgspec.Struct, frozen=True, kw_only=True):
         group: Hot-connect group; empty for none.
         members: Slaves of that group.
         identification: Register and value by which the group is found; None for none.
+        by_vendor: It has the settings of its vendor's description, not of an ENI file.
         any_revision: The file checks vendor and product, but not the revision.
         output_bits: Bits that it takes; 0 if the file does not say.
         input_bits: Bits that it gives.
@@ -128,6 +131,7 @@ class EniSlave(msgspec.Struct, frozen=True, kw_only=True):
     group: str = ""
     members: int = 1
     identification: tuple[int, int] | None = None
+    by_vendor: bool = False
     any_revision: bool = False
     output_bits: int = 0
     input_bits: int = 0
@@ -209,6 +213,9 @@ class _Reader:
     def _take(self, element: XmlElement) -> None:
         if element.tag == "Info":
             self._name = element.findtext("Name")
+        elif element.tag == "MailboxStates":
+            message = "this master sees full mailboxes by its own means"
+            self._report.note(self._file, element.line, element.tag, ImportOutcome.LEFT, message)
         elif element.tag == "Slave":
             self._take_slave(element)
         elif element.tag == "Cyclic":
@@ -227,7 +234,7 @@ class _Reader:
                 raise XmlError(message, line=element.line, expected=f"at most {_MAX_VARIABLES}")
             self._variables.append(
                 EniVariable(
-                    name=element.findtext("Name"),
+                    name=element.findtext("Name")[: 2 * _MAX_NAME],
                     type=element.findtext("DataType"),
                     bits=element.number_at("BitSize", 0, _U32),
                     offset=element.number_at("BitOffs", 0, _U32),
@@ -254,7 +261,7 @@ class _Reader:
             note(self._file, self._first_cyclic, "Cyclic", ImportOutcome.WARNING, message)
 
     def _take_slave(self, element: XmlElement) -> None:
-        name = element.findtext("Info/Name") or f"slave {len(self._slaves) + 1}"
+        name = element.findtext("Info/Name")[:_MAX_NAME] or f"slave {len(self._slaves) + 1}"
         content = ("ProcessData", "Mailbox", "InitCmds")
         if element.find("Info/PhysAddr") is None and not any(map(element.find, content)):
             message = "no station address and no commands: no EtherCAT slave, such as an end cap"

@@ -339,6 +339,34 @@ def test_all_faults_of_a_file_are_reported_at_once_with_lines(importer: Importer
     assert [each.line for each in result.findings] == [3, 9]
 
 
+def test_devices_of_an_esi_folder_become_a_bus_in_the_order_given(importer: Importer) -> None:
+    choices = ImportChoices(bus="sim", devices=("C100", "DO4", "DO4", "SD1"), cycle_us=4000)
+    result = importer.run(ESI, choices=choices)
+    assert result.ok, result.findings
+    slaves = importer.bus("esi-bus.yaml").slaves
+    assert [each.name for each in slaves] == ["C100", "DO4", "DO4-2", "SD1"]
+    assert [each.group for each in slaves[1].outputs[:2]] == ["Channel 1", "Channel 2"]
+    # The settings of the vendor.
+    assert slaves[3].config.sync is not None
+    assert "cycle_us: 4000" in importer.plant.read_text()
+
+
+def test_esi_file_alone_is_a_bus_of_its_devices_in_their_newest_revisions(
+    importer: Importer,
+) -> None:
+    result = importer.run(ESI / "terminals.xml")
+    assert result.ok, result.findings
+    revisions = {each.name: each.revision for each in importer.bus("terminals-bus.yaml").slaves}
+    assert revisions["DO4"] == 0x00120000
+
+
+def test_unknown_device_of_esi_files_is_a_finding(importer: Importer) -> None:
+    result = importer.run(ESI, choices=ImportChoices(bus="sim", devices=("DO5",)))
+    assert not result.ok
+    assert "DO5" in str(result.findings[0])
+    assert list(importer.folder.iterdir()) == []
+
+
 def test_bus_files_go_when_the_plant_file_cannot_be_written(importer: Importer) -> None:
     result = importer.run(CELL, choices=ImportChoices(bus="nothing://{n}"))
     assert not result.ok

@@ -311,7 +311,7 @@ def test_pointers_are_refused(importer: Importer, kind: str, size: int) -> None:
     [
         ("a.tszip", "PK", "it is an archive: unpack it"),
         ("a.xml", "<TcConfig/>", "'eapctl routes import STATION FILE' takes the routes of it"),
-        ("a.xml", "<EtherCATInfo/>", "a bus file names it"),
+        ("a.xml", "<EtherCATInfo/>", "it describes no device"),
         ("a.xti", '<TcSmItem><Box BoxType="9099"/></TcSmItem>', "nothing in it can be imported"),
         ("a.tsproj", project(device(more='Disabled="1"')), "nothing in it can be imported"),
     ],
@@ -387,9 +387,9 @@ def test_plant_in_a_file_with_spaces_has_a_name_without(importer: Importer) -> N
     assert importer.loaded().name == "my_plant"
 
 
-def test_folders_are_named_as_such(importer: Importer) -> None:
+def test_folder_without_esi_files_is_refused(importer: Importer) -> None:
     result = importer.run(importer.folder)
-    assert messages(result) == ["cannot be read: it is a folder"]
+    assert messages(result) == ["it describes no device"]
     importer.plant = importer.folder / "none" / "plant.yaml"
     with pytest.raises(EnvironmentalError, match="cannot be written: No such file"):
         importer.run(LINE)
