@@ -17,6 +17,7 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from ipaddress import IPv4Address
 from pathlib import Path
 
 from eap.codec.ams import AMS_TCP_PORT
@@ -249,7 +250,14 @@ class AddressKeeper:
                 except (OSError, EnvironmentalError) as exc:
                     logger.warning("%s: its interface was made again: %s", address, exc)
 
+    @property
+    def is_empty(self) -> bool:
+        """True if there is nothing to keep."""
+        return not self._renewals
+
     def _keep(self, address: str, renew: Callable[[int], None]) -> None:
+        if IPv4Address(address).is_loopback:  # that interface is never deleted
+            return
         self._renewals.setdefault(address, []).append(renew)
 
 

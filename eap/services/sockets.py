@@ -178,8 +178,8 @@ class LinkWatch:
         self._interfaces.append(interface)
 
     async def serve(self) -> None:
-        """Poll until cancelled."""
-        while True:
+        """Poll until cancelled; return at once without any interface."""
+        while self._transports or self._interfaces or not self.addresses.is_empty:
             self.poll()
             await asyncio.sleep(LINK_POLL_S)
 

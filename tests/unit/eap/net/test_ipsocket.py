@@ -9,6 +9,7 @@ import pytest
 from eap.errors import EnvironmentalError
 from eap.net import ipsocket
 from eap.net.ipsocket import (
+    AddressKeeper,
     describe_holder,
     find_holders,
     open_ams_broadcast,
@@ -19,6 +20,7 @@ from eap.net.ipsocket import (
     open_udp_receiver,
 )
 from tests.support.addresses import own_address
+from tests.unit.eap.net.conftest import ip
 
 pytestmark = pytest.mark.net
 
@@ -285,3 +287,28 @@ def test_a_broadcast_address_that_is_taken_is_a_warning(caplog):
         other.bind(("127.255.255.255", 48899))
         assert open_ams_broadcast("127.9.6.1", "") is None
     assert "Address already in use" in caplog.text
+
+
+@pytest.mark.root
+def test_keeper_joins_interfaces_made_again_more_often_than_a_socket_has_memberships(cable):
+    near, far = cable
+    keeper = AddressKeeper()
+    ip(f"addr add 10.99.1.1/24 dev {near}")
+    pair = open_udp_group_pair("239.99.1.1", "10.99.1.1", PORT)
+    try:
+        for sock in pair:
+            keeper.keep_group(sock, "239.99.1.1", "10.99.1.1")
+        for _ in range(24):  # the kernel's limit is 20 (net.ipv4.igmp_max_memberships)
+            keeper.look()
+            ip(f"link del {near}")
+            keeper.look()
+            ip(f"link add {near} type veth peer name {far}")
+            ip(f"addr add 10.99.1.1/24 dev {near}")
+        ip(f"link set {near} up")
+        keeper.look()
+        joined = socket.inet_aton("239.99.1.1") + socket.inet_aton("10.99.1.1")
+        for sock in pair:
+            with pytest.raises(OSError, match="Address already in use"):
+                sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, joined)
+    finally:
+        close(pair)

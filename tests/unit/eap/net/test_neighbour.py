@@ -24,7 +24,7 @@ from eap.net.neighbour import (
 )
 from eap.net.packetsocket import open_arp
 from eap.pd.monitor import ProbeResult
-from tests.unit.eap.net.conftest import ip
+from tests.unit.eap.net.conftest import ip, wait_for_links
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
 
@@ -256,3 +256,27 @@ def test_as_many_addresses_as_the_kernel_takes(make_prober):
     prober.watch(addresses[:300])
     with pytest.raises(EnvironmentalError, match="1001 addresses to monitor"):
         prober.watch(addresses)
+
+
+def test_arp_prober_finds_an_interface_made_again(make_prober, cable):
+    near, far = cable
+    prober = make_prober()
+    ip(f"link del {near}")
+    assert not prober.probe(ADDRESS)
+    ip(f"link add {near} address 02:00:00:00:00:11 type veth peer name {far}")
+    for name in cable:
+        ip(f"link set {name} up")
+    wait_for_links(*cable)
+    limit = time.monotonic() + 5
+    while str(prober.mac) != "02:00:00:00:00:11":
+        assert time.monotonic() < limit
+        prober.drain()
+    host = Host(far)
+    try:
+        assert prober.probe(ADDRESS)
+        frame, asked = host.hear()
+        assert (frame[6:12], asked.sender_mac) == (prober.mac, prober.mac)
+        host.answer(asked)
+        assert wait_heard(prober) == [ArpSighting(ADDRESS, host.mac, is_claim=False)]
+    finally:
+        host.sock.close()
