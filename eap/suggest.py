@@ -13,6 +13,13 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return found[0] if found else None
 
 
+def nearest_in_any_case(name: str, known: Iterable[str]) -> str | None:
+    """Return the same as :func:`nearest` where upper and lower case make no difference."""
+    by_case = {each.upper(): each for each in known}
+    near = nearest(name.upper(), by_case)
+    return None if near is None else by_case[near]
+
+
 def suggest(name: str, known: Iterable[str]) -> str:
     """Return ``, did you mean …?`` with the one of *known* that comes nearest, or nothing."""
     meant = nearest(name, known)

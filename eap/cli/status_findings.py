@@ -423,6 +423,8 @@ def _of_received(where: str, row: Row) -> Iterator[StatusFinding]:
         advice = "compare the plant files of both stations"
         if wrong == "version":
             advice += f"; {VERSION_HINT}"
+        else:
+            advice += ", and the packing of their structs"
         yield _error(where, f"dropped: unexpected {wrong}", advice)
     remarks = []
     if row.get("timeouts"):

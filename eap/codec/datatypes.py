@@ -32,7 +32,7 @@ from eap.codec.basetypes import (
 from eap.codec.enumerations import MAX_MEMBERS, make_enumeration
 from eap.codec.structures import MAX_DEPTH, Member, make_structure
 from eap.codec.times import TIMES
-from eap.suggest import nearest
+from eap.suggest import nearest_in_any_case
 
 # Users of types import all of them from here.
 __all__ = [
@@ -407,9 +407,8 @@ class _Parser:
 
 def _suggestion(name: str, known: Iterable[str]) -> str:
     """Return the name that comes near in whatever case, or examples."""
-    by_case = {each.upper(): each for each in known}
-    near = nearest(name.upper(), by_case)
-    return f", did you mean {by_case[near]}?" if near else f" {_SUCH_AS}"
+    near = nearest_in_any_case(name, known)
+    return f", did you mean {near}?" if near else f" {_SUCH_AS}"
 
 
 class PdoLayout(NamedTuple):

@@ -331,6 +331,8 @@ class _Converter:
                 shown = "is a list"
             case None:
                 shown = "has no value"
+            case bool():
+                shown = f"is {str(node.value).lower()}"
             case value:
                 shown = f"is {value!r}"
         self._report.add(path, f"{key} {shown}", expected)

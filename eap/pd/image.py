@@ -40,7 +40,7 @@ from eap.pd.layout import (
 )
 from eap.pd.spec import Writer
 from eap.pd.words import StationWord
-from eap.suggest import nearest
+from eap.suggest import nearest_in_any_case
 
 READ_ATTEMPTS = 1000
 """Spread over a tenth of a second by the pauses of a mapped file: a busy host stalls that long."""
@@ -60,11 +60,10 @@ _CYCLE, _FUTEX, _SEQUENCE = StationWord.CYCLE, StationWord.FUTEX, StationWord.EN
 
 def _near_variable(name: str, known: Iterable[str]) -> str:
     """Return a hint to the variable that *name*, or the start of a path, comes near to."""
-    by_case = {each.lower(): each for each in known}
     for each in (name, *(variable for variable, _ in split_paths(name))):
-        near = nearest(each.lower(), by_case)
+        near = nearest_in_any_case(each, known)
         if near is not None:
-            return f", did you mean {by_case[near]}{name[len(each) :]}?"
+            return f", did you mean {near}{name[len(each) :]}?"
     return ""
 
 

@@ -208,7 +208,8 @@ def test_cyclic_pd_that_never_came_is_a_warning_and_any_other_a_remark() -> None
 
 
 @pytest.mark.parametrize(
-    ("var_state", "wrong", "hint"), [(1, "version", f"; {VERSION_HINT}"), (2, "length", "")]
+    ("var_state", "wrong", "hint"),
+    [(1, "version", f"; {VERSION_HINT}"), (2, "length", ", and the packing of their structs")],
 )
 def test_pd_of_another_layout_is_an_error(var_state: int, wrong: str, hint: str) -> None:
     assert texts(rx=[rx("left", var_state=var_state)]) == [

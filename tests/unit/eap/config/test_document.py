@@ -172,7 +172,7 @@ def test_document_with_tabs_that_yaml_takes_is_read(tree) -> None:
             "1: unknown key 'plnt', did you mean plant?; one of plant, stations, defaults",
         ),
         ("id: 1,", "id: 70000,", "15: id is 70000; a whole number from 0 to 65535"),
-        ("id: 1,", "id: true,", "15: id is True; a whole number from 0 to 65535"),
+        ("id: 1,", "id: true,", "15: id is true; a whole number from 0 to 65535"),
         ("id: 1,", "id: 1.0,", "15: id is 1.0; a whole number from 0 to 65535"),
         ("id: 1,", "id: ,", "15: id has no value; a whole number from 0 to 65535"),
         ("id: 1, ", "", "15: 'state' has no id; the key id"),

@@ -63,7 +63,7 @@ def frame(text):
             [pd("divider: 2, on_change: {}")],
             "15: PD 'state' is sent on change and has a divider; o",
         ),
-        ([pd("on_change: true")], "15: on_change is True; a mapping"),
+        ([pd("on_change: true")], "15: on_change is true; a mapping"),
         (
             [pd("on_change: {timeout_ms: -1}")],
             "15: timeout_ms is -1; a whole number of milliseconds from 0 to 4294967295",
