@@ -71,7 +71,10 @@ class OwnDevice:
             "RevisionNo": f"#x{eni.revision:08X}",
         }
         kind = _node("Type", line=eni.line, keys=identity)
-        parts = [kind, _node("Name", eni.type or eni.name, keys={"LcId": "1033"})]
+        parts = [
+            kind,
+            _node("Name", eni.type or f"Product 0x{eni.product:08X}", keys={"LcId": "1033"}),
+        ]
         if dictionary := self._dictionary():
             parts.append(_node("Profile", "", dictionary))
         parts += self._fmmus()

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from ipaddress import IPv4Address
 from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryDirectory
 
 import msgspec
 
-from devicebus.esi.choice import DeviceQuery
 from devicebus.esi.content import ROOT as ESI_ROOT
 from eap.codec.xmlstream import CHUNK, XmlError, XmlReader
 from eap.config.finding import PlantFinding
 from eap.config.imports.eni import ROOT as ENI_ROOT
-from eap.config.imports.eni import EniBus, EniSlave, read_eni
+from eap.config.imports.eni import EniBus, read_eni
 from eap.config.imports.insertion import InsertionError, insert_stations
 from eap.config.imports.planttext import plant_text, station_lines
 from eap.config.imports.records import ImportNote, ImportOutcome, ImportReport
 from eap.config.imports.resolution import resolve, with_peers
 from eap.config.imports.stations import (
     DEFAULT_CYCLE_US,
-    MAX_CYCLE_US,
-    MIN_CYCLE_US,
     ImportedSystem,
     PlannedPort,
     PlannedStation,
@@ -42,14 +39,19 @@ from eap.config.imports.typefile import TypeFile, TypeRecord, read_type_file
 from eap.config.imports.typenames import TypeNames
 from eap.errors import ConfigError, EnvironmentalError
 from eap.ids import NET_ID, InterfaceUri, NetId
-from eap.ops.eni_bus import BusFiles, BusPlan
+from eap.ops.imported_buses import (
+    NUMBER,
+    bus_of_devices,
+    plan_buses,
+    vendor_files,
+    with_buses,
+    written_files,
+)
 from eap.pd.rules import NAME, is_name, plain_name, plant_name_of
-from eap.runtime.busfile import describe
 from eap.runtime.durable import whole_file
 from eap.runtime.esi_files import EsiSource
 from eap.runtime.plantfile import load_plant
 
-NUMBER = "{n}"
 DEFAULT_ADDRESS = "ethernet://line{n}"
 """No interface is called so on purpose: nothing is sent before the user has named his own."""
 EDC = (
@@ -58,9 +60,6 @@ EDC = (
     " project itself"
 )
 DEFAULT_BUS = "ethernet://bus{n}"
-SIMULATED = "sim"
-MAX_DEVICES = 64
-"""Devices of ESI files that become a bus without being named."""
 _ARCHIVE = "it is an archive: unpack it, and import the .tsproj file in it"
 _SOLUTION = "it is a solution: import the .tsproj file in its folder"
 _NOT_READ = {
@@ -161,9 +160,12 @@ def run_import(
         folder = target.parent if target else Path(stack.enter_context(TemporaryDirectory()))
         sources = _read(files, choices, report)
         stations, types = _plan(sources, choices, report)
-        buses = list(_plan_buses(sources.buses, folder, report))
+        buses = list(plan_buses(sources.buses, folder, report))
         if buses and not report.findings:
-            stations = _with_buses(stations, buses, choices, target)
+            only = bool(stations) and (len(stations) == 1 or bool(choices.peer))
+            stations = with_buses(
+                stations, buses, choices.bus, target, is_first=only, cycle_us=choices.cycle_us
+            )
         if report.findings or not stations:
             if not report.findings:
                 expected = "an EAP device (DevType 112) that is enabled, symbols, or slaves"
@@ -173,7 +175,7 @@ def run_import(
         head = [f"Made by 'eapctl import {' '.join(each.name for each in files)}'."]
         text = plant_text(name, stations, types, head=head)
         result = _result(report, name, stations)
-        written = stack.enter_context(_bus_files(buses, folder))
+        written = stack.enter_context(written_files(buses, folder))
         if target is not None and target.exists():
             result = _add(target, text, stations, types, result)
         else:
@@ -186,102 +188,6 @@ def run_import(
             if target is not None:
                 written.clear()
         return result, text
-
-
-def _plan_buses(
-    buses: Sequence[tuple[EniBus, EsiSource | None]], folder: Path, report: ImportReport
-) -> Iterator[BusFiles]:
-    """Yield the files of each bus, which have been tried; what is wrong goes to *report*."""
-    taken: set[str] = set()
-    for bus, source in buses:
-        plan = BusPlan(bus, source, report)
-        if report.findings:
-            continue
-        with TemporaryDirectory() as name:
-            trial = plan.files("bus", Path(name))
-            for file, text in trial.texts.items():
-                (Path(name) / file).write_text(text, encoding="utf-8")
-            described = describe(Path(name) / trial.name)
-        if isinstance(described, tuple):
-            for each in described:
-                report.add(bus.file, 0, each.message, each.expected, item=each.path)
-            continue
-        plan.note_order([each.name for each in described.slaves])
-        stem = plain_name(f"{Path(bus.file).stem}-bus", "bus")
-        numbers = (f"{stem}{'' if n == 1 else f'-{n}'}" for n in itertools.count(1))
-        files = (plan.files(each, folder) for each in numbers)
-        free = next(
-            each
-            for each in files
-            if not any(file in taken or (folder / file).exists() for file in each.texts)
-        )
-        taken |= set(free.texts)
-        yield free
-
-
-def _with_buses(
-    stations: list[PlannedStation],
-    buses: Sequence[BusFiles],
-    choices: ImportChoices,
-    target: Path | None,
-) -> list[PlannedStation]:
-    """Return *stations* with a port for each bus: of the only controller, else of a new station."""
-    if not stations or (len(stations) > 1 and not choices.peer):
-        stations = [*stations, _bus_station(buses, stations, choices.cycle_us, target)]
-        owner = stations[-1]
-    else:
-        owner = stations[0]
-    first = len(owner.ports)
-    ports = tuple(
-        PlannedPort(
-            name=f"bus{number}",
-            interface=f"{SIMULATED}://{each.name}"
-            if choices.bus == SIMULATED
-            else choices.bus.replace(NUMBER, str(number + 1)),
-            net_id=NetId(bytes(owner.net_id[:4]) + bytes((2 + first + number, 1))),
-            bus=each.name,
-            clocks=each.has_clock,
-        )
-        for number, each in enumerate(buses)
-    )
-    changed = msgspec.structs.replace(owner, ports=(*owner.ports, *ports))
-    return [changed if each is owner else each for each in stations]
-
-
-def _bus_station(
-    buses: Sequence[BusFiles], others: Sequence[PlannedStation], cycle_us: int, target: Path | None
-) -> PlannedStation:
-    """Return a station without ports, with a name and a NetID that no other has."""
-    before = load_plant(target).plant if target is not None and target.exists() else None
-    known = [(each.name, each.net_id) for each in others]
-    known += [(each.name, each.net_id) for each in before.stations] if before else []
-    base = made_up_net_id(None)
-    free = (NetId(bytes(base[:3]) + bytes((last,)) + b"\1\1") for last in range(base[3], 255))
-    taken = {bytes(net_id[:4]) for _, net_id in known}
-    cycles = [each.cycle_us for each in buses if each.cycle_us]
-    cycle_us = cycle_us or min(cycles, default=DEFAULT_CYCLE_US)
-    return PlannedStation(
-        name=UniqueNames(name for name, _ in known).take("master"),
-        net_id=next((each for each in free if bytes(each[:4]) not in taken), base),
-        cycle_us=max(MIN_CYCLE_US, min(cycle_us, MAX_CYCLE_US)),
-        remarks=("The NetID is made up: an ENI file has none.",),
-    )
-
-
-@contextmanager
-def _bus_files(buses: Sequence[BusFiles], folder: Path) -> Iterator[list[Path]]:
-    """Write the files of *buses*; those that are still in the list at the end are removed."""
-    written: list[Path] = []
-    try:
-        for each in buses:
-            for name, text in each.texts.items():
-                with whole_file(folder / name) as file:
-                    file.write(text.encode())
-                written.append(folder / name)
-        yield written
-    finally:
-        for path in written:
-            path.unlink(missing_ok=True)
 
 
 def _result(
@@ -297,60 +203,9 @@ def _result(
     )
 
 
-def _vendor_files(path: Path | None) -> EsiSource | None:
-    try:
-        return None if path is None else EsiSource(path)
-    except OSError as exc:
-        raise ConfigError(f"--esi {path}: {exc.strerror or exc}") from None
-
-
-def _devices_of(path: Path, types: Sequence[str], report: ImportReport) -> EniBus | None:
-    """Return a bus of the devices of an ESI file or folder; None with findings."""
-    try:
-        source = EsiSource(path)
-    except OSError as exc:
-        report.add(str(path), 0, f"cannot be read: {exc.strerror or exc}", "ESI files")
-        return None
-    chosen = types or list(dict.fromkeys(each.listed.type for each in source.devices))
-    if not chosen:
-        report.findings += source.findings()
-        report.add(
-            str(path),
-            0,
-            "it describes no device",
-            "an ESI file with devices, or a folder of such files",
-        )
-    elif len(chosen) > MAX_DEVICES:
-        message = f"it describes {len(chosen)} devices"
-        report.add(str(path), 0, message, "those of the bus: --device TYPE for each")
-        return None
-    slaves = []
-    for name in chosen:
-        try:
-            found = source.choose(DeviceQuery(type=name))
-        except ValueError as exc:
-            report.add(str(path), 0, str(exc), "a type of its devices (--device)")
-            continue
-        report.findings += found.findings if found.device is None else ()
-        listed = found.located.listed
-        slaves.append(
-            EniSlave(
-                name=listed.type,
-                line=listed.line,
-                address=0,
-                vendor=listed.vendor,
-                product=listed.product,
-                revision=listed.revision,
-                type=listed.type,
-                by_vendor=True,
-            )
-        )
-    return None if report.findings else EniBus(file=str(path), slaves=tuple(slaves))
-
-
 def _read(files: Sequence[Path], choices: ImportChoices, report: ImportReport) -> _Sources:
     sources = _Sources()
-    vendors = _vendor_files(choices.esi)
+    vendors = vendor_files(choices.esi)
     known: set[Path] = set()
     for path in files:
         file = str(path)
@@ -363,7 +218,7 @@ def _read(files: Sequence[Path], choices: ImportChoices, report: ImportReport) -
             continue
         root = ESI_ROOT if path.is_dir() else _root_of(path, report)
         if root == ESI_ROOT:
-            made = _devices_of(path, choices.devices, report)
+            made = bus_of_devices(path, choices.devices, report)
             sources.buses += [(made, EsiSource(path))] if made is not None else []
         elif root in {PROJECT, ITEM}:
             sources.projects.append(read_project(file, _chunks, report))

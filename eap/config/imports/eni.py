@@ -17,7 +17,7 @@ from eap.config.imports.records import ImportOutcome, ImportReport
 from eap.od.slave_config import IdnWrite, MappedObject, SdoWrite, Transition
 
 ROOT = "EtherCATConfig"
-MAX_SLAVES = 4096
+MAX_SLAVES = 1000
 _MAX_COMMANDS = 10_000
 _MAX_VARIABLES = 100_000
 _MAX_NAME = 200

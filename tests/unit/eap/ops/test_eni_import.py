@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from eap.config.imports.records import ImportOutcome
 from eap.config.index import DescribedSlave, ExpectedBus
+from eap.errors import ConfigError
 from eap.od.slave_config import IdnWrite, RevisionRule, SdoWrite, Transition
 from eap.ops.imports import ImportChoices, ImportResult, run_import
 from eap.runtime.busfile import describe
@@ -368,8 +369,20 @@ def test_unknown_device_of_esi_files_is_a_finding(importer: Importer) -> None:
 
 
 def test_bus_files_go_when_the_plant_file_cannot_be_written(importer: Importer) -> None:
-    result = importer.run(CELL, choices=ImportChoices(bus="nothing://{n}"))
-    assert not result.ok
+    importer.put("plant: [", "plant.yaml")
+    assert not importer.run(CELL).ok
+    assert list(importer.folder.iterdir()) == [importer.plant]
+
+
+def test_equal_slaves_have_one_description(importer: Importer) -> None:
+    slaves = [eni.slave(f"T{number}", number, ONE_INPUT) for number in range(1, 30)]
+    assert importer.run(importer.put(eni.config(*slaves))).ok
+    assert (importer.folder / "Net-bus-esi.xml").read_text().count("<Device>") == 1
+
+
+def test_interface_of_buses_is_checked(importer: Importer) -> None:
+    with pytest.raises(ConfigError, match=r"bus 'nothing'"):
+        importer.run(CELL, choices=ImportChoices(bus="nothing"))
     assert list(importer.folder.iterdir()) == []
 
 
