@@ -12,8 +12,9 @@ from eap.ams.spec import MqttSpec, RoutingSpec
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AmsAnswer, AmsCommand
 from eap.ids import Endpoint, NetId
-from eap.runtime.drop_counters import DropCounters, DropReason
-from eap.services.transports.mqtt_transport import MqttTransport, open_mqtt_transports
+from eap.runtime.drop_counters import DropReason
+from eap.services.transports.mqtt_transport import MqttTransport
+from eap.services.transports.station_brokers import StationBrokers
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.busads import until
 from tests.support.eventually import eventually
@@ -232,21 +233,19 @@ def test_packets_are_sent_with_the_configured_qos(tmp_path, qos):
         )
 
 
-def test_stations_get_the_mqtt_transports_of_their_plant_file(tmp_path):
+def test_station_gets_the_mqtt_transports_of_its_plant_file():
     async def story():
-        routers = {"a": station("5.1.1.1.2.1"), "b": station("6.1.1.1.2.1")}
-        routing = {"a": RoutingSpec(mqtt=(spec("x"), spec("y"))), "b": RoutingSpec()}
-        with DropCounters(tmp_path / "counters", [*routers]) as counters:
-            transports = open_mqtt_transports(routing, routers, counters)
-            transports[0]._overrun()
-            assert counters.stats() == {"a": {"mqtt_full": 1}, "b": {}}
-        assert [transport.name for transport in transports] == ["mqtt:x", "mqtt:y"]
-        assert (
-            transports[0]
-            .send("6.1.1.1.1.1", (bytes(32),))
-            .startswith("no connection to MQTT broker")
-        )
-        assert routers["a"].is_down(Endpoint("mqtt:x", "6.1.1.1.1.1"))
+        router = station("5.1.1.1.2.1")
+        dropped = []
+        brokers = StationBrokers(router)
+        brokers.open(RoutingSpec(mqtt=(spec("x"), spec("y"))), dropped.append)
+        transports = brokers._transports
+        transports["x"]._overrun()
+        assert dropped == [DropReason.MQTT_FULL]
+        assert [each.name for each in transports.values()] == ["mqtt:x", "mqtt:y"]
+        why = transports["x"].send("6.1.1.1.1.1", (bytes(32),))
+        assert why.startswith("no connection to MQTT broker")
+        assert router.is_down(Endpoint("mqtt:x", "6.1.1.1.1.1"))
 
     asyncio.run(story())
 
@@ -255,15 +254,14 @@ def test_mqtt_transport_learns_in_the_configured_networks(tmp_path):
     async def story():
         one, two = station("5.1.1.1.2.1"), Place(TWO, spec("y"), spec("x"))
         told = RoutingSpec(mqtt=(spec("x"), spec("y")), learn=("mqtt:y",))
-        with DropCounters(tmp_path / "counters", ["a"]) as counters:
-            transports = open_mqtt_transports({"a": told}, {"a": one}, counters)
-            tasks = [asyncio.ensure_future(transport.serve()) for transport in transports]
-            async with running(two):
-                await eventually(lambda: len([*one.table]) == 1)
-                await eventually(lambda: len([*two.router.table]) == 2)
-            for task in tasks:
-                task.cancel()
-            await asyncio.wait(tasks)
+        brokers = StationBrokers(one)
+        brokers.open(told, lambda reason: None)
+        task = asyncio.ensure_future(brokers.serve())
+        async with running(two):
+            await eventually(lambda: len([*one.table]) == 1)
+            await eventually(lambda: len([*two.router.table]) == 2)
+        task.cancel()
+        await asyncio.wait([task])
         assert [each.hop.transport for each in one.table] == ["mqtt:y"]
 
     with broker(tmp_path, ADDRESS):
