@@ -197,17 +197,25 @@ def _fits_whole(
     link: LinkSection, source: DataType, target: DataType, shown: str, report: FindingReport
 ) -> bool:
     if link.swap:
-        if source.size == target.size > 1 and not (source.is_bits or target.is_bits):
+        if _can_swap(source, target):
             return True
         report.add(f"{link.at}.swap", shown, "two variables of the same size, at least 2 bytes")
         return False
     if source.wire != target.wire and not (_is_bool(source) and _is_bool(target)):
-        expected = (
-            f"both alike, or bits: {min(source.bit_length, target.bit_length)}, scale or swap"
-        )
-        report.add(link.at, shown, expected)
+        ways = [f"bits: {min(source.bit_length, target.bit_length)}"]
+        if _is_number(source) and _is_number(target):
+            ways.append("scale")
+        if _can_swap(source, target):
+            ways.append("swap")
+        *first, last = ways
+        others = f"{', '.join(first)} or {last}" if first else last
+        report.add(link.at, shown, f"both alike, or {others}")
         return False
     return True
+
+
+def _can_swap(source: DataType, target: DataType) -> bool:
+    return source.size == target.size > 1 and not (source.is_bits or target.is_bits)
 
 
 def _fits_bitwise(

@@ -231,6 +231,22 @@ def test_struct_of_too_many_levels_is_named_without_its_text(tmp_path):
     ]
 
 
+@pytest.mark.parametrize(
+    ("member", "ways"),
+    [
+        ("S", "bits: 16"),
+        ("T", "bits: 32"),
+        ("BYTE[8]", "bits: 64 or swap"),
+        ("INT", "bits: 16 or scale"),
+    ],
+)
+def test_link_of_other_types_names_the_ways_that_are_possible(tmp_path, member, ways):
+    types = f"  S: {{members: {{a: INT}}}}\n  T: TIME\n  A: {{members: {{m: '{member}'}}}}"
+    more = "    links: [{from: axis.m, to: speed}]"
+    found = findings(tmp_path, types=types, axis="A", more=more)
+    assert [each.partition("both alike, or ")[2] for each in found] == [ways]
+
+
 def test_variable_of_a_wrong_type_has_no_finding_of_its_own(tmp_path):
     types = "  ST_Axis: {members: {x: Q}}"
     links = "    links: [{from: axis.x, to: speed}]"

@@ -265,7 +265,7 @@ def test_these_links_run(findings, link):
         ("from: fault", "item 1 of links has no to; the key to"),
         ("from: a, too: fault", "unknown key 'too', did you mean to"),
         ("from: word, to: level", "word is UINT, level is INT; both alike, or bits: 16, scale or"),
-        ("from: word, to: fault", "word is UINT, fault is BOOL; both alike, or bits: 1, scale"),
+        ("from: word, to: fault", "word is UINT, fault is BOOL; both alike, or bits: 1"),
         (
             "from: fault, to: count, bits: 1",
             "'count' has a source (line 19), so no link can write it; a vari",
