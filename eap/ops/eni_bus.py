@@ -19,7 +19,7 @@ from devicebus.esi.records import EsiDevice
 from devicebus.sim.devices.esi import plan_device
 from eap.codec.soe import Idn
 from eap.codec.xmlstream import XmlElement
-from eap.config.imports.eni import EniBus, EniSlave, EniVariable
+from eap.config.imports.eni_records import EniBus, EniSlave, EniVariable
 from eap.config.imports.planttext import scalar
 from eap.config.imports.records import ImportOutcome, ImportReport
 from eap.config.imports.stations import UniqueNames
@@ -111,6 +111,11 @@ class BusPlan:
                 vendor, [text for owner, _, text in self._devices.values() if owner == vendor]
             )
         return BusFiles(f"{stem}.yaml", self.has_clock, self._eni.cycle_us, texts)
+
+    def line_of(self, message: str) -> int:
+        """Return the line of the slave that a finding about the bus file begins with, else 0."""
+        name = message.partition(": ")[0]
+        return next((each.eni.line for each in self._slaves if each.name == name), 0)
 
     def note_order(self, names: Sequence[str]) -> None:
         """Note the slaves whose place, or station address, is another one than in the ENI.

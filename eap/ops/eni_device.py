@@ -7,7 +7,7 @@ from types import MappingProxyType
 from xml.sax.saxutils import escape, quoteattr
 
 from eap.codec.xmlstream import XmlElement
-from eap.config.imports.eni import EniSlave, EniSyncManager, EniVariable
+from eap.config.imports.eni_records import EniSlave, EniSyncManager, EniVariable
 from eap.config.imports.records import ImportOutcome, ImportReport
 from eap.od.slave_config import IdnWrite, SdoWrite
 

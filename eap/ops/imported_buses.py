@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 import msgspec
 
 from devicebus.esi.choice import DeviceQuery
-from eap.config.imports.eni import EniBus, EniSlave
+from eap.config.imports.eni_records import EniBus, EniSlave
 from eap.config.imports.records import ImportReport
 from eap.config.imports.stations import (
     DEFAULT_CYCLE_US,
@@ -105,7 +105,7 @@ def plan_buses(
             described = describe(Path(name) / trial.name)
         if isinstance(described, tuple):
             for each in described:
-                report.add(bus.file, 0, each.message, each.expected, item=each.path)
+                report.add(bus.file, plan.line_of(each.message), each.message, each.expected)
             continue
         plan.note_order([each.name for each in described.slaves])
         stem = plain_name(f"{Path(bus.file).stem}-bus", "bus")

@@ -15,7 +15,8 @@ from devicebus.esi.content import ROOT as ESI_ROOT
 from eap.codec.xmlstream import CHUNK, XmlError, XmlReader
 from eap.config.finding import PlantFinding
 from eap.config.imports.eni import ROOT as ENI_ROOT
-from eap.config.imports.eni import EniBus, read_eni
+from eap.config.imports.eni import read_eni
+from eap.config.imports.eni_records import EniBus
 from eap.config.imports.insertion import InsertionError, insert_stations
 from eap.config.imports.planttext import plant_text, station_lines
 from eap.config.imports.records import ImportNote, ImportOutcome, ImportReport

@@ -10,9 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-import msgspec
-
 from eap.codec.xmlstream import XmlElement, XmlError, read_elements
+from eap.config.imports.eni_records import (
+    EniBus,
+    EniSlave,
+    EniSync,
+    EniSyncManager,
+    EniVariable,
+)
 from eap.config.imports.records import ImportOutcome, ImportReport
 from eap.od.slave_config import IdnWrite, MappedObject, SdoWrite, Transition
 
@@ -47,115 +52,6 @@ _MAX_ENTRIES = 254
 _FIRST_AREA = 0x0F00
 """Lowest address of process data: that of terminals with digital outputs."""
 _MAX_TIMEOUT_MS = 600_000
-
-
-class EniSyncManager(msgspec.Struct, frozen=True, kw_only=True):
-    """Sync manager of a slave; *size* in bytes, 0 if the file does not say."""
-
-    start: int
-    control: int
-    size: int = 0
-    is_enabled: bool = True
-    is_output: bool
-    is_mailbox: bool = False
-    pdos: tuple[int, ...] | None = None
-    """PDOs that it has; None if the file does not say."""
-    bits: int | None = None
-    """Bits that its FMMU maps; None without one."""
-
-
-class EniSync(msgspec.Struct, frozen=True, kw_only=True):
-    """SYNC0 and SYNC1; times in nanoseconds."""
-
-    activate: int | None
-    """Registers 0x0980 and 0x0981; None if no command writes them."""
-    cycle0_ns: int
-    cycle1_ns: int
-    shift_ns: int
-
-
-class EniSlave(msgspec.Struct, frozen=True, kw_only=True):
-    """One slave.
-
-    Attributes:
-        name: As in the file.
-        line: In the file.
-        address: Station address; 0 if the file has none.
-        vendor: Vendor ID.
-        product: Product code.
-        revision: Revision.
-        serial: Serial number; 0 for any.
-        type: Type of the device, EL2004; may be empty.
-        managers: Sync managers by number.
-        pdos: Elements RxPdo and TxPdo.
-        bootstrap: Mailboxes of the state BOOT as the EEPROM has them; empty without one.
-        protocols: Protocols of its mailbox, in lower case.
-        drives: Drives that SoE writes go to.
-        writes: Start-up writes, without those of PDOs.
-        refused: Start-up commands that are not clear, in words.
-        assigns: PDO assignment that is written by SDO.
-        mapping: PDO mapping that is written by SDO.
-        has_clock: It has a distributed clock.
-        sync: Its SYNC0 and SYNC1; None without.
-        timeouts: Of state changes, by keys of a bus file.
-        previous: Port and station address of the slave before.
-        group: Hot-connect group; empty for none.
-        members: Slaves of that group.
-        identification: Register and value by which the group is found; None for none.
-        by_vendor: It has the settings of its vendor's description, not of an ENI file.
-        any_revision: The file checks vendor and product, but not the revision.
-        output_bits: Bits that it takes; 0 if the file does not say.
-        input_bits: Bits that it gives.
-    """
-
-    name: str
-    line: int
-    address: int
-    vendor: int
-    product: int
-    revision: int
-    serial: int = 0
-    type: str = ""
-    managers: Mapping[int, EniSyncManager] = {}
-    pdos: tuple[XmlElement, ...] = ()
-    bootstrap: bytes = b""
-    protocols: frozenset[str] = frozenset()
-    writes: tuple[SdoWrite | IdnWrite, ...] = ()
-    refused: tuple[str, ...] = ()
-    assigns: Mapping[int, tuple[int, ...]] = {}
-    mapping: Mapping[int, tuple[MappedObject, ...]] = {}
-    has_clock: bool = False
-    sync: EniSync | None = None
-    timeouts: Mapping[str, int] = {}
-    previous: tuple[str, int] | None = None
-    group: str = ""
-    members: int = 1
-    identification: tuple[int, int] | None = None
-    by_vendor: bool = False
-    any_revision: bool = False
-    output_bits: int = 0
-    input_bits: int = 0
-
-
-class EniVariable(msgspec.Struct, frozen=True):
-    """Variable of the process image; its offset orders it among those of its slave."""
-
-    name: str
-    type: str
-    bits: int
-    offset: int
-    is_output: bool
-
-
-class EniBus(msgspec.Struct, frozen=True, kw_only=True):
-    """The bus of one file, in the order of the file."""
-
-    file: str
-    name: str = ""
-    slaves: tuple[EniSlave, ...] = ()
-    variables: tuple[EniVariable, ...] = ()
-    cycle_us: int = 0
-    """Shortest cycle; 0 if the file does not say."""
 
 
 def read_eni(chunks: Iterable[bytes], file: str, report: ImportReport) -> EniBus | None:
@@ -329,9 +225,7 @@ class _SlaveReader:
             serial=_unsigned(info, "SerialNo"),
             type=revision or inside,
             managers=managers,
-            pdos=tuple(
-                each for each in _children(element, "ProcessData") if each.tag in {"RxPdo", "TxPdo"}
-            ),
+            pdos=self._pdos(),
             bootstrap=self._bootstrap(),
             protocols=frozenset(each.text.lower() for each in element.iterfind("Mailbox/Protocol"))
             | {each.tag.lower() for each in _children(element, "Mailbox")} & {"coe", "soe"},
@@ -499,6 +393,26 @@ class _SlaveReader:
             self._note(command.line, ImportOutcome.LEFT, message)
         return known
 
+    def _pdos(self) -> tuple[XmlElement, ...]:
+        """Return the PDOs, whose numbers are checked."""
+        found = [
+            each
+            for each in _children(self._element, "ProcessData")
+            if each.tag in {"RxPdo", "TxPdo"}
+        ]
+        known: set[int] = set()
+        for pdo in found:
+            index = pdo.number_at("Index", 1, _U16)
+            if not index or index in known:
+                message = f"{pdo.tag} 0x{index:04X} is there twice, or has no index"
+                raise XmlError(message, line=pdo.line, expected="an index of its own")
+            known.add(index)
+            for entry in pdo.iterfind("Entry"):
+                entry.number_at("Index", 0, _U16)
+                entry.number_at("SubIndex", 0, 0xFF)
+                entry.number_at("BitLen", 0, _U16)
+        return tuple(found)
+
     def _pdo_lists(
         self,
     ) -> tuple[dict[int, tuple[int, ...]], dict[int, tuple[MappedObject, ...]]]:
@@ -511,6 +425,9 @@ class _SlaveReader:
                 int.from_bytes(values.get(number, b""), "little")
                 for number in range(1, min(count, _MAX_ENTRIES) + 1)
             ]
+            if 0 in entries:
+                message = f"0x{index:04X} has {count} entries, not all of which are written"
+                raise XmlError(message, line=self._element.line, expected="a write for each")
             if index in _ASSIGNMENTS:
                 assigns[index - _ASSIGNMENTS.start] = tuple(each & _U16 for each in entries)
             else:

@@ -313,6 +313,9 @@ BAD_PARTS = {
     "with complete access": eni.mailbox(eni.sdo("8192", 2, "01", more="complete")),
     "Sm0 has Type 'Both'": eni.process_data(eni.manager(0, "Both", 1, 1)),
     "65000 bits": eni.process_data(eni.manager(0, "Inputs", 4096, 0, 0x1A00), LONG),
+    "BitLen is 'x'": ONE_INPUT.replace("<BitLen>16", "<BitLen>x"),
+    "0x1A00 is there twice": eni.process_data(INPUT, INPUT),
+    "not all of which are written": eni.mailbox(eni.sdo("#x1c12", 0, "02")),
     "DriveNo is '8'": eni.mailbox(soe=eni.idn(1, "00", drive=8)),
 }
 BAD = {
