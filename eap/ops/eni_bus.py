@@ -57,7 +57,7 @@ class _BusSlave(msgspec.Struct, kw_only=True):
     group: str = ""
 
 
-class BusPlan:
+class ImportedBusPlan:
     """The bus of an ENI file with the descriptions of its slaves.
 
     Args:

@@ -24,7 +24,7 @@ from eap.config.imports.stations import (
 )
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri, NetId
-from eap.ops.eni_bus import BusFiles, BusPlan
+from eap.ops.eni_bus import BusFiles, ImportedBusPlan
 from eap.pd.rules import plain_name
 from eap.runtime.busfile import describe
 from eap.runtime.durable import whole_file
@@ -95,7 +95,7 @@ def plan_buses(
     """Yield the files of each bus, which have been tried; what is wrong goes to *report*."""
     taken: set[str] = set()
     for bus, source in buses:
-        plan = BusPlan(bus, source, report)
+        plan = ImportedBusPlan(bus, source, report)
         if report.findings:
             continue
         with TemporaryDirectory() as name:

@@ -72,7 +72,7 @@ def ask_publisher(net_id: str) -> list[PublishedPd]:
 
 def published_pds(device: OdDevice, net_id: str) -> Iterator[PublishedPd]:
     """Yield the PDs of the dictionary of *device*; parts that cannot be read are left out."""
-    reader = _DictionaryReader(device)
+    reader = _PublisherReader(device)
     indexes = [each.index for each in device.objects()]
     destinations = _destinations(reader, [each for each in indexes if each in _FRAMES])
     for index in indexes:
@@ -99,7 +99,7 @@ def published_pds(device: OdDevice, net_id: str) -> Iterator[PublishedPd]:
         )
 
 
-class _DictionaryReader:
+class _PublisherReader:
     """Reader of entries that need not be there; each variable is read once."""
 
     def __init__(self, device: OdDevice) -> None:
@@ -194,7 +194,7 @@ def _gap(begin: int, end: int) -> Iterator[DataType]:
         yield datatypes.parse(f"BIT{rest}")
 
 
-def _destinations(reader: _DictionaryReader, frames: Sequence[int]) -> dict[int, tuple[str, str]]:
+def _destinations(reader: _PublisherReader, frames: Sequence[int]) -> dict[int, tuple[str, str]]:
     """Return transport and destination of each TxPD that one of *frames* carries."""
     found = {}
     for frame in frames:
@@ -210,7 +210,7 @@ def _destinations(reader: _DictionaryReader, frames: Sequence[int]) -> dict[int,
 _BY_IP = {AddressMode.IP: "udp", AddressMode.TCP: "tcp"}
 
 
-def _destination(reader: _DictionaryReader, frame: int) -> tuple[str, str]:
+def _destination(reader: _PublisherReader, frame: int) -> tuple[str, str]:
     """Return transport and destination of a frame; of a NetID the MAC address is not known."""
     mode = reader.number(frame, FrameSub.ADDRESS_MODE)
     octets = b""

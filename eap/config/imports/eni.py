@@ -62,10 +62,10 @@ def read_eni(chunks: Iterable[bytes], file: str, report: ImportReport) -> EniBus
         file: Its name, for findings.
         report: Takes the findings and the notes on what is left.
     """
-    return _Reader(file, report).read(chunks)
+    return _EniReader(file, report).read(chunks)
 
 
-class _Reader:
+class _EniReader:
     """One file while it is read."""
 
     def __init__(self, file: str, report: ImportReport) -> None:
