@@ -147,12 +147,14 @@ def diagnosis_view(
 
 
 def _lock_line(lock: LockState) -> str:
+    if lock.reference is None:
+        return "cycle runs free: no slave with a distributed clock answers"
     state = "locked to" if lock.is_locked else "not locked yet to"
-    clock = "no clock" if lock.reference is None else f"the clock of slave {lock.reference}"
     return (
-        f"cycle {state} {clock}: offset {lock.offset_ns / 1000:+.1f} µs,"
-        f" drift {lock.drift_ppb / 1000:+.1f} ppm\nframes {duration(lock.lead_ns // 1000)} before"
-        f" SYNC0: {lock.late} too late, {lock.early} too early"
+        f"cycle {state} the clock of slave {lock.reference}:"
+        f" offset {lock.offset_ns / 1000:+.1f} µs, drift {lock.drift_ppb / 1000:+.1f} ppm\n"
+        f"frames {duration(lock.lead_ns // 1000)} before SYNC0:"
+        f" {lock.late} too late, {lock.early} too early"
     )
 
 

@@ -131,9 +131,11 @@ class SlaveFaults:
                     call(event)
 
     def _begin(self, station: int, text: str, at_ns: int) -> None:
-        """Note a fault; one that follows another began with it."""
+        """Note a fault; one that follows another began with it, except silence: that is news."""
         before = self.last(station)
         lasts = bool(before.text) and before.until_ns is None
+        if text == NO_ANSWER:
+            lasts = lasts and before.text == NO_ANSWER
         self._faults[station] = SlaveFault(text, before.since_ns if lasts else at_ns)
 
     def _end(self, station: int, at_ns: int) -> None:

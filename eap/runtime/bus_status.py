@@ -97,7 +97,7 @@ def count_frames(source: BusReport | LinkStats) -> FrameCounts:
 
 def report_findings(report: BusReport) -> list[BusFinding]:
     """Return the causes of the present faults of a bus, and its mailbox time-outs."""
-    views = [_view(slave) for slave in report.slaves]
+    views = [_view(slave) for slave in report.slaves if not slave.is_absent]
     if is_silent(report):
         return [find_silence(views, report.silent_since_ns)]
     cut = [each for each in find_ring_cut(views, _ring_cut(report)) if not each.is_over]

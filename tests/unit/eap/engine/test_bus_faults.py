@@ -67,3 +67,11 @@ def test_unsolicited_messages_are_forwarded():
     faults.handle_events(Master(message, SlaveLost(1001, 1)))
     assert heard == [message]
     assert faults.of(1001) == "it does not answer"
+
+
+def test_slave_faults_silence_after_another_fault_has_its_own_start():
+    faults = SlaveFaults()
+    faults.handle_events(Master(SlaveFailed(1001, "it refuses", 1), SlaveLost(1001, 7)))
+    assert faults.last(1001).since_ns == 7
+    faults.handle_events(Master(SlaveLost(1001, 9), SlaveFailed(1001, "it refuses", 11)))
+    assert faults.last(1001).since_ns == 7

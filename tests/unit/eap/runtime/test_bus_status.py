@@ -78,3 +78,10 @@ def test_bus_document_blames_no_slave_while_no_frame_comes_back():
     ]
     assert finding.what.startswith("s1002 (1002) does not answer")
     assert finding.since == 98.0
+
+
+def test_bus_document_absent_slave_behind_a_silent_one_is_not_said_to_answer():
+    absent = slave(0, 1003, is_absent=True)
+    report = msgspec.structs.replace(UP, slaves=(slave(8), LOST, absent))
+    (finding,) = bus_document(report, 100.0)["bus"]["findings"]
+    assert "behind answers" not in finding.what
