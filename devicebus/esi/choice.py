@@ -33,6 +33,7 @@ MODULE_LIST = 0xF030
 """Object with the idents of the configured modules (ETG.5001)."""
 _LOW = 0xFFFF
 _MAX_INDEX = 0xFFFF
+_SHOWN_TYPES = 12
 
 
 class DeviceQuery(NamedTuple):
@@ -73,9 +74,7 @@ def choose_devices(devices: Iterable[ListedDevice], query: DeviceQuery) -> list[
     known = list(devices)
     found = [each for each in known if query.fits(each)]
     if not found:
-        types = dict.fromkeys(each.type for each in known)
-        hint = suggest(query.type, types) if query.type else ""
-        raise ValueError(f"none of {len(known)} devices is {query}{hint}")
+        raise ValueError(_no_device(known, query))
     if query.revision is None:
         return sorted(
             found, key=lambda each: (not each.revision & _LOW, each.revision), reverse=True
@@ -85,6 +84,23 @@ def choose_devices(devices: Iterable[ListedDevice], query: DeviceQuery) -> list[
         revisions = ", ".join(f"0x{each:08X}" for each in sorted({d.revision for d in found}))
         raise ValueError(f"{query} has no revision 0x{query.revision:08X}; known: {revisions}")
     return exact
+
+
+def _no_device(known: Sequence[ListedDevice], query: DeviceQuery) -> str:
+    """Return the reason that none of the *known* devices fits *query*."""
+    if not known:
+        return "no device in its ESI files"
+    named = query.type.casefold()
+    others = {f"0x{each.product:08X}" for each in known if each.type.casefold() == named}
+    if others and query.product:
+        products = ", ".join(sorted(others))
+        return f"{query.type} has product {products}, not 0x{query.product:08X}"
+    types = list(dict.fromkeys(each.type for each in known))
+    hint = suggest(query.type, types) if query.type else ""
+    if not hint and len(types) <= _SHOWN_TYPES:
+        hint = f"; known: {', '.join(types)}"
+    number = "its device is not" if len(known) == 1 else f"none of {len(known)} devices is"
+    return f"{number} {query}{hint}"
 
 
 def match_slave(devices: Iterable[ListedDevice], query: DeviceQuery) -> list[ListedDevice]:
@@ -183,7 +199,8 @@ def find_modules(
     """
     slots = expand_slots(device)
     if len(names) > len(slots):
-        raise ValueError(f"{device.label} has {len(slots)} slots, these are {len(names)} modules")
+        there = f"{len(slots)} slot{'s' * (len(slots) != 1)}" if slots else "no slots for modules"
+        raise ValueError(f"{device.label} has {there}, but {len(names)} in modules")
     return tuple(
         None if name is None else _find_module(device, name, slots[number], number)
         for number, name in enumerate(names)

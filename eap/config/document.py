@@ -415,8 +415,7 @@ class _Converter:
         if short and isinstance(node.value, bool | int | float | str):
             node = Node(node.line, {short: (node.line, node)})
         if not isinstance(node.value, dict):
-            known = ", ".join(each.encode_name for each in kind.fields if each.required)
-            raise self._unexpected(node, path, key, f"a mapping{f' with {known}' if known else ''}")
+            raise self._unexpected(node, path, key, _mapping_of(kind))
         self._enter(node, path)
         own = issubclass(kind.cls, Section)
         fields = {each.encode_name: each for each in kind.fields if not (own and each.name == "at")}
@@ -459,6 +458,10 @@ class _Converter:
             where = f"{path}.{name}" if path else name
             missing = [each for each in shown if each not in given]
             message = f"unknown key {name!r}{suggest(name, missing)}"
+            homes = [each.encode_name for each in kind.fields if _has_key(each.type, name)]
+            if homes:
+                self._report.add(where, message, f"it under the key {homes[0]}", line=line)
+                continue
             self._report.add(where, message, one_of(shown), line=line)
             meant = nearest(name, missing)
             if meant is not None:
@@ -545,6 +548,27 @@ def read_net_id(text: str, path: str, report: FindingReport) -> NetId:
     except ValueError:
         report.add(path, f"net_id: {text!r} is not an AMS NetID", NET_ID)
         return INVALID_NET_ID
+
+
+def _has_key(kind: inspect.Type, name: str) -> bool:
+    """Return whether *kind* is a section, or none, with the key *name*."""
+    kinds = kind.types if isinstance(kind, inspect.UnionType) else (kind,)
+    return any(
+        name in (field.encode_name for field in each.fields if field.name != "at")
+        for each in kinds
+        if isinstance(each, inspect.StructType)
+    )
+
+
+_SHOWN_KEYS = 6
+
+
+def _mapping_of(kind: inspect.StructType) -> str:
+    """Return the expectation of a mapping with its required keys, or else its few keys."""
+    keys = ", ".join(each.encode_name for each in kind.fields if each.required)
+    if not keys and len(kind.fields) <= _SHOWN_KEYS:
+        keys = "keys of " + ", ".join(e.encode_name for e in kind.fields if e.encode_name != "at")
+    return f"a mapping with {keys}" if keys else "a mapping"
 
 
 def _title(given: dict[str, Node], key: str) -> str:

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from eap.codec import datatypes
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.codec.structures import variable_of
-from eap.config.finding import FindingReport, one_of
+from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index, SentPd
 from eap.config.ports import (
     EXPECTED,
@@ -116,7 +116,7 @@ def _check_pd(
         ):
             names = index.names(station)
             message = f"station {station.name} has no variable {name!r}{suggest(name, names)}"
-            expected = one_of(names)
+            expected = one_beside(name, names)
             if (variable := variable_of(name, names)) in names:
                 message = f"{name!r} is a part of {variable!r}; a PD carries whole variables"
                 expected = f"{variable}, or a variable of its own that a link fills"

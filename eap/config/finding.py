@@ -124,7 +124,28 @@ def _parent(path: str) -> str:
     return path[: max(path.rfind("."), path.rfind("["), 0)]
 
 
+_SHOWN = 12
+"""Names that are listed, where only those beside the unknown one help."""
+
+
 def one_of(known: Iterable[str]) -> str:
     """Return *known* as the expectation of a finding."""
     names = ", ".join(known)
     return f"one of {names}" if names else "none (there are none here)"
+
+
+def one_beside(name: str, known: Iterable[str]) -> str:
+    """Return the expectation of one of *known*, of many those that begin as *name* does.
+
+    A bus has hundreds of variables: of ``bus0.axis.csp.Target`` those of ``bus0.axis.csp`` are
+    listed, else those of ``bus0.axis``, and so on.
+    """
+    names = list(known)
+    prefix = name
+    while len(names) > _SHOWN and "." in prefix:
+        prefix = prefix.rpartition(".")[0]
+        if beside := [each for each in names if each.startswith(f"{prefix}.")]:
+            names = beside
+            break
+    more = len(names) - _SHOWN
+    return one_of(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")

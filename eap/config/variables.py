@@ -11,7 +11,7 @@ from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.structures import complete, find_part, split_paths, variable_of
 from eap.config.exchange import is_unresolved
-from eap.config.finding import FindingReport, one_of
+from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index, Span, VariablePart
 from eap.config.ports import check_names
 from eap.config.structs import StationSection, VariableSection
@@ -144,7 +144,7 @@ def _report_no_variable(
         message = f"{name!r} is received, so it cannot have a source"
     else:
         message = f"station {station.name} has no variable {name!r}{suggest(name, known)}"
-    report.add(path, message, one_of(known))
+    report.add(path, message, one_beside(name, known))
 
 
 def _check_random(path: str, name: str, kind: DataType, report: FindingReport) -> None:
@@ -264,7 +264,7 @@ def named_part(
     if part is None and not is_unresolved(index, report, station, name):
         hint = suggest(name, names) or suggest(re.split(r"[.[]", name)[0], names)
         message = f"station {station.name} has no variable {name!r}{hint}"
-        report.add(path, message, one_of(names))
+        report.add(path, message, one_beside(name, names))
     return part
 
 

@@ -289,7 +289,7 @@ def _check_slave(slave: SlaveSpec, bus: BusFile, report: FindingReport, at: str)
     try:
         build_slave(slave, bus.resources, bus.devices.get(slave.name))
     except ValueError as exc:
-        report.add(at, f"{slave.name}: {exc}", "a device that can be built")
+        report.add(at, f"{slave.name}: {exc}", "keys that fit the device")
 
 
 def _check_faults(bus: BusFile, report: FindingReport) -> None:

@@ -17,7 +17,7 @@ from eap.config.index import DescribedPdo, DescribedPdoEntry, DescribedSlave
 from eap.runtime.esi_files import EsiSource
 
 _FILE = "an ESI file or a folder of ESI files, its path from the bus file on"
-_NAMED = "a device of it by the key device or product"
+_NAMED = "the key device or product to name one of its devices"
 
 
 class EsiDevices:

@@ -60,6 +60,10 @@ def test_highest_revision_without_a_special_version_by_default():
 
 def test_device_by_its_type():
     assert choose_devices(LIST, DeviceQuery(type="el3204"))[0].product == PRODUCT
+    with pytest.raises(ValueError, match=r"EL3204 has product 0x[0-9A-F]{8}, not 0x00000005"):
+        choose_devices(LIST, DeviceQuery(type="EL3204", product=5))
+    with pytest.raises(ValueError, match="no device in its ESI files"):
+        choose_devices([], DeviceQuery(type="EL3204"))
     with pytest.raises(ValueError, match=r"none of 5 devices is EL3240, did you mean EL3204\?"):
         choose_devices(LIST, DeviceQuery(type="EL3240"))
 
@@ -153,7 +157,7 @@ def test_default_modules_fill_the_slots_that_need_one():
     [
         (["INN"], r"no module 'INN' fits slot 0, did you mean IN\?"),
         ([9], "no module 0x00000009 fits slot 0"),
-        (["IN"] * 4, "has 3 slots, these are 4 modules"),
+        (["IN"] * 4, "has 3 slots, but 4 in modules"),
     ],
 )
 def test_module_that_does_not_fit(names, message):

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from eap.config.document import Node
-from eap.config.finding import FindingReport, PlantFinding, one_of
+from eap.config.finding import FindingReport, PlantFinding, one_beside, one_of
 
 
 def test_a_finding_reads_as_file_line_what_and_what_was_expected():
@@ -32,6 +32,15 @@ def test_findings_are_in_file_order_without_duplicates():
 def test_one_of_nothing_says_so():
     assert one_of(["a", "b"]) == "one of a, b"
     assert one_of([]) == "none (there are none here)"
+
+
+def test_one_beside_lists_what_begins_as_the_unknown_name_does():
+    known = [f"bus0.s{n}.{each}" for n in range(9) for each in ("in", "out")]
+    assert one_beside("bus0.s3.inn", known) == "one of bus0.s3.in, bus0.s3.out"
+    assert one_beside("bus0.s3.a.b", known) == "one of bus0.s3.in, bus0.s3.out"
+    assert one_beside("other", known).startswith("one of bus0.s0.in, ")
+    assert one_beside("other", known).endswith(" and 6 more")
+    assert one_beside("a", ["x", "y"]) == "one of x, y"
 
 
 def test_findings_of_other_files_come_last():

@@ -93,6 +93,18 @@ def test_master_keys_configure_the_slave(tmp_path):
     assert [each.name for each in analogue.outputs] == ["o", ""]
 
 
+def test_master_key_outside_its_section_is_sent_there(tmp_path):
+    wrong = GOOD.replace("    inputs", "    startup: []\n    inputs")
+    (finding,) = busfile.load(write(tmp_path, wrong)).findings
+    assert str(finding).endswith("unknown key 'startup'; expected it under the key master")
+
+
+def test_section_that_is_no_mapping_names_its_keys(tmp_path):
+    wrong = GOOD.replace("    inputs", "    master: {sync0: true}\n    inputs")
+    (finding,) = busfile.load(write(tmp_path, wrong)).findings
+    assert "sync0 is true; expected a mapping with keys of " in str(finding)
+
+
 def test_finding_about_a_master_key_has_its_line(tmp_path):
     wrong = GOOD.replace("    inputs", "    master:\n      pdos: [0x1A09]\n    inputs")
     (finding,) = busfile.load(write(tmp_path, wrong)).findings

@@ -137,7 +137,10 @@ def test_modules_of_slots_have_variables_and_start_up_writes(folder):
 
 def test_module_that_does_not_fit_is_found(folder):
     (found,) = findings(folder, "name: e, device: DO4, modules: [IN]")
-    assert "bus.yaml:4: e: DO4 (revision 0x00120000) has 0 slots, these are 1 modules" in found
+    assert (
+        "bus.yaml:4: e: DO4 (revision 0x00120000) has no slots for modules, but 1 in modules"
+        in found
+    )
 
 
 def test_slave_without_a_file_is_found(folder):
