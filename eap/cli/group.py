@@ -174,7 +174,7 @@ _COMMANDS = {
     "export-peer": ("files:export_peer", "Write what TwinCAT needs to talk to a station."),
     "gateway": ("gateway:gateway", "Start, stop and show the mailbox gateways of a station."),
     "gw": ("gateway:gw", "Access a master and its slaves through any mailbox gateway."),
-    "import": ("files:import_files", "Make a plant file of TwinCAT's files."),
+    "import": ("files:import_files", "Make a plant file of TwinCAT, ENI and ESI files."),
     "new": ("plant:new", "Write a plant file to start from."),
     "od": ("od:od", "Read and write the object dictionary of a device."),
     "pd": ("pd:pd", "List, watch and set the process data of running stations."),
