@@ -151,11 +151,15 @@ def test_only_variables_of_the_application_are_written(appliance, tower) -> None
     tower.write_by_name("level", 1)
 
 
-def test_every_cycle_is_notified_with_its_own_time(told) -> None:
+def test_every_cycle_is_notified_with_its_own_time(appliance, told) -> None:
+    skipped = appliance.station("tower")["overruns"]
     ticks = told.of("ticks", pyads.PLCTYPE_UDINT, cycle_time=0, **CYCLIC)
     wait_until(lambda: len(ticks) > 400)
     values = [value for _, value in ticks]
-    assert values == list(range(values[0], values[0] + len(values)))
+    assert values == sorted(set(values))
+    # The counter goes on in cycles that the engine had to skip on a busy machine.
+    missing = values[-1] - values[0] + 1 - len(values)
+    assert missing <= appliance.station("tower")["overruns"] - skipped
     distances = sorted(b - a for (a, _), (b, _) in pairwise(ticks))
     assert distances[len(distances) // 2] == pytest.approx(0.002, abs=0.0005)
     assert time.time() - ticks[-1][0] < 5
