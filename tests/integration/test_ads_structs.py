@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,9 @@ import pytest
 
 from eap.codec.ads import AdsError
 from eap.codec.adssymbol import DataTypeEntry, DataTypeFlag, UploadInfo
+from tests.support.adslib import open_connection
 from tests.support.adstypes import decode_types
-from tests.support.appliance import Appliance, plants, run_eapctl, wait_until
+from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 
 pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 
@@ -127,18 +127,14 @@ SHOWN = VALUES | {
 
 
 @pytest.fixture(scope="module")
-def appliance() -> Iterator[Appliance]:
-    with plants() as folder:
-        yield folder.run(folder.write(PLANT))
+def appliance(module_farm: Plants) -> Appliance:
+    return module_farm.run(module_farm.write(PLANT))
 
 
 @pytest.fixture(scope="module")
 def tower(appliance: Appliance) -> pyads.Connection:
-    """Return a connection that stays open: AdsLib may crash where it closes one that notified."""
     del appliance
-    connection = pyads.Connection(PORT, DEVICE, ADDRESS)
-    connection.open()
-    return connection
+    return open_connection(PORT, DEVICE, ADDRESS)
 
 
 @pytest.fixture(scope="module")

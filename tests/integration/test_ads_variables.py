@@ -18,8 +18,9 @@ import pytest
 
 from eap.codec.ads import AdsError, AdsState
 from tests.support import aoe
+from tests.support.adslib import open_connection
 from tests.support.amsclient import AmsClient
-from tests.support.appliance import Appliance, plants, run_eapctl, wait_until
+from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 from tests.support.machine import slowness
 
 pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
@@ -56,18 +57,14 @@ stations:
 
 
 @pytest.fixture(scope="module")
-def appliance() -> Iterator[Appliance]:
-    with plants() as folder:
-        yield folder.run(folder.write(PLANT))
+def appliance(module_farm: Plants) -> Appliance:
+    return module_farm.run(module_farm.write(PLANT))
 
 
 @pytest.fixture(scope="module")
 def tower(appliance: Appliance) -> pyads.Connection:
-    """Return a connection that stays open: AdsLib may crash where it closes one that notified."""
     del appliance
-    connection = pyads.Connection(PORT, DEVICE, ADDRESS)
-    connection.open()
-    return connection
+    return open_connection(PORT, DEVICE, ADDRESS)
 
 
 class Told:
