@@ -7,11 +7,12 @@ received data on adds the time that the data has been with it.
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TypeAlias
 
 from eap.codec.pd import PdHeader
+from eap.codec.structures import variable_of
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxSlot
 from eap.pd.spec import LinkSpec
@@ -89,15 +90,8 @@ def find_origins(layout: ImageLayout, links: Iterable[LinkSpec]) -> Origins:
     found = {name: (slot,) for slot in layout.rx for name in slot.variables}
     names = {slot.name for slot in layout.variables}
     for link in links:
-        source, target = _variable(link.source, names), _variable(link.target, names)
-        if came := found.get(source):
+        if came := found.get(variable_of(link.source, names)):
             # Several links may fill one target by bits or members.
+            target = variable_of(link.target, names)
             found[target] = tuple(dict.fromkeys((*found.get(target, ()), *came)))
     return found
-
-
-def _variable(path: str, names: Collection[str]) -> str:
-    """Return the variable that a path to a member or element begins with."""
-    while path not in names:
-        path = path[: max(path.rfind("."), path.rfind("["))]
-    return path
