@@ -9,8 +9,6 @@ from __future__ import annotations
 import select
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from functools import lru_cache
-from ipaddress import IPv4Address
 from pathlib import Path
 from time import monotonic
 from types import MappingProxyType
@@ -303,7 +301,7 @@ def _row(pd: ObservedPd, takers: Iterable[Taker], now_ns: int, *, with_guess: bo
         destination=key.destination,
         taken_by=taken_by,
         transport=key.transport,
-        destination_kind=destination_kind(key.transport, key.destination),
+        destination_kind=key.destination_kind,
         vlan_id=key.vlan_id,
         sources=list(pd.sources),
         received=pd.rhythm.received,
@@ -372,7 +370,7 @@ def _unseen(pd: PublishedPd, takers: Iterable[Taker]) -> DiscoveredPd:
         name=pd.name,
         variables=_variables(pd),
         transport=pd.transport,
-        destination_kind=destination_kind(pd.transport, pd.destination) if pd.transport else "",
+        destination_kind=key.destination_kind if pd.transport else "",
         trigger=Reason.CYCLE.value if pd.cycle_us else None,
         period_ms=pd.cycle_us / 1000 if pd.cycle_us else None,
     )
@@ -384,17 +382,3 @@ def _variables(pd: PublishedPd) -> list[DiscoveredVariable]:
 
 NOT_REACHED = "other_destination"
 """Reason of a subscription whose port does not get frames to the PD's destination."""
-
-
-@lru_cache(maxsize=1024)
-def destination_kind(transport: str, destination: str) -> str:
-    """Return ``unicast``, ``multicast`` or ``broadcast``."""
-    if transport == "ethernet":
-        if destination == "ff:ff:ff:ff:ff:ff":
-            return "broadcast"
-        return "multicast" if int(destination[:2], 16) & 1 else "unicast"
-    host = destination.partition(":")[0]
-    if IPv4Address(host).is_multicast:
-        return "multicast"
-    # Without a netmask a host number of 255 is taken for the directed broadcast.
-    return "broadcast" if host.endswith(".255") else "unicast"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from eap.codec import datatypes
@@ -58,8 +57,7 @@ class Taker(NamedTuple):
         host, _, number = pd.destination.partition(":")
         if int(number or EAP_PORT) != (uri.port or EAP_PORT):
             return False
-        address = IPv4Address(host)
-        is_group = address.is_multicast or host.endswith(".255")
+        is_group = pd.destination_kind != "unicast"
         return is_group or uri.host in {host, "0.0.0.0"}  # noqa: S104  a comparison
 
 

@@ -7,6 +7,7 @@ push out those that send again; what is not kept is counted.
 
 from __future__ import annotations
 
+from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from eap.codec.ethercat import EtherCatHeader, FrameType
@@ -68,6 +69,19 @@ class ObservedPdKey(NamedTuple):
     transport: str
     destination: str
     vlan_id: int | None
+
+    @property
+    def destination_kind(self) -> str:
+        """``unicast``, ``multicast`` or ``broadcast``."""
+        if self.transport == "ethernet":
+            if self.destination == "ff:ff:ff:ff:ff:ff":
+                return "broadcast"
+            return "multicast" if int(self.destination[:2], 16) & 1 else "unicast"
+        host = self.destination.partition(":")[0]
+        if IPv4Address(host).is_multicast:
+            return "multicast"
+        # Without a netmask a host number of 255 is taken for the directed broadcast.
+        return "broadcast" if host.endswith(".255") else "unicast"
 
 
 class ObservedPd:
