@@ -341,14 +341,12 @@ class _SlaveSampler:
         was_failing = value.error is not None
         try:
             data = await self._read(self._station, value.place)
-        except (AdsRefusedError, EapError) as exc:
-            result, why = (
-                (exc.result, exc.why)
-                if isinstance(exc, AdsRefusedError)
-                else (ads_result(exc), str(exc))
-            )
+        except AdsRefusedError as exc:
             now_ns = monotonic_ns()
-            value.fail(AdsRefusedError(result, why), now_ns)
+            value.fail(exc, now_ns)
+        except EapError as exc:
+            now_ns = monotonic_ns()
+            value.fail(AdsRefusedError(ads_result(exc), str(exc)), now_ns)
         else:
             now_ns = monotonic_ns()
             value.take(data, now_ns)
