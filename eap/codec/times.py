@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from datetime import date, datetime, time, timedelta
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from eap.codec.basetypes import DataType, Integer, Plain, Value
 from eap.codec.wire import Buffer
@@ -92,7 +92,7 @@ class LongDateTime(_Long, datetime):
     @classmethod
     def of(cls, ns: int) -> Self:
         """Return the time *ns* nanoseconds after the start of 1970."""
-        day = date.fromordinal(_EPOCH.toordinal() + ns // _DAY)
+        day = _day_of(ns)
         value = cls(day.year, day.month, day.day, *_clock(ns % _DAY))
         value.nanoseconds = ns % _US
         return value
@@ -128,6 +128,10 @@ def _time_ns(value: time | datetime) -> int:
     return seconds * _S + value.microsecond * _US + getattr(value, "nanoseconds", 0)
 
 
+def _day_of(ns: int) -> date:
+    return date.fromordinal(_EPOCH.toordinal() + ns // _DAY)
+
+
 def _date_ns(value: date) -> int:
     return (value.toordinal() - _EPOCH.toordinal()) * _DAY
 
@@ -142,6 +146,8 @@ class Timed(Integer, frozen=True):
     tick_ns: int = 1
     prefix: str = ""
     """Before ``#`` in its literals."""
+    expected: ClassVar[str]
+    """Description of a value, for messages."""
 
     @property
     def scalar_range(self) -> None:  # type: ignore[override]  # it is no number for users
@@ -154,7 +160,7 @@ class Timed(Integer, frozen=True):
         largest = (1 << self.bit_length) - 1
         if ns is None or not 0 <= ns // self.tick_ns <= largest:
             low, high = self._show(0), self._show(largest * self.tick_ns)
-            raise self._refuse(value, f"{self._form()} from {low} to {high}")
+            raise self._refuse(value, f"{self.expected} from {low} to {high}")
         return (ns // self.tick_ns).to_bytes(self.size, "little")
 
     def decode(self, buffer: Buffer, offset: int) -> Value:
@@ -184,9 +190,6 @@ class Timed(Integer, frozen=True):
         return f"{self.prefix}#{self._text(ns)}"
 
     # Abstract, as decode and encode are in the base.
-
-    def _form(self) -> str:
-        raise NotImplementedError
 
     def _to_ns(self, value: Any) -> int | None:
         """Return a value in nanoseconds, None if it is no such time."""
@@ -225,8 +228,7 @@ _BOTH = re.compile(rf"({_DATE.pattern})[-T_ ]({_TIME.pattern})", re.ASCII)
 class Duration(Timed, frozen=True):
     """TIME and LTIME: a ``timedelta``."""
 
-    def _form(self) -> str:
-        return "a duration such as T#1h30m5s250ms"
+    expected = "a duration such as T#1h30m5s250ms"
 
     def _to_ns(self, value: Any) -> int | None:
         return _duration_ns(value) if isinstance(value, timedelta) else None
@@ -261,8 +263,7 @@ class Duration(Timed, frozen=True):
 class TimeOfDay(Timed, frozen=True):
     """TOD and LTOD: a ``time``; numbers beyond a day, which no controller makes, begin again."""
 
-    def _form(self) -> str:
-        return "a time of day such as TOD#12:30:15.25"
+    expected = "a time of day such as TOD#12:30:15.25"
 
     def _show(self, ns: int) -> str:
         return super()._show(min(ns, _DAY - self.tick_ns))
@@ -286,28 +287,26 @@ class TimeOfDay(Timed, frozen=True):
 class CalendarDate(Timed, frozen=True):
     """DATE and LDATE: a ``date``; a time of day within the number is not shown."""
 
-    def _form(self) -> str:
-        return "a date such as D#2026-11-23"
+    expected = "a date such as D#2026-11-23"
 
     def _to_ns(self, value: Any) -> int | None:
         return _date_ns(value) if isinstance(value, date) else None
 
     def _of_ns(self, ns: int) -> Value:
-        return date.fromordinal(_EPOCH.toordinal() + ns // _DAY)
+        return _day_of(ns)
 
     def _parse(self, text: str) -> int | None:
         match = _DATE.fullmatch(text)
         return _date_ns(date(*map(int, match.groups()))) if match else None
 
     def _text(self, ns: int) -> str:
-        return date.fromordinal(_EPOCH.toordinal() + ns // _DAY).isoformat()
+        return _day_of(ns).isoformat()
 
 
 class DateAndTime(Timed, frozen=True):
     """DT and LDT: a ``datetime`` without a zone."""
 
-    def _form(self) -> str:
-        return "a date and time without a zone such as DT#2026-11-23-12:30:15"
+    expected = "a date and time without a zone such as DT#2026-11-23-12:30:15"
 
     def _to_ns(self, value: Any) -> int | None:
         is_local = isinstance(value, datetime) and value.tzinfo is None
@@ -326,8 +325,7 @@ class DateAndTime(Timed, frozen=True):
         return None if clock is None else day + clock
 
     def _text(self, ns: int) -> str:
-        day = date.fromordinal(_EPOCH.toordinal() + ns // _DAY)
-        return f"{day.isoformat()}-{_clock_text(ns % _DAY)}"
+        return f"{_day_of(ns).isoformat()}-{_clock_text(ns % _DAY)}"
 
 
 def _clock_ns(parts: tuple[str | None, ...]) -> int | None:
