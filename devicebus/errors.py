@@ -28,7 +28,9 @@ from eap.errors import EapError
 
 
 class BusError(EapError):
-    """Base class of the errors of the device bus."""
+    """Base class of the errors of the device bus; those of several slaves have a line for each."""
+
+    has_lines = True
 
 
 class FrameLostError(BusError):

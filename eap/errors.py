@@ -20,7 +20,13 @@ from __future__ import annotations
 
 
 class EapError(Exception):
-    """Base class; catch this at the edge of the process."""
+    """Base class; catch this at the edge of the process.
+
+    Attributes:
+        has_lines: True if its text has a line for each cause.
+    """
+
+    has_lines = False
 
 
 class CodecError(EapError, ValueError):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import SequenceMatcher
-from itertools import groupby
+from itertools import combinations, groupby
 from typing import TypeAlias
 
 import msgspec
@@ -19,6 +19,8 @@ from devicebus.errors import IdentityError
 from devicebus.master.pdo import ProcessDataChannel
 from devicebus.master.scan import FoundSlave, Identity
 from eap.od.slave_config import ALIAS_REGISTER, BY_SERIAL, SlaveConfig
+
+_EXCHANGE = ": exchange the cables or the names in the bus file"
 
 
 class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
@@ -103,6 +105,8 @@ def check_bus(
     """Compare found with expected slaves; raise IdentityError with every difference."""
     lines = list(iter_differences(expected, found, marks))
     if lines:
+        if not all(line.endswith(_EXCHANGE) for line in lines):
+            lines.append("connect the slaves as expected, or name those that are there")
         text = "\n  ".join(lines)
         raise IdentityError(
             f"the bus is not as configured ({len(expected)} slaves expected, {len(found)} found):"
@@ -143,12 +147,18 @@ def iter_differences(
 ) -> Iterator[str]:
     """Yield one line for each difference; a missing slave does not make those behind it differ.
 
-    With the expected number of slaves, they are compared by position.
+    With the expected number of slaves, they are compared by position, and two that have each
+    other's position are one difference.
     """
     marks = marks or [marks_of(slave) for slave in found]
     if len(expected) == len(found):
-        for each, slave, its in zip(expected, found, marks, strict=True):
-            yield from _compare(each, slave, its)
+        swapped = _swapped(expected, found, marks)
+        for at, (each, slave, its) in enumerate(zip(expected, found, marks, strict=True)):
+            if at not in swapped:
+                yield from _compare(each, slave, its)
+            elif at < swapped[at]:
+                names = f"{each.name} and {expected[swapped[at]].name}"
+                yield f"{names} are swapped{_EXCHANGE}"
         return
     matcher = SequenceMatcher(
         None,
@@ -167,6 +177,24 @@ def iter_differences(
             yield f"{missing.name} is missing {before}, expected {describe(missing)}"
         for slave in found[there + pairs : there_end]:
             yield f"{_name_of(slave)}: {slave.fault or slave.identity}, expected no slave here"
+
+
+def _swapped(
+    expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave], marks: Sequence[Marks]
+) -> dict[int, int]:
+    """Return the positions of slaves that have each other's position, both ways."""
+    wrong = [
+        at for at, row in enumerate(zip(expected, found, marks, strict=True)) if not _is_match(*row)
+    ]
+    swapped: dict[int, int] = {}
+    for first, second in combinations(wrong, 2):
+        if (
+            not {first, second} & swapped.keys()
+            and _is_match(expected[first], found[second], marks[second])
+            and _is_match(expected[second], found[first], marks[first])
+        ):
+            swapped |= {first: second, second: first}
+    return swapped
 
 
 def has_mark(expected: ExpectedSlave, marks: Marks) -> bool:
@@ -339,4 +367,4 @@ def _alias_register(expected: ExpectedSlave) -> int:
 
 
 def _name_of(slave: FoundSlave) -> str:
-    return f"position {slave.position} (station {slave.station})"
+    return f"slave {slave.station} ({slave.sii.name})" if slave.sii.name else slave.name

@@ -23,6 +23,9 @@ from eap.suggest import suggest
 DEBUG_VARIABLE = "EAP_DEBUG"
 
 
+_NEXT_CAUSE = "\n  "
+
+
 class ExitCode(IntEnum):
     """Exit status."""
 
@@ -119,7 +122,7 @@ def exit_code_of(error: Exception) -> int:
 
 
 def describe(error: Exception) -> str:
-    """Return an error in words for a person: one line, or one for each finding of a plant file."""
+    """Return an error in words for a person: one line, or one for each cause if it has several."""
     if isinstance(error, ConfigError):
         return str(error)
     if isinstance(error, click.UsageError):
@@ -134,8 +137,11 @@ def describe(error: Exception) -> str:
         text = str(error) or type(error).__name__
     else:
         text = f"unexpected {type(error).__name__}: {error} ({DEBUG_VARIABLE}=1 shows where)"
-    # One line whatever the text holds: scripts read stderr by lines.
-    return " ".join("; ".join((text, *_notes_of(error))).split())
+    text = "; ".join((text, *_notes_of(error)))
+    # One line whatever the text holds, unless it has several causes: scripts read stderr by lines.
+    has_lines = isinstance(error, EapError) and error.has_lines
+    lines = text.split(_NEXT_CAUSE) if has_lines else [text]
+    return _NEXT_CAUSE.join(" ".join(line.split()) for line in lines)
 
 
 def _has_reader_left() -> bool:

@@ -11,6 +11,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from devicebus.errors import BusError
 from eap.cli.group import ExitCode, LazyGroup, main
 from eap.errors import ConfigError, ControlError, EnvironmentalError, ImageError
 
@@ -42,6 +43,7 @@ def failing(error: BaseException) -> Failing:
         (EnvironmentalError("no such interface"), 2, "no such interface\n"),
         (ImageError("no variable"), 1, "no variable\n"),
         (ControlError("refused\n  by all"), 1, "refused by all\n"),
+        (BusError("not as expected:\n  a is missing"), 1, "not as expected:\n  a is missing\n"),
         (click.UsageError("wrong words"), 2, "eapctl x: wrong words (see 'eapctl x --help')\n"),
         (click.ClickException("failed"), 1, "failed\n"),
         (FileNotFoundError(errno.ENOENT, "No such file", "x"), 1, "[Errno 2] No such file: 'x'\n"),
