@@ -57,7 +57,8 @@ _WANTED = (
 IO_FOLDER = "_Config/IO"
 MAX_FILES = 2000
 """Limit of the files of one project."""
-FILE_NAME = "__FILENAME__"
+_FILE_NAME = "__FILENAME__"
+"""Name of an item that is called like its file."""
 _DEVICE_TYPES = {
     111: "EtherCAT master: an ENI file, or 'eapctl bus scan --write', describes its slaves",
     138: "Real-Time Ethernet adapter: network variables of TwinCAT 2 are not read from it",
@@ -210,14 +211,10 @@ class _Project:
 
     def _device(self, element: XmlElement, file: str) -> EapImportDevice | None:
         """Return the EAP device of *element*, which may be in a file of its own."""
-        if name := element.get("File"):
-            if not self._is_inside(name, file, element.line):
-                return None
-            file = f"{self._folder}/{name}"
-            found = [each for each in self._read_file(file, (ITEM,)) if each.tag == "Device"]
-            if not found:
-                return None
-            element = found[0]
+        found = self._resolve_file(element, file, self._folder)
+        if found is None:
+            return None
+        element, file = found
         title = _name(element, file)
         folder = f"{self._folder}/{_stem(file) if _is_item(file) else title}"
         try:
@@ -231,6 +228,19 @@ class _Project:
         except XmlError as exc:
             self._report.add_error(file, exc, item=title)
             return None
+
+    def _resolve_file(
+        self, element: XmlElement, file: str, folder: str
+    ) -> tuple[XmlElement, str] | None:
+        """Return *element*, or the one in the file in *folder* that it names, with its file."""
+        name = element.get("File")
+        if not name:
+            return element, file
+        if not self._is_inside(name, file, element.line):
+            return None
+        file = f"{folder}/{name}"
+        found = [each for each in self._read_file(file, (ITEM,)) if each.tag == element.tag]
+        return (found[0], file) if found else None
 
     def _eap_device(
         self, element: XmlElement, title: str, file: str, folder: str
@@ -257,14 +267,10 @@ class _Project:
         )
 
     def _box(self, element: XmlElement, device: str, file: str, folder: str) -> EapBox | None:
-        if name := element.get("File"):
-            if not self._is_inside(name, file, element.line):
-                return None
-            file = f"{folder}/{name}"
-            found = [each for each in self._read_file(file, (ITEM,)) if each.tag == "Box"]
-            if not found:
-                return None
-            element = found[0]
+        found = self._resolve_file(element, file, folder)
+        if found is None:
+            return None
+        element, file = found
         title = _name(element, file)
         item = f"{device}/{title}"
         try:
@@ -336,15 +342,14 @@ class _Project:
 
     def _read_links(self, owner: XmlElement, file: str) -> None:
         """Note the links of one owner; in the file of a device the owner may be that device."""
-        names = {owner.get("Name")}
         for other in owner.iterfind("OwnerB" if owner.tag == "OwnerA" else "OwnerA"):
-            names = {owner.get("Name"), other.get("Name")}
+            names = owner.get("Name"), other.get("Name")
             devices = [each for each in names if not each or each.startswith("TIID^")]
             programs = [each for each in names if each.startswith(("TIPC^", "TIRT^", "TIRC^"))]
             if not devices or not programs:
                 continue
             own = devices[0] or f"TIID^{_stem(file)}"
-            is_program_first = owner.get("Name") == programs[0]
+            is_program_first = names[0] == programs[0]
             for link in other.iterfind("Link"):
                 first, second = link.get("VarA"), link.get("VarB")
                 if owner.tag == "OwnerB":
@@ -381,24 +386,16 @@ class _Project:
 
 
 def _variable(element: XmlElement, name: str) -> EapVariable:
-    data = next(
-        (
-            each
-            for group in element.iterfind("Vars")
-            for each in group.iterfind("Var")
-            if each.findtext("Name") == _DATA
-        ),
-        None,
-    )
+    inner = list(element.iterfind("Vars/Var"))
+    data = next((each for each in inner if each.findtext("Name") == _DATA), None)
     kind = None if data is None else data.find("Type")
-    unknown: list[UnknownSetting] = unknown_attributes(element, _VARIABLE_ATTRIBUTES)
+    unknown = unknown_attributes(element, _VARIABLE_ATTRIBUTES)
     unknown += unknown_children(element, _VARIABLE_CHILDREN)
-    for group in element.iterfind("Vars"):
-        unknown += [
-            UnknownSetting(each.line, f"Var {each.findtext('Name')}")
-            for each in group.iterfind("Var")
-            if each.findtext("Name") not in _STATES | {_DATA}
-        ]
+    unknown += [
+        UnknownSetting(each.line, f"Var {each.findtext('Name')}")
+        for each in inner
+        if each.findtext("Name") not in _STATES | {_DATA}
+    ]
     if not element.get("NvId"):
         message, expected = f"EapVar {name!r} has no NvId", "the attribute NvId"
         raise XmlError(message, line=element.line, expected=expected)
@@ -415,7 +412,7 @@ def _variable(element: XmlElement, name: str) -> EapVariable:
 
 def _name(element: XmlElement, file: str) -> str:
     name = element.findtext("Name")
-    return _stem(file) if name in {"", FILE_NAME} else name
+    return _stem(file) if name in {"", _FILE_NAME} else name
 
 
 def _is_item(file: str) -> bool:
