@@ -239,7 +239,11 @@ class _Project:
         if not self._is_inside(name, file, element.line):
             return None
         file = f"{folder}/{name}"
+        before = len(self._report.findings)
         found = [each for each in self._read_file(file, (ITEM,)) if each.tag == element.tag]
+        if not found and len(self._report.findings) == before:
+            message = f"its file has no {element.tag}"
+            self._report.note(file, 0, _stem(file), ImportOutcome.LEFT, message)
         return (found[0], file) if found else None
 
     def _eap_device(

@@ -133,6 +133,17 @@ def test_missing_file_is_a_finding_and_the_rest_is_read() -> None:
     assert [each.name for each in found.devices] == [DEVICE]
 
 
+def test_file_without_the_device_or_box_is_noted() -> None:
+    files = {
+        "p/_Config/IO/a.xti": item(STATE),
+        f"p/_Config/IO/{DEVICE}/b.xti": item("<Other/>"),
+    }
+    text = project('<Device File="a.xti"/>', device('<Box File="b.xti"/>'))
+    found, report = read(text, files)
+    assert outcomes(report) == ["left a: its file has no Device", "left b: its file has no Box"]
+    assert [each.boxes for each in found.devices] == [()]
+
+
 def test_number_of_files_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(twincat, "MAX_FILES", 3)
     files = {"p/_Config/IO/a.xti": item(device(STATE))}
