@@ -13,18 +13,17 @@ import msgspec
 from eap.codec import datatypes
 from eap.codec.arrays import Array
 from eap.codec.basetypes import Block, Boolean, DataType, Integer, String
-from eap.config.imports.records import EapBox, EapImportDevice, EapVariable
+from eap.config.imports.records import ARP_MS, EapBox, EapImportDevice, EapVariable
 from eap.config.imports.treeitems import device_items, tree_items_text
 from eap.config.load import Plant
+from eap.config.ports import IP_BROADCAST
 from eap.errors import ConfigError, EnvironmentalError
-from eap.ids import Destination, DestinationKind, NetId
+from eap.ids import BROADCAST_MAC, Destination, DestinationKind, NetId
 from eap.ops.plant import load_or_raise
 from eap.pd.spec import REQUESTER, PortKind, PortSpec, RxPdSpec, StationSpec, TxFrameSpec, TxPdSpec
 from eap.runtime.durable import whole_file
 from eap.suggest import suggest
 
-_ARP_MS = 1000
-"""Interval that TwinCAT offers."""
 _Periods: TypeAlias = dict[tuple[str, str, str], str]
 """Time between two of a variable, by device, box and name."""
 _NO_PERIODS: Mapping[str, str] = MappingProxyType({})
@@ -242,7 +241,7 @@ class _PeerBuilder:
             modulo=frame.modulo,
             vlan_id=port.vlan_id,
             vlan_priority=port.vlan_priority,
-            arp_ms=frame.monitor_interval_ms or _ARP_MS,
+            arp_ms=frame.monitor_interval_ms or ARP_MS,
             is_monitored=bool(frame.monitor_interval_ms),
             is_changeable=frame.changeable,
             variables=tuple(
@@ -286,9 +285,10 @@ class _PeerBuilder:
         self, frame: TxFrameSpec, pds: Iterable[TxPdSpec], port: PortSpec
     ) -> EapBox:
         destination = Destination.parse(frame.destination)
+        # Broadcasts come to every subscriber: there is no group to receive from.
         is_group = destination.is_group and destination.host not in {
-            "ff:ff:ff:ff:ff:ff",
-            "255.255.255.255",
+            str(BROADCAST_MAC),
+            IP_BROADCAST,
         }
         is_mac = destination.kind is DestinationKind.MAC
         return EapBox(

@@ -19,6 +19,10 @@ EAP_DEVICE = 112
 """DevType, or ItemSubType, of an EAP device."""
 PUBLISHER, SUBSCRIBER = 9051, 9052
 """BoxTypes."""
+DATA = "VarData"
+"""Variable of a network variable that has its data; those beside it have its state."""
+ARP_MS = 1000
+"""Interval of the checks whether a receiver is present that TwinCAT offers."""
 MAX_U16, MAX_U32 = 0xFFFF, 0xFFFF_FFFF
 ITEMS = 10_000
 """Limit of the boxes of one import, and of the variables of one box."""
@@ -96,7 +100,7 @@ class EapBox(msgspec.Struct, frozen=True, kw_only=True):
     modulo: int = 0
     vlan_id: int = 0
     vlan_priority: int = 0
-    arp_ms: int = 1000
+    arp_ms: int = ARP_MS
     is_monitored: bool = True
     is_changeable: bool = False
     is_disabled: bool = False
@@ -190,6 +194,15 @@ def unknown_children(element: XmlElement, known: Iterable[str]) -> list[UnknownS
         for child in element.children
         if child.tag not in set(known)
     ]
+
+
+def six_bytes(text: str) -> bytes:
+    """Return the bytes of 12 hexadecimal digits (MAC address, NetID); empty if it has others."""
+    try:
+        found = bytes.fromhex(text)
+    except ValueError:
+        return b""
+    return found if len(found) == 6 else b""
 
 
 def _shown(text: str) -> str:

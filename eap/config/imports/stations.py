@@ -23,7 +23,8 @@ from eap.config.imports.records import (
     ImportOutcome,
     ImportReport,
 )
-from eap.ids import BROADCAST_MAC, InterfaceUri, MacAddr, NetId
+from eap.config.ports import IP_BROADCAST
+from eap.ids import BROADCAST_MAC, Destination, InterfaceUri, NetId
 from eap.pd.rules import plain_name
 
 DEFAULT_CYCLE_US = 10_000
@@ -34,7 +35,6 @@ _MAC = (
     " this station."
 )
 _GATEWAY = "in the project by gateway {}: here the routes of the host decide"
-_UDP_BROADCAST = "255.255.255.255"
 
 
 class PublisherIdentity(StrEnum):
@@ -496,7 +496,7 @@ def _destination(box: EapBox, port: PlannedPort) -> tuple[str, str]:
     """Return the destination of a publisher by its address, or in words if that cannot be."""
     if box.udp:
         if port.scheme == "udp":
-            return "broadcast" if box.udp == _UDP_BROADCAST else box.udp, ""
+            return "broadcast" if box.udp == IP_BROADCAST else box.udp, ""
         return "", f"UDP to {box.udp}"
     if box.mac:
         if port.scheme in {"ethernet", "loop"}:
@@ -514,11 +514,7 @@ def _is_unicast(box: EapBox, to: str) -> bool:
 def is_group_address(text: str) -> bool:
     """Return whether *text* is a multicast or broadcast address, of MAC or IPv4."""
     try:
-        return MacAddr.parse(text).is_group
-    except ValueError:
-        pass
-    try:
-        return IPv4Address(text).is_multicast or text == _UDP_BROADCAST
+        return Destination.parse(text).is_group
     except ValueError:
         return text in {"multicast", "broadcast"}
 

@@ -18,6 +18,8 @@ import msgspec
 
 from eap.codec.xmlstream import XmlElement, XmlError, read_tree
 from eap.config.imports.records import (
+    ARP_MS,
+    DATA,
     EAP_DEVICE,
     ITEMS,
     MAX_U16,
@@ -29,6 +31,7 @@ from eap.config.imports.records import (
     EapVariable,
     ImportOutcome,
     ImportReport,
+    six_bytes,
     unknown_children,
 )
 from eap.ids import NET_ID, MacAddr, NetId
@@ -36,7 +39,7 @@ from eap.ids import NET_ID, MacAddr, NetId
 ROOTS = "TreeItem", "TreeItems"
 NAMESPACE = "urn:eap-appliance:peer"
 """Of the settings that TwinCAT has no known element for."""
-_DEVICE, _BOX, _DATA = 2, 5, 7
+_DEVICE, _BOX, _VARIABLE = 2, 5, 7
 _PUBLISHER_VARIABLE, _SUBSCRIBER_VARIABLE = 35, 36
 _NO_MAC, _NO_NET_ID, _NO_IP = "00 00 00 00 00 00", "0.0.0.0.0.0", "255.255.255.255"
 _PUBLISHER_KEYS = (
@@ -133,7 +136,7 @@ class _Assembly:
             kind = definition.findtext("VarType")
             bits = definition.number_at("VarBitSize", 0, 8 * MAX_U16)
             # Below the variable, in its group: ...^Var 1^Outputs^VarData.
-            owner = item.path[:-2] if item.path[-1] == "VarData" else item.path
+            owner = item.path[:-2] if item.path[-1] == DATA else item.path
             self._types[owner] = (kind, bits)
 
     def _take_variable(self, item: TreeItem) -> None:
@@ -229,7 +232,7 @@ def _publisher(definition: XmlElement) -> EapBox:
         modulo=definition.number_at("IoDiv/Modulo", 0, MAX_U16),
         vlan_id=definition.number_at("VLAN/Id", 0, 4094) if has_vlan else 0,
         vlan_priority=definition.number_at("VLAN/Prio", 0, 7) if has_vlan else 0,
-        arp_ms=definition.number_at("ArpInterval", 0, MAX_U32, 1000),
+        arp_ms=definition.number_at("ArpInterval", 0, MAX_U32, ARP_MS),
         is_monitored=not definition.flag_at("DisableSubscriberMonitoring"),
         is_changeable=definition.flag_at("TargetChangeable"),
         unknown=tuple(unknown_children(definition, _PUBLISHER_KEYS)),
@@ -264,11 +267,8 @@ def _mac(text: str, line: int) -> str:
     """Return a MAC address of hexadecimal digits; empty for none and for one of zeros."""
     if not text:
         return ""
-    try:
-        octets = bytes.fromhex(text)
-    except ValueError:
-        octets = b""
-    if len(octets) != 6:
+    octets = six_bytes(text)
+    if not octets:
         message = f"MAC address {text[:40]!r}"
         raise XmlError(message, line=line, expected="12 hexadecimal digits")
     return str(MacAddr(octets)) if any(octets) else ""
@@ -331,7 +331,7 @@ def _variable_items(path: str, variable: EapVariable, box: EapBox) -> Iterator[t
     )
     size = f"<VarBitSize>{variable.bits}</VarBitSize>"
     definition = f"<VarDef><VarType>{escape(variable.type)}</VarType>{size}</VarDef>"
-    yield _item(f"{path}^{group}^VarData", _DATA, 0, (definition,))
+    yield _item(f"{path}^{group}^{DATA}", _VARIABLE, 0, (definition,))
 
 
 def _item(

@@ -19,6 +19,8 @@ import msgspec
 
 from eap.codec.xmlstream import XmlElement, XmlError, XmlReader
 from eap.config.imports.records import (
+    ARP_MS,
+    DATA,
     EAP_DEVICE,
     ITEMS,
     MAX_U16,
@@ -31,6 +33,7 @@ from eap.config.imports.records import (
     ImportOutcome,
     ImportReport,
     UnknownSetting,
+    six_bytes,
     unknown_attributes,
     unknown_children,
 )
@@ -66,7 +69,6 @@ _DEVICE_TYPES = {
 _STATES = frozenset(
     ("FrameState", "FrameCtrl", "VarState", "VarCtrl", "Quality", "CycleIndex", "CycleIdx")
 )
-_DATA = "VarData"
 _BOX_ATTRIBUTES = "Id", "BoxType", "File", "Disabled", "AmsPort", "RemoteName"
 _BOX_CHILDREN = "Name", "Comment", "ImageId", "Vars", "Eap"
 _EAP_ATTRIBUTES = "InOut", "Publisher", "ArpRetryInterval"
@@ -294,7 +296,7 @@ class _Project:
         unknown = unknown_attributes(element, _BOX_ATTRIBUTES)
         unknown += unknown_children(element, _BOX_CHILDREN)
         variables: list[EapVariable] = []
-        publisher, arp_ms = "", 1000
+        publisher, arp_ms = "", ARP_MS
         line = element.line
         for eap in element.iterfind("Eap"):
             unknown += unknown_attributes(eap, _EAP_ATTRIBUTES)
@@ -368,7 +370,7 @@ class _Project:
             prefix = f"TIID^{device.name}^{box.name}"
             variables = []
             for variable in box.variables:
-                link = self._links.get(f"{prefix}^{variable.name}^{group}^{_DATA}")
+                link = self._links.get(f"{prefix}^{variable.name}^{group}^{DATA}")
                 if link is not None:
                     variable = msgspec.structs.replace(  # noqa: PLW2901
                         variable,
@@ -391,14 +393,14 @@ class _Project:
 
 def _variable(element: XmlElement, name: str) -> EapVariable:
     inner = list(element.iterfind("Vars/Var"))
-    data = next((each for each in inner if each.findtext("Name") == _DATA), None)
+    data = next((each for each in inner if each.findtext("Name") == DATA), None)
     kind = None if data is None else data.find("Type")
     unknown = unknown_attributes(element, _VARIABLE_ATTRIBUTES)
     unknown += unknown_children(element, _VARIABLE_CHILDREN)
     unknown += [
         UnknownSetting(each.line, f"Var {each.findtext('Name')}")
         for each in inner
-        if each.findtext("Name") not in _STATES | {_DATA}
+        if each.findtext("Name") not in _STATES | {DATA}
     ]
     if not element.get("NvId"):
         message, expected = f"EapVar {name!r} has no NvId", "the attribute NvId"
@@ -432,11 +434,8 @@ def _hex_net_id(text: str, line: int) -> NetId | None:
     """Return the NetID of 12 hexadecimal digits; None for none and for one of zeros."""
     if not text:
         return None
-    try:
-        octets = bytes.fromhex(text)
-    except ValueError:
-        octets = b""
-    if len(octets) != 6:
+    octets = six_bytes(text)
+    if not octets:
         message, expected = f"Publisher is {text[:40]!r}", "a NetID of 12 hexadecimal digits"
         raise XmlError(message, line=line, expected=expected)
     return NetId(octets) if any(octets) else None
@@ -444,9 +443,5 @@ def _hex_net_id(text: str, line: int) -> NetId | None:
 
 def _mac(text: str) -> str:
     """Return the MAC address of 12 hexadecimal digits; empty if it is none."""
-    try:
-        octets = bytes.fromhex(text)
-    except ValueError:
-        return ""
-    is_address = len(octets) == 6 and any(octets) and not octets[0] & 1
-    return str(MacAddr(octets)) if is_address else ""
+    octets = six_bytes(text)
+    return str(MacAddr(octets)) if any(octets) and not octets[0] & 1 else ""
