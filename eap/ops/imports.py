@@ -53,18 +53,18 @@ from eap.runtime.durable import whole_file
 from eap.runtime.esi_files import EsiSource
 from eap.runtime.plantfile import load_plant
 
-DEFAULT_ADDRESS = "ethernet://line{n}"
+_DEFAULT_ADDRESS = "ethernet://line{n}"
 """No interface is called so on purpose: nothing is sent before the user has named his own."""
-EDC = (
+_EDC = (
     "EDC files have no public description, so none is read: export the publishers and subscribers"
     " of the EAP device as XML descriptions in TwinCAT (Export XML Description), or import the"
     " project itself"
 )
-DEFAULT_BUS = "ethernet://bus{n}"
+_DEFAULT_BUS = "ethernet://bus{n}"
 _ARCHIVE = "it is an archive: unpack it, and import the .tsproj file in it"
 _SOLUTION = "it is a solution: import the .tsproj file in its folder"
 _NOT_READ = {
-    ".edc": EDC,
+    ".edc": _EDC,
     ".sln": _SOLUTION,
     ".tszip": _ARCHIVE,
     ".tnzip": _ARCHIVE,
@@ -95,12 +95,12 @@ class ImportChoices(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     plant: str = ""
-    address: str = DEFAULT_ADDRESS
+    address: str = _DEFAULT_ADDRESS
     identity: PublisherIdentity = PublisherIdentity.DEVICE
     to: str = ""
     cycle_us: int = 0
     peer: str = ""
-    bus: str = DEFAULT_BUS
+    bus: str = _DEFAULT_BUS
     esi: Path | None = None
     devices: tuple[str, ...] = ()
 
@@ -246,12 +246,13 @@ def _root_of(path: Path, report: ImportReport) -> str:
         for chunk in _chunks(str(path)):
             reader.feed(chunk)
             if reader.root is not None:
-                return reader.root.tag
-        reader.close()
+                break
+        else:
+            reader.close()
     except XmlError as exc:
-        if reader.root is not None:
-            return reader.root.tag
-        report.add_error(str(path), exc)
+        # With a root, the reader of such files reports the error.
+        if reader.root is None:
+            report.add_error(str(path), exc)
     except OSError as exc:
         report.add(str(path), 0, f"cannot be read: {exc.strerror or exc}", "an XML file")
     return "" if reader.root is None else reader.root.tag
@@ -287,12 +288,8 @@ def _plan(
         stations = [
             station
             for file, found in sources.types
-            if (station := _of_symbols(file, found, types, names, interfaces, report))
+            if (station := _of_symbols(file, found, types, names, interfaces, choices, report))
         ]
-        if choices.cycle_us:
-            stations = [
-                msgspec.structs.replace(each, cycle_us=choices.cycle_us) for each in stations
-            ]
     elif choices.peer and stations:
         stations = with_peers(stations, choices.peer, interfaces)
     return resolve(stations, choices.to, report), types.section()
@@ -342,6 +339,7 @@ def _of_symbols(
     types: TypeNames,
     names: UniqueNames,
     interfaces: Iterator[InterfaceUri],
+    choices: ImportChoices,
     report: ImportReport,
 ) -> PlannedStation | None:
     """Return a station that has the symbols of a TMC or TPY file as variables."""
@@ -373,7 +371,7 @@ def _of_symbols(
     return PlannedStation(
         name=names.take(plain_name(Path(file).stem, "station")),
         net_id=router,
-        cycle_us=DEFAULT_CYCLE_US,
+        cycle_us=choices.cycle_us or DEFAULT_CYCLE_US,
         ports=(port,),
         variables=tuple(variables),
         remarks=("Symbols of a program: publish those that others need.",),

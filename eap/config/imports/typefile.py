@@ -11,14 +11,14 @@ from enum import StrEnum
 
 import msgspec
 
-from eap.codec.xmlstream import XmlElement, XmlError, XmlReader
+from eap.codec.xmlstream import XmlElement, XmlError, read_elements
 from eap.config.imports.records import ImportReport
 
 _MAX_BITS = 1 << 40
 _MAX_BOUND = (1 << 31) - 1
 _MAX_DIMENSIONS = 8
 _ENUM = 1 << 64
-TMC_TYPE, TPY_TYPE = "TcModuleClass/DataTypes/DataType", "PlcProjectInfo/DataTypes/DataType"
+_TMC_TYPE, _TPY_TYPE = "TcModuleClass/DataTypes/DataType", "PlcProjectInfo/DataTypes/DataType"
 TSPROJ_TYPE = "TcSmProject/DataTypes/DataType"
 _AREA = "TcModuleClass/Modules/Module/DataAreas/DataArea"
 _TPY_SYMBOL, _TPY_ADS = "PlcProjectInfo/Symbols/Symbol", "PlcProjectInfo/RoutingInfo/AdsInfo"
@@ -153,31 +153,23 @@ def read_type_file(chunks: Iterable[bytes], file: str, report: ImportReport) -> 
         file: Its name, for findings.
         report: Takes the findings.
     """
-    wanted = (TMC_TYPE, TPY_TYPE, _AREA, _TPY_SYMBOL, _TPY_ADS)
-    reader = XmlReader(wanted, roots=ROOTS, ignored=IGNORED)
+    wanted = (_TMC_TYPE, _TPY_TYPE, _AREA, _TPY_SYMBOL, _TPY_ADS)
     types: list[TypeRecord] = []
     symbols: list[SymbolRecord] = []
     net_id = ""
-
-    def take(elements: list[XmlElement]) -> None:
-        nonlocal net_id
-        for element in elements:
+    try:
+        for element in read_elements(chunks, wanted, roots=ROOTS, ignored=IGNORED):
             match element.tag:
                 case "DataType":
-                    types.extend(read_types([element], file, report))
+                    types += read_types([element], file, report)
                 case "AdsInfo":
                     net_id = element.findtext("NetId")
                 case "DataArea":
                     number = element.find("AreaNo")
                     area = _AREAS.get(number.get("AreaType"), "") if number else ""
-                    symbols.extend(_symbols(element.iterfind("Symbol"), area, file, report))
+                    symbols += _symbols(element.iterfind("Symbol"), area, file, report)
                 case "Symbol":
-                    symbols.extend(_symbols([element], "", file, report))
-
-    try:
-        for chunk in chunks:
-            take(reader.feed(chunk))
-        take(reader.close())
+                    symbols += _symbols([element], "", file, report)
     except XmlError as exc:
         report.add_error(file, exc)
     return TypeFile(tuple(types), tuple(symbols), net_id)
