@@ -10,7 +10,7 @@ import msgspec
 from devicebus.esi.device import identify, read_device, read_module
 from devicebus.esi.fields import EsiFinding, Fields, english
 from devicebus.esi.records import EsiDevice, EsiModule
-from eap.codec.xmlstream import CHUNK, XmlElement, XmlError, read_elements
+from eap.codec.xmlstream import CHUNK, XmlElement, XmlError, XmlReader
 
 ROOT = "EtherCATInfo"
 MAX_DEVICES = 20_000
@@ -180,7 +180,8 @@ def _read(
 ) -> Iterator[XmlElement]:
     """Yield the wanted elements; a fault of the file is a finding and ends them."""
     chunks = iter(lambda: stream.read(CHUNK), b"")
+    reader = XmlReader(wanted, roots=(ROOT,), ignored=_IGNORED, select=select)
     try:
-        yield from read_elements(chunks, wanted, roots=(ROOT,), ignored=_IGNORED, select=select)
+        yield from reader.read(chunks)
     except XmlError as exc:
         fields.report(exc.line, str(exc), exc.expected)

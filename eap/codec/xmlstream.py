@@ -199,6 +199,12 @@ class XmlReader:
             self._parser.close()
         return self._builder.take()
 
+    def read(self, chunks: Iterable[bytes | str]) -> Iterator[XmlElement]:
+        """Yield the wanted elements of a whole file that comes in *chunks*."""
+        for chunk in chunks:
+            yield from self.feed(chunk)
+        yield from self.close()
+
     def _parse(self, text: str) -> None:
         # Always parts of one size: a token that never ends is found after each of them.
         for start in range(0, len(text), CHUNK):
@@ -214,31 +220,14 @@ class XmlReader:
                 )
 
 
-def read_elements(
-    chunks: Iterable[bytes | str],
-    wanted: Collection[str],
-    *,
-    roots: Collection[str] = (),
-    ignored: Collection[str] = (),
-    limits: XmlLimits = DEFAULT_LIMITS,
-    select: Callable[[XmlElement], bool] | None = None,
-) -> Iterator[XmlElement]:
-    """Yield the *wanted* elements of a file that comes in *chunks*; arguments as for XmlReader."""
-    reader = XmlReader(wanted, roots=roots, ignored=ignored, limits=limits, select=select)
-    for chunk in chunks:
-        yield from reader.feed(chunk)
-    yield from reader.close()
-
-
 def read_tree(
     chunks: Iterable[bytes | str],
     *,
     roots: Collection[str] = (),
-    ignored: Collection[str] = (),
     limits: XmlLimits = DEFAULT_LIMITS,
 ) -> XmlElement:
     """Return the root of a file with everything in it; arguments as for XmlReader."""
-    (root,) = read_elements(chunks, ("*",), roots=roots, ignored=ignored, limits=limits)
+    (root,) = XmlReader(("*",), roots=roots, limits=limits).read(chunks)
     return root
 
 

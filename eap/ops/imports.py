@@ -54,7 +54,7 @@ from eap.runtime.esi_files import EsiSource
 from eap.runtime.plantfile import load_plant
 
 _DEFAULT_ADDRESS = "ethernet://line{n}"
-"""No interface is called so on purpose: nothing is sent before the user has named his own."""
+"""An interface that no host has: nothing is sent before the user names one that exists."""
 _EDC = (
     "EDC files have no public description, so none is read: export the publishers and subscribers"
     " of the EAP device as XML descriptions in TwinCAT (Export XML Description), or import the"

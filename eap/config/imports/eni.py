@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from eap.codec.xmlstream import XmlElement, XmlError, read_elements
+from eap.codec.xmlstream import XmlElement, XmlError, XmlReader
 from eap.config.imports.eni_records import (
     EniBus,
     EniSlave,
@@ -83,7 +83,7 @@ class _EniReader:
     def read(self, chunks: Iterable[bytes]) -> EniBus | None:
         before = len(self._report.findings)
         try:
-            for element in read_elements(chunks, _WANTED, roots=(ROOT,)):
+            for element in XmlReader(_WANTED, roots=(ROOT,)).read(chunks):
                 try:
                     self._take(element)
                 except XmlError as exc:

@@ -12,7 +12,6 @@ device.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from itertools import chain
 from typing import TypeAlias
 
 import msgspec
@@ -155,9 +154,8 @@ class _Project:
         if not self._may_open_another():
             return items
         try:
-            for chunk in chain(self._open(file), [None]):
-                for element in reader.close() if chunk is None else reader.feed(chunk):
-                    self._take(element, file, items)
+            for element in reader.read(self._open(file)):
+                self._take(element, file, items)
         except XmlError as exc:
             self._report.add_error(file, exc)
         except OSError as exc:

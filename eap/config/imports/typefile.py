@@ -11,7 +11,7 @@ from enum import StrEnum
 
 import msgspec
 
-from eap.codec.xmlstream import XmlElement, XmlError, read_elements
+from eap.codec.xmlstream import XmlElement, XmlError, XmlReader
 from eap.config.imports.records import ImportReport
 
 _MAX_BITS = 1 << 40
@@ -158,7 +158,7 @@ def read_type_file(chunks: Iterable[bytes], file: str, report: ImportReport) -> 
     symbols: list[SymbolRecord] = []
     net_id = ""
     try:
-        for element in read_elements(chunks, wanted, roots=ROOTS, ignored=IGNORED):
+        for element in XmlReader(wanted, roots=ROOTS, ignored=IGNORED).read(chunks):
             match element.tag:
                 case "DataType":
                     types += read_types([element], file, report)

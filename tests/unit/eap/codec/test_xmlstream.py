@@ -13,7 +13,6 @@ from eap.codec.xmlstream import (
     XmlLimits,
     XmlReader,
     parse_integer,
-    read_elements,
     read_tree,
 )
 
@@ -39,7 +38,7 @@ def refusal(*chunks: bytes | str, limits: XmlLimits | None = None) -> XmlError:
 
 
 def test_reader_returns_wanted_elements_with_their_lines() -> None:
-    first, second = read_elements([FILE], [DEVICES], roots=["Info"], ignored=["Picture"])
+    first, second = XmlReader([DEVICES], roots=["Info"], ignored=["Picture"]).read([FILE])
     assert [each.tag for each in first.children] == ["Name", "On"]
     assert (first.line, second.line) == (5, 7)
     assert first.findtext("Name") == "Out & in"
@@ -78,7 +77,7 @@ def test_reader_takes_encodings_in_single_bytes(encoding: str) -> None:
     name = encoding.removesuffix("-sig")
     octets = FILE.replace('encoding="utf-8"', f'encoding="{name}"').encode(encoding)
     parts = [octets[at : at + 1] for at in range(len(octets))]
-    assert [each.findtext("Name") for each in read_elements(parts, [DEVICES])] == ["Out & in", "µ"]
+    assert [each.findtext("Name") for each in XmlReader([DEVICES]).read(parts)] == ["Out & in", "µ"]
 
 
 def test_reader_replaces_bytes_of_another_encoding() -> None:
@@ -137,9 +136,9 @@ def test_token_without_end_is_refused_before_the_file_ends(start: str) -> None:
 def test_dropped_elements_count_for_the_depth_only() -> None:
     text = "<a><skip>" + "<b>" * 10 + "</b>" * 10 + "</skip><c/></a>"
     limits = XmlLimits(elements=1, depth=12)
-    assert [each.tag for each in read_elements([text], ["a/c"], limits=limits)] == ["c"]
+    assert [each.tag for each in XmlReader(["a/c"], limits=limits).read([text])] == ["c"]
     with pytest.raises(XmlError, match="nested"):
-        list(read_elements([text], ["a/c"], limits=XmlLimits(depth=11)))
+        list(XmlReader(["a/c"], limits=XmlLimits(depth=11)).read([text]))
 
 
 @pytest.mark.parametrize(
