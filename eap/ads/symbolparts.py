@@ -12,8 +12,8 @@ from functools import lru_cache
 from itertools import accumulate
 from typing import NamedTuple
 
-from eap.codec.basetypes import WideString
-from eap.codec.datatypes import Array, DataType, String
+from eap.codec.basetypes import Text
+from eap.codec.datatypes import Array, DataType
 from eap.codec.structures import PATH_STEP, Structure
 
 
@@ -105,7 +105,7 @@ def find_path_at(kind: DataType, bit_offset: int, bit_length: int) -> str | None
 def _has_length(kind: DataType, bit_length: int) -> bool:
     if kind.is_bits or not bit_length:
         return kind.is_bits and not bit_length
-    is_text = isinstance(kind, String | WideString)
+    is_text = isinstance(kind, Text)
     return bit_length == kind.bit_length or (is_text and bit_length < kind.bit_length)
 
 

@@ -28,7 +28,7 @@ from eap.codec.adssymbol import (
     encode_data_type,
 )
 from eap.codec.arrays import Dimension
-from eap.codec.basetypes import WideChar, WideString
+from eap.codec.basetypes import Text, WideChar, WideString
 from eap.codec.datatypes import Array, Block, Boolean, DataType, Integer, Real, String
 from eap.codec.enumerations import Enumeration
 from eap.codec.structures import Member, Structure
@@ -97,8 +97,8 @@ class SymbolType(NamedTuple):
         Raises:
             AdsRefusedError: SIZE or VALUE.
         """
-        if isinstance(self.kind, String | WideString):
-            return self._from_text(data)
+        if isinstance(self.kind, Text):
+            return self._from_text(data, self.kind.unit)
         if len(data) != self.size:
             raise AdsRefusedError(AdsError.SIZE)
         if isinstance(self.kind, Boolean):
@@ -113,8 +113,7 @@ class SymbolType(NamedTuple):
         # The padding of a struct is never a client's: it goes to other stations.
         return (int.from_bytes(data, "little") & mask).to_bytes(self.size, "little")
 
-    def _from_text(self, data: bytes) -> bytes:
-        unit = 2 if isinstance(self.kind, WideString) else 1
+    def _from_text(self, data: bytes, unit: int) -> bytes:
         if len(data) > self.size or len(data) % unit:
             raise AdsRefusedError(AdsError.SIZE)
         end = next((n for n in range(0, len(data), unit) if not any(data[n : n + unit])), len(data))

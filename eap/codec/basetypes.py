@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from operator import index
-from typing import Any, Self, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 import msgspec
 
@@ -154,6 +154,12 @@ class DataType(msgspec.Struct, frozen=True, eq=False):
         return ValueError(f"{shown} is not a value of {self.name}: expected {expected}")
 
 
+def whole_number(text: str) -> int:
+    """Read decimal, or hexadecimal, octal and binary behind 0x, 0o and 0b; raise ValueError."""
+    # Base 0 refuses the leading zeros of 007, which users and CSV files write.
+    return int(text, 10 if text.strip().lstrip("+-").isdecimal() else 0)
+
+
 class Integer(DataType, frozen=True):
     """A whole number of 1 to 8 bytes, or of 1 to 8 bits in a byte of its own."""
 
@@ -197,7 +203,7 @@ class Integer(DataType, frozen=True):
     def parse_text(self, text: str) -> Value:
         """Read decimal, or hexadecimal, octal and binary behind 0x, 0o and 0b."""
         try:
-            number = int(text, 10 if text.strip().lstrip("+-").isdecimal() else 0)
+            number = whole_number(text)
         except ValueError:
             low, high = self.scalar_range
             raise self._refuse(text, f"a whole number from {low} to {high}") from None
@@ -286,49 +292,24 @@ class Real(DataType, frozen=True):
         return number
 
 
-class String(DataType, frozen=True):
-    """Text in a fixed number of bytes: UTF-8, padded with zeros, which end it on reading.
+class Text(DataType, frozen=True):
+    """Base of texts in a fixed number of bytes: padded with zeros, which end them on reading.
 
-    Bytes that are no UTF-8 read as U+FFFD: a peer's text never fails to be shown.
+    Bytes that are no text read as U+FFFD: a peer's text never fails to be shown.
     """
 
-    def encode(self, value: Any) -> bytes:
-        """Return the padded bytes of a text that fits and has no NUL; take bytes as they are."""
-        if isinstance(value, bytes) and len(value) == self.size:
-            return value
-        if not isinstance(value, str):
-            raise self._refuse(value, "a text")
-        try:
-            octets = value.encode()
-        except UnicodeEncodeError:
-            raise self._refuse(value, "a text without lone surrogates") from None
-        if 0 in octets:
-            raise self._refuse(value, "a text without NUL, which would end it")
-        if len(octets) > self.size:
-            raise self._refuse(value, f"at most {self.size} bytes, this text has {len(octets)}")
-        return octets.ljust(self.size, b"\0")
-
-    def parse_text(self, text: str) -> Value:
-        """Take the text as it is."""
-        self.encode(text)
-        return text
-
-    def decode(self, buffer: Buffer, offset: int) -> Value:
-        """Read the text up to the first NUL."""
-        octets, _, _ = bytes(buffer[offset : offset + self.size]).partition(b"\0")
-        return octets.decode(errors="replace")
-
-
-class WideString(DataType, frozen=True):
-    """Text in UTF-16: a fixed number of units, then the NUL that IEC 61131-3 controllers add.
-
-    Units that are no text read as U+FFFD.
-    """
+    encoding: ClassVar[str]
+    unit: ClassVar[int]
+    """Bytes of one unit of the encoding."""
+    units: ClassVar[str]
+    """Name of the units in messages."""
+    nul_size: ClassVar[int] = 0
+    """Bytes of a NUL that is behind the longest text too."""
 
     @property
     def alignment(self) -> int:
         """That of a unit."""
-        return 2
+        return self.unit
 
     def encode(self, value: Any) -> bytes:
         """Return the padded bytes of a text that fits and has no NUL; take bytes as they are."""
@@ -337,16 +318,15 @@ class WideString(DataType, frozen=True):
         if not isinstance(value, str):
             raise self._refuse(value, "a text")
         try:
-            octets = value.encode("utf-16-le")
+            octets = value.encode(self.encoding)
         except UnicodeEncodeError:
             raise self._refuse(value, "a text without lone surrogates") from None
         if "\0" in value:
             raise self._refuse(value, "a text without NUL, which would end it")
-        units = self.size // 2 - 1
-        if len(octets) > 2 * units:
-            raise self._refuse(
-                value, f"at most {units} units of UTF-16, this text has {len(octets) // 2}"
-            )
+        room = self.size - self.nul_size
+        if len(octets) > room:
+            most, given = room // self.unit, len(octets) // self.unit
+            raise self._refuse(value, f"at most {most} {self.units}, this text has {given}")
         return octets.ljust(self.size, b"\0")
 
     def parse_text(self, text: str) -> Value:
@@ -356,9 +336,25 @@ class WideString(DataType, frozen=True):
 
     def decode(self, buffer: Buffer, offset: int) -> Value:
         """Read the text up to the first NUL, or up to the place of the last one."""
-        octets = bytes(buffer[offset : offset + self.size - 2])
-        text = octets.decode("utf-16-le", errors="replace")
-        return text.partition("\0")[0]
+        octets = bytes(buffer[offset : offset + self.size - self.nul_size])
+        return octets.decode(self.encoding, errors="replace").partition("\0")[0]
+
+
+class String(Text, frozen=True):
+    """Text in UTF-8; all bytes may be text."""
+
+    encoding = "utf-8"
+    unit = 1
+    units = "bytes"
+
+
+class WideString(Text, frozen=True):
+    """Text in UTF-16: a fixed number of units, then the NUL that IEC 61131-3 controllers add."""
+
+    encoding = "utf-16-le"
+    unit = 2
+    units = "units of UTF-16"
+    nul_size = 2
 
 
 class WideChar(DataType, frozen=True):

@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, Self
 
-from eap.codec.basetypes import DataType, Integer, Plain, Value
+from eap.codec.basetypes import DataType, Integer, Plain, Value, whole_number
 from eap.codec.wire import Buffer
 from eap.suggest import suggest
 
@@ -88,9 +88,7 @@ class Enumeration(Integer, frozen=True):
         """Read a name, also behind that of the type and a dot, or a number."""
         word = text.strip()
         try:
-            return self.decode(
-                self.encode(int(word, 10 if word.lstrip("+-").isdecimal() else 0)), 0
-            )
+            return self.decode(self.encode(whole_number(word)), 0)
         except ValueError:
             return self.decode(self.encode(word), 0)
 

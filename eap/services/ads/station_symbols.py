@@ -26,8 +26,8 @@ from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import to_filetime
-from eap.codec.basetypes import WideString
-from eap.codec.datatypes import Array, String
+from eap.codec.basetypes import Text
+from eap.codec.datatypes import Array
 from eap.codec.structures import Structure
 from eap.errors import ImageError, TornReadError, WriterConflictError
 from eap.ids import Endpoint, NetId
@@ -79,7 +79,7 @@ class ImageVariables:
         kind = datatypes.parse(self._image.slot(name).type)
         # Bytes of texts go on as they are, whatever their encoding; so does the memory of a struct,
         # in which other members may have values that are none of their types.
-        is_memory = isinstance(kind, String | WideString | Structure | Array)
+        is_memory = isinstance(kind, Text | Structure | Array)
         value = bytes(octets) if is_memory else kind.decode(octets, 0)
         try:
             self._station.write_once(Writer.APPLICATION, {name: value})
