@@ -72,6 +72,11 @@ class FindingReport:
             # Two checks may find the same: one line for the user.
             self._findings.setdefault((where, message, expected), finding)
 
+    def add_error(self, path: str, subject: str, error: ValueError, expected: str) -> None:
+        """Report an error of a data type or value; *expected* is for one that does not say it."""
+        what, _, own = str(error).partition(": expected ")
+        self.add(path, f"{subject}: {what}", own or expected)
+
     def add_breaches(self, at: str, breaches: Iterable[RuleViolation]) -> None:
         """Report *breaches* of rules by the section at *at*."""
         for breach in breaches:

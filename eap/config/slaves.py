@@ -461,10 +461,8 @@ def _data(
             key = "value"
             data = kind.encode(kind.from_plain(section.value))
         except ValueError as exc:
-            reason, _, range_text = str(exc).partition(": expected ")
             usual = f"a value of {kind_text}" if key == "value" else "a data type"
-            message = f"{target} of {slave.name}: {reason}"
-            report.add(f"{section.at}.{key}", message, range_text or usual)
+            report.add_error(f"{section.at}.{key}", f"{target} of {slave.name}", exc, usual)
             raise _BadKeyError from None
     size = 0 if known is None else (known.bit_length + 7) // 8
     is_text = known is not None and known.type.startswith("STRING")

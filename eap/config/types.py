@@ -37,7 +37,7 @@ _CHUNK = 1 << 16
 _MANY_ROWS = 50
 """Members of a layout in a finding; of larger ones only those that differ."""
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,254}", re.ASCII)
-_A_TYPE = "a data type such as UINT, REAL or BLOCK(64)"
+A_TYPE = "a data type such as UINT, REAL or BLOCK(64)"
 
 
 class MemberDefinition(msgspec.Struct, frozen=True, kw_only=True):
@@ -276,7 +276,7 @@ class TypeTable:
             own = f"{member.name} of {each.name}"
             message = what if what.startswith(own) else f"{own}: {what}"
             where = msgspec.structs.replace(each, path=member.path, line=member.line)
-            raise self._reported(where, message, expected or _A_TYPE) from None
+            raise self._reported(where, message, expected or A_TYPE) from None
 
     def _contradiction(
         self,
@@ -437,8 +437,7 @@ def _complete(
         report.broken_types.add(variable.type)
         return variable
     except ValueError as exc:
-        what, _, expected = str(exc).partition(": expected ")
-        report.add(f"{variable.at}.type", f"{name}: {what}", expected or _A_TYPE)
+        report.add_error(f"{variable.at}.type", name, exc, A_TYPE)
         report.broken_types.add(variable.type)
         return variable
     return msgspec.structs.replace(variable, type=text)

@@ -15,6 +15,7 @@ from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index, Span, VariablePart
 from eap.config.ports import check_names
 from eap.config.structs import StationSection, VariableSection
+from eap.config.types import A_TYPE
 from eap.pd.rules import MADE_SUFFIXES
 from eap.pd.spec import (
     INTERFACE_MEASURES,
@@ -86,18 +87,14 @@ def _check_variable(path: str, name: str, variable: VariableSection, report: Fin
         kind = datatypes.parse(variable.type)
     except ValueError as exc:
         if variable.type not in report.broken_types:
-            what, _, expected = str(exc).partition(": expected ")
-            expected = expected or "a data type such as UINT, REAL or BLOCK(64)"
-            report.add(f"{path}.type", f"{name}: {what}", expected)
+            report.add_error(f"{path}.type", name, exc, A_TYPE)
         return
     if variable.default is None:
         return
     try:
         kind.from_plain(complete(kind, variable.default))
     except ValueError as exc:
-        what, _, expected = str(exc).partition(": expected ")
-        expected = expected or f"a value of {kind.name}"
-        report.add(f"{path}.default", f"default of {name}: {what}", expected)
+        report.add_error(f"{path}.default", f"default of {name}", exc, f"a value of {kind.name}")
 
 
 def _check_source(
