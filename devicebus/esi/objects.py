@@ -6,12 +6,13 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from devicebus.esi.fields import Fields, english
-from devicebus.esi.records import EsiAccess, EsiObject, EsiValue
+from devicebus.esi.records import EsiObject, EsiValue
 from eap.codec import datatypes
 from eap.codec.xmlstream import XmlElement, parse_integer
+from eap.od.model import RO, RW, RW_PREOP, WO, Access
 
 _BY_BITS = {1: "BOOL", 8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
-_ACCESS = {"ro": EsiAccess.READ, "wo": EsiAccess.WRITE, "rw": EsiAccess.READ_WRITE}
+_ACCESS = {"ro": RO, "wo": WO, "rw": RW}
 _MAX_SUBINDEX = 0xFF
 _MAX_BITS = 8 * 0xFFFF
 _MAX_BASES = 16
@@ -23,7 +24,7 @@ class _SubItem(NamedTuple):
     subindex: int
     name: str
     type: str
-    access: EsiAccess
+    access: Access
 
 
 def type_of(name: str, bits: int) -> str:
@@ -110,7 +111,7 @@ class _DictionaryReader:
                 label = english(item) or f"SubIndex {subindex:03}"
                 yield _SubItem(subindex, label, type_of(self._base(name), bits), access)
 
-    def _elements(self, array: XmlElement | None, access: EsiAccess) -> Iterator[_SubItem]:
+    def _elements(self, array: XmlElement | None, access: Access) -> Iterator[_SubItem]:
         """Yield the elements of an array."""
         if array is None:
             return
@@ -167,12 +168,10 @@ class _DictionaryReader:
         return None
 
 
-def _access(item: XmlElement) -> EsiAccess:
+def _access(item: XmlElement) -> Access:
     flags = item.find("Flags/Access")
     if flags is None:
-        return EsiAccess.READ_WRITE
-    access = _ACCESS.get(flags.text.lower(), EsiAccess.READ_WRITE)
-    restricted = flags.get("WriteRestrictions").lower() == "preop"
-    if access is EsiAccess.READ_WRITE and restricted:
-        return EsiAccess.CONFIGURATION
-    return access
+        return RW
+    access = _ACCESS.get(flags.text.lower(), RW)
+    is_restricted = flags.get("WriteRestrictions").lower() == "preop"
+    return RW_PREOP if access == RW and is_restricted else access

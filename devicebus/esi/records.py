@@ -5,10 +5,11 @@ Numbers of PDOs, sync managers and sizes are those of the file; nothing is compl
 
 from __future__ import annotations
 
-from enum import Enum, StrEnum
+from enum import StrEnum
 
 import msgspec
 
+from eap.od.model import RW, Access
 from eap.od.slave_config import OpMode, RevisionRule, StateTimeouts
 
 
@@ -166,24 +167,20 @@ class EsiAlternative(msgspec.Struct, frozen=True, kw_only=True):
     """PDOs by sync manager."""
 
 
-class EsiAccess(Enum):
-    """Access rights of an entry."""
-
-    READ = "ro"
-    WRITE = "wo"
-    READ_WRITE = "rw"
-    CONFIGURATION = "rw-preop"
-
-
 class EsiValue(msgspec.Struct, frozen=True, kw_only=True):
-    """Entry of an object: type and access; *default* is encoded."""
+    """Entry of an object.
+
+    Not an EntrySpec of a bus file: that has a value as a user writes it, with limits, whereas a
+    vendor gives the encoded initial value.
+    """
 
     subindex: int
     name: str
     type: str
     """For ``datatypes.parse``, with the length of the file."""
-    access: EsiAccess = EsiAccess.READ_WRITE
+    access: Access = RW
     default: bytes | None = None
+    """Encoded initial value; None without one."""
 
 
 class EsiObject(msgspec.Struct, frozen=True, kw_only=True):

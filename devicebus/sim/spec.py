@@ -42,7 +42,7 @@ class ProfileKind(Enum):
 
 
 class AccessKind(Enum):
-    """Access rights of an entry, by state where they differ."""
+    """Access rights of an entry or a file, as a bus file writes them."""
 
     READ = "ro"
     WRITE = "wo"

@@ -19,7 +19,6 @@ from devicebus.esi.choice import (
 from devicebus.esi.names import ProcessEntry, name_entries, process_entries
 from devicebus.esi.objects import type_of
 from devicebus.esi.records import (
-    EsiAccess,
     EsiCoe,
     EsiDevice,
     EsiInitCommand,
@@ -45,7 +44,7 @@ from devicebus.sim.pdo import ProcessChannel
 from devicebus.sim.spec import ChannelSpec, ClockSpec, MailboxSpec, ProfileKind, SlaveSpec
 from eap.ids import ObjectId
 from eap.od.dictionary import ObjectDictionary
-from eap.od.model import RO, RW, RW_PREOP, WO, Access, Entry, ObjectCode, OdObject, array, record
+from eap.od.model import RO, RW, RW_PREOP, Access, Entry, ObjectCode, OdObject, array, record
 from eap.suggest import suggest
 
 _STANDARD = frozenset(
@@ -59,12 +58,6 @@ _SM_TYPES = {
     SmUse.INPUTS: 4,
     SmUse.DYNAMIC_OUTPUTS: 3,
     SmUse.DYNAMIC_INPUTS: 4,
-}
-_ACCESS = {
-    EsiAccess.READ: RO,
-    EsiAccess.WRITE: WO,
-    EsiAccess.READ_WRITE: RW,
-    EsiAccess.CONFIGURATION: RW_PREOP,
 }
 _SINGLE_BUFFER = 2
 _BUFFERS = 3
@@ -356,7 +349,7 @@ def _device_type(device: EsiDevice, default: int) -> int:
 def _object(item: EsiObject) -> OdObject:
     entries: dict[int, Entry] = {}
     for each in item.entries:
-        entry = Entry(each.name, each.type, _ACCESS[each.access])
+        entry = Entry(each.name, each.type, each.access)
         if each.default is not None:
             octets = each.default.rstrip(b"\0") if entry.is_text else each.default
             entry.default = entry.octets = octets

@@ -6,8 +6,8 @@ import pytest
 
 from devicebus.esi.fields import Fields
 from devicebus.esi.objects import read_objects, type_of
-from devicebus.esi.records import EsiAccess
 from eap.codec.xmlstream import read_tree
+from eap.od.model import RO, RW, RW_PREOP, WO
 
 DICTIONARY_XML = """
 <Device><Profile><Dictionary>
@@ -68,24 +68,24 @@ def test_record(found):
         (each.subindex, each.name, each.type, each.default, each.access)
         for each in found[0x8000].entries
     ] == [
-        (1, "Filter", "UINT", b"\x34\x12", EsiAccess.CONFIGURATION),
-        (17, "Scale", "REAL", bytes.fromhex("0000803f"), EsiAccess.READ),
-        (18, "Flags", "BIT4", None, EsiAccess.READ_WRITE),
+        (1, "Filter", "UINT", b"\x34\x12", RW_PREOP),
+        (17, "Scale", "REAL", bytes.fromhex("0000803f"), RO),
+        (18, "Flags", "BIT4", None, RW),
     ]
 
 
 def test_array(found):
     assert [(each.subindex, each.type, each.access) for each in found[0x8010].entries] == [
-        (sub, "INT", EsiAccess.READ) for sub in (1, 2, 3)
+        (sub, "INT", RO) for sub in (1, 2, 3)
     ]
 
 
 def test_variables(found):
     entries = [found[index].entries[0] for index in (0x8012, 0x8013, 0x8014)]
     assert [(each.type, each.default, each.access) for each in entries] == [
-        ("STRING(4)", b"abc\0", EsiAccess.READ_WRITE),
-        ("UDINT", bytes.fromhex("10000000"), EsiAccess.WRITE),
-        ("UINT", None, EsiAccess.READ_WRITE),
+        ("STRING(4)", b"abc\0", RW),
+        ("UDINT", bytes.fromhex("10000000"), WO),
+        ("UINT", None, RW),
     ]
 
 
