@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import msgspec
 
 from devicebus.esi.content import ListedDevice
 from devicebus.esi.device import MAX_SLOTS
+from devicebus.esi.names import ProcessEntry, process_entries
 from devicebus.esi.records import (
+    EsiCoe,
     EsiDevice,
     EsiInitCommand,
     EsiModule,
@@ -31,6 +33,12 @@ from eap.suggest import suggest
 
 MODULE_LIST = 0xF030
 """Object with the idents of the configured modules (ETG.5001)."""
+DETECTED_MODULES = 0xF050
+"""Object with the idents of the modules that are there (ETG.5001)."""
+MAX_MODULE_LIST = 254
+"""Modules that either object can list."""
+_SYNC0 = 0x0200
+"""Bit of AssignActivate: register 0x0981, bit 1."""
 _LOW = 0xFFFF
 _MAX_INDEX = 0xFFFF
 _SHOWN_TYPES = 12
@@ -298,31 +306,66 @@ def needs_sync0(device: EsiDevice) -> bool:
     return bool(device.op_modes) and all(each.mode.activate & _SYNC0 for each in device.op_modes)
 
 
-_SYNC0 = 0x0200
-"""Bit of AssignActivate: register 0x0981, bit 1."""
+class EsiPlan(NamedTuple):
+    """Device with its modules, and the PDOs of its sync managers by default."""
+
+    device: EsiDevice
+    assignment: dict[int, tuple[EsiPdo, ...]]
+    modules: tuple[int, ...] = ()
+    """Idents of the modules in the slots, 0 for none."""
+
+    @property
+    def coe(self) -> EsiCoe | None:
+        """Its CoE, None without one."""
+        return self.device.mailbox.coe if self.device.mailbox else None
+
+    @property
+    def takes_assignment(self) -> bool:
+        """True if a master may change the PDO assignment."""
+        return self.coe is not None and self.coe.pdo_assign
+
+    def has_fixed_mapping(self, pdo: EsiPdo) -> bool:
+        """Return true if a master cannot change the entries of *pdo*."""
+        if self.device.is_soe:
+            return False  # the lists S-0-0016 and S-0-0024 change a telegram
+        return pdo.is_fixed or self.coe is None or not self.coe.pdo_config
+
+    def entries(self) -> Iterator[ProcessEntry]:
+        """Yield the entries of all PDOs, assigned or not."""
+        yield from process_entries(self.device.pdos, is_soe=self.device.is_soe)
 
 
-def default_config(
-    device: EsiDevice, assignment: Mapping[int, Sequence[EsiPdo]], modules: Sequence[int] = ()
-) -> SlaveConfig:
+def plan_device(device: EsiDevice, modules: Sequence[int | str | None] | None = None) -> EsiPlan:
+    """Return the plan of a device with *modules*; None for its defaults.
+
+    Raises:
+        ValueError: a module does not fit.
+    """
+    chosen = default_modules(device) if modules is None else find_modules(device, modules)
+    whole = with_modules(device, chosen)
+    idents = tuple(module.ident if module else 0 for module in chosen)
+    return EsiPlan(whole, default_assignment(whole), idents)
+
+
+def default_config(plan: EsiPlan) -> SlaveConfig:
     """Return the configuration that a tool gives a slave with this description.
 
-    The list of the idents of its *modules* where the slave wants it, its PDO assignment where the
+    The list of the idents of its modules where the slave wants it, its PDO assignment where the
     slave takes one, its start-up writes, its first operation mode, time-outs and the rule for its
     revision.
     """
-    coe = device.mailbox.coe if device.mailbox else None
-    takes_pdos = coe is not None and coe.pdo_assign
+    device = plan.device
     mode = device.op_modes[0].mode if device.op_modes else None
     identification = ID_REGISTER if device.has_reg134_identification else ALIAS_REGISTER
     return SlaveConfig(
         assignment={
             number: tuple(pdo.index for pdo in pdos)
-            for number, pdos in assignment.items()
-            if takes_pdos and any(manager_for(device, pdo) == number for pdo in device.pdos)
+            for number, pdos in plan.assignment.items()
+            if plan.takes_assignment
+            and any(manager_for(device, pdo) == number for pdo in device.pdos)
         },
-        fixed_pdos=not takes_pdos,
-        writes=(*_module_list(device, modules), *_writes(device)),
+        fixed_pdos=not plan.takes_assignment,
+        writes=(*_module_list(plan), *_writes(device)),
         sync=mode if mode is not None and mode.activate >> 8 else None,
         timeouts=device.timeouts,
         revision_rule=device.revision_rule or RevisionRule.EXACT,
@@ -330,14 +373,14 @@ def default_config(
     )
 
 
-def _module_list(device: EsiDevice, modules: Sequence[int]) -> Iterator[SdoWrite]:
+def _module_list(plan: EsiPlan) -> Iterator[SdoWrite]:
     """Yield the writes of the configured module ident list (ETG.5001, object 0xF030)."""
-    if not (device.downloads_modules and modules):
+    if not (plan.device.downloads_modules and plan.modules):
         return
     yield SdoWrite(index=MODULE_LIST, data=b"\0", comment="modules")
-    for subindex, ident in enumerate(modules, 1):
+    for subindex, ident in enumerate(plan.modules, 1):
         yield SdoWrite(index=MODULE_LIST, subindex=subindex, data=ident.to_bytes(4, "little"))
-    yield SdoWrite(index=MODULE_LIST, data=bytes((len(modules),)), comment="number of modules")
+    yield SdoWrite(index=MODULE_LIST, data=bytes((len(plan.modules),)), comment="number of modules")
 
 
 def _writes(device: EsiDevice) -> Iterator[SdoWrite | IdnWrite]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from devicebus.esi.fields import Fields, english, flag
+from devicebus.esi.fields import Fields, english, flag, is_true
 from devicebus.esi.objects import read_objects
 from devicebus.esi.records import (
     EsiAlternative,
@@ -92,8 +92,7 @@ def read_device(element: XmlElement, vendor: int, vendor_name: str, fields: Fiel
         timeouts=_timeouts(element, fields),
         starts_without_sync=_flag_at(element, "Info/StateMachine/Behavior", "StartToSafeopNoSync"),
         ebus_ma=fields.child(element, "Info/Electrical/EBusCurrent", bits=16, is_signed=True),
-        has_reg134_identification=element.findtext("Info/IdentificationReg134").lower()
-        in {"1", "true"},
+        has_reg134_identification=is_true(element.findtext("Info/IdentificationReg134")),
         profile_number=fields.optional_child(element, "Profile/ProfileNo"),
         eeprom=_eeprom(element.find("Eeprom"), fields),
         alternatives=tuple(_alternatives(element, fields)),
@@ -317,7 +316,7 @@ def _init_command(each: XmlElement, place: str, fields: Fields) -> EsiInitComman
         is_adapted=data is not None and flag(data, "AdaptAutomatically"),
         overwritten_by_module=flag(each, "OverwrittenByModule"),
         depends_on_slot=flag(index, "DependOnSlot"),
-        comment=" ".join(english(each, "Comment").split()),
+        comment=english(each, "Comment"),
     )
 
 

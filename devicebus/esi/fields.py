@@ -105,8 +105,13 @@ class Fields:
 
 
 def flag(element: XmlElement, name: str) -> bool:
-    """Return a Boolean attribute: 1 or true."""
-    return element.get(name).lower() in _TRUE
+    """Return a Boolean attribute."""
+    return is_true(element.get(name))
+
+
+def is_true(text: str) -> bool:
+    """Return true for 1 and true, the texts of an XML Boolean."""
+    return text.lower() in _TRUE
 
 
 def english(element: XmlElement, tag: str = "Name") -> str:

@@ -35,8 +35,7 @@ def process_entries(pdos: Iterable[EsiPdo], *, is_soe: bool = False) -> Iterator
     With SoE the IDNs of each drive have a subindex of their own, so that drives do not share them.
     """
     for pdo in pdos:
-        # PDO 24 is the MDT of the first drive, 0x1018 that of the second (ETG.1000.6).
-        drive = (pdo.index >> 12) + 1 if is_soe else 0
+        drive = pdo.drive + 1 if is_soe else 0
         for entry in pdo.entries:
             for bits in _parts(entry.bits):
                 place = (entry.index, entry.subindex + drive) if entry.index else (0, 0)

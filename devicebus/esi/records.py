@@ -90,6 +90,12 @@ class EsiPdo(msgspec.Struct, frozen=True, kw_only=True):
     line: int = 0
 
     @property
+    def drive(self) -> int:
+        """Drive whose telegram it is, with SoE."""
+        # PDO 24 is the MDT of the first drive, 0x1018 that of the second (ETG.1000.6).
+        return self.index >> 12
+
+    @property
     def bits(self) -> int:
         """Sum of the bits of all entries."""
         return sum(entry.bits for entry in self.entries)

@@ -12,11 +12,10 @@ from pathlib import Path
 
 import msgspec
 
-from devicebus.esi.choice import DeviceQuery
+from devicebus.esi.choice import DeviceQuery, plan_device
 from devicebus.esi.device import read_device
 from devicebus.esi.fields import Fields
 from devicebus.esi.records import EsiDevice
-from devicebus.sim.devices.esi import plan_device
 from eap.codec.soe import Idn
 from eap.codec.xmlstream import XmlElement
 from eap.config.imports.eni_records import EniBus, EniSlave, EniVariable
@@ -250,7 +249,7 @@ def _by_slave(bus: EniBus) -> dict[str, list[EniVariable]]:
 def _disagreement(eni: EniSlave, device: EsiDevice) -> str:
     """Return what the vendor's description lacks of the ENI; empty if they agree."""
     try:
-        plan = plan_device(device, None)
+        plan = plan_device(device)
     except ValueError as exc:
         return str(exc)
     known = {pdo.index: pdo for pdo in plan.device.pdos}
@@ -359,7 +358,7 @@ def _assignment(slave: _BusSlave) -> dict[int, tuple[int, ...]]:
     """Return the PDOs that are not those of the vendor's description by default."""
     if slave.vendor_device is None:
         return {}
-    plan = plan_device(slave.vendor_device, None)
+    plan = plan_device(slave.vendor_device)
     usual = {number: tuple(pdo.index for pdo in pdos) for number, pdos in plan.assignment.items()}
     wanted = dict(slave.eni.assigns)
     for number, manager in slave.eni.managers.items():

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from devicebus.esi.choice import DeviceQuery
+from devicebus.esi.choice import DETECTED_MODULES, MAX_MODULE_LIST, DeviceQuery, plan_device
 from devicebus.esi.names import legal
 from devicebus.esi.records import EsiDevice
 from devicebus.mailbox import coe_client
@@ -18,7 +18,6 @@ from devicebus.master import eeprom
 from devicebus.master.image import ProcessVariable, data_type_of
 from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel, channels_from_sii, read_channels
 from devicebus.master.procedure import read
-from devicebus.sim.devices.esi import DETECTED_MODULES, plan_device
 from devicebus.wire import sii
 from devicebus.wire.register import Register
 from devicebus.wire.sii import Sii, SiiProtocol
@@ -27,7 +26,6 @@ from eap.od.slave_config import RevisionRule
 from eap.ops.bus_session import Begin, Slave, SlaveBus
 from eap.runtime.esi_files import EsiSource
 
-_MAX_MODULES = 254
 _MAX_MAILBOX, _MIN_MAILBOX = 1486, 32
 _CLOCK = 0x04
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
@@ -145,7 +143,7 @@ def _modules(bus: SlaveBus, slave: Slave, notes: list[str]) -> tuple[int, ...]:
     try:
         octets = bus.converse(slave, _upload(DETECTED_MODULES, 0), "counting modules")
         idents = []
-        for subindex in range(1, min(octets[0], _MAX_MODULES) + 1 if octets else 0):
+        for subindex in range(1, min(octets[0], MAX_MODULE_LIST) + 1 if octets else 0):
             ident = bus.converse(slave, _upload(DETECTED_MODULES, subindex), "modules")
             idents.append(int.from_bytes(ident, "little"))
     except EapError as exc:

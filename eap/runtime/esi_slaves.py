@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from devicebus.esi.choice import DeviceQuery, default_config
+from devicebus.esi.choice import DeviceQuery, EsiPlan, default_config, plan_device
 from devicebus.esi.names import ProcessEntry, process_entries
 from devicebus.esi.objects import type_of
 from devicebus.esi.records import EsiDevice, EsiPdo
-from devicebus.sim.devices.esi import EsiPlan, plan_device
 from devicebus.sim.spec import DEFAULT_VENDOR, SlaveSpec
 from eap.codec import datatypes
 from eap.config.finding import FindingReport
@@ -97,7 +96,7 @@ def describe_device(spec: SlaveSpec, device: EsiDevice) -> DescribedSlave:
         alias=spec.alias or None,
         outputs=tuple(_assigned(plan, is_output=True)),
         inputs=tuple(_assigned(plan, is_output=False)),
-        config=default_config(whole, plan.assignment, plan.modules),
+        config=default_config(plan),
         pdos=pdos,
         objects=tuple(_objects(whole)),
         op_modes=tuple(each.mode for each in whole.op_modes),
@@ -129,7 +128,6 @@ def _pdos(plan: EsiPlan) -> Iterator[DescribedPdo]:
     for number, each in reversed(list(enumerate(plan.device.sync_managers))):
         if not each.is_mailbox:
             first[each.is_output] = number
-    coe = plan.coe
     order = [pdo for pdos in plan.assignment.values() for pdo in pdos]
     order += [pdo for pdo in plan.device.pdos if pdo.index not in assigned]
     for pdo in order:
@@ -146,7 +144,7 @@ def _pdos(plan: EsiPlan) -> Iterator[DescribedPdo]:
             manager=manager,
             assigned=pdo.index in assigned,
             mandatory=pdo.is_mandatory,
-            fixed=not plan.device.is_soe and (pdo.is_fixed or coe is None or not coe.pdo_config),
+            fixed=plan.has_fixed_mapping(pdo),
             excludes=pdo.excludes,
             entries=tuple(_entries(pdo, manager)),
         )

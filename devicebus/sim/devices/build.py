@@ -8,13 +8,13 @@ from functools import partial
 
 import msgspec
 
+from devicebus.esi.choice import EsiPlan, plan_device
 from devicebus.esi.records import EsiDevice
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_server import SoeParameter
 from devicebus.sim.device import Behaviour, Device
 from devicebus.sim.devices import drive, esi, esi_image
 from devicebus.sim.devices.drive import Axes
-from devicebus.sim.devices.esi import EsiPlan
 from devicebus.sim.devices.objects import INPUTS, OUTPUTS, build_dictionary, object_ids_of
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.devices.signal import Signals
@@ -109,7 +109,7 @@ def build_slave(
     if spec.kind is DeviceKind.ESI:
         if device is None:
             raise ValueError("a device of kind esi needs its description (key esi)")
-        return _build_esi(spec, resources, esi.plan_device(device, spec.modules), ports)
+        return _build_esi(spec, resources, plan_device(device, spec.modules), ports)
     spec = complete(spec)
     dictionary = build_dictionary(spec, device_type(spec))
     axes = spec.axes if spec.kind is DeviceKind.DRIVE else 0

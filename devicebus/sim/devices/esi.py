@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple
 
 import msgspec
 
 from devicebus.esi.choice import (
+    DETECTED_MODULES,
+    MAX_MODULE_LIST,
     MODULE_LIST,
-    default_assignment,
-    default_modules,
-    find_modules,
+    EsiPlan,
     needs_sync0,
-    with_modules,
 )
-from devicebus.esi.names import ProcessEntry, name_entries, process_entries
+from devicebus.esi.names import ProcessEntry, name_entries
 from devicebus.esi.objects import type_of
 from devicebus.esi.records import (
-    EsiCoe,
     EsiDevice,
     EsiInitCommand,
     EsiObject,
@@ -65,41 +62,7 @@ _MEMORY = 0x1000
 _MAX_RAM = 60 << 10
 _CONTROL_WORD, _STATUS_WORD = 0x6040, 0x6041
 _MAX_AXES = 8
-DETECTED_MODULES = 0xF050
-"""Object with the idents of the modules that are there (ETG.5001)."""
-_MAX_MODULES = 254
 _DEFAULT_MAILBOX = 128
-
-
-class EsiPlan(NamedTuple):
-    """Device with its modules, and the PDOs of its sync managers by default."""
-
-    device: EsiDevice
-    assignment: dict[int, tuple[EsiPdo, ...]]
-    modules: tuple[int, ...] = ()
-    """Idents of the modules in the slots, 0 for none."""
-
-    @property
-    def coe(self) -> EsiCoe | None:
-        """Its CoE, None without one."""
-        return self.device.mailbox.coe if self.device.mailbox else None
-
-    def entries(self) -> Iterator[ProcessEntry]:
-        """Yield the entries of all PDOs, assigned or not."""
-        yield from process_entries(self.device.pdos, is_soe=self.device.is_soe)
-
-
-def plan_device(device: EsiDevice, modules: Iterable[int | str | None] | None) -> EsiPlan:
-    """Return the plan of a device with *modules*; None for its defaults.
-
-    Raises:
-        ValueError: a module does not fit.
-    """
-    given = None if modules is None else tuple(modules)
-    chosen = default_modules(device) if given is None else find_modules(device, given)
-    whole = with_modules(device, chosen)
-    idents = tuple(module.ident if module else 0 for module in chosen)
-    return EsiPlan(whole, default_assignment(whole), idents)
 
 
 def complete(spec: SlaveSpec, plan: EsiPlan) -> SlaveSpec:
@@ -386,18 +349,20 @@ def _add_entries(spec: SlaveSpec, plan: EsiPlan, dictionary: ObjectDictionary) -
 
 
 def _add_pdos(plan: EsiPlan, dictionary: ObjectDictionary) -> None:
-    device, coe = plan.device, plan.coe
+    device = plan.device
     mapped: dict[int, list[tuple[int, int, int]]] = {pdo.index: [] for pdo in device.pdos}
     for entry in plan.entries():
         mapped[entry.pdo].append((entry.index, entry.subindex, entry.bits))
     for pdo in device.pdos:
         if pdo.index in dictionary:
             raise ValueError(f"PDO 0x{pdo.index:04X} is there twice, or is an object as well")
-        # With SoE the lists S-0-0016 and S-0-0024 change a telegram.
-        is_fixed = not device.is_soe and (pdo.is_fixed or coe is None or not coe.pdo_config)
         dictionary.add(
             mapping(
-                pdo.index, mapped[pdo.index], dictionary, is_output=pdo.is_output, is_fixed=is_fixed
+                pdo.index,
+                mapped[pdo.index],
+                dictionary,
+                is_output=pdo.is_output,
+                is_fixed=plan.has_fixed_mapping(pdo),
             )
         )
     excludes = _exclusions(device.pdos)
@@ -407,7 +372,7 @@ def _add_pdos(plan: EsiPlan, dictionary: ObjectDictionary) -> None:
         rules = PdoRules(
             frozenset(pdo.index for pdo in device.pdos if pdo.is_output is manager.is_output),
             excludes,
-            is_fixed=coe is None or not coe.pdo_assign,
+            is_fixed=not plan.takes_assignment,
         )
         pdos = [pdo.index for pdo in plan.assignment.get(number, ())]
         dictionary.add(
@@ -426,7 +391,7 @@ def _exclusions(pdos: Iterable[EsiPdo]) -> Mapping[int, frozenset[int]]:
 
 def _add_modules(plan: EsiPlan, dictionary: ObjectDictionary) -> None:
     """Add the lists of configured and detected modules (ETG.5001)."""
-    modules = plan.modules[:_MAX_MODULES]
+    modules = plan.modules[:MAX_MODULE_LIST]
     if DETECTED_MODULES not in dictionary:
         dictionary.add(array(DETECTED_MODULES, "Detected module ident list", "UDINT", modules))
     if MODULE_LIST not in dictionary:

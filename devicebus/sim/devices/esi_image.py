@@ -6,10 +6,11 @@ from collections.abc import Iterable
 
 import msgspec
 
+from devicebus.esi.choice import EsiPlan
 from devicebus.esi.names import process_entries
 from devicebus.esi.objects import type_of
 from devicebus.esi.records import EsiDevice, EsiOpMode, EsiPdo, SmUse
-from devicebus.sim.devices.esi import EsiPlan, control_of, fixed_size, mailbox_sizes, sm_type
+from devicebus.sim.devices.esi import control_of, fixed_size, mailbox_sizes, sm_type
 from devicebus.sim.devices.siibuild import SiiStrings, fill, protocols_of
 from devicebus.sim.spec import SlaveSpec
 from devicebus.wire import sii

@@ -66,11 +66,6 @@ def find_value(dictionary: ObjectDictionary, idn: int, drive: int) -> Entry | No
     return dictionary[idn].entries.get(drive + 1)
 
 
-def drive_of(pdo: EsiPdo) -> int:
-    """Return the drive of a telegram: 24 and 16 are of the first one, 0x1018 is of the second."""
-    return pdo.index >> 12
-
-
 def soe_parameters(
     device: EsiDevice, dictionary: ObjectDictionary
 ) -> dict[int, list[SoeParameter]]:
@@ -84,7 +79,7 @@ def _parameters(
 ) -> Iterator[SoeParameter]:
     known: set[int] = set()
     for pdo in device.pdos:
-        if drive_of(pdo) != drive:
+        if pdo.drive != drive:
             continue
         number = _MDT_LIST if pdo.is_output else _AT_LIST
         if number not in known:

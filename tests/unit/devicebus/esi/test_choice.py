@@ -13,6 +13,7 @@ from devicebus.esi.choice import (
     find_modules,
     match_slave,
     needs_sync0,
+    plan_device,
     with_modules,
 )
 from devicebus.esi.content import ListedDevice
@@ -192,7 +193,7 @@ def test_configuration_by_default():
             EsiInitCommand(transitions=("BI",), index=0x8000, subindex=1, data=b"\6"),
         ),
     )
-    config = default_config(described, default_assignment(described))
+    config = default_config(plan_device(described))
     assert config.assignment == {2: (0x1600,)}
     assert not config.fixed_pdos
     assert config.writes == (SdoWrite(at=(Transition.IP,), index=0x8000, subindex=1, data=b"\5"),)
@@ -202,7 +203,7 @@ def test_configuration_by_default():
 
 def test_configuration_of_a_simple_terminal_leaves_its_pdos():
     described = device(pdo(0x1600, 2), mailbox=None, op_modes=(FREE, DC))
-    config = default_config(described, default_assignment(described))
+    config = default_config(plan_device(described))
     assert (config.assignment, config.fixed_pdos, config.sync) == ({}, True, None)
 
 

@@ -6,9 +6,10 @@ import io
 
 import pytest
 
+from devicebus.esi.choice import plan_device
 from devicebus.esi.content import list_devices, load_device
 from devicebus.sim.devices.build import build_slave
-from devicebus.sim.devices.esi import complete, plan_device
+from devicebus.sim.devices.esi import complete
 from devicebus.sim.spec import ChannelSpec, DeviceKind, SlaveSpec
 from devicebus.wire import sii
 from tests.support.terminals import esi
@@ -62,7 +63,7 @@ def device_of(xml, number=1):
 
 
 def completed(xml, number=1, spec=SPEC):
-    return complete(spec, plan_device(device_of(xml, number), None))
+    return complete(spec, plan_device(device_of(xml, number)))
 
 
 def test_esi_device_equals_its_file():

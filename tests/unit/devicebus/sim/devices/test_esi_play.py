@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from devicebus.errors import AlStatusError
-from devicebus.esi.choice import default_config
+from devicebus.esi.choice import default_config, plan_device
 from devicebus.esi.content import list_devices, load_device
 from devicebus.mailbox import coe_client, soe_client
 from devicebus.master.bus import MasterSettings
@@ -16,7 +16,6 @@ from devicebus.master.master import Master
 from devicebus.master.matching import ExpectedSlave
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.devices.drive import DriveState
-from devicebus.sim.devices.esi import plan_device
 from devicebus.sim.spec import BusSpec, DeviceKind, ProfileKind, SlaveSpec
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState
@@ -51,9 +50,7 @@ def wire(device, config=None, modules=None, **spec):
         name="x",
         vendor=device.vendor,
         product=device.product,
-        config=default_config(plan.device, plan.assignment, plan.modules)
-        if config is None
-        else config,
+        config=default_config(plan) if config is None else config,
     )
     return Paced(Master(MasterSettings(expected=(expected,), cycle_ns=CYCLE_NS)), segment)
 
