@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from devicebus.esi.choice import DeviceQuery, EsiPlan, default_config, plan_device
+from devicebus.esi.choice import DeviceQuery, EsiPlan, default_config, manager_for, plan_device
 from devicebus.esi.names import ProcessEntry, process_entries
 from devicebus.esi.objects import type_of
 from devicebus.esi.records import EsiDevice, EsiPdo
@@ -124,18 +124,12 @@ def _assignments(device: EsiDevice) -> dict[str, dict[int, tuple[int, ...]]]:
 
 def _pdos(plan: EsiPlan) -> Iterator[DescribedPdo]:
     assigned = {pdo.index: n for n, pdos in plan.assignment.items() for pdo in pdos}
-    first: dict[bool, int] = {}
-    for number, each in reversed(list(enumerate(plan.device.sync_managers))):
-        if not each.is_mailbox:
-            first[each.is_output] = number
     order = [pdo for pdos in plan.assignment.values() for pdo in pdos]
     order += [pdo for pdo in plan.device.pdos if pdo.index not in assigned]
     for pdo in order:
-        manager = assigned.get(pdo.index, pdo.sync_manager)
+        manager = assigned.get(pdo.index, manager_for(plan.device, pdo))
         if manager is None:
-            if pdo.is_output not in first:
-                continue
-            manager = first[pdo.is_output]
+            continue
         yield DescribedPdo(
             index=pdo.index,
             name=pdo.name,

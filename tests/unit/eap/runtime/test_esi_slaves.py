@@ -7,9 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from devicebus.esi.records import EsiDevice, EsiPdo, EsiSyncManager, SmUse
+from devicebus.sim.spec import DeviceKind, SlaveSpec
 from eap.config.index import name_bus
 from eap.od.slave_config import RevisionRule, SdoWrite
 from eap.runtime import busfile
+from eap.runtime.esi_slaves import describe_device
 
 ROOT = Path(__file__).parents[4] / "config"
 
@@ -53,6 +56,21 @@ def test_variables_have_the_names_of_pdos_and_entries(folder):
     names = list(name_bus("bus0", bus).variables)
     assert names[3:5] == ["bus0.in.Channel_1.Input", "bus0.in.Channel_2.Input"]
     assert "bus0.ai.AI_Standard_Channel_2.Value" in names
+
+
+def test_optional_pdo_has_the_first_sync_manager_that_is_set_up():
+    device = EsiDevice(
+        vendor=1,
+        product=1,
+        revision=1,
+        sync_managers=(
+            EsiSyncManager(use=SmUse.OUTPUTS, is_virtual=True),
+            EsiSyncManager(use=SmUse.OUTPUTS, start=0x1000),
+        ),
+        pdos=(EsiPdo(index=0x1600, name="", is_output=True),),
+    )
+    described = describe_device(SlaveSpec(name="a", kind=DeviceKind.ESI), device)
+    assert [each.manager for each in described.pdos] == [1]
 
 
 def test_pdo_that_is_called_state_leaves_the_state_of_the_slave(folder):
