@@ -339,9 +339,14 @@ def plan_device(device: EsiDevice, modules: Sequence[int | str | None] | None = 
     """Return the plan of a device with *modules*; None for its defaults.
 
     Raises:
-        ValueError: a module does not fit.
+        ValueError: a module does not fit, or there are more than the device can be told of.
     """
     chosen = default_modules(device) if modules is None else find_modules(device, modules)
+    if device.downloads_modules and len(chosen) > MAX_MODULE_LIST:
+        raise ValueError(
+            f"{device.label} has {len(chosen)} modules, object 0x{MODULE_LIST:04X} lists at most"
+            f" {MAX_MODULE_LIST}"
+        )
     whole = with_modules(device, chosen)
     idents = tuple(module.ident if module else 0 for module in chosen)
     return EsiPlan(whole, default_assignment(whole), idents)

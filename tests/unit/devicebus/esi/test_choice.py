@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from devicebus.esi.choice import (
@@ -170,6 +171,16 @@ def test_two_modules_with_the_same_pdo_are_refused():
     modular = device(slots=(SLOT,), modules=MODULES)
     with pytest.raises(ValueError, match="slot 1 has PDO 0x1600, which another slot has"):
         with_modules(modular, find_modules(modular, ["OUT", "OUT"]))
+
+
+def test_modules_that_the_list_of_idents_cannot_hold_are_refused():
+    slot = EsiSlot(idents=(1,), max_instances=255)
+    modular = device(slots=(slot,), modules=(EsiModule(ident=1, type="M"),))
+    assert len(plan_device(modular, ["M"] * 255).modules) == 255
+    writing = msgspec.structs.replace(modular, downloads_modules=True)
+    assert default_config(plan_device(writing, ["M"] * 254)).writes[-1].data == b"\xfe"
+    with pytest.raises(ValueError, match="has 255 modules, object 0xF030 lists at most 254"):
+        plan_device(writing, ["M"] * 255)
 
 
 def test_module_replaces_the_pdo_of_the_device():
