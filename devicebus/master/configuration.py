@@ -6,13 +6,14 @@ are registers.  An error names the slave, the transition and the object that was
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TypeVar
 
 import msgspec
 
 from devicebus.errors import BusError, FrameLostError, MailboxClosedError
 from devicebus.mailbox import coe_client, soe_client
-from devicebus.mailbox.conversation import Conversation
+from devicebus.mailbox.conversation import Conversation, map_requests
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.bus import BusSlave, BusState
 from devicebus.master.clocks import start_sync, stop_sync
@@ -249,26 +250,9 @@ def _ask(bus: BusState, slave: BusSlave, conversation: Conversation[T], name: st
     assert isinstance(mailbox, Mailbox)  # noqa: S101  checked by the callers
     limit_ms = slave.config.timeouts.response_ms
     if limit_ms is not None:
-        conversation = _with_timeout(conversation, limit_ms * _MS)
+        conversation = map_requests(
+            conversation, partial(msgspec.structs.replace, timeout_ns=limit_ms * _MS)
+        )
     _, now_ns = yield Sleep(0)
     task = mailbox.converse(conversation, now_ns, name=name, requester=bus)
     return (yield from wait_for(task))
-
-
-def _with_timeout(conversation: Conversation[T], timeout_ns: int) -> Conversation[T]:
-    """Run a conversation whose answers may take *timeout_ns*."""
-    try:
-        request = next(conversation)
-        while True:
-            request = msgspec.structs.replace(request, timeout_ns=timeout_ns)
-            try:
-                message = yield request
-            except BusError as exc:
-                request = conversation.throw(exc)
-            else:
-                request = conversation.send(message)
-    except StopIteration as end:
-        result: T = end.value
-        return result
-    finally:
-        conversation.close()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator
 import pytest
 
 from devicebus.errors import BusError, MailboxTimeoutError
-from devicebus.mailbox.conversation import drive, drive_async
+from devicebus.mailbox.conversation import drive, drive_async, map_requests
 from eap.errors import EngineGoneError
 
 
@@ -40,15 +40,20 @@ def asynchronous(conversation: Generator[int, str, str], exchange: Callable[[int
     return asyncio.run(drive_async(conversation, exchange_later))
 
 
-both = pytest.mark.parametrize("run", [blocking, asynchronous])
+def mapped(conversation: Generator[int, str, str], exchange: Callable[[int], str]) -> str:
+    shifted = map_requests(conversation, lambda request: request + 10)
+    return drive(shifted, lambda request: exchange(request - 10))
 
 
-@both
+each_way = pytest.mark.parametrize("run", [blocking, asynchronous, mapped])
+
+
+@each_way
 def test_drive_returns_the_result_of_the_conversation(run):
     assert run(Scripted().conversation(), lambda request: f"reply {request};") == "reply 1;reply 2;"
 
 
-@both
+@each_way
 def test_drive_throws_bus_errors_into_the_conversation(run):
     def exchange(request: int) -> str:
         if request == 1:
@@ -58,7 +63,7 @@ def test_drive_throws_bus_errors_into_the_conversation(run):
     assert run(Scripted().conversation(), exchange) == "<no reply>end"
 
 
-@both
+@each_way
 def test_drive_raises_bus_errors_that_the_conversation_does_not_handle(run):
     def exchange(request: int) -> str:
         if request == 2:
@@ -71,7 +76,7 @@ def test_drive_raises_bus_errors_that_the_conversation_does_not_handle(run):
     assert script.log == ["closed"]
 
 
-@both
+@each_way
 def test_drive_closes_the_conversation_on_other_errors(run):
     def exchange(request: int) -> str:
         raise EngineGoneError("restarted")
@@ -97,10 +102,17 @@ def test_drive_async_closes_a_conversation_whose_task_is_cancelled():
     assert script.log == ["closed"]
 
 
-@both
+@each_way
 def test_drive_returns_at_once_when_nothing_is_requested(run):
     def conversation() -> Generator[int, str, str]:
         return "empty"
         yield 0
 
     assert run(conversation(), lambda request: "") == "empty"
+
+
+def test_map_requests_changes_each_request_of_the_conversation():
+    requests = []
+    conversation = map_requests(Scripted().conversation(), lambda request: request + 10)
+    drive(conversation, lambda request: str(requests.append(request)))
+    assert requests == [11, 12]
