@@ -14,11 +14,19 @@ from devicebus.mailbox import soe_client
 from devicebus.mailbox.conversation import Conversation, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel
-from eap.codec.soe import Element, Idn, SoeAttribute, SoeErrorCode, encode_list
+from eap.codec.soe import (
+    AT,
+    CONTROL_WORD,
+    MDT,
+    STATUS_WORD,
+    Element,
+    Idn,
+    SoeAttribute,
+    SoeErrorCode,
+    encode_list,
+)
 from eap.od.slave_config import MappedObject
 
-AT, MDT = 16, 24
-CONTROL_WORD, STATUS_WORD = 134, 135
 _WORDS = (CONTROL_WORD, STATUS_WORD)
 _WORD_BITS = 16
 _DRIVE_SHIFT = 12

@@ -18,6 +18,10 @@ from eap.errors import MalformedError, TruncatedError
 DATA_OVERHEAD = 10
 """Bytes of a mailbox that a message takes before its data."""
 MAX_DRIVE = 7
+AT, MDT = 16, 24
+"""Telegrams of drive 0: numbers of their PDOs, and of the IDNs with the lists of their entries."""
+CONTROL_WORD, STATUS_WORD = 134, 135
+"""Master control word in each MDT, drive status word in each AT; their lists do not have them."""
 
 
 class SoeOpcode(IntEnum):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from msgspec.structs import replace
 
 from eap.codec import datatypes
-from eap.codec.soe import Idn
+from eap.codec.soe import CONTROL_WORD, STATUS_WORD, Idn
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import DescribedPdo, DescribedPdoEntry, DescribedSlave, plain_name
 from eap.config.structs import SlaveSection, StartupSection
@@ -41,8 +41,6 @@ _CYCLIC_BIT = 0x0100
 _TIMES = 1 << 32
 """Times in nanoseconds are 32 bits in the registers."""
 _MAX_ENTRIES = 254
-_FIXED_WORDS = (134, 135)
-"""IDNs of master control word and drive status word."""
 _MANAGERS = {str(number): number for number in range(16)}
 
 
@@ -322,7 +320,9 @@ def _object_id(text: str) -> ObjectId:
 def _fixed_word(pdo: DescribedPdo, entries: Iterable[MappedObject]) -> Iterator[MappedObject]:
     """Yield the first entry of a telegram (SoE), which no list can leave out."""
     for first in pdo.entries[:1]:
-        if first.index in _FIXED_WORDS and all(each.index != first.index for each in entries):
+        if first.index in {CONTROL_WORD, STATUS_WORD} and all(
+            each.index != first.index for each in entries
+        ):
             yield MappedObject(first.index, first.subindex, first.bit_length)
 
 

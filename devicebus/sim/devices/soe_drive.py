@@ -12,12 +12,20 @@ from devicebus.errors import SoeError
 from devicebus.esi.records import EsiDevice, EsiPdo
 from devicebus.mailbox.soe_server import SoeParameter
 from devicebus.wire.alstatus import AlState
-from eap.codec.soe import Display, Idn, SoeAttribute, SoeErrorCode, name_of
+from eap.codec.soe import (
+    AT,
+    CONTROL_WORD,
+    MDT,
+    STATUS_WORD,
+    Display,
+    Idn,
+    SoeAttribute,
+    SoeErrorCode,
+    name_of,
+)
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Entry
 
-_AT_LIST, _MDT_LIST = 16, 24
-_CONTROL, _STATUS = 134, 135
 # Position and velocity: command value in the MDT, feedback value in the AT.
 _FOLLOWERS = ((47, 51), (36, 40))
 _ON = 0xE000
@@ -40,10 +48,10 @@ class SoeAxes:
         """Follow the control word; out of OP the axes are off."""
         del now_ns
         for drive in range(self._channels):
-            control = self._entry(_CONTROL, drive)
+            control = self._entry(CONTROL_WORD, drive)
             word = control.value if control is not None and state is AlState.OP else 0
             is_enabled = word & _ON == _ON
-            status = self._entry(_STATUS, drive)
+            status = self._entry(STATUS_WORD, drive)
             if status is not None:
                 status.value = _ENABLED if is_enabled else _READY
             for command, feedback in _FOLLOWERS if is_enabled else ():
@@ -81,7 +89,7 @@ def _parameters(
     for pdo in device.pdos:
         if pdo.drive != drive:
             continue
-        number = _MDT_LIST if pdo.is_output else _AT_LIST
+        number = MDT if pdo.is_output else AT
         if number not in known:
             known.add(number)
             yield _list(number, pdo, dictionary, drive)
