@@ -11,7 +11,6 @@ from eap.codec import datatypes
 from eap.codec.xmlstream import XmlElement, parse_integer
 from eap.od.model import RO, RW, RW_PREOP, WO, Access
 
-_BY_BITS = {1: "BOOL", 8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
 _ACCESS = {"ro": RO, "wo": WO, "rw": RW}
 _MAX_SUBINDEX = 0xFF
 _MAX_BITS = 8 * 0xFFFF
@@ -35,14 +34,12 @@ def type_of(name: str, bits: int) -> str:
         kind = None
     if kind is not None and kind.bit_length == bits:
         return name
-    if bits in _BY_BITS:
-        return _BY_BITS[bits]
-    if bits < 8:
-        return f"BIT{bits}"
+    if number := datatypes.untyped(bits):
+        return number
     if bits % 8 == 0:
         return f"BLOCK({bits // 8})"
-    whole = f"BLOCK({bits // 8 + 1})"
-    return next((kind for size, kind in _BY_BITS.items() if size > bits), whole)
+    wider = next((size for size in (16, 32, 64) if size > bits), 0)
+    return datatypes.untyped(wider) or f"BLOCK({bits // 8 + 1})"
 
 
 def read_objects(parent: XmlElement, fields: Fields) -> tuple[EsiObject, ...]:

@@ -243,7 +243,6 @@ _NAMES = (
     "UINT24", "ULINT", "BYTE", "WORD", "DWORD", *(f"BIT{bits}" for bits in range(1, 9)),
 )  # fmt: skip
 _KINDS = {kind.code: kind for kind in map(datatypes.parse, _NAMES)}
-_UNTYPED = {8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
 
 
 class BusImage:
@@ -360,6 +359,5 @@ def data_type_of(variable: ProcessVariable) -> DataType | None:
     # A type of another length than the mapped one is wrong: the mapped length counts.
     if kind is not None and kind.bit_length == variable.bit_length:
         return kind
-    bits = variable.bit_length
-    name = "BOOL" if bits == 1 else f"BIT{bits}" if 0 < bits < 8 else _UNTYPED.get(bits)
+    name = datatypes.untyped(variable.bit_length)
     return datatypes.parse(name) if name else None

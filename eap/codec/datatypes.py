@@ -101,6 +101,7 @@ _BY_WIDTH = {
     "INT": {8: "SINT", 16: "INT", 32: "DINT", 64: "LINT"},
     "UINT": {8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"},
 }
+_UNTYPED = {1: "BOOL", **{bits: f"BIT{bits}" for bits in range(2, 8)}, **_BY_WIDTH["UINT"]}
 _ALIASES = {
     "BOOLEAN": "BOOL",
     "BIT": "BIT1",
@@ -176,6 +177,11 @@ def is_base_name(name: str) -> bool:
     """Return whether *name* is that of a base type, which no definition can have."""
     upper = name.upper()
     return upper in _BASE or upper in _SIZED or upper in _ALIASES or upper in {"ARRAY", "OF"}
+
+
+def untyped(bits: int) -> str:
+    """Return the name of the unsigned type of *bits* bits, for a value without a type, else ""."""
+    return _UNTYPED.get(bits, "")
 
 
 def byte_bool(kind: DataType) -> DataType:

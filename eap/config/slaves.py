@@ -31,7 +31,6 @@ from eap.od.slave_config import (
 from eap.suggest import suggest
 
 _IDENTIFICATIONS = {"alias": ALIAS_REGISTER, "id": ID_REGISTER, "serial": BY_SERIAL}
-_BY_BITS = {1: "BOOL", 8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
 _MAX_ENTRY_BITS = 0xFF
 _SDO = "an object as INDEX:SUB in hexadecimal, such as 0x8000:01"
 _ENTRY = "the name of an entry, INDEX:SUB, INDEX:SUB/BITS, or 0/BITS for padding"
@@ -343,7 +342,7 @@ def _described(slave: DescribedSlave, mapped: MappedObject) -> DescribedPdoEntry
     bits = mapped.bit_length
     if known is not None and known.bit_length == bits:
         return known
-    kind = _BY_BITS.get(bits) or (f"BIT{bits}" if bits < 8 else f"BLOCK({bits // 8})")
+    kind = datatypes.untyped(bits) or f"BLOCK({bits // 8})"
     if not mapped.index or (bits > 8 and bits % 8):
         kind = ""
     return DescribedPdoEntry("" if known is None else known.name, kind, *place, bits)

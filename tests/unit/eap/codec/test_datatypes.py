@@ -168,3 +168,10 @@ def test_nothing_overlaps_and_no_octet_is_wasted(texts):
         assert kind.is_bits or offset % 8 == 0
         end = offset + kind.bit_length
     assert end <= size * 8 < end + 8
+
+
+def test_untyped_value_has_the_unsigned_type_of_its_length():
+    named = {bits: name for bits in range(-1, 70) if (name := datatypes.untyped(bits))}
+    assert list(named) == [*range(1, 9), 16, 32, 64]
+    assert (named[1], named[2], named[8], named[64]) == ("BOOL", "BIT2", "USINT", "ULINT")
+    assert all(datatypes.parse(name).bit_length == bits for bits, name in named.items())
