@@ -7,7 +7,7 @@ slaves that are known.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 from devicebus.errors import BusError, IdentityError
 from devicebus.master.bus import BusSlave, BusState, ChangeCount
@@ -91,7 +91,11 @@ def identify_arrivals(bus: BusState, stations: Sequence[int]) -> Procedure[list[
     places: list[tuple[int, int]] = []
     strangers = []
     order = {station: number for number, station in enumerate(bus.slaves)}
-    away = {at: slave for at, slave in bus.slaves.items() if slave.is_lost}
+    away = {
+        at: slave.expected
+        for at, slave in bus.slaves.items()
+        if slave.is_lost and slave.expected is not None
+    }
     known = list(stations)
     for position, station in enumerate(stations):
         if station in order and known.index(station) == position:
@@ -100,21 +104,19 @@ def identify_arrivals(bus: BusState, stations: Sequence[int]) -> Procedure[list[
         yield from assign_stations([(position, PROBE_STATION)])
         identity = yield from read_identity(PROBE_STATION)
         octets = yield from read(PROBE_STATION, Register.STATION_ALIAS, 2, "alias")
-        expected = [slave.expected for slave in away.values() if slave.expected is not None]
         marks = yield from read_marks(
-            expected, PROBE_STATION, identity, int.from_bytes(octets, "little")
+            away.values(), PROBE_STATION, identity, int.from_bytes(octets, "little")
         )
         between = _between(order, known, position)
         fitting = [
             at
-            for at, slave in away.items()
-            if slave.expected is not None
-            and fits(slave.expected, identity)
-            and has_mark(slave.expected, marks)
-            and (_is_movable(bus, slave) or order[at] in between)
+            for at, expected in away.items()
+            if fits(expected, identity)
+            and has_mark(expected, marks)
+            and (_is_movable(bus, expected) or order[at] in between)
         ]
         # One with a mark of its own before those that are told by their position only.
-        fitting.sort(key=lambda at: away[at].expected.mark is None)  # type: ignore[union-attr]
+        fitting.sort(key=lambda at: away[at].mark is None)
         if fitting:
             known[position] = fitting[0]
             away.pop(fitting[0])
@@ -174,17 +176,11 @@ def _between(order: dict[int, int], stations: Sequence[int], position: int) -> r
     return range(max(before, default=-1) + 1, min(behind, default=len(order)))
 
 
-def _is_movable(bus: BusState, slave: BusSlave) -> bool:
-    """Return true if the slave may be anywhere: by its mark, or behind such a slave."""
-    if slave.expected is not None and slave.expected.mark is not None:
+def _is_movable(bus: BusState, expected: ExpectedSlave) -> bool:
+    """Return true if a slave may be anywhere: by its mark, or by that of its group."""
+    if expected.mark is not None:
         return True
-    group = slave.config.group
-    heads = _first_of_groups(bus.slaves.values())
-    return bool(group) and any(head.config.group == group for head in heads)
-
-
-def _first_of_groups(slaves: Iterable[BusSlave]) -> Iterator[BusSlave]:
-    """Yield the slaves of hot-connect groups that have a mark."""
-    for slave in slaves:
-        if slave.config.group and slave.expected is not None and slave.expected.mark is not None:
-            yield slave
+    group = expected.config.group
+    return bool(group) and any(
+        each.mark is not None and each.config.group == group for each in bus.settings.expected
+    )
