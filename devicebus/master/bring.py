@@ -16,7 +16,7 @@ from devicebus.master.configuration import (
 )
 from devicebus.master.cycle import Participation
 from devicebus.master.esm import acknowledge, change_state, path
-from devicebus.master.image import MAX_FMMUS, SlaveLayout, SlaveProcessData
+from devicebus.master.image import MAX_FMMUS, SlaveLayout
 from devicebus.master.mailboxes import MailboxArea, configure
 from devicebus.master.procedure import Procedure, Sleep, write
 from devicebus.master.scan import FoundSlave, count_slaves, find_ring_end, read_topology
@@ -216,7 +216,7 @@ def _prepare_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     if image is None or slave.station not in image.layout.slaves:
         return
     layout = image.replan_slave(
-        SlaveProcessData(slave.station, slave.channels, slave.found.esc.fmmus),
+        slave.process_data,
         is_described=slave.expected is not None and bool(slave.expected.channels),
     )
     yield from prepare_registers(bus, slave)

@@ -11,7 +11,7 @@ import msgspec
 
 from devicebus.master.clocks import drift_datagram
 from devicebus.master.cycle import Cycle, Participation
-from devicebus.master.image import BusImage
+from devicebus.master.image import BusImage, SlaveProcessData
 from devicebus.master.link import CEILING_NS, INDEXES, MAX_PIGGYBACK, RETRIES, Link
 from devicebus.master.lock import CycleLock
 from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
@@ -198,6 +198,11 @@ class BusSlave:
         """Note the task that brings the slave to a state, and its end."""
         self.work = work
         work.watch(lambda _: self.note_change())
+
+    @property
+    def process_data(self) -> SlaveProcessData:
+        """Its part of the process image, to plan."""
+        return SlaveProcessData(self.station, self.channels, self.found.esc.fmmus)
 
     @property
     def al_state(self) -> int:

@@ -89,7 +89,7 @@ def _run_last_writes(bus: BusState, slave: BusSlave) -> Procedure[None]:
 def set_up_cycle(bus: BusState) -> None:
     """Plan the process image of all slaves and create the cycle."""
     slaves = bus.slaves.values()
-    layout = plan_image([_process_data_of(slave) for slave in slaves])
+    layout = plan_image([slave.process_data for slave in slaves])
     knows_lrw = bus.settings.allow_lrw and all(slave.found.esc.knows_lrw for slave in slaves)
 
     def on_fault(now_ns: int) -> None:
@@ -169,7 +169,7 @@ def _run_process_data(bus: BusState, starting: _StartingSlaves, target: AlState)
 def _read_process_data(bus: BusState, slave: BusSlave) -> Procedure[None]:
     """Configure and read the process data of a slave, and check that it fits a frame."""
     yield from prepare_safeop(bus, slave)
-    plan_image([_process_data_of(slave)])
+    plan_image([slave.process_data])
 
 
 def _channels_by_eeprom(slave: BusSlave) -> tuple[ProcessDataChannel, ...]:
@@ -180,10 +180,6 @@ def _channels_by_eeprom(slave: BusSlave) -> tuple[ProcessDataChannel, ...]:
     except BusError:
         return ()
     return channels
-
-
-def _process_data_of(slave: BusSlave) -> SlaveProcessData:
-    return SlaveProcessData(slave.station, slave.channels, slave.found.esc.fmmus)
 
 
 class _StartingSlaves:
