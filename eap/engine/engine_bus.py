@@ -227,16 +227,12 @@ class EngineBus:
         """Value that changes with anything that a description of the bus shows."""
         return self.master, self.master.changes, self.is_up, self.fault
 
-    def fileno(self) -> int:
-        """Return the descriptor that becomes readable when a frame waits."""
-        return self._port.fileno()
-
     def filenos(self) -> list[int]:
-        """Return the descriptors of all lines."""
+        """Return the descriptor of each line, which becomes readable when a frame waits."""
         return [each.fileno() for each in (self._port, self._second) if each is not None]
 
     def close(self) -> None:
-        """Close the bus port."""
+        """Close the ports of all lines."""
         self._port.close()
         if self._second is not None:
             self._second.close()
@@ -373,21 +369,17 @@ class EngineBus:
 
     def _receive_frames(self, now_ns: int) -> None:
         """Receive a batch of frames first: a frame that waits in the socket is not overdue."""
-        for _ in range(BATCH):
-            frame = self._receive_frame(self._port)
-            if frame is None:
-                break
-            self.master.receive_frame(frame, now_ns)
+        self._receive_line(self._port, RingEnd.FIRST, now_ns)
         if self._second is not None:
-            self._receive_second(self._second, now_ns)
+            self._receive_line(self._second, RingEnd.SECOND, now_ns)
+            self.master.merge_overdue(now_ns)
 
-    def _receive_second(self, port: BusPort, now_ns: int) -> None:
+    def _receive_line(self, port: BusPort, line: RingEnd, now_ns: int) -> None:
         for _ in range(BATCH):
             frame = self._receive_frame(port)
             if frame is None:
                 break
-            self.master.receive_frame(frame, now_ns, RingEnd.SECOND)
-        self.master.merge_overdue(now_ns)
+            self.master.receive_frame(frame, now_ns, line)
 
     def _receive_frame(self, port: BusPort) -> bytes | None:
         try:
