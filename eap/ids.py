@@ -110,6 +110,10 @@ EAP_MULTICAST_MAC = MacAddr.parse("01:01:05:04:00:00")
 INTERFACE_SCHEMES = ("udp", "ethernet", "tcp", "loop", "sim")
 
 
+INTERFACE_NAME_SIZE = 15
+"""Bytes of the longest name of an interface in Linux."""
+
+
 class InterfaceUri:
     """Interface of a port: ``udp://127.0.1.1``, ``ethernet://eth0``, ``loop://line``.
 

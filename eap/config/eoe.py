@@ -11,11 +11,9 @@ from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.routes import SectionError
 from eap.config.structs import EoeSection, EoeSlaveSection, PortSection, StationSection
-from eap.ids import MacAddr
+from eap.ids import INTERFACE_NAME_SIZE, MacAddr
 from eap.pd.spec import EoeSlaveSpec, EoeSpec, PortKind
 
-NAME_LIMIT = 15
-"""Bytes of the longest name of an interface in Linux."""
 _INTERFACE = "1 to 15 characters without spaces, slashes, colons and percent signs"
 _WITH_NETWORK = "an IPv4 address with the length of its network, such as 192.168.7.10/24"
 _ADDRESS = "an IPv4 address"
@@ -110,7 +108,7 @@ def _check_slaves(port: PortSection, report: FindingReport) -> None:
 
 def _check_interface(port: PortSection, path: str, report: FindingReport) -> None:
     name = (port.eoe.interface if port.eoe is not None else "") or default_interface(port)
-    is_valid = len(name.encode()) <= NAME_LIMIT and name not in {".", ".."}
+    is_valid = len(name.encode()) <= INTERFACE_NAME_SIZE and name not in {".", ".."}
     if not is_valid or any(each.isspace() or each in "/:%" for each in name):
         report.add(path, f"TAP interface {name!r}", f"interface: {_INTERFACE}")
 

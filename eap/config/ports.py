@@ -17,6 +17,7 @@ from eap.config.structs import FrameSection, PortSection, StationSection
 from eap.ids import (
     BROADCAST_MAC,
     EAP_MULTICAST_MAC,
+    INTERFACE_NAME_SIZE,
     Destination,
     DestinationKind,
     InterfaceUri,
@@ -234,7 +235,6 @@ def check_frame_monitoring(
 
 
 _EAP_SCHEMES = {"udp", "ethernet", "tcp", "loop"}
-_MAX_INTERFACE_NAME = 15
 _SCHEMES = {row.key.partition(".")[0]: row.schemes for row in profile.row_of(profile.PORT).entries}
 _LIMITED = {
     "vlan": "has a vlan",
@@ -319,8 +319,8 @@ def _check_port(port: PortSection, report: FindingReport) -> None:
         expected = INTERFACE if is_bus else "such as udp://127.0.1.1 or ethernet://eth0"
         report.add(path, f"interface: {exc}", expected)
         return
-    if uri.scheme == "ethernet" and (len(uri.host) > _MAX_INTERFACE_NAME or "/" in uri.host):
-        expected = f"a name of at most {_MAX_INTERFACE_NAME} characters"
+    if uri.scheme == "ethernet" and (len(uri.host) > INTERFACE_NAME_SIZE or "/" in uri.host):
+        expected = f"a name of at most {INTERFACE_NAME_SIZE} characters"
         report.add(path, f"{uri.host!r} is no interface name", expected)
     if port.kind is PortKind.BUS:
         check_bus_port(port, uri, report)

@@ -9,6 +9,7 @@ import struct
 from functools import cache
 
 from eap.errors import EnvironmentalError
+from eap.ids import INTERFACE_NAME_SIZE
 
 _SIOCGIFCONF = 0x8912
 _SIOCGIFFLAGS = 0x8913
@@ -17,7 +18,6 @@ _IFF_UP = 0x1
 _IFF_RUNNING = 0x40
 _IFREQ_SIZE = 40
 _INTERFACES = 1024
-_NAME_LIMIT = 15
 
 
 @cache
@@ -120,7 +120,7 @@ def link_is_up(name: str) -> bool:
 
 
 def _flags(name: str) -> int | None:
-    if len(name.encode()) > _NAME_LIMIT:
+    if len(name.encode()) > INTERFACE_NAME_SIZE:
         return None
     request = struct.pack("@16s24x", name.encode())
     sock = _kernel()

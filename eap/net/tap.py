@@ -13,8 +13,6 @@ from ipaddress import IPv4Interface
 
 from eap.errors import EnvironmentalError
 
-NAME_LIMIT = 15
-"""Bytes of the longest name of an interface."""
 _DEVICE = "/dev/net/tun"
 _TUNSETIFF = 0x400454CA
 _IFF_TAP, _IFF_NO_PI = 0x0002, 0x1000
