@@ -232,6 +232,7 @@ class BusState:
     Attributes:
         changes: Count of changes: of slaves, of events and of the list of slaves.
         slaves: By station address, in the order of the segment.
+        found: Slaves of the last scan, also if they are not the expected ones.
         image, cycle: None before the process data layout is known.
         reference: Station address of the slave whose clock the others follow.
         is_lost: True while no frame comes back, so that the state of every slave is unknown.
@@ -263,6 +264,7 @@ class BusState:
         self.runner = Runner(self.link)
         self.changes = ChangeCount()
         self.slaves: dict[int, BusSlave] = {}
+        self.found: Sequence[FoundSlave] = ()
         self.image: BusImage | None = None
         self.cycle: Cycle | None = None
         self.reference: int | None = None

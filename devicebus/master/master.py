@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from typing import TypeVar
 
 import msgspec
@@ -88,6 +88,11 @@ class Master:
     def slaves(self) -> dict[int, BusSlave]:
         """Slaves by station address in the order of the segment, read-only."""
         return self._bus.slaves
+
+    @property
+    def found(self) -> Sequence[FoundSlave]:
+        """Slaves of the last scan, also if they are not the expected ones."""
+        return self._bus.found
 
     @property
     def changes(self) -> int:

@@ -39,7 +39,7 @@ def start_up(bus: BusState, target: AlState) -> Procedure[None]:
     if bus.ring is not None:
         # A master that died while it measured delays has left the ring opened.
         yield [bwr(LOOP_CONTROL, b"\0")]
-    found = yield from scan(bus.settings.first_station)
+    bus.found = found = yield from scan(bus.settings.first_station)
     slaves = yield from _identify(bus, found)
     bus.slaves = {slave.station: slave for slave in slaves}
     bus.locate_cut()

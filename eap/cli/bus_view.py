@@ -45,10 +45,15 @@ _COMMAND_STATES = {0x0: "idle", 0x3: "done", 0x7: "executing", 0xF: "failed"}
 
 
 def scan_tables(found: BusScan) -> Iterator[TextTable | str]:
-    """Yield the table of a scan, and a line for each fault of slaves."""
+    """Yield the table of a scan, and a line for each fault of slaves.
+
+    On a bus that is not as configured the expected slaves are beside those that are there.
+    """
+    expected = {each.address: each.name for each in found.expected}
     table = TextTable(
         "Slave",
         "Name",
+        *(["Expected"] if expected else []),
         Column("Vendor", rank=3),
         "Product",
         Column("Revision", rank=2),
@@ -62,13 +67,19 @@ def scan_tables(found: BusScan) -> Iterator[TextTable | str]:
         table.add_row(
             str(row.address),
             row.name,
+            *([expected.pop(row.address, "")] if found.expected else []),
             *numbers,
             str(row.serial),
             str(row.alias or ""),
             Styled(ABSENT, style="dim") if row.is_absent else _state(row.state),
             "?" if row.mailbox is None else " ".join(row.mailbox),
         )
+    for address, name in expected.items():
+        table.add_row(str(address), "", name)
     yield table
+    if found.fault:
+        yield ""
+        yield from found.fault.splitlines()
     if faults := fault_lines(found.slaves):
         yield ""
         yield from faults

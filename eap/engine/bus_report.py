@@ -9,6 +9,7 @@ from msgspec.structs import asdict
 from devicebus.master.bus import BusSlave
 from devicebus.master.findings import NO_ANSWER
 from devicebus.master.master import why_closed
+from devicebus.master.scan import FoundSlave
 from eap.engine.engine_bus import WHOLE_BUS, EngineBus
 from eap.runtime.bus_errors import to_record
 from eap.runtime.engine_messages import (
@@ -39,6 +40,7 @@ def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
         is_up=bus.is_up,
         fault=bus.fault,
         slaves=tuple(slaves),
+        refused=tuple(_refused_slave(each) for each in bus.refused),
         silent_since_ns=now_ns - silence.since_ns if silence.text else None,
         silent_until_ns=None if silence.until_ns is None else now_ns - silence.until_ns,
         frames_sent=stats.link.sent,
@@ -205,6 +207,24 @@ def expected_slaves(bus: EngineBus) -> list[SlaveDescription]:
         )
         for slave in bus.spec.slaves
     ]
+
+
+def _refused_slave(found: FoundSlave) -> SlaveReport:
+    """Return the report of a slave on a bus that is not as configured."""
+    identity, status = found.identity, found.al_status
+    return SlaveReport(
+        station=found.station,
+        name=found.name,
+        vendor=identity.vendor,
+        product=identity.product,
+        revision=identity.revision,
+        serial=identity.serial,
+        alias=found.alias,
+        state=status.state | status.error << 4,
+        target=0,
+        protocols=int(found.sii.fixed.protocols),
+        fault=found.fault,
+    )
 
 
 class BusPublisher:

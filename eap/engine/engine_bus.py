@@ -6,10 +6,10 @@ report of the bus, and tried again.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from devicebus.errors import BusError, FrameLostError
+from devicebus.errors import BusError, FrameLostError, IdentityError
 from devicebus.master.bus import (
     BusBack,
     BusLost,
@@ -27,6 +27,7 @@ from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
 from devicebus.master.procedure import Task
 from devicebus.master.ring import RingEnd
+from devicebus.master.scan import FoundSlave
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from eap.engine.bus_mapping import BusMapping
 from eap.errors import EnvironmentalError
@@ -171,6 +172,7 @@ class EngineBus:
     Attributes:
         is_simulated: Whether its slaves are a process of this appliance.
         is_up: Whether the bus has been brought up, in any state of its slaves.
+        refused: Slaves that were found, but are not as configured; empty without that fault.
         tasks: Requests that are under way.
     """
 
@@ -190,6 +192,7 @@ class EngineBus:
         self.master = Master(settings)
         self.faults = SlaveFaults()
         self.is_up = False
+        self.refused: Sequence[FoundSlave] = ()
         self.tasks: set[Task[Any]] = set()
         self._settings = settings
         self._is_slow = cycle_ns > _LONG_CYCLE_NS
@@ -322,6 +325,7 @@ class EngineBus:
         self._starting = None
         self.is_up = task.error is None or self.master.cycle is not None
         self._start_fault = "" if self.is_up else str(task.error)
+        self.refused = self.master.found if isinstance(task.error, IdentityError) else ()
         if not self.is_up:
             is_silent = isinstance(task.error, FrameLostError)
             self._retry_ns = now_ns + (SILENT_RETRY_NS if is_silent else RETRY_NS)
@@ -334,6 +338,7 @@ class EngineBus:
         self._mapping.lay_out(None)
         self._starting = None
         self.is_up = False
+        self.refused = ()
         self._start_fault = f"the master has failed: {type(exc).__name__}: {exc}"
         # Not at once: a fault that returns with each start would keep the slaves in transitions.
         self._retry_ns = now_ns + RETRY_NS

@@ -166,6 +166,10 @@ class GatewayBus:
         """Return nothing: a gateway reports no history."""
         return {}
 
+    def mismatch(self) -> None:
+        """Return None: a gateway says nothing about the configuration of its bus."""
+        return
+
     def eoe_report(self) -> None:
         """Return None: a gateway reports no Ethernet frames."""
         return

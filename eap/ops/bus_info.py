@@ -73,6 +73,10 @@ class BusScan(msgspec.Struct, frozen=True):
     """``eapctl bus scan``."""
 
     slaves: list[ScannedSlave]
+    fault: str = ""
+    """Differences of a bus that is not as configured, a line for each."""
+    expected: list[NamedSlave] = []
+    """Configured slaves of such a bus."""
 
 
 class SlaveStateRow(msgspec.Struct, frozen=True):
@@ -170,7 +174,13 @@ class WrittenEeprom(msgspec.Struct, frozen=True):
 
 
 def scan_slaves(bus: SlaveBus) -> BusScan:
-    """Return all slaves in the order of the line; raises as a scan does."""
+    """Return all slaves in the order of the line; raises as a scan does.
+
+    Those of a running station that are not as configured are those that its master has found.
+    """
+    if (mismatch := bus.mismatch()) is not None:
+        expected = [NamedSlave(each.station, each.name) for each in mismatch.expected]
+        return BusScan([_scanned(each) for each in mismatch.found], mismatch.fault, expected)
     return BusScan([_scanned(slave) for slave in bus.scan()])
 
 

@@ -26,7 +26,7 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.control import bus as words
 from eap.control.protocol import AnswerT, Method, ParametersT
 from eap.errors import ControlError
-from eap.ops.bus_session import Begin, Slave, choose
+from eap.ops.bus_session import Begin, BusMismatch, Slave, choose
 from eap.ops.client import ControlClient, connect_station
 from eap.runtime.bus_status import (
     FrameCounts,
@@ -83,28 +83,18 @@ class RunningBus:
         self._report = self._describe()
         reports = self._report.slaves
         self._reports = {report.station: report for report in reports}
-        return [
-            Slave(
-                station=report.station,
-                name=report.name,
-                vendor=report.vendor,
-                product=report.product,
-                revision=report.revision,
-                serial=report.serial,
-                alias=report.alias,
-                status=AlStatus(report.state),
-                protocols=report.protocols,
-                parent=None,
-                ports=(),
-                fault=report.fault,
-                target=report.target,
-                since_ns=report.since_ns if report.fault else None,
-                mailbox_timeouts=report.mailbox_timeouts,
-                mailbox_late=report.mailbox_late,
-                is_absent=report.is_absent,
-            )
-            for report in reports
-        ]
+        return [_slave(report) for report in reports]
+
+    def mismatch(self) -> BusMismatch | None:
+        """Return found and expected slaves of a bus that is not as configured, else None."""
+        # Without waiting: such a bus comes up only when somebody changes it.
+        report = self._call(words.BUS_DESCRIBE, words.BUS_WAIT_UP_S, wait=False)
+        if report.is_up or not report.refused:
+            return None
+        found, expected = (
+            [_slave(each) for each in rows] for rows in (report.refused, report.slaves)
+        )
+        return BusMismatch(report.fault, found, expected)
 
     def history(self) -> History:
         """Return the recorded faults of the running master, as of the last :meth:`known`."""
@@ -246,6 +236,28 @@ def open_running(station: str, port: str, plant: str | None = None) -> Iterator[
     """
     with connect_station(station, plant) as client:
         yield RunningBus(client, station, port)
+
+
+def _slave(report: SlaveReport) -> Slave:
+    return Slave(
+        station=report.station,
+        name=report.name,
+        vendor=report.vendor,
+        product=report.product,
+        revision=report.revision,
+        serial=report.serial,
+        alias=report.alias,
+        status=AlStatus(report.state),
+        protocols=report.protocols,
+        parent=None,
+        ports=(),
+        fault=report.fault,
+        target=report.target,
+        since_ns=report.since_ns if report.fault else None,
+        mailbox_timeouts=report.mailbox_timeouts,
+        mailbox_late=report.mailbox_late,
+        is_absent=report.is_absent,
+    )
 
 
 def _with_registers(slave: Slave, read: tuple[AlStatus, DlStatus], node: TopologyNode) -> Slave:

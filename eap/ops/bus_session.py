@@ -15,7 +15,7 @@ import select
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Protocol, TypeAlias, TypeVar
+from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 import msgspec
 
@@ -150,6 +150,10 @@ class BusSession:
 
     def eoe_report(self) -> None:
         """Return None: this master carries no Ethernet frames."""
+        return
+
+    def mismatch(self) -> None:
+        """Return None: this master expects no slaves."""
         return
 
     def known(self) -> Sequence[Slave]:
@@ -299,6 +303,15 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """Replies that came after their request had timed out."""
 
 
+class BusMismatch(NamedTuple):
+    """Bus of a running station that is not as configured."""
+
+    fault: str
+    """The differences, a line for each."""
+    found: Sequence[Slave]
+    expected: Sequence[Slave]
+
+
 class SlaveBus(Protocol):
     """A bus with a master."""
 
@@ -337,6 +350,9 @@ class SlaveBus(Protocol):
 
     def eoe_report(self) -> EoeReport | None:
         """Return the state of the Ethernet switch; None without one."""
+
+    def mismatch(self) -> BusMismatch | None:
+        """Return found and expected slaves of a bus that is not as configured, else None."""
 
     def known(self) -> Sequence[Slave]:
         """Return all slaves in the order of the line, without a new scan if they are known."""

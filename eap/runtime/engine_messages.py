@@ -292,6 +292,8 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     fault: str = ""
     """Reason if not."""
     slaves: tuple[SlaveReport, ...] = ()
+    refused: tuple[SlaveReport, ...] = ()
+    """Slaves that are there instead, while the bus is not as configured."""
     silent_since_ns: int | None = None
     """Nanoseconds since frames stopped coming back, the last time."""
     silent_until_ns: int | None = None

@@ -224,3 +224,45 @@ def test_interface_that_goes_and_comes_back(farm, folder):
             assert describe(appliance)["fault"] == ""
         assert appliance.station("one")["restarts"] == 0
         assert appliance.stop()[0] == 0
+
+
+SWAPPED = f"""
+plant: swapped
+stations:
+  - name: line
+    net_id: 5.1.2.1.1.1
+    cycle_us: 5000
+    ports:
+      - name: bus0
+        kind: bus
+        interface: udp://{SLAVES}
+        bus: swapped.yaml
+        net_id: 5.1.2.1.3.1
+"""
+
+
+def test_bus_commands_of_swapped_slaves_name_both(farm):
+    folder = with_buses(farm)
+    bus = (folder / "coe.yaml").read_text()
+    head, coupler, buttons, sensor = bus.split("  - name: ", 3)
+    other = "  - name: ".join((head, coupler, sensor.rstrip() + "\n\n", buttons))
+    (folder / "swapped.yaml").write_text(other)
+    with simulator(BUSES / "coe.yaml", f"udp://{SLAVES}"):
+        appliance = farm.run(farm.write(SWAPPED))
+
+        def scan():
+            done = run_eapctl(appliance.runtime, "bus", "scan", "line/bus0", "--json")
+            assert done.returncode == 0, done.stderr
+            return json.loads(done.stdout)
+
+        wait_until(lambda: scan()["fault"])
+        found = scan()
+        assert [each["name"] for each in found["slaves"]] == ["coupler", "buttons", "sensor"]
+        assert [each["name"] for each in found["expected"]] == ["coupler", "sensor", "buttons"]
+        swap = "  sensor and buttons are swapped: exchange the cables or the names in the bus file"
+        assert found["fault"].splitlines()[1:] == [swap]
+        for command in ("diag", "state"):
+            done = run_eapctl(appliance.runtime, "bus", command, "line/bus0")
+            assert (done.returncode, done.stdout) == (1, "")
+            assert done.stderr.splitlines()[1:] == [swap]
+        assert "sensor and buttons are swapped" in run_eapctl(appliance.runtime, "status").stdout

@@ -62,6 +62,19 @@ def test_slave_whose_eeprom_is_unreadable():
     assert "?" in text
 
 
+def test_scan_of_a_bus_that_is_not_as_configured_has_expected_slaves_beside_found_ones():
+    row = {"address": 1001, "name": "drive", "vendor": 1, "product": 2, "revision": 0, "serial": 0,
+           "alias": 0, "state": "INIT", "mailbox": [], "fault": "", "code": 0, "parent": None,
+           "ports": []}  # fmt: skip
+    expected = [{"address": 1001, "name": "axis"}, {"address": 1002, "name": "valve"}]
+    fault = "not as configured:\n  valve is missing"
+    text = shown(*scan_tables(record(BusScan, slaves=[row], fault=fault, expected=expected)))
+    (first, second, *_, head, line) = text.splitlines()[2:]
+    assert first.split()[:3] == ["1001", "drive", "axis"]
+    assert second.split() == ["1002", "valve"]
+    assert (head, line) == ("not as configured:", "  valve is missing")
+
+
 def test_state_with_its_reason():
     row = {"address": 1001, "name": "a", "state": "INIT+ERROR", "code": 0x51, "reason": "bad"}
     gone = row | {"state": None, "code": 0, "reason": "it does not answer"}

@@ -96,10 +96,15 @@ def test_engine_bus_reports_unexpected_bus_and_retries(tmp_path):
     assert not rig.bus.is_up
     assert "product 0x00000002" in rig.bus.fault
     assert "expected io with vendor 0x00000E5A, product 0x00000063" in rig.bus.fault
+    assert [each.name for each in rig.bus.refused] == ["coupler", "io", "level"]
+    report = report_bus(rig.bus, rig.now_ns)
+    assert [each.vendor for each in report.refused] == [0xE5A] * 3
+    assert [each.name for each in report.slaves] == ["coupler", "io", "level"]
     rig.bus.master = good
     assert rig.wait_op() < RETRY_NS + 100 * MS
     rig.run(2 * MS)
     assert rig.bus.fault == ""
+    assert rig.bus.refused == report_bus(rig.bus, rig.now_ns).refused == ()
 
 
 def test_wire_that_is_cut_at_the_start(tmp_path):
