@@ -15,20 +15,18 @@ import msgspec
 from devicebus.esi.choice import DeviceQuery, plan_device
 from devicebus.esi.device import read_device
 from devicebus.esi.fields import Fields
-from devicebus.esi.records import EsiDevice
+from devicebus.esi.records import EsiDevice, EsiPdoEntry
 from eap.codec.soe import Idn
-from eap.codec.xmlstream import XmlElement
 from eap.config.imports.eni_records import EniBus, EniSlave, EniVariable
 from eap.config.imports.planttext import scalar
 from eap.config.imports.records import ImportOutcome, ImportReport
 from eap.config.imports.stations import UniqueNames
-from eap.od.slave_config import US, IdnWrite, MappedObject, RevisionRule, SdoWrite
+from eap.od.slave_config import ALIAS_REGISTER, US, IdnWrite, MappedObject, RevisionRule, SdoWrite
 from eap.ops.eni_device import OwnDevice, pdo_bits, xml_text
 from eap.pd.rules import plain_name
 from eap.runtime.esi_files import EsiSource
 
 _PORTS = {"B": 1, "C": 2, "D": 3}
-_ALIAS = 0x12
 _SYNC0, _SYNC1 = 0x0200, 0x0400
 
 
@@ -48,8 +46,6 @@ class _BusSlave(msgspec.Struct, kw_only=True):
     eni: EniSlave
     name: str
     wiring: dict[str, str] = {}
-    own: XmlElement | None = None
-    """Description made of the ENI file."""
     type: str = ""
     vendor_file: Path | None = None
     vendor_device: EsiDevice | None = None
@@ -161,7 +157,6 @@ class ImportedBusPlan:
             kind = f"{base}/{len(same) + 1}" if same else base
             element.children[0].text = kind
             self._devices[key] = eni.vendor, kind, xml_text(element)
-        slave.own = element
         slave.type = self._devices[key][1]
 
     def _find_vendor(self, slave: _BusSlave) -> None:
@@ -272,11 +267,8 @@ def _disagreement(eni: EniSlave, device: EsiDevice) -> str:
     return "" if wrong is None else f"its PDO 0x{wrong:04X} has {known[wrong].bits} bits"
 
 
-def _mapping_of(entries: Iterable[object]) -> tuple[MappedObject, ...]:
-    return tuple(
-        MappedObject(each.index, each.subindex, each.bits)  # type: ignore[attr-defined]
-        for each in entries
-    )
+def _mapping_of(entries: Iterable[EsiPdoEntry]) -> tuple[MappedObject, ...]:
+    return tuple(MappedObject(each.index, each.subindex, each.bits) for each in entries)
 
 
 def _esi_text(vendor: int, devices: Iterable[str]) -> str:
@@ -329,7 +321,7 @@ def _master_lines(slave: _BusSlave, cycle_us: int) -> Iterator[str]:
         if eni.identification is not None and eni.group:
             register, value = eni.identification
             yield f"alias: {value}"
-            yield f"identification: {'alias' if register == _ALIAS else 'id'}"
+            yield f"identification: {'alias' if register == ALIAS_REGISTER else 'id'}"
     if pdos := _assignment(slave):
         lists = (
             f'"{number}": [{", ".join(f"0x{index:04X}" for index in indexes)}]'

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
+from eap.codec.soe import Element, Idn, SoeOpcode
 from eap.codec.xmlstream import XmlElement, XmlError, XmlReader
 from eap.config.imports.eni_records import (
     EniBus,
@@ -19,7 +20,14 @@ from eap.config.imports.eni_records import (
     EniVariable,
 )
 from eap.config.imports.records import ImportOutcome, ImportReport
-from eap.od.slave_config import IdnWrite, MappedObject, SdoWrite, Transition
+from eap.od.slave_config import (
+    ALIAS_REGISTER,
+    ID_REGISTER,
+    IdnWrite,
+    MappedObject,
+    SdoWrite,
+    Transition,
+)
 
 ROOT = "EtherCATConfig"
 MAX_SLAVES = 1000
@@ -37,17 +45,21 @@ _WANTED = (
     f"{_CONFIG}/ProcessImage/Outputs",
 )
 _DOWNLOAD, _UPLOAD = 1, 2
-_SOE_WRITE, _SOE_VALUE = 3, 0x40
+# Commands and registers are those of devicebus.wire, which eap.config may not import.
+_READS = frozenset((1, 4))
+"""Commands APRD and FPRD."""
 _WRITES = frozenset((2, 5))
 """Commands APWR and FPWR."""
-_READS = frozenset((1, 4))
 _FMMU, _MANAGER, _END = 0x600, 0x800, 0x880
 _EEPROM = 0x502
 _REVISION_WORD = 0x0C
 _AL_STATUS, _ACTIVATE, _CYCLE0, _CYCLE1 = 0x130, 0x980, 0x9A0, 0x9A4
-_ALIAS, _IDENTIFICATION = 0x12, 0x134
 _ASSIGNMENTS, _MAPPINGS = range(0x1C10, 0x1C30), (range(0x1600, 0x1800), range(0x1A00, 0x1C00))
-_MANAGERS = 16
+_MANAGERS = {f"Sm{number}": number for number in range(16)}
+"""Sync managers by their elements in ProcessData."""
+_USES = frozenset(("Outputs", "Inputs", "DynamicOutputs", "DynamicInputs"))
+_MAILBOXES = ("Send",), ("Recv", "Receive")
+"""Elements of the mailboxes to and from a slave; TwinCAT writes Recv, SOEM's sample Receive."""
 _MAX_ENTRIES = 254
 _FIRST_AREA = 0x0F00
 """Lowest address of process data: that of terminals with digital outputs."""
@@ -212,7 +224,8 @@ class _SlaveReader:
         hot = element.find("HotConnect")
         assigns, mapping = self._pdo_lists()
         managers = self._managers(assigns)
-        mapping = self._known_mapping(mapping, managers)
+        pdos = self._pdos()
+        mapping = self._known_mapping(mapping, managers, pdos)
         sides = [f"ProcessData/{tag}/BitLength" for tag in ("Send", "Recv", "Receive")]
         bits = [element.number_at(path, 0, _U32) for path in sides]
         return EniSlave(
@@ -225,7 +238,7 @@ class _SlaveReader:
             serial=_unsigned(info, "SerialNo"),
             type=revision or inside,
             managers=managers,
-            pdos=self._pdos(),
+            pdos=tuple(pdos.values()),
             bootstrap=self._bootstrap(),
             protocols=frozenset(each.text.lower() for each in element.iterfind("Mailbox/Protocol"))
             | {each.tag.lower() for each in _children(element, "Mailbox")} & {"coe", "soe"},
@@ -359,15 +372,14 @@ class _SlaveReader:
 
     def _take_idn(self, command: XmlElement) -> None:
         number = _unsigned(command, "IDN", 16)
-        group = "P" if number & 0x8000 else "S"
-        what = f"{group}-{number >> 12 & 7}-{number & 0xFFF:04}"
-        operation = command.number_at("OpCode", 0, _U16, _SOE_WRITE)
-        elements = command.number_at("Elements", 0, _U16, _SOE_VALUE)
+        what = str(Idn.of(number))
+        operation = command.number_at("OpCode", 0, _U16, SoeOpcode.WRITE_REQUEST)
+        elements = command.number_at("Elements", 0, _U16, Element.VALUE)
         at = self._transitions(command, what)
         data = _octets(command)
         if not at:
             return
-        if operation != _SOE_WRITE or not elements & _SOE_VALUE or not data:
+        if operation != SoeOpcode.WRITE_REQUEST or not elements & Element.VALUE or not data:
             self._note(command.line, ImportOutcome.LEFT, f"{what}: no write of a value")
             return
         self._writes.append(
@@ -393,25 +405,22 @@ class _SlaveReader:
             self._note(command.line, ImportOutcome.LEFT, message)
         return known
 
-    def _pdos(self) -> tuple[XmlElement, ...]:
-        """Return the PDOs, whose numbers are checked."""
-        found = [
-            each
-            for each in _children(self._element, "ProcessData")
-            if each.tag in {"RxPdo", "TxPdo"}
-        ]
-        known: set[int] = set()
-        for pdo in found:
+    def _pdos(self) -> dict[int, XmlElement]:
+        """Return the PDOs, whose numbers are checked, by index."""
+        found: dict[int, XmlElement] = {}
+        for pdo in _children(self._element, "ProcessData"):
+            if pdo.tag not in {"RxPdo", "TxPdo"}:
+                continue
             index = pdo.number_at("Index", 1, _U16)
-            if not index or index in known:
+            if not index or index in found:
                 message = f"{pdo.tag} 0x{index:04X} is there twice, or has no index"
                 raise XmlError(message, line=pdo.line, expected="an index of its own")
-            known.add(index)
+            found[index] = pdo
             for entry in pdo.iterfind("Entry"):
                 entry.number_at("Index", 0, _U16)
                 entry.number_at("SubIndex", 0, 0xFF)
                 entry.number_at("BitLen", 0, _U16)
-        return tuple(found)
+        return found
 
     def _pdo_lists(
         self,
@@ -441,14 +450,10 @@ class _SlaveReader:
         self,
         mapping: Mapping[int, tuple[MappedObject, ...]],
         managers: Mapping[int, EniSyncManager],
+        pdos: Mapping[int, XmlElement],
     ) -> dict[int, tuple[MappedObject, ...]]:
         """Return the mapping of PDOs that the file has; notes on the others."""
-        known = {index for each in managers.values() for index in each.pdos or ()}
-        known |= {
-            each.number_at("Index", 0, _U16)
-            for each in _children(self._element, "ProcessData")
-            if each.tag in {"RxPdo", "TxPdo"}
-        }
+        known = {index for each in managers.values() for index in each.pdos or ()} | pdos.keys()
         for index in sorted(mapping.keys() - known):
             message = f"mapping of PDO 0x{index:04X}, which no sync manager has"
             self._note(self._element.line, ImportOutcome.LEFT, message)
@@ -456,20 +461,18 @@ class _SlaveReader:
 
     def _managers(self, assigns: Mapping[int, tuple[int, ...]]) -> dict[int, EniSyncManager]:
         found: dict[int, EniSyncManager] = {}
-        for number, tags in enumerate((("Send",), ("Recv", "Receive"))):
-            for tag in tags:
-                box = self._element.find(f"Mailbox/{tag}")
-                if box is not None:
-                    found[number] = EniSyncManager(
-                        start=box.number_at("Start", 0, _U16),
-                        size=box.number_at("Length", 0, _U16),
-                        control=(0x26, 0x22)[number],
-                        is_output=not number,
-                        is_mailbox=True,
-                    )
+        for number, box in enumerate(_mailboxes(self._element, "Mailbox")):
+            if box is not None:
+                found[number] = EniSyncManager(
+                    start=box.number_at("Start", 0, _U16),
+                    size=box.number_at("Length", 0, _U16),
+                    control=(0x26, 0x22)[number],
+                    is_output=not number,
+                    is_mailbox=True,
+                )
         for number, (start, size, control) in self._areas.items():
             # Bits 0 and 1: 2 is a mailbox; bits 2 and 3: 1 is written by the master.
-            if number < _MANAGERS and number not in found and control & 3 != 2:
+            if number in _MANAGERS.values() and number not in found and control & 3 != 2:
                 is_output = control >> 2 & 3 == 1
                 found[number] = EniSyncManager(
                     start=start,
@@ -480,10 +483,9 @@ class _SlaveReader:
                     pdos=assigns.get(number),
                 )
         for element in _children(self._element, "ProcessData"):
-            number = int(element.tag[2:]) if element.tag[2:] in _NUMBERS else -1
-            if not element.tag.startswith("Sm") or number < 0:
-                continue
-            found[number] = self._manager(element, number, assigns, found.get(number))
+            if element.tag in _MANAGERS:
+                number = _MANAGERS[element.tag]
+                found[number] = self._manager(element, number, assigns, found.get(number))
         first = 2 if any(each.is_mailbox for each in found.values()) else 0
         for (start, is_output), bits in sorted(self._mapped.items()):
             # An FMMU whose sync manager is nowhere in the file.
@@ -520,13 +522,9 @@ class _SlaveReader:
         )
 
     def _bootstrap(self) -> bytes:
-        boxes = [
-            next((b for t in tags if (b := self._element.find(f"Mailbox/BootStrap/{t}"))), None)
-            for tags in (("Send",), ("Recv", "Receive"))
-        ]
         return b"".join(
             box.number_at(path, 0, _U16).to_bytes(2, "little")
-            for box in boxes
+            for box in _mailboxes(self._element, "Mailbox/BootStrap")
             if box is not None
             for path in ("Start", "Length")
         )
@@ -564,15 +562,11 @@ class _SlaveReader:
         return chosen.findtext("Port"), chosen.number_at("PhysAddr", 0, _U16)
 
 
-_NUMBERS = frozenset(map(str, range(_MANAGERS)))
-_USES = frozenset(("Outputs", "Inputs", "DynamicOutputs", "DynamicInputs"))
-
-
 def _identification(hot: XmlElement) -> tuple[int, int] | None:
     """Return the register, and its value, by which a hot-connect group is found."""
     for command in hot.iterfind("IdentifyCmd"):
         register = command.number_at("Ado", 0, _U16)
-        if register in {_ALIAS, _IDENTIFICATION}:
+        if register in {ALIAS_REGISTER, ID_REGISTER}:
             value = int.from_bytes(_octets(command, "Validate/Data"), "little")
             if 0 < value <= _U16:
                 return register, value
@@ -589,6 +583,14 @@ def _limited(element: XmlElement, path: str) -> Iterator[XmlElement]:
 def _children(element: XmlElement, path: str) -> list[XmlElement]:
     found = element.find(path)
     return [] if found is None else found.children
+
+
+def _mailboxes(element: XmlElement, path: str) -> list[XmlElement | None]:
+    """Return the elements of the mailboxes to and from a slave at *path*."""
+    return [
+        next((box for tag in tags if (box := element.find(f"{path}/{tag}"))), None)
+        for tags in _MAILBOXES
+    ]
 
 
 def _unsigned(element: XmlElement, path: str, bits: int = 32) -> int:

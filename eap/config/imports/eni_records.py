@@ -51,7 +51,6 @@ class EniSlave(msgspec.Struct, frozen=True, kw_only=True):
         pdos: Elements RxPdo and TxPdo.
         bootstrap: Mailboxes of the state BOOT as the EEPROM has them; empty without one.
         protocols: Protocols of its mailbox, in lower case.
-        drives: Drives that SoE writes go to.
         writes: Start-up writes, without those of PDOs.
         refused: Start-up commands that are not clear, in words.
         assigns: PDO assignment that is written by SDO.
