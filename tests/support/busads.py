@@ -147,14 +147,12 @@ slaves:
 def play(
     scene: Callable[[Client, FakeEngine], Awaitable[Any]],
     name: str = "drive",
-    *,
-    silence_limit_s: float = 0.05,
 ) -> Any:
     """Run *scene* with a client and the engine behind the service that it asks."""
 
     async def run() -> Any:
         engine = FakeEngine(FakeBus(_line(name)))
-        link = EngineLink(engine.services, silence_limit_s=silence_limit_s)
+        link = EngineLink(engine.services, silence_limit_s=5.0)  # a loaded machine
         bus = BusClient(link, 0, PORT)
         told: list[tuple[Endpoint, bytes]] = []
         provider = MasterDictionaryProvider(bus, "1.2.3")

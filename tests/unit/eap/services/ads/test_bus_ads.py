@@ -77,7 +77,7 @@ def test_request_to_a_slave_costs_one_engine_round_trip():
             await client.good(MASTER, operation)
         assert not engine.requests
 
-    play(scene, silence_limit_s=5.0)
+    play(scene)
 
 
 def test_service_answers_for_the_master_at_port_0xffff():

@@ -403,4 +403,4 @@ def test_other_requests_have_turns_beside_notifications():
         # 21 requests of the client among at most as many readings.
         assert len(engine.requests) <= 60
 
-    play(scene, silence_limit_s=5.0)
+    play(scene)
