@@ -43,11 +43,11 @@ from eap.runtime.handover import (
     NO_DESCRIPTOR,
     BusSocket,
     Handover,
-    PassedConnection,
     PortName,
     SharedSocket,
     SocketKind,
 )
+from eap.runtime.passing import PassedConnection, PassedDescriptor
 from eap.runtime.startup import Step, no_step
 
 REST_NS = 300_000_000
@@ -226,6 +226,8 @@ class EnginePlant:
         folder = ApplianceFolder(Path(handover.folder))
         self._stations: dict[str, EngineStation] = {}
         self._batch = ReceiveBatch()
+        self._sockets: dict[SharedSocket, socket.socket] = {}
+        """Sockets that were passed, by key."""
         self._tallies: list[DropCounterFeed] = []
         self._counters = self._resources.enter_context(
             DropCounters(folder.discards("engine"), [s.name for s in handover.stations])
@@ -260,7 +262,16 @@ class EnginePlant:
         self.engine.start(now_ns, self._handover.states)
         self.buses.start(now_ns)
 
-    def add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
+    def take(self, sock: socket.socket, passed: PassedDescriptor) -> None:
+        """Take what services passed: a connection, or a socket for ports that come later."""
+        if isinstance(passed, PassedConnection):
+            self._add_connection(sock, passed)
+        elif passed.socket in self._sockets:
+            sock.close()
+        else:
+            self._sockets[passed.socket] = sock
+
+    def _add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
         """Take frames from a connection that services accepted, for all ports behind it."""
         first = passed.owners[0]
         port = self._stations[first.station].tcp_ports[first.port]
@@ -300,6 +311,8 @@ class EnginePlant:
     def close(self) -> None:
         """Release all sockets and images."""
         self._resources.close()
+        for sock in self._sockets.values():
+            sock.close()
         for entry in self._stations.values():
             entry.close()
 

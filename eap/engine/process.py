@@ -20,7 +20,8 @@ from eap.engine.build import EnginePlant
 from eap.errors import ConfigError, EapError, EnvironmentalError
 from eap.net import realtime
 from eap.net.ticker import Ticker
-from eap.runtime.handover import EngineOptions, Handover, receive_connection
+from eap.runtime.handover import EngineOptions, Handover
+from eap.runtime.passing import receive_passed
 from eap.runtime.startup import Startup
 
 WINDOW_NS = 20_000_000
@@ -81,7 +82,7 @@ class CycleWaiter:
 
 
 LOOK_PERIOD_NS = 20_000_000
-"""Interval of work beside the cycles; each time at most one connection of services is taken."""
+"""Interval of work beside the cycles; each time at most one descriptor of services is taken."""
 
 GARBAGE = 5000
 """Objects allocated and not freed before the garbage collector runs."""
@@ -125,8 +126,8 @@ def run_cycles(
                 # Automatic collection is off; this is between two cycles.
                 if gc.get_count()[0] > GARBAGE and not rebuilder.is_building:
                     gc.collect()
-                if passed := receive_connection(link):
-                    plant.add_connection(*passed)
+                if passed := receive_passed(link):
+                    plant.take(*passed)
     finally:
         ticker.close()
 

@@ -1,18 +1,12 @@
-"""Handover of the supervisor to its child processes, and of TCP connections to the engine.
+"""Handover of the supervisor to its child processes.
 
 Specifications, descriptors and options travel as JSON in an anonymous file whose descriptor the
 child inherits.  So the size has no limit, no other process can read it, and nothing is left behind.
-
-Services passes a TCP connection as one message with one descriptor on a SOCK_SEQPACKET pair.  The
-pair outlives both processes, so the next engine takes a connection that was passed while the engine
-restarted.  Neither side ever waits for the other.
 """
 
 from __future__ import annotations
 
-import array
 import os
-import socket
 from enum import StrEnum
 from typing import Self
 
@@ -75,6 +69,11 @@ class SharedSocket(SpecRecord, frozen=True):
     """Ports whose frames arrive here; several share a group, a broadcast or an interface."""
     engine_fd: int = NO_DESCRIPTOR
     services_fd: int = NO_DESCRIPTOR
+
+    @property
+    def key(self) -> SharedSocket:
+        """The socket without owners and descriptors, which change."""
+        return SharedSocket(self.kind, self.address, self.port, self.group, self.vlan_id)
 
 
 class BusSocket(SpecRecord, frozen=True):
@@ -163,6 +162,8 @@ class Handover(InheritedRecord, frozen=True):
     buses: tuple[BusSocket, ...] = ()
     bus_fd: int = NO_DESCRIPTOR
     """This side of the pair for requests of services to the engine."""
+    supervisor_fd: int = NO_DESCRIPTOR
+    """Services' side of the pair for requests to the supervisor."""
     options: EngineOptions = EngineOptions()
     states: dict[str, DeviceState] = msgspec.field(default_factory=dict)
     """To which each station is brought, Op if it is not here."""
@@ -184,44 +185,3 @@ class Handover(InheritedRecord, frozen=True):
             for port in station.ports
             if port.name == name.port
         )
-
-
-_MAX_MESSAGE = 8192
-_DESCRIPTOR_SPACE = socket.CMSG_SPACE(array.array("i").itemsize)
-
-
-class PassedConnection(SpecRecord, frozen=True):
-    """A type-4 connection: the ports that its frames are for, and its peer."""
-
-    owners: tuple[PortName, ...]
-    host: str
-    """Address of the peer, as the policy counts it (eap.net.limits)."""
-
-
-def pass_connection(
-    link: socket.socket, connection: socket.socket, description: PassedConnection
-) -> bool:
-    """Send *connection*, which the caller then closes; return whether there was room for it."""
-    message = msgspec.json.encode(description)
-    rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [connection.fileno()]))
-    try:
-        # socket.send_fds() of Python 3.11 forgets its flags, and would wait here.
-        link.sendmsg([message], [rights], socket.MSG_DONTWAIT)
-    except OSError:
-        return False
-    return True
-
-
-def receive_connection(link: socket.socket) -> tuple[socket.socket, PassedConnection] | None:
-    """Return the next connection that was passed, None if there is none now."""
-    # CLOEXEC at once: a process that is started in between must not inherit the connection.
-    flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
-    try:
-        message, ancillary, _, _ = link.recvmsg(_MAX_MESSAGE, _DESCRIPTOR_SPACE, flags)
-    except OSError:
-        return None
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            connection = socket.socket(fileno=array.array("i", data)[0])
-            return connection, msgspec.json.decode(message, type=PassedConnection)
-    return None

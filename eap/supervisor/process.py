@@ -37,7 +37,13 @@ from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
 from eap.suggest import suggest
 from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
-from eap.supervisor.sockets import SharedSockets, segments
+from eap.supervisor.sockets import (
+    SharedSockets,
+    UnavailableSocketError,
+    inherited_by_engine,
+    inherited_by_services,
+    segments,
+)
 
 GRACE_NS = 1_000_000_000
 """Time for a process to end after SIGTERM; the whole appliance has two seconds."""
@@ -186,7 +192,7 @@ class Supervisor:
             plant=info.plant,
             plant_file=info.plant_file,
             stations=plant.stations,
-            sockets=sockets.descriptions,
+            sockets=(),
             buses=sockets.buses,
             options=options,
             first_state=first_state,
@@ -194,19 +200,17 @@ class Supervisor:
             directory=plant.directory,
             audit_required=plant.audit_required,
         )
+        self._sockets = sockets
         self._given = _given_to_segments(self._segments, common, bytecode)
-        self._given[self._engine] = (
-            replace(common, link_fd=sockets.engine_link, bus_fd=sockets.engine_bus),
-            sockets.engine_descriptors(),
+        self._given[self._engine] = replace(
+            common, link_fd=sockets.engine_link, bus_fd=sockets.engine_bus
         )
-        self._given[self._services] = (
-            replace(
-                common,
-                link_fd=sockets.services_link,
-                bus_fd=sockets.services_bus,
-                control_fd=sockets.control,
-            ),
-            sockets.services_descriptors(),
+        self._given[self._services] = replace(
+            common,
+            link_fd=sockets.services_link,
+            bus_fd=sockets.services_bus,
+            control_fd=sockets.control,
+            supervisor_fd=sockets.services_end,
         )
         self._children = tuple(self._given)
 
@@ -225,10 +229,20 @@ class Supervisor:
 
     def _start(self, child: Child) -> None:
         self._restart_ns.pop(child, None)
-        handover, descriptors = self._given[child]
-        if isinstance(handover, Handover):
+        handover = self._given[child]
+        if isinstance(handover, SegmentHandover):
+            given = (handover.frames_fd, handover.command_fd, handover.second_fd)
+            descriptors = [fd for fd in given if fd != NO_DESCRIPTOR]
+        else:
             # At each start and not once: the station may have been reconfigured since.
-            handover = with_stored_configuration(handover)
+            handover = with_stored_configuration(handover, self._sockets)
+            if child is self._services:
+                # The process before may have ended in a change, which no one goes on with.
+                self._sockets.serve()
+                self._sockets.keep_only(handover.sockets)
+                descriptors = inherited_by_services(handover)
+            else:
+                descriptors = inherited_by_engine(handover)
         try:
             child.start(handover, descriptors, self._clock())
         except OSError as exc:
@@ -254,6 +268,7 @@ class Supervisor:
     def _wait(self, wake_fd: int, timeout_ms: int) -> None:
         poll = select.poll()
         poll.register(wake_fd, select.POLLIN)
+        poll.register(self._sockets, select.POLLIN)
         for child in self._children:
             for fd in (child.pid_fd, child.report_fd, child.error_fd):
                 if fd >= 0:
@@ -264,6 +279,8 @@ class Supervisor:
             os.read(wake_fd, 64)
             self._exit_code = 0
             return
+        if self._sockets.fileno() in fired:
+            self._sockets.serve()
         for child in self._children:
             if child.error_fd in fired:
                 child.forward_output()
@@ -414,25 +431,24 @@ def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:
 
 def _given_to_segments(
     children: dict[str, Child], common: Handover, bytecode: str
-) -> dict[Child, tuple[Handover | SegmentHandover, list[int]]]:
+) -> dict[Child, Handover | SegmentHandover]:
     """Add a child for each simulated segment; return what they are given."""
-    given: dict[Child, tuple[Handover | SegmentHandover, list[int]]] = {}
+    given: dict[Child, Handover | SegmentHandover] = {}
     handovers = segments(
         common.stations, common.buses, common.supervisor, realtime=common.options.realtime
     )
     for owner, handover in handovers:
         name = f"{owner.station}/{owner.port}"
         child = children[name] = Child(f"segment {name}", "eap.segment.process", bytecode)
-        wanted = (handover.frames_fd, handover.command_fd, handover.second_fd)
-        given[child] = handover, [fd for fd in wanted if fd != NO_DESCRIPTOR]
+        given[child] = handover
     return given
 
 
-def with_stored_configuration(handover: Handover) -> Handover:
+def with_stored_configuration(handover: Handover, sockets: SharedSockets) -> Handover:
     """Return *handover* with each station as it was configured last, since the plant file or now.
 
-    A configuration that needs other sockets than those that were opened, or that no engine could
-    ever run, is none of this start.
+    A configuration whose sockets cannot be opened, or that no engine could ever run, is none of
+    this start.
     """
     specs = []
     states = {}
@@ -445,7 +461,31 @@ def with_stored_configuration(handover: Handover) -> Handover:
             logger.warning("station %s: the plant file runs: %s", given.name, reason)
         specs.append(given if reasons else found.spec)
         states[given.name] = found.state
-    return replace(handover, stations=tuple(specs), states=states)
+    while True:
+        try:
+            opened = sockets.fit(specs)
+        except UnavailableSocketError as exc:
+            changed = _without_stored(handover, specs, {owner.station for owner in exc.owners})
+            if changed == specs:
+                raise
+            logger.warning("%s: the plant file runs: %s", ", ".join(_names_of(exc)), exc)
+            specs = changed
+        else:
+            return replace(handover, stations=tuple(specs), states=states, sockets=opened)
+
+
+def _without_stored(
+    handover: Handover, specs: list[StationSpec], names: Collection[str]
+) -> list[StationSpec]:
+    """Return *specs* with the stations of these *names* as the plant file has them."""
+    return [
+        given if given.name in names else spec
+        for given, spec in zip(handover.stations, specs, strict=True)
+    ]
+
+
+def _names_of(error: UnavailableSocketError) -> list[str]:
+    return [f"station {name}" for name in dict.fromkeys(each.station for each in error.owners)]
 
 
 def find_build_errors(spec: StationSpec) -> list[str]:

@@ -1,8 +1,8 @@
 """Shared sockets of an appliance: planned from the stations, opened once, kept open, handed down.
 
-The kernel sorts frames between engine and services by the order in which their sockets joined, and
-that order changes when a member closes.  Hence one process opens them all, in the order of the
-plan, and holds them as long as the appliance lives.
+The kernel sorts frames between engine and services by the order in which the two sockets of a pair
+joined, and that order changes when one of them closes.  Hence one process opens them all, and holds
+each as long as a port needs it: both processes may restart meanwhile.
 
 A simulated segment is a process at the other end of a pair.  Both ends stay open here, so either
 process may die and restart: what was sent meanwhile is lost, as frames are on a cut cable.
@@ -10,15 +10,15 @@ process may die and restart: what was sent meanwhile is lost, as frames are on a
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-import msgspec
+from msgspec.structs import replace
 
 from eap.closeable import Closeable
-from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.busport import open_bus_socket
@@ -32,25 +32,20 @@ from eap.net.ipsocket import (
     open_udp_receiver,
 )
 from eap.net.packetsocket import open_arp, open_packet_pair
-from eap.pd.spec import PortKind, PortSpec, StationSpec
+from eap.pd.spec import PortSpec, StationSpec
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
     BusSocket,
+    Handover,
     PortName,
     SegmentHandover,
     SharedSocket,
     SocketKind,
 )
+from eap.runtime.passing import CloseSocket, SupervisorRequests
+from eap.runtime.socket_plan import bus_ports, plan_sockets
 
 SIMULATED = "sim"
-
-
-def bus_ports(stations: Iterable[StationSpec]) -> Iterator[tuple[PortName, PortSpec]]:
-    """Yield all bus ports, in the order that numbers them."""
-    for station in stations:
-        for port in station.ports:
-            if port.kind is PortKind.BUS:
-                yield PortName(station.name, port.name), port
 
 
 def open_buses(stations: Sequence[StationSpec], opened: ExitStack) -> tuple[BusSocket, ...]:
@@ -112,122 +107,133 @@ def _is_simulated(port: PortSpec) -> bool:
     return port.interface.scheme == SIMULATED
 
 
-BROADCAST = "255.255.255.255"
-EVERY_ADDRESS = "0.0.0.0"  # noqa: S104  what a plant file may say
 CONTROL_BACKLOG = 512
-_ORDER = tuple(SocketKind)
 
 
-def plan_sockets(stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
-    """Return the sockets to open for *stations*, each once, in fixed order."""
-    owners: dict[SharedSocket, list[PortName]] = {}
-    ports = [(station.name, port) for station in stations for port in station.ports]
-    ports = [(station, port) for station, port in ports if port.kind is PortKind.EAP]
-    for each in stations:
-        for name, wanted in _gateway_sockets(each):
-            owners.setdefault(wanted, []).append(name)
-    for station, port in ports:
-        for wanted in _sockets_of(port):
-            owners.setdefault(wanted, []).append(PortName(station, port.name))
-    ams = [(PortName(station, port.name), _ams_address(port)) for station, port in ports]
-    # A socket on 0.0.0.0 occupies the port at every address, so all stations share it.
-    every = any(address == EVERY_ADDRESS for _, address in ams)
-    for name, address in ams:
-        if address:
-            for wanted in _ams_sockets(EVERY_ADDRESS if every else address):
-                owners.setdefault(wanted, []).append(name)
-    planned = [
-        msgspec.structs.replace(wanted, owners=tuple(names)) for wanted, names in owners.items()
-    ]
-    return tuple(sorted(planned, key=lambda item: _ORDER.index(item.kind)))
+class UnavailableSocketError(EnvironmentalError):
+    """A socket cannot be opened.
 
+    Attributes:
+        owners: Ports that need it.
+    """
 
-def _sockets_of(port: PortSpec) -> Iterator[SharedSocket]:
-    uri = port.interface
-    number = uri.port or EAP_PORT
-    if uri.scheme == "ethernet":
-        yield SharedSocket(SocketKind.PACKET, uri.host)
-        yield SharedSocket(SocketKind.ARP, uri.host, vlan_id=port.vlan_id)
-    if uri.scheme == "udp":
-        yield SharedSocket(SocketKind.UDP, uri.host, number)
-        for group in port.join:
-            yield SharedSocket(SocketKind.GROUP, uri.host, number, group=group)
-        if port.broadcast:
-            yield SharedSocket(SocketKind.GROUP, uri.host, number, group=BROADCAST)
-    if uri.scheme in {"udp", "tcp"}:
-        # Beside UDP too: gateway requests and published frames may come by TCP to the same port
-        # (ETG.8200 has TCP as an option).
-        yield SharedSocket(SocketKind.TCP, uri.host, number)
-
-
-def _ams_sockets(address: str) -> Iterator[SharedSocket]:
-    yield SharedSocket(SocketKind.AMS_TCP, address)
-    yield SharedSocket(SocketKind.AMS_UDP, address)
-    if address != EVERY_ADDRESS:  # which broadcasts arrive at too
-        yield SharedSocket(SocketKind.AMS_BROADCAST, address)
-        yield SharedSocket(SocketKind.AMS_BROADCAST, address, group=BROADCAST)
-
-
-def _gateway_sockets(station: StationSpec) -> Iterator[tuple[PortName, SharedSocket]]:
-    """Yield what gateways have to themselves, at each address of their station."""
-    uris = [port.interface for port in station.ports if port.bus is None]
-    hosts = dict.fromkeys(uri.host for uri in uris if uri.scheme in {"udp", "tcp"})
-    for port in station.ports:
-        if port.gateway is not None and port.gateway.port:
-            name = PortName(station.name, port.name)
-            for host in hosts:
-                yield name, SharedSocket(SocketKind.GATEWAY_UDP, host, port.gateway.port)
-                yield name, SharedSocket(SocketKind.GATEWAY_TCP, host, port.gateway.port)
-
-
-def _ams_address(port: PortSpec) -> str:
-    """Return where AMS routers listen for *port*, nothing if nowhere."""
-    uri = port.interface
-    return uri.host if port.ams and uri.scheme in {"udp", "tcp"} else ""
+    def __init__(self, text: str, owners: tuple[PortName, ...]) -> None:
+        super().__init__(text)
+        self.owners = owners
 
 
 class SharedSockets(Closeable):
     """All open descriptors of an appliance; the supervisor closes them at its very end.
 
+    Sockets of ports are a table that follows the ports: services requests additions and removals.
+    Each address and port number is a reuseport group of its own, so an addition changes no other.
+
     Attributes:
-        descriptions: The plan, with the descriptors filled in.
         buses: What belongs to each bus port.
         engine_link: The engine's side of its pair with services.
         services_link: The other side.
         engine_bus: The engine's side of the pair for requests to stations and buses.
         services_bus: The other side.
+        services_end: Services' side of the pair for requests to the supervisor.
         control: The listening control socket.
     """
 
     def __init__(self, stations: Sequence[StationSpec], control_path: Path) -> None:
-        """Open everything, or nothing: EnvironmentalError says what could not be opened."""
+        """Open all but the sockets of EAP ports, or nothing.
+
+        Raises:
+            EnvironmentalError: something cannot be opened, and why.
+        """
+        self._table: dict[SharedSocket, SharedSocket] = {}
+        self._owned: dict[SharedSocket, ExitStack] = {}
         with ExitStack() as opened:
-            self.descriptions = tuple(_open(planned, opened) for planned in plan_sockets(stations))
+            opened.callback(self._close_table)
             self.buses = open_buses(stations, opened)
             self.engine_link, self.services_link = open_message_pair(opened)
             self.engine_bus, self.services_bus = open_message_pair(opened)
+            own_end, self.services_end = open_message_pair(opened)
+            self._requests = SupervisorRequests(
+                opened.enter_context(socket.socket(fileno=os.dup(own_end)))
+            )
             self.control = _open_control(control_path, opened).fileno()
             self._opened = opened.pop_all()
 
-    def engine_descriptors(self) -> list[int]:
-        """Return what the engine inherits."""
-        wanted = [shared.engine_fd for shared in self.descriptions]
-        wanted += [fd for bus in self.buses for fd in (bus.engine_fd, bus.second_fd)]
-        return _existing(*wanted, self.engine_link, self.engine_bus)
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when services requests sockets."""
+        return self._requests.fileno()
 
-    def services_descriptors(self) -> list[int]:
-        """Return what services inherits."""
-        wanted = [shared.services_fd for shared in self.descriptions]
-        # Beside what it receives, what ICMP says of the frames that the engine sends, and the
-        # memberships of the engine's sockets, which end with their interface:
-        shared_kinds = SocketKind.UDP, SocketKind.GROUP
-        wanted += [each.engine_fd for each in self.descriptions if each.kind in shared_kinds]
-        wanted += [bus.command_fd for bus in self.buses]
-        return _existing(*wanted, self.services_link, self.services_bus, self.control)
+    def serve(self) -> None:
+        """Serve the requests of services that are there."""
+        while (request := self._requests.receive()) is not None:
+            if isinstance(request, CloseSocket):
+                self._close(request.socket.key)
+                continue
+            try:
+                opened = self._open(request.socket)
+            except EnvironmentalError as exc:
+                self._requests.refuse(request.id, str(exc))
+                continue
+            pair = {"engine_fd": opened.engine_fd, "services_fd": opened.services_fd}
+            existing = {name: fd for name, fd in pair.items() if fd != NO_DESCRIPTOR}
+            self._requests.reply(request.id, existing)
+
+    def fit(self, stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
+        """Open what *stations* need beside what is open; return their sockets.
+
+        Raises:
+            UnavailableSocketError: one cannot be opened; those that were opened stay open.
+        """
+        return tuple(
+            replace(self._open(planned), owners=planned.owners)
+            for planned in plan_sockets(stations)
+        )
+
+    def keep_only(self, wanted: Iterable[SharedSocket]) -> None:
+        """Close all sockets of ports but *wanted*."""
+        for key in self._table.keys() - {each.key for each in wanted}:
+            self._close(key)
 
     def close(self) -> None:
         """Close all."""
         self._opened.close()
+
+    def _open(self, planned: SharedSocket) -> SharedSocket:
+        key = planned.key
+        if key not in self._table:
+            with ExitStack() as opened:
+                try:
+                    self._table[key] = _open(key, opened)
+                except EnvironmentalError as exc:
+                    raise UnavailableSocketError(str(exc), planned.owners) from None
+                self._owned[key] = opened.pop_all()
+        return self._table[key]
+
+    def _close(self, key: SharedSocket) -> None:
+        if self._table.pop(key, None) is not None:
+            self._owned.pop(key).close()
+
+    def _close_table(self) -> None:
+        self.keep_only(())
+
+
+def inherited_by_engine(handover: Handover) -> list[int]:
+    """Return the descriptors in the *handover* to the engine."""
+    wanted = [shared.engine_fd for shared in handover.sockets]
+    wanted += [fd for bus in handover.buses for fd in (bus.engine_fd, bus.second_fd)]
+    return _existing(*wanted, handover.link_fd, handover.bus_fd)
+
+
+def inherited_by_services(handover: Handover) -> list[int]:
+    """Return the descriptors in the *handover* to services."""
+    wanted = [shared.services_fd for shared in handover.sockets]
+    # Those of the engine, too: services passes them to an engine that lacks them, reads what ICMP
+    # says of the frames that the engine sends, and renews memberships, which end with their
+    # interface.
+    wanted += [shared.engine_fd for shared in handover.sockets]
+    wanted += [bus.command_fd for bus in handover.buses]
+    return _existing(
+        *wanted, handover.link_fd, handover.bus_fd, handover.control_fd, handover.supervisor_fd
+    )
 
 
 def _existing(*descriptors: int) -> list[int]:
@@ -240,16 +246,14 @@ def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:
         if broadcast is None:
             return planned
         opened.enter_context(broadcast)
-        return msgspec.structs.replace(planned, services_fd=broadcast.fileno())
+        return replace(planned, services_fd=broadcast.fileno())
     if (single := _open_single(planned)) is not None:
         opened.enter_context(single)
-        return msgspec.structs.replace(planned, services_fd=single.fileno())
+        return replace(planned, services_fd=single.fileno())
     engine, services = _open_pair(planned)
     opened.enter_context(engine)
     opened.enter_context(services)
-    return msgspec.structs.replace(
-        planned, engine_fd=engine.fileno(), services_fd=services.fileno()
-    )
+    return replace(planned, engine_fd=engine.fileno(), services_fd=services.fileno())
 
 
 def _open_single(planned: SharedSocket) -> socket.socket | None:

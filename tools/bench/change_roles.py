@@ -137,7 +137,7 @@ def run(job: dict[str, Any]) -> None:
     spec = station(job["pds"])
     with SharedSockets((spec,), folder / "control") as shared:
         handover = Handover(
-            os.getppid(), str(folder), "change", "", (spec,), own_sockets(shared.descriptions)
+            os.getppid(), str(folder), "change", "", (spec,), own_sockets(shared.fit((spec,)))
         )
         with closing(EnginePlant(handover)) as plant:
             realtime.prepare(job["priority"], [job["cpu"]])

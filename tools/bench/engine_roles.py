@@ -70,7 +70,7 @@ def run(job: dict[str, Any]) -> None:
             plant="lateness",
             plant_file="",
             stations=stations,
-            sockets=own_sockets(shared.descriptions),
+            sockets=own_sockets(shared.fit(stations)),
         )
         with closing(EnginePlant(handover)) as plant:
             realtime.prepare(job["priority"], [job["cpu"]])

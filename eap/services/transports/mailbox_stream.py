@@ -26,7 +26,8 @@ from eap.net.limits import OWN_HOST, Activity, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.drop_counters import DropReason
-from eap.runtime.handover import PassedConnection, PortName, pass_connection
+from eap.runtime.handover import PortName
+from eap.runtime.passing import PassedConnection, pass_connection
 from eap.services.tasks import TaskSet
 from eap.services.transports.accepting import (
     Listeners,

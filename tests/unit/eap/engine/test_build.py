@@ -28,7 +28,8 @@ from eap.runtime.busfile import load_or_raise
 from eap.runtime.drop_counters import DropCounters
 from eap.runtime.engine_messages import EngineMessage, EngineStarted, SetState
 from eap.runtime.folder import ApplianceFolder
-from eap.runtime.handover import NO_DESCRIPTOR, BusSocket, Handover, PassedConnection, PortName
+from eap.runtime.handover import NO_DESCRIPTOR, BusSocket, Handover, PortName
+from eap.runtime.passing import PassedConnection
 from eap.supervisor.sockets import SharedSockets
 from tests.support.cyclic import image_of
 from tests.support.enginebus import station_of
@@ -99,7 +100,7 @@ def shared(tmp_path):
         # The plant closes what it is given: here it shares a process with the supervisor.
         return [
             msgspec.structs.replace(each, engine_fd=socket.dup(each.engine_fd))
-            for each in sockets.descriptions
+            for each in sockets.fit(stations)
             if each.engine_fd != NO_DESCRIPTOR
         ]
 
@@ -132,7 +133,7 @@ def test_frames_of_a_passed_connection_reach_the_port_behind_it(start, shared):
         with socket.create_connection(listener.getsockname()) as peer:
             connection, _ = listener.accept()
             owners = (PortName("right", "eap0"),)
-            running.plant.add_connection(connection, PassedConnection(owners, "10.0.0.2"))
+            running.plant.take(connection, PassedConnection(owners, "10.0.0.2"))
             peer.sendall(EtherCatHeader(1, 0, 4).encode() + b"\0")
             peer.sendall(EtherCatHeader(0, 0, 5).encode())
             running.run_cycles(3)
@@ -157,7 +158,7 @@ def test_host_over_its_share_loses_its_silent_connection_to_a_port(start, shared
         ]
         for _ in peers:
             passed = PassedConnection(owners, "10.0.0.1")
-            running.plant.add_connection(listener.accept()[0], passed)
+            running.plant.take(listener.accept()[0], passed)
         assert peers[0].recv(1) == b""
         running.run_cycles(3)
         running.plant.publish_discards()

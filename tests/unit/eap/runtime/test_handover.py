@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 
 import pytest
 
@@ -12,13 +11,10 @@ from eap.pd.spec import CounterSource, PortKind, PortSpec, StationSpec, Variable
 from eap.runtime.handover import (
     EngineOptions,
     Handover,
-    PassedConnection,
     PortName,
     SegmentHandover,
     SharedSocket,
     SocketKind,
-    pass_connection,
-    receive_connection,
 )
 
 PORT = PortSpec(
@@ -54,56 +50,3 @@ def test_a_segment_gets_its_own():
 
 def test_finds_a_port_by_name():
     assert handover().port(PortName("a", "eap0")) == PORT
-
-
-pytestmark = pytest.mark.net
-
-DESCRIPTION = PassedConnection((PortName("a", "eap0"),), "10.0.0.2")
-
-
-@pytest.fixture
-def link():
-    services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with services, engine:
-        yield services, engine
-
-
-def test_descriptor_and_description_arrive_together(link):
-    services, engine = link
-    assert receive_connection(engine) is None
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        assert pass_connection(services, theirs, DESCRIPTION)
-        theirs.close()
-        taken = receive_connection(engine)
-        assert taken is not None
-        connection, description = taken
-        assert description == DESCRIPTION
-        with connection:
-            ours.sendall(b"hello")
-            assert connection.recv(5) == b"hello"
-    assert receive_connection(engine) is None
-
-
-def test_a_message_without_a_descriptor_is_dropped(link):
-    services, engine = link
-    services.send(b"{}")
-    assert receive_connection(engine) is None
-
-
-def test_pass_connection_returns_false_for_full_or_closed_link(link):
-    services, engine = link
-    with socket.socket() as connection:
-        for _ in range(100_000):
-            if not pass_connection(services, connection, DESCRIPTION):
-                break
-        else:
-            pytest.fail("the link never filled up")
-        while taken := receive_connection(engine):
-            taken[0].close()
-        assert pass_connection(services, connection, DESCRIPTION)
-        taken = receive_connection(engine)
-        assert taken is not None
-        taken[0].close()
-        engine.close()
-        assert not pass_connection(services, connection, DESCRIPTION)

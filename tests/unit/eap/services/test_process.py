@@ -24,7 +24,7 @@ from eap.runtime.folder import ApplianceFolder, ApplianceInfo
 from eap.runtime.handover import Handover
 from eap.runtime.startup import Report
 from eap.services import process
-from eap.supervisor.sockets import SharedSockets
+from eap.supervisor.sockets import SharedSockets, inherited_by_services
 from tests.support.startup import read_reports
 
 pytestmark = pytest.mark.net
@@ -43,21 +43,23 @@ class Services:
         self.folder.write_info(self.info)
         self.sockets = SharedSockets(stations, self.folder.control_socket)
         self.ready, ready_end = os.pipe()
-        fd = Handover(
+        handover = Handover(
             supervisor,
             str(tmp_path),
             "demo",
             "demo.yaml",
             stations,
-            self.sockets.descriptions,
+            self.sockets.fit(stations),
             link_fd=self.sockets.services_link,
             control_fd=self.sockets.control,
             buses=self.sockets.buses,
             bus_fd=self.sockets.services_bus,
-        ).to_descriptor()
+            supervisor_fd=self.sockets.services_end,
+        )
+        fd = handover.to_descriptor()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "eap.runtime.startup", MODULE, str(fd), str(ready_end), ""],
-            pass_fds=(fd, ready_end, *self.sockets.services_descriptors()),
+            pass_fds=(fd, ready_end, *inherited_by_services(handover)),
             stderr=subprocess.PIPE,
             text=True,
         )

@@ -40,7 +40,7 @@ def script_on(tmp_path):
                 names = [each.name for each in stations]
                 sockets = resources.enter_context(SharedSockets(stations, tmp_path / "control"))
                 counters = resources.enter_context(DropCounters(tmp_path / "counts", names))
-                handover = Handover(1, "", "", "", stations, sockets.descriptions)
+                handover = Handover(1, "", "", "", stations, sockets.fit(stations))
                 handover = _with_own_descriptors(handover)
                 routers = {
                     each.name: station(str(each.ports[0].net_id), name=each.name)

@@ -179,43 +179,55 @@ def handover():
     return Handover(1, "/run/x", "demo", "demo.yaml", (left(), right()), ())
 
 
+@pytest.fixture
+def sockets(tmp_path):
+    with SharedSockets([], tmp_path / "control") as sockets:
+        yield sockets
+
+
 def store(spec, state=DeviceState.OP):
     StationStore("demo", "left").configuration.save(
         Stored(base=digest_of(left()), spec=spec, state=state)
     )
 
 
-def test_without_any_configuration_the_plant_file_runs():
-    found = with_stored_configuration(handover())
-    assert found == replace(handover(), states={"left": DeviceState.OP, "right": DeviceState.OP})
+@pytest.mark.net
+def test_without_any_configuration_the_plant_file_runs(sockets):
+    found = with_stored_configuration(handover(), sockets)
+    states = {"left": DeviceState.OP, "right": DeviceState.OP}
+    assert found == replace(handover(), states=states, sockets=sockets.fit((left(), right())))
 
 
-def test_stations_that_start_in_preop():
+@pytest.mark.net
+def test_stations_that_start_in_preop(sockets):
     store(left(), DeviceState.SAFEOP)
-    found = with_stored_configuration(replace(handover(), first_state=DeviceState.PREOP))
+    found = with_stored_configuration(replace(handover(), first_state=DeviceState.PREOP), sockets)
     assert found.states == {"left": DeviceState.SAFEOP, "right": DeviceState.PREOP}
 
 
-def test_stored_configuration_runs_in_requested_state():
+@pytest.mark.net
+def test_stored_configuration_runs_in_requested_state(sockets):
     changed = replace(left(), frames=())
     store(changed, DeviceState.SAFEOP)
-    found = with_stored_configuration(handover())
+    found = with_stored_configuration(handover(), sockets)
     assert found.stations == (changed, right())
     assert found.states == {"left": DeviceState.SAFEOP, "right": DeviceState.OP}
 
 
-def test_stored_configuration_with_other_sockets_does_not_run(caplog):
+@pytest.mark.net
+def test_stored_configuration_with_other_sockets_does_not_run(caplog, sockets):
     store(left(eap_port(9)), DeviceState.SAFEOP)
     with caplog.at_level(logging.WARNING):
-        found = with_stored_configuration(handover())
+        found = with_stored_configuration(handover(), sockets)
     assert found.stations == (left(), right())
     assert "station left: the plant file runs: port eap0: interface" in caplog.text
 
 
-def test_stored_configuration_that_cannot_be_built_does_not_run(caplog):
+@pytest.mark.net
+def test_stored_configuration_that_cannot_be_built_does_not_run(caplog, sockets):
     store(replace(left(), variables=()))
     with caplog.at_level(logging.WARNING):
-        found = with_stored_configuration(handover())
+        found = with_stored_configuration(handover(), sockets)
     assert found.stations == (left(), right())
     assert "station left: the plant file runs: it cannot be built: KeyError" in caplog.text
 

@@ -14,13 +14,16 @@ import pytest
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec
-from eap.runtime.handover import NO_DESCRIPTOR, PortName, SocketKind
+from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
+from eap.runtime.passing import CloseSocket, OpenSocket, pass_descriptors, receive_reply
+from eap.runtime.socket_plan import bus_ports, plan_sockets
 from eap.supervisor.sockets import (
     SharedSockets,
-    bus_ports,
+    UnavailableSocketError,
+    inherited_by_engine,
+    inherited_by_services,
     open_buses,
     open_message_pair,
-    plan_sockets,
     segments,
 )
 from tests.unit.eap.conftest import eap_port, left, right
@@ -130,18 +133,29 @@ def open_descriptors() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
+def handover(shared: SharedSockets, *stations: StationSpec) -> Handover:
+    return Handover(
+        1, "", "", "", stations, shared.fit(stations), link_fd=shared.services_link,
+        control_fd=shared.control, buses=shared.buses, bus_fd=shared.services_bus,
+        supervisor_fd=shared.services_end,
+    )  # fmt: skip
+
+
 @pytest.mark.net
 def test_all_are_opened_and_described(tmp_path):
     before = open_descriptors()
     port = eap_port(1, join=("239.1.1.1",), broadcast=True)
     with SharedSockets([left(port)], tmp_path / "control") as shared:
-        for described in shared.descriptions:
+        given = handover(shared, left(port))
+        for described in given.sockets:
             of_both = described.kind in {SocketKind.UDP, SocketKind.GROUP}
             assert (described.engine_fd != NO_DESCRIPTOR) == of_both
             assert described.services_fd != NO_DESCRIPTOR
-        inherited = {*shared.engine_descriptors(), *shared.services_descriptors()}
-        assert len(inherited) == open_descriptors() - before
+        inherited = inherited_by_services(given)
+        assert len(set(inherited)) == len(inherited)
         assert not any(os.get_inheritable(fd) for fd in inherited)
+        engine = {each.engine_fd for each in given.sockets} - {NO_DESCRIPTOR}
+        assert engine < set(inherited_by_engine(given))
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(tmp_path / "control"))
     assert open_descriptors() == before
@@ -161,13 +175,11 @@ def test_buses_add_theirs(tmp_path):
     station = msgspec.structs.replace(station, ports=(*station.ports, bus))
     with SharedSockets([station], tmp_path / "control") as shared:
         (described,) = shared.buses
-        engine, services = shared.engine_descriptors(), shared.services_descriptors()
-        assert {described.engine_fd, shared.engine_bus} < set(engine)
-        assert {described.command_fd, shared.services_bus} < set(services)
-        own_datagrams = {each.engine_fd for each in shared.descriptions} - {NO_DESCRIPTOR}
-        assert set(engine) & set(services) == own_datagrams
+        given = handover(shared, station)
+        assert described.engine_fd in inherited_by_engine(given)
+        assert {described.command_fd, shared.services_bus} < set(inherited_by_services(given))
         segment = {described.segment_fd, described.segment_command_fd}
-        assert len({*engine, *services, *segment}) == open_descriptors() - before
+        assert not segment & {*inherited_by_engine(given), *inherited_by_services(given)}
     assert open_descriptors() == before
 
 
@@ -176,13 +188,61 @@ def test_shared_sockets_close_all_when_one_fails(tmp_path):
     before = open_descriptors()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
         squatter.bind(("127.9.2.2", 34980))
-        with pytest.raises(EnvironmentalError, match=r"127\.9\.2\.2:34980"):
-            SharedSockets([left(), right()], tmp_path / "control")
+        with (
+            SharedSockets([left(), right()], tmp_path / "control") as shared,
+            pytest.raises(UnavailableSocketError, match=r"127\.9\.2\.2:34980") as caught,
+        ):
+            shared.fit([left(), right()])
+    assert caught.value.owners == (RIGHT,)
     assert open_descriptors() == before
-    (tmp_path / "control").touch()
+    (tmp_path / "control2").touch()
     with pytest.raises(EnvironmentalError, match="control socket"):
-        SharedSockets([left()], tmp_path / "control")
+        SharedSockets([left()], tmp_path / "control2")
     assert open_descriptors() == before
+
+
+@pytest.mark.net
+def test_sockets_of_ports_that_stay_are_not_opened_again(tmp_path):
+    with SharedSockets([], tmp_path / "control") as shared:
+        first = shared.fit([left()])
+        both = shared.fit([left(), right()])
+        assert {each.services_fd for each in first} < {each.services_fd for each in both}
+        shared.keep_only(first)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.9.2.2", 34980))
+        assert shared.fit([left()]) == first
+
+
+@pytest.mark.net
+def test_services_requests_sockets(tmp_path):
+    wanted = SharedSocket(SocketKind.UDP, "127.9.2.1", 34980)
+    with (
+        SharedSockets([], tmp_path / "control") as shared,
+        socket.socket(fileno=os.dup(shared.services_end)) as services,
+    ):
+
+        def request(number: int, socket: SharedSocket) -> tuple[str, set[str]]:
+            pass_descriptors(services, OpenSocket(number, socket), [])
+            shared.serve()
+            received = receive_reply(services)
+            assert received is not None
+            for fd in received[1].values():
+                os.close(fd)
+            assert received[0].id == number
+            return received[0].error, set(received[1])
+
+        pair = ("", {"engine_fd", "services_fd"})
+        assert request(1, wanted) == pair
+        assert request(2, wanted) == pair
+        broken = SharedSocket(SocketKind.PACKET, "nothere")
+        error, descriptors = request(3, broken)
+        assert "nothere" in error
+        assert not descriptors
+        pass_descriptors(services, CloseSocket(wanted), [])
+        pass_descriptors(services, CloseSocket(broken), [])
+        shared.serve()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.9.2.1", 34980))
 
 
 SIM = BusPortSpec("/plants/io.yaml")

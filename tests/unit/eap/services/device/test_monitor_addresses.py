@@ -118,7 +118,7 @@ def test_usual_port_has_no_need_to_be_named():
 
 def handover(tmp_path, sockets):
     stations = (left(), right())
-    return Handover(1, str(tmp_path), "p", "p.yaml", stations, sockets.descriptions)
+    return Handover(1, str(tmp_path), "p", "p.yaml", stations, sockets.fit(stations))
 
 
 def test_every_udp_port_has_a_way(tmp_path):

@@ -14,7 +14,8 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.net import limits
 from eap.net.limits import OWN_HOST, Activity, ListenerLimits
 from eap.runtime.drop_counters import DropReason
-from eap.runtime.handover import PortName, receive_connection
+from eap.runtime.handover import PortName
+from eap.runtime.passing import receive_passed
 from eap.services.gateway.gateway_transport import GatewayTransport
 from eap.services.transports import accepting
 from eap.services.transports import mailbox_stream as tcp_door
@@ -92,7 +93,7 @@ def test_type_4_goes_to_the_engine_with_its_first_frame():
         await settle()
         writer.write(data[1:])
         taken = []
-        await eventually(lambda: taken.append(receive_connection(scene.engine)) or taken[-1])
+        await eventually(lambda: taken.append(receive_passed(scene.engine)) or taken[-1])
         connection, passed = taken[-1]
         with connection:
             assert passed.owners == OWNERS
