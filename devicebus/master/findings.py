@@ -349,9 +349,14 @@ def join_errors(errors: Sequence[tuple[str, EapError]]) -> EapError:
 
 def describe_trouble(names: Sequence[str], trouble: str) -> str:
     """Return the text of a fault that the slaves of these *names* share."""
-    text = _SLAVE.sub("", trouble)
+    text = without_slave(trouble)
     colon = "" if len(names) == 1 and text.startswith("it ") else ":"
     return f"{_listed(names)}{colon} {text.removeprefix('it ')}"
+
+
+def without_slave(text: str) -> str:
+    """Return the text of a fault without the slave at its start."""
+    return _SLAVE.sub("", text)
 
 
 def describe_counters(port: PortErrors) -> str:
@@ -367,7 +372,7 @@ def describe_counters(port: PortErrors) -> str:
 
 def _cause(error: EapError) -> str:
     """Return the text of an error without its slave."""
-    return _NO_FRAME if isinstance(error, FrameLostError) else _SLAVE.sub("", str(error))
+    return _NO_FRAME if isinstance(error, FrameLostError) else without_slave(str(error))
 
 
 def _silent_runs(slaves: Sequence[SlaveView]) -> list[tuple[int, int]]:

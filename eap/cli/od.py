@@ -234,11 +234,13 @@ def state(ctx: click.Context, wanted: str | None, target: Target, output: Render
         TargetState(str(target), answer.state, answer.error),
         lambda found: f"{target}: {found.state or 'no answer'}",
     )
-    # A station keeps the error of its last request, also when its state is only read.
     if answer.error is not None:
-        what = f"{wanted} was refused" if is_refused else "the last request was refused"
         code = f" (0x{answer.error.code:04X})" if answer.error.code else ""
-        output.remark(f"{target}: {what}: {answer.error.text}{code}")
+        text = f"{answer.error.text}{code}"
+        if not target.slave:
+            # A station keeps the error of its last request, also when its state is only read.
+            text = f"{wanted if is_refused else 'the last request'} was refused: {text}"
+        output.remark(f"{target}: {text}")
     if is_refused:
         ctx.exit(ExitCode.FAILED)
 

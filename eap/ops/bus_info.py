@@ -23,6 +23,7 @@ from devicebus.master.findings import (
     describe_trouble,
     find_causes,
     find_silence,
+    without_slave,
 )
 from devicebus.master.procedure import Procedure, Sleep
 from devicebus.wire import sii
@@ -204,6 +205,8 @@ def slave_states(bus: SlaveBus, slave: str | None, target: str | None) -> SlaveS
     units: Sequence[Slave] = [bus.find(slave)] if slave is not None else bus.scan()
     if target is not None:
         bus.bring([unit for unit in units if not unit.is_absent], AlState[target])
+        # Faults of the time before: a slave that does not reach the target raises.
+        units = [msgspec.structs.replace(unit, fault="") for unit in units]
     return SlaveStates([_state(bus, unit) for unit in units])
 
 
@@ -381,6 +384,6 @@ def _state(bus: SlaveBus, slave: Slave) -> SlaveStateRow:
         status = bus.run(read_status(slave.station), f"slave {slave.station}: its state")
     except WorkingCounterError:
         return SlaveStateRow(slave.station, slave.name, None, 0, "it does not answer")
-    reason = name_of(status.code) if status.code else ""
+    reason = name_of(status.code) if status.code else without_slave(slave.fault)
     state = state_name(status.state | status.error << 4)
     return SlaveStateRow(slave.station, slave.name, state, status.code, reason)

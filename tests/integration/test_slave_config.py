@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.addresses import own_address
-from tests.support.appliance import Plants, SharedAppliance, wait_until
+from tests.support.appliance import Plants, SharedAppliance, run_eapctl, wait_until
 
 pytestmark = pytest.mark.net
 
@@ -160,6 +160,11 @@ def test_refused_start_up_write_is_in_status_and_diag(running):
     wait_until(lambda: text in flat(running.command("status")))
     assert text in flat(running.command("bus", "diag", "cell/bus0"))
     assert running.values("cell")["bus0.strict.state"] in {0, 1, 2}
+    answer = running.command("bus", "state", "cell/bus0", "--json")
+    (row,) = (each for each in json.loads(answer)["slaves"] if each["name"] == "strict")
+    assert row["reason"].startswith(text)
+    done = run_eapctl(running.runtime, "state", "cell/bus0/strict")
+    assert done.stderr.startswith(f"cell/bus0/strict: {text}")
 
 
 def flat(text):

@@ -76,6 +76,17 @@ def test_slave_state_has_the_reason_of_a_refusal(line):
     assert (row.state, row.code, row.reason) == ("INIT+ERROR", 0x51, "EEPROM error")
 
 
+def test_slave_state_has_the_fault_that_its_master_knows(line, monkeypatch):
+    fault = "slave 1003: start-up write of 0x8000:02 in PS (data f4 01): value is out of range"
+    with line.session() as bus:
+        known = [msgspec.structs.replace(each, fault=fault) for each in bus.scan()]
+        monkeypatch.setattr(bus, "scan", lambda: known)
+        row = slave_states(bus, None, None).slaves[2]
+        assert row.reason == fault.removeprefix("slave 1003: ")
+        # All slaves reach a requested state, or the command fails: the old fault is over.
+        assert [row.reason for row in slave_states(bus, None, "PREOP").slaves] == [""] * 3
+
+
 def test_diagnosis_of_a_sound_bus(line):
     with line.session() as bus:
         found = diagnosis(bus, None, 100.0)
