@@ -54,13 +54,7 @@ def bus_of_devices(path: Path, types: Sequence[str], report: ImportReport) -> En
         return None
     chosen = types or list(dict.fromkeys(each.listed.type for each in source.devices))
     if not chosen:
-        report.findings += source.findings()
-        report.add(
-            str(path),
-            0,
-            "it describes no device",
-            "an ESI file with devices, or a folder of such files",
-        )
+        report.findings += [*source.findings(), source.no_device]
     elif len(chosen) > MAX_DEVICES:
         message = f"it describes {len(chosen)} devices"
         report.add(str(path), 0, message, "those of the bus: --device TYPE for each")

@@ -53,7 +53,7 @@ class WrittenBus(msgspec.Struct, frozen=True):
     file: str
     slaves: list[WrittenSlave]
     faults: list[str]
-    """Faults of ESI files, whose devices could not all be listed."""
+    """Faults of ESI files, whose devices could not all be listed, and a source without devices."""
 
 
 class FoundDescription(msgspec.Struct, frozen=True, kw_only=True):
@@ -109,7 +109,7 @@ def _describe(
 def _find_device(
     slave: Slave, source: EsiSource | None, notes: list[str]
 ) -> tuple[EsiDevice | None, Path | None]:
-    if source is None:
+    if source is None or not source.devices:
         return None, None
     query = DeviceQuery(slave.vendor, slave.product, "", slave.revision)
     found = source.match(query)
@@ -176,6 +176,9 @@ def _free_name(slave: Slave, content: Sii, device: EsiDevice | None, taken: set[
 
 def written(file: Path, found: Sequence[FoundDescription], source: EsiSource | None) -> WrittenBus:
     """Return the result of writing *found* to *file*."""
+    faults = [] if source is None else [str(each) for each in source.findings()]
+    if source is not None and not source.devices:
+        faults.append(str(source.no_device))
     return WrittenBus(
         str(file),
         [
@@ -188,7 +191,7 @@ def written(file: Path, found: Sequence[FoundDescription], source: EsiSource | N
             )
             for each in found
         ],
-        [] if source is None else [str(each) for each in source.findings()],
+        faults,
     )
 
 

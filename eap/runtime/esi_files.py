@@ -98,6 +98,13 @@ class EsiSource:
         for file, content in self._files.items():
             yield from _findings(file, content.findings)
 
+    @property
+    def no_device(self) -> PlantFinding:
+        """Finding for a source without devices."""
+        message = "it describes no device"
+        expected = "an ESI file with devices, or a folder of such files"
+        return PlantFinding(str(self.path), 0, "", message, expected)
+
     def choose(self, query: DeviceQuery) -> FoundDevice:
         """Return the device that a configuration names.
 

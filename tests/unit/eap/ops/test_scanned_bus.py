@@ -120,6 +120,18 @@ def test_faults_of_other_files_are_shown(written, tmp_path):
     assert f"{esi}/bad.xml:1: not XML that can be read" in shown
 
 
+@pytest.mark.parametrize("name", ["readme.txt", "dictionary.xml"])
+def test_folder_without_a_device_is_named_once(written, tmp_path, name):
+    esi = tmp_path / "esi"
+    esi.mkdir()
+    (esi / name).write_text("<EtherCATDict/>")
+    file, shown = written("cell", "--esi", str(esi))
+    assert shown.count(f"{esi}: it describes no device; expected an ESI file with devices") == 1
+    # Nothing about each slave: its EEPROM and objects are all that there is.
+    assert "no description of" not in shown
+    assert len(identities(file)) == 5
+
+
 def test_modules_that_a_slave_detects_are_written(written, tmp_path):
     bus = tmp_path / "modular.yaml"
     bus.write_text(
