@@ -18,6 +18,7 @@ from eap.ids import ObjectId
 if TYPE_CHECKING:
     from eap.config.load import Plant
     from eap.control.device import ObjectChange
+    from eap.ops.check import CheckedBus, CheckedPlant
     from eap.ops.plant import ChangeReport, PlanReport, PlantLink, StepOutcome
     from eap.pd.spec import StationSpec
 
@@ -26,33 +27,43 @@ SHAPES = ("ring", "star")
 
 
 @click.command()
-@click.argument("plant", type=PLANT_FILE)
+@click.argument("file", type=PLANT_FILE)
 @json_option("Print one object: ok, all findings, and warnings.")
 @click.pass_context
-def check(ctx: click.Context, plant: Path, output: Renderer) -> None:
-    """Check the plant file PLANT and report all errors.
+def check(ctx: click.Context, file: Path, output: Renderer) -> None:
+    """Check the plant file or bus file FILE and report all errors.
 
     Exits with 2 when there is an error.  A warning names a part that runs but that some commands do
     not support.
     """
-    from eap.ops.plant import check_plant  # yaml; --help must not wait
+    from eap.ops.check import CheckedBus, check_file  # yaml; --help must not wait
 
-    found, checked = check_plant(plant)
+    checked = check_file(file)
+    found = checked.report
     for warning in found.warnings:
         output.remark(f"warning: {warning}")
     for finding in found.findings:
         output.remark(str(finding))
     if len(found.findings) > 1:
+        what = "bus" if isinstance(checked, CheckedBus) else "plant"
         output.remark(
-            f"{plant}: {len(found.findings)} errors: the plant cannot run; correct the file"
+            f"{file}: {len(found.findings)} errors: the {what} cannot run; correct the file"
         )
-    output.show(found, lambda _: _summary(plant, checked))
+    output.show(found, lambda _: _summary(file, checked))
     if found.findings:
         ctx.exit(ExitCode.UNUSABLE)
 
 
-def _summary(file: Path, plant: Plant | None) -> Iterator[str]:
-    """Yield the numbers of stations and PDs of a plant without errors."""
+def _summary(file: Path, checked: CheckedPlant | CheckedBus) -> Iterator[str]:
+    """Yield the numbers of slaves, or of stations and PDs, of a file without errors."""
+    from eap.ops.check import CheckedBus
+
+    if isinstance(checked, CheckedBus):
+        if checked.bus is not None:
+            spec = checked.bus.spec
+            yield f"{file}: no errors (bus {spec.bus}: {count(len(spec.slaves), 'slave')})"
+        return
+    plant = checked.plant
     if plant is None:
         return
     sent = sum(len(frame.pds) for station in plant.stations for frame in station.frames)

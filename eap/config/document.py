@@ -267,6 +267,8 @@ def _resolve(text: str) -> Scalar:
 
 T = TypeVar("T")
 
+_MAIN_KEYS = {"plant": frozenset(("plant", "stations")), "bus": frozenset(("bus", "slaves"))}
+_RUN_BY = {"plant": "eapctl run", "bus": "eapctl sim run"}
 _UNITS = {"us": " of microseconds", "ms": " of milliseconds"}
 
 
@@ -281,6 +283,13 @@ class _ReportedError(Exception):
     """The number if it is only out of range, so that the checks can continue with it."""
 
 
+def kind_of(root: Node) -> str:
+    """Return plant or bus, as the main keys of a file say; empty if they do not."""
+    given = set(root.value) if isinstance(root.value, dict) else set()
+    fitting = [kind for kind, keys in _MAIN_KEYS.items() if given & keys]
+    return fitting[0] if len(fitting) == 1 else ""
+
+
 def convert(root: Node, report: FindingReport) -> PlantFile | None:
     """Convert *root* to a plant file without the reported items; None if it is not a plant."""
     return convert_to(PlantFile, root, report, "plant")
@@ -289,9 +298,14 @@ def convert(root: Node, report: FindingReport) -> PlantFile | None:
 def convert_to(kind: type[T], root: Node, report: FindingReport, what: str) -> T | None:
     """Convert *root* to *kind* without the reported items; None if it cannot be read.
 
-    *what* names it in findings.
+    *what* is plant or bus, and names it in findings.
     """
     report.lines[""] = root.line
+    if (other := kind_of(root)) not in {"", what}:
+        # One finding: those about its keys would say nothing of the mistake.
+        expected = f"a {what} file; '{_RUN_BY[other]}' runs a {other} file"
+        report.add("", f"it is a {other} file", expected, line=0)
+        return None
     try:
         described = _describe_type(kind)  # type: ignore[arg-type]  # classes are hashable
         found: T = _Converter(report).value(root, described, "", what)

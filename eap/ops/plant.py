@@ -1,4 +1,4 @@
-"""Operations on a plant: warnings about its file, and changes of the running plant by that file.
+"""Changes of a running plant by its plant file.
 
 Rule 1: all stations make a plan before the first one is changed.
 Rule 2: the order is that of :mod:`eap.device.rollout`: a receiver takes a new layout beside the old
@@ -20,7 +20,6 @@ from typing import Any, Self, TypeAlias
 import msgspec
 
 from eap.ams.spec import RoutingSpec
-from eap.config.finding import PlantFinding
 from eap.config.load import Plant
 from eap.control import device as protocol
 from eap.control.device import (
@@ -32,14 +31,11 @@ from eap.control.device import (
     RunningSpec,
 )
 from eap.control.protocol import AnswerT, ErrorCode, Method, ParametersT
-from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_spec import fill
 from eap.device.rollout import Step, steps, without_alternates
 from eap.errors import ConfigError, ControlError
 from eap.ids import encode_value
 from eap.ops.client import ControlClient, connect_those
-from eap.pd.device import DeviceFault
-from eap.pd.spec import BusSlaveSpec, PortKind, StationSpec
+from eap.pd.spec import StationSpec
 from eap.runtime.plantfile import load_plant
 from eap.runtime.store import new_cause
 from eap.suggest import suggest
@@ -411,71 +407,3 @@ def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[StepOu
             # Stopped at once: the steps behind rely on those before them.
             if not keep_going:
                 return
-
-
-class CheckReport(msgspec.Struct, frozen=True):
-    """``eapctl check``: all errors of a plant file, and its warnings if it has none."""
-
-    ok: bool
-    findings: tuple[PlantFinding, ...]
-    warnings: tuple[PlantFinding, ...]
-
-
-def check_plant(path: Path) -> tuple[CheckReport, Plant | None]:
-    """Load the plant file at *path*; return the findings, and the plant if it has no errors."""
-    result = load_plant(path)
-    if result.plant is None:
-        return CheckReport(not result.findings, tuple(result.findings), ()), None
-    warnings = []
-    for number, station in enumerate(result.plant.stations):
-        place = f"stations[{number}]"
-        for message, expected in (*_small_dictionaries(station), *_alike_slaves(station)):
-            line = result.lines.get(place, 0)
-            warnings.append(
-                PlantFinding(str(path), line, place, f"station {station.name}, {message}", expected)
-            )
-    return CheckReport(True, (), (*warnings, *result.warnings)), result.plant
-
-
-def _small_dictionaries(station: StationSpec) -> Iterator[tuple[str, str]]:
-    for port, reason in _misfits(station):
-        yield (
-            f"port {port}: {reason}; the port runs, but cannot be changed at run time",
-            "no more than an object dictionary holds",
-        )
-
-
-def _alike_slaves(station: StationSpec) -> Iterator[tuple[str, str]]:
-    """Yield simulated slaves that have the identity of one before, but other process data."""
-    for port in station.ports:
-        if port.bus is None or port.interface.scheme != "sim":
-            continue
-        known: dict[tuple[int, int, int | None], BusSlaveSpec] = {}
-        for slave in port.bus.slaves:
-            first = known.setdefault((slave.vendor, slave.product, slave.revision), slave)
-            if _process_data(first) != _process_data(slave):
-                message = (
-                    f"port {port.name}: {first.name} and {slave.name} have the same vendor,"
-                    " product and revision, but other process data; masters such as SOEM take"
-                    " them to be alike"
-                )
-                yield message, f"a product number of its own for {slave.name} in the bus file"
-
-
-def _process_data(slave: BusSlaveSpec) -> list[list[tuple[int, int, int]]]:
-    return [
-        [(entry.index, entry.subindex, entry.bit_length) for entry in entries]
-        for entries in (slave.outputs, slave.inputs)
-    ]
-
-
-def _misfits(station: StationSpec) -> list[tuple[str, str]]:
-    """Return the EAP ports of *station* whose dictionary is too small, and why."""
-    found = []
-    for port in station.ports:
-        if port.kind is PortKind.EAP:
-            try:
-                fill(EapDictionary(station, port.name))
-            except DeviceFault as exc:
-                found.append((port.name, exc.text))
-    return found

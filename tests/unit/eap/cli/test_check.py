@@ -73,6 +73,38 @@ def test_findings_for_programs(plant: Path) -> None:
     assert all(set(finding) == keys for finding in answer["findings"])
 
 
+BUS = """\
+bus: small
+slaves:
+  - {name: a, kind: coupler}
+  - {name: b, kind: analogue, inputs: [{name: level, type: INT}]}
+"""
+
+
+def test_check_of_a_bus_file(tmp_path: Path) -> None:
+    path = tmp_path / "bus.yaml"
+    path.write_text(BUS)
+    result = CliRunner().invoke(main, ["check", str(path)])
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == f"{path}: no errors (bus small: 2 slaves)\n"
+    path.write_text(BUS.replace("coupler", "couple").replace("type: INT", "bits: x"))
+    result = CliRunner().invoke(main, ["check", str(path)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    first, second, total = result.stderr.splitlines()
+    assert first.startswith(f"{path}:3: kind is 'couple'")
+    assert second.startswith(f"{path}:4: bits is 'x'")
+    assert total == f"{path}: 2 errors: the bus cannot run; correct the file"
+
+
+@pytest.mark.parametrize("command", [["run"], ["plan"]])
+def test_bus_file_in_place_of_a_plant_is_one_finding(tmp_path: Path, command: list[str]) -> None:
+    path = tmp_path / "bus.yaml"
+    path.write_text(BUS)
+    result = CliRunner().invoke(main, [*command, str(path)])
+    expected = "expected a plant file; 'eapctl sim run' runs a bus file"
+    assert (result.exit_code, result.stderr) == (2, f"{path}: it is a bus file; {expected}\n")
+
+
 def test_a_directory_is_a_finding_too(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["check", str(tmp_path), "--json"])
     assert result.exit_code == 2

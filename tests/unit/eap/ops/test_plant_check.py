@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.ops.plant import check_plant
+from eap.ops.check import check_plant
 
 PLANTS = sorted((Path(__file__).parents[4] / "config").glob("*.yaml"))
 PLANT = """\

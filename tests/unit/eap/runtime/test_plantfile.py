@@ -57,6 +57,15 @@ def test_load_plant_includes_findings_of_bus_file(tmp_path):
     assert finding.message == "kind is 'digial'"
 
 
+def test_plant_in_place_of_a_bus_is_one_finding(tmp_path):
+    (tmp_path / "plant.yaml").write_text(PLANT.replace("buses/io.yaml", "plant.yaml"))
+    (finding,) = load_plant(tmp_path / "plant.yaml").findings
+    assert (finding.message, finding.expected) == (
+        "it is a plant file",
+        "a bus file; 'eapctl run' runs a plant file",
+    )
+
+
 def test_a_slave_whose_name_no_plant_can_use(tmp_path):
     path = write(tmp_path, bus=BUS.replace("name: inputs", "name: my inputs"))
     [finding] = load_plant(path).findings
