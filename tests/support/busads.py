@@ -28,6 +28,7 @@ from eap.services.routing.service import LocalRequest
 from eap.services.slaves.bus_client import BusClient
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 BUS = NetId.parse("5.1.1.1.3.1")
 TOOL = NetId.parse("7.7.7.7.1.1")
@@ -152,7 +153,7 @@ def play(
 
     async def run() -> Any:
         engine = FakeEngine(FakeBus(_line(name)))
-        link = EngineLink(engine.services, silence_limit_s=5.0)  # a loaded machine
+        link = EngineLink(engine.services)
         bus = BusClient(link, 0, PORT)
         told: list[tuple[Endpoint, bytes]] = []
         provider = MasterDictionaryProvider(bus, "1.2.3")
@@ -172,7 +173,7 @@ def play(
             engine.close()
             await asyncio.sleep(0)
 
-    return asyncio.run(run())
+    return run_virtual(run())
 
 
 def _line(name: str) -> LoopBus:

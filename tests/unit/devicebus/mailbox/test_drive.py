@@ -8,6 +8,7 @@ import pytest
 from devicebus.errors import BusError, MailboxTimeoutError
 from devicebus.mailbox.conversation import drive, drive_async, map_requests
 from eap.errors import EngineGoneError
+from tests.support.virtualtime import run_virtual
 
 
 class Scripted:
@@ -37,7 +38,7 @@ def asynchronous(conversation: Generator[int, str, str], exchange: Callable[[int
         await asyncio.sleep(0)
         return exchange(request)
 
-    return asyncio.run(drive_async(conversation, exchange_later))
+    return run_virtual(drive_async(conversation, exchange_later))
 
 
 def mapped(conversation: Generator[int, str, str], exchange: Callable[[int], str]) -> str:
@@ -98,7 +99,7 @@ def test_drive_async_closes_a_conversation_whose_task_is_cancelled():
         with pytest.raises(asyncio.CancelledError):
             await task
 
-    asyncio.run(scene())
+    run_virtual(scene())
     assert script.log == ["closed"]
 
 

@@ -13,6 +13,7 @@ from eap.services.engine_link import EngineLink
 from tests.support.eventually import elapse, settle
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 
 def play(scene, *buses, silence_limit_s=1.0):
@@ -28,7 +29,7 @@ def play(scene, *buses, silence_limit_s=1.0):
             link.close()
             engine.close()
 
-    return asyncio.run(run())
+    return run_virtual(run())
 
 
 def describe(bus=0):

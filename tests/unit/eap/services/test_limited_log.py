@@ -11,6 +11,7 @@ import pytest
 
 from eap.services import limited_log
 from eap.services.limited_log import MAX_CAUSES, PERIOD_S, RATES, LimitedLogHandler, caused_by
+from tests.support.virtualtime import run_virtual
 
 
 class Log:
@@ -116,5 +117,5 @@ def test_log_serve_writes_what_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
             async with asyncio.timeout(0.1):
                 await log.handler.serve()
 
-    asyncio.run(run())
+    run_virtual(run())
     assert log.lines() == ["a", "a; repeated once in 60 s"]

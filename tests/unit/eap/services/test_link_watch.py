@@ -9,6 +9,7 @@ from eap.ids import Endpoint
 from eap.services.sockets import LinkWatch
 from tests.support.eventually import eventually
 from tests.support.routing import RecordingSender, station, while_serving
+from tests.support.virtualtime import run_virtual
 
 HOP = Endpoint("link", "hop")
 
@@ -47,8 +48,8 @@ def test_link_watch_serve_polls_repeatedly():
         await eventually(lambda: len(polls) >= 2)
         serving.cancel()
 
-    asyncio.run(while_serving(script(), there))
+    run_virtual(while_serving(script(), there))
 
 
 def test_link_watch_without_interfaces_ends_at_once():
-    asyncio.run(asyncio.wait_for(LinkWatch().serve(), 1))
+    run_virtual(asyncio.wait_for(LinkWatch().serve(), 1))

@@ -20,6 +20,7 @@ from eap.services.process import StationDevices
 from tests.support import aoe
 from tests.support.eventually import eventually
 from tests.support.stationengine import StationEngine
+from tests.support.virtualtime import run_virtual
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def play(devices, script):
         finally:
             serving.cancel()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_each_device_has_its_state_and_identity(devices):

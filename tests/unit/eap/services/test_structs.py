@@ -18,6 +18,7 @@ from eap.pd.spec import CsvSource, StationSpec, VariableSpec, Writer
 from eap.services.control.methods import Methods
 from eap.services.device.image_values import ImageValues
 from eap.services.device.sources import play_sources
+from tests.support.virtualtime import run_virtual
 from tests.unit.eap.conftest import left, right
 
 AXIS = (
@@ -57,7 +58,7 @@ def methods(images: dict[str, StationImage]) -> Methods:
 
 
 def call(methods: Methods, method: str, **params: Any) -> Any:
-    return msgspec.to_builtins(asyncio.run(methods.call(method, params)))
+    return msgspec.to_builtins(run_virtual(methods.call(method, params)))
 
 
 def test_control_reads_and_writes_members(methods: Methods) -> None:
@@ -136,7 +137,7 @@ def test_source_of_services_fills_a_member(
             images["left"].release_writer(Writer.SERVICES)
             return images["left"].image.read("shadow")
 
-        return asyncio.run(asyncio.wait_for(briefly(), 20))
+        return run_virtual(asyncio.wait_for(briefly(), 20))
 
     assert play("shadow.state", "state")["state"].name == "On"
     assert play("shadow", "whole")["x"] == 2.5

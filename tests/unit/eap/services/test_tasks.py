@@ -11,6 +11,7 @@ from eap.control.protocol import ErrorCode
 from eap.errors import ControlError
 from eap.services import tasks as module
 from eap.services.tasks import JobQueue, TaskSet
+from tests.support.virtualtime import run_virtual
 
 
 async def fail() -> None:
@@ -30,7 +31,7 @@ def test_task_set_keeps_tasks_until_they_are_done():
         await asyncio.sleep(0)
         assert len(tasks) == 0
 
-    asyncio.run(scene())
+    run_virtual(scene())
 
 
 def test_task_set_logs_the_exception_of_a_task(caplog):
@@ -39,7 +40,7 @@ def test_task_set_logs_the_exception_of_a_task(caplog):
         await asyncio.wait({task})
         await asyncio.sleep(0)
 
-    asyncio.run(scene())
+    run_virtual(scene())
     (record,) = caplog.records
     assert record.getMessage() == "gateway bus0: a task failed"
     assert record.exc_info is not None
@@ -51,7 +52,7 @@ def test_task_set_leaves_the_exception_to_those_that_await_it(caplog):
             await TaskSet("test").start_awaited(fail())
         await asyncio.sleep(0)
 
-    asyncio.run(scene())
+    run_virtual(scene())
     assert not caplog.records
 
 
@@ -71,7 +72,7 @@ def test_task_set_closed_has_ended_all_tasks(caplog):
         assert ended == [1, 1]
         assert all(task.cancelled() for task in started)
 
-    asyncio.run(scene())
+    run_virtual(scene())
     assert not caplog.records
 
 
@@ -79,7 +80,7 @@ def play(script):
     async def run():
         return await script(JobQueue("station a"))
 
-    return asyncio.run(run())
+    return run_virtual(run())
 
 
 def test_jobs_run_one_at_a_time():

@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-import asyncio
-
 from textual.app import App, ComposeResult
 
 from eap.cli.routes_tui.table import Grid, PlantRouter, View, lines
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
+from tests.support.virtualtime import run_virtual
 
 
 class Holder(App[None]):
@@ -36,4 +35,4 @@ def test_lines_change_in_place_and_the_cursor_follows_its_line() -> None:
             grid.show_lines(View.ROUTES, found(), 80, has_station=True)
             assert grid.chosen.row is ISLAND
 
-    asyncio.run(script())
+    run_virtual(script())

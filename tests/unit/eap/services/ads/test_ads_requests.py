@@ -9,6 +9,7 @@ from eap.ads.request import OperationOutcome
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsAnswer, AmsCommand
 from eap.services.ads.ads_service import answer_request, begin_answer
+from tests.support.virtualtime import run_virtual
 
 OK = bytes(4)
 
@@ -21,7 +22,7 @@ async def echo(operation):
 
 
 def ask(command, body):
-    return asyncio.run(answer_request(command, body, echo))
+    return run_virtual(answer_request(command, body, echo))
 
 
 def sum_read(*places):
@@ -50,7 +51,7 @@ def test_operation_without_waiting_is_answered_at_once():
     assert begin_answer(AmsCommand.READ, b"", at_once) == AmsAnswer(b"\5\7\0\0" + OK)
     asked = sum_read((1, 6, 1), (1, 7, 1))
     later = begin_answer(AmsCommand.READ_WRITE, asked, at_once)
-    assert asyncio.run(later).data.endswith(b"\7\7")
+    assert run_virtual(later).data.endswith(b"\7\7")
 
 
 def test_malformed_ads_request_is_answered_with_an_error():
@@ -72,5 +73,5 @@ def test_others_have_a_turn_in_a_long_one():
         assert len(seen) < 200
         await asking
 
-    asyncio.run(run())
+    run_virtual(run())
     assert seen == list(range(200))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 
 import pytest
@@ -18,6 +17,7 @@ from eap.services.ads.ads_service import AdsService, device_info
 from eap.services.routing.service import LocalRequest
 from tests.support import aoe
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 ONE, OTHER = 300, 301
 WAY, OTHER_WAY = Endpoint("ams-tcp", "1"), Endpoint("ams-tcp", "2")
@@ -48,7 +48,7 @@ class Bench:
         answer = self.service.answer(LocalRequest(header, body, endpoint))
         if isinstance(answer, AmsAnswer):
             return answer.data
-        return asyncio.run(answer).data
+        return run_virtual(answer).data
 
     def watchers(self):
         return [len(self.service.notifications[port]) for port in (ONE, OTHER)]

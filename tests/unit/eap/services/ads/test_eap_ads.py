@@ -23,6 +23,7 @@ from eap.services.routing.service import LocalRequest
 from eap.services.tasks import MAX_WAITING
 from tests.support import aoe
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 TXPD, CONTROL = 0xD000, 0xF200
 OK = bytes(4)
@@ -56,7 +57,7 @@ class Bench:
         return struct.unpack("<IHH", (await self.ask(AmsCommand.READ_STATE)).data)
 
     def run(self, script):
-        return asyncio.run(script())
+        return run_virtual(script())
 
 
 @pytest.fixture

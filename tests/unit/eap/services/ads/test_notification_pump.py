@@ -21,6 +21,7 @@ from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
 from eap.services.ads.station_symbols import NotificationPump, StationSymbols
 from tests.support.eventually import eventually
+from tests.support.virtualtime import run_virtual
 
 MS = 1_000_000
 CYCLE = 10 * MS
@@ -262,7 +263,7 @@ def test_pump_sends_soon_to_a_new_client(bench):
         await eventually(lambda: bench.sent)
         serving.cancel()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_pump_logs_a_fault_and_goes_on(bench, caplog, monkeypatch):
@@ -277,5 +278,5 @@ def test_pump_logs_a_fault_and_goes_on(bench, caplog, monkeypatch):
         assert not serving.done()
         serving.cancel()
 
-    asyncio.run(run())
+    run_virtual(run())
     assert "notifications of station left" in caplog.text

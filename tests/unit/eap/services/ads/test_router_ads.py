@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 
 import pytest
@@ -22,6 +21,7 @@ from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
 from tests.support import aoe
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 IO, DEVICE = 300, 0xFFFF
 WAY = Endpoint("ams-tcp", "1")
@@ -48,7 +48,7 @@ class Bench:
         answer = self.ads.answer(LocalRequest(header, body, WAY))
         if isinstance(answer, AmsAnswer):
             return answer
-        return asyncio.run(answer)
+        return run_virtual(answer)
 
     def read(self, port, group, offset):
         answer = self.ask(port, AmsCommand.READ, aoe.read_body(offset, group=group))
@@ -108,6 +108,6 @@ def test_sum_commands(bench):
     items = struct.pack("<6I", G.SDO, 0x1000_0000, 4, G.SDO, 0x1234_0000, 4)
     body = struct.pack("<4I", G.SUM_READ, 2, 100, len(items)) + items
     header = AmsHeader(CLIENT, DEVICE, CLIENT, 1, AmsCommand.READ_WRITE)
-    answer = asyncio.run(bench.ads.answer(LocalRequest(header, body, WAY)))
+    answer = run_virtual(bench.ads.answer(LocalRequest(header, body, WAY)))
     assert answer.data[8:16] == OK + AdsError.NOT_FOUND.to_bytes(4, "little")
     assert answer.why == "0x1234:00: object does not exist (0x06020000)"

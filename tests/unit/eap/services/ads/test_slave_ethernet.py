@@ -23,6 +23,7 @@ from eap.services.gateway import remote_ethernet
 from eap.services.gateway.remote_ethernet import RemoteEthernet
 from tests.support.busads import DRIVE, Client, play, until
 from tests.support.elsewhere import Bus, Station
+from tests.support.virtualtime import run_virtual
 
 EOE = IndexGroup.EOE
 SETTINGS = IpSettings.decode(bytes.fromhex("03000000 020000000002 0200000a"))
@@ -206,4 +207,4 @@ def test_gateway_asks_a_station_that_refuses_seldom():
         assert len(station.asked) <= 2
         await ethernet.close()
 
-    asyncio.run(run())
+    run_virtual(run())

@@ -19,6 +19,7 @@ from eap.runtime.engine_messages import ExchangeMailbox
 from eap.services.ads import slave_notifications
 from eap.services.ads.slave_notifications import Pace, SamplingBudget, SlaveNotifications
 from tests.support.busads import DRIVE, Client, play, until
+from tests.support.virtualtime import run_virtual
 
 BUS = NetId.parse("5.1.1.1.3.1")
 ME = AdsClient(Endpoint("tcp", "1"), NetId(b"client"), 30000)
@@ -237,7 +238,7 @@ def on_line(scene) -> None:
         async with asyncio.timeout(20):
             await scene(Line())
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_clients_share_the_readings_of_a_value():

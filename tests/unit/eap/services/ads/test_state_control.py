@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import pytest
 
 from eap.ads.request import OperationOutcome, WriteControl
@@ -12,10 +10,11 @@ from eap.errors import EngineRefusedError
 from eap.pd.device import DeviceState
 from eap.services.ads.ads_service import control_state
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 
 def control(device, ads_state):
-    return asyncio.run(control_state(device, WriteControl(ads_state, 0, b"")))
+    return run_virtual(control_state(device, WriteControl(ads_state, 0, b"")))
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from tests.support import aoe
 from tests.support.eventually import eventually
 from tests.support.routing import RecordingSender
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 CONNECTION = "127.0.0.1:9 #1"
 
@@ -91,7 +92,7 @@ def test_notifications_leave_by_the_router(ads, router, sender, stations, files)
         serving.cancel()
         return added, sender.sent[-1]
 
-    added, (connection, told) = asyncio.run(run())
+    added, (connection, told) = run_virtual(run())
     assert (connection, told.command) == (CONNECTION, AmsCommand.NOTIFICATION)
     assert told.source == f"{target}:65535"
     ((sample,),) = [stamp.samples for stamp in decode_notification(told.body)]

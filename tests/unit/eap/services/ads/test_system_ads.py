@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 
 import pytest
@@ -17,6 +16,7 @@ from eap.services.ads.station_ads import SystemAds
 from eap.services.routing.service import LocalRequest
 from tests.support import aoe
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 WAY = Endpoint("ams-tcp", "1")
 HERE = NetId.parse("1.2.3.4.1.1")
@@ -40,7 +40,7 @@ def ask(system, device):
         answer = system.answer(LocalRequest(header, body, WAY))
         if isinstance(answer, AmsAnswer):
             return answer.data
-        return asyncio.run(answer).data
+        return run_virtual(answer).data
 
     return ask
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import asyncio
 from typing import Any
 
 import msgspec
@@ -16,6 +15,7 @@ from eap.services.control.route_methods import AmsMethods
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.tracing import RouteQuery
 from tests.support.routing import StubService
+from tests.support.virtualtime import run_virtual
 
 NET_ID = NetId.parse("5.1.1.1.1.1")
 PLANT = Directory([DirectoryStation("island-01", NET_ID, ())])
@@ -34,7 +34,7 @@ def call(method: str, **params: Any) -> Any:
         methods = AmsMethods({"island-01": router}, PLANT, {"island-01": "127.0.1.1"})
         return msgspec.to_builtins(await methods.table()[method](params))
 
-    return asyncio.run(get())
+    return run_virtual(get())
 
 
 def test_trace_of_a_local_target() -> None:

@@ -16,6 +16,7 @@ from eap.codec.ams import AmsHeader
 from eap.ids import Endpoint, InterfaceUri, NetId
 from eap.services.control import audit as module
 from eap.services.control.audit import BURST, KEPT, Audit, AuditFile
+from tests.support.virtualtime import run_virtual
 
 LAPTOP = Endpoint("ams-tcp", "10.0.0.5:49152")
 HEADER = AmsHeader(
@@ -324,7 +325,7 @@ def test_audit_writes_skipped_lines_at_its_end(audit: Audit) -> None:
         await asyncio.wait([serving])
 
     audit.write("island-01", entry(count=BURST + 2))
-    asyncio.run(serve_and_end())
+    run_virtual(serve_and_end())
     assert lines(audit)[-1]["skipped"] == 2
 
 

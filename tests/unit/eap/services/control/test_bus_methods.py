@@ -22,6 +22,7 @@ from eap.services.slaves.bus_client import open_buses
 from eap.services.slaves.segment_link import SegmentLink
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine, FakeSegment
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 WHERE = {"station": "left", "port": "bus0"}
 VENDOR = "00204018100100000000"
@@ -88,7 +89,7 @@ def play(scene):
         finally:
             stage.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 async def refusal(connection, method, **params):
@@ -279,4 +280,4 @@ def test_appliance_without_buses():
         error = await refusal(Connection(buses), "bus_describe", station="right", port="bus0")
         assert "has no bus ports" in str(error)
 
-    asyncio.run(scene())
+    run_virtual(scene())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from inspect import isawaitable
 
 import msgspec
@@ -22,6 +21,7 @@ from eap.runtime.store import StationStore, digest_of
 from eap.services.control.device_methods import DeviceMethods
 from tests.support.routervalues import Values
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 BUS_ONLY = StationSpec(
     "io",
@@ -56,7 +56,7 @@ def call(methods):
             result = methods[method](params)
             return await result if isawaitable(result) else result
 
-        return msgspec.json.decode(msgspec.json.encode(asyncio.run(run()), enc_hook=encode_value))
+        return msgspec.json.decode(msgspec.json.encode(run_virtual(run()), enc_hook=encode_value))
 
     return call
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from inspect import isawaitable
 from typing import Any
 
@@ -19,6 +18,7 @@ from eap.services.gateway.gateway import Settings
 from eap.services.gateway.reply_encoder import GatewayStatistics
 from eap.services.gateway.sessions import SessionKey
 from tests.support.cyclic import station
+from tests.support.virtualtime import run_virtual
 
 HERE = Endpoint("udp:eap0", "127.0.0.1:9")
 FIRST, SECOND = PortName("left", "bus0"), PortName("left", "bus1")
@@ -68,7 +68,7 @@ def ask(gateways):
         async def wait() -> Any:
             return await answer
 
-        found = asyncio.run(wait()) if isawaitable(answer) else answer
+        found = run_virtual(wait()) if isawaitable(answer) else answer
         return msgspec.to_builtins(found)
 
     return call

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import asyncio
 from inspect import isawaitable
 from ipaddress import IPv4Address
 from typing import Any
@@ -16,6 +15,7 @@ from eap.services.control.route_methods import RouteMethods
 from eap.services.routing.remote_routers import RemoteRouter
 from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
+from tests.support.virtualtime import run_virtual
 
 PLC = {"station": "left", "name": "plc", "net_id": "5.1.2.3.1.1", "via": "ams-tcp:10.0.0.5"}
 
@@ -34,7 +34,7 @@ def methods(left):
 def ask(methods):
     def ask(method, **params):
         result = methods[f"routes_{method}"](params)
-        return asyncio.run(result) if isawaitable(result) else result
+        return run_virtual(result) if isawaitable(result) else result
 
     return ask
 
@@ -136,7 +136,7 @@ def test_virtual_routes_have_their_local_net_ids(ask):
 
 def test_routes_test_sends_a_request(methods, left):
     testing = methods["routes_test"]({"station": "left", "target": "left", "timeout_ms": 200})
-    found = asyncio.run(while_serving(testing, left.router))
+    found = run_virtual(while_serving(testing, left.router))
     assert (found.ok, found.state) == (True, "RUN")
 
 

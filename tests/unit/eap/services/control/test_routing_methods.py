@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import asyncio
 from inspect import isawaitable
 
 import msgspec
@@ -15,6 +14,7 @@ from eap.services.routing.station_routes import StationRoutes
 from eap.services.routing.station_routing import StationRouting
 from eap.services.transports.station_brokers import StationBrokers
 from tests.support.routing import station
+from tests.support.virtualtime import run_virtual
 
 HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")
 OLD = RoutingSpec()
@@ -34,7 +34,7 @@ def ask(tmp_path, monkeypatch):
     def call(method, **params):
         plain = {name: msgspec.to_builtins(value) for name, value in params.items()}
         result = methods[f"routing_{method}"]({"station": "left", **plain})
-        return asyncio.run(result) if isawaitable(result) else result
+        return run_virtual(result) if isawaitable(result) else result
 
     return call
 

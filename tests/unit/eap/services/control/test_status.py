@@ -30,6 +30,7 @@ from eap.services.control.status import (
     take_snapshot,
 )
 from tests.support.eventually import eventually
+from tests.support.virtualtime import run_virtual
 from tests.unit.eap.conftest import left
 
 
@@ -142,14 +143,14 @@ def test_snapshot_within_a_cycle_is_taken_after_it_while_others_go_on(files):
             image.words[StationWord.FUTEX] = 1
         return taken.result()
 
-    assert asyncio.run(scene()).words[StationWord.OVERRUNS] == 5
+    assert run_virtual(scene()).words[StationWord.OVERRUNS] == 5
 
 
 def test_snapshot_of_an_engine_that_hangs_within_a_cycle(files, monkeypatch):
     monkeypatch.setattr(status, "SNAPSHOT_PAUSES", 2)
     image = files["left"].image
     image.words[StationWord.CYCLE] = 1
-    assert asyncio.run(take_snapshot(image)).words[StationWord.CYCLE] == 1
+    assert run_virtual(take_snapshot(image)).words[StationWord.CYCLE] == 1
 
 
 def test_buses_and_segments(tmp_path):
@@ -200,5 +201,5 @@ def test_shared_answer_is_made_once_for_concurrent_requests():
         answers = [await each for each in (first, *others)]
         return [each["number"] for each in answers]
 
-    assert asyncio.run(run()) == [0, 1, 1]
+    assert run_virtual(run()) == [0, 1, 1]
     assert made == [0, 1]

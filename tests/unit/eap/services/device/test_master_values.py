@@ -38,6 +38,7 @@ from eap.services.slaves.bus_client import BusClient, BusDescription
 from tests.support.eventually import elapse, eventually, settle
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 CONFIGURED, DIAGNOSIS, LISTS = 0x8000, 0xA000, 0xF020
 SLAVE = SlaveDescription(
@@ -61,7 +62,7 @@ def play(scene: Callable[[MasterView, FakeEngine], Awaitable[None]], bus: str = 
             link.close()
             engine.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_view_shows_configured_and_detected_slaves() -> None:
@@ -274,7 +275,7 @@ def facts_of(client: ScriptedClient, times: int = 1) -> tuple[int, bool]:
             await view.refresh(CONFIGURED)
         assert view.is_fresh(CONFIGURED)
 
-    asyncio.run(run())
+    run_virtual(run())
     return view.of_configured(1001, MasterLive.DEVICE_TYPE), view.of_configured(
         1001, MasterLive.HAS_HISTORY
     )
@@ -301,7 +302,7 @@ def test_slave_objects_are_read_again_after_the_slave_was_gone() -> None:
         await view.refresh(CONFIGURED)
         assert view.of_configured(1001, MasterLive.DEVICE_TYPE) == 0x0002_0192
 
-    asyncio.run(run())
+    run_virtual(run())
     assert client.asked == 2
 
 
@@ -384,4 +385,4 @@ def test_provider_serves_a_dictionary_that_is_fresh() -> None:
             link.close()
             engine.close()
 
-    asyncio.run(run())
+    run_virtual(run())

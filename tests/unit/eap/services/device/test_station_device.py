@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 
 import pytest
@@ -17,6 +16,7 @@ from eap.pd.spec import TriggerSpec, TxFrameSpec, TxPdSpec, VariableSpec
 from eap.runtime import draft
 from eap.runtime.store import StationStore, digest_of, effective, plant_folder
 from tests.support.stationengine import make_device
+from tests.support.virtualtime import run_virtual
 
 TXPD, FRAME, CONTROL, STATUS = 0xD000, 0x8000, 0xF200, 0xF100
 
@@ -64,7 +64,7 @@ def test_walk_through_the_states(spec):
             assert await device.request_state(state) == (state, None)
             assert engine.state == state == word(device, STATUS, 1)
 
-    asyncio.run(script())
+    run_virtual(script())
     assert not any(call.startswith("configure") for call in engine.calls)
 
 
@@ -80,7 +80,7 @@ def test_downloads_in_preop_run_from_safeop_on(spec):
         assert engine.spec == device.spec == spec
         await write(device, CONTROL, 1, 8)
 
-    asyncio.run(script())
+    run_virtual(script())
     (frame,) = engine.spec.frames
     assert [pd.pd_id for pd in frame.pds] == [77]
     assert device.spec == engine.spec
@@ -96,7 +96,7 @@ def test_next_services_find_the_same_dictionary(spec):
         await write(device, 0x6010, 4, int.from_bytes(b"UINT", "little"), 4)  # used by nothing
         await write(device, CONTROL, 1, 4)
 
-    asyncio.run(script())
+    run_virtual(script())
     assert 0x6010 in device.dictionaries["eap0"]
     again, _ = make_device(engine.spec, DeviceState.SAFEOP)
     assert dump_configuration(again.dictionaries["eap0"]) == dump_configuration(
@@ -124,7 +124,7 @@ async def download_three(device):
 def test_next_services_find_downloads_in_preop_that_were_not_taken(spec):
     device, _ = make_device(spec)
     unchanged = content(device)
-    asyncio.run(download_three(device))
+    run_virtual(download_three(device))
     again = restarted(device)
     assert content(again) == content(device) != unchanged
     assert again.spec == spec
@@ -133,7 +133,7 @@ def test_next_services_find_downloads_in_preop_that_were_not_taken(spec):
         await write(again, TXPD, Tx.PD_ID, 78)  # it goes on where the one before ended
         await write(restarted(again), CONTROL, 1, 4)
 
-    asyncio.run(script())
+    run_virtual(script())
     stored = StationStore("demo", "left").configuration.read()
     assert [pd.pd_id for frame in stored.spec.frames for pd in frame.pds] == [78]
 
@@ -147,7 +147,7 @@ def test_refused_download_in_preop_is_not_repeated(spec):
             await write(device, TXPD, Tx.PD_ID, 77, 1)
         await write(device, TXPD, Tx.PD_ID, 78)
 
-    asyncio.run(script())
+    run_virtual(script())
     assert content(restarted(device)) == content(device)
 
 
@@ -159,7 +159,7 @@ def test_downloads_that_were_taken_are_not_repeated(spec):
         await device.request_state(4)
         await device.request_state(2)
 
-    asyncio.run(script())
+    run_virtual(script())
     again, _ = make_device(engine.spec, DeviceState.PREOP)
     assert content(again) == content(device)
     assert StationStore("demo", "left").draft.read(digest_of(engine.spec)) is None
@@ -172,13 +172,13 @@ def test_apply_in_preop_replaces_downloads(spec):
         await download_three(device)
         await device.apply(with_more(spec))
 
-    asyncio.run(script())
+    run_virtual(script())
     again, _ = make_device(engine.spec, DeviceState.PREOP)
     assert content(again) == content(device)
 
 
 def test_downloads_of_another_configuration_are_left_out(spec):
-    asyncio.run(download_three(make_device(spec)[0]))
+    run_virtual(download_three(make_device(spec)[0]))
     other = replace(spec, frames=())
     again, _ = make_device(other, DeviceState.PREOP)
     assert content(again) == content(make_device(other, DeviceState.OP)[0])
@@ -194,7 +194,7 @@ def test_many_downloads_are_kept_in_bounded_space(spec, monkeypatch):
             await write(device, TXPD, Tx.PD_ID, number + 1)
             assert content(restarted(device)) == content(device)
 
-    asyncio.run(script())
+    run_virtual(script())
     found = StationStore("demo", "left").draft.read(digest_of(spec))
     assert found.objects
     assert len(found.downloads) < 10
@@ -205,11 +205,11 @@ def test_downloads_that_cannot_be_kept_are_warned_of_once(spec, caplog):
     folder = plant_folder("demo")
     folder.mkdir(parents=True)
     (folder / "drafts").write_text("a file in place of the folder")
-    asyncio.run(download_three(device))
+    run_virtual(download_three(device))
     (warning,) = [each.message for each in caplog.records if "cannot be kept" in each.message]
     assert warning.startswith("station left: downloads in PREOP cannot be kept in ")
     (folder / "drafts").unlink()
-    asyncio.run(write(device, TXPD, Tx.PD_ID, 79))
+    run_virtual(write(device, TXPD, Tx.PD_ID, 79))
     assert content(restarted(device)) == content(device)
 
 
@@ -229,13 +229,13 @@ def test_line_that_a_kill_has_cut_is_left_out(spec, cut):
         await write(again, TXPD, Tx.PD_ID, 79)
         assert content(restarted(again)) == content(again)
 
-    asyncio.run(script())
+    run_virtual(script())
 
 
 def test_damaged_downloads_are_put_aside_with_a_warning(spec, caplog):
     device, _ = make_device(spec)
     unchanged = content(device)
-    asyncio.run(download_three(device))
+    run_virtual(download_three(device))
     path = plant_folder("demo") / "drafts" / "left.jsonl"
     path.write_bytes(path.read_bytes().replace(b'"index"', b'"indox"', 1))
     assert content(restarted(device)) == unchanged
@@ -258,7 +258,7 @@ def test_refused_state_says_why_and_by_which_object(spec):
         await write(device, TXPD, Tx.PDO_INDEX, 0x1A00)
         assert await device.request_state(8) == (8, None)
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.calls == ["left PREOP", "left OP"]
 
 
@@ -267,7 +267,7 @@ def test_refused_state_says_why_and_by_which_object(spec):
 )
 def test_state_that_cannot_be_requested(spec, wanted, code):
     device, engine = make_device(spec)
-    refused = asyncio.run(device.request_state(wanted))
+    refused = run_virtual(device.request_state(wanted))
     assert (refused.state, refused.fault.code) == (DeviceState.OP, code)
     assert engine.calls == []
 
@@ -286,7 +286,7 @@ def test_engine_that_does_not_take_it_leaves_the_device_in_preop(spec):
         assert word(device, TXPD, Tx.PD_ID) == 77  # to be tried again
         assert await device.request_state(8) == (8, None)
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.spec.frames[0].pds[0].pd_id == 77
 
 
@@ -302,7 +302,7 @@ def test_engine_that_does_not_change_its_state(spec):
         engine.calls.clear()
         await device.resend()
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.calls == ["configure left", "left PREOP"]
 
 
@@ -315,7 +315,7 @@ def test_port_that_the_supervisor_opened_cannot_be_changed_by_downloads(spec):
         assert refused.fault.code == FaultCode.PORT
         assert "port eap0: tcp False -> True" in refused.fault.text
 
-    asyncio.run(script())
+    run_virtual(script())
 
 
 @pytest.mark.parametrize("state", [DeviceState.PREOP, DeviceState.OP])
@@ -333,7 +333,7 @@ def test_apply_changes_a_running_station(spec, state):
         assert again.is_empty
         assert fault is None
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.spec == device.spec == wanted
     assert engine.calls == ["configure left"]
     assert engine.state is state
@@ -346,7 +346,7 @@ def test_apply_keeps_the_indexes_of_unchanged_objects(spec):
     (frame,) = spec.frames
     first = TxPdSpec("first", 6, ("ticks",), trigger=TriggerSpec(divider=2))
     wanted = replace(spec, frames=(replace(frame, pds=(first, *frame.pds)),))
-    asyncio.run(device.apply(wanted))
+    run_virtual(device.apply(wanted))
     assert engine.spec == wanted
     names = [device.upload("eap0", index, Tx.NAME) for index in (TXPD, TXPD + 1)]
     assert names == [b"state", b"first"]
@@ -354,12 +354,12 @@ def test_apply_keeps_the_indexes_of_unchanged_objects(spec):
 
 def test_plan_changes_nothing(spec):
     device, engine = make_device(spec)
-    plan = asyncio.run(device.plan(with_more(spec)))
+    plan = run_virtual(device.plan(with_more(spec)))
     assert plan.changes
     assert not plan.is_empty
     assert device.spec == spec
     assert engine.calls == []
-    assert asyncio.run(device.plan(spec)).is_empty
+    assert run_virtual(device.plan(spec)).is_empty
 
 
 def test_apply_of_an_invalid_change_changes_nothing(spec):
@@ -374,7 +374,7 @@ def test_apply_of_an_invalid_change_changes_nothing(spec):
         plan, fault = await device.apply(unknown)
         assert (len(plan.refused), fault) == (1, None)
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.calls == []
     assert device.spec == spec
     assert StationStore("demo", "left").configuration.read() is None
@@ -390,7 +390,7 @@ def test_apply_that_the_engine_refuses_changes_nothing(spec):
         assert plan.changes
         assert "no memory" in fault.text
 
-    asyncio.run(script())
+    run_virtual(script())
     assert device.spec == engine.spec == spec
     assert dump_configuration(device.dictionaries["eap0"]) == before
     assert effective("demo", (spec,)) == ((spec, DeviceState.OP),)
@@ -415,9 +415,9 @@ def test_rollback_goes_back_and_forth(spec):
         assert device.spec == engine.spec == wanted
         assert dump_configuration(device.dictionaries["eap0"]) == after
 
-    asyncio.run(script())
+    run_virtual(script())
     again, engine = make_device(wanted)
-    asyncio.run(again.roll_back())
+    run_virtual(again.roll_back())
     assert engine.spec == spec
 
 
@@ -441,7 +441,7 @@ def test_spec_too_large_for_dictionaries_runs_without_downloads(spec, caplog):
         await device.apply(spec)
         assert await device.request_state(8) == (8, None)
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.spec == spec
 
 
@@ -467,7 +467,7 @@ def test_entry_that_may_be_changed_while_it_runs(spec):
             await write(device, TXPD, Tx.VERSION, 1)
         assert caught.value.code == AbortCode.DEVICE_STATE
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.spec.frames[0].pds[0].pd_id == 77
     assert effective("demo", (changeable(spec),))[0].spec == engine.spec
 
@@ -486,7 +486,7 @@ def test_change_while_it_runs_that_cannot_be_is_refused_by_the_dictionary(spec):
         assert caught.value.code == AbortCode.PARAMETER
         assert word(device, TXPD, Tx.PD_ID) == 7
 
-    asyncio.run(script())
+    run_virtual(script())
     assert engine.calls == []
 
 
@@ -497,7 +497,7 @@ def test_device_that_cannot_be_kept_has_a_finding(spec, monkeypatch):
     device, _ = make_device(spec)
     assert device.findings() == []
     monkeypatch.setattr("eap.runtime.store.replace_file", full)
-    asyncio.run(device.request_state(DeviceState.SAFEOP))
+    run_virtual(device.request_state(DeviceState.SAFEOP))
     (only,) = device.findings()
     assert (only["severity"], only["where"]) == ("error", "left")
     assert only["what"].endswith(

@@ -21,6 +21,7 @@ from eap.runtime.store import (
 )
 from eap.services.device.station_keeper import StationKeeper
 from tests.support.stationengine import StationEngine
+from tests.support.virtualtime import run_virtual
 from tests.unit.eap.conftest import right
 
 OLD, NEW = {"eap0": "old"}, {"eap0": "new"}
@@ -70,7 +71,7 @@ def test_unchanged_station_is_not_stored(keeper, spec):
 def test_change_is_kept_and_runs(keeper, engine, spec, changed):
     told = []
     keeper.on_change.append(told.append)
-    asyncio.run(keeper.change(changed, NEW))
+    run_virtual(keeper.change(changed, NEW))
     assert engine.spec == keeper.spec == changed
     assert told == [changed]
     stored = kept()
@@ -80,18 +81,18 @@ def test_change_is_kept_and_runs(keeper, engine, spec, changed):
 
 
 def test_next_keeper_goes_on_from_there(keeper, engine, spec, changed):
-    asyncio.run(keeper.change(changed, NEW))
+    run_virtual(keeper.change(changed, NEW))
     again = StationKeeper(
         changed, DeviceState.OP, StationStore("demo", changed.name).configuration, engine
     )
     assert (again.objects, again.previous.spec) == (NEW, spec)
-    asyncio.run(again.change(spec, OLD))
+    run_virtual(again.change(spec, OLD))
     assert kept().base == digest_of(spec)
     assert kept().previous.spec == changed
 
 
 def test_stored_objects_of_another_spec_are_ignored(keeper, engine, spec, changed):
-    asyncio.run(keeper.change(changed, NEW))
+    run_virtual(keeper.change(changed, NEW))
     assert (
         StationKeeper(
             spec, DeviceState.OP, StationStore("demo", spec.name).configuration, engine
@@ -109,14 +110,14 @@ def test_change_is_stored_before_the_engine_request(keeper, engine, changed):
         engine.gate.set()
         await changing
 
-    asyncio.run(script())
+    run_virtual(script())
 
 
 @pytest.mark.parametrize("error", [EngineRefusedError("no room"), EngineGoneError("it is gone")])
 def test_spec_that_the_engine_refuses_is_not_stored(keeper, engine, spec, changed, error):
     engine.failure = error
     with pytest.raises(DeviceFault, match=str(error)) as caught:
-        asyncio.run(keeper.change(changed, NEW))
+        run_virtual(keeper.change(changed, NEW))
     assert caught.value.code == FaultCode.NOT_RUNNING
     assert keeper.spec == kept().spec == spec
     assert keeper.previous is None
@@ -129,7 +130,7 @@ def test_spec_that_cannot_be_stored_does_not_run(keeper, engine, changed, monkey
 
     monkeypatch.setattr(StationFile, "save", full)
     with pytest.raises(DeviceFault, match="disk full"):
-        asyncio.run(keeper.change(changed, NEW))
+        run_virtual(keeper.change(changed, NEW))
     assert engine.calls == []
     assert keeper.unsaved is None  # what runs is still what was kept
 
@@ -137,44 +138,44 @@ def test_spec_that_cannot_be_stored_does_not_run(keeper, engine, changed, monkey
 def test_restarted_engine_gets_the_configuration_again(keeper, engine, spec, changed):
     engine.failure = EngineGoneError("it is gone")
     with pytest.raises(DeviceFault):
-        asyncio.run(keeper.change(changed, NEW))
+        run_virtual(keeper.change(changed, NEW))
     engine.spec = changed  # it had been started with it
     engine.failure = EngineRefusedError("not yet")
-    asyncio.run(keeper.resend())
-    asyncio.run(keeper.resend())
+    run_virtual(keeper.resend())
+    run_virtual(keeper.resend())
     assert engine.spec == spec
     engine.spec, engine.state = changed, DeviceState.PREOP  # it missed what came before its start
-    asyncio.run(keeper.resend())
+    run_virtual(keeper.resend())
     assert (engine.spec, engine.state) == (spec, DeviceState.OP)
 
 
 def test_other_objects_of_the_same_specification_are_kept_without_the_engine(keeper, engine, spec):
-    asyncio.run(keeper.change(spec, NEW))
+    run_virtual(keeper.change(spec, NEW))
     assert engine.calls == []
     assert kept().objects == NEW
     before = kept()
-    asyncio.run(keeper.change(spec, NEW))
+    run_virtual(keeper.change(spec, NEW))
     assert kept() == before
 
 
 def test_states_are_kept(keeper, engine, spec):
-    asyncio.run(keeper.change_state(DeviceState.OP))
+    run_virtual(keeper.change_state(DeviceState.OP))
     assert engine.calls == []
-    asyncio.run(keeper.change_state(DeviceState.PREOP))
+    run_virtual(keeper.change_state(DeviceState.PREOP))
     assert engine.state is keeper.state is kept().state is DeviceState.PREOP
     assert effective("demo", (spec,)) == ((spec, DeviceState.PREOP),)
 
 
 def test_way_up_can_fail_and_way_down_cannot(keeper, engine, caplog):
     engine.failure = EngineGoneError("it is gone")
-    asyncio.run(keeper.change_state(DeviceState.PREOP))
+    run_virtual(keeper.change_state(DeviceState.PREOP))
     assert "station left: PREOP not requested from the engine: it is gone" in caplog.text
     assert keeper.state is kept().state is DeviceState.PREOP
     engine.failure = EngineGoneError("it is still gone")
     with pytest.raises(DeviceFault, match="still gone"):
-        asyncio.run(keeper.change_state(DeviceState.OP))
+        run_virtual(keeper.change_state(DeviceState.OP))
     assert keeper.state is kept().state is DeviceState.PREOP
-    asyncio.run(keeper.resend())
+    run_virtual(keeper.resend())
     assert engine.state is DeviceState.PREOP
 
 
@@ -183,12 +184,12 @@ def test_state_that_cannot_be_stored_is_reported(keeper, engine, monkeypatch, ca
         raise EnvironmentalError("disk full")
 
     monkeypatch.setattr(StationFile, "save", full)
-    asyncio.run(keeper.change_state(DeviceState.SAFEOP))
+    run_virtual(keeper.change_state(DeviceState.SAFEOP))
     assert engine.state is keeper.state is DeviceState.SAFEOP
     assert "disk full; a start restores the configuration before" in caplog.text
     engine.failure = EngineRefusedError("no")
     with pytest.raises(DeviceFault, match="disk full"):
-        asyncio.run(keeper.change(replace(keeper.spec, cycle_us=30_000), NEW))
+        run_virtual(keeper.change(replace(keeper.spec, cycle_us=30_000), NEW))
 
 
 def versions() -> tuple[StationSpec, StationSpec]:
@@ -212,7 +213,7 @@ def test_steps_of_one_change_have_one_way_back(engine):
     keeper = going(old, engine)
     applied = []
     for spec, objects in ((tolerant(old), OLD), (tolerant(new), NEW), (new, NEW)):
-        asyncio.run(keeper.change(spec, objects, cause="1", applied=True))
+        run_virtual(keeper.change(spec, objects, cause="1", applied=True))
         assert keeper.previous == Configuration(base=digest_of(old), spec=old)
         assert (keeper.cause, keeper.undone) == ("1", False)
         applied.append(StationStore("demo", "right").configuration.read().applied)
@@ -222,12 +223,12 @@ def test_steps_of_one_change_have_one_way_back(engine):
 def test_way_back_and_forth(engine):
     old, new = versions()
     keeper = going(old, engine)
-    asyncio.run(keeper.change(new, NEW, cause="1"))
+    run_virtual(keeper.change(new, NEW, cause="1"))
     for goal, objects, undone in ((old, OLD, True), (new, NEW, False), (old, OLD, True)):
         before = Configuration(base=digest_of(old), spec=keeper.spec, objects=keeper.objects)
-        asyncio.run(keeper.roll_back(tolerant(keeper.spec), keeper.objects))
-        asyncio.run(keeper.roll_back(tolerant(goal), objects))
-        asyncio.run(keeper.roll_back(goal, objects))
+        run_virtual(keeper.roll_back(tolerant(keeper.spec), keeper.objects))
+        run_virtual(keeper.roll_back(tolerant(goal), objects))
+        run_virtual(keeper.roll_back(goal, objects))
         assert keeper.previous == before
         assert (keeper.cause, keeper.undone) == ("1", undone)
         again = going(keeper.spec, engine)
@@ -237,23 +238,23 @@ def test_way_back_and_forth(engine):
 def test_change_that_was_taken_back_is_made_again(engine):
     old, new = versions()
     keeper = going(old, engine)
-    asyncio.run(keeper.change(new, NEW, cause="1"))
-    asyncio.run(keeper.roll_back(old, OLD))
-    asyncio.run(keeper.change(new, NEW, cause="1"))
+    run_virtual(keeper.change(new, NEW, cause="1"))
+    run_virtual(keeper.roll_back(old, OLD))
+    run_virtual(keeper.change(new, NEW, cause="1"))
     assert (keeper.previous.spec, keeper.undone) == (old, False)
 
 
 def test_changes_of_a_tool_are_changes_of_their_own(engine):
     old, new = versions()
     keeper = going(old, engine)
-    asyncio.run(keeper.change(old, OLD))
+    run_virtual(keeper.change(old, OLD))
     assert (keeper.previous, keeper.cause) == (None, "")  # all that is new is that it is kept
-    asyncio.run(keeper.change(new, NEW))
+    run_virtual(keeper.change(new, NEW))
     first = keeper.cause
     assert first
-    asyncio.run(keeper.change(new, NEW))
+    run_virtual(keeper.change(new, NEW))
     assert keeper.cause == first
-    asyncio.run(keeper.change(new, OLD))
+    run_virtual(keeper.change(new, OLD))
     assert keeper.cause > first
     assert (keeper.previous.spec, keeper.previous.objects) == (new, NEW)
 
@@ -265,8 +266,8 @@ def test_state_that_cannot_be_kept_is_shown_until_it_is(keeper, monkeypatch, cap
     with monkeypatch.context() as patch:
         patch.setattr("eap.runtime.store.replace_file", full)
         for state in (DeviceState.SAFEOP, DeviceState.PREOP):
-            asyncio.run(keeper.change_state(state))
+            run_virtual(keeper.change_state(state))
     assert len(caplog.records) == 1
     assert keeper.unsaved.reason.endswith("No space left on device; make room there")
-    asyncio.run(keeper.change_state(DeviceState.PREOP))
+    run_virtual(keeper.change_state(DeviceState.PREOP))
     assert (keeper.unsaved, kept().state) == (None, DeviceState.PREOP)

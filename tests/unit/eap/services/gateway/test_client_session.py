@@ -41,6 +41,7 @@ from eap.services.slaves.access import RemoteAccessError
 from tests.support.elsewhere import Station
 from tests.support.eventually import elapse, eventually
 from tests.support.memoryslave import memory_share
+from tests.support.virtualtime import run_virtual
 
 COE, SOE, FOE, VOE, AOE, EOE = (
     MailboxType[name] for name in ("COE", "SOE", "FOE", "VOE", "AOE", "EOE")
@@ -80,7 +81,7 @@ def play(
         await scene(handle, session)
         session.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_session_repeated_segment_is_answered_once_more() -> None:
@@ -222,7 +223,7 @@ class Codec:
 def test_session_passes_a_mailbox_error_of_the_slave() -> None:
     codec = Codec(MailboxRefusedError("no", detail=4))
     session = ClientSession(COE, codec, answer_s=0.5)
-    (reply,) = asyncio.run(session.handle(b"\0\x20\x40", is_step=False))
+    (reply,) = run_virtual(session.handle(b"\0\x20\x40", is_step=False))
     assert (reply.type, reply.body) == (MailboxType.ERR, bytes.fromhex("0100 0400"))
     assert reply.reason is None
     assert codec.resets == 1
@@ -235,13 +236,13 @@ def test_session_request_that_is_cancelled_leaves_nothing_behind() -> None:
             await ClientSession(COE, codec, answer_s=0.5).handle(b"", is_step=False)
         assert codec.resets == 1
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 @pytest.mark.parametrize(("is_long", "cause"), [(False, Cause.TIMEOUT), (True, None)])
 def test_session_last_step_of_a_download_may_take_longer(is_long: bool, cause: Cause) -> None:
     session = ClientSession(COE, Codec(is_long=is_long), answer_s=0.2)
-    (reply,) = asyncio.run(session.handle(b"\0\x20\1", is_step=False))
+    (reply,) = run_virtual(session.handle(b"\0\x20\1", is_step=False))
     assert reply.reason is cause
 
 

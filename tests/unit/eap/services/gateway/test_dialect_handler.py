@@ -51,6 +51,7 @@ from eap.services.slaves.remote_slave import LONGEST_ANSWER
 from tests.support import busads
 from tests.support.elsewhere import Bus, Station
 from tests.support.memoryslave import memory_slave
+from tests.support.virtualtime import run_virtual
 
 HEAD = 10
 """Octets in front of the data of an answer."""
@@ -65,7 +66,7 @@ def handler(room: int = 100, answer_s: float = 1.0, *rules: AccessRule) -> Diale
 
 
 def perform(task: Task, subject: DialectTarget, room: int = 100, answer_s: float = 1.0) -> bytes:
-    return asyncio.run(handler(room, answer_s)._perform(task, subject))
+    return run_virtual(handler(room, answer_s)._perform(task, subject))
 
 
 def failure(task: Task, subject: Any, room: int = 100, answer_s: float = 1.0) -> DialectError:
@@ -258,7 +259,7 @@ def test_dialect_request_that_is_refused_reaches_nothing() -> None:
         answer, cause = await handle("0020 40 1810 01 0000")
         assert (answer.hex(), cause) == ("00304318100161626364", None)
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_dialect_slave_that_cannot_be_reached() -> None:
@@ -266,5 +267,5 @@ def test_dialect_slave_that_cannot_be_reached() -> None:
         raise GatewayError(Cause.NO_SLAVE)
 
     body = bytes.fromhex("0020 40 1810 01 0000")
-    answer, cause = asyncio.run(handler().answer(MailboxType.COE, body, HERE, BUS, find))
+    answer, cause = run_virtual(handler().answer(MailboxType.COE, body, HERE, BUS, find))
     assert (answer.hex(), cause) == ("00208018100100000206", Cause.NO_SLAVE)

@@ -37,6 +37,7 @@ from tests.support.elsewhere import Station
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 from tests.support.vectors import load
+from tests.support.virtualtime import run_virtual
 
 COE, FOE, SOE, VOE, AOE, EOE = (
     MailboxType[name] for name in ("COE", "FOE", "SOE", "VOE", "AOE", "EOE")
@@ -155,7 +156,7 @@ def play(
         finally:
             await desk.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_each_protocol_of_a_slave() -> None:

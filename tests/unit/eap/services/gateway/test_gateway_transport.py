@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Any
 
 from eap.codec.mailbox import decode_frame
@@ -10,6 +9,7 @@ from eap.ids import Endpoint, NetId
 from eap.runtime.drop_counters import DropReason
 from eap.services.gateway.gateway import Settings
 from eap.services.gateway.gateway_transport import GatewayTransport
+from tests.support.virtualtime import run_virtual
 
 UPLOAD = bytes.fromhex("10 50 0a 00 e9 03 00 23 00 20 41 18 10 02 00 00 00 00")
 
@@ -42,7 +42,7 @@ def test_the_first_station_with_a_bus_has_the_gateway() -> None:
     assert not second.heard
     assert sent == [("me", b"answer")]
     transport.connection_closed("me")
-    asyncio.run(transport.wait_below("me", 3))
+    run_virtual(transport.wait_below("me", 3))
     assert first.heard[1:] == [
         ("closed", Endpoint("udp:a", "me")),
         ("below", Endpoint("udp:a", "me"), 3),
@@ -53,7 +53,7 @@ def test_transport_without_a_gateway_drops_frames() -> None:
     transport = GatewayTransport([])
     assert transport.receive(UPLOAD, "me", lambda *each: None) is DropReason.MAILBOX
     transport.connection_closed("me")
-    asyncio.run(transport.wait_below("me", 1))
+    run_virtual(transport.wait_below("me", 1))
 
 
 def test_unknown_protocol_is_answered_with_a_mailbox_error() -> None:

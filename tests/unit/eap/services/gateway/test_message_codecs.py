@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Iterator
 
 import pytest
@@ -36,6 +35,7 @@ from eap.services.slaves.access import RemoteAccessError
 from eap.services.slaves.remote_slave import LONGEST_ANSWER
 from tests.support.elsewhere import Station
 from tests.support.memoryslave import lead, memory_share, memory_slave
+from tests.support.virtualtime import run_virtual
 
 CLIENT, SLAVE = NetId.parse("7.7.7.7.1.1"), NetId.parse("5.1.1.1.9.1")
 ROOM = 100
@@ -45,7 +45,7 @@ TEXT = Idn.parse("P-0-0140")
 
 def answer(codec: SessionCodec, body: str | bytes) -> list[str]:
     octets = bytes.fromhex(body) if isinstance(body, str) else body
-    return [each.hex() for each in asyncio.run(codec.answer(octets))]
+    return [each.hex() for each in run_virtual(codec.answer(octets))]
 
 
 def elements(station: Station) -> ElementCodec:
@@ -95,7 +95,7 @@ def test_element_codec_carries_lists_in_fragments() -> None:
             await lead(codec, soe_client.read(Idn.parse("S-0-0001")))
         assert refused.value.code == 0x1001
 
-    asyncio.run(run())
+    run_virtual(run())
     assert all(len(each) <= sizes.to_slave - 6 for each in mailbox.asked)
 
 

@@ -20,6 +20,7 @@ from eap.services.gateway.transfer_codecs import ObjectCodec
 from tests.support.elsewhere import Station
 from tests.support.eventually import eventually
 from tests.support.memoryslave import MemoryMailbox, lead, memory_share, memory_slave
+from tests.support.virtualtime import run_virtual
 
 COE = MailboxType.COE
 SIZES = MailboxSizes(32, 40)
@@ -46,7 +47,7 @@ def play(scene: Callable[[ObjectCodec, MemoryMailbox], Awaitable[None]]) -> None
         await scene(codec, mailbox)
         codec.reset()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def play_remote(
@@ -57,7 +58,7 @@ def play_remote(
         await scene(lambda body: handle(codec, body))
         codec.reset()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 @pytest.mark.parametrize("size", [0, 1, 4, 5, 16, 17, 24, 25, 100, 300])
@@ -134,7 +135,7 @@ def test_object_codec_aborts_with_the_code_of_the_slave_or_its_own(
         assert bytes.fromhex(answer)[6:] == code.to_bytes(4, "little")
         assert not codec.is_running
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_object_codec_is_given_up_by_an_abort() -> None:

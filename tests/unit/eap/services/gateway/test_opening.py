@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-
 from msgspec.structs import replace
 
 from eap.od.model import OdState
@@ -16,6 +14,7 @@ from tests.support.cyclic import bus_port, eap_port, station
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 from tests.support.routing import station as router
+from tests.support.virtualtime import run_virtual
 
 NAMES = [PortName("left", "bus0"), PortName("left", "bus1")]
 TOLD = GatewaySpec(
@@ -56,4 +55,4 @@ def test_each_bus_has_one_as_the_plant_file_says() -> None:
             link.close()
             engine.close()
 
-    asyncio.run(run())
+    run_virtual(run())

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import asyncio
 from time import monotonic_ns, time
 
 import pytest
@@ -21,6 +20,7 @@ from eap.services.routing.route_rows import (
 )
 from tests.support.ams import Ams
 from tests.support.routeviews import Left
+from tests.support.virtualtime import run_virtual
 
 FAR = NetId.parse("127.0.9.2.1.1")
 HOP = Endpoint("udp:eap0", "127.0.9.2:34980")
@@ -106,7 +106,7 @@ def test_requests_and_connections_of_a_running_router() -> None:
         left.router.receive(packet, "udp:eap0", "127.0.0.1:5000")
         return left
 
-    left = asyncio.run(script())
+    left = run_virtual(script())
     left.router.record.add(loop("later"))
     found = row(left, requests=1)
     assert [each.outcome for each in found.requests] == ["loop"]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +19,7 @@ from eap.services.routing import scanning
 from eap.services.routing.scanning import scan, scan_targets
 from tests.support.eventually import elapse
 from tests.support.tracedplant import Line, Station, to
+from tests.support.virtualtime import run_virtual
 
 NOBODY = AdsClient(Endpoint("x", "1"), NetId(bytes(6)), 1)
 
@@ -108,7 +108,7 @@ def plant(*more: Route) -> tuple[Line, Station]:
 
 
 def look(station: Station, directory: Directory = PLANT, *routes: Route) -> list[dict[str, Any]]:
-    return msgspec.to_builtins(asyncio.run(scan(station, scan_targets(directory, routes))))
+    return msgspec.to_builtins(run_virtual(scan(station, scan_targets(directory, routes))))
 
 
 def test_stations_ports_and_slaves_are_listed() -> None:

@@ -11,6 +11,7 @@ from eap.services.routing import service as service_module
 from eap.services.routing.service import LocalRequest, SerialQueues
 from tests.support import aoe
 from tests.support.routing import StubService
+from tests.support.virtualtime import run_virtual
 
 ONE, OTHER = Endpoint("link", "1"), Endpoint("link", "2")
 
@@ -49,7 +50,7 @@ def play(script):
         finally:
             await queues.close()
 
-    asyncio.run(run())
+    run_virtual(run())
     return answers
 
 

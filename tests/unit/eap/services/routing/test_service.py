@@ -17,6 +17,7 @@ from eap.services.transports.mailbox_frames import ChannelSender
 from eap.services.transports.mailbox_stream import MailboxStreams
 from tests.support import aoe
 from tests.support.routing import RecordingSender, StubService, echo, station, while_serving
+from tests.support.virtualtime import run_virtual
 
 
 @pytest.mark.parametrize("service", [AdsService, StubService])
@@ -113,7 +114,7 @@ def test_requests_side_by_side_get_their_own_answers():
             *(there.request(TARGET, 0xFFFF, aoe.READ, bytes([n]), timeout_s=1) for n in (9, 5, 1))
         )
 
-    answers = asyncio.run(while_serving(script(), there))
+    answers = run_virtual(while_serving(script(), there))
     assert answers == [AmsAnswer(bytes([0, 0, 0, 0, 2, n])) for n in (9, 5, 1)]
     assert there.record.connections.snapshot() == {}
 
@@ -127,7 +128,7 @@ def test_errors_are_answers():
             await there.request(NetId.parse("9.9.9.9.9.9"), 1, aoe.READ, timeout_s=1),
         ]
 
-    answers = asyncio.run(while_serving(script(), there))
+    answers = run_virtual(while_serving(script(), there))
     assert [each.error_code for each in answers] == [6, 7]
 
 
@@ -146,5 +147,5 @@ def test_local_client_time_out_is_an_error_and_drops_the_late_answer():
         await asyncio.sleep(0)
         return answer
 
-    assert asyncio.run(while_serving(script(), there)) == AmsAnswer(error_code=AdsError.TIMEOUT)
+    assert run_virtual(while_serving(script(), there)) == AmsAnswer(error_code=AdsError.TIMEOUT)
     assert there.stats().in_flight == 0

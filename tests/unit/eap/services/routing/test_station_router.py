@@ -20,6 +20,7 @@ from tests.support import aoe
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.eventually import elapse, eventually, settle
 from tests.support.routing import RecordingSender, StubService, while_serving
+from tests.support.virtualtime import run_virtual
 
 ROUTER, DEVICE = NetId.parse("1.1.1.1.1.1"), NetId.parse("1.1.1.1.2.1")
 CLIENT = "192.168.9.9.1.1:33000"
@@ -123,7 +124,7 @@ def test_immediate_answer_does_not_overtake_earlier_requests_of_its_client(scene
         access_filter.set()
         await settle()
 
-    asyncio.run(while_serving(script(), scene.station))
+    run_virtual(while_serving(script(), scene.station))
     assert [each.body for each in scene.sent] == [b"now fast of another", b"slow", b"fast"]
 
 
@@ -208,7 +209,7 @@ def test_time_is_up_at_a_hop_and_at_a_service():
         scene.ask(f"{ROUTER}:1", invoke_id=2)
         await eventually(lambda: len(scene.sent) >= 3)
 
-    asyncio.run(while_serving(script(), scene.station))
+    run_virtual(while_serving(script(), scene.station))
     assert [(each.error, each.invoke_id) for each in scene.sent[1:]] == [(0x719, 1), (0x719, 2)]
 
 
@@ -219,7 +220,7 @@ def test_hops_are_probed_as_soon_as_there_is_a_route(scene):
         await eventually(lambda: scene.sent)
         assert scene.station.remove_route(NetId.parse("7.7.7.7.1.1"), HOP)
 
-    asyncio.run(while_serving(script(), scene.station))
+    run_virtual(while_serving(script(), scene.station))
     (probe,) = scene.sent
     assert (probe.target, probe.command) == ("7.7.7.7.1.1:10000", 4)
 
@@ -287,7 +288,7 @@ def test_reader_waits_while_too_many_of_its_requests_do(scene):
         access_filter.set()
         await scene.station.wait_below("in", "peer", 1)
 
-    asyncio.run(while_serving(script(), scene.station))
+    run_virtual(while_serving(script(), scene.station))
     assert len(scene.sent) == 2
 
 
@@ -344,7 +345,7 @@ def play(script):
             await script(clock)
         clock.timer.stop()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_timer_fires_at_the_due_time():

@@ -14,6 +14,7 @@ from eap.services.routing.station_routes import StationRoutes
 from eap.services.routing.station_routing import StationRouting
 from eap.services.transports.station_brokers import StationBrokers
 from tests.support.routing import station
+from tests.support.virtualtime import run_virtual
 
 HOP = HopSpec(TransportKind.UDP, "eap0", "10.0.0.2:34980")
 MILL = RouteSpec(name="mill", net_id="10.0.0.2.1.1", hop=HOP)
@@ -48,7 +49,7 @@ def test_applied_routing_is_in_force_at_once_and_after_a_restart(caplog):
     assert house.routing.applied is None
     changes = ["route mill: removed", "route saw: added", "access rule a: added"]
     assert house.routing.plan(OTHER).changes == changes
-    assert asyncio.run(house.routing.apply(OTHER, "1")) == changes
+    assert run_virtual(house.routing.apply(OTHER, "1")) == changes
     assert (house.names(), house.access) == (["saw"], [FILE, OTHER])
     again = House()
     assert (again.names(), again.access) == (["saw"], [OTHER])
@@ -56,7 +57,7 @@ def test_applied_routing_is_in_force_at_once_and_after_a_restart(caplog):
 
 
 def test_edited_plant_file_replaces_applied_routing(caplog):
-    asyncio.run(House().routing.apply(OTHER, "1"))
+    run_virtual(House().routing.apply(OTHER, "1"))
     edited = House(RoutingSpec())
     assert edited.names() == []
     assert edited.routing.applied is None
@@ -67,40 +68,40 @@ def test_edited_plant_file_replaces_applied_routing(caplog):
 
 
 def test_plant_file_equal_to_applied_routing_is_not_logged(caplog):
-    asyncio.run(House().routing.apply(OTHER, "1"))
+    run_virtual(House().routing.apply(OTHER, "1"))
     assert House(OTHER).names() == ["saw"]
     assert caplog.text == ""
 
 
 def test_a_change_is_taken_back_and_made_again():
     house = House()
-    asyncio.run(house.routing.apply(OTHER, "1"))
-    assert asyncio.run(house.routing.roll_back()) == [
+    run_virtual(house.routing.apply(OTHER, "1"))
+    assert run_virtual(house.routing.roll_back()) == [
         "route saw: removed",
         "route mill: added",
         "access rule a: removed",
     ]
     assert house.names() == ["mill"]
     assert house.routing.applied.undone
-    asyncio.run(house.routing.roll_back())
+    run_virtual(house.routing.roll_back())
     assert House().names() == ["saw"]
     assert not house.routing.applied.undone
 
 
 def test_steps_of_one_change_are_taken_back_together():
     house = House()
-    asyncio.run(house.routing.apply(OTHER, "1"))
-    asyncio.run(house.routing.apply(RoutingSpec(), "1"))
-    asyncio.run(house.routing.roll_back())
+    run_virtual(house.routing.apply(OTHER, "1"))
+    run_virtual(house.routing.apply(RoutingSpec(), "1"))
+    run_virtual(house.routing.roll_back())
     assert house.names() == ["mill"]
 
 
 def test_apply_of_the_same_routing_changes_nothing():
     house = House()
-    assert asyncio.run(house.routing.apply(FILE, "1")) == []
+    assert run_virtual(house.routing.apply(FILE, "1")) == []
     assert house.routing.applied is None
     with pytest.raises(ControlError, match="were not changed while the station ran"):
-        asyncio.run(house.routing.roll_back())
+        run_virtual(house.routing.roll_back())
 
 
 BROKER = MqttSpec(network="n", host="127.0.0.1", port=1)
@@ -138,7 +139,7 @@ def test_brokers_come_change_and_go_while_the_station_runs():
         serving.cancel()
         await asyncio.wait([serving])
 
-    asyncio.run(script())
+    run_virtual(script())
     assert House().routing.routes.spec.mqtt == (BROKER,)
 
 
@@ -156,7 +157,7 @@ def test_broker_without_mqtt_installed_is_refused(monkeypatch):
     spec = replace(FILE, mqtt=(BROKER,))
     assert house.routing.plan(spec).refused == ["MQTT needs aiomqtt"]
     with pytest.raises(ControlError, match="MQTT needs aiomqtt"):
-        asyncio.run(house.routing.apply(spec, "1"))
+        run_virtual(house.routing.apply(spec, "1"))
     assert house.routing.applied is None
 
 
@@ -164,5 +165,5 @@ def test_routing_that_cannot_be_stored_is_not_in_force(monkeypatch):
     monkeypatch.setenv("EAP_STATE_DIR", "/dev/null/x")
     house = House()
     with pytest.raises(EnvironmentalError, match="routes and access rules cannot be kept"):
-        asyncio.run(house.routing.apply(OTHER, "1"))
+        run_virtual(house.routing.apply(OTHER, "1"))
     assert house.names() == ["mill"]

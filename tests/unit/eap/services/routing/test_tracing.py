@@ -36,6 +36,7 @@ from tests.support.eventually import settle
 from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 from tests.support.tracedplant import Line, Station, run_state, to
+from tests.support.virtualtime import run_virtual
 
 FAR = NetId.parse("5.1.1.3.3.1")
 
@@ -51,7 +52,7 @@ def line_of_three() -> tuple[Line, Station]:
 
 def follow(station: Station, target: NetId = FAR, port: int = 1001) -> TraceResult:
     ticks = count(0, 1000)
-    return asyncio.run(trace(station, target, port, clock=lambda: next(ticks)))
+    return run_virtual(trace(station, target, port, clock=lambda: next(ticks)))
 
 
 def names(traced: TraceResult) -> list[str]:
@@ -184,7 +185,7 @@ def test_trace_several_stations_known_to_be_dead_names_the_first() -> None:
     line.stations["island-02"].router.hop_down("link", "island-03", "it does not answer", 1)
     why = "island-02: island-03 (island-03 by link) is down: it does not answer"
     assert follow(first, LAST).why == why
-    assert asyncio.run(find_fault(first, LAST, 1001)) == why
+    assert run_virtual(find_fault(first, LAST, 1001)) == why
     line.dead.add("island-02")
     first.router.hop_down("link", "island-02", "it does not answer", 1)
     why = "island-01: island-02 (island-02 by link) is down: it does not answer"
@@ -312,7 +313,7 @@ def ask(operation: Operation) -> AmsAnswer:
         answer = service(Rest()).answer(LocalRequest(header, body, WAY))
         return await answer if isinstance(answer, Awaitable) else answer
 
-    return asyncio.run(get())
+    return run_virtual(get())
 
 
 @pytest.mark.parametrize(("further", "station"), [(0, "island-01"), (1, "island-02")])
@@ -402,7 +403,7 @@ def probe(
                 left.router.receive(answer.octets(), "udp:eap0", endpoint)
         return await task
 
-    return asyncio.run(while_serving(script(), left.router))
+    return run_virtual(while_serving(script(), left.router))
 
 
 def test_probe_reports_round_trip_and_state() -> None:
@@ -447,7 +448,7 @@ def test_request_beyond_a_dead_router_names_the_router() -> None:
     target = AmsAddress(NetId.parse("127.0.9.3.1.1"), 10000)
     ask = probe_target(left.router, target, 0.2)
     left.router.hop_down("udp:eap0", "127.0.9.2:34980", "it does not answer")
-    found = asyncio.run(while_serving(ask, left.router))
+    found = run_virtual(while_serving(ask, left.router))
     text = "right (127.0.9.2:34980 by udp:eap0) is down: it does not answer"
     assert (found.name, found.text) == ("third", text)
 

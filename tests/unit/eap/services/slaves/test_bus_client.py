@@ -26,6 +26,7 @@ from eap.services.slaves.bus_client import BusClient, open_buses
 from tests.support.eventually import settle
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 SENSOR = 1003
 DRIVE = 1001
@@ -44,7 +45,7 @@ def play(scene, name="coe"):
             link.close()
             engine.close()
 
-    return asyncio.run(run())
+    return run_virtual(run())
 
 
 def vendor():
@@ -280,4 +281,4 @@ def test_bus_clients_request_their_buses_by_number():
             link.close()
             engine.close()
 
-    asyncio.run(run())
+    run_virtual(run())

@@ -23,6 +23,7 @@ from eap.services.slaves.bus_client import BusView
 from tests.support.eventually import elapse
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 LOOK_S = 0.05
 
@@ -40,7 +41,7 @@ def play(scene, *, silence_limit_s=LOOK_S):
             link.close()
             engine.close()
 
-    return asyncio.run(run())
+    return run_virtual(run())
 
 
 def slave(station: int, state: int) -> SlaveDescription:
@@ -156,7 +157,7 @@ def with_pair(scene) -> None:
         finally:
             pair.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_view_merges_slaves_that_have_changed_in_the_order_of_the_bus():

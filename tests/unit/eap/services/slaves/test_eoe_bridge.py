@@ -30,6 +30,7 @@ from eap.services.slaves.eoe_bridge import EoeBridge, default_mac
 from tests.support.busads import until
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 BUS = """
 bus: drives
@@ -148,7 +149,7 @@ def play(
             for tap in stage.taps:
                 tap.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_host_reaches_slaves_with_the_settings_of_the_plant():

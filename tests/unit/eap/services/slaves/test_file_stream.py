@@ -15,6 +15,7 @@ from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
 from eap.services.slaves import file_stream
 from eap.services.slaves.file_stream import AHEAD, FileHistory, LocalFile, StallMeter
+from tests.support.virtualtime import run_virtual
 
 SIZES = MailboxSizes(1024, 1024)
 LONG = bytes(range(256)) * 1024
@@ -77,7 +78,7 @@ def play(scene, turn, *, is_write=False, name="a.bin"):
         with suppress(EapError):
             await file.finish()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_file_is_read_ahead_but_not_to_its_end():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -22,6 +21,7 @@ from eap.services.slaves.bus_client import BusClient
 from tests.support.eventually import eventually
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 CONTROLWORD, NO_OBJECT, CALIBRATION = 0x6040, 0x5555, 0x8001
 ABORT = 4
@@ -46,7 +46,7 @@ def play(
             link.close()
             engine.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_local_slave_reads_and_writes_objects() -> None:

@@ -17,6 +17,7 @@ from eap.services.slaves.bus_client import MailboxLock, MailboxQueues
 from tests.support.eventually import settle
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 VENDOR = MailboxRequest(MailboxType.COE, bytes.fromhex("00204018100100000000"))
 
@@ -34,7 +35,7 @@ def play(scene, kind=MailboxType.COE):
             link.close()
             engine.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_mailbox_turn_passes_a_step_as_requested():
@@ -97,7 +98,7 @@ def test_mailbox_queues_alternate_between_clients():
             for client in "aaaabb":
                 group.create_task(use(queues, client))
 
-    asyncio.run(play())
+    run_virtual(play())
     assert "".join(order) == "aababa"
 
 
@@ -109,7 +110,7 @@ def test_mailbox_queues_of_other_mailboxes_are_free():
         queues.release("x")
         await asyncio.wait_for(queues.acquire("x", 2), 1)
 
-    asyncio.run(play())
+    run_virtual(play())
 
 
 def test_mailbox_queues_pass_a_turn_on_when_its_client_leaves():
@@ -132,4 +133,4 @@ def test_mailbox_queues_pass_a_turn_on_when_its_client_leaves():
             with suppress(asyncio.CancelledError):
                 await task
 
-    asyncio.run(play())
+    run_virtual(play())

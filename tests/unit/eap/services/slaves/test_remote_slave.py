@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import pytest
 
 from eap.ads.request import Read, Write
@@ -17,6 +15,7 @@ from eap.services.slaves.access import RemoteAccessError
 from eap.services.slaves.remote_slave import LONGEST_ANSWER, RemoteSlave
 from tests.support import busads
 from tests.support.elsewhere import Station
+from tests.support.virtualtime import run_virtual
 
 
 def mailboxes(bus: str, station: int) -> tuple[int, int]:
@@ -59,7 +58,7 @@ def test_a_slave_behind_the_first_list() -> None:
 
     number = 256
     expected = 0x8000 + number + 33, 0x8000 + number + 34
-    found = asyncio.run(RemoteSlave(ask, 1001, 1).sizes())
+    found = run_virtual(RemoteSlave(ask, 1001, 1).sizes())
     assert (found.to_slave, found.to_master) == expected
 
 
@@ -72,7 +71,7 @@ def test_a_slave_behind_the_first_list() -> None:
 )
 def test_remote_master_without_a_dictionary(result: AdsError, told: AdsError) -> None:
     with pytest.raises(RemoteAccessError) as caught:
-        asyncio.run(Station(result=result).link().sizes())
+        run_virtual(Station(result=result).link().sizes())
     assert caught.value.result == told
 
 
@@ -81,7 +80,7 @@ def test_remote_slave_forwards_ams_requests() -> None:
     body = Read(IndexGroup.SDO, 1, 2)
     octets = b"".join(each.to_bytes(4, "little") for each in body)
     header = AmsHeader(NetId(bytes(6)), 1, NetId(bytes(6)), 2, AmsCommand.READ, invoke_id=7)
-    answer = asyncio.run(station.link().exchange_ads(header, octets))
+    answer = run_virtual(station.link().exchange_ads(header, octets))
     back, data = decode_packet(answer)
     assert (back.invoke_id, bytes(data[8:])) == (7, b"xy")
     assert station.asked == [body]
@@ -99,7 +98,7 @@ def test_remote_slave_reads_sdo_information(
     opcode: SdoInfoOpcode, request_: str, group: IndexGroup, offset: int
 ) -> None:
     station = Station(b"described")
-    found = asyncio.run(station.link().read_info(opcode, bytes.fromhex(request_)))
+    found = run_virtual(station.link().read_info(opcode, bytes.fromhex(request_)))
     assert found == b"described"
     assert station.asked == [Read(group, offset, LONGEST_ANSWER)]
 
@@ -107,21 +106,21 @@ def test_remote_slave_reads_sdo_information(
 def test_remote_slave_refuses_unknown_sdo_information() -> None:
     slave = Station().link()
     with pytest.raises(RemoteAccessError):
-        asyncio.run(slave.read_info(SdoInfoOpcode.LIST_RESPONSE, b""))
+        run_virtual(slave.read_info(SdoInfoOpcode.LIST_RESPONSE, b""))
     with pytest.raises(CodecError):
-        asyncio.run(slave.read_info(SdoInfoOpcode.LIST_REQUEST, b"\1"))
+        run_virtual(slave.read_info(SdoInfoOpcode.LIST_REQUEST, b"\1"))
 
 
 def test_remote_slave_reads_and_writes_whole_objects() -> None:
     station = Station(b"\2\0abcd")
     slave = station.link()
-    assert asyncio.run(slave.read_object(0x1018, 0, complete=True)) == b"\2\0abcd"
-    assert asyncio.run(slave.read_object(0x1018, 1, complete=True)) == b"abcd"
+    assert run_virtual(slave.read_object(0x1018, 0, complete=True)) == b"\2\0abcd"
+    assert run_virtual(slave.read_object(0x1018, 1, complete=True)) == b"abcd"
     assert station.asked == [Read(IndexGroup.SDO, 0x1018_0100, LONGEST_ANSWER)] * 2
-    asyncio.run(slave.write_object(0x2000, 0, b"ab", complete=True))
+    run_virtual(slave.write_object(0x2000, 0, b"ab", complete=True))
     assert station.asked[-1] == Write(IndexGroup.SDO, 0x2000_0100, b"ab")
     with pytest.raises(SdoAbortError) as caught:
-        asyncio.run(slave.write_object(0x2000, 1, b"ab", complete=True))
+        run_virtual(slave.write_object(0x2000, 1, b"ab", complete=True))
     assert caught.value.code == AbortCode.NO_COMPLETE_ACCESS
 
 
@@ -138,21 +137,21 @@ def test_remote_slave_separates_errors_from_routing_errors(
 ) -> None:
     slave = Station(result=result).link()
     with pytest.raises(error) as caught:
-        asyncio.run(slave.read_object(0x1018, 1))
+        run_virtual(slave.read_object(0x1018, 1))
     assert getattr(caught.value, "code", None) == code
     if code is None:
         with pytest.raises(RemoteAccessError):
-            asyncio.run(slave.probe())
+            run_virtual(slave.probe())
     else:
-        asyncio.run(slave.probe())
+        run_virtual(slave.probe())
 
 
 def test_remote_slave_addresses_elements() -> None:
     station = Station(b"1")
     slave = station.link()
-    assert asyncio.run(slave.read_elements(32, 0x42, drive=3)) == b"1"
-    asyncio.run(slave.write_elements(32, 0x42, b"1", drive=3))
-    asyncio.run(slave.send_vendor(b"abc"))
+    assert run_virtual(slave.read_elements(32, 0x42, drive=3)) == b"1"
+    run_virtual(slave.write_elements(32, 0x42, b"1", drive=3))
+    run_virtual(slave.send_vendor(b"abc"))
     assert station.asked == [
         Read(IndexGroup.SOE, 0x0342_0020, LONGEST_ANSWER),
         Write(IndexGroup.SOE, 0x0342_0020, b"1"),

@@ -12,6 +12,7 @@ from eap.services.slaves.segment_link import SegmentLink
 from tests.support.eventually import settle
 from tests.support.fakeengine import FakeSegment
 from tests.support.loopbus import LoopBus
+from tests.support.virtualtime import run_virtual
 
 CUT = {"kind": "cut", "slave": "sensor"}
 
@@ -26,7 +27,7 @@ def play(scene, timeout_s=2.0):
             link.close()
             segment.close()
 
-    asyncio.run(run())
+    run_virtual(run())
 
 
 def test_faults_and_values():
@@ -74,5 +75,5 @@ def test_pair_that_is_closed():
             await link.command(CUT)
         return link
 
-    link = asyncio.run(run())
+    link = run_virtual(run())
     link.close()  # also behind the end of its loop
