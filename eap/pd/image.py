@@ -8,9 +8,10 @@ read from a snapshot, which is taken between two cycles.
 Rule 4: the engine waits for no writer.  Its :class:`Inputs` copy what others write at the start of
 a cycle, when a sequence word moved, and keep the last whole copy while a writer writes.
 Rule 5: the engine takes samples of all variables at the end of a cycle as long as a reader asks for
-them, and never waits for the reader: a slow reader finds that the slot of a sample holds a later
-one.  A sample is taken with the copies that the cycle itself has read, so that its values belong to
-one moment, for all writers.
+them, and never waits for a reader: a slow one finds that the slot of a sample holds a later one.  A
+sample is taken with the copies that the cycle itself has read, so that its values belong to one
+moment, for all writers.  Any number of readers share the samples: reading takes none away, and all
+extend the same term by the same time.
 
 This module works on any writable buffer; ``eap.net.image_file`` maps one from a file.
 """
@@ -464,8 +465,12 @@ class Sampler:
         self._heads[head] = cycle
 
 
+SAMPLING_TERM_US = 1_000_000
+"""Time that the engine goes on sampling for readers that do not extend it."""
+
+
 class ImageSamples:
-    """The reader's side of the samples; only one reader may request them.
+    """The side of one reader of the samples; readers do not affect each other.
 
     Args:
         image: Where they are.
@@ -484,9 +489,18 @@ class ImageSamples:
         """The cycle that ran last, or runs right now."""
         return int(self.image.words[_CYCLE])
 
-    def want(self, cycles: int) -> None:
-        """Have samples taken of so many cycles from now on."""
-        self.image.words[_SAMPLED_UNTIL] = self.newest + cycles
+    def extend(self) -> None:
+        """Have samples taken for SAMPLING_TERM_US from now on; call it several times in that."""
+        # One word for all readers: every one sets the same term, so the last to write it takes
+        # nothing away from the others, but for the moment between its reading and its writing.
+        cycles = 2 + SAMPLING_TERM_US // self.image.layout.cycle_us
+        words, until = self.image.words, self.newest + cycles
+        words[_SAMPLED_UNTIL] = max(words[_SAMPLED_UNTIL], until)
+
+    @property
+    def count(self) -> int:
+        """Number of cycles that samples are kept of."""
+        return self._slot.count
 
     def since(self, cycle: int) -> Iterable[int]:
         """Return the cycles behind *cycle* that there may be samples of, the oldest first."""

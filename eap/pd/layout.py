@@ -49,9 +49,9 @@ HEADER = struct.Struct("<8sIIQQQ")
 WORDS_OFFSET = 64
 
 SAMPLE_HEAD = 16
-SAMPLES_FOR_US = 250_000
+SAMPLES_FOR_US = 1_000_000
 """Age of the oldest sample, unless that takes too much memory."""
-MIN_SAMPLES, MAX_SAMPLES = 8, 256
+MIN_SAMPLES, MAX_SAMPLES = 8, 1024
 SAMPLES_SIZE = 1 << 20
 """Bytes that more than MIN_SAMPLES may take."""
 

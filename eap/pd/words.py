@@ -91,7 +91,7 @@ class StationWord(IntEnum):
     LINKS_HELD = LATENESS + HISTOGRAM_BINS
     """Values that no link could pass on, because their source was infinite or no number."""
     SAMPLED_UNTIL = LINKS_HELD + 1
-    """The last cycle of which services wants a sample; written by services."""
+    """The last cycle of which a reader wants a sample; written by all readers of samples."""
     SIZE = LINKS_HELD + 2
 
 

@@ -159,8 +159,6 @@ Send: TypeAlias = Callable[[Endpoint, bytes], object]
 
 _POLL_NS = 200_000_000
 """Longest period of the requests for samples."""
-_SAMPLE_LEASE_NS = 1_000_000_000
-"""Time that the engine goes on sampling for a dead services process."""
 _CYCLE_TIME_NS = 200_000
 """Usual delay from the start of a cycle to its end."""
 _SHORT_PAUSE_NS = 1_000_000
@@ -240,7 +238,7 @@ class NotificationPump:
             self._samples = ImageSamples(image)
         is_done = self._send_due(self._samples, unix_ns - now_ns)
         # The engine samples only on request, so an idle station pays nothing.
-        self._samples.want(2 + _SAMPLE_LEASE_NS // (1000 * image.layout.cycle_us))
+        self._samples.extend()
         return self._delay_ns(now_ns) if is_done else _SHORT_PAUSE_NS
 
     def _send_due(self, samples: ImageSamples, unix_at_0_ns: int) -> bool:

@@ -10,6 +10,7 @@ from eap.codec.datatypes import parse
 from eap.errors import ImageError, TornReadError
 from eap.pd.image import (
     READ_ATTEMPTS,
+    SAMPLING_TERM_US,
     SNAPSHOT_ATTEMPTS,
     Image,
     ImageSamples,
@@ -443,17 +444,35 @@ def test_sampler_takes_no_samples_without_request(running):
     assert samples.read(3) is None
 
 
-def test_wanted_cycles_are_sampled_and_no_more(running):
+def test_samples_are_taken_for_the_term_and_no_longer(running):
     made, samples = running
-    samples.want(2)
+    term = 2 + SAMPLING_TERM_US // 1000
+    samples.extend()
+    run(made, 1)
+    assert samples.ran_at_ns(1) == 7
+    run(made, term, first_ns=MS)
+    assert samples.ran_at_ns(term) is not None
+    assert samples.ran_at_ns(term + 1) is None
+
+
+def test_readers_of_samples_take_nothing_from_each_other(running):
+    made, first = running
+    second = ImageSamples(made.image)
+    first.extend()
     run(made, 3)
-    assert [samples.ran_at_ns(cycle) for cycle in range(1, 4)] == [7, MS + 7, None]
+    second.extend()
+    assert list(first.since(0)) == list(second.since(0)) == [1, 2, 3]
+    assert first.read(2) == second.read(2) is not None
+    until = made.image.words[StationWord.SAMPLED_UNTIL]
+    made.image.words[StationWord.CYCLE] = 1  # as a reader saw it that was stopped before it wrote
+    first.extend()
+    assert made.image.words[StationWord.SAMPLED_UNTIL] == until
 
 
 def test_sample_holds_all_variables_as_the_cycle_saw_them(running):
     made, samples = running
     image = made.image
-    samples.want(9)
+    samples.extend()
     with image.writing(Writer.APPLICATION):
         image.write("x", 5)
     with image.writing(Writer.SERVICES):
@@ -470,8 +489,10 @@ def test_sample_holds_all_variables_as_the_cycle_saw_them(running):
 def test_later_samples_take_the_slot_of_the_oldest(running):
     made, samples = running
     count = made.image.layout.samples.count
-    samples.want(10 * count)
-    run(made, count + 2)
+    samples.extend()
+    run(made, 2)
+    samples.extend()
+    run(made, count, first_ns=2 * MS)
     assert samples.ran_at_ns(2) is None
     assert samples.read(2) is None
     assert values(made.image, samples.read(3))["n"] == 3
@@ -481,7 +502,7 @@ def test_later_samples_take_the_slot_of_the_oldest(running):
 def test_sample_that_is_being_taken_is_none_yet():
     image = image_of(counting())
     sampler, samples = Sampler(image, memoryview(bytearray(len(image.memory)))), ImageSamples(image)
-    samples.want(4)
+    samples.extend()
     sampler.end_cycle(4, 1)
     assert samples.read(4) is not None
     image.memory[image.layout.samples.offset + 4 * image.layout.samples.size] = 0
@@ -491,15 +512,15 @@ def test_sample_that_is_being_taken_is_none_yet():
 @pytest.mark.parametrize(
     ("cycle_us", "octets", "count"),
     [
-        (10_000, 100, 25),
-        (1000, 100, 250),
+        (10_000, 100, 100),
+        (1000, 100, 1000),
         (100, 100, MAX_SAMPLES),
         (1_000_000, 100, MIN_SAMPLES),
         (10_000, 60_000, SAMPLES_SIZE // 60_016),
-        (1000, 0, 250),
+        (1000, 0, 1000),
     ],
 )
-def test_samples_reach_back_a_quarter_of_a_second_if_there_is_room(cycle_us, octets, count):
+def test_samples_reach_back_a_second_if_there_is_room(cycle_us, octets, count):
     variables = written(f"x:BLOCK({octets})") if octets else ()
     layout = plan_layout(station(cycle_us=cycle_us, variables=variables))
     slot = layout.samples
