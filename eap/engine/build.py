@@ -19,10 +19,12 @@ from devicebus.master.matching import ExpectedSlave
 from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.engine_bus import EngineBus
+from eap.engine.frame_taps import FrameRecording
 from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort
 from eap.net.ethernet import EthernetInterface, packet_batch
+from eap.net.framering_file import FrameRingFile
 from eap.net.image_file import create_image
 from eap.net.limits import CloseReason
 from eap.net.loopback import LoopbackLines
@@ -214,6 +216,7 @@ class EnginePlant:
 
     Attributes:
         engine: Runs them.
+        recording: Records their frames while somebody reads them.
         rebuilder: Changes them while they run.
         buses: The slaves below them.
         arrivals: Callbacks for descriptors that are served between the cycles.
@@ -247,6 +250,8 @@ class EnginePlant:
             elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
                 self._open_datagrams(shared)
         self.engine = Engine([entry.station for entry in self._stations.values()])
+        ring = self._resources.enter_context(FrameRingFile(folder.frames))
+        self.recording = FrameRecording(ring, self._stations)
         self.rebuilder = StationRebuilder(self.engine, self._stations)
         self._resources.callback(self.rebuilder.close)
         self.arrivals[self.rebuilder.fileno()] = self.rebuilder.collect

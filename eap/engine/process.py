@@ -123,6 +123,7 @@ def run_cycles(
                 look_ns = now_ns + LOOK_PERIOD_NS
                 plant.publish_discards()
                 plant.buses.publish()
+                plant.recording.look(now_ns)
                 # Automatic collection is off; this is between two cycles.
                 if gc.get_count()[0] > GARBAGE and not rebuilder.is_building:
                     gc.collect()

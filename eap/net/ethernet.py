@@ -14,7 +14,7 @@ from eap.codec.ethercat import ETHERTYPE
 from eap.ids import BROADCAST_MAC, EAP_MULTICAST_MAC, Destination, MacAddr
 from eap.net.mmsg import BATCH, BUFFER_SIZE, ReceiveBatch, SendBatch, note_receive_error
 from eap.net.packetsocket import InterfaceBinding
-from eap.pd.link import FrameHandler, OutFrame
+from eap.pd.link import FrameHandler, OutFrame, exchange
 
 ETHERNET_HEADER = 14
 MINIMUM_SIZE = 60
@@ -152,6 +152,15 @@ class EthernetInterface:
                 else:
                     self._local.append((handler, data, now_ns))
 
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
+        for by_address in self._routes.values():
+            for handlers in by_address.values():
+                exchange(handlers, old, new)
+        for port in self._ports:
+            if port.handler is old:
+                port.handler = new
+
     def sender_of(self, data: memoryview) -> str:
         """Return the source address of the frame in *data*; nothing if it is none of a station."""
         source = MacAddr(self.source_of(data))
@@ -260,6 +269,10 @@ class EthernetPort:
             sent = [frame for frame in frames if frame not in failed] if failed else frames
             self.interface.deliver(sent, self, now_ns)
         return failed
+
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Exchange a handler of the interface."""
+        self.interface.exchange_handler(old, new)
 
     def readdress(self) -> None:
         """Write the interface's present address into each frame that is sent from now on."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
-from eap.pd.link import FrameHandler, OutFrame
+from eap.pd.link import FrameHandler, OutFrame, exchange
 
 DRAIN_LIMIT = 256
 HOLD_NS = 100_000_000
@@ -110,6 +110,10 @@ class LoopbackChannel:
             for handle in self.handlers:
                 handle(frame.data, len(frame.data), frame.due_ns, self)
         return len(due)
+
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
+        exchange(self.handlers, old, new)
 
     def sender_of(self, data: memoryview) -> str:
         """Return which port of the line sent *data*."""

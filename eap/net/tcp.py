@@ -16,7 +16,7 @@ from eap.codec.ethercat import EAP_PORT, EtherCatHeader, FrameType
 from eap.ids import Destination
 from eap.net.limits import OWN_HOST, Activity
 from eap.net.mmsg import count_error
-from eap.pd.link import FrameHandler, OutFrame
+from eap.pd.link import FrameHandler, OutFrame, exchange
 
 _SEND_BUFFER = 32 << 10
 _DEAD_PEER_MS = 3000
@@ -160,6 +160,11 @@ class TcpSender:
         except OSError as error:
             self._fail(error.errno, now_ns)
             return False
+
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
+        if self._receiver is not None:
+            exchange(self._receiver.handlers, old, new)
 
     def close(self) -> None:
         """Close the connection; :meth:`poll` would open the next one."""

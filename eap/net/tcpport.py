@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from eap.ids import Destination, DestinationKind
 from eap.net.limits import CloseReason, ConnectionTable, ListenerLimits
 from eap.net.tcp import CONNECTION, TcpReceiver, TcpSender
-from eap.pd.link import FrameChannel, FrameHandler, OutFrame
+from eap.pd.link import FrameChannel, FrameHandler, OutFrame, exchange
 
 LIMITS = ListenerLimits(total=32, reserved=8, per_host=16)
 """Incoming connections of a port: each costs a system call a cycle, whether it says anything."""
@@ -103,6 +103,16 @@ class TcpPort:
                 for late in self._table.remove_overdue(now_ns):
                     late.close(CloseReason.OVERDUE)
         return total
+
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
+        if self._datagrams is not None:
+            self._datagrams.exchange_handler(old, new)
+        exchange(self._answers, old, new)
+        for sender in self._senders.values():
+            sender.exchange_handler(old, new)
+        for receiver in self._receivers:
+            exchange(receiver.handlers, old, new)
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* by the transport of their destinations; return those that were not sent."""

@@ -18,7 +18,7 @@ from typing import NamedTuple
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import Destination
 from eap.net.mmsg import BATCH, ReceiveBatch, SendBatch, note_receive_error
-from eap.pd.link import FrameHandler, OutFrame
+from eap.pd.link import FrameHandler, OutFrame, exchange
 
 _BATCHES_PER_DRAIN = 4
 _NO_ADDRESS = "0.0.0.0"  # noqa: S104  a source, which Linux would take for this host
@@ -70,6 +70,10 @@ class UdpChannel:
             if count < BATCH:
                 break
         return total
+
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
+        exchange(self.handlers, old, new)
 
     def sender_of(self, data: memoryview) -> str:
         """Return ``address:port`` of the sender of *data*; empty if it has no address."""

@@ -55,6 +55,12 @@ class OutFrame:
         self.oversized = False
 
 
+def exchange(handlers: list[FrameHandler], old: FrameHandler, new: FrameHandler) -> None:
+    """Put *new* in the place of *old* in a list of handlers."""
+    # By identity: frames may be read by an object and its successor, which may be equal.
+    handlers[:] = [new if each is old else each for each in handlers]
+
+
 class FrameChannel(Protocol):
     """Transport of frames: a UDP socket, an Ethernet interface, a TCP connection, a loopback."""
 
@@ -67,12 +73,25 @@ class FrameChannel(Protocol):
         A destination is what a specification says, or what an origin of the same port gave.
         """
 
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
+
     def link_header(self, destination: str) -> bytes:
         """Return the headroom bytes of every frame to *destination*; empty for UDP and TCP."""
 
     @property
     def minimum_size(self) -> int:
         """Shortest buffer to hand over; shorter frames are padded with zeros."""
+
+
+class PortTap(Protocol):
+    """Observer of the frames of one port; a port without one pays nothing for it."""
+
+    def received(self, handle: FrameHandler) -> FrameHandler:
+        """Return a handler that observes a frame and hands it to *handle*."""
+
+    def sending(self, channel: FrameChannel) -> FrameChannel:
+        """Return a channel that sends through *channel* and observes what was sent."""
 
 
 class CyclicBus(Protocol):
@@ -139,6 +158,10 @@ class StateChannel:
     def drain(self, now_ns: int) -> int:
         """Drain the channel."""
         return self._channel.drain(now_ns)
+
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        """Exchange a handler of the channel."""
+        self._channel.exchange_handler(old, new)
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* with state and toggle; return those that could not be sent."""

@@ -10,7 +10,7 @@ that a reader sees inputs and what follows from them in one cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from types import MappingProxyType
 
@@ -19,7 +19,7 @@ import msgspec
 from eap.pd.address import NetIdLearner, forget
 from eap.pd.device import DeviceState, EapDevice
 from eap.pd.image import Image, Inputs, Sampler
-from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, StateChannel
+from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, PortTap, StateChannel
 from eap.pd.links import Generators, Links
 from eap.pd.poll import outgoing_polls, requests_at
 from eap.pd.publisher import FrameRow, PollResponder, Publisher
@@ -84,6 +84,10 @@ class Station:
         self._publishers: list[tuple[Publisher | PollResponder, FrameChannel]] = []
         self._sending: list[tuple[Publisher | PollResponder, FrameChannel]] = []
         """The publishers, in states that send."""
+        self._senders: list[tuple[str, Publisher | PollResponder, FrameChannel]] = []
+        """The publishers with their ports, and the channels without taps."""
+        self._taps: dict[str, tuple[PortTap, FrameHandler]] = {}
+        """Taps by port, each with the handler that is behind it."""
         self._ports: dict[str, tuple[FrameChannel, Publisher | None]] = {}
         self._channels: list[FrameChannel] = []
         self._drains: list[Callable[[int], object]] = []
@@ -138,13 +142,14 @@ class Station:
         publisher = None
         if pushed := _pds_of(frames, polled=False):
             publisher = Publisher(self.image, self._inputs, net_id, out, pushed, self._origins)
-            self._publishers.append((publisher, out))
+            self._senders.append((port, publisher, out))
         if polled := _pds_of(frames, polled=True):
             requests = self._requests[port]
             answerer = PollResponder(
                 self.image, self._inputs, net_id, out, polled, requests, self._origins
             )
-            self._publishers.append((answerer, out))
+            self._senders.append((port, answerer, out))
+        self._connect_senders()
         self._ports[port] = channel, publisher
         self._teach(port)
 
@@ -154,6 +159,40 @@ class Station:
         if learner := self._learners.get(port):
             learner.wanted = () if publisher is None else publisher.wanted
             learner.learn = forget if publisher is None else publisher.learn
+
+    def _connect_senders(self) -> None:
+        """Have the publishers send through their channels, or through the taps of their ports."""
+        # In place: the list of those that send is the same one, or empty.
+        self._publishers[:] = [
+            (publisher, self._taps[port][0].sending(channel) if port in self._taps else channel)
+            for port, publisher, channel in self._senders
+        ]
+
+    @property
+    def untapped_ports(self) -> Collection[str]:
+        """The ports that have a channel and no tap."""
+        return self._ports.keys() - self._taps.keys()
+
+    def tap(self, port: str, tap: PortTap) -> None:
+        """Have *tap* observe all frames of *port*, between two cycles, until :meth:`untap`."""
+        if port in self._taps:
+            return
+        plain = self.handlers[port]
+        self._taps[port] = tap, plain
+        self._exchange_handler(port, plain, tap.received(plain))
+        self._connect_senders()
+
+    def untap(self) -> None:
+        """Remove all taps."""
+        for port, (_, plain) in self._taps.items():
+            self._exchange_handler(port, self.handlers[port], plain)
+        self._taps.clear()
+        self._connect_senders()
+
+    def _exchange_handler(self, port: str, old: FrameHandler, new: FrameHandler) -> None:
+        self.handlers[port] = new
+        for channel in (*(each for each, _ in self._ports.values()), *self._channels):
+            channel.exchange_handler(old, new)
 
     def drain_also(self, channel: FrameChannel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""
@@ -282,6 +321,8 @@ class Station:
                 self._supervisors.append(subscriber.handle_timeout)
         self._subscribers, before._subscribers = before._subscribers, self._subscribers
         self.handlers = before.handlers
+        self._taps = before._taps
+        self._connect_senders()
         self._learners = before._learners
         for port, requests in self._requests.items():
             requests.follow(before._requests[port])

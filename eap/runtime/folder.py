@@ -214,6 +214,11 @@ class ApplianceFolder(Closeable):
         """Return the file of the drop counters of *process*."""
         return self.path / f"{process}.discards"
 
+    @property
+    def frames(self) -> Path:
+        """File of the ring of recorded frames."""
+        return self.path / "frames.ring"
+
     def image(self, station: str) -> Path:
         """Return the file of one station's process image."""
         return self.path / f"{folder_name(station)}.image"

@@ -1,0 +1,107 @@
+"""Recording of the frames of all ports, while a reader of the ring of frames wants them.
+
+The engine looks for readers between its cycles.  Without one, nothing is in the path of a frame.
+A received frame is recorded with the kernel's time stamp where there is one, a sent one with the
+time just before the system call; so a frame that goes from one station of this appliance to another
+is never received before it was sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from time import monotonic_ns
+
+from eap.engine.rebuild import EngineStation
+from eap.net.framering_file import FrameRingFile
+from eap.pd.address import source_word, to_word
+from eap.pd.framering import MAX_FRAME, FrameRingWriter
+from eap.pd.link import FrameChannel, FrameHandler, FrameOrigin, OutFrame
+
+_address_of = lru_cache(1024)(to_word)  # the same destinations again and again
+_source_of = lru_cache(1024)(source_word)
+
+
+class FrameTap:
+    """Records the frames of one port, which has *number* in the ring."""
+
+    def __init__(self, ring: FrameRingWriter, number: int) -> None:
+        self._ring = ring
+        self._number = number
+
+    def received(self, handle: FrameHandler) -> FrameHandler:
+        """Return a handler that records a frame and hands it to *handle*."""
+        add, number = self._ring.add, self._number
+
+        def record(data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
+            add(number, at_ns, _source_of(origin.source_of(data)), data[: min(size, MAX_FRAME)])
+            handle(data, size, at_ns, origin)
+
+        return record
+
+    def sending(self, channel: FrameChannel) -> FrameChannel:
+        """Return a channel that sends through *channel* and records what was sent."""
+        return _RecordingChannel(channel, self._ring, self._number)
+
+
+class _RecordingChannel:
+    """A channel whose sent frames are recorded."""
+
+    def __init__(self, channel: FrameChannel, ring: FrameRingWriter, number: int) -> None:
+        self._channel = channel
+        self._add = ring.add
+        self._number = number
+        self.drain = channel.drain
+        self.exchange_handler = channel.exchange_handler
+        self.link_header = channel.link_header
+        self.minimum_size = channel.minimum_size
+
+    def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
+        """Send *frames* and record those that were sent; return the others."""
+        del now_ns
+        # The time for loopback lines, too: what is received there has the time of the sending.
+        at_ns = monotonic_ns()
+        failed = self._channel.send(frames, at_ns)
+        add, number = self._add, self._number
+        for frame in frames:
+            if failed and frame in failed:
+                continue
+            address = _address_of(frame.destination)
+            add(number, at_ns, address, frame.view[frame.headroom :], is_sent=True)
+        return failed
+
+
+class FrameRecording:
+    """Starts and ends the recording of the frames of *stations*.
+
+    Args:
+        file: The ring.
+        stations: By name; exchanged while they run.
+    """
+
+    def __init__(self, file: FrameRingFile, stations: Mapping[str, EngineStation]) -> None:
+        self._file = file
+        self._stations = stations
+        self._ring: FrameRingWriter | None = None
+        self._is_on = False
+
+    def look(self, now_ns: int) -> None:
+        """Follow the readers, and the ports of the stations; called between two cycles."""
+        if not self._file.header.is_wanted(now_ns):
+            if self._is_on:
+                self._is_on = False
+                for entry in self._stations.values():
+                    entry.station.untap()
+            return
+        if self._ring is None:
+            self._ring = self._file.writer()
+        if self._ring is not None:
+            self._is_on = True
+            self._tap(self._ring)
+
+    def _tap(self, ring: FrameRingWriter) -> None:
+        for name, entry in self._stations.items():
+            for port in entry.station.untapped_ports:
+                number = ring.number(f"{name}/{port}")
+                if number is not None:
+                    entry.station.tap(port, FrameTap(ring, number))
