@@ -24,8 +24,9 @@ from typing import Any, NamedTuple
 from rich.console import Group, RenderableType
 
 import eap
-from eap.cli.output import Column, Styled, TextTable, duration, repaint
+from eap.cli.output import Column, Styled, TextTable, repaint
 from eap.errors import EapError
+from eap.quantities import duration
 from eap.runtime.attach import AttachedStation
 
 PLANT = Path("config/demo.yaml")

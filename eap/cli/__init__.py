@@ -5,8 +5,8 @@ new, run, plan, apply, rollback), ``status``, ``pd``, ``od`` (also state), ``net
 trace), ``routes``, ``bus``, ``gateway`` (also gw), ``sim``, ``decode``, ``discover``, ``types`` and
 ``files`` (import and export-peer).
 A command reads a plant file, starts an appliance in the foreground, or calls an operation of
-``eap.ops``, which returns a typed result.  ``output`` prints that as JSON or by the command's view
-(``*_view``, ``od_text``); ``status_findings`` finds the faults in a status document.  ``params``
+``eap.ops`` or ``eap.live``, which returns a typed result.  ``output`` prints that as JSON or by the
+command's view (``*_view``, ``od_text``).  ``params``
 has what commands share, ``group`` the main command and the exit codes, ``routes_tui`` the live view
 of routes.
 """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import CommandGroup, LazyGroup
-from eap.cli.output import Renderer, times
+from eap.cli.output import Renderer
 from eap.cli.params import (
     BusAddress,
     BusCommand,
@@ -27,6 +27,7 @@ from eap.cli.params import (
     parse_type,
     slave_argument,
 )
+from eap.quantities import times
 
 if TYPE_CHECKING:
     from eap.codec.datatypes import DataType

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import UNSET
 
-from eap.cli.output import Column, Styled, TextTable, count, duration
+from eap.cli.output import Column, Styled, TextTable
 from eap.ids import ObjectId
 from eap.ops.bus_info import (
     BusScan,
@@ -28,6 +28,7 @@ from eap.ops.bus_objects import (
     SlaveObject,
 )
 from eap.ops.od import OdObjectRow
+from eap.quantities import count, duration
 from eap.runtime.bus_status import FindingRow
 from eap.runtime.engine_messages import EoeReport, LockState
 

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer, count, repaint, write_view
+from eap.cli.output import Renderer, repaint, write_view
 from eap.cli.params import PLANT_FILE, check_new_file, examples, json_option
 from eap.errors import CodecError, ConfigError, ControlError, EnvironmentalError
 from eap.ids import NetId
+from eap.quantities import count
 
 if TYPE_CHECKING:
     from eap.ops.discover import DiscoveredPd, ObserverFeed

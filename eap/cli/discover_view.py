@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from eap.cli.output import Column, Styled, TextTable, count, duration
-from eap.cli.status_findings import PUBLISHER_HINT, VERSION_HINT
+from eap.cli.output import Column, Styled, TextTable
+from eap.live.findings import PUBLISHER_HINT, VERSION_HINT
+from eap.quantities import count, duration
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult

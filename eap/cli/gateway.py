@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from eap.cli.group import CommandGroup, LazyGroup
-from eap.cli.output import Column, Renderer, TextTable, count
+from eap.cli.output import Column, Renderer, TextTable
 from eap.cli.params import (
     BusAddress,
     BusCommand,
@@ -26,6 +26,7 @@ from eap.cli.params import (
     plant_option,
 )
 from eap.errors import ControlError
+from eap.quantities import count
 
 if TYPE_CHECKING:
     from rich.tree import Tree

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Column, Renderer, Styled, TextTable, count, duration
+from eap.cli.output import Column, Renderer, Styled, TextTable
 from eap.cli.params import examples, json_option, plant_option
+from eap.quantities import count, duration
 
 if TYPE_CHECKING:
     from eap.control.routes import (

@@ -1,4 +1,4 @@
-"""Renderer of ``eapctl``, and the parts of a text view: tables, styled text, numbers in words.
+"""Renderer of ``eapctl``, and the parts of a text view: tables, styled text, values.
 
 Each command hands its result to :class:`Renderer`: ``--json`` prints the encoded record, else
 the lines and tables of the command's view.  Results go to stdout, everything else to stderr.  A
@@ -150,9 +150,6 @@ def _render(console: Console, parts: Iterable[RenderableType]) -> str:
         return text
     return "\n".join(line.rstrip() for line in text.split("\n"))
 
-
-QUALITY_MAX = 0xFFFF
-"""Saturation value of a quality: 6.5535 s."""
 
 _GAP = 2
 """Spaces between two columns: what rich puts there for one space of padding and no border."""
@@ -309,35 +306,6 @@ class ItemLine:
                 line = Text(" " * len(self._heading))
             line.append(" ").append_text(item).append(comma, "none")
         yield line
-
-
-def duration(us: int) -> str:
-    """Return microseconds in the unit that keeps the number short."""
-    if us < 1000:
-        return f"{us} µs" if us else "0"
-    if us < 1_000_000:
-        return f"{us / 1000:.1f} ms"
-    seconds = us / 1_000_000
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
-
-
-def quality(units: int | None) -> str:
-    """Return a quality (in units of 100 us) as a time; empty while nothing was received."""
-    if units is None:
-        return ""
-    return "> 6.5 s" if units == QUALITY_MAX else duration(units * 100)
-
-
-def times(count: int) -> str:
-    """Return a number of times as text."""
-    return "once" if count == 1 else f"{count} times"
-
-
-def count(number: int, thing: str) -> str:
-    """Return *number* and *thing*, in singular or plural."""
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def value_text(value: Any) -> str:

@@ -16,13 +16,20 @@ from typing import Any, TypeAlias
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from eap.cli.output import Column, Styled, TextTable, offset_text, quality, value_text
+from eap.cli.output import (
+    Column,
+    Styled,
+    TextTable,
+    offset_text,
+    value_text,
+)
 from eap.codec.datatypes import parse
 from eap.codec.structures import member_type_name, parts_of
 from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
 from eap.ops.client import connect_station
 from eap.pd.report import MemberRow, PdRow, PdRowVariable
+from eap.quantities import quality
 
 
 class UncarriedVariables(Struct, frozen=True):

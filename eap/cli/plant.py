@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer, count, write_text
+from eap.cli.output import Renderer, write_text
 from eap.cli.params import PLANT_FILE, CommandT, check_new_file, json_option, parse_cycle
 from eap.errors import ConfigError, ControlError
 from eap.ids import ObjectId
+from eap.quantities import count
 
 if TYPE_CHECKING:
     from eap.config.load import Plant

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 
-from eap.cli.output import Column, Styled, TextTable, count, duration
+from eap.cli.output import Column, Styled, TextTable
 from eap.control.routes import (
     ConnectionRow,
     EndpointRow,
@@ -18,6 +18,7 @@ from eap.control.routes import (
 )
 from eap.ids import Endpoint
 from eap.ops.routing import RouterList, TestedTarget
+from eap.quantities import count, duration
 
 _UNITS = ("", "k", "M", "G", "T", "P", "E")
 _STYLES = {"up": "green", "down": "bold red", "unknown": "dim", "client": "dim"}

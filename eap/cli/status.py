@@ -23,15 +23,12 @@ from eap.cli.output import (
     Renderer,
     Styled,
     TextTable,
-    count,
-    duration,
-    quality,
     repaint,
-    times,
     write_json,
 )
 from eap.cli.params import json_option, plant_option, station_option
-from eap.cli.status_findings import (
+from eap.errors import ControlError
+from eap.live.findings import (
     LISTENER_COUNTS,
     REASONS,
     STATES,
@@ -43,12 +40,12 @@ from eap.cli.status_findings import (
     is_hung,
     is_special,
 )
-from eap.errors import ControlError
+from eap.quantities import count, duration, quality, times
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
-    from eap.ops.client import ApplianceStatus
+    from eap.live.status import ApplianceStatus
 
 
 _LEAST_INTERVAL_S = 0.1
@@ -61,13 +58,11 @@ class StatusSample(NamedTuple):
         now_s: Unix time of the sample.
         document: The merged status with its findings.
         earlier: The document of the previous sample, if there is one.
-        seconds: Time since the previous sample.
     """
 
     now_s: float
     document: StatusReport
     earlier: StatusReport | None = None
-    seconds: float = 0.0
 
 
 @click.command()
@@ -122,7 +117,7 @@ def _samples(
     plant: str | None, station: str | None, interval_s: float
 ) -> Iterator[StatusSample | str]:
     """Yield a sample every *interval_s*, or the error of the request; never end."""
-    before: tuple[float, StatusSample] | None = None
+    before: StatusSample | None = None
     while True:
         start = time.monotonic()
         try:
@@ -133,9 +128,8 @@ def _samples(
             yield str(exc)
         else:
             if before is not None:
-                at, last = before
-                sample = sample._replace(earlier=last.document, seconds=start - at)
-            before = (start, sample)
+                sample = sample._replace(earlier=before.document)
+            before = sample
             yield sample
         _pause(max(0.0, start + interval_s - time.monotonic()))
 
@@ -149,11 +143,15 @@ def _take_sample(plant: str | None, station: str | None) -> StatusSample:
     """Return the merged answer of the chosen appliances, cut down to *station* if it is given."""
     from msgspec.structs import asdict, replace
 
-    from eap.ops.client import MergedStatus, connect, request_each
+    from eap.live.status import MergedStatus, SilentAppliance
+    from eap.ops.client import connect, request_each
 
     with ExitStack() as stack:
         clients = [stack.enter_context(client) for client in connect(plant, station)]
-        status = MergedStatus.of(*request_each(clients, "status"))
+        answers, silent = request_each(clients, "status")
+    status = MergedStatus.of(
+        answers, [SilentAppliance(each.plant, each.stations, each.services.pid) for each in silent]
+    )
     if station:
         status = replace(
             status, stations=[row for row in status.stations if row["name"] == station]
@@ -184,7 +182,7 @@ def _page(
 
 
 def _screen(sample: StatusSample) -> Iterator[RenderableType]:
-    yield StatusScreen(sample.document, sample.now_s, sample.earlier, sample.seconds)
+    yield StatusScreen(sample.document, sample.now_s, sample.earlier)
 
 
 def _full(sample: StatusSample) -> Iterator[RenderableType]:
@@ -210,7 +208,7 @@ _LEAST_ROWS = 1
 class StatusScreen:
     """One status document, fitted to the screen.
 
-    With the document of *seconds* ago as *earlier* it shows rates in place of counts.
+    With an *earlier* document it shows rates in place of counts.
     """
 
     def __init__(
@@ -218,14 +216,12 @@ class StatusScreen:
         document: StatusReport,
         now_s: float,
         earlier: StatusReport | None = None,
-        seconds: float = 0.0,
     ) -> None:
         self._document = document
         self._findings = [each for each in document.findings if each.severity is not Severity.INFO]
         self._remarks = len(document.findings) - len(self._findings)
         self._now_s = now_s
         self._earlier = earlier
-        self._seconds = seconds
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         def excess(findings: int, stations: int) -> int:
@@ -296,20 +292,17 @@ class StatusScreen:
 
     def _figure(self, station: Row, direction: str, key: str) -> str:
         """Return a sum over all PDs: since the start, or per second after a previous sample."""
-        total = _total(station, direction, key)
+        # Imported here: its records take time to build, and --help needs none of them.
+        from eap.live.rows import count_total, key_of, rate, stations_of
+
+        total = count_total(station, direction, key)
         if self._earlier is None:
             return str(total)
-        before = [
-            row
-            for row in self._earlier.stations
-            if (row["plant"], row["name"]) == (station["plant"], station["name"])
-        ]
-        if not before or total < (total_before := _total(before[0], direction, key)):
-            return ""  # the station is new, or its counters restarted
-        # Not the time between the samples: the counters are older than the answer by an unknown
-        # time, while the number of cycles belongs to the same moment as they do.
-        seconds = _station_s(station) - _station_s(before[0])
-        return f"{(total - total_before) / (seconds if seconds > 0 else self._seconds):.0f}"
+        earlier = stations_of(self._earlier).get(key_of(station))
+        if earlier is None:
+            return ""  # the station is new
+        per_s = rate(total, count_total(earlier, direction, key), station, earlier)
+        return "" if per_s is None else f"{per_s:.0f}"
 
 
 def summaries(document: StatusReport) -> list[Styled]:
@@ -344,17 +337,6 @@ def finding_grid(found: Iterable[StatusFinding], now_s: float) -> RenderableType
     for each in found:
         grid.add_row(Styled(each.severity, style=_STYLES[each.severity]), Styled(each.text(now_s)))
     return grid
-
-
-def _total(station: Row, direction: str, key: str) -> int:
-    return sum(row[key] for row in station["pd"][direction])
-
-
-def _station_s(station: Row) -> float:
-    """Return the time of a station's counters: its cycles since the first, also those left out."""
-    cycles: int = station.get("cycle", 0) + station.get("overruns", 0)
-    cycle_us: int = station.get("cycle_us", 0)
-    return cycles * cycle_us / 1e6
 
 
 def _states(stations: Iterable[Row]) -> str:

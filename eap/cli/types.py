@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.output import Column, Renderer, Styled, TextTable, count, offset_text
+from eap.cli.output import (
+    Column,
+    Renderer,
+    Styled,
+    TextTable,
+    offset_text,
+)
 from eap.cli.params import PLANT_FILE, examples, json_option
+from eap.quantities import count
 
 if TYPE_CHECKING:
     from eap.ops.types import ShownType

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from time import monotonic
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -387,66 +387,6 @@ def _to_json(kind: DataType, text: str) -> Any:
     if not is_finite(value):
         raise ValueError(f"{text!r} cannot be sent to the appliance: expected a finite number")
     return kind.to_plain(value)
-
-
-class ApplianceStatus(msgspec.Struct, frozen=True):
-    """Status of one appliance, without its stations."""
-
-    plant: str
-    stations: list[str]
-    processes: dict[str, Any]
-    findings: list[dict[str, Any]] = []
-    audit: dict[str, Any] | None = None
-    listeners: list[dict[str, Any]] = []
-
-
-class SilentAppliance(msgspec.Struct, frozen=True):
-    """Appliance that does not answer: its plant, stations, and the process id of its services."""
-
-    plant: str
-    stations: list[str]
-    services: int
-
-
-class MergedStatus(msgspec.Struct, frozen=True):
-    """Status of several appliances.
-
-    Attributes:
-        version: Of the format.
-        processes: Those of the first appliance.
-        stations: Of all appliances that answer, each with the name of its plant.
-        appliances: All appliances that answer.
-        silent: Appliances that do not answer.
-    """
-
-    version: int
-    processes: dict[str, Any]
-    stations: list[dict[str, Any]]
-    appliances: list[ApplianceStatus]
-    silent: list[SilentAppliance] = []
-
-    @classmethod
-    def of(cls, answers: Sequence[dict[str, Any]], silent: Sequence[ApplianceInfo] = ()) -> Self:
-        """Merge the answers of appliances to the method ``status``."""
-        appliances = [
-            msgspec.convert(
-                answer | {"stations": [station["name"] for station in answer["stations"]]},
-                ApplianceStatus,
-            )
-            for answer in answers
-        ]
-        stations = [
-            {"plant": answer["plant"], **station}
-            for answer in answers
-            for station in answer["stations"]
-        ]
-        return cls(
-            answers[0]["version"],
-            answers[0]["processes"],
-            stations,
-            appliances,
-            [SilentAppliance(info.plant, info.stations, info.services.pid) for info in silent],
-        )
 
 
 def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> ControlClient:

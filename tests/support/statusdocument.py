@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 from msgspec.structs import asdict
 
-from eap.cli.status_findings import StatusReport, findings
-from eap.ops.client import MergedStatus
+from eap.live.findings import StatusReport, findings
+from eap.live.status import MergedStatus
 
 NOW_S = 1_795_000_000.0
 

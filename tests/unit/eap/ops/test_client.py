@@ -14,9 +14,7 @@ import pytest
 from devicebus.errors import AlStatusError
 from eap.errors import ControlError
 from eap.ops.client import (
-    ApplianceStatus,
     ControlClient,
-    MergedStatus,
     call_each,
     connect,
     request_each,
@@ -166,19 +164,6 @@ def test_a_socket_that_does_not_listen_is_named():
         demo.write_info(info())
         with pytest.raises(ControlError, match="cannot be reached"):
             connect()
-
-
-def test_status_of_several_becomes_one():
-    first = {"version": 1, "plant": "p", "processes": {"engine": {}}, "stations": [{"name": "a"}]}
-    second = {"version": 1, "plant": "q", "processes": {}, "stations": [{"name": "b"}]}
-    merged = MergedStatus.of([first, second])
-    assert merged.processes == {"engine": {}}
-    assert [station["name"] for station in merged.stations] == ["a", "b"]
-    assert [station["plant"] for station in merged.stations] == ["p", "q"]
-    assert merged.appliances == [
-        ApplianceStatus("p", ["a"], {"engine": {}}, findings=[], audit=None, listeners=[]),
-        ApplianceStatus("q", ["b"], {}, findings=[], audit=None, listeners=[]),
-    ]
 
 
 def answer_one(listener: socket.socket, result: object) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.cli.status_findings import PUBLISHER_HINT, VERSION_HINT, Severity, StatusFinding, findings
-from eap.ops.client import SilentAppliance
+from eap.live.findings import PUBLISHER_HINT, VERSION_HINT, Severity, StatusFinding, findings
+from eap.live.status import SilentAppliance
 from tests.support.statusdocument import NOW_S, bus_port, document, frame, merged, rx, tx
 
 

@@ -18,11 +18,11 @@ from datetime import datetime
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
-from eap.cli.output import count, duration
-from eap.cli.output import times as times_of
+from eap.quantities import count, duration
+from eap.quantities import times as times_of
 
 if TYPE_CHECKING:
-    from eap.ops.client import ApplianceStatus, MergedStatus, SilentAppliance
+    from eap.live.status import ApplianceStatus, MergedStatus, SilentAppliance
 
 Row = Mapping[str, Any]
 

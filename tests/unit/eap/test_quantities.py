@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.cli import output as table
+from eap import quantities
 
 
 @pytest.mark.parametrize(
@@ -19,16 +19,16 @@ from eap.cli import output as table
     ],
 )
 def test_duration(us: int, text: str) -> None:
-    assert table.duration(us) == text
+    assert quantities.duration(us) == text
 
 
 def test_quality_counts_in_100_us_and_saturates() -> None:
-    assert table.quality(None) == ""
-    assert table.quality(3) == "300 µs"
-    assert table.quality(0xFFFE) == "6.6 s"
-    assert table.quality(0xFFFF) == "> 6.5 s"
+    assert quantities.quality(None) == ""
+    assert quantities.quality(3) == "300 µs"
+    assert quantities.quality(0xFFFE) == "6.6 s"
+    assert quantities.quality(0xFFFF) == "> 6.5 s"
 
 
 def test_numbers_agree_with_their_words() -> None:
-    assert (table.times(1), table.times(2)) == ("once", "2 times")
-    assert (table.count(1, "PD"), table.count(0, "PD")) == ("1 PD", "0 PDs")
+    assert (quantities.times(1), quantities.times(2)) == ("once", "2 times")
+    assert (quantities.count(1, "PD"), quantities.count(0, "PD")) == ("1 PD", "0 PDs")

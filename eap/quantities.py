@@ -1,0 +1,35 @@
+"""Quantities in words: durations, numbers of things and times, and the quality of a PD."""
+
+from __future__ import annotations
+
+QUALITY_MAX = 0xFFFF
+"""Saturation value of a quality: 6.5535 s."""
+
+
+def duration(us: int) -> str:
+    """Return microseconds in the unit that keeps the number short."""
+    if us < 1000:
+        return f"{us} µs" if us else "0"
+    if us < 1_000_000:
+        return f"{us / 1000:.1f} ms"
+    seconds = us / 1_000_000
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
+
+
+def quality(units: int | None) -> str:
+    """Return a quality (in units of 100 us) as a time; empty while nothing was received."""
+    if units is None:
+        return ""
+    return "> 6.5 s" if units == QUALITY_MAX else duration(units * 100)
+
+
+def times(count: int) -> str:
+    """Return a number of times as text."""
+    return "once" if count == 1 else f"{count} times"
+
+
+def count(number: int, thing: str) -> str:
+    """Return *number* and *thing*, in singular or plural."""
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
