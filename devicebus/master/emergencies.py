@@ -7,7 +7,7 @@ has no layout of its own: drives send the bytes of CoE.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -111,6 +111,11 @@ class EmergencyLog:
         if station not in self._counts:
             return SlaveHistory()
         return SlaveHistory(self._counts[station], tuple(self._latest[station]))
+
+    def forget_others(self, kept: Collection[int]) -> None:
+        """Forget all slaves but those with station addresses in *kept*."""
+        for station in self._counts.keys() - set(kept):
+            del self._counts[station], self._latest[station]
 
     def clear(self) -> None:
         """Forget all, but not errors that are still there."""

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TypeAlias
 
+from msgspec.structs import replace
+
 from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.finding import FindingReport, PlantFinding
@@ -147,7 +149,7 @@ def _configure(
     slaves = override(description.slaves, port.slaves, report, f"{port.at}.slaves")
     cycle_us = station.cycle_us or plant.defaults.cycle_us
     check_cycles({slave.name: slave for slave in slaves}, cycle_us, report, port.at)
-    return ExpectedBus(slaves, description.is_ring)
+    return replace(description, slaves=slaves)
 
 
 def bus_file(port: PortSection, folder: Path) -> tuple[str, Path | None]:

@@ -112,6 +112,8 @@ class ExpectedBus(msgspec.Struct, frozen=True):
     slaves: tuple[DescribedSlave, ...] = ()
     is_ring: bool = False
     """True if its bus file has a second line to the master."""
+    digest: str = ""
+    """Of all that a simulator plays from its bus file."""
 
 
 class BusVariable(NamedTuple):
@@ -127,6 +129,8 @@ class NamedBus(NamedTuple):
 
     slaves: tuple[BusSlaveSpec, ...]
     variables: dict[str, BusVariable]
+    digest: str
+    """As that of ExpectedBus."""
 
 
 def name_bus(port: str, description: ExpectedBus) -> NamedBus:
@@ -161,7 +165,7 @@ def name_bus(port: str, description: ExpectedBus) -> NamedBus:
                 config=slave.config,
             )
         )
-    return NamedBus(tuple(slaves), variables)
+    return NamedBus(tuple(slaves), variables, description.digest)
 
 
 def _name(entry: DescribedPdoEntry, prefix: str, name: str) -> BusEntrySpec:

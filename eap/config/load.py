@@ -323,7 +323,7 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
     uri = index.uris[station.name, port.name]
     file = bus_file(port, folder)[1]
     path = "" if file is None else str(file.resolve())
-    slaves = index.buses[station.name, port.name].slaves
+    bus = index.buses[station.name, port.name]
     return PortSpec(
         name=port.name,
         kind=port.kind,
@@ -331,7 +331,7 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
         net_id=port.net_id,
         bus=BusPortSpec(
             path,
-            slaves,
+            bus.slaves,
             port.target,
             port.clocks,
             port.frame_timeout_us,
@@ -339,6 +339,7 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
             port.redundant,
             locked_port(index, station) == port.name,
             port.sync_lead_us,
+            bus.digest if uri.scheme == "sim" else "",
         ),
         gateway=gateway_spec(index, station, port),
         eoe=eoe_spec(port),

@@ -6,18 +6,14 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from functools import partial
-from itertools import groupby
 from pathlib import Path
 from time import monotonic_ns
 from typing import Protocol
 
-from devicebus.master.bus import MasterSettings
-from devicebus.master.matching import ExpectedSlave
-from devicebus.master.pdo import Pdo, PdoEntry, ProcessDataChannel
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
+from eap.engine.bus_settings import epoch_offset_ns, master_settings
 from eap.engine.engine_bus import EngineBus
 from eap.engine.frame_taps import FrameRecording
 from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
@@ -36,7 +32,7 @@ from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
 from eap.pd.link import FrameChannel, FrameHandler
-from eap.pd.spec import BusPortSpec, BusSlaveSpec, PortKind, PortSpec, Wake
+from eap.pd.spec import PortKind, PortSpec, Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 from eap.runtime.drop_counters import DropCounterFeed, DropCounters, DropReason
@@ -54,13 +50,10 @@ from eap.runtime.startup import Step, no_step
 
 REST_NS = 300_000_000
 """Limit for bringing slaves to INIT when the engine ends."""
-_MIN_BUDGET, _BUDGET_PER_US = 1536, 3
-_EPOCH_S = 946_684_800
-"""2000-01-01, from which the clocks of slaves count."""
 
 
 class EngineBuses:
-    """The buses of *stations*, in the order of the handover.
+    """The buses of *stations*.
 
     Attributes:
         buses: By their numbers in requests.
@@ -75,24 +68,25 @@ class EngineBuses:
         serve_station: ServeStation,
     ) -> None:
         self._handover = handover
-        self.buses = [self._make(given, stations[given.owner.station]) for given in handover.buses]
+        self.buses = {
+            given.number: self._make(given, stations[given.owner.station])
+            for given in handover.buses
+        }
         self.requests: BusRequestHandler | None = None
         self.arrivals: dict[int, Callable[[int], None]] = {
-            fd: bus.drain for bus in self.buses for fd in bus.filenos()
+            fd: bus.drain for bus in self.buses.values() for fd in bus.filenos()
         }
         if handover.bus_fd != NO_DESCRIPTOR:
-            self.requests = BusRequestHandler(
-                socket.socket(fileno=handover.bus_fd), self.buses, serve_station
-            )
+            self.requests = BusRequestHandler(socket.socket(fileno=handover.bus_fd), serve_station)
             self.arrivals[self.requests.fileno()] = self.requests.serve
-            for number, bus in enumerate(self.buses):
-                bus.faults.on_unsolicited.append(partial(self.requests.forward, number))
+            for number, bus in self.buses.items():
+                self.requests.add(number, bus)
 
     def start(self, now_ns: int) -> None:
         """Begin to bring all buses up."""
         if self.requests is not None:
             self.requests.announce()
-        for bus in self.buses:
+        for bus in self.buses.values():
             bus.start(now_ns)
 
     def publish(self) -> None:
@@ -105,7 +99,7 @@ class EngineBuses:
         now_ns = clock()
         # Slaves that do not answer must not delay the end: their watchdogs stop the outputs too.
         end_ns = now_ns + REST_NS
-        tasks = {bus: bus.shut_down(now_ns) for bus in self.buses}
+        tasks = {bus: bus.shut_down(now_ns) for bus in self.buses.values()}
         while (now_ns := clock()) < end_ns:
             waiting = [bus for bus, task in tasks.items() if not task.is_done]
             if not waiting:
@@ -119,7 +113,7 @@ class EngineBuses:
 
     def close(self) -> None:
         """Close all sockets."""
-        for bus in self.buses:
+        for bus in self.buses.values():
             bus.close()
         if self.requests is not None:
             self.requests.close()
@@ -127,7 +121,6 @@ class EngineBuses:
     def _make(self, given: BusSocket, entry: EngineStation) -> EngineBus:
         port = self._handover.port(given.owner)
         station = entry.station
-        epoch_offset_ns = time.time_ns() - time.monotonic_ns() - _EPOCH_S * 1_000_000_000
         first = BusPort(socket.socket(fileno=given.engine_fd), interface=port.interface.host)
         second = None
         if given.second_fd != NO_DESCRIPTOR:
@@ -139,59 +132,17 @@ class EngineBuses:
             )
         bus = EngineBus(
             port,
-            master_settings(port, station.spec.cycle_us, epoch_offset_ns),
+            master_settings(port, station.spec.cycle_us, epoch_offset_ns()),
             station.cycle_ns,
             station.image,
             station.memory_of,
             first,
             second,
-            entry.set_step if port.bus is not None and port.bus.lock_cycle else None,
+            entry.set_step,
         )
         station.connect_bus(bus)
         entry.buses[port.name] = bus
         return bus
-
-
-def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> MasterSettings:
-    """Return the settings of the master of *port*, which exchanges data every *cycle_us*.
-
-    *epoch_offset_ns* leads from the engine's clock to the time since 2000.
-    """
-    spec = port.bus or BusPortSpec()
-    expected = [
-        ExpectedSlave(
-            name=slave.name,
-            vendor=slave.vendor,
-            product=slave.product,
-            revision=slave.revision,
-            serial=slave.serial,
-            alias=slave.alias,
-            config=slave.config,
-            channels=tuple(_channels(slave)),
-        )
-        for slave in spec.slaves
-    ]
-    return MasterSettings(
-        expected=expected,
-        frame_timeout_ns=1000 * spec.frame_timeout_us,
-        frame_retries=spec.frame_retries,
-        acyclic_octets=max(_MIN_BUDGET, _BUDGET_PER_US * cycle_us),
-        clocks=spec.clocks,
-        cycle_ns=1000 * cycle_us,
-        epoch_offset_ns=epoch_offset_ns,
-        lock=spec.lock_cycle,
-        lead_ns=1000 * spec.sync_lead_us,
-        redundant=bool(spec.redundant),
-    )
-
-
-def _channels(slave: BusSlaveSpec) -> Iterator[ProcessDataChannel]:
-    """Yield the described process data, for which a place is kept while the slave is absent."""
-    for entries, is_output in ((slave.outputs, True), (slave.inputs, False)):
-        for manager, mapped in groupby(entries, key=lambda each: each.manager):
-            pdo = Pdo(0, tuple(PdoEntry(e.index, e.subindex, e.bit_length) for e in mapped))
-            # Its sync manager is read from its EEPROM when it is there.
-            yield ProcessDataChannel(manager, 0, 0, is_output, (pdo,))
 
 
 _REFUSALS: Mapping[str, DropReason] = {

@@ -91,7 +91,6 @@ class BusRequestHandler:
 
     Args:
         sock: The engine's end of the pair with services.
-        buses: By their numbers in requests.
         serve_station: Serves requests to a station, and calls back when one is done.
 
     Attributes:
@@ -99,16 +98,12 @@ class BusRequestHandler:
         dropped: Replies that services did not take.
     """
 
-    def __init__(
-        self, sock: socket.socket, buses: Sequence[EngineBus], serve_station: ServeStation
-    ) -> None:
+    def __init__(self, sock: socket.socket, serve_station: ServeStation) -> None:
         self.malformed = 0
         self.dropped = 0
         self._sock = sock
-        self._buses = buses
-        self._publishers = [
-            BusPublisher(number, bus, self._send) for number, bus in enumerate(buses)
-        ]
+        self._buses: dict[int, tuple[EngineBus, BusPublisher]] = {}
+        """By number."""
         self._serve_station = serve_station
         self._decoder = msgspec.msgpack.Decoder(EngineRequest)
         self._pending: dict[int, _PendingRequest] = {}
@@ -123,18 +118,19 @@ class BusRequestHandler:
         """Close the socket."""
         self._sock.close()
 
+    def add(self, number: int, bus: EngineBus) -> None:
+        """Serve requests to *bus* under its *number* from now on."""
+        self._buses[number] = bus, BusPublisher(number, bus, self._send)
+        bus.faults.on_unsolicited.append(partial(self._forward, number))
+
     def announce(self) -> None:
         """Send the first message of a new engine."""
         self._send(EngineStarted(os.getpid()))
 
-    def forward(self, bus: int, message: Unsolicited) -> None:
-        """Forward an unsolicited message of a slave on the bus numbered *bus*."""
-        self._send(UnsolicitedMessage(bus, message))
-
     def publish(self) -> None:
         """Send the changes on the buses."""
-        for each in self._publishers:
-            each.flush()
+        for _, publisher in self._buses.values():
+            publisher.flush()
 
     def serve(self, now_ns: int) -> None:
         """Serve a few of the waiting requests."""
@@ -181,11 +177,11 @@ class BusRequestHandler:
 
     def _serve_bus(self, request: BusRequest, now_ns: int) -> None:
         self._cancel(request.id)  # a requester that used the number before has gone
-        if not 0 <= request.bus < len(self._buses):
-            error = BusError(f"there is no bus {request.bus}, there are {len(self._buses)}")
+        if request.bus not in self._buses:
+            error = BusError(f"there is no bus {request.bus}")
             self._send(EngineReply(id=request.id, error=to_record(error)))
             return
-        bus = self._buses[request.bus]
+        bus, publisher = self._buses[request.bus]
         try:
             match request:
                 case DescribeBus():
@@ -196,7 +192,7 @@ class BusRequestHandler:
                     bus.forget_past()
                     self._reply(request, EngineReply(id=request.id))
                 case Republish():
-                    self._publishers[request.bus].reset()
+                    publisher.reset()
                     self._reply(request, EngineReply(id=request.id))
                 case ExchangeMailbox():
                     self._exchange(bus, request, now_ns)
@@ -209,8 +205,12 @@ class BusRequestHandler:
 
     def _reply(self, request: BusRequest, reply: EngineReply) -> None:
         """Reply to a request behind the changes that it made, or its sender has not received."""
-        self._publishers[request.bus].flush()
+        self._buses[request.bus][1].flush()
         self._send(reply)
+
+    def _forward(self, bus: int, message: Unsolicited) -> None:
+        """Forward an unsolicited message of a slave on the bus numbered *bus*."""
+        self._send(UnsolicitedMessage(bus, message))
 
     def _report(self, bus: EngineBus, now_ns: int) -> BusReport:
         return msgspec.structs.replace(

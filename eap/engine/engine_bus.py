@@ -6,7 +6,7 @@ report of the bus, and tried again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
 from devicebus.errors import BusError, FrameLostError, IdentityError
@@ -100,6 +100,13 @@ class SlaveFaults:
         self.emergencies.clear()
         self._faults = {at: each for at, each in self._faults.items() if each.until_ns is None}
 
+    def forget_others(self, kept: Collection[int]) -> None:
+        """Forget all slaves but those with station addresses in *kept*."""
+        self.emergencies.forget_others(kept)
+        stations = {WHOLE_BUS, *kept}
+        self._faults = {at: each for at, each in self._faults.items() if at in stations}
+        self._counts = {at: each for at, each in self._counts.items() if at in stations}
+
     def end_all(self, now_ns: int) -> None:
         """End the faults that last: a master that is replaced reports no end of them."""
         for station, each in self._faults.items():
@@ -155,6 +162,15 @@ class SlaveFaults:
             )
 
 
+class BusSuccessor(NamedTuple):
+    """Parts of a bus that restarts with other settings."""
+
+    spec: BusPortSpec
+    settings: MasterSettings
+    master: Master
+    mapping: BusMapping
+
+
 class EngineBus:
     """Runs one bus; fits :class:`eap.pd.link.CyclicBus`.
 
@@ -166,8 +182,8 @@ class EngineBus:
         memory_of: Returns where a station reads what a writer writes.
         port: The wire.
         second: Second line to a ring of slaves, None on a bus with one line.
-        set_step: Sets the distance to the next cycle of the station in ns; None on a bus whose
-            reference clock it does not follow.
+        set_step: Sets the distance to the next cycle of the station in ns, for a bus whose
+            reference clock it follows.
 
     Attributes:
         is_simulated: Whether its slaves are a process of this appliance.
@@ -280,6 +296,38 @@ class EngineBus:
         """Use another image from now on; it holds what the one before held."""
         self._mapping = mapping
 
+    def prepare_restart(
+        self,
+        port: PortSpec,
+        settings: MasterSettings,
+        image: Image,
+        memory_of: Callable[[Writer], memoryview],
+    ) -> BusSuccessor:
+        """Return the parts for :meth:`restart`: all slow work is done here."""
+        mapping = BusMapping(port, image, memory_of)
+        return BusSuccessor(port.bus or BusPortSpec(), settings, Master(settings), mapping)
+
+    def restart(self, successor: BusSuccessor, now_ns: int) -> Master:
+        """Take the bus down, and bring it up with other settings and another image.
+
+        Its requests fail.  Slaves that keep station address and name keep their faults.
+
+        Returns:
+            The master before, for the caller to free: that takes long.
+        """
+        master = self.master
+        names = {slave.station: slave.name for slave in self.spec.slaves}
+        self.spec, self._settings = successor.spec, successor.settings
+        self._is_slow = successor.settings.cycle_ns > _LONG_CYCLE_NS
+        self._mapping = successor.mapping
+        self._replace_master(successor.master, "it restarts with other settings", now_ns)
+        self.faults.forget_others(
+            {each.station for each in self.spec.slaves if names.get(each.station) == each.name}
+        )
+        # Bringing up begins with INIT for all slaves.
+        self._guarded(self._start, now_ns)
+        return master
+
     def copy_inputs(self) -> None:
         """Copy the inputs of the last exchange and the states of the slaves into the image."""
         self._mapping.copy_inputs(self.master)
@@ -332,18 +380,23 @@ class EngineBus:
 
     def _restart_master(self, exc: Exception, now_ns: int) -> None:
         """Replace a master that has failed."""
+        reason = f"the master has failed: {type(exc).__name__}: {exc}"
+        self._replace_master(Master(self._settings), reason, now_ns)
+        self._mapping.lay_out(None)
+        # Not at once: a fault that returns with each start would keep the slaves in transitions.
+        self._retry_ns = now_ns + RETRY_NS
+
+    def _replace_master(self, master: Master, reason: str, now_ns: int) -> None:
+        """Use *master* from now on, and fail all requests for *reason*."""
         self.faults.handle_events(self.master)
         self.faults.end_all(now_ns)
-        self.master = Master(self._settings)
-        self._mapping.lay_out(None)
+        self.master = master
         self._starting = None
         self.is_up = False
         self.refused = ()
-        self._start_fault = f"the master has failed: {type(exc).__name__}: {exc}"
-        # Not at once: a fault that returns with each start would keep the slaves in transitions.
-        self._retry_ns = now_ns + RETRY_NS
+        self._start_fault = reason
         for task in list(self.tasks):
-            task.fail(BusError(f"{task.name}: {self._start_fault}"))
+            task.fail(BusError(f"{task.name}: {reason}"))
 
     def _exchange(self, now_ns: int) -> None:
         self.master.handle_timeout(now_ns)

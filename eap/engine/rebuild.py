@@ -16,8 +16,10 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
+from devicebus.master.master import Master
 from eap.engine.bus_mapping import BusMapping
-from eap.engine.engine_bus import EngineBus
+from eap.engine.bus_settings import epoch_offset_ns, master_settings
+from eap.engine.engine_bus import BusSuccessor, EngineBus
 from eap.errors import EapError, EngineRefusedError
 from eap.ids import Destination, DestinationKind
 from eap.net import realtime
@@ -25,7 +27,7 @@ from eap.net.image_file import ImageFile, prepare_image
 from eap.net.tcpport import TcpPort
 from eap.pd.device import DeviceState
 from eap.pd.engine import Engine
-from eap.pd.handover import ImageHandover, needs_new_start
+from eap.pd.handover import ImageHandover, needs_new_start, restarting_buses
 from eap.pd.layout import plan_layout
 from eap.pd.link import FrameChannel
 from eap.pd.spec import REQUESTER, PortSpec, StationSpec, record_from_lines
@@ -56,10 +58,6 @@ def follow_station(port: TcpPort, station: Station, name: str) -> None:
     port.follow(sends_to(spec, name), [station.handlers[name]] if asks else [])
 
 
-_LOCK_RANGE = 50
-"""A clock of a bus changes the cycle by less than this part of it."""
-
-
 class EngineStation:
     """A station of the engine and its image; both are replaced together."""
 
@@ -72,10 +70,7 @@ class EngineStation:
 
     def set_step(self, step_ns: int) -> None:
         """Set the distance from the present cycle to the next, as a clock of a bus wants it."""
-        station = self.station
-        # A bus keeps the cycle that it was started with, also if that of the station is changed.
-        if abs(step_ns - station.cycle_ns) * _LOCK_RANGE < station.cycle_ns:
-            station.step_ns = step_ns
+        self.station.step_ns = step_ns
 
     def update_tcp(self) -> None:
         """Keep connections only to the present destinations of the station."""
@@ -115,8 +110,18 @@ class StationReplacement:
             self._images.commit()
             memory_of = self._station.memory_of
             self._mappings: list[tuple[EngineBus, BusMapping]] = []
+            self._restarts: list[tuple[EngineBus, BusSuccessor]] = []
+            self._old_masters: list[Master] = []
+            restarting = restarting_buses(before.spec, spec)
             for port in spec.ports:
-                if (bus := entry.buses.get(port.name)) is not None:
+                bus = entry.buses.get(port.name)
+                if bus is None:
+                    continue
+                if port.name in restarting:
+                    settings = master_settings(port, spec.cycle_us, epoch_offset_ns())
+                    successor = bus.prepare_restart(port, settings, image, memory_of)
+                    self._restarts.append((bus, successor))
+                else:
                     self._mappings.append((bus, bus.prepare_mapping(port, image, memory_of)))
         except BaseException:
             self.discard()
@@ -146,6 +151,7 @@ class StationReplacement:
         station.follow(before, now_ns)
         for bus, mapping in self._mappings:
             bus.swap_mapping(mapping)
+        self._old_masters = [bus.restart(parts, now_ns) for bus, parts in self._restarts]
         engine.replace(before, station, now_ns)
         self._file.release()
         entry.file.wake_waiters()

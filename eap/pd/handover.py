@@ -13,7 +13,7 @@ from array import array
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 from eap.codec import datatypes
 from eap.codec.pd import PdHeader
@@ -22,7 +22,7 @@ from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxSlot
 from eap.pd.monitor import SubscriberPresence
-from eap.pd.spec import GatewaySpec, PortSpec, StationSpec, Writer
+from eap.pd.spec import BusPortSpec, GatewaySpec, PortSpec, StationSpec, Writer
 from eap.pd.words import (
     REASON_INDEX,
     TRACKER_START,
@@ -35,8 +35,6 @@ from eap.pd.words import (
 
 _IN_FRAMES = {"net_id", "eap_sm", "length"}
 """Fields of a port that only concern the content of its frames."""
-_WHOLE = {"bus"}
-"""Fields that are too much for a line."""
 _FIXED_OF_GATEWAY = ("port", "full", "padded")
 """Fields of a gateway that concern its sockets and the dictionary of its master."""
 _OWN_WORDS = {
@@ -322,10 +320,17 @@ def _port_differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
     for field, value in asdict(new).items():
         if field == "gateway":
             yield from _gateway_differences(old.gateway or GatewaySpec(), value or GatewaySpec())
+        elif field == "bus":
+            yield from _bus_differences(old.bus or BusPortSpec(), value or BusPortSpec())
         elif field not in _IN_FRAMES and value != was[field]:
-            yield (
-                f"{field} is another one" if field in _WHOLE else f"{field} {was[field]} -> {value}"
-            )
+            yield f"{field} {was[field]} -> {value}"
+
+
+def _bus_differences(old: BusPortSpec, new: BusPortSpec) -> Iterator[str]:
+    if old.redundant != new.redundant:
+        yield f"redundant {old.redundant or 'none'} -> {new.redundant or 'none'}"
+    if old.simulated != new.simulated:
+        yield f"{new.file or old.file} simulates other slaves"
 
 
 def _gateway_differences(old: GatewaySpec, new: GatewaySpec) -> Iterator[str]:
@@ -333,3 +338,16 @@ def _gateway_differences(old: GatewaySpec, new: GatewaySpec) -> Iterator[str]:
         was, value = getattr(old, field), getattr(new, field)
         if was != value:
             yield f"gateway.{field} {was} -> {value}"
+
+
+def restarting_buses(old: StationSpec, new: StationSpec) -> set[str]:
+    """Return the bus ports whose slaves go to INIT and are brought up with other settings."""
+    before = {port.name: port.bus for port in old.ports if port.bus is not None}
+    return {
+        port.name
+        for port in new.ports
+        if port.bus is not None and (was := before.get(port.name)) is not None
+        # The path of the file alone changes nothing at the slaves.
+        if replace(was, file="") != replace(port.bus, file="")
+        or (port.bus.has_sync and old.cycle_us != new.cycle_us)
+    }

@@ -329,6 +329,13 @@ class BusPortSpec(SpecRecord, frozen=True):
     """True if the cycle of the station follows the reference clock of this bus."""
     sync_lead_us: int = 0
     """Time before SYNC0 at which frames then pass that clock; 0 for 30 % of the cycle."""
+    simulated: str = ""
+    """Digest of the simulated slaves in *file*; empty on other buses."""
+
+    @property
+    def has_sync(self) -> bool:
+        """True if the clocks of its slaves depend on the cycle of the station."""
+        return self.clocks or any(slave.config.sync is not None for slave in self.slaves)
 
 
 class LinkSpec(SpecRecord, frozen=True):

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from devicebus.esi.records import EsiDevice
 from devicebus.master.pdo import PdoEntry, channels_from_sii
@@ -27,6 +28,7 @@ from eap.config.structs import SlaveSection
 from eap.errors import ConfigError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import ObjectCode
+from eap.runtime.durable import digest
 from eap.runtime.esi_slaves import EsiDevices, describe_device
 from eap.suggest import suggest
 
@@ -53,6 +55,12 @@ class BusFile(msgspec.Struct, frozen=True):
     resources: dict[str, bytes]
     devices: dict[str, EsiDevice]
     """Vendors' descriptions of the slaves of kind esi, by their names."""
+
+    def digest(self) -> str:
+        """Return the digest of what is simulated, without paths and the settings of a master."""
+        slaves = tuple(replace(slave, esi="", master=SlaveSection()) for slave in self.spec.slaves)
+        spec = replace(self.spec, bus="", esi="", slaves=slaves)
+        return digest(msgspec.msgpack.encode(replace(self, spec=spec)))
 
     def build(self) -> FaultySegment:
         """Make the segment with the script of its faults."""
@@ -123,6 +131,7 @@ def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
             for number in _line(bus.spec)
         ),
         bus.spec.ring,
+        bus.digest(),
     )
 
 

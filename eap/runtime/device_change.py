@@ -31,6 +31,7 @@ from eap.pd.spec import (
     StationSpec,
     VariableSpec,
 )
+from eap.runtime.bus_change import describe_bus_changes
 from eap.runtime.store import Configuration
 
 
@@ -158,6 +159,7 @@ def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
     on_bus = bus_variables(old) | bus_variables(new)
     return [
         *kept_versions(old, new),
+        *describe_bus_changes(old, new),
         *_gateway_changes(old, new),
         *_differences("source of", _source_name, old.sources, new.sources),
         *_differences("link", _link_name, old.links, new.links),

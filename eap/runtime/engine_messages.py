@@ -45,7 +45,7 @@ StationRequest: TypeAlias = Configure | SetState
 
 
 class BusRequest(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
-    """Base of requests to a bus; *bus* counts the bus ports in the handover's order."""
+    """Base of requests to a bus; *bus* is its number, as in BusSocket."""
 
     id: int
     """Chosen by the requester and repeated in the reply."""

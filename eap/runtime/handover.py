@@ -77,12 +77,11 @@ class SharedSocket(SpecRecord, frozen=True):
 
 
 class BusSocket(SpecRecord, frozen=True):
-    """Descriptors of one bus port, opened once like the shared sockets.
-
-    The number of a bus in requests is its place in the handover.
-    """
+    """Descriptors of one bus port, opened once like the shared sockets."""
 
     owner: PortName
+    number: int = 0
+    """Number of the bus in requests, which no other bus of the appliance ever has."""
     engine_fd: int = NO_DESCRIPTOR
     """Socket of the engine's frames: packet, UDP, or a pair with the segment process."""
     segment_fd: int = NO_DESCRIPTOR

@@ -88,7 +88,7 @@ def _ams_address(port: PortSpec) -> str:
 
 
 def bus_ports(stations: Iterable[StationSpec]) -> Iterator[tuple[PortName, PortSpec]]:
-    """Yield all bus ports, in the order that numbers them."""
+    """Yield all bus ports."""
     for station in stations:
         for port in station.ports:
             if port.kind is PortKind.BUS:

@@ -246,7 +246,7 @@ class Services:
         self._resources.callback(link.close)
         devices = self._devices(images, link)
         self._startup.step("opening gateways and sockets")
-        clients = open_buses(link, [bus.owner for bus in self._handover.buses])
+        clients = open_buses(link, self._handover.buses)
         providers, gateways = self._gateways(clients, devices)
         network = Network(
             self._handover,

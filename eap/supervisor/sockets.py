@@ -54,7 +54,8 @@ def open_buses(stations: Sequence[StationSpec], opened: ExitStack) -> tuple[BusS
     Raises:
         EnvironmentalError: an interface cannot be opened, and why.
     """
-    return tuple(_open_bus(name, port, opened) for name, port in bus_ports(stations))
+    ports = enumerate(bus_ports(stations), 1)
+    return tuple(_open_bus(name, port, number, opened) for number, (name, port) in ports)
 
 
 def open_message_pair(opened: ExitStack) -> tuple[int, int]:
@@ -87,20 +88,20 @@ def segments(
             )
 
 
-def _open_bus(name: PortName, port: PortSpec, opened: ExitStack) -> BusSocket:
+def _open_bus(name: PortName, port: PortSpec, number: int, opened: ExitStack) -> BusSocket:
     if not _is_simulated(port):
         sock = opened.enter_context(open_bus_socket(port.interface))
         second_fd = NO_DESCRIPTOR
         if port.bus is not None and port.bus.redundant:
             second = open_bus_socket(InterfaceUri.parse(port.bus.redundant))
             second_fd = opened.enter_context(second).fileno()
-        return BusSocket(name, engine_fd=sock.fileno(), second_fd=second_fd)
+        return BusSocket(name, number, engine_fd=sock.fileno(), second_fd=second_fd)
     engine_fd, segment_fd = open_message_pair(opened)
     command_fd, segment_command_fd = open_message_pair(opened)
     lines = (NO_DESCRIPTOR, NO_DESCRIPTOR)
     if port.bus is not None and port.bus.redundant:
         lines = open_message_pair(opened)
-    return BusSocket(name, engine_fd, segment_fd, segment_command_fd, command_fd, *lines)
+    return BusSocket(name, number, engine_fd, segment_fd, segment_command_fd, command_fd, *lines)
 
 
 def _is_simulated(port: PortSpec) -> bool:

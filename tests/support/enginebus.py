@@ -10,7 +10,7 @@ import msgspec
 
 from devicebus.sim.spec import FaultSpec
 from devicebus.wire.alstatus import AlState
-from eap.engine.build import master_settings
+from eap.engine.bus_settings import master_settings
 from eap.engine.engine_bus import EngineBus
 from eap.errors import EnvironmentalError
 from eap.pd.spec import StationSpec, Writer

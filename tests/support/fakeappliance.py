@@ -29,7 +29,7 @@ from eap.pd.spec import (
 )
 from eap.pd.words import RxWord, StationWord
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
-from eap.runtime.handover import PortName
+from eap.runtime.handover import BusSocket, PortName
 from eap.services.control.bus_methods import Buses
 from eap.services.control.control_server import ControlServer
 from eap.services.control.methods import Methods
@@ -172,7 +172,8 @@ class Appliance:
         }
         link = EngineLink(engine.services)
         links = {port: SegmentLink(segment.services) for port, segment in segments.items()}
-        buses = Buses(tuple(self._specs.values()), open_buses(link, self._ports), links)
+        numbered = [BusSocket(port, number) for number, port in enumerate(self._ports)]
+        buses = Buses(tuple(self._specs.values()), open_buses(link, numbered), links)
         meter = ProcessMeter()
         images = [each.image for each in self.images.values()]
 

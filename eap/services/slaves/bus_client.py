@@ -52,7 +52,7 @@ from eap.runtime.engine_messages import (
     SlaveDescription,
     UnsolicitedMessage,
 )
-from eap.runtime.handover import PortName
+from eap.runtime.handover import BusSocket, PortName
 from eap.services.engine_link import EngineLink
 
 ENGINE_PING_S = 1.0
@@ -258,7 +258,7 @@ class BusClient:
 
     Args:
         link: To the engine.
-        number: Of the bus in requests, in the order of the handover.
+        number: Of the bus in requests.
         port: Its port.
 
     Attributes:
@@ -449,6 +449,6 @@ class BusClient:
         )
 
 
-def open_buses(link: EngineLink, ports: Sequence[PortName]) -> dict[PortName, BusClient]:
-    """Return the clients of all buses; *ports* are in the order that numbers them."""
-    return {port: BusClient(link, number, port) for number, port in enumerate(ports)}
+def open_buses(link: EngineLink, buses: Sequence[BusSocket]) -> dict[PortName, BusClient]:
+    """Return the clients of *buses*."""
+    return {bus.owner: BusClient(link, bus.number, bus.owner) for bus in buses}

@@ -178,7 +178,7 @@ class RunningBuses:
         self.station = Station(spec, image_of(spec), lambda: None)
         engine_end, slaves_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.services, desk_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        given = BusSocket(PortName("one", "bus0"), engine_end.detach())
+        given = BusSocket(PortName("one", "bus0"), 1, engine_end.detach())
         handover = Handover(
             1, str(folder), "p", "p.yaml", (spec,), (), buses=(given,), bus_fd=desk_end.detach()
         )

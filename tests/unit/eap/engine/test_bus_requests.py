@@ -59,7 +59,8 @@ class Office:
         self.rig = rig
         self.services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.services.setblocking(False)
-        self.handler = BusRequestHandler(engine, [rig.bus], self.serve_station)
+        self.handler = BusRequestHandler(engine, self.serve_station)
+        self.handler.add(0, rig.bus)
         self.heard = {}
         self.changes = []
         self.asked = []
@@ -184,7 +185,8 @@ def test_datagrams_without_reply_are_answered_when_sent(office):
 
 
 def test_unsolicited_message_reaches_services(office):
-    office.handler.forward(0, Unsolicited(1001, MailboxType.EOE, b"frame"))
+    (forward,) = office.rig.bus.faults.on_unsolicited
+    forward(Unsolicited(1001, MailboxType.EOE, b"frame"))
     message = msgspec.msgpack.decode(office.services.recv(100), type=EngineMessage)
     assert message == UnsolicitedMessage(0, Unsolicited(1001, MailboxType.EOE, b"frame"))
 
@@ -233,7 +235,7 @@ def test_datagrams_that_disturb_slaves_are_rejected(office, command):
             ExchangeDatagrams(id=1, bus=0, datagrams=(DatagramRequest(4, 1, 1, b"", 1),)),
             "with 0 bytes",
         ),
-        (DescribeBus(id=1, bus=1), "no bus 1, there are 1"),
+        (DescribeBus(id=1, bus=1), "there is no bus 1"),
         (DescribeBus(id=1, bus=-1), "no bus -1"),
         (BringSlaves(id=1, bus=0, station=0, target=5), "malformed request: Invalid enum value 5"),
         (read(1, 77), "malformed request: Invalid enum value 77"),

@@ -4,7 +4,7 @@ import pytest
 
 from devicebus.master.link import CEILING_NS, RETRIES
 from devicebus.master.matching import ExpectedSlave
-from eap.engine.build import master_settings
+from eap.engine.bus_settings import master_settings
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, BusSlaveSpec, PortKind, PortSpec
 from tests.support.cyclic import MS

@@ -6,12 +6,14 @@ import random
 from typing import Any
 
 import msgspec
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from eap.ids import InterfaceUri, NetId
-from eap.pd.handover import ImageHandover, needs_new_start
+from eap.od.slave_config import OpMode, SlaveConfig
+from eap.pd.handover import ImageHandover, needs_new_start, restarting_buses
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot, TxSlot
 from eap.pd.monitor import SubscriberPresence
@@ -19,6 +21,8 @@ from eap.pd.quality import tracker_word
 from eap.pd.report import station_status
 from eap.pd.spec import (
     BusPortSpec,
+    BusSlaveSpec,
+    BusTarget,
     GatewaySpec,
     OnChangeSpec,
     PortKind,
@@ -434,10 +438,43 @@ def test_ports_stay_the_same_ones():
     ]
 
 
-def test_a_bus_is_not_written_out():
-    before = replace(left(), ports=(BUS,))
-    after = replace(left(), ports=(replace(BUS, bus=BusPortSpec("/y.yaml")),))
-    assert needs_new_start(before, after) == [f"port bus0: bus is another one{END}"]
+def with_bus(**changes):
+    return replace(left(), ports=(replace(BUS, bus=BusPortSpec("/x.yaml", **changes)),))
+
+
+def test_other_lines_and_simulated_slaves_need_a_new_start():
+    other = with_bus(redundant="sim://x.yaml", simulated="b")
+    assert needs_new_start(with_bus(simulated="a"), other) == [
+        f"port bus0: redundant none -> sim://x.yaml{END}",
+        f"port bus0: /x.yaml simulates other slaves{END}",
+    ]
+
+
+SYNCED = BusSlaveSpec("a", 1001, 1, 2, config=SlaveConfig(sync=OpMode()))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "cycle_us", "restarting"),
+    [
+        ({}, {}, 10_000, set()),
+        ({}, {"target": BusTarget.PREOP}, 10_000, {"bus0"}),
+        ({}, {"slaves": (BusSlaveSpec("a", 1001, 1, 2),)}, 10_000, {"bus0"}),
+        ({}, {}, 5_000, set()),
+        ({"clocks": True}, {"clocks": True}, 5_000, {"bus0"}),
+        ({"slaves": (SYNCED,)}, {"slaves": (SYNCED,)}, 5_000, {"bus0"}),
+    ],
+)
+def test_bus_restarts_if_its_master_needs_other_settings(before, after, cycle_us, restarting):
+    old = replace(with_bus(**before), cycle_us=10_000)
+    new = replace(with_bus(**after), cycle_us=cycle_us)
+    assert needs_new_start(old, new) == []
+    assert restarting_buses(old, new) == restarting
+    assert restarting_buses(replace(old, ports=()), new) == set()
+
+
+def test_bus_does_not_restart_for_the_path_of_its_file():
+    moved = replace(left(), ports=(replace(BUS, bus=BusPortSpec("/y.yaml")),))
+    assert restarting_buses(with_bus(), moved) == set()
 
 
 def test_needs_new_start_reports_changed_gateway():

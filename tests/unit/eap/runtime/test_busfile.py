@@ -191,3 +191,19 @@ def test_a_master_finds_a_bus_as_it_is_described(path):
                 for pdo in channel.pdos
                 for entry in pdo.entries
             ]
+
+
+def test_digest_tells_what_is_simulated(tmp_path):
+    def digest(text):
+        result = busfile.describe(write(tmp_path, text))
+        assert not isinstance(result, tuple), result
+        return result.digest
+
+    before = digest(GOOD)
+    named = GOOD.replace("bus: small", "bus: large")
+    configured = GOOD.replace("csv: level.csv}", "csv: level.csv}\n    master: {optional: true}")
+    assert digest(named) == digest(configured) == before
+    assert configured != GOOD
+    assert digest(GOOD.replace("name: level", "name: height")) != before
+    (tmp_path / "level.csv").write_text("3\n")
+    assert busfile.describe(tmp_path / "bus.yaml").digest != before

@@ -277,6 +277,7 @@ def test_simulated_buses_have_two_pairs_and_others_one_socket():
     with ExitStack() as opened:
         remote, simulated = open_buses(plant, opened)
         assert remote.owner == PortName("a", "bus0")
+        assert 0 < remote.number < simulated.number
         assert remote.segment_fd == remote.segment_command_fd == remote.command_fd == NO_DESCRIPTOR
         with socket.socket(fileno=socket.dup(remote.engine_fd)) as sock:
             assert sock.getpeername() == ("127.0.9.1", 40009)

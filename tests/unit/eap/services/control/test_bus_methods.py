@@ -15,7 +15,7 @@ from eap.errors import ControlError, EngineGoneError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.runtime.engine_messages import Cancel, ExchangeMailbox
-from eap.runtime.handover import PortName
+from eap.runtime.handover import BusSocket, PortName
 from eap.services.control.bus_methods import BusConnection, Buses
 from eap.services.engine_link import EngineLink
 from eap.services.slaves.bus_client import open_buses
@@ -69,7 +69,9 @@ class Scene:
         self.segment = FakeSegment(line)
         self._link = EngineLink(self.engine.services, silence_limit_s=0.1)
         self._segment_link = SegmentLink(self.segment.services)
-        client = open_buses(self._link, [PORT, PortName("left", "bus1")])
+        client = open_buses(
+            self._link, [BusSocket(PORT, 0), BusSocket(PortName("left", "bus1"), 1)]
+        )
         self.buses = Buses(STATIONS, client, {PORT: self._segment_link})
 
     def connect(self):

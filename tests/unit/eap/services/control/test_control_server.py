@@ -15,6 +15,7 @@ from eap.ids import InterfaceUri, NetId
 from eap.net.limits import Activity, CloseReason, ListenerLimits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
+from eap.runtime.handover import BusSocket
 from eap.services.control import control_server
 from eap.services.control.bus_methods import Buses
 from eap.services.control.control_server import ControlConnection, ControlServer
@@ -400,7 +401,7 @@ def test_errors_of_a_bus_keep_kind_and_detail(methods):
             "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.1.1.1.3.1")
         )
         station = StationSpec("left", NetId.parse("1.1.1.1.1.1"), 10_000, (port,))
-        buses = Buses((station,), open_buses(link, [PORT]), {})
+        buses = Buses((station,), open_buses(link, [BusSocket(PORT)]), {})
         where = {"station": "left", "port": "bus0"}
         async with Talk(ControlServer(methods, buses)) as client:
             answer = await client.ask("bus_open", **where, slave=1009, protocol="coe")

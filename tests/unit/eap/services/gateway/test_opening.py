@@ -17,6 +17,7 @@ from tests.support.routing import station as router
 from tests.support.virtualtime import run_virtual
 
 NAMES = [PortName("left", "bus0"), PortName("left", "bus1")]
+BUSES = tuple(BusSocket(name, number) for number, name in enumerate(NAMES))
 TOLD = GatewaySpec(
     enabled=False,
     answer_ms=250,
@@ -35,10 +36,10 @@ def test_each_bus_has_one_as_the_plant_file_says() -> None:
         handover = Handover(
             supervisor=1, folder="", plant="p", plant_file="",
             stations=(station(name="left", ports=ports), station(name="right")),
-            sockets=(), buses=tuple(BusSocket(owner=name) for name in NAMES),
+            sockets=(), buses=BUSES,
         )  # fmt: skip
         try:
-            clients = open_buses(link, NAMES)
+            clients = open_buses(link, BUSES)
             providers = open_dictionaries(handover, clients, "1.0")
             gateways = open_gateways(handover, clients, providers, {"left": router("5.1.1.1.1.1")})
             assert list(gateways) == NAMES

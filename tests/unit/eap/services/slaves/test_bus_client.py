@@ -19,7 +19,7 @@ from eap.codec.mailbox import MailboxType
 from eap.errors import EngineGoneError
 from eap.od.abort import SdoAbortError
 from eap.runtime.engine_messages import Cancel, ExchangeMailbox
-from eap.runtime.handover import PortName
+from eap.runtime.handover import BusSocket, PortName
 from eap.services.engine_link import EngineLink
 from eap.services.slaves import bus_client
 from eap.services.slaves.bus_client import BusClient, open_buses
@@ -271,7 +271,7 @@ def test_bus_clients_request_their_buses_by_number():
         link = EngineLink(engine.services)
         second = PortName("left", "bus1")
         try:
-            clients = open_buses(link, [PORT, second])
+            clients = open_buses(link, [BusSocket(PORT, 0), BusSocket(second, 1)])
             found = {port: len((await each.describe()).slaves) for port, each in clients.items()}
             assert found == {PORT: 1, second: 3}
             assert [each.bus for each in engine.requests] == [0, 1]

@@ -1,0 +1,181 @@
+"""Buses and the settings of their slaves become what a plant file says while all else runs."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.addresses import own_address
+from tests.support.appliance import Appliance, Plants, run_eapctl, troubles, wait_until
+
+pytestmark = pytest.mark.net
+
+HERE, THERE = own_address(0), own_address(1)
+DRIVE = """\
+bus: drive
+slaves:
+  - {name: drive, kind: drive, product: 0x5621, mailbox: {size: 256, coe: true}}
+"""
+BUTTONS = """\
+bus: buttons
+slaves:
+  - {name: coupler, kind: coupler}
+  - name: buttons
+    kind: digital
+    inputs: [{name: echo, follows: lamp}]
+    outputs: [{name: lamp}]
+"""
+BUSES = f"""\
+      - name: bus0
+        kind: bus
+        interface: sim://drive.yaml
+        net_id: {HERE}.3.1
+      - {{name: bus1, kind: bus, interface: "sim://buttons.yaml", net_id: {HERE}.4.1}}
+"""
+PLANT = f"""\
+plant: buses
+defaults: {{cycle_us: 5000}}
+stations:
+  - name: press
+    net_id: {HERE}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{HERE}", net_id: {HERE}.2.1}}
+{BUSES}
+    variables: {{beat: UINT}}
+    sources: {{beat: {{kind: counter}}}}
+    frames: [{{name: out, port: eap0, to: mill/eap0}}]
+    publish: [{{name: state, frame: out, id: 1, version: 1, variables: [beat]}}]
+    links: [{{from: beat, bits: 1, to: bus1.buttons.lamp}}]
+  - name: mill
+    net_id: {THERE}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{THERE}", net_id: {THERE}.2.1}}
+    subscribe: [{{name: state, port: eap0, from: press/state, variables: {{beat: UINT}}}}]
+"""
+OF_DRIVE = f"net_id: {HERE}.3.1\n"
+MODE = f"""{OF_DRIVE}\
+        slaves:
+          drive:
+            startup: [{{sdo: "0x6060", value: 1}}]
+"""
+PROCESSES = ("engine", "services")
+
+
+class Works:
+    """An appliance and its plant file, which the tests change."""
+
+    def __init__(self, farm: Plants) -> None:
+        self.farm = farm
+        self.file = self.write(PLANT)
+        farm.write(DRIVE, "drive.yaml")
+        farm.write(BUTTONS, "buttons.yaml")
+        self.appliance: Appliance = farm.run(self.file)
+        self.wait_op("bus0", "bus1")
+
+    def write(self, text: str) -> Path:
+        return self.farm.write(text)
+
+    def eapctl(self, *words: str) -> str:
+        return self.appliance.command(*words)
+
+    def plan(self) -> list[str]:
+        return self.eapctl("plan", str(self.file)).splitlines()
+
+    def apply(self) -> str:
+        return self.eapctl("apply", str(self.file))
+
+    def roll_back(self) -> str:
+        return self.eapctl("rollback", str(self.file))
+
+    def states(self) -> dict[str, Any]:
+        values = self.appliance.values("press")
+        return {name: value for name, value in values.items() if name.endswith(".state")}
+
+    def wait_op(self, *ports: str) -> None:
+        wait_until(lambda: all(self.states().get(f"{port}.state") == 8 for port in ports))
+
+    def report(self, port: str) -> Any:
+        return self.appliance.request("bus_describe", station="press", port=port)
+
+    def mode(self) -> str:
+        return self.eapctl("bus", "sdo", "read", "press/bus0", "drive", "0x6060")
+
+    def undisturbed(self) -> tuple[Any, ...]:
+        """Return counters that stay while only another bus changes."""
+        bus, pd = self.report("bus1"), self.appliance.rx("mill", "state")
+        slaves = [(each["losses"], each["departures"]) for each in bus["slaves"]]
+        return troubles(pd), bus["cycles_lost"], bus["wkc_errors"], slaves
+
+
+@pytest.fixture(scope="module")
+def works(module_farm: Plants) -> Works:
+    return Works(module_farm)
+
+
+@pytest.fixture(autouse=True)
+def as_before(works: Works) -> Iterator[None]:
+    """Have each test begin with the first plant file."""
+    yield
+    works.write(PLANT)
+    works.farm.write(DRIVE, "drive.yaml")
+    works.farm.write(BUTTONS, "buttons.yaml")
+    works.apply()
+    works.wait_op("bus0", "bus1")
+
+
+def test_start_up_write_takes_effect_and_goes_back(works: Works) -> None:
+    assert works.mode().startswith("0x6060:00 = SINT 8")
+    before = works.undisturbed()
+    received = works.appliance.rx("mill", "state")["received"]
+    works.write(PLANT.replace(OF_DRIVE, MODE))
+    assert works.plan()[:3] == [
+        "press",
+        "  * bus0 restarts: its slaves go to INIT, and to OP again",
+        "  * bus0.drive: start-up write PS 0x6060:00 none -> 01",
+    ]
+    assert "press runs the new configuration: ok" in works.apply()
+    works.wait_op("bus0")
+    assert works.mode().startswith("0x6060:00 = SINT 1")
+    assert works.plan() == ["no differences: all 2 stations are as the file says"]
+    assert "press runs the new configuration: ok" in works.roll_back()
+    works.wait_op("bus0")
+    assert works.report("bus0")["slaves"][0]["losses"] == 0
+    assert works.undisturbed() == before
+    assert works.appliance.rx("mill", "state")["received"] > received
+
+
+@pytest.mark.parametrize("process", PROCESSES)
+def test_changed_settings_outlive_a_killed_process(works: Works, process: str) -> None:
+    works.write(PLANT.replace(OF_DRIVE, MODE))
+    works.apply()
+    works.wait_op("bus0")
+    pid = works.appliance.pid(process)
+    os.kill(pid, signal.SIGKILL)
+    works.appliance.wait_for_another(process, pid)
+    works.wait_op("bus0", "bus1")
+    assert works.plan() == ["no differences: all 2 stations are as the file says"]
+    assert works.mode().startswith("0x6060:00 = SINT 1")
+
+
+def test_bus_goes_to_another_target(works: Works) -> None:
+    works.write(PLANT.replace("sim://drive.yaml", "sim://drive.yaml\n        target: PREOP"))
+    assert "  * bus0: target OP -> PREOP" in works.plan()
+    works.apply()
+    wait_until(lambda: works.states()["bus0.state"] == 2)
+    assert works.states()["bus1.state"] == 8
+
+
+def test_invalid_settings_change_nothing(works: Works) -> None:
+    before = works.report("bus0")["frames_sent"], works.undisturbed()
+    works.write(PLANT.replace(OF_DRIVE, MODE.replace("value: 1", "value: 800")))
+    done = run_eapctl(works.appliance.runtime, "apply", str(works.file))
+    assert done.returncode
+    assert "800" in done.stderr
+    assert works.report("bus0")["slaves"][0]["state"] == 8
+    assert works.report("bus0")["frames_sent"] > before[0]
+    assert works.undisturbed() == before[1]
