@@ -183,7 +183,7 @@ class FrameRingWriter:
         words[_WRITTEN] = lap
 
 
-class RecordedFrame(NamedTuple):
+class RingRecord(NamedTuple):
     """One record: *port* is a number, *at_ns* on the monotonic clock."""
 
     port: int
@@ -268,7 +268,7 @@ def _heads(octets: bytes) -> Iterator[tuple[int, int]]:
         yield at, number
 
 
-def records_in(octets: bytes, ports: Sequence[bool] = ()) -> Iterator[RecordedFrame]:
+def records_in(octets: bytes, ports: Sequence[bool] = ()) -> Iterator[RingRecord]:
     """Yield the records of a :class:`FrameRun`, only those of *ports* that are true if given."""
     at, size = 0, len(octets)
     unpack, head_size = _HEAD.unpack_from, _HEAD.size
@@ -280,4 +280,4 @@ def records_in(octets: bytes, ports: Sequence[bool] = ()) -> Iterator[RecordedFr
         at = (start + length + _ALIGN) & ~_ALIGN
         if not ports or (port < wanted and ports[port]):
             frame = octets[start : start + length]
-            yield RecordedFrame(port, bool(head & _SENT), at_ns, address, frame)
+            yield RingRecord(port, bool(head & _SENT), at_ns, address, frame)
