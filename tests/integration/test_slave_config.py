@@ -106,8 +106,9 @@ def test_drive_is_enabled_in_csp_with_sync0_by_the_plant_file_alone(running):
 
 def test_drive_is_enabled_again_after_a_loss_of_power(running):
     wait_until(lambda: is_enabled(running))
-    running.command("sim", "fault", "axis/bus0", "power", "slave=drive", "for_ms=300")
+    running.command("sim", "fault", "axis/bus0", "power", "slave=drive")
     wait_until(lambda: running.values("axis")["bus0.drive.state"] == 0)
+    running.command("sim", "fault", "axis/bus0", "power", "slave=drive", "--end")
     wait_until(lambda: is_enabled(running))
     assert running.values("axis")["bus0.drive.Modes_of_operation_display"] == 8
 
