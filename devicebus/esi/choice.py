@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -42,6 +43,7 @@ _SYNC0 = 0x0200
 _LOW = 0xFFFF
 _MAX_INDEX = 0xFFFF
 _SHOWN_TYPES = 12
+_DESIGNATION = re.compile(r"(.+)-(\d{4})-(\d{4})", re.ASCII)
 
 
 class DeviceQuery(NamedTuple):
@@ -61,6 +63,26 @@ class DeviceQuery(NamedTuple):
             and self.type.casefold() in {"", device.type.casefold()}
         )
 
+    def designated(self) -> DeviceQuery:
+        """Return the query that a type with version and revision means, else this one.
+
+        That is Beckhoff's designation of a device: EL3314-0010-0016 is revision 16 of version 10.
+        Both numbers are decimal, although the revision number of the ESI file holds the one in its
+        high and the other in its low word.
+
+        Raises:
+            ValueError: the query has another revision, too.
+        """
+        match = _DESIGNATION.fullmatch(self.type)
+        if match is None:
+            return self
+        base, version = match[1], int(match[2])
+        revision = int(match[3]) << 16 | version
+        if self.revision not in {None, revision}:
+            raise ValueError(f"{self.type} is revision 0x{revision:08X}, not 0x{self.revision:08X}")
+        # Types have no -0000: the basic version is left out.
+        return self._replace(type=f"{base}-{match[2]}" if version else base, revision=revision)
+
     def __str__(self) -> str:
         parts = [self.type] if self.type else []
         if self.vendor:
@@ -73,14 +95,18 @@ class DeviceQuery(NamedTuple):
 def choose_devices(devices: Iterable[ListedDevice], query: DeviceQuery) -> list[ListedDevice]:
     """Return the devices that a configuration names, the best first; a revision is meant exactly.
 
-    Without one the highest comes first, and those without a special version (low word 0) before
-    the others.  Old revisions that a newer one hides are lower than it, so they need no rule.
+    The type may be a whole designation, unless a device has it for its type.  Without a revision
+    the highest comes first, and those without a special version (low word 0) before the others.
+    Old revisions that a newer one hides are lower than it, so they need no rule.
 
     Raises:
         ValueError: there is none; the message has the known types or revisions.
     """
     known = list(devices)
     found = [each for each in known if query.fits(each)]
+    if not found:
+        query = query.designated()
+        found = [each for each in known if query.fits(each)]
     if not found:
         raise ValueError(_no_device(known, query))
     if query.revision is None:

@@ -85,13 +85,15 @@ def describe_device(spec: SlaveSpec, device: EsiDevice) -> DescribedSlave:
     """
     plan = plan_device(device, spec.modules)
     whole = plan.device
+    # A designation in the place of the type has the revision, too.
+    is_type = spec.device.casefold() in {"", whole.type.casefold()}
     pdos = tuple(_pdos(plan))
     mailbox = whole.mailbox
     return DescribedSlave(
         name=spec.name,
         vendor=whole.vendor,
         product=whole.product,
-        revision=spec.revision,
+        revision=spec.revision if is_type else whole.revision,
         serial=spec.serial or None,
         alias=spec.alias or None,
         outputs=tuple(_assigned(plan, is_output=True)),

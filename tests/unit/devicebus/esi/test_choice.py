@@ -60,6 +60,41 @@ def test_highest_revision_without_a_special_version_by_default():
     assert choose_devices(LIST, query())[0].revision == 0x0012_0000
 
 
+@pytest.mark.parametrize(
+    ("designation", "name", "revision"),
+    [
+        ("EL3204-0000-0016", "EL3204", 0x0010_0000),
+        ("el3204-0000-0018", "EL3204", 0x0012_0000),
+        ("EL3204-0010-0020", "EL3204-0010", 0x0014_000A),
+    ],
+)
+def test_device_by_its_whole_designation(designation, name, revision):
+    special = msgspec.structs.replace(LIST[0], revision=0x0014_000A, type="EL3204-0010")
+    (found,) = choose_devices([*LIST, special], DeviceQuery(type=designation))
+    assert (found.type, found.revision) == (name, revision)
+
+
+def test_type_that_looks_like_a_designation_is_taken_as_it_is():
+    other = msgspec.structs.replace(LIST[0], type="XR-1000-0018")
+    assert choose_devices([*LIST, other], DeviceQuery(type="xr-1000-0018")) == [other]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ({"type": "EL3204-0000-0019"}, "EL3204 has no revision 0x00130000; known: 0x00100000"),
+        (
+            {"type": "EL3204-0000-0016", "revision": 0x0012_0000},
+            "EL3204-0000-0016 is revision 0x00100000, not 0x00120000",
+        ),
+        ({"type": "EL3240-0000-0016"}, r"none of 5 devices is EL3240, did you mean EL3204\?"),
+    ],
+)
+def test_designation_of_no_device(wanted, message):
+    with pytest.raises(ValueError, match=message):
+        choose_devices(LIST, DeviceQuery(**wanted))
+
+
 def test_device_by_its_type():
     assert choose_devices(LIST, DeviceQuery(type="el3204"))[0].product == PRODUCT
     with pytest.raises(ValueError, match=r"EL3204 has product 0x[0-9A-F]{8}, not 0x00000005"):

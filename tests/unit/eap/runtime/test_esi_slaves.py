@@ -41,14 +41,20 @@ def describe(folder, *slaves):
 
 
 def test_revision_asked_for_is_built_and_expected(folder):
-    bus = describe(folder, "name: a, device: DO4, revision: 0x00100000", "name: b, device: DO4")
+    bus = describe(
+        folder,
+        "name: a, device: DO4, revision: 0x00100000",
+        "name: b, device: DO4",
+        "name: c, device: do4-0000-0016",
+    )
     assert [(each.revision, len(each.outputs)) for each in bus.slaves] == [
         (0x0010_0000, 2),
         (None, 4),
+        (0x0010_0000, 2),
     ]
     built = busfile.load_or_raise(folder / "bus.yaml").build().segment.slaves
     revisions = [each.device.dictionary.entry(0x1018, 3).value for each in built]
-    assert revisions == [0x0010_0000, 0x0012_0000]
+    assert revisions == [0x0010_0000, 0x0012_0000, 0x0010_0000]
 
 
 def test_variables_have_the_names_of_pdos_and_entries(folder):
