@@ -393,9 +393,23 @@ def execute_command(segment: FaultySegment, command: object, now_ns: int) -> Non
             segment.release(name.slave, name.entry, now_ns)
         else:
             _check_keys(command)
-            _switch(segment, msgspec.convert(command, FaultCommand), now_ns)
+            numbers = {
+                key: value if key in _TEXTS else _number(value) for key, value in command.items()
+            }
+            _switch(segment, msgspec.convert(numbers, FaultCommand), now_ns)
     except msgspec.MsgspecError as exc:
         raise ValueError(str(exc)) from None
+
+
+_TEXTS = frozenset(("kind", "object", "slave", "state"))
+
+
+def _number(value: object) -> object:
+    """Return the number that a text means, such as 0x7305, which JSON cannot write as a number."""
+    try:
+        return int(value, 0) if isinstance(value, str) else value
+    except ValueError:
+        return value  # the conversion says what is expected
 
 
 def _check_keys(command: dict[str, object]) -> None:

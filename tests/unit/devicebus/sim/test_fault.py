@@ -397,6 +397,16 @@ def test_output_is_set_for_the_device_too(commanded):
     assert inputs(commanded) == 2
 
 
+def test_numbers_of_a_fault_may_be_hexadecimal_texts():
+    faulty = make()
+    obey(faulty, b'{"kind":"refuse","slave":"a","state":"PREOP","code":"0x8000"}', 0)
+    assert faulty.segment.slaves[0].refused_states == {AlState.PREOP: 0x8000}
+    obey(faulty, b'{"kind":"refuse","slave":"a","state":"PREOP","code":"32768","end":true}', 0)
+    assert faulty.segment.slaves[0].refused_states == {}
+    with pytest.raises(ValueError, match=r"Expected `int`, got `str` - at `\$.code`"):
+        obey(faulty, b'{"kind":"refuse","slave":"a","state":"PREOP","code":"many"}', 0)
+
+
 def test_faults_begin_and_end(commanded):
     faulty = FaultySegment(commanded.segment)
     obey(faulty, b'{"kind": "power", "slave": "slave"}', 0)
