@@ -183,6 +183,7 @@ def _bus_ports(plant: PlantFile) -> Iterator[tuple[StationSection, PortSection]]
 def _describe(file: Path, describe: DescribeBus, report: FindingReport) -> ExpectedBus | None:
     description = describe(file)
     if isinstance(description, ExpectedBus):
+        report.warnings += description.warnings
         return description
     report.adopt(description)
     return None

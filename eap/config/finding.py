@@ -18,7 +18,7 @@ _VARYING = re.compile(r"'[^']*'|\S*\d\S*|, did you mean [^?]*\?")
 
 
 class PlantFinding(msgspec.Struct, frozen=True):
-    """One error in a plant file."""
+    """One error in a plant file, or a warning about it."""
 
     file: str
     line: int
@@ -41,6 +41,9 @@ class FindingReport:
 
     A part of the file that an anchor repeats has one finding, at its first use, with the number of
     further uses.
+
+    Attributes:
+        warnings: Warnings about the file, and about other files, without repetition.
     """
 
     def __init__(self, file: str) -> None:
@@ -50,6 +53,7 @@ class FindingReport:
         self.stations: set[str] = set()
         self.broken_types: set[str] = set()
         """Texts of types that have a finding, or whose definition has one."""
+        self.warnings: list[PlantFinding] = []
         self._nodes: dict[str, Node] = {}
         self._findings: dict[tuple[int, str, str], PlantFinding] = {}
         self._first_use: dict[tuple[int, str, str], PlantFinding] = {}
@@ -71,6 +75,12 @@ class FindingReport:
         else:
             # Two checks may find the same: one line for the user.
             self._findings.setdefault((where, message, expected), finding)
+
+    def warn(self, path: str, message: str, expected: str) -> None:
+        """Record a warning about *path*."""
+        warning = PlantFinding(self.file, self.line_of(path), path, message, expected)
+        if warning not in self.warnings:
+            self.warnings.append(warning)
 
     def add_error(self, path: str, subject: str, error: ValueError, expected: str) -> None:
         """Report an error of a data type or value; *expected* is for one that does not say it."""

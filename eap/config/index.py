@@ -20,6 +20,7 @@ import msgspec
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.structures import find_variable
+from eap.config.finding import PlantFinding
 from eap.config.structs import (
     FrameSection,
     FromSection,
@@ -30,6 +31,7 @@ from eap.config.structs import (
     SubscribeSection,
 )
 from eap.ids import InterfaceUri, ObjectId
+from eap.od.model import RW, Access
 from eap.od.slave_config import OpMode, SlaveConfig
 from eap.pd.spec import BusEntrySpec, BusSlaveSpec, PortKind
 
@@ -53,6 +55,8 @@ class DescribedPdoEntry(msgspec.Struct, frozen=True):
     """Sync manager of the PDO that maps it."""
     group: str = ""
     """Name of its PDO, if variables have it before the name of the entry."""
+    access: Access = RW
+    """Rights of the object, where they are known."""
 
 
 class DescribedPdo(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,6 +118,8 @@ class ExpectedBus(msgspec.Struct, frozen=True):
     """True if its bus file has a second line to the master."""
     digest: str = ""
     """Of all that a simulator plays from its bus file."""
+    warnings: tuple[PlantFinding, ...] = ()
+    """Warnings about its bus file."""
 
 
 class BusVariable(NamedTuple):

@@ -522,7 +522,11 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
         derive_directory(index),
         audit_required=plant_file.access.audit is AuditMode.REQUIRED,
     )
-    warnings = (*follow_routes(index, plant.routing, report), *warn_of_open_brokers(index, report))
+    warnings = (
+        *report.warnings,
+        *follow_routes(index, plant.routing, report),
+        *warn_of_open_brokers(index, report),
+    )
     return PlantResult(plant, (), report.lines, warnings, types)
 
 

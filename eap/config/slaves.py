@@ -16,6 +16,7 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import DescribedPdo, DescribedPdoEntry, DescribedSlave, plain_name
 from eap.config.structs import SlaveSection, StartupSection
 from eap.ids import ObjectId
+from eap.od.model import RW, WO, OdState
 from eap.od.slave_config import (
     ALIAS_REGISTER,
     BY_SERIAL,
@@ -40,6 +41,7 @@ _CYCLIC_BIT = 0x0100
 _TIMES = 1 << 32
 """Times in nanoseconds are 32 bits in the registers."""
 _MAX_ENTRIES = 254
+_STATES = {"P": OdState.PREOP, "S": OdState.SAFEOP, "O": OdState.OP}
 _MANAGERS = {str(number): number for number in range(16)}
 
 
@@ -425,6 +427,8 @@ def _sdo_write(
         report.add(f"{section.at}.sdo", message, "subindex 0 or 1 with complete access")
     known = _known_entries(slave).get((place.object_index, place.subindex))
     data = _data(slave, section, None if section.complete else known, report)
+    if not section.complete:
+        _check_access(slave, place, at, section, report)
     return SdoWrite(
         at=at,
         index=place.object_index,
@@ -433,6 +437,28 @@ def _sdo_write(
         complete=section.complete,
         comment=section.comment,
     )
+
+
+def _check_access(
+    slave: DescribedSlave,
+    place: ObjectId,
+    at: tuple[Transition, ...],
+    section: StartupSection,
+    report: FindingReport,
+) -> None:
+    """Warn of an object without the right to write it: descriptions are not always right."""
+    # Not those of PDOs: a mapped entry has no rights in its description.
+    key = place.object_index, place.subindex
+    access = next((each.access for each in slave.objects if (each.index, each.subindex) == key), RW)
+    for transition in at:
+        # A write of IP is sent in PREOP, because INIT has no mailbox.
+        state = _STATES.get(transition[0], OdState.PREOP)
+        if not access & state.write_right:
+            where = f" in {state.name}" if access & WO else ""
+            message = f"{place} of {slave.name} is read-only{where} by its description"
+            expected = "an object that can be written, otherwise the slave may stay in"
+            report.warn(section.at, message, f"{expected} {state.name}")
+            return
 
 
 def _data(

@@ -59,7 +59,9 @@ def _check_bus(path: Path) -> CheckedBus:
     from eap.runtime import busfile  # simulated devices
 
     result = busfile.load(path)
-    return CheckedBus(CheckReport(result.bus is not None, result.findings, ()), result.bus)
+    return CheckedBus(
+        CheckReport(not result.findings, result.findings, result.warnings), result.bus
+    )
 
 
 def check_plant(path: Path) -> CheckedPlant:

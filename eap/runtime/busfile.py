@@ -74,6 +74,8 @@ class BusResult(msgspec.Struct, frozen=True):
 
     bus: BusFile | None
     findings: tuple[PlantFinding, ...]
+    warnings: tuple[PlantFinding, ...] = ()
+    """Warnings about a bus that is valid."""
 
 
 def load(path: Path) -> BusResult:
@@ -103,7 +105,7 @@ def load(path: Path) -> BusResult:
     if not report.findings():
         _check_faults(bus, report)
     findings = report.findings()
-    return BusResult(None if findings else bus, findings)
+    return BusResult(None, findings) if findings else BusResult(bus, (), tuple(report.warnings))
 
 
 def load_or_raise(path: Path) -> BusFile:
@@ -132,6 +134,7 @@ def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
         ),
         bus.spec.ring,
         bus.digest(),
+        result.warnings,
     )
 
 
@@ -241,9 +244,8 @@ def _describe_objects(dictionary: ObjectDictionary) -> Iterator[DescribedPdoEntr
         for subindex, entry in item.entries.items():
             if subindex or item.code is ObjectCode.VAR:
                 kind = entry.kind
-                yield DescribedPdoEntry(
-                    entry.name, kind.text, item.index, subindex, kind.bit_length
-                )
+                place = item.index, subindex, kind.bit_length
+                yield DescribedPdoEntry(entry.name, kind.text, *place, access=entry.access)
 
 
 def _files(slave: SlaveSpec) -> Iterator[str]:

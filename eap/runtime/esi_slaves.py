@@ -177,4 +177,4 @@ def _objects(device: EsiDevice) -> Iterator[DescribedPdoEntry]:
         for entry in item.entries:
             kind = datatypes.parse(entry.type)
             place = item.index, entry.subindex, kind.bit_length
-            yield DescribedPdoEntry(entry.name, kind.text, *place)
+            yield DescribedPdoEntry(entry.name, kind.text, *place, access=entry.access)

@@ -10,6 +10,7 @@ from eap.config.finding import FindingReport
 from eap.config.index import DescribedPdo, DescribedPdoEntry, DescribedSlave
 from eap.config.slaves import check_cycles, configure, override
 from eap.config.structs import SlaveSection
+from eap.od.model import RO, RW_PREOP
 from eap.od.slave_config import (
     IdnWrite,
     MappedObject,
@@ -322,3 +323,30 @@ def test_plant_keys_go_over_those_of_the_bus_file():
     assert found.config.optional
     (finding,) = report.findings()
     assert str(finding) == "p: unknown slave 'drvie', did you mean drive?; expected one of drive"
+
+
+@pytest.mark.parametrize(
+    ("write", "warning"),
+    [
+        ('{sdo: "0x2003", value: 1}', "0x2003:00 of drive is read-only by its description"),
+        ('{sdo: "0x2004", value: 1}', ""),
+        (
+            '{transition: [PS, SO], sdo: "0x2004", value: 1}',
+            "0x2004:00 of drive is read-only in SAFEOP by its description",
+        ),
+        ('{transition: IP, sdo: "0x2004", value: 1}', ""),
+        ('{sdo: "0x2001", data: "0000000000000000"}', ""),
+        ('{sdo: "0x2003", complete: true, data: "0000"}', ""),
+    ],
+)
+def test_write_of_an_object_that_is_read_only_is_a_warning(tmp_path, write, warning):
+    objects = (
+        *DRIVE.objects,
+        replace(entry("serial", 0x2003), access=RO),
+        replace(entry("filter", 0x2004), access=RW_PREOP),
+    )
+    keys, report = read_keys(tmp_path, f"startup:\n  - {write}\n")
+    configure(replace(DRIVE, objects=objects), keys, report)
+    assert report.findings() == ()
+    assert [each.message for each in report.warnings] == ([warning] if warning else [])
+    assert all(each.line == 2 for each in report.warnings)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.ops.check import check_plant
+from eap.ops.check import check_file, check_plant
 
 PLANTS = sorted((Path(__file__).parents[4] / "config").glob("*.yaml"))
 PLANT = """\
@@ -89,6 +89,36 @@ def test_check_warns_of_slaves_of_one_product_with_other_process_data(tmp_path: 
     assert warning.message.startswith("station mixer, port bus0: in and out have the same vendor")
     (tmp_path / "bus.yaml").write_text(BUS.replace("out, kind", "out, product: 7, kind"))
     assert check_plant(tmp_path / "plant.yaml")[0].warnings == ()
+
+
+READ_ONLY = """\
+bus: b
+slaves:
+  - name: sensor
+    kind: analogue
+    inputs: [{name: level, type: INT}]
+    objects: [{index: 0x8001, name: Serial, type: UDINT, access: ro}]
+    master: {startup: [{sdo: "0x8001", value: 5}]}
+"""
+
+
+def test_check_warns_of_a_start_up_write_to_a_read_only_object(tmp_path: Path) -> None:
+    (tmp_path / "plant.yaml").write_text(BUS_PLANT)
+    (tmp_path / "bus.yaml").write_text(READ_ONLY)
+    message = (
+        f"{tmp_path}/bus.yaml:7: 0x8001:00 of sensor is read-only by its description; expected an"
+        " object that can be written, otherwise the slave may stay in PREOP"
+    )
+    for name in ("plant.yaml", "bus.yaml"):
+        report = check_file(tmp_path / name).report
+        assert (report.ok, [str(each) for each in report.warnings]) == (True, [message])
+    # The same key of the plant file has its line there.
+    bus, _, write = READ_ONLY.partition("    master: ")
+    (tmp_path / "bus.yaml").write_text(bus)
+    slaves = f"slaves: {{sensor: {write.strip()}}}"
+    (tmp_path / "plant.yaml").write_text(BUS_PLANT.replace("3.1}", f"3.1, {slaves}}}"))
+    (warning,) = check_file(tmp_path / "plant.yaml").report.warnings
+    assert (warning.file, warning.line) == (str(tmp_path / "plant.yaml"), 6)
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda path: path.stem)
