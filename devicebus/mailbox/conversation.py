@@ -472,23 +472,3 @@ async def drive_async(
         return result
     finally:
         conversation.close()
-
-
-def map_requests(
-    conversation: Generator[RequestT, ReplyT, T], change: Callable[[RequestT], RequestT]
-) -> Generator[RequestT, ReplyT, T]:
-    """Return a conversation with each request changed by *change*; all else stays the same."""
-    try:
-        request = next(conversation)
-        while True:
-            try:
-                reply = yield change(request)
-            except BusError as exc:
-                request = conversation.throw(exc)
-            else:
-                request = conversation.send(reply)
-    except StopIteration as end:
-        result: T = end.value
-        return result
-    finally:
-        conversation.close()

@@ -6,14 +6,11 @@ are registers.  An error names the slave, the transition and the object that was
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TypeVar
-
-import msgspec
 
 from devicebus.errors import BusError, FrameLostError, MailboxClosedError
 from devicebus.mailbox import coe_client, soe_client
-from devicebus.mailbox.conversation import Conversation, map_requests
+from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.bus import BusSlave, BusState
 from devicebus.master.clocks import start_sync, stop_sync
@@ -249,10 +246,7 @@ def _ask(bus: BusState, slave: BusSlave, conversation: Conversation[T], name: st
     mailbox = slave.mailbox
     assert isinstance(mailbox, Mailbox)  # noqa: S101  checked by the callers
     limit_ms = slave.config.timeouts.response_ms
-    if limit_ms is not None:
-        conversation = map_requests(
-            conversation, partial(msgspec.structs.replace, timeout_ns=limit_ms * _MS)
-        )
+    timeout_ns = None if limit_ms is None else limit_ms * _MS
     _, now_ns = yield Sleep(0)
-    task = mailbox.converse(conversation, now_ns, name=name, requester=bus)
+    task = mailbox.converse(conversation, now_ns, name=name, requester=bus, timeout_ns=timeout_ns)
     return (yield from wait_for(task))

@@ -122,17 +122,24 @@ class QueuedConversation:
     Attributes:
         step: Its next request.
         ready_ns: Earliest time of this request.
+        timeout_ns: Time-out of each request, instead of its own; None for its own.
     """
 
-    __slots__ = ("conversation", "ready_ns", "requester", "step", "task")
+    __slots__ = ("conversation", "ready_ns", "requester", "step", "task", "timeout_ns")
 
     def __init__(
-        self, conversation: Conversation[Any], step: MailboxRequest, name: str, requester: Hashable
+        self,
+        conversation: Conversation[Any],
+        step: MailboxRequest,
+        name: str,
+        requester: Hashable,
+        timeout_ns: int | None = None,
     ) -> None:
         self.conversation = conversation
         self.step = step
         self.ready_ns = 0
         self.requester = requester
+        self.timeout_ns = timeout_ns
         self.task: Task[Any] = Task(name, conversation.close)
 
 

@@ -355,8 +355,12 @@ class Mailbox:
         *,
         name: str = "a request",
         requester: Hashable = None,
+        timeout_ns: int | None = None,
     ) -> Task[T]:
-        """Start a conversation; requesters of the same protocol alternate."""
+        """Start a conversation; requesters of the same protocol alternate.
+
+        *timeout_ns* replaces the time-outs of its requests.
+        """
         task: Task[T]
         try:
             step = next(conversation)
@@ -367,7 +371,8 @@ class Mailbox:
             else:
                 task.finish(end.value)
             return task
-        job = QueuedConversation(conversation, step, f"slave {self.station}: {name}", requester)
+        where = f"slave {self.station}: {name}"
+        job = QueuedConversation(conversation, step, where, requester, timeout_ns)
         problem = self._check_step(step, job.task.name)
         if problem is not None:
             conversation.close()
@@ -491,6 +496,8 @@ class Mailbox:
     def _serve_one(self, job: QueuedConversation) -> Procedure[int]:
         """Execute one step of a conversation and resume it; return the time."""
         step = job.step
+        if job.timeout_ns is not None:
+            step = replace(step, timeout_ns=job.timeout_ns)
         _, start_ns = yield Sleep(0)
         error: EapError | None = None
         message = MailboxMessage(step.type, b"")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator
 import pytest
 
 from devicebus.errors import BusError, MailboxTimeoutError
-from devicebus.mailbox.conversation import drive, drive_async, map_requests
+from devicebus.mailbox.conversation import drive, drive_async
 from eap.errors import EngineGoneError
 from tests.support.virtualtime import run_virtual
 
@@ -41,12 +41,7 @@ def asynchronous(conversation: Generator[int, str, str], exchange: Callable[[int
     return run_virtual(drive_async(conversation, exchange_later))
 
 
-def mapped(conversation: Generator[int, str, str], exchange: Callable[[int], str]) -> str:
-    shifted = map_requests(conversation, lambda request: request + 10)
-    return drive(shifted, lambda request: exchange(request - 10))
-
-
-each_way = pytest.mark.parametrize("run", [blocking, asynchronous, mapped])
+each_way = pytest.mark.parametrize("run", [blocking, asynchronous])
 
 
 @each_way
@@ -110,10 +105,3 @@ def test_drive_returns_at_once_when_nothing_is_requested(run):
         yield 0
 
     assert run(conversation(), lambda request: "") == "empty"
-
-
-def test_map_requests_changes_each_request_of_the_conversation():
-    requests = []
-    conversation = map_requests(Scripted().conversation(), lambda request: request + 10)
-    drive(conversation, lambda request: str(requests.append(request)))
-    assert requests == [11, 12]
