@@ -167,7 +167,7 @@ def test_datagrams_are_recorded_with_their_addresses(open_recorded, tmp_path):
     try:
         given = [
             msgspec.structs.replace(each, engine_fd=socket.dup(each.engine_fd))
-            for each in sockets.descriptions
+            for each in sockets.fit(stations)
             if each.engine_fd != NO_DESCRIPTOR
         ]
         recorded = open_recorded(stations, given)
