@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.tree import Tree
 
     from eap.ops.decode import DecodedAms, DecodedDatagram, DecodedFrame
-    from eap.ops.packets import Packet
+    from eap.recording.packets import Packet
 
 _NAMES = {
     1: "datagrams",
@@ -70,7 +70,7 @@ def _frames(source: str) -> Iterator[DecodedFrame]:
 def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
     from eap.errors import CodecError
     from eap.ops.decode import CycleOrders, decode_frame
-    from eap.ops.packets import iter_capture
+    from eap.recording.packets import iter_capture
 
     orders = CycleOrders()
     try:
@@ -87,7 +87,7 @@ def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
 
 def _frames_of_octets(octets: bytes) -> Iterator[DecodedFrame]:
     from eap.ops.decode import decode_frame
-    from eap.ops.packets import cut_frames, unwrap
+    from eap.recording.packets import cut_frames, unwrap
 
     packet = unwrap(octets)
     if packet is None:

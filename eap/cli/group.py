@@ -185,6 +185,7 @@ _COMMANDS = {
     "od": ("od:od", "Read and write the object dictionary of a device."),
     "pd": ("pd:pd", "List, watch and set the process data of running stations."),
     "plan": ("plant:plan", "Show the differences between a plant file and the running plant."),
+    "record": ("record:record", "Record values and frames, and describe recordings."),
     "rollback": ("plant:rollback", "Undo the last change of a running plant."),
     "routes": ("routes:routes", "Show, add, remove and test AMS routes; live without a command."),
     "run": ("plant:run", "Run a plant, or some of its stations."),

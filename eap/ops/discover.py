@@ -20,12 +20,12 @@ from msgspec.structs import replace
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import NetId
 from eap.net.capture import FrameCapture
-from eap.ops.packets import Packet, capture_drops, iter_capture, unwrap
 from eap.ops.takers import Taker
 from eap.pd.appearance import guess
 from eap.pd.observer import MAX_PDS, ObservedPath, ObservedPd, ObservedPdKey, Observer
 from eap.pd.rhythm import CycleOrder
 from eap.pd.words import PdDropReason, Reason
+from eap.recording.packets import Packet, capture_drops, iter_capture, unwrap
 
 if TYPE_CHECKING:
     from eap.ops.publisher_dictionary import PublishedPd  # which loads clients of dictionaries

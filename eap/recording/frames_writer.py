@@ -22,6 +22,7 @@ from eap.codec.ethercat import ETHERTYPE
 from eap.ids import MacAddr
 from eap.recording.header import FORMAT, EventKind, RecordingEvent, RecordingHeader
 from eap.recording.published import encode_published
+from eap.recording.repair import lock
 from eap.release import RELEASE
 
 SECTION, INTERFACE, STATISTICS, PACKET = 0x0A0D0D0A, 1, 5, 6
@@ -190,6 +191,7 @@ class FramesWriter:
         self.frames = 0
         # Unbuffered: the blocks below are joined and written in one call.
         self._file = path.open("xb", buffering=0)
+        lock(self._file)
         self._blocks = [section_header(header)]
         self._bytes = len(self._blocks[0])
         self._written = 0

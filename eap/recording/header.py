@@ -6,13 +6,13 @@ from enum import StrEnum
 
 from msgspec import Struct
 
-from eap.recording.published import PublishedFrame
+from eap.recording.published import RecordedFrame
 
 FORMAT = "1"
 """Version of what this project writes into MCAP and pcapng files beside values and frames."""
 
 
-class PlantFile(Struct, frozen=True):
+class AttachedFile(Struct, frozen=True):
     """A file of the plant, with the name that the plant knows it by."""
 
     name: str
@@ -29,8 +29,8 @@ class RecordingHeader(Struct, frozen=True, kw_only=True):
     host: str
     started_ns: int
     options: dict[str, str] = {}
-    files: tuple[PlantFile, ...] = ()
-    published: tuple[PublishedFrame, ...] = ()
+    files: tuple[AttachedFile, ...] = ()
+    published: tuple[RecordedFrame, ...] = ()
 
 
 class EventKind(StrEnum):

@@ -485,6 +485,7 @@ class StationMessages:
         station: The same.
         variables: The same, in the order of the message.
         leaves: Their values without parts, in the order in which :meth:`unpack` returns them.
+        owners: The variable of each leaf.
 
     Raises:
         ValueError: the type of a variable is none.
@@ -498,14 +499,13 @@ class StationMessages:
             kind = datatypes.parse(variable.type)
             fields.append((variable, list(_parts(number, variable.name, kind, bit_offset))))
         self.variables = tuple(variable for variable, _ in fields)
-        fixed = [parts for _, parts in fields if _fixed_sizes(parts) is not None]
-        self._varying = [
-            part for _, parts in fields if _fixed_sizes(parts) is None for part in parts
-        ]
-        flat = list(_flatten(chain.from_iterable(fixed)))
+        fixed = [each for each in fields if _fixed_sizes(each[1]) is not None]
+        varying = [each for each in fields if _fixed_sizes(each[1]) is None]
+        self._varying = [part for _, parts in varying for part in parts]
+        self.owners = [owner for owner, parts in fixed + varying for _ in _leaves(parts)]
+        flat = list(_flatten(chain.from_iterable(parts for _, parts in fixed)))
         self._packer = _Packer(flat)
         self.leaves = [part for part in flat if isinstance(part, Leaf)]
-        self._fixed_count = len(self.leaves)
         self.leaves += _leaves(self._varying)
         self._fixed = struct.Struct(f"<xQ{''.join(map(_reader_code, flat))}")
 

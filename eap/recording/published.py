@@ -17,7 +17,7 @@ from eap.pd.layout import ImageLayout
 from eap.recording.messages import PlacedVariable, RecordedVariable
 
 
-class PublishedPd(Struct, frozen=True, kw_only=True):
+class RecordedPd(Struct, frozen=True, kw_only=True):
     """One PD: its identification, and its variables in the order of its data."""
 
     name: str
@@ -36,7 +36,7 @@ class PublishedPd(Struct, frozen=True, kw_only=True):
         ]
 
 
-class PublishedFrame(Struct, frozen=True, kw_only=True):
+class RecordedFrame(Struct, frozen=True, kw_only=True):
     """One frame: its sender, its destination, and its PDs in order.
 
     *publisher* is the NetID of the port.
@@ -48,15 +48,15 @@ class PublishedFrame(Struct, frozen=True, kw_only=True):
     interface: str
     name: str
     destination: str
-    pds: tuple[PublishedPd, ...]
+    pds: tuple[RecordedPd, ...]
 
 
-def published_by(layouts: Iterable[ImageLayout]) -> tuple[PublishedFrame, ...]:
+def published_by(layouts: Iterable[ImageLayout]) -> tuple[RecordedFrame, ...]:
     """Return all frames of the stations with these images."""
     return tuple(frame for layout in layouts for frame in _frames(layout))
 
 
-def _frames(layout: ImageLayout) -> Iterable[PublishedFrame]:
+def _frames(layout: ImageLayout) -> Iterable[RecordedFrame]:
     ports = {port.name: port for port in layout.ports}
     frames = {frame.name: frame for frame in layout.frames}
     slots = {slot.name: slot for slot in layout.variables}
@@ -64,7 +64,7 @@ def _frames(layout: ImageLayout) -> Iterable[PublishedFrame]:
     for name, pds in groupby(layout.tx, key=lambda pd: pd.frame):
         frame = frames[name]
         port = ports[frame.port]
-        yield PublishedFrame(
+        yield RecordedFrame(
             station=layout.station,
             port=port.name,
             publisher=port.net_id,
@@ -72,7 +72,7 @@ def _frames(layout: ImageLayout) -> Iterable[PublishedFrame]:
             name=name,
             destination=frame.destination,
             pds=tuple(
-                PublishedPd(
+                RecordedPd(
                     name=pd.name,
                     pd_id=pd.pd_id,
                     version=pd.version,
@@ -87,14 +87,14 @@ def _frames(layout: ImageLayout) -> Iterable[PublishedFrame]:
         )
 
 
-def encode_published(frames: Iterable[PublishedFrame]) -> bytes:
+def encode_published(frames: Iterable[RecordedFrame]) -> bytes:
     """Return *frames* as JSON."""
     return msgspec.json.encode(tuple(frames))
 
 
-def decode_published(octets: bytes) -> tuple[PublishedFrame, ...]:
+def decode_published(octets: bytes) -> tuple[RecordedFrame, ...]:
     """Return the frames of :func:`encode_published`; raise ValueError if *octets* are none."""
     try:
-        return msgspec.json.decode(octets, type=tuple[PublishedFrame, ...])
+        return msgspec.json.decode(octets, type=tuple[RecordedFrame, ...])
     except msgspec.MsgspecError as exc:
         raise ValueError(f"the PDs of the plant cannot be read: {exc}") from None

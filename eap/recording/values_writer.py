@@ -4,7 +4,7 @@ The file has, beside the messages of :mod:`eap.recording.messages`:
 
 - metadata ``eap``: format, plant, host, release, options of the command;
 - attachments: the files of the plant, and ``published.json`` (:mod:`eap.recording.published`);
-- channel ``eap/events``: JSON, one :class:`~eap.recording.header.RecordingEvent` each;
+- channel ``eap_events``: JSON, one :class:`~eap.recording.header.RecordingEvent` each;
 - metadata of each station's channel: its variables with their types and units.
 
 Messages are compressed in chunks of at most a second, so that a killed recorder loses no more.  The
@@ -23,6 +23,7 @@ from eap.errors import EnvironmentalError
 from eap.recording.header import FORMAT, EventKind, RecordingEvent, RecordingHeader
 from eap.recording.messages import PlacedVariable, StationMessages
 from eap.recording.published import encode_published
+from eap.recording.repair import lock
 from eap.release import RELEASE
 
 try:
@@ -37,7 +38,7 @@ HEADER = "eap"
 """Name of the metadata that the file begins with."""
 VARIABLES, STATION = "variables", "station"
 """Metadata of a channel."""
-EVENTS = "eap/events"
+EVENTS = "eap_events"
 """Topic of the events."""
 PUBLISHED = "published.json"
 """Attachment with the PDs of the plant."""
@@ -74,6 +75,7 @@ class ValuesWriter:
         self.lost = 0
         self.messages = 0
         self._file = path.open("xb")
+        lock(self._file)
         # Any, because mcap annotates some of its methods only.
         self._writer: Any = Writer(self._file, _CHUNK_BYTES, CompressionType.ZSTD)
         self._stations: list[StationMessages] = []

@@ -21,7 +21,7 @@ from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import NetId
 from eap.net import interface
 from eap.net.capture import FrameCapture
-from eap.ops.packets import iter_capture
+from eap.recording.packets import iter_capture
 from tests.support.appliance import (
     EAPCTL,
     Appliance,

@@ -21,7 +21,7 @@ from eap.codec.mailbox import encode_frame as encode_mailbox
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import NetId
 from eap.ops.decode import decode_frame
-from eap.ops.packets import iter_capture
+from eap.recording.packets import iter_capture
 from tests.support.packets import ethernet, tcp_segment, tcp_stream, udp
 from tests.support.tshark import dissect, write_pcap
 from tests.support.vectors import load, load_datagrams

@@ -20,7 +20,7 @@ import pytest
 from eap.codec.pd import PdFrameHeader
 from eap.ids import NetId
 from eap.ops.decode import decode_frame
-from eap.ops.packets import iter_capture
+from eap.recording.packets import iter_capture
 from tests.support.appliance import Plants, plants, wait_until
 from tests.support.namespaces import cable, namespace
 from tests.support.tshark import dissect

@@ -10,7 +10,7 @@ import pytest
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import MacAddr, NetId
 from eap.recording.frames_writer import FramesWriter, ethernet_wrapping, udp_wrapping
-from eap.recording.header import EventKind, PlantFile, RecordingEvent, RecordingHeader
+from eap.recording.header import AttachedFile, EventKind, RecordingEvent, RecordingHeader
 from tests.support.tshark import dissect
 
 pytestmark = pytest.mark.tshark
@@ -23,7 +23,7 @@ PUBLISHER = NetId.parse("127.0.1.1.2.1")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two ports, UDP and Ethernet with a VLAN tag, a mark, a loss, a plant file of 200 kB."""
     path = tmp_path_factory.mktemp("frames") / "a.pcapng"
-    plant = PlantFile("mill.yaml", b"plant: m\xc3\xbchle\n" + b"# comment\n" * 20_000)
+    plant = AttachedFile("mill.yaml", b"plant: m\xc3\xbchle\n" + b"# comment\n" * 20_000)
     header = RecordingHeader(plant="mill", host="pc", started_ns=T0, files=(plant,))
     writer = FramesWriter(path, header)
     udp = writer.add_interface("island-01/eap0", "udp://127.0.1.1")

@@ -10,7 +10,7 @@ from typing import Self
 
 from eap.codec.ethercat import FrameType
 from eap.codec.pd import PD_FRAME_START, PdFrameHeader, iter_pds
-from eap.ops.packets import unwrap
+from eap.recording.packets import unwrap
 
 _ALL = 3  # ETH_P_ALL; taps for one EtherType are not shown what leaves
 _OUTGOING = 4

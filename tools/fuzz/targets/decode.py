@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from eap.ops.decode import decode_frame
-from eap.ops.packets import unwrap
+from eap.recording.packets import unwrap
 
 
 def fuzz_one(data: bytes) -> None:

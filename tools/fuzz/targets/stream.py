@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.ops.packets import Stream, TcpSegment
+from eap.recording.packets import Stream, TcpSegment
 
 
 def fuzz_one(data: bytes) -> None:

@@ -173,7 +173,7 @@ def test_gw_od_prints_a_tree() -> None:
 def test_help_imports_no_decoder() -> None:
     code = (
         "import sys, eap.cli.decode;"
-        "slow = {'dpkt', 'rich', 'msgspec', 'eap.ops.decode', 'eap.ops.packets'};"
+        "slow = {'dpkt', 'rich', 'msgspec', 'eap.ops.decode', 'eap.recording.packets'};"
         "print(sorted(slow & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

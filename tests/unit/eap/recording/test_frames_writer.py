@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from eap.ids import MacAddr
-from eap.ops.packets import capture_drops, iter_capture
 from eap.recording.frames_writer import (
     FramesWriter,
     ethernet_wrapping,
     interface_block,
     udp_wrapping,
 )
-from eap.recording.header import EventKind, PlantFile, RecordingEvent, RecordingHeader
+from eap.recording.header import AttachedFile, EventKind, RecordingEvent, RecordingHeader
+from eap.recording.packets import capture_drops, iter_capture
 
 T0 = 1_700_000_000_123_456_789
 FRAME = bytes.fromhex("0c40 7f0001010201 0000 0100 0000")
@@ -22,7 +22,7 @@ FRAME = bytes.fromhex("0c40 7f0001010201 0000 0100 0000")
 
 def header(content: bytes = b"plant: mill\n") -> RecordingHeader:
     return RecordingHeader(
-        plant="mill", host="pc", started_ns=T0, files=(PlantFile("mill.yaml", content),)
+        plant="mill", host="pc", started_ns=T0, files=(AttachedFile("mill.yaml", content),)
     )
 
 

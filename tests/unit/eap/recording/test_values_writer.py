@@ -12,7 +12,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from eap.recording.header import EventKind, PlantFile, RecordingEvent, RecordingHeader
+from eap.recording.header import AttachedFile, EventKind, RecordingEvent, RecordingHeader
 from eap.recording.messages import RecordedVariable, pack_closely
 from eap.recording.values_writer import EVENTS, ValuesWriter
 
@@ -27,7 +27,7 @@ def header() -> RecordingHeader:
         host="pc",
         started_ns=T0,
         options={"every": "1"},
-        files=(PlantFile("mill.yaml", b"plant: mill\n"),),
+        files=(AttachedFile("mill.yaml", b"plant: mill\n"),),
     )
 
 

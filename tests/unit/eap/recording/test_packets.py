@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.codec.ethercat import EtherCatHeader
-from eap.ops.packets import Stream, TcpSegment, cut_frames, unwrap
+from eap.recording.packets import Stream, TcpSegment, cut_frames, unwrap
 from tests.support.packets import ethernet, tcp_segment, tcp_stream, udp
 
 FRAME = bytes.fromhex("0240abcd")

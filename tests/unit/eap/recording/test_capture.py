@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.errors import MalformedError
-from eap.ops.packets import CapturedFrame, iter_capture
+from eap.recording.packets import CapturedFrame, iter_capture
 from tests.support.packets import ethernet, tcp_segment, tcp_stream, udp
 from tests.support.tshark import write_pcap
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -15,9 +16,8 @@ from typing import BinaryIO, NamedTuple
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE, EtherCatHeader
 from eap.errors import MalformedError
 from eap.ids import MacAddr
+from eap.recording.capture_file import ETHERNET, CaptureFile
 
-_ETHERNET = 1
-"""Link type of Ethernet in both file formats."""
 _VLAN_TYPES = (0x8100, 0x88A8)
 _IPV4 = 0x0800
 _TCP, _UDP = 6, 17
@@ -25,12 +25,6 @@ _SYN = 0x02
 _SEQUENCES = 1 << 32
 _MOST_WAITING = 64
 """Segments of a TCP stream kept for a missing one before it counts as lost."""
-_SECTION, _STATISTICS = 0x0A0D0D0A, 5
-"""Types of blocks in pcapng."""
-_BYTE_ORDERS = {b"\x1a\x2b\x3c\x4d": ">", b"\x4d\x3c\x2b\x1a": "<"}
-_LONGEST_STATISTICS = 1 << 16
-_IF_DROP, _OS_DROP = 5, 7
-"""Options of a block of statistics."""
 
 
 class TcpSegment(NamedTuple):
@@ -211,56 +205,26 @@ def capture_drops(path: Path) -> int | None:
     Counted in Interface Statistics Blocks (pcapng, isb_ifdrop and isb_osdrop), which programs
     write at the end.
     """
-    lost: dict[tuple[int, int], int] = {}
-    order = ""
     with path.open("rb") as file:
-        while len(head := file.read(8)) == 8:
-            if head[:4] == _SECTION.to_bytes(4):
-                magic = file.read(4)
-                order = _BYTE_ORDERS.get(magic, "")
-                file.seek(-len(magic), 1)
-            if not order:
-                return None
-            kind, size = struct.unpack(f"{order}II", head)
-            if size < 12:
-                break
-            if kind != _STATISTICS or size > _LONGEST_STATISTICS:
-                file.seek(size - 8, 1)
-                continue
-            body = file.read(size - 8)
-            if len(body) >= 16:
-                (interface,) = struct.unpack_from(f"{order}I", body)
-                for code, count in _statistics(body[12:-4], order):
-                    lost[interface, code] = count
-    return sum(lost.values()) if lost else None
-
-
-def _statistics(options: bytes, order: str) -> Iterator[tuple[int, int]]:
-    """Yield the counters of lost packets among the options of a block."""
-    at = 0
-    while at + 4 <= len(options):
-        code, size = struct.unpack_from(f"{order}HH", options, at)
-        if code in {_IF_DROP, _OS_DROP} and size == 8 and at + 12 <= len(options):
-            yield code, struct.unpack_from(f"{order}Q", options, at + 4)[0]
-        at += 4 + size + -size % 4
+        capture = CaptureFile(file, str(path))
+        with suppress(MalformedError):
+            for _ in capture.packets():
+                pass
+        return capture.lost
 
 
 def _iter_packets(file: BinaryIO, name: str) -> Iterator[tuple[int, bytes]]:
-    import dpkt
+    capture = CaptureFile(file, name)
+    for packet in capture.packets():
+        if capture.interfaces[packet.interface].link_type != ETHERNET:
+            raise _other_link_type(capture, name)
+        yield packet.at_ns, packet.octets
+    if capture.interfaces and all(each.link_type != ETHERNET for each in capture.interfaces):
+        raise _other_link_type(capture, name)
 
-    link_type = _ETHERNET
-    try:
-        reader = dpkt.pcap.UniversalReader(file)
-        link_type = reader.datalink()
-        if link_type == _ETHERNET:
-            for seconds, octets in reader:
-                yield round(seconds * 1_000_000_000), octets
-    except (dpkt.Error, ValueError, ArithmeticError) as exc:
-        raise MalformedError(
-            f"no whole pcap or pcapng file ({exc})", layout=name, offset=file.tell()
-        ) from None
-    if link_type != _ETHERNET:
-        raise MalformedError(
-            f"link type {link_type}, expected {_ETHERNET}, Ethernet (capture on one interface)",
-            layout=name,
-        )
+
+def _other_link_type(capture: CaptureFile, name: str) -> MalformedError:
+    found = next(each.link_type for each in capture.interfaces if each.link_type != ETHERNET)
+    return MalformedError(
+        f"link type {found}, expected {ETHERNET}, Ethernet (capture on one interface)", layout=name
+    )
