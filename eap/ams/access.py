@@ -63,6 +63,7 @@ LOOKUPS = frozenset(
         IndexGroup.FOE_READ,
         IndexGroup.FOE_PROGRESS,
         IndexGroup.ROUTE_QUERY,
+        IndexGroup.CONTROL,
     )
 )
 """Groups whose ReadWrite changes only the client's own handles."""

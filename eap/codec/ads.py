@@ -186,6 +186,9 @@ class IndexGroup(IntEnum):
     its body there, and returns the answer."""
     ROUTE_QUERY = 0x4541_5001
     """Own format: of the system service, where it forwards requests to, see ``HopQuestion``."""
+    CONTROL = 0x4541_5002
+    """Own format: ReadWrite of a request of the control protocol that only reads, see
+    ``ControlOffset``."""
 
 
 class AdsRange(WireStruct, frozen=True):

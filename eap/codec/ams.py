@@ -20,6 +20,8 @@ IO_PORT = 300
 """AMS port of the I/O server, which knows the masters of a station."""
 DEVICE_PORT = 0xFFFF
 """AMS port of an EAP device, of a master, and of the dictionary of a router."""
+CONTROL_PORT = 17_729
+"""AMS port of the control protocol of an appliance, at the NetIDs of its routers; own format."""
 
 ADDRESSES = struct.Struct("<6sH6sH")
 """The head of an AMS header by itself: target and source, a NetID and a port each."""

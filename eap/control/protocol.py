@@ -248,6 +248,8 @@ def decode_request(line: bytes) -> Request:
         request = _REQUEST.decode(line)
     except msgspec.DecodeError as exc:
         raise ControlError(f"not a request: {exc}", code=ErrorCode.BAD_REQUEST) from None
+    except RecursionError:
+        raise ControlError("not a request: nested too deep", code=ErrorCode.BAD_REQUEST) from None
     if request.v != VERSION:
         raise ControlError(
             f"protocol version {request.v}, this appliance speaks {VERSION}",
@@ -286,7 +288,7 @@ def request_id(line: bytes) -> int | None:
     """Return the id of a line that is otherwise refused, so that its sender can match the error."""
     try:
         number = msgspec.json.decode(line)["id"]
-    except (msgspec.DecodeError, KeyError, TypeError):
+    except (msgspec.DecodeError, RecursionError, KeyError, TypeError):
         return None
     return number if isinstance(number, int) else None
 

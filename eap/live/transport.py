@@ -23,7 +23,7 @@ from eap.control.protocol import (
     encode_request,
 )
 from eap.errors import ControlError
-from eap.runtime.bus_errors import ErrorRecord, to_error
+from eap.ops.client import checked
 from eap.services.tasks import TaskSet
 
 
@@ -141,12 +141,7 @@ class UnixConnection:
             raise gone(f"the appliance does not answer: {exc}") from None
         finally:
             self._waiting.pop(number, None)
-        error = reply.error
-        if error is None:
-            return reply
-        if error.kind:
-            raise to_error(ErrorRecord(error.kind, error.message, error.detail))
-        raise ControlError(error.message, code=error.code)
+        return checked(reply)
 
     async def _receive(self) -> None:
         why = "the appliance closed the connection"

@@ -119,7 +119,7 @@ class ControlClient(Closeable):
             reply = self._next_reply()
             # Events of an earlier subscription may precede the answer.
             if reply.subscription is None:
-                return _checked(reply).result
+                return checked(reply).result
 
     def has_data(self, timeout_s: float) -> bool:
         """Wait for *timeout_s* at most; return whether an answer or its begin has come."""
@@ -162,7 +162,7 @@ class ControlClient(Closeable):
         # Events come when values change, which may take any time: no timeout from here on.
         self._socket.settimeout(None)
         while True:
-            event = _checked(self._next_reply()).event
+            event = checked(self._next_reply()).event
             if event is None:
                 continue
             if failure := event.get("error"):
@@ -196,8 +196,8 @@ class ControlClient(Closeable):
         )
 
 
-def _checked(reply: ControlReply) -> ControlReply:
-    """Return *reply*, or raise the error in it."""
+def checked(reply: ControlReply) -> ControlReply:
+    """Return *reply*; raise ControlError or BusError if it is an error."""
     error = reply.error
     if error is None:
         return reply

@@ -43,6 +43,7 @@ from eap.runtime.store import StationStore, plant_folder
 from eap.services.ads.station_ads import StationAds
 from eap.services.control.audit import Audit, AuditFile
 from eap.services.control.bus_methods import Buses, GatewayMethods
+from eap.services.control.control_ads import ControlAds, RemoteControl
 from eap.services.control.control_server import ControlServer
 from eap.services.control.device_methods import DeviceMethods
 from eap.services.control.methods import Methods
@@ -263,6 +264,9 @@ class Services:
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(clients, devices, providers)
         methods = self._methods(images, buses, devices, gateways, audit)
+        remote = RemoteControl(methods.call, devices.routers)
+        for name, router in devices.routers.items():
+            router.add_service(router.net_id, ControlAds(name, remote))
         server = ControlServer(methods, buses, audit.write_request, announce=audit.begin_request)
         watch = SubscriberWatch(images, open_subscriber_probes(self._handover, self._resources))
         on_sockets: list[Callable[[], Awaitable[None]]] = [

@@ -88,7 +88,7 @@ def is_well(report: LiveReport) -> bool:
 
 def test_view_shows_stations_with_rates(plant: Appliance) -> None:
     async def script(view: LiveView) -> None:
-        first = await view.take()
+        (*_, first) = await reports(view, lambda report: report.status.stations)
 
         def rates(report: LiveReport) -> list[float | None]:
             rows = station_rows(report.status, first.status)
@@ -104,7 +104,7 @@ def test_view_shows_stations_with_rates(plant: Appliance) -> None:
 
 def test_client_calls_methods_of_the_control_protocol(plant: Appliance) -> None:
     async def script(view: LiveView) -> None:
-        await view.take()
+        await reports(view, lambda report: report.status.stations)
         client = view.client_of("live", "one")
         await client.call(WRITE, station="one", values={"setpoint": 7})
         assert (await client.call(READ, station="one", names=["setpoint"])).values == {
@@ -127,7 +127,7 @@ def test_client_watches_values_over_a_restart_of_services(plant: Appliance) -> N
                     yield event
 
     async def script(view: LiveView) -> None:
-        await view.take()
+        await reports(view, lambda report: report.status.stations)
         stream = values(view.client_of("live", "one"))
         async with aclosing(stream):  # type: ignore[type-var]
             first = await anext(stream)
@@ -144,7 +144,7 @@ def test_client_watches_values_over_a_restart_of_services(plant: Appliance) -> N
 
 def test_slow_consumer_gets_one_event_with_the_latest_values(plant: Appliance) -> None:
     async def script(view: LiveView) -> None:
-        await view.take()
+        await reports(view, lambda report: report.status.stations)
         client = view.client_of("live", "one")
         changes = Subscription(station="one", names=("ticks",), period_ms=10, only_changes=True)
         async with aclosing(client.watch(changes)) as events:
@@ -163,7 +163,7 @@ def test_slow_consumer_gets_one_event_with_the_latest_values(plant: Appliance) -
 @pytest.mark.parametrize("process", ["engine", "services"])
 def test_killed_process_is_an_event_in_words(plant: Appliance, process: str) -> None:
     async def script(view: LiveView) -> None:
-        await view.take()
+        await reports(view, lambda report: report.status.stations)
         os.kill(plant.pid(process), signal.SIGKILL)
         found = await reports(
             view, lambda report: any("was restarted" in each.text for each in report.events)

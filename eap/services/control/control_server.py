@@ -172,6 +172,21 @@ LIMITS = ListenerLimits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
 logger = logging.getLogger(__name__)
 
 
+def failure_of(exc: Exception) -> Failure:
+    """Return the exception of a method as its client gets it; a defect is logged."""
+    if isinstance(exc, ControlError):
+        return Failure(exc.code, str(exc))
+    if isinstance(exc, ImageError):
+        return Failure(ErrorCode.UNAVAILABLE, str(exc))
+    if isinstance(exc, BusError):
+        why = to_record(exc)
+        return Failure(ErrorCode.BUS, why.message, why.kind, why.detail)
+    if isinstance(exc, SdoAbortError):
+        return Failure(ErrorCode.ABORT, str(exc), detail=exc.code)
+    logger.error("control method failed", exc_info=exc)
+    return Failure(ErrorCode.INTERNAL, "internal error; the log of services has the cause")
+
+
 class ControlServer:
     """Serve *methods*, and those on *buses*, on a listening Unix socket."""
 
@@ -374,24 +389,9 @@ class _Client:
         # The client has disconnected, see while_there(): no answer can be sent.
         except TimeoutError:
             raise
-        except ControlError as exc:
-            await self.send(encode_error(request_id(line) if number is None else number, exc))
-        except ImageError as exc:
-            error = ControlError(str(exc), code=ErrorCode.UNAVAILABLE)
-            await self.send(encode_error(number, error))
-        except BusError as exc:
-            why = to_record(exc)
-            failure = Failure(ErrorCode.BUS, why.message, why.kind, why.detail)
-            await self.send(encode_failure(number, failure))
-        except SdoAbortError as exc:
-            failure = Failure(ErrorCode.ABORT, str(exc), detail=exc.code)
-            await self.send(encode_failure(number, failure))
-        except Exception:
-            logger.exception("control method failed")
-            error = ControlError(
-                "internal error; the log of services has the cause", code=ErrorCode.INTERNAL
-            )
-            await self.send(encode_error(number, error))
+        except Exception as exc:  # noqa: BLE001  failure_of() logs a defect
+            number = request_id(line) if number is None else number
+            await self.send(encode_failure(number, failure_of(exc)))
         else:
             await self.send(encode_result(number, result))
 

@@ -22,6 +22,7 @@ from time import monotonic_ns
 from typing import TypeAlias
 
 from eap.ams.access import AccessList, AuditEntry, host_of
+from eap.ams.error_reply import RoutingError
 from eap.ams.hop_prober import HopProber
 from eap.ams.inflight import RouterLimits
 from eap.ams.record import Outcome, Record, Stats, Trace, reason_of
@@ -30,7 +31,7 @@ from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
 from eap.ams.transport_table import Action, Forward, Reply, Transport
-from eap.codec.ams import AmsAnswer, AmsHeader
+from eap.codec.ams import AmsAnswer, AmsHeader, encode_packet
 from eap.ids import Endpoint, NetId
 from eap.services.limited_log import caused_by
 from eap.services.routing.service import (
@@ -251,6 +252,18 @@ class StationRouter:
     def set_access(self, access: AccessList) -> None:
         """Apply other access rules from now on."""
         self._router.access_filter.access = access
+
+    def denial(self, header: AmsHeader, body: bytes, endpoint: Endpoint) -> str:
+        """Return why the access rules deny a request, empty if they allow it; denials are audited.
+
+        For a service of another station whose requests concern this station, too.
+        """
+        packet = encode_packet(header, body)
+        found = self._router.access_filter.filter_request(header, packet, endpoint, monotonic_ns())
+        if not isinstance(found, RoutingError):
+            return ""
+        self._publish_events()
+        return found.text
 
     def require_record(self, record: Callable[[AuditEntry], str]) -> None:
         """Deny changes that cannot be recorded: *record* returns the reason, or an empty text."""

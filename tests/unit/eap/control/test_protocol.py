@@ -91,3 +91,10 @@ def test_unless_unavailable_converts_environmental_errors():
     with pytest.raises(ControlError, match="disk full") as caught, unless_unavailable():
         raise EnvironmentalError("disk full")
     assert caught.value.code is ErrorCode.UNAVAILABLE
+
+
+def test_a_line_nested_too_deep_is_refused():
+    line = b'{"v": 1, "id": 3, "method": "read", "params": {"a": ' + b"[" * 100_000
+    with pytest.raises(ControlError, match="nested too deep"):
+        control.decode_request(line)
+    assert control.request_id(line) is None
