@@ -219,6 +219,10 @@ class ApplianceFolder(Closeable):
         """File of the ring of recorded frames."""
         return self.path / "frames.ring"
 
+    def segment(self, digest: str) -> Path:
+        """Return the file of the simulated slaves with *digest*."""
+        return self.path / f"{digest}.slaves"
+
     def image(self, station: str) -> Path:
         """Return the file of one station's process image."""
         return self.path / f"{folder_name(station)}.image"

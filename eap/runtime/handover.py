@@ -77,7 +77,10 @@ class SharedSocket(SpecRecord, frozen=True):
 
 
 class BusSocket(SpecRecord, frozen=True):
-    """Descriptors of one bus port, opened once like the shared sockets."""
+    """Lines of one bus port to its slaves, opened once like the shared sockets.
+
+    A port with another interface, second line or simulation has another bus.
+    """
 
     owner: PortName
     number: int = 0
@@ -94,6 +97,26 @@ class BusSocket(SpecRecord, frozen=True):
     """Socket of the second line of a ring, for the engine."""
     segment_second_fd: int = NO_DESCRIPTOR
     """The other side of its pair, for the process of a simulated segment."""
+    interface: str = ""
+    redundant: str = ""
+    """Interface of the second line of a ring."""
+    simulated: str = ""
+    """Digest of the simulated slaves."""
+
+    @property
+    def key(self) -> BusSocket:
+        """The bus without number and descriptors."""
+        return BusSocket(
+            self.owner,
+            interface=self.interface,
+            redundant=self.redundant,
+            simulated=self.simulated,
+        )
+
+    @property
+    def is_simulated(self) -> bool:
+        """True if a process of the appliance is its slaves."""
+        return self.interface.startswith("sim:")
 
 
 class InheritedRecord(SpecRecord, frozen=True):
@@ -123,6 +146,10 @@ class SegmentHandover(InheritedRecord, frozen=True):
     """Process id, as in Handover."""
     file: str
     """The bus file."""
+    digest: str
+    """Of the slaves that it had when it was applied; empty for whatever it has now."""
+    copy: str
+    """File with these slaves, as long as the appliance runs."""
     frames_fd: int
     """This side of the pair with the engine."""
     command_fd: int

@@ -17,7 +17,7 @@ from typing import TypeAlias, TypeVar
 import msgspec
 
 from eap.pd.spec import SpecRecord
-from eap.runtime.handover import PortName, SharedSocket
+from eap.runtime.handover import BusSocket, PortName, SharedSocket
 
 _MAX_MESSAGE = 8192
 _MAX_DESCRIPTORS = 16
@@ -62,7 +62,25 @@ class CloseSocket(SpecRecord, frozen=True, tag="close", tag_field="do"):
     socket: SharedSocket
 
 
-SupervisorRequest: TypeAlias = OpenSocket | CloseSocket
+class OpenBus(SpecRecord, frozen=True, tag="open-bus", tag_field="do"):
+    """Open the lines of a bus, and start its simulated slaves, or pass those of an open one again.
+
+    The reply has the number of the bus, and its descriptors for engine and services.  It comes
+    when the simulated slaves are ready.
+    """
+
+    id: int
+    """As in OpenSocket."""
+    bus: BusSocket
+
+
+class CloseBus(SpecRecord, frozen=True, tag="close-bus", tag_field="do"):
+    """Close the lines of a bus, which no port uses any more; not answered."""
+
+    bus: BusSocket
+
+
+SupervisorRequest: TypeAlias = OpenSocket | CloseSocket | OpenBus | CloseBus
 """Message of services to the supervisor."""
 
 
@@ -72,6 +90,8 @@ class SupervisorReply(SpecRecord, frozen=True):
     id: int
     error: str = ""
     names: tuple[str, ...] = ()
+    number: int = 0
+    """Number of a bus."""
 
 
 def pass_descriptors(
@@ -153,10 +173,10 @@ class SupervisorRequests:
         received = receive_descriptors(self._socket)
         return None if received is None or not received[0] else self._decoder.decode(received[0])
 
-    def reply(self, number: int, descriptors: Mapping[str, int]) -> None:
-        """Answer request *number* with the named descriptors."""
+    def reply(self, number: int, descriptors: Mapping[str, int], bus: int = 0) -> None:
+        """Answer request *number* with the named descriptors, and the number of a *bus*."""
         # A process that reads no replies reports the time-out of its request.
-        message = SupervisorReply(number, names=tuple(descriptors))
+        message = SupervisorReply(number, names=tuple(descriptors), number=bus)
         pass_descriptors(self._socket, message, [*descriptors.values()])
 
     def refuse(self, number: int, error: str) -> None:

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from msgspec.structs import replace
 
 from eap.codec.ethercat import EAP_PORT
-from eap.pd.spec import PortKind, PortSpec, StationSpec
-from eap.runtime.handover import PortName, SharedSocket, SocketKind
+from eap.pd.spec import BusPortSpec, PortKind, PortSpec, StationSpec
+from eap.runtime.handover import BusSocket, PortName, SharedSocket, SocketKind
 
 BROADCAST = "255.255.255.255"
 EVERY_ADDRESS = "0.0.0.0"  # noqa: S104  what a plant file may say
@@ -87,9 +87,22 @@ def _ams_address(port: PortSpec) -> str:
     return uri.host if port.ams and uri.scheme in {"udp", "tcp"} else ""
 
 
-def bus_ports(stations: Iterable[StationSpec]) -> Iterator[tuple[PortName, PortSpec]]:
-    """Yield all bus ports."""
-    for station in stations:
-        for port in station.ports:
-            if port.kind is PortKind.BUS:
-                yield PortName(station.name, port.name), port
+def plan_buses(stations: Iterable[StationSpec]) -> tuple[BusSocket, ...]:
+    """Return the buses to open for *stations*, in the order of their ports."""
+    return tuple(
+        bus_of(station.name, port)
+        for station in stations
+        for port in station.ports
+        if port.kind is PortKind.BUS
+    )
+
+
+def bus_of(station: str, port: PortSpec) -> BusSocket:
+    """Return the bus at a bus port, without number and descriptors."""
+    bus = port.bus or BusPortSpec()
+    return BusSocket(
+        PortName(station, port.name),
+        interface=str(port.interface),
+        redundant=bus.redundant,
+        simulated=bus.simulated,
+    )

@@ -14,7 +14,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -138,7 +138,7 @@ def run_for_appliance(handover: SegmentHandover, startup: Startup) -> None:
         ConfigError: the bus file is none; one line a finding.
     """
     startup.step("reading the bus file")
-    bus = load_or_raise(Path(handover.file))
+    bus = load_copy(handover)
     startup.step("building the slaves")
     segment = bus.build()
     with catch_end_signals() as end_fd, ExitStack() as stack:
@@ -154,6 +154,32 @@ def run_for_appliance(handover: SegmentHandover, startup: Startup) -> None:
         gc.freeze()
         startup.finish({"slaves": len(bus.spec.slaves)})
         _Loop(segment, sockets, CommandMessages(commands)).run(end_fd)
+
+
+def load_copy(handover: SegmentHandover) -> BusFile:
+    """Return the bus file with the slaves that it had when it was applied.
+
+    They are copied at the first start: the file may be edited, and be applied and rolled back.
+
+    Raises:
+        ConfigError: the bus file is none; one line a finding.
+    """
+    copy, file = Path(handover.copy), Path(handover.file)
+    if not handover.copy:
+        return load_or_raise(file)
+    with suppress(OSError, msgspec.MsgspecError):
+        return msgspec.msgpack.decode(copy.read_bytes(), type=BusFile)
+    bus = load_or_raise(file)
+    if bus.digest() != handover.digest:
+        sys.stderr.write(
+            f"segment: {file} has changed since it was applied: it is played as it is\n"
+        )
+        return bus
+    temporary = copy.with_suffix(f".{os.getpid()}")
+    with suppress(OSError):  # without a copy the file is played as it is
+        temporary.write_bytes(msgspec.msgpack.encode(bus))
+        temporary.replace(copy)
+    return bus
 
 
 class _Loop:

@@ -31,7 +31,13 @@ from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, StationSpec
 from eap.pd.station import Station
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
-from eap.runtime.handover import NO_DESCRIPTOR, EngineOptions, Handover, SegmentHandover
+from eap.runtime.handover import (
+    NO_DESCRIPTOR,
+    BusSocket,
+    EngineOptions,
+    Handover,
+    SegmentHandover,
+)
 from eap.runtime.plantfile import load_plant, require_own_buses
 from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
@@ -42,7 +48,6 @@ from eap.supervisor.sockets import (
     UnavailableSocketError,
     inherited_by_engine,
     inherited_by_services,
-    segments,
 )
 
 GRACE_NS = 1_000_000_000
@@ -116,7 +121,7 @@ def _run(
     adopt_plant_file(info.plant, stations, first_state)
     if info.plant_file:
         _log_stored_differences(info.plant, stations)
-    with SharedSockets(stations, folder.control_socket) as sockets:
+    with SharedSockets(folder.control_socket) as sockets:
         supervisor = Supervisor(
             info, plant, folder, sockets, options=options, first_state=first_state
         )
@@ -178,10 +183,13 @@ class Supervisor:
         self._info = info
         info.audit_required = plant.audit_required
         self._folder = folder
-        bytecode = str(folder.bytecode)
-        self._engine = Child("engine", "eap.engine.process", bytecode)
-        self._services = Child("services", "eap.services.process", bytecode)
-        self._segments: dict[str, Child] = {}
+        self._bytecode = str(folder.bytecode)
+        self._engine = Child("engine", "eap.engine.process", self._bytecode)
+        self._services = Child("services", "eap.services.process", self._bytecode)
+        self._segments: dict[BusSocket, Child] = {}
+        """Of simulated buses, by key."""
+        self._leaving: dict[Child, int] = {}
+        """Segments of buses that were closed, and when they are killed."""
         self._restart_ns: dict[Child, int] = {}
         self._announced = False
         self._is_info_old = False
@@ -193,7 +201,6 @@ class Supervisor:
             plant_file=info.plant_file,
             stations=plant.stations,
             sockets=(),
-            buses=sockets.buses,
             options=options,
             first_state=first_state,
             routing=_own_routing(plant),
@@ -201,24 +208,27 @@ class Supervisor:
             audit_required=plant.audit_required,
         )
         self._sockets = sockets
-        self._given = _given_to_segments(self._segments, common, bytecode)
-        self._given[self._engine] = replace(
-            common, link_fd=sockets.engine_link, bus_fd=sockets.engine_bus
-        )
-        self._given[self._services] = replace(
-            common,
-            link_fd=sockets.services_link,
-            bus_fd=sockets.services_bus,
-            control_fd=sockets.control,
-            supervisor_fd=sockets.services_end,
-        )
-        self._children = tuple(self._given)
+        self._common = common
+        self._given = {
+            self._engine: replace(common, link_fd=sockets.engine_link, bus_fd=sockets.engine_bus),
+            self._services: replace(
+                common,
+                link_fd=sockets.services_link,
+                bus_fd=sockets.services_bus,
+                control_fd=sockets.control,
+                supervisor_fd=sockets.services_end,
+            ),
+        }
+
+    @property
+    def _children(self) -> tuple[Child, ...]:
+        return (*self._segments.values(), self._engine, self._services, *self._leaving)
 
     def run(self) -> int:
         """Return the exit code when everything has ended."""
         with catch_end_signals() as wake_fd:
             try:
-                for child in self._children:
+                for child in (self._engine, self._services):
                     self._start(child)
                 while self._exit_code is None:
                     self._wait(wake_fd, self._timeout_ms())
@@ -228,28 +238,76 @@ class Supervisor:
         return self._exit_code
 
     def _start(self, child: Child) -> None:
-        self._restart_ns.pop(child, None)
-        handover = self._given[child]
-        if isinstance(handover, SegmentHandover):
-            given = (handover.frames_fd, handover.command_fd, handover.second_fd)
-            descriptors = [fd for fd in given if fd != NO_DESCRIPTOR]
+        # At each start and not once: the station may have been reconfigured since.
+        handover = with_stored_configuration(self._given[child], self._sockets)
+        if child is self._services:
+            # The process before may have ended in a change, which no one goes on with.
+            self._sockets.serve()
+            self._sockets.keep_only((*handover.sockets, *handover.buses))
+            descriptors = inherited_by_services(handover)
         else:
-            # At each start and not once: the station may have been reconfigured since.
-            handover = with_stored_configuration(handover, self._sockets)
-            if child is self._services:
-                # The process before may have ended in a change, which no one goes on with.
-                self._sockets.serve()
-                self._sockets.keep_only(handover.sockets)
-                descriptors = inherited_by_services(handover)
-            else:
-                descriptors = inherited_by_engine(handover)
+            descriptors = inherited_by_engine(handover)
+        self._start_with(child, handover, descriptors)
+        self._follow_buses()
+
+    def _start_segment(self, bus: BusSocket, child: Child) -> None:
+        self._restart_ns.pop(child, None)
+        handover = SegmentHandover(
+            self._common.supervisor,
+            InterfaceUri.parse(bus.interface).host,
+            bus.simulated,
+            str(self._folder.segment(bus.simulated)) if bus.simulated else "",
+            frames_fd=bus.segment_fd,
+            command_fd=bus.segment_command_fd,
+            second_fd=bus.segment_second_fd,
+            realtime=self._common.options.realtime,
+        )
+        given = (handover.frames_fd, handover.command_fd, handover.second_fd)
+        self._start_with(child, handover, [fd for fd in given if fd != NO_DESCRIPTOR])
+
+    def _follow_buses(self) -> None:
+        """Start the simulated slaves of buses that are new, and end those of closed ones."""
+        simulated = {bus.key: bus for bus in self._sockets.buses if bus.is_simulated}
+        for key in self._segments.keys() - simulated.keys():
+            self._dismiss(self._segments.pop(key))
+        for key, bus in simulated.items():
+            if key not in self._segments:
+                name = f"segment {_label(key)}"
+                child = Child(name, "eap.segment.process", self._bytecode)
+                self._segments[key] = child
+                self._start_segment(bus, child)
+            elif self._segments[key].watch.has_run:
+                self._sockets.confirm(bus)
+
+    def _dismiss(self, child: Child) -> None:
+        """End a segment whose bus was closed."""
+        self._restart_ns.pop(child, None)
+        if child.pid:
+            child.send_signal(signal.SIGTERM)
+            self._leaving[child] = self._clock() + SEGMENT_GRACE_NS
+
+    def _refuse_bus(self, child: Child, reason: str) -> bool:
+        """Refuse the request for the bus of a segment that cannot start; return False if none."""
+        key = next((key for key, each in self._segments.items() if each is child), None)
+        if key is None or not self._sockets.refuse(key, reason):
+            return False
+        del self._segments[key]
+        self._restart_ns.pop(child, None)
+        return True
+
+    def _start_with(
+        self, child: Child, handover: Handover | SegmentHandover, descriptors: list[int]
+    ) -> None:
         try:
             child.start(handover, descriptors, self._clock())
         except OSError as exc:
             # A start that failed half way leaves its pipes open.
             child.close()
-            if not child.watch.has_run:
-                raise EnvironmentalError(f"{child.name} cannot be started: {exc}") from None
+            reason = f"{child.name} cannot be started: {exc}"
+            if self._refuse_bus(child, reason):
+                return
+            if not child.watch.has_run and not self._announced:
+                raise EnvironmentalError(reason) from None
             delay_ns = child.policy.delay_ns(0)
             self._restart_ns[child] = self._clock() + delay_ns
             logger.warning(
@@ -260,7 +318,7 @@ class Supervisor:
 
     def _timeout_ms(self) -> int:
         now_ns = self._clock()
-        deadlines = list(self._restart_ns.values())
+        deadlines = [*self._restart_ns.values(), *self._leaving.values()]
         timeouts = (child.watch.next_timeout() for child in self._children)
         deadlines += [each for each in timeouts if each is not None]
         return max(0, -(-(min(deadlines) - now_ns) // 1_000_000)) if deadlines else -1
@@ -279,8 +337,6 @@ class Supervisor:
             os.read(wake_fd, 64)
             self._exit_code = 0
             return
-        if self._sockets.fileno() in fired:
-            self._sockets.serve()
         for child in self._children:
             if child.error_fd in fired:
                 child.forward_output()
@@ -288,6 +344,10 @@ class Supervisor:
                 self._follow_start(child)
             if child.pid_fd in fired:
                 self._handle_exit(child)
+        # Last: a descriptor of a process that it starts may be equal to one that has fired.
+        if self._sockets.fileno() in fired:
+            self._sockets.serve()
+            self._follow_buses()
 
     def _follow_start(self, child: Child) -> None:
         running = {each.name for each in self._children if each.is_ready}
@@ -304,6 +364,7 @@ class Supervisor:
         child.watch.succeed()
         for each in self._children:
             each.watch.release(child.name, self._clock())
+        self._follow_buses()  # a request may wait for this segment
         self._write_info()
         if child.restarts:
             took_ms = (self._clock() - child.started_ns) // 1_000_000
@@ -320,8 +381,15 @@ class Supervisor:
     def _handle_exit(self, child: Child) -> None:
         lived_ns = self._clock() - child.started_ns
         code, last_line = child.reap()
+        if self._leaving.pop(child, None) is not None:
+            self._write_info()
+            return
+        never_ran = not child.watch.has_run and not child.watch.is_stuck
+        if never_ran and self._refuse_bus(child, last_line.removeprefix("segment: ")):
+            self._write_info()
+            return
         # A process that has never run would fail again: the appliance ends with its exit code.
-        if not child.watch.has_run and not child.watch.is_stuck:
+        if never_ran and not self._announced:
             if code < 0:
                 # A signal leaves no line of the process itself, unlike an exit code.
                 logger.error("%s was %s while starting", child.name, describe_end(code))
@@ -341,13 +409,24 @@ class Supervisor:
             self._restart_ns[child] = self._clock() + delay_ns
             self._write_info()
         else:
-            self._start(child)
+            self._start_again(child)
+
+    def _start_again(self, child: Child) -> None:
+        for bus in self._sockets.buses:
+            if self._segments.get(bus.key) is child:
+                self._start_segment(bus, child)
+                return
+        self._start(child)
 
     def _check_time(self) -> None:
         now_ns = self._clock()
         for child, due_ns in list(self._restart_ns.items()):
             if now_ns >= due_ns and self._exit_code is None:
-                self._start(child)
+                self._start_again(child)
+        for child, end_ns in self._leaving.items():
+            if now_ns >= end_ns:
+                child.send_signal(signal.SIGKILL)
+                self._leaving[child] = now_ns + GRACE_NS
         for child in self._children:
             self._check_start(child, now_ns)
 
@@ -372,7 +451,7 @@ class Supervisor:
     def _end_children(self) -> None:
         """End all: segments last, for the engine brings their slaves to rest."""
         self._end((self._engine, self._services), GRACE_NS)
-        self._end(self._segments.values(), SEGMENT_GRACE_NS)
+        self._end((*self._segments.values(), *self._leaving), SEGMENT_GRACE_NS)
 
     def _end(self, children: Collection[Child], grace_ns: int) -> None:
         for child in children:
@@ -398,7 +477,9 @@ class Supervisor:
     def _write_info(self) -> None:
         self._info.engine = _process_info(self._engine)
         self._info.services = _process_info(self._services)
-        self._info.segments = {name: _process_info(child) for name, child in self._segments.items()}
+        self._info.segments = {
+            _label(key): _process_info(child) for key, child in self._segments.items()
+        }
         try:
             self._folder.write_info(self._info)
         except OSError as exc:  # a full disk: what commands find in it is older than it should be
@@ -429,19 +510,8 @@ def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:
     return {name: routing for name, routing in plant.routing.items() if name in names}
 
 
-def _given_to_segments(
-    children: dict[str, Child], common: Handover, bytecode: str
-) -> dict[Child, Handover | SegmentHandover]:
-    """Add a child for each simulated segment; return what they are given."""
-    given: dict[Child, Handover | SegmentHandover] = {}
-    handovers = segments(
-        common.stations, common.buses, common.supervisor, realtime=common.options.realtime
-    )
-    for owner, handover in handovers:
-        name = f"{owner.station}/{owner.port}"
-        child = children[name] = Child(f"segment {name}", "eap.segment.process", bytecode)
-        given[child] = handover
-    return given
+def _label(bus: BusSocket) -> str:
+    return f"{bus.owner.station}/{bus.owner.port}"
 
 
 def with_stored_configuration(handover: Handover, sockets: SharedSockets) -> Handover:
@@ -463,7 +533,7 @@ def with_stored_configuration(handover: Handover, sockets: SharedSockets) -> Han
         states[given.name] = found.state
     while True:
         try:
-            opened = sockets.fit(specs)
+            opened, buses = sockets.fit(specs), sockets.fit_buses(specs)
         except UnavailableSocketError as exc:
             changed = _without_stored(handover, specs, {owner.station for owner in exc.owners})
             if changed == specs:
@@ -471,7 +541,9 @@ def with_stored_configuration(handover: Handover, sockets: SharedSockets) -> Han
             logger.warning("%s: the plant file runs: %s", ", ".join(_names_of(exc)), exc)
             specs = changed
         else:
-            return replace(handover, stations=tuple(specs), states=states, sockets=opened)
+            return replace(
+                handover, stations=tuple(specs), states=states, sockets=opened, buses=buses
+            )
 
 
 def _without_stored(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -32,30 +32,23 @@ from eap.net.ipsocket import (
     open_udp_receiver,
 )
 from eap.net.packetsocket import open_arp, open_packet_pair
-from eap.pd.spec import PortSpec, StationSpec
+from eap.pd.spec import StationSpec
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
     BusSocket,
     Handover,
     PortName,
-    SegmentHandover,
     SharedSocket,
     SocketKind,
 )
-from eap.runtime.passing import CloseSocket, SupervisorRequests
-from eap.runtime.socket_plan import bus_ports, plan_sockets
-
-SIMULATED = "sim"
-
-
-def open_buses(stations: Sequence[StationSpec], opened: ExitStack) -> tuple[BusSocket, ...]:
-    """Open what all bus ports need; *opened* closes it.
-
-    Raises:
-        EnvironmentalError: an interface cannot be opened, and why.
-    """
-    ports = enumerate(bus_ports(stations), 1)
-    return tuple(_open_bus(name, port, number, opened) for number, (name, port) in ports)
+from eap.runtime.passing import (
+    CloseBus,
+    CloseSocket,
+    OpenBus,
+    OpenSocket,
+    SupervisorRequests,
+)
+from eap.runtime.socket_plan import plan_buses, plan_sockets
 
 
 def open_message_pair(opened: ExitStack) -> tuple[int, int]:
@@ -65,47 +58,27 @@ def open_message_pair(opened: ExitStack) -> tuple[int, int]:
     return first, second
 
 
-def segments(
-    stations: Sequence[StationSpec],
-    buses: Sequence[BusSocket],
-    supervisor: int,
-    *,
-    realtime: bool,
-) -> Iterator[tuple[PortName, SegmentHandover]]:
-    """Yield what the process of each simulated segment is given."""
-    for (name, port), bus in zip(bus_ports(stations), buses, strict=True):
-        if _is_simulated(port) and port.bus is not None:
-            yield (
-                name,
-                SegmentHandover(
-                    supervisor,
-                    port.bus.file,
-                    frames_fd=bus.segment_fd,
-                    command_fd=bus.segment_command_fd,
-                    second_fd=bus.segment_second_fd,
-                    realtime=realtime,
-                ),
-            )
-
-
-def _open_bus(name: PortName, port: PortSpec, number: int, opened: ExitStack) -> BusSocket:
-    if not _is_simulated(port):
-        sock = opened.enter_context(open_bus_socket(port.interface))
-        second_fd = NO_DESCRIPTOR
-        if port.bus is not None and port.bus.redundant:
-            second = open_bus_socket(InterfaceUri.parse(port.bus.redundant))
-            second_fd = opened.enter_context(second).fileno()
-        return BusSocket(name, number, engine_fd=sock.fileno(), second_fd=second_fd)
+def _open_bus(planned: BusSocket, opened: ExitStack) -> BusSocket:
+    if not planned.is_simulated:
+        uris = [planned.interface, *([planned.redundant] if planned.redundant else [])]
+        fds = [
+            opened.enter_context(open_bus_socket(InterfaceUri.parse(uri))).fileno() for uri in uris
+        ]
+        return replace(planned, engine_fd=fds[0], second_fd=fds[1] if fds[1:] else NO_DESCRIPTOR)
     engine_fd, segment_fd = open_message_pair(opened)
     command_fd, segment_command_fd = open_message_pair(opened)
-    lines = (NO_DESCRIPTOR, NO_DESCRIPTOR)
-    if port.bus is not None and port.bus.redundant:
-        lines = open_message_pair(opened)
-    return BusSocket(name, number, engine_fd, segment_fd, segment_command_fd, command_fd, *lines)
-
-
-def _is_simulated(port: PortSpec) -> bool:
-    return port.interface.scheme == SIMULATED
+    second_fd = segment_second_fd = NO_DESCRIPTOR
+    if planned.redundant:
+        second_fd, segment_second_fd = open_message_pair(opened)
+    return replace(
+        planned,
+        engine_fd=engine_fd,
+        segment_fd=segment_fd,
+        segment_command_fd=segment_command_fd,
+        command_fd=command_fd,
+        second_fd=second_fd,
+        segment_second_fd=segment_second_fd,
+    )
 
 
 CONTROL_BACKLOG = 512
@@ -130,7 +103,6 @@ class SharedSockets(Closeable):
     Each address and port number is a reuseport group of its own, so an addition changes no other.
 
     Attributes:
-        buses: What belongs to each bus port.
         engine_link: The engine's side of its pair with services.
         services_link: The other side.
         engine_bus: The engine's side of the pair for requests to stations and buses.
@@ -139,17 +111,20 @@ class SharedSockets(Closeable):
         control: The listening control socket.
     """
 
-    def __init__(self, stations: Sequence[StationSpec], control_path: Path) -> None:
-        """Open all but the sockets of EAP ports, or nothing.
+    def __init__(self, control_path: Path) -> None:
+        """Open all but the sockets of ports, or nothing.
 
         Raises:
             EnvironmentalError: something cannot be opened, and why.
         """
         self._table: dict[SharedSocket, SharedSocket] = {}
-        self._owned: dict[SharedSocket, ExitStack] = {}
+        self._buses: dict[BusSocket, BusSocket] = {}
+        self._owned: dict[SharedSocket | BusSocket, ExitStack] = {}
+        self._last_bus = 0
+        self._waiting: dict[int, BusSocket] = {}
+        """Requests for buses by id, until their simulated slaves are ready."""
         with ExitStack() as opened:
             opened.callback(self._close_table)
-            self.buses = open_buses(stations, opened)
             self.engine_link, self.services_link = open_message_pair(opened)
             self.engine_bus, self.services_bus = open_message_pair(opened)
             own_end, self.services_end = open_message_pair(opened)
@@ -166,20 +141,57 @@ class SharedSockets(Closeable):
     def serve(self) -> None:
         """Serve the requests of services that are there."""
         while (request := self._requests.receive()) is not None:
-            if isinstance(request, CloseSocket):
-                self._close(request.socket.key)
-                continue
-            try:
-                opened = self._open(request.socket)
-            except EnvironmentalError as exc:
-                self._requests.refuse(request.id, str(exc))
-                continue
+            match request:
+                case CloseSocket():
+                    self._close(request.socket.key)
+                case CloseBus():
+                    self._close(request.bus.key)
+                case _:
+                    try:
+                        self._serve(request)
+                    except EnvironmentalError as exc:
+                        self._requests.refuse(request.id, str(exc))
+
+    def _serve(self, request: OpenSocket | OpenBus) -> None:
+        if isinstance(request, OpenSocket):
+            opened = self._open(request.socket)
             pair = {"engine_fd": opened.engine_fd, "services_fd": opened.services_fd}
-            existing = {name: fd for name, fd in pair.items() if fd != NO_DESCRIPTOR}
-            self._requests.reply(request.id, existing)
+            self._requests.reply(request.id, _open_ones(pair))
+            return
+        bus = self._open_bus(request.bus)
+        self._waiting[request.id] = bus.key
+        if not bus.is_simulated:
+            self.confirm(bus)
+
+    @property
+    def buses(self) -> tuple[BusSocket, ...]:
+        """All open buses."""
+        return tuple(self._buses.values())
+
+    def confirm(self, bus: BusSocket) -> None:
+        """Answer the requests for *bus*, whose slaves are ready if they are simulated."""
+        lines = {
+            "engine_fd": bus.engine_fd,
+            "second_fd": bus.second_fd,
+            "command_fd": bus.command_fd,
+        }
+        for number in self._take_waiting(bus):
+            self._requests.reply(number, _open_ones(lines), bus.number)
+
+    def refuse(self, bus: BusSocket, reason: str) -> bool:
+        """Close *bus*, whose slaves cannot be simulated; return False if no request waits for it.
+
+        It stays open then.
+        """
+        numbers = self._take_waiting(bus)
+        for number in numbers:
+            self._requests.refuse(number, reason)
+        if numbers:
+            self._close(bus.key)
+        return bool(numbers)
 
     def fit(self, stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
-        """Open what *stations* need beside what is open; return their sockets.
+        """Open the sockets that *stations* need beside what is open; return all of theirs.
 
         Raises:
             UnavailableSocketError: one cannot be opened; those that were opened stay open.
@@ -189,9 +201,13 @@ class SharedSockets(Closeable):
             for planned in plan_sockets(stations)
         )
 
-    def keep_only(self, wanted: Iterable[SharedSocket]) -> None:
-        """Close all sockets of ports but *wanted*."""
-        for key in self._table.keys() - {each.key for each in wanted}:
+    def fit_buses(self, stations: Sequence[StationSpec]) -> tuple[BusSocket, ...]:
+        """Open the buses that *stations* need beside what is open; returns and raises as fit."""
+        return tuple(self._open_bus(planned) for planned in plan_buses(stations))
+
+    def keep_only(self, wanted: Iterable[SharedSocket | BusSocket]) -> None:
+        """Close all sockets and buses of ports but *wanted*."""
+        for key in self._owned.keys() - {each.key for each in wanted}:
             self._close(key)
 
     def close(self) -> None:
@@ -209,9 +225,33 @@ class SharedSockets(Closeable):
                 self._owned[key] = opened.pop_all()
         return self._table[key]
 
-    def _close(self, key: SharedSocket) -> None:
-        if self._table.pop(key, None) is not None:
-            self._owned.pop(key).close()
+    def _open_bus(self, planned: BusSocket) -> BusSocket:
+        key = planned.key
+        if key not in self._buses:
+            with ExitStack() as opened:
+                try:
+                    bus = _open_bus(key, opened)
+                except EnvironmentalError as exc:
+                    raise UnavailableSocketError(str(exc), (key.owner,)) from None
+                # Counted up for each: requests to a bus that is gone must not reach another one.
+                self._last_bus += 1
+                self._buses[key] = replace(bus, number=self._last_bus)
+                self._owned[key] = opened.pop_all()
+        return self._buses[key]
+
+    def _take_waiting(self, bus: BusSocket) -> list[int]:
+        numbers = [number for number, key in self._waiting.items() if key == bus.key]
+        for number in numbers:
+            del self._waiting[number]
+        return numbers
+
+    def _close(self, key: SharedSocket | BusSocket) -> None:
+        if isinstance(key, BusSocket):
+            self._buses.pop(key, None)
+        else:
+            self._table.pop(key, None)
+        if (opened := self._owned.pop(key, None)) is not None:
+            opened.close()
 
     def _close_table(self) -> None:
         self.keep_only(())
@@ -231,10 +271,16 @@ def inherited_by_services(handover: Handover) -> list[int]:
     # says of the frames that the engine sends, and renews memberships, which end with their
     # interface.
     wanted += [shared.engine_fd for shared in handover.sockets]
-    wanted += [bus.command_fd for bus in handover.buses]
+    wanted += [
+        fd for bus in handover.buses for fd in (bus.engine_fd, bus.second_fd, bus.command_fd)
+    ]
     return _existing(
         *wanted, handover.link_fd, handover.bus_fd, handover.control_fd, handover.supervisor_fd
     )
+
+
+def _open_ones(descriptors: Mapping[str, int]) -> dict[str, int]:
+    return {name: fd for name, fd in descriptors.items() if fd != NO_DESCRIPTOR}
 
 
 def _existing(*descriptors: int) -> list[int]:

@@ -135,7 +135,7 @@ def run(job: dict[str, Any]) -> None:
     """Run one station that changes again and again, and answer how late its cycles were."""
     folder = Path(job["folder"])
     spec = station(job["pds"])
-    with SharedSockets((spec,), folder / "control") as shared:
+    with SharedSockets(folder / "control") as shared:
         handover = Handover(
             os.getppid(), str(folder), "change", "", (spec,), own_sockets(shared.fit((spec,)))
         )

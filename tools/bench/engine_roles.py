@@ -63,7 +63,7 @@ def run(job: dict[str, Any]) -> None:
     """Run two stations that send to each other, in the loop of the engine process."""
     folder, cycle_us = Path(job["folder"]), job["cycle_us"]
     stations = tuple(_station(number, cycle_us) for number in (1, 2))
-    with SharedSockets(stations, folder / "control") as shared:
+    with SharedSockets(folder / "control") as shared:
         handover = Handover(
             supervisor=os.getppid(),
             folder=str(folder),

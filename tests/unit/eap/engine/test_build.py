@@ -95,7 +95,7 @@ def shared(tmp_path):
     opened = []
 
     def open_for(*stations):
-        sockets = SharedSockets(stations, tmp_path / f"control{len(opened)}")
+        sockets = SharedSockets(tmp_path / f"control{len(opened)}")
         opened.append(sockets)
         # The plant closes what it is given: here it shares a process with the supervisor.
         return [

@@ -163,7 +163,7 @@ def test_restarted_engine_goes_on_in_the_same_ring(open_recorded):
 
 def test_datagrams_are_recorded_with_their_addresses(open_recorded, tmp_path):
     stations = [left(), right(eap_port(2, tcp=True))]
-    sockets = SharedSockets(stations, tmp_path / "control")
+    sockets = SharedSockets(tmp_path / "control")
     try:
         given = [
             msgspec.structs.replace(each, engine_fd=socket.dup(each.engine_fd))

@@ -44,7 +44,7 @@ def test_crosses_in_a_file_without_a_name():
 
 
 def test_a_segment_gets_its_own():
-    given = SegmentHandover(7, "/plants/io.yaml", 5, 6)
+    given = SegmentHandover(7, "/plants/io.yaml", "digest", "/run/digest.slaves", 5, 6)
     assert SegmentHandover.from_descriptor(given.to_descriptor()) == given
 
 

@@ -20,10 +20,12 @@ from devicebus.sim.fault import FaultySegment
 from devicebus.sim.segment import SegmentEnd, SimulatedSegment
 from devicebus.sim.spec import BusSpec
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
+from eap.errors import ConfigError
 from eap.ids import InterfaceUri
-from eap.runtime.busfile import BusFile
+from eap.runtime.busfile import BusFile, load_or_raise
 from eap.runtime.handover import SegmentHandover
 from eap.segment import process as segment_process
+from eap.segment.process import load_copy
 from tests.support.bus import datagram, generic
 from tests.support.startup import read_reports
 
@@ -165,7 +167,7 @@ class Child:
             self.frames.send(frame)
         self.ready, ready = os.pipe()
         given = SegmentHandover(
-            supervisor or os.getpid(), str(file), frames.fileno(), commands.fileno()
+            supervisor or os.getpid(), str(file), "", "", frames.fileno(), commands.fileno()
         )
         fd = given.to_descriptor()
         self.process = subprocess.Popen(
@@ -286,3 +288,24 @@ def test_frames_that_waited_for_a_late_process_come_before_watchdogs(
     loop._poll_timeout_ms()
     loop._forward_frames()
     assert len(calls) == postponed
+
+
+def test_slaves_stay_those_that_were_applied(tmp_path, capsys):
+    file, copy = tmp_path / "bus.yaml", tmp_path / "copy.slaves"
+    file.write_text("bus: b\nslaves: [{name: first, kind: coupler}]\n")
+    digest = load_or_raise(file).digest()
+
+    def slaves(digest):
+        bus = load_copy(SegmentHandover(1, str(file), digest, str(copy), 5, 6))
+        return [slave.name for slave in bus.spec.slaves]
+
+    assert slaves(digest) == ["first"]
+    file.write_text("bus: b\nslaves: [{name: second, kind: coupler}]\n")
+    assert slaves(digest) == ["first"]
+    copy.write_bytes(b"damaged")
+    assert slaves(digest) == ["second"]
+    assert "has changed since it was applied" in capsys.readouterr().err
+    assert load_copy(SegmentHandover(1, str(file), "", "", 5, 6)) == load_or_raise(file)
+    file.write_text("bus: b\nslaves: []\n")
+    with pytest.raises(ConfigError, match="no slaves"):
+        slaves(digest)

@@ -41,7 +41,7 @@ class Services:
             "demo", "demo.yaml", [s.name for s in stations], "2026-01-01T00:00:00+00:00", 1
         )
         self.folder.write_info(self.info)
-        self.sockets = SharedSockets(stations, self.folder.control_socket)
+        self.sockets = SharedSockets(self.folder.control_socket)
         self.ready, ready_end = os.pipe()
         handover = Handover(
             supervisor,
@@ -52,7 +52,7 @@ class Services:
             self.sockets.fit(stations),
             link_fd=self.sockets.services_link,
             control_fd=self.sockets.control,
-            buses=self.sockets.buses,
+            buses=self.sockets.fit_buses(stations),
             bus_fd=self.sockets.services_bus,
             supervisor_fd=self.sockets.services_end,
         )

@@ -38,7 +38,7 @@ def script_on(tmp_path):
         async def serve():
             with ExitStack() as resources:
                 names = [each.name for each in stations]
-                sockets = resources.enter_context(SharedSockets(stations, tmp_path / "control"))
+                sockets = resources.enter_context(SharedSockets(tmp_path / "control"))
                 counters = resources.enter_context(DropCounters(tmp_path / "counts", names))
                 handover = Handover(1, "", "", "", stations, sockets.fit(stations))
                 handover = _with_own_descriptors(handover)

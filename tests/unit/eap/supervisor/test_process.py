@@ -70,7 +70,7 @@ def test_info_names_this_process(stations):
 def test_a_child_that_cannot_start_ends_all_with_its_exit_code(stations, capfd):
     options = EngineOptions(realtime=False)
     with ApplianceFolder.claim("demo") as folder:
-        with SharedSockets(stations, folder.control_socket) as sockets:
+        with SharedSockets(folder.control_socket) as sockets:
             folder.image("left").mkdir()  # no image can be made here
             info = make_info("demo", "demo.yaml", stations)
             assert (
@@ -100,7 +100,7 @@ def test_a_segment_that_cannot_start_ends_all_with_its_exit_code(tmp_path, stati
     station = replace(stations[0], ports=(*stations[0].ports, bus))
     options = EngineOptions(realtime=False)
     with ApplianceFolder.claim("demo") as folder:
-        with SharedSockets([station], folder.control_socket) as sockets:
+        with SharedSockets(folder.control_socket) as sockets:
             info = make_info("demo", "demo.yaml", [station])
             assert (
                 Supervisor(info, Plant("x", (station,)), folder, sockets, options=options).run()
@@ -134,7 +134,7 @@ def test_supervisor_gives_children_that_got_stuck_more_time_and_never_gives_up(
     info = make_info("demo", "demo.yaml", stations)
     with (
         ApplianceFolder.claim("demo") as folder,
-        SharedSockets(stations, folder.control_socket) as sockets,
+        SharedSockets(folder.control_socket) as sockets,
         ThreadPoolExecutor(1) as other,
     ):
         supervisor = Supervisor(
@@ -158,7 +158,7 @@ def test_supervisor_tries_again_when_a_process_that_ran_cannot_be_started(
 
     with (
         ApplianceFolder.claim("demo") as folder,
-        SharedSockets(stations, folder.control_socket) as sockets,
+        SharedSockets(folder.control_socket) as sockets,
     ):
         options = EngineOptions(realtime=False)
         info = make_info("demo", "demo.yaml", stations)
@@ -181,7 +181,7 @@ def handover():
 
 @pytest.fixture
 def sockets(tmp_path):
-    with SharedSockets([], tmp_path / "control") as sockets:
+    with SharedSockets(tmp_path / "control") as sockets:
         yield sockets
 
 

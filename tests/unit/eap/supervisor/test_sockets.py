@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import socket
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import msgspec
@@ -14,17 +14,29 @@ import pytest
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec
-from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
-from eap.runtime.passing import CloseSocket, OpenSocket, pass_descriptors, receive_reply
-from eap.runtime.socket_plan import bus_ports, plan_sockets
+from eap.runtime.handover import (
+    NO_DESCRIPTOR,
+    BusSocket,
+    Handover,
+    PortName,
+    SharedSocket,
+    SocketKind,
+)
+from eap.runtime.passing import (
+    CloseBus,
+    CloseSocket,
+    OpenBus,
+    OpenSocket,
+    pass_descriptors,
+    receive_reply,
+)
+from eap.runtime.socket_plan import plan_buses, plan_sockets
 from eap.supervisor.sockets import (
     SharedSockets,
     UnavailableSocketError,
     inherited_by_engine,
     inherited_by_services,
-    open_buses,
     open_message_pair,
-    segments,
 )
 from tests.unit.eap.conftest import eap_port, left, right
 
@@ -145,7 +157,7 @@ def handover(shared: SharedSockets, *stations: StationSpec) -> Handover:
 def test_all_are_opened_and_described(tmp_path):
     before = open_descriptors()
     port = eap_port(1, join=("239.1.1.1",), broadcast=True)
-    with SharedSockets([left(port)], tmp_path / "control") as shared:
+    with SharedSockets(tmp_path / "control") as shared:
         given = handover(shared, left(port))
         for described in given.sockets:
             of_both = described.kind in {SocketKind.UDP, SocketKind.GROUP}
@@ -173,8 +185,8 @@ def test_buses_add_theirs(tmp_path):
     )
     station = left()
     station = msgspec.structs.replace(station, ports=(*station.ports, bus))
-    with SharedSockets([station], tmp_path / "control") as shared:
-        (described,) = shared.buses
+    with SharedSockets(tmp_path / "control") as shared:
+        (described,) = shared.fit_buses([station])
         given = handover(shared, station)
         assert described.engine_fd in inherited_by_engine(given)
         assert {described.command_fd, shared.services_bus} < set(inherited_by_services(given))
@@ -189,7 +201,7 @@ def test_shared_sockets_close_all_when_one_fails(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
         squatter.bind(("127.9.2.2", 34980))
         with (
-            SharedSockets([left(), right()], tmp_path / "control") as shared,
+            SharedSockets(tmp_path / "control") as shared,
             pytest.raises(UnavailableSocketError, match=r"127\.9\.2\.2:34980") as caught,
         ):
             shared.fit([left(), right()])
@@ -197,13 +209,13 @@ def test_shared_sockets_close_all_when_one_fails(tmp_path):
     assert open_descriptors() == before
     (tmp_path / "control2").touch()
     with pytest.raises(EnvironmentalError, match="control socket"):
-        SharedSockets([left()], tmp_path / "control2")
+        SharedSockets(tmp_path / "control2")
     assert open_descriptors() == before
 
 
 @pytest.mark.net
 def test_sockets_of_ports_that_stay_are_not_opened_again(tmp_path):
-    with SharedSockets([], tmp_path / "control") as shared:
+    with SharedSockets(tmp_path / "control") as shared:
         first = shared.fit([left()])
         both = shared.fit([left(), right()])
         assert {each.services_fd for each in first} < {each.services_fd for each in both}
@@ -217,7 +229,7 @@ def test_sockets_of_ports_that_stay_are_not_opened_again(tmp_path):
 def test_services_requests_sockets(tmp_path):
     wanted = SharedSocket(SocketKind.UDP, "127.9.2.1", 34980)
     with (
-        SharedSockets([], tmp_path / "control") as shared,
+        SharedSockets(tmp_path / "control") as shared,
         socket.socket(fileno=os.dup(shared.services_end)) as services,
     ):
 
@@ -262,20 +274,27 @@ def stations(*ports):
     return first, second
 
 
-def test_ports_are_numbered_station_by_station():
-    plant = stations(bus_port("bus0", "udp://127.0.9.1"), bus_port("bus1", "udp://127.0.9.2"))
-    assert [name for name, _ in bus_ports(plant)] == [
-        PortName("a", "bus0"),
-        PortName("a", "bus1"),
-        PortName("b", "bus0"),
-    ]
+def test_buses_are_planned_station_by_station():
+    ring = msgspec.structs.replace(SIM, redundant="udp://127.0.9.2", simulated="digest")
+    plant = stations(bus_port("bus0", "udp://127.0.9.1"), bus_port("bus1", "udp://127.0.9.2", ring))
+    assert plan_buses(plant) == (
+        BusSocket(PortName("a", "bus0"), interface="udp://127.0.9.1"),
+        BusSocket(
+            PortName("a", "bus1"),
+            interface="udp://127.0.9.2",
+            redundant="udp://127.0.9.2",
+            simulated="digest",
+        ),
+        BusSocket(PortName("b", "bus0"), interface="sim:///plants/io.yaml"),
+    )
 
 
 @pytest.mark.net
-def test_simulated_buses_have_two_pairs_and_others_one_socket():
+def test_simulated_buses_have_two_pairs_and_others_one_socket(tmp_path):
     plant = stations(bus_port("bus0", "udp://127.0.9.1:40009"))
-    with ExitStack() as opened:
-        remote, simulated = open_buses(plant, opened)
+    with SharedSockets(tmp_path / "control") as shared:
+        remote, simulated = shared.fit_buses(plant)
+        assert shared.buses == (remote, simulated)
         assert remote.owner == PortName("a", "bus0")
         assert 0 < remote.number < simulated.number
         assert remote.segment_fd == remote.segment_command_fd == remote.command_fd == NO_DESCRIPTOR
@@ -292,19 +311,90 @@ def test_simulated_buses_have_two_pairs_and_others_one_socket():
                 near.send(b"one")
                 near.send(b"two")
                 assert (far.recv(100), far.recv(100)) == (b"one", b"two")
-        ((name, handover),) = segments(plant, (remote, simulated), 77, realtime=True)
-        assert name == PortName("b", "bus0")
-        assert (handover.supervisor, handover.file) == (77, "/plants/io.yaml")
-        assert handover.frames_fd == simulated.segment_fd
-        assert handover.command_fd == simulated.segment_command_fd
-        assert handover.realtime
 
 
 @pytest.mark.net
-def test_an_interface_that_is_not_there_is_named():
+def test_bus_with_other_lines_has_another_number(tmp_path):
+    before = open_descriptors()
+    ring = msgspec.structs.replace(SIM, redundant="sim:///plants/io.yaml")
+    changed = msgspec.structs.replace(SIM, simulated="other slaves")
+    with SharedSockets(tmp_path / "control") as shared:
+        (first,) = shared.fit_buses([stations()[1]])
+        assert shared.fit_buses([stations()[1]]) == (first,)
+        numbers = {first.number}
+        for bus in (ring, changed):
+            port = bus_port("bus0", "sim:///plants/io.yaml", bus)
+            (other,) = shared.fit_buses([msgspec.structs.replace(stations()[1], ports=(port,))])
+            numbers.add(other.number)
+            assert (other.second_fd != NO_DESCRIPTOR) == (bus is ring)
+        shared.keep_only(())
+        assert shared.buses == ()
+        (again,) = shared.fit_buses([stations()[1]])
+        assert len({*numbers, again.number}) == 4
+    assert open_descriptors() == before
+
+
+@pytest.mark.net
+def test_an_interface_that_is_not_there_is_named(tmp_path):
     plant = stations(bus_port("bus0", "ethernet://nothere"))
-    with ExitStack() as opened, pytest.raises(EnvironmentalError, match="'nothere'"):
-        open_buses(plant, opened)
+    with (
+        SharedSockets(tmp_path / "control") as shared,
+        pytest.raises(UnavailableSocketError, match="'nothere'") as caught,
+    ):
+        shared.fit_buses(plant)
+    assert caught.value.owners == (PortName("a", "bus0"),)
+
+
+class Requester:
+    """Services' end of the pair with the supervisor."""
+
+    def __init__(self, shared):
+        self._shared = shared
+        self._socket = socket.socket(fileno=os.dup(shared.services_end))
+
+    def send(self, message):
+        pass_descriptors(self._socket, message, [])
+        self._shared.serve()
+
+    def reply(self):
+        """Return error, names of descriptors, and number of a bus; None without a reply."""
+        received = receive_reply(self._socket)
+        if received is None:
+            return None
+        for fd in received[1].values():
+            os.close(fd)
+        return received[0].error, set(received[1]), received[0].number
+
+    def close(self):
+        self._socket.close()
+
+
+@pytest.mark.net
+def test_services_requests_buses(tmp_path):
+    remote, simulated = (
+        each.key for each in plan_buses(stations(bus_port("b", "udp://127.0.9.1")))
+    )
+    with SharedSockets(tmp_path / "control") as shared, closing(Requester(shared)) as services:
+        services.send(OpenBus(1, remote))
+        assert services.reply() == ("", {"engine_fd"}, 1)
+        services.send(OpenBus(2, simulated))
+        assert services.reply() is None
+        shared.confirm(shared.buses[1])
+        assert services.reply() == ("", {"engine_fd", "command_fd"}, 2)
+        shared.confirm(shared.buses[1])
+        assert services.reply() is None
+        services.send(CloseBus(simulated))
+        assert [bus.number for bus in shared.buses] == [1]
+        services.send(OpenBus(3, simulated))
+        (failing,) = shared.buses[1:]
+        assert shared.refuse(failing.key, "no slaves")
+        assert services.reply() == ("no slaves", set(), 0)
+        assert not shared.refuse(failing.key, "again")
+        assert [bus.number for bus in shared.buses] == [1]
+        services.send(OpenBus(4, BusSocket(PortName("a", "c"), interface="ethernet://nothere")))
+        error, descriptors, _ = services.reply()
+        assert "nothere" in error
+        assert not descriptors
 
 
 @pytest.mark.net

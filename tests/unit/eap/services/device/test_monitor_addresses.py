@@ -122,7 +122,7 @@ def handover(tmp_path, sockets):
 
 
 def test_every_udp_port_has_a_way(tmp_path):
-    with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
+    with SharedSockets(tmp_path / "control") as sockets, ExitStack() as opened:
         endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
         assert set(endpoints.udp) == {PortName("left", "eap0"), PortName("right", "eap0")}
         assert endpoints.arp == {}
@@ -136,7 +136,7 @@ def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog,
         raise EnvironmentalError("the neighbour table cannot be read: forbidden")
 
     monkeypatch.setattr(monitor_ways, "NeighbourTable", refuse)
-    with SharedSockets([left(), right()], tmp_path / "control") as sockets, ExitStack() as opened:
+    with SharedSockets(tmp_path / "control") as sockets, ExitStack() as opened:
         endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
         endpoint = endpoints.udp[PortName("left", "eap0")]
         assert endpoint.evidence_of(closed, 0) is ProbeResult.BLIND
