@@ -6,44 +6,33 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from time import monotonic_ns
-from typing import Protocol
 
 from eap.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.engine.bus_settings import epoch_offset_ns, master_settings
+from eap.engine.channels import PortChannels
 from eap.engine.engine_bus import EngineBus
 from eap.engine.frame_taps import FrameRecording
-from eap.engine.rebuild import EngineStation, StationRebuilder, has_tcp, open_tcp_port
+from eap.engine.rebuild import EngineStation, StationRebuilder
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort
-from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.framering_file import FrameRingFile
 from eap.net.image_file import create_image
-from eap.net.limits import CloseReason
-from eap.net.loopback import LoopbackLines
-from eap.net.mmsg import ReceiveBatch
-from eap.net.realtime import descriptor_reserve, spare_descriptors
-from eap.net.tcp import TcpReceiver
-from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
-from eap.pd.link import FrameChannel, FrameHandler
-from eap.pd.spec import PortKind, PortSpec, Wake
+from eap.pd.link import FrameHandler
 from eap.pd.station import Station
 from eap.pd.words import StationWord
-from eap.runtime.drop_counters import DropCounterFeed, DropCounters, DropReason
+from eap.runtime.drop_counters import DropCounters
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
     BusSocket,
     Handover,
     PortName,
-    SharedSocket,
-    SocketKind,
 )
 from eap.runtime.passing import PassedConnection, PassedDescriptor
 from eap.runtime.startup import Step, no_step
@@ -145,19 +134,6 @@ class EngineBuses:
         return bus
 
 
-_REFUSALS: Mapping[str, DropReason] = {
-    CloseReason.OVERDUE: DropReason.TCP_SLOW,
-    CloseReason.EVICTED: DropReason.TCP_EVICTED,
-}
-
-
-class SocketChannel(FrameChannel, Protocol):
-    """A channel over a descriptor."""
-
-    def fileno(self) -> int:
-        """Return the descriptor that becomes readable when a frame waits."""
-
-
 class EnginePlant:
     """All stations of one engine process, with their images and channels.
 
@@ -179,31 +155,26 @@ class EnginePlant:
         self._handover = handover
         folder = ApplianceFolder(Path(handover.folder))
         self._stations: dict[str, EngineStation] = {}
-        self._batch = ReceiveBatch()
-        self._sockets: dict[SharedSocket, socket.socket] = {}
-        """Sockets that were passed, by key."""
-        self._tallies: list[DropCounterFeed] = []
-        self._counters = self._resources.enter_context(
+        counters = self._resources.enter_context(
             DropCounters(folder.discards("engine"), [s.name for s in handover.stations])
         )
+        self._channels = PortChannels(counters, self.arrivals)
+        self._resources.callback(self._channels.close)
         for spec in handover.stations:
             step(f"building station {spec.name}")
             file = create_image(folder.image(spec.name), plan_layout(spec))
             station = Station(spec, file.image, file.wake_waiters)
-            self._stations[spec.name] = EngineStation(station, file)
+            self._stations[spec.name] = EngineStation(station, file, self._channels)
         step("opening ports")
-        # Loopback lines and outgoing TCP need no socket of the supervisor: nothing of them has to
-        # outlive the engine.
-        self._open_own()
         for shared in handover.sockets:
-            if shared.kind is SocketKind.PACKET:
-                self._open_interface(shared)
-            elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
-                self._open_datagrams(shared)
+            if shared.engine_fd != NO_DESCRIPTOR:
+                self._channels.add_socket(shared.key, socket.socket(fileno=shared.engine_fd))
+        for entry in self._stations.values():
+            entry.open_ports()
         self.engine = Engine([entry.station for entry in self._stations.values()])
         ring = self._resources.enter_context(FrameRingFile(folder.frames))
         self.recording = FrameRecording(ring, self._stations)
-        self.rebuilder = StationRebuilder(self.engine, self._stations)
+        self.rebuilder = StationRebuilder(self.engine, self._stations, self._channels)
         self._resources.callback(self.rebuilder.close)
         self.arrivals[self.rebuilder.fileno()] = self.rebuilder.collect
         step("building buses")
@@ -221,28 +192,9 @@ class EnginePlant:
     def take(self, sock: socket.socket, passed: PassedDescriptor) -> None:
         """Take what services passed: a connection, or a socket for ports that come later."""
         if isinstance(passed, PassedConnection):
-            self._add_connection(sock, passed)
-        elif passed.socket in self._sockets:
-            sock.close()
+            self._channels.add_connection(sock, passed, self._handler)
         else:
-            self._sockets[passed.socket] = sock
-
-    def _add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
-        """Take frames from a connection that services accepted, for all ports behind it."""
-        first = passed.owners[0]
-        port = self._stations[first.station].tcp_ports[first.port]
-        handlers = [self._handler(owner) for owner in passed.owners]
-        spare = spare_descriptors(connection.fileno(), descriptor_reserve())
-        try:
-            receiver = TcpReceiver(connection, handlers, host=passed.host)
-        except OSError:
-            connection.close()  # the peer has left again
-            return
-        # Services accepts for all; only the engine knows how many connections the port has.
-        if not port.accept(receiver, monotonic_ns(), spare_descriptors=spare):
-            receiver.close()
-            for station in {owner.station for owner in passed.owners}:
-                self._counters.count(station, DropReason.TCP_FULL)
+            self._channels.add_socket(passed.socket, sock)
 
     def image(self, station: str) -> Image:
         """Return the process image of a station as it is now."""
@@ -250,8 +202,7 @@ class EnginePlant:
 
     def publish_discards(self) -> None:
         """Add the frames that the interfaces dropped since the last call to the counters."""
-        for tally in self._tallies:
-            tally.publish()
+        self._channels.publish_discards()
 
     def stop(self) -> None:
         """Bring all stations out of Op and wake programs that wait for a next cycle.
@@ -267,93 +218,8 @@ class EnginePlant:
     def close(self) -> None:
         """Release all sockets and images."""
         self._resources.close()
-        for sock in self._sockets.values():
-            sock.close()
         for entry in self._stations.values():
-            entry.close()
-
-    def _open_own(self) -> None:
-        """Connect the ports that need no shared socket."""
-        lines = LoopbackLines()
-        for name, port in self._ports():
-            uri = port.interface
-            if port.kind is not PortKind.EAP:
-                continue
-            if uri.scheme == "tcp":
-                self._connect(name, None)
-            elif uri.scheme == "loop":
-                channel = lines.open(uri)
-                channel.handlers.append(self._handler(name))
-                self._station(name).connect(port.name, channel)
-
-    def _open_datagrams(self, shared: SharedSocket) -> None:
-        channel = UdpChannel(
-            socket.socket(fileno=shared.engine_fd),
-            self._batch,
-            [self._handler(owner) for owner in shared.owners],
-        )
-        self._resources.callback(channel.close)
-        for owner in shared.owners:
-            if shared.kind is SocketKind.UDP:
-                self._connect(owner, channel)
-            else:
-                self._station(owner).drain_also(channel)
-        self._wake_on_arrival(shared.owners, channel)
-
-    def _connect(self, name: PortName, datagrams: FrameChannel | None) -> None:
-        """Connect a port to its datagrams, to TCP, or to both."""
-        spec = self._handover.port(name)
-        station = self._station(name)
-        if datagrams is not None and not has_tcp(station.spec, spec):
-            station.connect(name.port, datagrams)
-            return
-        port = open_tcp_port(spec, datagrams)
-        entry = self._stations[name.station]
-        entry.tcp_ports[name.port] = port
-        self._tallies.append(
-            DropCounterFeed(self._counters, [name.station], port.closed, _tcp_reason)
-        )
-        station.connect(name.port, port)
-        entry.update_tcp()
-
-    def _open_interface(self, shared: SharedSocket) -> None:
-        interface = EthernetInterface(
-            socket.socket(fileno=shared.engine_fd), packet_batch(), shared.address
-        )
-        self._resources.callback(interface.close)
-        stations = sorted({owner.station for owner in shared.owners})
-        self._tallies.append(
-            DropCounterFeed(self._counters, stations, interface.discarded, DropReason)
-        )
-        for owner in shared.owners:
-            spec = self._handover.port(owner)
-            port = interface.port(
-                self._handler(owner),
-                vlan_id=spec.vlan_id,
-                priority=spec.vlan_priority,
-                join=spec.join,
-            )
-            self._station(owner).connect(owner.port, port)
-        self._wake_on_arrival(shared.owners, port)
-
-    def _wake_on_arrival(self, owners: Iterable[PortName], channel: SocketChannel) -> None:
-        if any(self._handover.port(owner).wake is Wake.ARRIVAL for owner in owners):
-            self.arrivals[channel.fileno()] = channel.drain
+            entry.file.close()
 
     def _handler(self, name: PortName) -> FrameHandler:
-        return self._station(name).handlers[name.port]
-
-    def _station(self, name: PortName) -> Station:
-        return self._stations[name.station].station
-
-    def _ports(self) -> Iterable[tuple[PortName, PortSpec]]:
-        for station in self._handover.stations:
-            for port in station.ports:
-                yield PortName(station.name, port.name), port
-
-
-def _tcp_reason(closed: str) -> DropReason | None:
-    """Return the reason to count for a connection that ended, None for an orderly close."""
-    if closed.startswith("frame of type"):
-        return DropReason.TCP_TYPE
-    return _REFUSALS.get(closed)
+        return self._stations[name.station].station.handlers[name.port]

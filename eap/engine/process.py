@@ -12,7 +12,7 @@ import gc
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from time import monotonic_ns
 
@@ -39,6 +39,7 @@ class CycleWaiter:
     def __init__(self, ticker: Ticker, handlers: Mapping[int, Callable[[int], object]]) -> None:
         self._ticker = ticker
         self._handlers = handlers
+        self._registered: dict[int, Callable[[int], object]] = {}
         self._spent_ns = 0
         self._window_end_ns = 0
         self._is_open = False
@@ -65,20 +66,41 @@ class CycleWaiter:
             self._window_end_ns = begun_ns + WINDOW_NS
             self._spent_ns = 0
         for fd in self._ticker.arrivals():
-            self._handlers[fd](monotonic_ns())
+            # A handler may close the descriptors of others.
+            if (handler := self._handlers.get(fd)) is not None:
+                handler(monotonic_ns())
         self._spent_ns += monotonic_ns() - begun_ns
         if self._spent_ns > SHARE_NS:
             self._close()
 
+    def update(self) -> None:
+        """Follow the descriptors that were added to the handlers, or removed and closed."""
+        if self._is_open:
+            self._unregister({fd for fd in self._registered if self._is_other(fd)})
+            self._register()
+
+    def _is_other(self, fd: int) -> bool:
+        # Compared by handler: the number of a closed descriptor may be that of another socket now.
+        return self._handlers.get(fd) != self._registered[fd]
+
+    def _register(self) -> None:
+        for fd, handler in self._handlers.items():
+            if fd not in self._registered:
+                self._registered[fd] = handler
+                self._ticker.register(fd)
+
+    def _unregister(self, descriptors: Collection[int]) -> None:
+        for fd in descriptors:
+            del self._registered[fd]
+            self._ticker.unregister(fd)
+
     def _open(self) -> None:
         self._is_open = True
-        for fd in self._handlers:
-            self._ticker.register(fd)
+        self._register()
 
     def _close(self) -> None:
         self._is_open = False
-        for fd in self._handlers:
-            self._ticker.unregister(fd)
+        self._unregister([*self._registered])
 
 
 LOOK_PERIOD_NS = 20_000_000
@@ -109,6 +131,8 @@ def run_cycles(
     ticker = Ticker()
     try:
         arrivals = CycleWaiter(ticker, plant.arrivals)
+        rebuilder.on_swap.append(arrivals.update)
+        rebuilder.receive_sockets = partial(_take_all, plant, link)
         while not stop.is_set:
             if not is_notified and engine.is_under_way:
                 is_notified = True
@@ -131,6 +155,12 @@ def run_cycles(
                     plant.take(*passed)
     finally:
         ticker.close()
+
+
+def _take_all(plant: EnginePlant, link: socket.socket) -> None:
+    """Take everything that services has passed."""
+    while passed := receive_passed(link):
+        plant.take(*passed)
 
 
 def run_engine(handover: Handover, startup: Startup) -> None:

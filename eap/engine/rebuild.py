@@ -19,69 +19,51 @@ from pathlib import Path
 from devicebus.master.master import Master
 from eap.engine.bus_mapping import BusMapping
 from eap.engine.bus_settings import epoch_offset_ns, master_settings
+from eap.engine.channels import PortChannels, engine_sockets, has_tcp
 from eap.engine.engine_bus import BusSuccessor, EngineBus
 from eap.errors import EapError, EngineRefusedError
-from eap.ids import Destination, DestinationKind
 from eap.net import realtime
 from eap.net.image_file import ImageFile, prepare_image
 from eap.net.tcpport import TcpPort
 from eap.pd.device import DeviceState
 from eap.pd.engine import Engine
-from eap.pd.handover import ImageHandover, needs_new_start, restarting_buses
+from eap.pd.handover import (
+    ImageHandover,
+    PortChanges,
+    needs_new_start,
+    port_changes,
+    restarting_buses,
+)
 from eap.pd.layout import plan_layout
-from eap.pd.link import FrameChannel
-from eap.pd.spec import REQUESTER, PortSpec, StationSpec, record_from_lines
+from eap.pd.spec import PortKind, StationSpec, record_from_lines
 from eap.pd.station import Station
 from eap.runtime.engine_messages import Configure, SetState, StationRequest
-
-
-def sends_to(spec: StationSpec, port: str) -> set[str]:
-    """Return the destinations to which frames of *port* go by TCP."""
-    destinations = {frame.destination for frame in spec.frames if frame.port == port} - {REQUESTER}
-    return {each for each in destinations if Destination.parse(each).kind is DestinationKind.TCP}
-
-
-def has_tcp(spec: StationSpec, port: PortSpec) -> bool:
-    """Return whether *port* sends or receives by TCP."""
-    return port.tcp or port.interface.scheme == "tcp" or bool(sends_to(spec, port.name))
-
-
-def open_tcp_port(spec: PortSpec, datagrams: FrameChannel | None) -> TcpPort:
-    """Return the channel of a port with TCP, beside its *datagrams* if it has any."""
-    return TcpPort(spec.interface.host, datagrams)
-
-
-def follow_station(port: TcpPort, station: Station, name: str) -> None:
-    """Configure *port* for the frames of *station* at its port *name*."""
-    spec = station.spec
-    asks = any(pd.poll_request and pd.port == name for pd in spec.subscriptions)
-    port.follow(sends_to(spec, name), [station.handlers[name]] if asks else [])
+from eap.runtime.handover import PortName, SharedSocket
 
 
 class EngineStation:
     """A station of the engine and its image; both are replaced together."""
 
-    def __init__(self, station: Station, file: ImageFile) -> None:
+    def __init__(self, station: Station, file: ImageFile, channels: PortChannels) -> None:
         self.station = station
         self.file = file
+        self.channels = channels
         self.buses: dict[str, EngineBus] = {}
         """By port."""
-        self.tcp_ports: dict[str, TcpPort] = {}
+
+    def open_ports(self) -> None:
+        """Open and connect all EAP ports, before the station starts."""
+        station = self.station
+        for port in station.spec.ports:
+            if port.kind is PortKind.EAP:
+                opened = self.channels.open(station.spec, port, station.handlers[port.name])
+                station.connect(port.name, opened.channel, opened.groups)
+                self.channels.enter(opened)
+        self.channels.update_tcp(station)
 
     def set_step(self, step_ns: int) -> None:
         """Set the distance from the present cycle to the next, as a clock of a bus wants it."""
         self.station.step_ns = step_ns
-
-    def update_tcp(self) -> None:
-        """Keep connections only to the present destinations of the station."""
-        for name, port in self.tcp_ports.items():
-            follow_station(port, self.station, name)
-
-    def close(self) -> None:
-        """Release the image and of all connections."""
-        self.file.close()
-        for port in self.tcp_ports.values():
-            port.close()
 
 
 class StationReplacement:
@@ -97,16 +79,23 @@ class StationReplacement:
         if reasons := needs_new_start(before.spec, spec):
             raise EngineRefusedError("\n".join(reasons))
         self._entry = entry
+        self._changes = port_changes(before.spec, spec)
         self._file = prepare_image(entry.file.path, plan_layout(spec), entry.file.generation + 1)
         try:
             image = self._file.image
-            self._images = ImageHandover(before.image, image)
+            replaced = {port.name for port in self._changes.gone}
+            self._images = ImageHandover(before.image, image, replaced)
             # Before Station(): its subscribers read from the words which trackers they share.
             self._images.carry_words()
             self._images.carry_values(before.inputs.memory)
-            self._station = Station(spec, image, self._file.wake_waiters)
-            self._tcp_ports = _new_tcp_ports(entry, spec)
-            self._station.prepare_handover(before, self._tcp_ports)
+            self._station = station = Station(spec, image, self._file.wake_waiters)
+            self._opened = [
+                entry.channels.open(spec, port, station.handlers[port.name])
+                for port in self._changes.added
+            ]
+            self._tcp_ports = _new_tcp_ports(entry, spec, self._changes)
+            added = {each.name.port: (each.channel, each.groups) for each in self._opened}
+            station.prepare_handover(before, added, self._tcp_ports)
             self._images.commit()
             memory_of = self._station.memory_of
             self._mappings: list[tuple[EngineBus, BusMapping]] = []
@@ -148,7 +137,16 @@ class StationReplacement:
         # Who writes from now on sees that the image is retired, and writes in the new one again.
         if before.inputs.refresh():
             self._images.carry_values(before.inputs.memory)
+        channels, name = entry.channels, station.spec.name
+        # Recordings take the new ports up by themselves.
+        before.untap([port.name for port in self._changes.gone])
+        for port in self._changes.gone:
+            channels.remove(PortName(name, port.name))
         station.follow(before, now_ns)
+        for opened in self._opened:
+            channels.enter(opened)
+        for port_name, tcp in self._tcp_ports.items():
+            channels.enter_tcp(PortName(name, port_name), tcp)
         for bus, mapping in self._mappings:
             bus.swap_mapping(mapping)
         self._old_masters = [bus.restart(parts, now_ns) for bus, parts in self._restarts]
@@ -157,7 +155,6 @@ class StationReplacement:
         entry.file.wake_waiters()
         entry.file.close()
         entry.file, entry.station = self._file, station
-        entry.tcp_ports.update(self._tcp_ports)
         return before
 
     def discard(self) -> None:
@@ -165,12 +162,16 @@ class StationReplacement:
         self._file.discard()
 
 
-def _new_tcp_ports(entry: EngineStation, spec: StationSpec) -> dict[str, TcpPort]:
-    """Return the channels of ports that have not had any TCP so far."""
+def _new_tcp_ports(
+    entry: EngineStation, spec: StationSpec, changes: PortChanges
+) -> dict[str, TcpPort]:
+    """Return the channels of ports that stay and have not had any TCP so far."""
     return {
-        port.name: open_tcp_port(port, entry.station.channel(port.name))
+        port.name: TcpPort(port.interface.host, entry.station.channel(port.name))
         for port in spec.ports
-        if port.name not in entry.tcp_ports and has_tcp(spec, port)
+        if port not in changes.added
+        and not entry.channels.has_tcp(PortName(spec.name, port.name))
+        and has_tcp(spec, port)
     }
 
 
@@ -197,6 +198,7 @@ class _Job:
         error: Reason that nothing was built, or that the swap failed.
         is_built: Whether the thread has made one of them.
         is_stale: Whether it has to be built again.
+        sockets: Those that the ports of the requested specification need.
     """
 
     def __init__(self, entry: EngineStation, request: Configure, reply: Reply) -> None:
@@ -207,6 +209,7 @@ class _Job:
         self.error: EapError | None = None
         self.is_built = False
         self.is_stale = False
+        self.sockets: list[SharedSocket] = []
         self._before: Station | None = None
         self._taken = threading.Lock()
 
@@ -235,7 +238,7 @@ class _Job:
                 successor.discard()  # PDs that shared an account have parted meanwhile
             else:
                 self._put(successor, engine, now_ns)
-        self.entry.update_tcp()
+        self.entry.channels.update_tcp(self.entry.station)
         self._taken.release()
 
     def abandon(self) -> None:
@@ -249,6 +252,7 @@ class _Job:
         self.is_stale = False
         try:
             spec = _read(self.request)
+            self.sockets = engine_sockets(spec)
             if spec != self.entry.station.spec:
                 self.successor = StationReplacement(self.entry, spec)
         except EngineRefusedError as exc:
@@ -266,11 +270,22 @@ class _Job:
 
 
 class StationRebuilder:
-    """Reconfigures the *stations* of *engine* as services requests, one change after the other."""
+    """Reconfigures the *stations* of *engine* as services requests, one change after the other.
 
-    def __init__(self, engine: Engine, stations: dict[str, EngineStation]) -> None:
+    Attributes:
+        on_swap: Called when the ports of a station may have changed.
+        receive_sockets: Takes all sockets that services has passed, before a request that may need
+            them.
+    """
+
+    def __init__(
+        self, engine: Engine, stations: dict[str, EngineStation], channels: PortChannels
+    ) -> None:
         self._engine = engine
         self._stations = stations
+        self._channels = channels
+        self.on_swap: list[Callable[[], object]] = []
+        self.receive_sockets: Callable[[], object] = int
         self._waiting: deque[_Job] = deque()
         self._job: _Job | None = None
         self._thread: threading.Thread | None = None
@@ -307,6 +322,7 @@ class StationRebuilder:
         elif len(self._waiting) >= MAX_WAITING:
             reply(EngineRefusedError(f"{MAX_WAITING} changes wait already"))
         else:
+            self.receive_sockets()
             self._waiting.append(_Job(entry, request, reply))
             if self._thread is None:
                 self._begin(self._waiting.popleft())
@@ -339,6 +355,9 @@ class StationRebuilder:
         # The new objects live as long as the station: the collector need not look through them.
         gc.freeze()
         if not job.is_stale:
+            self._channels.close_unused(job.sockets)
+            for notify in self.on_swap:
+                notify()
             job.reply(job.error)
 
     def _begin(self, job: _Job) -> None:

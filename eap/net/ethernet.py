@@ -92,16 +92,49 @@ class EthernetInterface:
         It receives frames to the interface's address, broadcasts, the EAP multicast address and
         the multicast MAC addresses of *join*.
         """
+        port = self.make_port(handler, vlan_id=vlan_id, priority=priority, join=join)
+        self.add(port)
+        return port
+
+    def make_port(
+        self,
+        handler: FrameHandler,
+        *,
+        vlan_id: int = 0,
+        priority: int = 0,
+        join: Sequence[str] = (),
+    ) -> EthernetPort:
+        """Return a port as :meth:`port` does, which receives nothing before it is added."""
         groups = {EAP_MULTICAST_MAC, *(MacAddr.parse(text) for text in join)}
         for group in groups:
             self._binding.join(group)
-        by_address = self._routes.setdefault(vlan_id, {})
-        for address in (self.address, BROADCAST_MAC, *groups):
-            by_address.setdefault(_key(address), []).append(handler)
+        return EthernetPort(self, handler, vlan_id, priority, frozenset(groups))
+
+    def add(self, port: EthernetPort) -> None:
+        """Receive frames for *port* from now on."""
+        by_address = self._routes.setdefault(port.vlan_id, {})
+        for address in (self.address, BROADCAST_MAC, *port.groups):
+            by_address.setdefault(_key(address), []).append(port.handler)
+        self._ports.append(port)
         # Copies for other ports cost time in each cycle, so a single port makes none.
-        self.has_neighbours = bool(self._ports)
-        self._ports.append(EthernetPort(self, handler, vlan_id, priority))
-        return self._ports[-1]
+        self.has_neighbours = len(self._ports) > 1
+        if port.own_address != self.address:
+            port.readdress()
+
+    def remove(self, port: EthernetPort) -> None:
+        """Receive nothing for *port* any more."""
+        # The socket stays a member of the port's groups: to leave one waits for a lock of the
+        # kernel, and this is called between two cycles.
+        self._ports.remove(port)
+        self.has_neighbours = len(self._ports) > 1
+        by_address = self._routes[port.vlan_id]
+        for address in (self.address, BROADCAST_MAC, *port.groups):
+            by_address[_key(address)].remove(port.handler)
+            if not by_address[_key(address)]:
+                del by_address[_key(address)]
+        if not by_address:
+            del self._routes[port.vlan_id]
+        self._local = deque(each for each in self._local if each[0] != port.handler)
 
     def drain(self) -> int:
         """Hand every waiting frame to the ports it is for; return how many were handed over."""
@@ -247,11 +280,18 @@ class EthernetPort:
     minimum_size = MINIMUM_SIZE
 
     def __init__(
-        self, interface: EthernetInterface, handler: FrameHandler, vlan_id: int, priority: int
+        self,
+        interface: EthernetInterface,
+        handler: FrameHandler,
+        vlan_id: int,
+        priority: int,
+        groups: frozenset[MacAddr],
     ) -> None:
         self.interface = interface
         self.handler = handler
         self.vlan_id = vlan_id
+        self.groups = groups
+        self.own_address = interface.address
         self._send = interface.sender.send
         # VID 0 with a priority is a priority tag (802.1Q); without both the frame is untagged.
         tag = priority << 13 | vlan_id

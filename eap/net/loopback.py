@@ -94,7 +94,10 @@ class LoopbackChannel:
         self._order = 0
         self._address = f"{_ADDRESS}{next(_numbers)}"
         self._sender = ""
-        ports.append(self)
+
+    def join(self) -> None:
+        """Receive the frames of the line from now on."""
+        self._ports.append(self)
 
     def drain(self, now_ns: int) -> int:
         """Hand over the frames that have arrived by *now_ns*, in the order of arrival."""
@@ -170,10 +173,18 @@ class LoopbackLines:
     def __init__(self) -> None:
         self._lines: dict[str, list[LoopbackChannel]] = {}
 
-    def open(self, uri: InterfaceUri) -> LoopbackChannel:
-        """Return a new port on the line that *uri* names; its options are the faults of its frames.
+    def make(self, uri: InterfaceUri) -> LoopbackChannel:
+        """Return a new port for the line that *uri* names, which receives nothing before it joins.
+
+        The options of *uri* are the faults of its frames.
 
         Raises:
             ConfigError: the options of *uri* are wrong.
         """
         return LoopbackChannel(self._lines.setdefault(uri.host, []), Faults.parse(uri))
+
+    def open(self, uri: InterfaceUri) -> LoopbackChannel:
+        """Return a new port on the line; arguments and errors are those of :meth:`make`."""
+        channel = self.make(uri)
+        channel.join()
+        return channel

@@ -132,6 +132,12 @@ class TcpPort:
             failed += rest if self._datagrams is None else self._datagrams.send(rest, now_ns)
         return failed
 
+    def forget(self, handler: FrameHandler) -> None:
+        """Hand no frames to *handler* any more: its port shared the listener and was removed."""
+        for receiver in self._receivers:
+            if handler in receiver.handlers:
+                receiver.handlers.remove(handler)
+
     def _answer(self, frame: OutFrame) -> bool:
         """Send *frame* back on the connection that it answers."""
         asked = (each for each in self._receivers if each.name == frame.destination)

@@ -7,6 +7,7 @@ import os
 import select
 import struct
 import time
+from contextlib import suppress
 from functools import partial
 
 _CLOCK_MONOTONIC = 1
@@ -64,7 +65,8 @@ class Ticker:
         """Forget *fd*."""
         if self._epoll is not None and fd in self._registered:
             self._registered.remove(fd)
-            self._epoll.unregister(fd)
+            with suppress(OSError):  # its owner has closed it already
+                self._epoll.unregister(fd)
 
     def wait(self, deadline_ns: int) -> bool:
         """Return True once *deadline_ns* has passed, False if something else came first.

@@ -10,7 +10,7 @@ Rule 3: everything is planned beside running cycles; between two cycles, only by
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import NamedTuple
 
 from msgspec.structs import asdict, replace
@@ -22,7 +22,7 @@ from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxSlot
 from eap.pd.monitor import SubscriberPresence
-from eap.pd.spec import BusPortSpec, GatewaySpec, PortSpec, StationSpec, Writer
+from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec, Writer
 from eap.pd.words import (
     REASON_INDEX,
     TRACKER_START,
@@ -70,13 +70,14 @@ class ImageHandover:
     Args:
         old: The image that is in use.
         new: A fresh one that is not in use yet.
+        replaced: Names of the ports that are removed, or replaced by others.
     """
 
-    def __init__(self, old: Image, new: Image) -> None:
+    def __init__(self, old: Image, new: Image, replaced: Collection[str] = ()) -> None:
         self._old, self._new = old, new
         station = [index for index in range(StationWord.SIZE) if index not in _OWN_WORDS]
         self._runs = _joined(_WordRun(index, index, 1) for index in station)
-        self._sent = _Sent(old.layout, new.layout)
+        self._sent = _Sent(old.layout, new.layout, replaced)
         self._received = _Received(old, new)
         self._from_engine, self._from_others = _plan_values(old, new)
 
@@ -109,19 +110,24 @@ class ImageHandover:
 class _Sent:
     """The words of TxFrames and TxPDs.
 
-    The address of a frame is forgotten when its destination changes; the presence of its subscriber
-    then, too, and when it is monitored in another way.  A frame that is no more what it was gives
-    the count of its cycles as a whole to its old PDs.
+    The address of a frame is forgotten when its destination or its port changes; the presence of
+    its subscriber then, too, and when it is monitored in another way.  A frame that is no more what
+    it was gives the count of its cycles as a whole to its old PDs.
     """
 
-    def __init__(self, old: ImageLayout, new: ImageLayout) -> None:
+    def __init__(self, old: ImageLayout, new: ImageLayout, replaced: Collection[str]) -> None:
         frames = {frame.name: frame for frame in old.frames}
         kept = [(frames[frame.name], frame) for frame in new.frames if frame.name in frames]
         self._changed = [
             b.words for a, b in kept if _schedules(old, a.name) != _schedules(new, b.name)
         ]
-        self._moved = [b.words for a, b in kept if a.destination != b.destination]
-        self._target_changed = [b.words for a, b in kept if a.target != b.target]
+        # Another port may lead to another network, where hosts have other addresses.
+        self._moved = [
+            b.words for a, b in kept if a.destination != b.destination or b.port in replaced
+        ]
+        self._target_changed = [
+            b.words for a, b in kept if a.target != b.target or b.port in replaced
+        ]
         whole = {b.name for _, b in kept if b.words not in self._changed}
         before = {pd.name: pd for pd in old.tx}
         pds = [(before[pd.name], pd) for pd in new.tx if pd.name in before]
@@ -300,6 +306,49 @@ def _copy(runs: Iterable[_WordRun], old: memoryview, new: memoryview) -> None:
         new[target : target + size] = old[source : source + size]
 
 
+class PortChanges(NamedTuple):
+    """Differences between the EAP ports of two specifications.
+
+    A port whose settings change is in both, the old one and the new one.
+    """
+
+    gone: tuple[PortSpec, ...]
+    added: tuple[PortSpec, ...]
+
+    def __bool__(self) -> bool:
+        """Return whether any port changes."""
+        return bool(self.gone or self.added)
+
+
+def port_changes(old: StationSpec, new: StationSpec) -> PortChanges:
+    """Return the EAP ports that go and come from *old* to *new*."""
+    before = {port.name: port for port in old.ports if port.kind is PortKind.EAP}
+    after = {port.name: port for port in new.ports if port.kind is PortKind.EAP}
+    changed = {
+        name
+        for name in before.keys() & after.keys()
+        if any(True for _ in _port_differences(before[name], after[name]))
+    }
+    return PortChanges(
+        tuple(port for name, port in before.items() if name not in after or name in changed),
+        tuple(port for name, port in after.items() if name not in before or name in changed),
+    )
+
+
+def describe_port_changes(old: StationSpec, new: StationSpec) -> Iterator[str]:
+    """Yield the changes of EAP ports from *old* to *new*, one line each."""
+    gone, added = port_changes(old, new)
+    before = {port.name: port for port in gone}
+    names = {port.name for port in added}
+    yield from (f"port {port.name}: removed" for port in gone if port.name not in names)
+    for port in added:
+        if port.name in before:
+            for what in _port_differences(before[port.name], port):
+                yield f"port {port.name}: {what}"
+        else:
+            yield f"port {port.name}: added at {port.interface}"
+
+
 def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
     """Return the differences that the engine cannot apply while it runs, one line each."""
     found = []
@@ -307,10 +356,11 @@ def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
         found.append(f"station {old.name} cannot become {new.name}")
     before = {port.name: port for port in old.ports}
     after = {port.name: port for port in new.ports}
-    found += [f"port {name} is new" for name in after if name not in before]
-    found += [f"port {name} is gone" for name in before if name not in after]
+    buses = {port.name for port in (*old.ports, *new.ports) if port.kind is PortKind.BUS}
+    found += [f"port {name} is new" for name in after if name in buses - before.keys()]
+    found += [f"port {name} is gone" for name in before if name in buses - after.keys()]
     for name, port in after.items():
-        if name in before:
+        if name in before and name in buses:
             found += [f"port {name}: {what}" for what in _port_differences(before[name], port)]
     return [f"{line}: restart the appliance" for line in found]
 

@@ -10,9 +10,10 @@ that a reader sees inputs and what follows from them in one cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
+from typing import NamedTuple
 
 import msgspec
 
@@ -44,6 +45,14 @@ WAKE_FOR_CYCLES = 100
 
 _UNREAD_FOR_US = 10_000
 """Interval of draining a port without subscriptions, whose frames are only counted."""
+
+
+class _ConnectedPort(NamedTuple):
+    """An EAP port with its channels."""
+
+    channel: FrameChannel
+    publisher: Publisher | None
+    groups: tuple[FrameChannel, ...]
 
 
 class Station:
@@ -88,7 +97,9 @@ class Station:
         """The publishers with their ports, and the channels without taps."""
         self._taps: dict[str, tuple[PortTap, FrameHandler]] = {}
         """Taps by port, each with the handler that is behind it."""
-        self._ports: dict[str, tuple[FrameChannel, Publisher | None]] = {}
+        self._ports: dict[str, _ConnectedPort] = {}
+        self._added: frozenset[str] = frozenset()
+        """Ports without a predecessor in the station before this one."""
         self._channels: list[FrameChannel] = []
         self._drains: list[Callable[[int], object]] = []
         self._rarely: list[Callable[[int], int]] = []
@@ -121,10 +132,13 @@ class Station:
             self.image, own, self.cycle_ns, self._requests[port], self._polls, lenient=lenient
         )
 
-    def connect(self, port: str, channel: FrameChannel) -> None:
-        """Send the frames of *port* through *channel*, and drain it.
+    def connect(
+        self, port: str, channel: FrameChannel, groups: Sequence[FrameChannel] = ()
+    ) -> None:
+        """Send the frames of *port* through *channel*, and drain it and *groups*.
 
-        That is done in each cycle, or now and then if nothing is subscribed to there.
+        That is done in each cycle; *channel* is drained now and then if nothing is subscribed to
+        there.  *groups* are further channels that feed the port, such as multicast groups.
         """
         layout = self.image.layout
         frames = [
@@ -133,9 +147,11 @@ class Station:
             if frame.port == port
         ]
         if any(pd.port == port for pd in self.spec.subscriptions):
-            self.drain_also(channel)
+            self._drain(channel)
         else:
             self._rarely.append(channel.drain)
+        for group in groups:
+            self._drain(group)
         own = next(p for p in self.spec.ports if p.name == port)
         net_id = own.net_id
         out = StateChannel(channel, self._words) if own.eap_sm else channel
@@ -150,12 +166,12 @@ class Station:
             )
             self._senders.append((port, answerer, out))
         self._connect_senders()
-        self._ports[port] = channel, publisher
+        self._ports[port] = _ConnectedPort(channel, publisher, tuple(groups))
         self._teach(port)
 
     def _teach(self, port: str) -> None:
         """Have the publisher of *port* learn the addresses of its NetIDs."""
-        publisher = self._ports[port][1]
+        publisher = self._ports[port].publisher
         if learner := self._learners.get(port):
             learner.wanted = () if publisher is None else publisher.wanted
             learner.learn = forget if publisher is None else publisher.learn
@@ -182,20 +198,20 @@ class Station:
         self._exchange_handler(port, plain, tap.received(plain))
         self._connect_senders()
 
-    def untap(self) -> None:
-        """Remove all taps."""
-        for port, (_, plain) in self._taps.items():
+    def untap(self, ports: Collection[str] | None = None) -> None:
+        """Remove the taps of *ports*, or all."""
+        for port in self._taps.keys() & (self._taps.keys() if ports is None else set(ports)):
+            _, plain = self._taps.pop(port)
             self._exchange_handler(port, self.handlers[port], plain)
-        self._taps.clear()
         self._connect_senders()
 
     def _exchange_handler(self, port: str, old: FrameHandler, new: FrameHandler) -> None:
         self.handlers[port] = new
-        for channel in (*(each for each, _ in self._ports.values()), *self._channels):
+        for channel in (*(each.channel for each in self._ports.values()), *self._channels):
             channel.exchange_handler(old, new)
 
-    def drain_also(self, channel: FrameChannel) -> None:
-        """Drain another channel that feeds this station, such as a multicast group."""
+    def _drain(self, channel: FrameChannel) -> None:
+        """Drain *channel* in each cycle, once."""
         # Two ports may share an interface: drained once, its frames go to the handlers of both.
         if channel not in self._channels:
             self._channels.append(channel)
@@ -263,9 +279,9 @@ class Station:
                 subscriber.close()
             elif state.receives and not before.receives:
                 subscriber.resume(now_ns)
-        for _, publisher in self._ports.values():
-            if publisher is not None and state.sends and not before.sends:
-                publisher.forget()
+        for port in self._ports.values():
+            if port.publisher is not None and state.sends and not before.sends:
+                port.publisher.forget()
 
     def stop(self) -> None:
         """Stop receiving and sending."""
@@ -283,63 +299,82 @@ class Station:
 
     def channel(self, port: str) -> FrameChannel:
         """Return the channel of *port*."""
-        return self._ports[port][0]
+        return self._ports[port].channel
 
     def prepare_handover(
-        self, before: Station, channels: Mapping[str, FrameChannel] = MappingProxyType({})
+        self,
+        before: Station,
+        added: Mapping[str, tuple[FrameChannel, Sequence[FrameChannel]]] = MappingProxyType({}),
+        channels: Mapping[str, FrameChannel] = MappingProxyType({}),
     ) -> None:
-        """Connect like *before*, or to *channels*, and learn the frames that it receives.
+        """Connect like *before*, and learn the frames that it receives.
 
         All slow work is done here, while *before* runs; it is only read.
+
+        Args:
+            before: The station in use.
+            added: Channel and groups of each port that is new, or replaces another of its name.
+            channels: Other channels of ports that stay.
         """
-        for port, (channel, was) in before._ports.items():
-            self.connect(port, channels.get(port, channel))
-            publisher = self._ports[port][1]
-            if publisher is not None and was is not None:
-                publisher.learn_from(was)
-        fed = [channel for channel, _ in (*before._ports.values(), *self._ports.values())]
-        for channel in before._channels:
-            if channel not in fed:
-                self.drain_also(channel)
+        for port, was in before._ports.items():
+            if port in self._subscribers and port not in added:
+                self.connect(port, channels.get(port, was.channel), was.groups)
+                publisher = self._ports[port].publisher
+                if publisher is not None and was.publisher is not None:
+                    publisher.learn_from(was.publisher)
+        for port, (channel, groups) in added.items():
+            self.connect(port, channel, groups)
+        self._added = frozenset(added)
         for bus in before.buses:
             self.connect_bus(bus)
         for port, subscriber in self._subscribers.items():
-            subscriber.learn_from(before._subscribers[port])
+            if port not in added:
+                subscriber.learn_from(before._subscribers[port])
 
     def follow(self, before: Station, now_ns: int) -> None:
         """Take the place of *before* between two of its cycles.
 
-        The image already holds the content of the other.  Channels keep the handlers of *before*.
+        The image already holds the content of the other.  Channels keep the handlers of *before*
+        for the ports that stay.
         """
         self._inputs.reload()
-        replaced = [subscriber.handle_timeout for subscriber in self._subscribers.values()]
+        kept = self._subscribers.keys() - self._added
+        replaced = [self._subscribers[port].handle_timeout for port in kept]
         self._supervisors = [each for each in self._supervisors if each not in replaced]
-        for port, subscriber in before._subscribers.items():
-            # The object stays and gets the parts of the new one: channels hold its bound method.
-            subscriber.swap_in(self._subscribers[port], now_ns)
-            if subscriber.has_timeouts:
-                self._supervisors.append(subscriber.handle_timeout)
-        self._subscribers, before._subscribers = before._subscribers, self._subscribers
-        self.handlers = before.handlers
+        for port in kept:
+            self._keep_subscriber(port, before, now_ns)
         self._taps = before._taps
         self._connect_senders()
-        self._learners = before._learners
         for port, requests in self._requests.items():
-            requests.follow(before._requests[port])
+            if port not in self._added:
+                requests.follow(before._requests[port])
         for name in self._polls.keys() & before._polls.keys():
             self._polls[name].follow(before._polls[name])
-        for port, (_, publisher) in self._ports.items():
-            was = before._ports[port][1]
-            if publisher is not None and was is not None:
-                publisher.follow(was)
+        for port, connected in self._ports.items():
+            was = None if port in self._added else before._ports[port].publisher
+            if connected.publisher is not None and was is not None:
+                connected.publisher.follow(was)
             self._teach(port)
         self._enter(before.device.state)
+        for port in self._added if self.device.state.receives else ():
+            self._subscribers[port].resume(now_ns)
+
+    def _keep_subscriber(self, port: str, before: Station, now_ns: int) -> None:
+        """Take over the subscriber of *before* at *port*: channels hold its bound method."""
+        subscriber, own = before._subscribers[port], self._subscribers[port]
+        subscriber.swap_in(own, now_ns)
+        self._subscribers[port], before._subscribers[port] = subscriber, own
+        if subscriber.has_timeouts:
+            self._supervisors.append(subscriber.handle_timeout)
+        self.handlers[port] = before.handlers[port]
+        if port in self._learners:
+            self._learners[port] = before._learners[port]
 
     def release(self) -> None:
         """Free all parts one by one, after another station has taken over."""
-        for _, publisher in self._ports.values():
-            if publisher is not None:
-                publisher.release()
+        for port in self._ports.values():
+            if port.publisher is not None:
+                port.publisher.release()
         for subscriber in self._subscribers.values():
             subscriber.release()
         self.image.release()

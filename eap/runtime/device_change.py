@@ -21,7 +21,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import fill, read_back
 from eap.device.rollout import bus_variables, kept_versions, without_alternates
 from eap.pd.device import DeviceFault
-from eap.pd.handover import needs_new_start
+from eap.pd.handover import describe_port_changes, needs_new_start
 from eap.pd.spec import (
     GatewayAddress,
     GatewaySpec,
@@ -147,7 +147,9 @@ def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
         for port in new.ports
         if port.name in before
     ]
-    return needs_new_start(old, new) + [
+    refused = needs_new_start(old, new)
+    refused += [f"{line}: restart the appliance" for line in describe_port_changes(old, new)]
+    return refused + [
         f"{what}: net_id {was} -> {becomes}: restart the appliance"
         for what, was, becomes in net_ids
         if was != becomes

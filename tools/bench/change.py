@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter_ns
 from typing import Any, NamedTuple
 
+from eap.engine.channels import PortChannels
 from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.ids import InterfaceUri
 from eap.net.image_file import create_image
@@ -17,6 +18,7 @@ from eap.net.loopback import LoopbackLines
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
 from eap.pd.station import Station
+from eap.runtime.drop_counters import DropCounters
 from tools.bench import machine
 from tools.bench.change_roles import station
 from tools.bench.figures import Figure, at_most, percentile, report
@@ -94,11 +96,14 @@ def _swaps(pds: int) -> list[Change]:
     lines = LoopbackLines()
     uri = InterfaceUri("loop", "line")
     specs = [station(pds, more, str(uri)) for more in (0, 1)]
-    with TemporaryDirectory(dir=machine.memory_folder()) as folder:
+    with (
+        TemporaryDirectory(dir=machine.memory_folder()) as folder,
+        DropCounters(Path(folder) / "counts", [specs[0].name]) as counters,
+    ):
         file = create_image(Path(folder) / "image", plan_layout(specs[0]))
         first = Station(specs[0], file.image, file.wake_waiters)
         first.connect("eap0", lines.open(uri))
-        place = EngineStation(first, file)
+        place = EngineStation(first, file, PortChannels(counters, {}))
         engine = Engine([first])
         engine.start(0)
         gc.collect()
@@ -107,7 +112,7 @@ def _swaps(pds: int) -> list[Change]:
             return [_change(place, engine, specs[number % 2]) for number in range(1, _ROUNDS)]
         finally:
             gc.enable()
-            place.close()
+            place.file.close()
 
 
 def _change(place: EngineStation, engine: Engine, spec: Any) -> Change:

@@ -15,6 +15,7 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
 from eap.codec.ethercat import EtherCatHeader
 from eap.engine.build import REST_NS, EngineBuses, EnginePlant
+from eap.engine.channels import PortChannels
 from eap.engine.rebuild import EngineStation
 from eap.net import limits, tcpport
 from eap.net.busport import SegmentSocket
@@ -183,7 +184,7 @@ class RunningBuses:
             1, str(folder), "p", "p.yaml", (spec,), (), buses=(given,), bus_fd=desk_end.detach()
         )
         self.asked = []
-        place = EngineStation(self.station, cast("ImageFile", None))
+        place = EngineStation(self.station, cast("ImageFile", None), cast("PortChannels", None))
         self.buses = EngineBuses(handover, {"one": place}, lambda *asked: self.asked.append(asked))
         self.segment = load_or_raise(folder / "bus.yaml").build()
         self._end = SegmentSocket(slaves_end)

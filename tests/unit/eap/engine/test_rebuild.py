@@ -10,9 +10,10 @@ from msgspec.structs import replace
 
 from eap.codec.pd import decode_frame_header
 from eap.engine.build import EnginePlant
-from eap.engine.rebuild import MAX_WAITING, EngineStation, StationReplacement, has_tcp, sends_to
+from eap.engine.channels import PortChannels, has_tcp, sends_to
+from eap.engine.rebuild import MAX_WAITING, EngineStation, StationReplacement
 from eap.errors import EngineRefusedError, EnvironmentalError
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, NetId
 from eap.net.image_file import ImageFile, create_image, open_image
 from eap.net.loopback import LoopbackLines
 from eap.pd.device import DeviceState
@@ -22,6 +23,9 @@ from eap.pd.layout import plan_layout
 from eap.pd.report import station_status
 from eap.pd.spec import (
     REQUESTER,
+    BusPortSpec,
+    PortKind,
+    PortSpec,
     RxPdSpec,
     TxFrameSpec,
     TxPdSpec,
@@ -31,6 +35,7 @@ from eap.pd.spec import (
 )
 from eap.pd.station import Station
 from eap.pd.words import StationWord
+from eap.runtime.drop_counters import DropCounters
 from eap.runtime.engine_messages import Configure, SetState
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import Handover
@@ -112,6 +117,12 @@ def running(tmp_path):
     made.plant.close()
 
 
+BUS = PortSpec(
+    "bus0", PortKind.BUS, InterfaceUri.parse("sim:///x.yaml"), NetId.parse("1.2.3.4.5.9"),
+    bus=BusPortSpec("/x.yaml"),
+)  # fmt: skip
+
+
 def wider(spec):
     """The sender with one more variable in a second PD."""
     (frame,) = spec.frames
@@ -175,10 +186,9 @@ def test_one_side_is_swapped_a_hundred_times_while_frames_flow(running, side):
 
 def test_rebuild_that_needs_new_start_is_rejected(running):
     running.cycles(3)
-    other = replace(running.left, ports=(eap_port(1, "loop://y"),))
-    error = running.configure(other)
+    error = running.configure(replace(running.left, ports=(*running.left.ports, BUS)))
     assert isinstance(error, EngineRefusedError)
-    assert str(error) == ("port eap0: interface loop://x -> loop://y: restart the appliance")
+    assert str(error) == "port bus0 is new: restart the appliance"
     cycle = running.word("left", StationWord.CYCLE)
     running.cycles(3)
     assert running.word("left", StationWord.CYCLE) == cycle + 3
@@ -296,9 +306,11 @@ pytestmark = pytest.mark.net
 def place(tmp_path):
     spec = left(eap_port(1, "loop://x"))
     file = create_image(tmp_path / "left.image", plan_layout(spec))
-    made = EngineStation(Station(spec, file.image, file.wake_waiters), file)
-    yield made
-    made.file.close()
+    with DropCounters(tmp_path / "counts", ["left"]) as counters:
+        channels = PortChannels(counters, {})
+        made = EngineStation(Station(spec, file.image, file.wake_waiters), file, channels)
+        yield made
+        made.file.close()
 
 
 def test_rebuild_loses_no_concurrent_writes(place, tmp_path):
@@ -340,10 +352,10 @@ def test_rebuild_keeps_partial_write_of_stopped_program(place, tmp_path):
 def test_an_image_that_is_not_used_is_removed(place, tmp_path):
     StationReplacement(place, replace(place.station.spec, frames=())).discard()
     with pytest.raises(EngineRefusedError):
-        StationReplacement(place, replace(place.station.spec, ports=()))
+        StationReplacement(place, replace(place.station.spec, name="other"))
     with pytest.raises(KeyError):
         StationReplacement(place, replace(place.station.spec, variables=()))
-    assert [path.name for path in tmp_path.iterdir()] == ["left.image"]
+    assert {path.name for path in tmp_path.iterdir()} == {"left.image", "counts"}
 
 
 pytestmark = pytest.mark.net
@@ -388,13 +400,15 @@ def test_destinations_by_tcp_come_and_go_while_the_station_runs(tmp_path, listen
     file = create_image(tmp_path / "left.image", plan_layout(spec))
     station = Station(spec, file.image, file.wake_waiters)
     station.connect("eap0", LoopbackLines().open(InterfaceUri.parse("loop://x")))
-    place = EngineStation(station, file)
+    counters = DropCounters(tmp_path / "counts", ["left"])
+    channels = PortChannels(counters, {})
+    place = EngineStation(station, file, channels)
     engine = Engine([station])
     engine.start(0)
 
     def configure(*destinations):
         StationReplacement(place, sending(*destinations)).take_over(engine, engine.next_timeout())
-        place.update_tcp()
+        place.channels.update_tcp(place.station)
 
     def accept(listener):
         while not select.select([listener], [], [], 0)[0]:
@@ -422,5 +436,6 @@ def test_destinations_by_tcp_come_and_go_while_the_station_runs(tmp_path, listen
             configure("127.9.2.2")
             while receive(two):
                 pass
-    place.close()
-    assert file.path.name == "left.image"
+    channels.close()
+    place.file.close()
+    counters.close()

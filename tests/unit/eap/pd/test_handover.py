@@ -13,7 +13,13 @@ from msgspec.structs import replace
 
 from eap.ids import InterfaceUri, NetId
 from eap.od.slave_config import OpMode, SlaveConfig
-from eap.pd.handover import ImageHandover, needs_new_start, restarting_buses
+from eap.pd.handover import (
+    ImageHandover,
+    PortChanges,
+    needs_new_start,
+    port_changes,
+    restarting_buses,
+)
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot, TxSlot
 from eap.pd.monitor import SubscriberPresence
@@ -413,28 +419,33 @@ def test_all_but_ports_may_change():
     assert needs_new_start(left(), replace(left(), frames=(), variables=(), cycle_us=7)) == []
 
 
-def test_needs_new_start_ignores_frame_fields_of_port():
+def test_port_changes_ignore_frame_fields_of_port():
     port = replace(eap_port(1), net_id=NetId.parse("9.9.9.9.1.1"), eap_sm=True)
+    assert not port_changes(left(), left(port))
     assert needs_new_start(left(), left(port)) == []
 
 
-def test_needs_new_start_names_changed_fields():
-    port = replace(
-        eap_port(1), interface=InterfaceUri.parse("udp://127.9.2.9"), join=("239.1.1.1",), tcp=True
-    )
-    assert needs_new_start(left(), left(port)) == [
-        f"port eap0: interface udp://127.9.2.1 -> udp://127.9.2.9{END}",
-        f"port eap0: join () -> ('239.1.1.1',){END}",
-        f"port eap0: tcp False -> True{END}",
-    ]
+def test_port_changes_name_ports_that_come_and_go():
+    first, second = eap_port(1), replace(eap_port(2), name="eap1")
+    both = replace(left(), ports=(first, second))
+    assert port_changes(left(), both) == PortChanges((), (second,))
+    assert port_changes(both, left()) == PortChanges((second,), ())
+    assert needs_new_start(left(), both) == []
 
 
-def test_ports_stay_the_same_ones():
-    other = replace(left(), name="up", ports=(replace(eap_port(1), name="eap1"), BUS))
+def test_port_with_other_settings_goes_and_comes():
+    moved = replace(eap_port(1), interface=InterfaceUri.parse("udp://127.9.2.9"))
+    for port in (moved, replace(eap_port(1), join=("239.1.1.1",)), replace(eap_port(1), tcp=True)):
+        assert port_changes(left(), left(port)) == PortChanges((eap_port(1),), (port,))
+        assert needs_new_start(left(), left(port)) == []
+
+
+def test_bus_ports_stay_the_same_ones():
+    other = replace(left(), name="up", ports=(eap_port(1), replace(BUS, name="bus1")))
     assert needs_new_start(replace(left(), ports=(eap_port(1), BUS)), other) == [
         f"station left cannot become up{END}",
-        f"port eap1 is new{END}",
-        f"port eap0 is gone{END}",
+        f"port bus1 is new{END}",
+        f"port bus0 is gone{END}",
     ]
 
 

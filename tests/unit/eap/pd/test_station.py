@@ -171,9 +171,7 @@ def test_two_ports_send_under_their_own_net_ids_and_take_their_own_subscriptions
     for wire, port in ((left, "left"), (right, "right"), (group, "right")):
         wire.handlers.append(made.handlers[port])
     made.connect("left", left)
-    made.connect("right", right)
-    made.drain_also(group)
-    made.drain_also(group)
+    made.connect("right", right, [group, group])
     made.start(0)
     left.waiting.append((octets([(7, b"\x01\0")]), 10))
     group.waiting.append((octets([(7, b"\x02\0")]), 10))

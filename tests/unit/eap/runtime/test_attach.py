@@ -17,6 +17,7 @@ import pytest
 
 import eap
 from eap.codec.times import LongDuration
+from eap.engine.channels import PortChannels
 from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.ids import InterfaceUri, NetId
@@ -39,6 +40,7 @@ from eap.pd.station import Station
 from eap.pd.txframe import EVENT_BIT
 from eap.pd.words import StationWord
 from eap.runtime import attach as attach_module
+from eap.runtime.drop_counters import DropCounters
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo
 from tests.support.cyclic import OWN, PEER, Wire, octets
 from tests.support.eventually import wait_until
@@ -70,7 +72,9 @@ class Runner:
 
     def __init__(self, path: Path, station: StationSpec) -> None:
         file = create_image(path, plan_layout(station))
-        self._place = EngineStation(Station(station, file.image, file.wake_waiters), file)
+        self._counters = DropCounters(path.parent / "counts", [station.name])
+        channels = PortChannels(self._counters, {})
+        self._place = EngineStation(Station(station, file.image, file.wake_waiters), file, channels)
         self._engine = Engine([self._place.station])
         self.successors: queue.SimpleQueue[StationReplacement] = queue.SimpleQueue()
         self._stop = threading.Event()
@@ -107,6 +111,7 @@ class Runner:
     def stop(self) -> None:
         self.pause()
         self.file.close()
+        self._counters.close()
 
 
 @contextmanager

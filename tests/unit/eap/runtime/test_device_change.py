@@ -167,7 +167,7 @@ def test_plan_reports_changed_layout_with_same_version(plain):
             lambda s: with_port(s, net_id="9.9.9.9.9.9"),
             "port eap0: net_id 1.2.3.4.5.1 -> 9.9.9.9.9.9",
         ),
-        (lambda s: replace(s, ports=()), "port eap0 is gone"),
+        (lambda s: replace(s, ports=()), "port eap0: removed"),
         (lambda s: replace(s, ports=(*s.ports, BUS)), "port bus0 is new"),
         (lambda s: with_port(s, tcp=True), "port eap0: tcp False -> True"),
     ],

@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 import signal
+import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -215,12 +216,32 @@ def test_stored_configuration_runs_in_requested_state(sockets):
 
 
 @pytest.mark.net
-def test_stored_configuration_with_other_sockets_does_not_run(caplog, sockets):
+def test_stored_configuration_with_other_ports_runs(sockets):
+    moved = left(eap_port(9))
+    store(moved)
+    found = with_stored_configuration(handover(), sockets)
+    assert found.stations == (moved, right())
+    assert found.sockets == sockets.fit((moved, right()))
+    assert "127.9.2.1" not in {each.address for each in found.sockets}
+
+
+@pytest.mark.net
+def test_stored_configuration_whose_socket_is_in_use_does_not_run(sockets, caplog):
     store(left(eap_port(9)), DeviceState.SAFEOP)
-    with caplog.at_level(logging.WARNING):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
+        squatter.bind(("127.9.2.9", 34980))
         found = with_stored_configuration(handover(), sockets)
     assert found.stations == (left(), right())
-    assert "station left: the plant file runs: port eap0: interface" in caplog.text
+    (line,) = caplog.messages
+    assert line.startswith("station left: the plant file runs: UDP 127.9.2.9:34980 is in use")
+
+
+@pytest.mark.net
+def test_socket_of_the_plant_file_in_use_is_refused(sockets):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
+        squatter.bind(("127.9.2.2", 34980))
+        with pytest.raises(EnvironmentalError, match=r"127\.9\.2\.2:34980 is in use"):
+            with_stored_configuration(handover(), sockets)
 
 
 @pytest.mark.net
