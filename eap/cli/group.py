@@ -177,6 +177,7 @@ _COMMANDS = {
     "check": ("plant:check", "Check a plant file and report all errors."),
     "decode": ("decode:decode", "Decode a frame, or the frames of a capture."),
     "discover": ("discover:discover", "Find the process data on a network, and who takes it."),
+    "export": ("recordings:export", "Write a recording as CSV, Parquet, MCAP or pcapng."),
     "export-peer": ("files:export_peer", "Write what TwinCAT needs to talk to a station."),
     "gateway": ("gateway:gateway", "Start, stop and show the mailbox gateways of a station."),
     "gw": ("gateway:gw", "Access a master and its slaves through any mailbox gateway."),

@@ -1,4 +1,4 @@
-"""Commands for recordings that are there: ``record info`` and ``record repair``."""
+"""Commands for recordings that are there: ``record info``, ``record repair`` and ``export``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.output import Column, Renderer, TextTable
-from eap.cli.params import examples, json_option
+from eap.cli.output import Column, Renderer, TextTable, write_text
+from eap.cli.params import PLANT_FILE, examples, json_option
 from eap.quantities import count
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from eap.ops.recordings import ExportResult
     from eap.recording.recording_file import RecordingInfo
 
 RECORDING = click.Path(path_type=Path, dir_okay=False)
@@ -49,6 +50,80 @@ def repair(file: Path) -> None:
 
     cut = finish_recording(file)
     click.echo(f"{file}: finished, {count(cut, 'byte')} cut off", err=True)
+
+
+@click.command(
+    epilog=examples(
+        "eapctl export line.mcap --csv island-01/temp island-02",
+        "eapctl export line.mcap --parquet --from 12:00 --until +30s",
+        "eapctl export line.pcapng --mcap -o line.mcap",
+        "eapctl export tcpdump.pcap --plant line.yaml --csv -o -",
+    )
+)
+@click.argument("file", type=RECORDING)
+@click.argument("variables", nargs=-1, metavar="[VAR]...")
+@click.option("--csv", "form", flag_value="csv", help="Text: time_ns, then a column a variable.")
+@click.option("--parquet", "form", flag_value="parquet", help="Parquet, for pandas and others.")
+@click.option("--mcap", "form", flag_value="mcap", help="Values as recorded; of frames too.")
+@click.option("--pcapng", "form", flag_value="pcapng", help="Frames as recorded.")
+@click.option(
+    "-o",
+    "--output-file",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False, allow_dash=True),
+    metavar="OUT",
+    help="File to write [default: FILE with another suffix]; - is stdout, for CSV.",
+)
+@click.option("--from", "begin", metavar="T", help="Begin: 12:00, +30s, -10s or ISO 8601.")
+@click.option("--until", "end", metavar="T", help="End; +30s counts from the begin.")
+@click.option(
+    "--plant",
+    "plant",
+    type=PLANT_FILE,
+    metavar="PLANT",
+    help="Plant file whose PDs are in FILE, for captures of other programs.",
+)
+@click.option("--force", is_flag=True, help="Overwrite OUT.")
+@json_option("Print one object.")
+def export(
+    file: Path,
+    variables: tuple[str, ...],
+    form: str | None,
+    target: Path | None,
+    begin: str | None,
+    end: str | None,
+    plant: Path | None,
+    force: bool,
+    output: Renderer,
+) -> None:
+    """Write the recording FILE, or a part of it, in another form.
+
+    VAR is a variable as STATION/NAME, a part of one, a station, or a pattern with * and ?; none
+    takes all.  Frames become values by the PDs of the plant that is in FILE.
+    """
+    from eap.ops.recordings import ExportRequest, export_recording
+
+    if form is None:
+        raise click.UsageError("expected a form: --csv, --parquet, --mcap or --pcapng")
+    request = ExportRequest(
+        file=file,
+        form=form,
+        target=target,
+        variables=variables,
+        begin=begin,
+        end=end,
+        plant=plant,
+        is_forced=force,
+    )
+    result = export_recording(request, lambda text: write_text(text, end=""))
+    if result.file != "-":
+        output.show(result, _export_text)
+
+
+def _export_text(result: ExportResult) -> str:
+    if result.columns:
+        return f"{result.file}: {count(result.rows, 'row')} of {count(result.columns, 'column')}"
+    return f"{result.file}: {count(result.rows, 'frame')}"
 
 
 def info_view(found: RecordingInfo) -> Iterator[RenderableType]:

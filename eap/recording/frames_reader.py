@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -19,10 +20,10 @@ from eap.recording.frames_writer import (
     PUBLISHED_COMMENT,
 )
 from eap.recording.header import AttachedFile, EventKind, RecordingEvent
-from eap.recording.messages import Leaf, StationMessages, read_leaf
+from eap.recording.messages import PlacedVariable, StationMessages, read_leaf
 from eap.recording.packets import Packet, cut_frames, unwrap
 from eap.recording.published import RecordedFrame, RecordedPd, decode_published
-from eap.recording.rows import ValueRow, ValueSource, source_of
+from eap.recording.rows import ALL, RawRow, TimeWindow, ValueRow, ValueSource, source_of
 
 _BY_PD = tuple[str, int, int, int]
 """Publisher, ID, version and size of a PD."""
@@ -51,7 +52,8 @@ class FramesFile:
         files: Files of the plant.
         published: PDs of the plant.
         events: Marks and losses, in order.
-        interfaces: Names of the interfaces.
+        described: Interfaces of the file.
+        interfaces: Their names.
         messages: Number of packets.
         first_ns: Time of the first packet, None if there is none.
         last_ns: Time of the last packet.
@@ -73,12 +75,14 @@ class FramesFile:
         with path.open("rb") as file:
             capture = CaptureFile(file, str(path))
             self._scan(capture)
+        self.described = tuple(capture.interfaces)
         self.interfaces = [each.name for each in capture.interfaces]
         self.facts, self.files, inside = _section(capture.comments, path)
         self.published = tuple(published) or inside
         self.sources: dict[int, ValueSource] = {}
         self._messages: list[StationMessages] = []
-        self._pds: dict[_BY_PD, tuple[int, tuple[Leaf, ...]]] = {}
+        self._placed: list[tuple[str, RecordedPd]] = []
+        self._pds: dict[_BY_PD, int] = {}
         self._own: dict[str, str] = {}
         for frame in self.published:
             self._own[frame.publisher] = f"{frame.station}/{frame.port}"
@@ -110,42 +114,66 @@ class FramesFile:
                     yield FramePacket(captured, packet, data)
 
     def rows(
-        self,
-        from_ns: int | None = None,
-        until_ns: int | None = None,
-        sources: set[int] | None = None,
+        self, window: TimeWindow = ALL, sources: Collection[int] | None = None
     ) -> Iterator[ValueRow]:
-        """Yield the values of all PDs in a time window; *sources* None takes all.
+        """Yield the values of the PDs *sources* (all of them) in a time window."""
+        for at_ns, source, cycle, data in self.raw_rows(window, sources):
+            values = [read_leaf(leaf, data) for leaf in self._messages[source].leaves]
+            yield ValueRow(at_ns, source, cycle, values)
+
+    def raw_rows(
+        self, window: TimeWindow = ALL, sources: Collection[int] | None = None
+    ) -> Iterator[RawRow]:
+        """Yield the data of the PDs *sources*, in the order of the file.
 
         A frame that several ports recorded counts once: as its sender's port sent it, else as the
         first port received it.
         """
         interfaces = set(self.interfaces)
-        taken_from: dict[str, str] = {
+        taken_from = {
             publisher: port for publisher, port in self._own.items() if port in interfaces
         }
         for captured, _, data in self.frames():
-            if from_ns is not None and captured.at_ns < from_ns:
+            if captured.at_ns not in window or (frame := self.pds_of(data)) is None:
                 continue
-            if until_ns is not None and captured.at_ns > until_ns:
-                continue
-            if len(data) < 2 or data[1] >> 4 != FrameType.PROCESS_DATA:
-                continue
-            try:
-                header = PdFrameHeader.decode(data, PD_FRAME_START)
-                pds = list(iter_pds(data))
-            except CodecError:
-                continue
-            publisher = str(header.publisher)
+            publisher, cycle, pds = frame
             name = self.interfaces[captured.interface]
             if taken_from.setdefault(publisher, name) != name:
                 continue
-            for pd, content in pds:
-                found = self._pds.get((publisher, pd.pd_id, pd.version, pd.length))
-                if found is not None and (sources is None or found[0] in sources):
-                    octets = bytes(content)
-                    values: list[Any] = [read_leaf(leaf, octets) for leaf in found[1]]
-                    yield ValueRow(captured.at_ns, found[0], header.cycle, values)
+            for source, content in pds:
+                if source is not None and (sources is None or source in sources):
+                    yield RawRow(captured.at_ns, source, cycle, content)
+
+    def pds_of(self, data: bytes) -> tuple[str, int, list[tuple[int | None, bytes]]] | None:
+        """Return publisher, cycle counter and PDs of a frame; None if it is no process data.
+
+        A PD is the number of its source, None if the plant has no such PD, and its data.
+        """
+        if len(data) < 2 or data[1] >> 4 != FrameType.PROCESS_DATA:
+            return None
+        try:
+            header = PdFrameHeader.decode(data, PD_FRAME_START)
+            pds = list(iter_pds(data))
+        except CodecError:
+            return None
+        publisher = str(header.publisher)
+        return (
+            publisher,
+            header.cycle,
+            [
+                (self._pds.get((publisher, pd.pd_id, pd.version, pd.length)), bytes(content))
+                for pd, content in pds
+            ],
+        )
+
+    def placed_of(self, source: int) -> list[PlacedVariable]:
+        """Return the variables of a PD with their places in its data."""
+        return self._placed[source][1].placed()
+
+    def name_of(self, source: int) -> str:
+        """Return the name of a PD with that of its station."""
+        station, pd = self._placed[source]
+        return f"{station}/{pd.name}"
 
     def messages_of(self, source: int) -> StationMessages:
         """Return the encoder and decoder of a source."""
@@ -158,33 +186,32 @@ class FramesFile:
                 at_ns = packet.at_ns
                 self.first_ns = at_ns if self.first_ns is None else min(self.first_ns, at_ns)
                 self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
-                for comment in packet.comments:
-                    self._add_event(comment)
+                self.events += events_in(packet.comments)
         except MalformedError:
             if not capture.interfaces:
                 raise
             self.is_finished = False
         if any(each.link_type != ETHERNET for each in capture.interfaces):
             raise MalformedError("no capture of Ethernet", layout=str(self.path))
-        for comment in capture.last_comments:
-            self._add_event(comment)
+        self.events += events_in(capture.last_comments)
         self.events.sort(key=lambda each: each.time_ns)
         self._lost = capture.lost
-
-    def _add_event(self, comment: str) -> None:
-        if comment.startswith(EVENT_COMMENT):
-            try:
-                event = msgspec.json.decode(comment[len(EVENT_COMMENT) :], type=RecordingEvent)
-            except msgspec.MsgspecError:
-                return  # of a later release
-            self.events.append(event)
 
     def _add_pd(self, frame: RecordedFrame, pd: RecordedPd) -> None:
         number = len(self.sources)
         messages = StationMessages(frame.station, pd.placed())
         self._messages.append(messages)
+        self._placed.append((frame.station, pd))
         self.sources[number] = source_of(messages)
-        self._pds[frame.publisher, pd.pd_id, pd.version, pd.size] = number, tuple(messages.leaves)
+        self._pds[frame.publisher, pd.pd_id, pd.version, pd.size] = number
+
+
+def events_in(comments: Iterable[str]) -> Iterator[RecordingEvent]:
+    """Yield the events among the comments of a packet."""
+    for comment in comments:
+        if comment.startswith(EVENT_COMMENT):
+            with suppress(msgspec.MsgspecError):  # of a later release
+                yield msgspec.json.decode(comment[len(EVENT_COMMENT) :], type=RecordingEvent)
 
 
 def _tolerant(capture: CaptureFile) -> Iterator[CapturePacket]:

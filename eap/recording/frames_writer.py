@@ -166,7 +166,7 @@ _PACKET_HEAD = struct.Struct("<IIIIIII")
 _FLAG_OPTIONS = {
     flags: option(FLAGS, flags.to_bytes(4, "little")) + option(END, b"")
     for flags in (INBOUND, OUTBOUND)
-}
+} | {0: b""}
 _PADDING = (b"", b"\0\0\0", b"\0\0", b"\0")
 """Behind a packet, by its size modulo 4."""
 
@@ -209,11 +209,20 @@ class FramesWriter:
         return len(self._lost_at) - 1
 
     def write(
-        self, interface: int, time_ns: int, packet: bytes, *, outbound: bool, comment: str = ""
+        self,
+        interface: int,
+        time_ns: int,
+        packet: bytes,
+        *,
+        outbound: bool | None,
+        comment: str = "",
     ) -> None:
-        """Add one packet from its Ethernet header on (:class:`Wrapping`), at Unix time."""
+        """Add one packet from its Ethernet header on (:class:`Wrapping`), at Unix time.
+
+        *outbound* None is a packet of unknown direction.
+        """
         size = len(packet)
-        flags = OUTBOUND if outbound else INBOUND
+        flags = 0 if outbound is None else OUTBOUND if outbound else INBOUND
         if comment or self._events or self._dropped.get(interface):
             options = self._options(interface, flags, comment)
         else:

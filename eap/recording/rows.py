@@ -14,6 +14,32 @@ from eap.recording.messages import StationMessages
 from eap.suggest import nearest_in_any_case
 
 
+class RawRow(NamedTuple):
+    """Values of one source at one time as they are in the file: a message, or the data of a PD."""
+
+    time_ns: int
+    source: int
+    cycle: int
+    data: bytes
+
+
+class TimeWindow(NamedTuple):
+    """Part of a recording in Unix time; None has no limit."""
+
+    from_ns: int | None = None
+    until_ns: int | None = None
+
+    def __contains__(self, at_ns: object) -> bool:
+        return (
+            isinstance(at_ns, int)
+            and (self.from_ns is None or at_ns >= self.from_ns)
+            and (self.until_ns is None or at_ns <= self.until_ns)
+        )
+
+
+ALL = TimeWindow()
+
+
 class ValueColumn(NamedTuple):
     """One value over time: *name* is ``STATION/VARIABLE`` with the path to a part.
 

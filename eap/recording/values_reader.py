@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from bisect import bisect_left
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import msgspec
@@ -12,7 +13,7 @@ from eap.recording.header import AttachedFile, EventKind, RecordingEvent
 from eap.recording.mcap_file import McapChannel, McapFile
 from eap.recording.messages import RecordedVariable, StationMessages, pack_closely
 from eap.recording.published import RecordedFrame, decode_published
-from eap.recording.rows import ValueRow, ValueSource, source_of
+from eap.recording.rows import ALL, RawRow, TimeWindow, ValueRow, ValueSource, source_of
 from eap.recording.values_writer import EVENTS, HEADER, PUBLISHED, STATION, VARIABLES
 
 _REORDER_NS = 2_000_000_000
@@ -80,29 +81,30 @@ class ValuesFile:
         return len(self._content.damaged_chunks)
 
     def rows(
-        self,
-        from_ns: int | None = None,
-        until_ns: int | None = None,
-        sources: set[int] | None = None,
+        self, window: TimeWindow = ALL, sources: Collection[int] | None = None
     ) -> Iterator[ValueRow]:
-        """Yield the messages of *sources* (all of them) in a time window, the oldest first."""
-        wanted = self._messages.keys() if sources is None else self._messages.keys() & sources
-        low = 0 if from_ns is None else from_ns
-        high = (1 << 64) if until_ns is None else until_ns
-        waiting: list[ValueRow] = []
+        """Yield the values of *sources* (all of them) in a time window, the oldest first."""
+        for at_ns, source, _, data in self.raw_rows(window, sources):
+            yield ValueRow(at_ns, source, *self._messages[source].unpack(data))
+
+    def raw_rows(
+        self, window: TimeWindow = ALL, sources: Collection[int] | None = None
+    ) -> Iterator[RawRow]:
+        """Yield the messages of *sources*; their cycles have 32 bits."""
+        wanted = self._messages.keys() if sources is None else self._messages.keys() & set(sources)
+        low = window.from_ns or 0
+        high = (1 << 64) if window.until_ns is None else window.until_ns
+        waiting: list[RawRow] = []
         newest = 0
         for chunk in self._content.chunks:
             if chunk.last_ns < low or chunk.first_ns > high or not chunk.counts.keys() & wanted:
                 continue
-            for message in self._content.messages(chunk):
-                if message.channel in wanted and low <= message.time_ns <= high:
-                    cycle, values = self._messages[message.channel].unpack(message.data)
-                    waiting.append(ValueRow(message.time_ns, message.channel, cycle, values))
+            for channel, sequence, time_ns, data, _ in self._content.messages(chunk):
+                if channel in wanted and low <= time_ns <= high:
+                    waiting.append(RawRow(time_ns, channel, sequence, data))
             newest = max(newest, chunk.last_ns)
             waiting.sort(key=_by_time)
-            ready = 0
-            while ready < len(waiting) and waiting[ready].time_ns < newest - _REORDER_NS:
-                ready += 1
+            ready = bisect_left(waiting, newest - _REORDER_NS, key=_by_time)
             yield from waiting[:ready]
             del waiting[:ready]
         yield from waiting
@@ -144,7 +146,7 @@ class ValuesFile:
                         continue  # of a later release
 
 
-def _by_time(row: ValueRow) -> int:
+def _by_time(row: RawRow) -> int:
     return row.time_ns
 
 

@@ -100,14 +100,17 @@ class ValuesWriter:
         self._events = writer.register_channel(EVENTS, "json", schema)
         self._file.flush()
 
-    def add_station(self, station: str, variables: list[PlacedVariable]) -> int:
-        """Return the number of *station*, whose samples have *variables* at these places."""
+    def add_station(self, station: str, variables: list[PlacedVariable], topic: str = "") -> int:
+        """Return the number of *station*, whose samples have *variables* at these places.
+
+        *topic* is the name of its channel, if that is not the station's.
+        """
         messages = StationMessages(station, variables)
         schema: int = self._writer.register_schema(
             messages.schema_name, "protobuf", messages.descriptor()
         )
         facts = {STATION: station, VARIABLES: msgspec.json.encode(messages.variables).decode()}
-        channel: int = self._writer.register_channel(station, "protobuf", schema, facts)
+        channel: int = self._writer.register_channel(topic or station, "protobuf", schema, facts)
         # The events' channel is the first one.
         assert channel == len(self._stations) + 2  # noqa: S101
         self._stations.append(messages)
@@ -115,8 +118,11 @@ class ValuesWriter:
 
     def write(self, station: int, cycle: int, time_ns: int, sample: bytes) -> None:
         """Add the values of one cycle, which ran at *time_ns* in Unix time."""
+        self.write_message(station, cycle, time_ns, self._stations[station - 2].pack(cycle, sample))
+
+    def write_message(self, station: int, cycle: int, time_ns: int, message: bytes) -> None:
+        """Add a message that another recording had, with the same variables."""
         self._make_chunk(time_ns)
-        message = self._stations[station - 2].pack(cycle, sample)
         self._writer.add_message(station, time_ns, message, time_ns, cycle & 0xFFFFFFFF)
         self.messages += 1
 

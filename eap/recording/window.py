@@ -6,6 +6,7 @@ import re
 from datetime import UTC, datetime, timedelta
 
 from eap.errors import ConfigError
+from eap.recording.rows import ALL, TimeWindow
 
 _NS = 1_000_000_000
 _OFFSET = re.compile(r"([+-])(\d+(?:\.\d+)?)\s*(ms|s|min|m|h)?")
@@ -43,20 +44,20 @@ def parse_time(text: str, base_ns: int, end_ns: int) -> int:
 
 def parse_window(
     begin: str | None, end: str | None, first_ns: int | None, last_ns: int | None
-) -> tuple[int | None, int | None]:
-    """Return both ends of a window in a recording; an offset of *end* counts from *begin*.
+) -> TimeWindow:
+    """Return the window in a recording; an offset of *end* counts from *begin*.
 
     Raises:
         ConfigError: one is no time, or the window is empty.
     """
     if first_ns is None or last_ns is None:
-        return None, None
+        return ALL
     from_ns = None if begin is None else parse_time(begin, first_ns, last_ns)
     base_ns = first_ns if from_ns is None else from_ns
     until_ns = None if end is None else parse_time(end, base_ns, last_ns)
     if from_ns is not None and until_ns is not None and until_ns < from_ns:
         raise ConfigError(f"--until {end} is before --from {begin}")
-    return from_ns, until_ns
+    return TimeWindow(from_ns, until_ns)
 
 
 def _fraction(digits: str | None) -> int:

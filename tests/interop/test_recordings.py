@@ -5,12 +5,15 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import MacAddr, NetId
+from eap.ops.recordings import ExportRequest, export_recording
 from eap.recording.frames_writer import FramesWriter, ethernet_wrapping, udp_wrapping
 from eap.recording.header import AttachedFile, EventKind, RecordingEvent, RecordingHeader
+from tests.support.recordings import write_values
 from tests.support.tshark import dissect
 
 pytestmark = pytest.mark.tshark
@@ -74,3 +77,17 @@ def test_capinfos_counts_frames_and_shows_the_plant_file(recording: Path) -> Non
     assert "Number of packets:   16" in done.stdout
     assert "eap-file mill.yaml 1/4" in done.stdout
     assert "Ethernet" in done.stdout
+
+
+def test_pandas_reads_csv_and_parquet_alike(tmp_path: Path) -> None:
+    values = write_values(tmp_path / "a.mcap")
+    for form in ("csv", "parquet"):
+        export_recording(ExportRequest(file=values, form=form), print)
+    from_csv = pd.read_csv(tmp_path / "a.csv")
+    from_parquet = pd.read_parquet(tmp_path / "a.parquet")
+    assert list(from_csv.columns) == list(from_parquet.columns)
+    assert len(from_csv) == len(from_parquet) == 300
+    for name in ("time_ns", "island-01/temp", "island-01/count", "island-01/list[1]"):
+        as_read = from_csv[name].astype(from_parquet[name].dtype)
+        assert as_read.to_numpy().tobytes() == from_parquet[name].to_numpy().tobytes()
+    assert from_csv["island-02/temp"].isna().sum() == 150

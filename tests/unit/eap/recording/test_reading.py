@@ -15,7 +15,7 @@ from eap.errors import ConfigError, LocalProtocolError, MalformedError
 from eap.recording.frames_reader import FramesFile
 from eap.recording.recording_file import describe, iso_time, open_recording
 from eap.recording.repair import finish_recording
-from eap.recording.rows import plain_value, select
+from eap.recording.rows import TimeWindow, plain_value, select
 from eap.recording.values_reader import ValuesFile
 from tests.support.examples import examples
 from tests.support.recordings import (
@@ -67,7 +67,7 @@ def test_columns_are_parts_of_variables(values: Path) -> None:
         )
     ]  # fmt: skip
     assert source.columns[0].unit == "°C"
-    row = next(recording.rows(T0 + 3 * CYCLE_NS))
+    row = next(recording.rows(TimeWindow(T0 + 3 * CYCLE_NS)))
     plain = [
         plain_value(column.kind, value)
         for column, value in zip(source.columns, row.values, strict=True)
@@ -76,7 +76,7 @@ def test_columns_are_parts_of_variables(values: Path) -> None:
 
 
 def test_window_of_values_has_both_ends(values: Path) -> None:
-    rows = ValuesFile(values).rows(T0 + 100 * CYCLE_NS, T0 + 102 * CYCLE_NS, {2})
+    rows = ValuesFile(values).rows(TimeWindow(T0 + 100 * CYCLE_NS, T0 + 102 * CYCLE_NS), {2})
     assert [row.cycle for row in rows] == [100, 101, 102]
 
 
